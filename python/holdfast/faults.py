@@ -11,6 +11,7 @@ another code is an exception of the device.
 """
 
 NO_CONNECTION = FAULTS["refused"]
+STANDBY = FAULTS["standby"]
 
 _WORDS = {code: word for word, code in FAULTS.items()}
 _TEXTS = {
@@ -22,7 +23,7 @@ _TEXTS = {
     FAULTS["not stored"]: "memory refused the values",
     FAULTS["internal error"]: "an internal error",
     FAULTS["flooded"]: "a flood of data that was not requested",
-    FAULTS["standby"]: "another node uses the device",
+    STANDBY: "another node uses the device",
 }
 
 

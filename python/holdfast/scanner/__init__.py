@@ -9,6 +9,8 @@ with NATS, `polling` and `commands` with devices. `registry` holds the subscript
 `adjusting` reads inexact requests. `keeping` and `kept` store subscriptions, and restore them.
 `expiring` ends those that are not renewed.
 
+`fleet` shares devices with other scanners.
+
 For the programs of tentacle-next: `watching` follows buckets, `configured` carries out the
 subscriptions in one, `enabling` pauses polling, `tentacle_next` reads messages of another form.
 """
@@ -16,8 +18,18 @@ subscriptions in one, `enabling` pauses polling, `tentacle_next` reads messages 
 from __future__ import annotations
 
 from holdfast.scanner.broker import Ping, Servers
+from holdfast.scanner.fleet.terms import FleetRefused, FleetSettings
 from holdfast.scanner.limits import ScannerLimits
 from holdfast.scanner.rules import Defaults
 from holdfast.scanner.service import Scanner, Settings
 
-__all__ = ["Defaults", "Ping", "Scanner", "ScannerLimits", "Servers", "Settings"]
+__all__ = [
+    "Defaults",
+    "FleetRefused",
+    "FleetSettings",
+    "Ping",
+    "Scanner",
+    "ScannerLimits",
+    "Servers",
+    "Settings",
+]

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -103,8 +103,14 @@ class Broker:
         ping: Ping,
         *,
         name: str = "holdfast scan",
+        shared: Collection[str] = (),
+        queue: str = "",
     ) -> None:
-        """`name` is what the server shows of the connection."""
+        """`name` is what the server shows of the connection.
+
+        Messages of `shared` subjects go to one of all members of `queue`.
+        """
+        self._shared, self._queue = shared, queue
         self._name = name
         self._ping = ping
         self._servers = servers
@@ -188,7 +194,8 @@ class Broker:
         """Subscribes to all subjects. Sets `ended` on failure."""
         try:
             for subject, handler in self._handlers.items():
-                await client.subscribe(subject, cb=handler)
+                queue = self._queue if subject in self._shared else ""
+                await client.subscribe(subject, queue=queue, cb=handler)
             # nats-py may send the ping of a flush before what is still in its buffer. At the end of
             # the first flush, the buffer is sent; the second one waits until the server has it.
             await client.flush()

@@ -74,6 +74,16 @@ def browsed(
     return answer
 
 
+def report(
+    device: ScannedDevice,
+    undecoded: Mapping[str, str],
+    counters: Mapping[str, Mapping[str, Any]],
+    most: int,
+) -> DeviceReport:
+    """Returns the report of one device; without tags, blocks and subscribers if it is too large."""
+    return _Report(device, undecoded, counters.get(device.polled_as, {})).whole(most)
+
+
 class _Report:
     """Creates the reports of one device."""
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast import logs
 from holdfast.client.requests import write_typed
-from holdfast.faults import fault_text
-from holdfast.scanner.errors import Refused
+from holdfast.faults import STANDBY, fault_text
+from holdfast.scanner.errors import Moved, Refused
 from holdfast.scanner.health import is_unwritten
 from holdfast.tags.text import value_from
 from holdfast.tags.writing import from_text
@@ -63,6 +63,8 @@ async def write(polling: Polling, device: ScannedDevice, tag: Tag, text: str) ->
     except ValueError as error:
         raise Refused(f"not written: {error}") from None
     fault = await polling.write(device, request)
+    if fault == STANDBY:
+        raise Moved(f"not written: {fault_text(fault)}")
     if fault:
         said = "not written" if is_unwritten(fault) else "not confirmed"
         raise Refused(f"{said}: {fault_text(fault)}")

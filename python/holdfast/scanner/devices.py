@@ -159,6 +159,8 @@ class ScannedDevice:
         self.latest = LatestBlocks()
         self.status = b""
         """The last published state, as JSON."""
+        self.partition = 0
+        """The partition of a fleet that it belongs to."""
         self.polled_as = ""
         """The device's name in the poller. Each change gives it a new one."""
         self._writes = writes

@@ -5,3 +5,7 @@ from __future__ import annotations
 
 class Refused(Exception):
     """A request was refused; nothing has changed. The message is sent to the caller."""
+
+
+class Moved(Refused):
+    """Another node uses the device. Nothing was written."""

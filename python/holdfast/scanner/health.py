@@ -7,7 +7,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from holdfast.faults import NO_CONNECTION, fault_text, is_exception
+from holdfast.faults import NO_CONNECTION, STANDBY, fault_text, is_exception
 from holdfast.protocol import (
     BUSY,
     ILLEGAL_ADDRESS,
@@ -39,6 +39,7 @@ UNWRITTEN = (
     BUSY,
     PATH_UNAVAILABLE,
     NO_CONNECTION,
+    STANDBY,
 )
 """Faults of a write that the device certainly has not carried out."""
 

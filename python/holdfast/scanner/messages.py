@@ -215,11 +215,13 @@ class LogEntry(_Message):
     logger: str
 
 
-class Announcement(_Message):
+class Announcement(_Message, omit_defaults=True):
     """Announces a scanner to other scanners on the same subjects; a part of a heartbeat."""
 
     started_at: int
     """In milliseconds since 1970."""
+    fleet: str | None = None
+    """The fleet that the scanner is a node of."""
 
 
 class Variable(_Message, omit_defaults=True):
@@ -343,6 +345,15 @@ class EntryReport(_Message):
     error: str
 
 
+class FleetReport(_Message):
+    """The fleet that answers."""
+
+    name: str
+    node: str
+    """The node that has answered."""
+    nodes: list[str]
+
+
 class ServiceReport(_Message, omit_defaults=True):
     """The counts of messages since the start."""
 
@@ -361,6 +372,8 @@ class ServiceReport(_Message, omit_defaults=True):
     """Whether the scanner is enabled in `service_enabled`; only with dialect `tentacle-next`."""
     refused_entries: list[EntryReport] | None = None
     """The first refused entries of the bucket of subscriptions, by key."""
+    fleet: FleetReport | None = None
+    """The other counts are those of the node that has answered."""
 
 
 class BrowseAnswer(_Message, omit_defaults=True):

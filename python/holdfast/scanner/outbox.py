@@ -17,7 +17,7 @@ from nats.errors import Error
 from holdfast.scanner import wire
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from nats.aio.client import Client
 
@@ -37,7 +37,19 @@ CHECK_INTERVAL = 0.005
 class Outbox:
     """The queue of messages for NATS."""
 
-    def __init__(self, most: int = KEPT) -> None:
+    def __init__(
+        self,
+        most: int = KEPT,
+        *,
+        may_send: Callable[[], bool] = lambda: True,
+        lost: Callable[[], None] = lambda: None,
+    ) -> None:
+        """While `may_send` returns false, messages are dropped, and `lost` is called.
+
+        It is asked before each sending.
+        """
+        self._may_send = may_send
+        self._lost = lost
         self._client: Client | None = None
         self._flowing: list[bytes] = []
         self._size = 0
@@ -81,6 +93,12 @@ class Outbox:
             await self._news.wait()
             self._news.clear()
             while (self._flowing or self._kept) and self._client is not None:
+                if not self._may_send():
+                    self.dropped += len(self._flowing) + len(self._kept)
+                    self._flowing, self._size = [], 0
+                    self._kept.clear()
+                    self._lost()
+                    continue
                 if not self._takes():
                     await asyncio.sleep(CHECK_INTERVAL)
                     continue

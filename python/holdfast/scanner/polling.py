@@ -58,7 +58,10 @@ class Polling:
         self,
         take: Callable[[ScannedDevice, float, list[PolledBlock]], None],
         poller: _core.Poller | None = None,
+        fence: Callable[[ScannedDevice], _core.Fence | None] = lambda _: None,
     ) -> None:
+        """`fence` returns what says when another node may poll a device."""
+        self._fence = fence
         self._take = take
         self._devices: dict[str, ScannedDevice] = {}
         """The devices by their name in the poller."""
@@ -185,6 +188,7 @@ class Polling:
             start_within=min(interval, FIRST_WITHIN),
             report=self._results,
             release=source.release,
+            fence=self._fence(device),
         )
 
     def counters(self) -> dict[str, dict[str, Any]]:

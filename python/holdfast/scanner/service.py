@@ -9,24 +9,38 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import (
+    AsyncIterator,
+    Awaitable,
+    Callable,
+    Coroutine,
+    Iterable,
+    Mapping,
+    Sequence,
+)
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 from weakref import WeakValueDictionary
 
 import msgspec
 
 from holdfast import _core, logs
+from holdfast.config.scanning import written_pollable
 from holdfast.net.tls import NO_FILES, Tls
-from holdfast.scanner import commands, device_tls, tentacle_next, wire
+from holdfast.scanner import browsing, commands, device_tls, kept_entries, tentacle_next, wire
 from holdfast.scanner.adjusting import Adjustments, adjusted
 from holdfast.scanner.broker import Broker, Ping, Servers
 from holdfast.scanner.browsing import browsed
 from holdfast.scanner.configured import Configured
 from holdfast.scanner.enabling import Enabling
-from holdfast.scanner.errors import Refused
+from holdfast.scanner.errors import Moved, Refused
 from holdfast.scanner.expiring import Expiring
+from holdfast.scanner.fleet.exchange import About, Command, Executed, subject
+from holdfast.scanner.fleet.part import FleetPart
+from holdfast.scanner.fleet.terms import PROTOCOL, FleetSettings, Terms
 from holdfast.scanner.groups import grouped
+from holdfast.scanner.health import Health
 from holdfast.scanner.heartbeat import EVERY, Heart
 from holdfast.scanner.hosts import Allowed
 from holdfast.scanner.kept import Kept
@@ -35,7 +49,9 @@ from holdfast.scanner.messages import (
     Announcement,
     Answer,
     BrowseRequest,
+    DeviceReport,
     EntryReport,
+    FleetReport,
     HeartbeatMetadata,
     ServiceReport,
     Status,
@@ -51,7 +67,7 @@ from holdfast.scanner.publishing import Publisher
 from holdfast.scanner.registry import Registry, understood
 from holdfast.scanner.rivals import Rivals
 from holdfast.scanner.rules import Defaults, Rules
-from holdfast.scanner.variables import variables
+from holdfast.scanner.variables import of_device, variables
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -63,6 +79,7 @@ if TYPE_CHECKING:
     from holdfast.net.allow_list import AllowEntry
     from holdfast.scanner.adjusting import Asked
     from holdfast.scanner.devices import ScannedDevice
+    from holdfast.scanner.fleet.wants import Want
     from holdfast.scanner.keeping import Unit
     from holdfast.scanner.messages import BrowseAnswer
     from holdfast.scanner.registry import Subscription
@@ -89,6 +106,15 @@ MAX_REFUSED_SHOWN = 100
 
 ENDING = 2.0
 """Timeout in seconds of each step of a stop."""
+
+LEAVING = 10.0
+"""Timeout in seconds of handing devices over to other nodes of a fleet."""
+
+BROWSED = 100
+"""Devices that other nodes are asked for at once."""
+
+ENVELOPE = 512
+"""Bytes of an answer of a fleet without devices."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +145,8 @@ class Settings:
     """The programs that it serves."""
     profiles: Mapping[str, TagList] = field(default_factory=dict)
     """The tags that requests can name by their profile."""
+    fleet: FleetSettings | None = None
+    """The fleet of scanners that it is a node of."""
 
 
 class Scanner:
@@ -147,7 +175,24 @@ class Scanner:
         self._publishers: dict[str, Publisher] = {}
         self._heart = Heart(settings.prefix, self._metadata, self._rival)
         self._rivals = Rivals(self._heart.started)
-        self.outbox = Outbox()
+        self._part: FleetPart | None = None
+        if settings.fleet is not None:
+            self._part = FleetPart(
+                settings.fleet,
+                _terms(settings, settings.fleet),
+                settings.prefix,
+                _Host(self),
+                self._about,
+            )
+        part = self._part
+        self.outbox = (
+            Outbox()
+            if part is None
+            else Outbox(
+                may_send=lambda: not part.is_joined or part.fleet.may_publish,
+                lost=self._publish_again,
+            )
+        )
         self._expiring = Expiring()
         self._configured: Configured | None = None
         self._enabling: Enabling | None = None
@@ -164,7 +209,14 @@ class Scanner:
         )
         self._ready = asyncio.Event()
         """Set when the kept subscriptions are restored, or can't be."""
-        self._broker = Broker(settings.servers, self._handlers(), self._connected, settings.ping)
+        self._broker = Broker(
+            settings.servers,
+            self._handlers(),
+            self._connected,
+            settings.ping,
+            shared=[] if part is None else self._shared(),
+            queue="" if settings.fleet is None else f"holdfast-{settings.fleet.name}",
+        )
         self._due = asyncio.Event()
         """Set when the next heartbeat is due immediately."""
 
@@ -174,10 +226,12 @@ class Scanner:
         Raises `OSError` for a file of the settings that can't be used.
         """
         device_tls.check(self._settings.device_tls)
-        self._polling = Polling(self._take, self._poller)
+        self._polling = Polling(self._take, self._poller, self._fence)
         works = [self._broker.run(), self.outbox.run(), self._beat(), self._ended.wait()]
         works.append(self._expiring.run(self._expire))
-        if self._settings.keep_subscriptions:
+        if self._part is not None:
+            works.append(self._part.run(self._ready))
+        elif self._settings.keep_subscriptions:
             works += [self._kept.keeper.run(), self._kept.restore(self._ready)]
         else:
             self._ready.set()
@@ -217,7 +271,10 @@ class Scanner:
         values and states again.
         """
         self.outbox.connected(client)
-        self._kept.keeper.connected(client)
+        if self._part is None:
+            self._kept.keeper.connected(client)
+        else:
+            self._part.connected(client)
         self._expiring.connected(client is not None)
         for part in (self._enabling, self._configured):
             if part is not None:
@@ -228,10 +285,17 @@ class Scanner:
                 self._publishers[device.id].renew()
                 self._publish_state(device)
 
+    def _publish_again(self) -> None:
+        """Publishes the next value of every tag, even if it is unchanged."""
+        for publisher in self._publishers.values():
+            publisher.renew()
+
     def _handlers(self) -> dict[str, Callable[[Msg], Awaitable[None]]]:
         prefix = self._settings.prefix
 
-        async def shutdown(_: Msg) -> None:
+        async def shutdown(message: Msg) -> None:
+            if not self._is_meant(message.data):
+                return
             logs.write(logging.INFO, "shutdown_asked")
             self.end()
 
@@ -246,7 +310,63 @@ class Scanner:
         }
         if self._is_next:  # Its PLC library sends commands here.
             handlers[f"{prefix}.module.command.>"] = handlers[f"{prefix}.command.>"]
+        if self._part is not None:
+            for what, handle in (
+                ("command", self._forwarded),
+                ("browse", self._browse_own),
+                ("variables", self._variables_own),
+            ):
+                where = subject(prefix, self._part.fleet.node, what)
+                handlers[where] = self._answering(what, handle)
+            handlers[subject(prefix, self._part.fleet.node, "drain")] = self._drain
         return handlers
+
+    def _shared(self) -> list[str]:
+        """The subjects that any node of the fleet answers."""
+        names = ("subscribe", "unsubscribe", "command.>", "browse", "variables")
+        return [f"{self._settings.prefix}.{name}" for name in names]
+
+    def _is_meant(self, payload: bytes) -> bool:
+        """Whether a shutdown message is for this scanner: for all of a fleet, or for one node."""
+        if self._part is None or not payload.strip():
+            return True
+        try:
+            node = msgspec.json.decode(payload, type=dict[str, str]).get("node")
+        except msgspec.DecodeError as error:
+            logs.refused("message_malformed", kind="shutdown", reason=str(error))
+            return False
+        return node in (None, self._part.fleet.node)
+
+    async def _drain(self, message: Msg) -> None:
+        """Hands all devices over to the other nodes, and ends."""
+        logs.write(logging.INFO, "shutdown_asked")
+        if message.reply:
+            done = wire.text(message.reply, msgspec.json.encode(Answer(success=True)))
+            await self.outbox.answer(message.reply, done)
+        self.end()
+
+    def _fence(self, device: ScannedDevice) -> _core.Fence | None:
+        return None if self._part is None else self._part.fence(device)
+
+    def _is_own(self, device: ScannedDevice) -> bool:
+        """Whether this scanner polls a device, and tells what it has."""
+        return self._part is None or self._part.is_own(device)
+
+    def _about(self) -> dict[str, Any]:
+        """What other nodes are shown of this one."""
+        assert self._part is not None, "it is a node"
+        own = list(self._part.own)
+        counters = self._polling.counters()
+        missed = sum(each["missed"] for each in counters.values())
+        return {
+            "version": _core.__version__,
+            "devices": len(own),
+            "tags": sum(len(device.tags) for device in own),
+            "scans": sum(device.health.scans for device in own),
+            "missed": missed,
+            "lost": self._polling.dropped,
+            "published": self.outbox.sent,
+        }
 
     @property
     def _is_next(self) -> bool:
@@ -263,7 +383,9 @@ class Scanner:
     async def _announced(self, message: Msg) -> None:
         """Handles the announcement of another scanner, or of this one."""
         with contextlib.suppress(msgspec.DecodeError):
-            self._rival(msgspec.json.decode(message.data, type=Announcement).started_at)
+            other = msgspec.json.decode(message.data, type=Announcement)
+            if self._part is None or other.fleet != self._part.fleet.settings.name:
+                self._rival(other.started_at)
 
     def _rival(self, started: int) -> None:
         if self._rivals.seen(started):
@@ -271,7 +393,8 @@ class Scanner:
 
     def _announce(self) -> None:
         subject = f"{self._settings.prefix}.scanner"
-        text = wire.message(subject, Announcement(started_at=self._heart.started))
+        fleet = None if self._part is None else self._part.fleet.settings.name
+        text = wire.message(subject, Announcement(started_at=self._heart.started, fleet=fleet))
         if self._broker.client is not None:
             self.outbox.put([((subject,), text)])
 
@@ -331,7 +454,11 @@ class Scanner:
             asked = understood(request, self._rules, changes)
             self._check_not_configured(asked.device, asked.subscriber)
         async with self._turn(asked.device):
-            await self._add(asked)
+            if self._part is not None:
+                change = partial(self._add, asked, kept=True)
+                await self._part.store(asked.device, change, asked.subscriber)
+            else:
+                await self._add(asked)
             if self._is_next:
                 self._remove_others(asked)
         await self._kept.settled(asked.device, asked.subscriber)
@@ -418,10 +545,11 @@ class Scanner:
         async with self._turn(asked.device):
             await self._add(asked, kept=True)
 
-    async def _add(self, asked: Subscription, *, kept: bool = False) -> None:
+    async def _add(self, asked: Subscription, *, kept: bool = False, renewed: bool = True) -> None:
         """Adds a subscription, and polls and publishes accordingly. Raises `Refused`.
 
-        A subscription that is already `kept` is not stored again.
+        A subscription that is already `kept` is not stored again. If it is not `renewed`, its time
+        runs on.
         """
         address, endpoint = await self._place(asked)
         known = self._registry.devices.get(asked.device)
@@ -430,7 +558,8 @@ class Scanner:
         device = change.device
         if device is None or asked.subscriber not in device.subscribers:
             return
-        self._expiring.renew(device.id, asked.subscriber, asked.ttl)
+        if renewed:
+            self._expiring.renew(device.id, asked.subscriber, asked.ttl)
         if change.former is not None:
             self._drop(change.former)
         device.endpoint = endpoint
@@ -440,7 +569,12 @@ class Scanner:
         if change.former is not None or not is_extended:
             self._publish_state(device)
         if change.polling or change.former or (asked.tags and device.rate > SOON):
-            self._polling.renew(device)
+            self._poll(device)
+
+    def _poll(self, device: ScannedDevice, *, at_once: bool = True) -> None:
+        """Polls a device as it is now, if this scanner polls it."""
+        if self._is_own(device):
+            self._polling.renew(device, at_once=at_once)
 
     def _decoded(self, data: bytes, kind: type[Asked], changes: Adjustments) -> Asked:
         most = self._settings.limits.request
@@ -465,6 +599,8 @@ class Scanner:
         if publisher is None:
             publisher = Publisher(self._settings.prefix, device.id, self._settings.dialect)
             self._publishers[device.id] = publisher
+        if self._part is not None:
+            self._part.added(device)
         publisher.want(lambda: grouped(device), asked.tags)
 
     async def _place(self, asked: Subscription) -> tuple[Target, Endpoint | None]:
@@ -494,7 +630,7 @@ class Scanner:
             request = self._decoded(message.data, UnsubscribeRequest, changes)
             self._check_not_configured(request.device_id, request.subscriber_id)
         async with self._turn(request.device_id):
-            self._remove(request)
+            await self._remove_wanted(request)
         await self._kept.settled(request.device_id, request.subscriber_id)
         self._log_adjustments(request.subscriber_id, request.device_id, changes)
         logs.write(
@@ -506,9 +642,21 @@ class Scanner:
         )
         return Answer(success=True)
 
+    async def _remove_wanted(self, request: UnsubscribeRequest) -> None:
+        """Removes tags of a subscription, also from what a fleet wants. Raises `Refused`."""
+
+        async def change() -> None:
+            self._remove(request)
+
+        if self._part is None:
+            self._remove(request)
+        else:
+            await self._part.store(request.device_id, change)
+
     def _remove(self, request: UnsubscribeRequest) -> None:
         """Removes tags of a subscription, and polls and publishes accordingly."""
-        self._kept.unsubscribed(request)
+        if self._part is None:
+            self._kept.unsubscribed(request)
         device, changed = self._registry.unsubscribe(request)
         if device is None:
             return
@@ -517,7 +665,7 @@ class Scanner:
         if device.subscribers:
             self._publishers[device.id].want(lambda: grouped(device))
             if changed:
-                self._polling.renew(device, at_once=False)
+                self._poll(device, at_once=False)
         elif changed:
             self._drop(device)
             self._kept.state_changed(device.id)
@@ -528,8 +676,20 @@ class Scanner:
         async with self._turn(unit.device):
             if not self._expiring.is_due(unit):  # It was renewed while this waited.
                 return
-            self._expiring.renew(unit.device, unit.subscriber, None)
-            self._remove(UnsubscribeRequest(unit.device, unit.subscriber))
+            device = self._registry.devices.get(unit.device)
+            ttl = None
+            if device is not None and not self._is_own(device):
+                # The node that polls the device ends it. If it does not, this one looks again.
+                subscriber = device.subscribers.get(unit.subscriber)
+                ttl = None if subscriber is None else subscriber.ttl
+            self._expiring.renew(unit.device, unit.subscriber, ttl)
+            if ttl is not None:
+                return
+            try:
+                await self._remove_wanted(UnsubscribeRequest(unit.device, unit.subscriber))
+            except Refused:
+                self._expiring.renew(unit.device, unit.subscriber, 1)
+                return
         logs.write(logging.INFO, "expired", device=unit.device, subscriber=unit.subscriber)
 
     @contextlib.asynccontextmanager
@@ -543,7 +703,10 @@ class Scanner:
     def _drop(self, device: ScannedDevice) -> None:
         """Removes a device without subscribers."""
         del self._publishers[device.id]
-        self._polling.drop(device)
+        if self._part is not None:
+            self._part.dropped(device)
+        if device.polled_as:
+            self._polling.drop(device)
 
     def _turn(self, device: str) -> asyncio.Lock:
         """Returns the lock that serializes requests for one device."""
@@ -563,13 +726,77 @@ class Scanner:
             text = tentacle_next.command(message.data)
         async with self._in_order(message):
             device, tag = self._registry.commanded(name)
-        await commands.write(self._polling, device, tag, text)
+        if self._part is None:
+            await commands.write(self._polling, device, tag, text)
+        else:
+            own = partial(self._write, device.id, tag.id, text)
+            await self._part.command(device, tag.id, text, own)
         return Answer(success=True)
+
+    async def _write(self, device_id: str, tag_id: str, text: str) -> bool:
+        """Writes to a device that this node polls. Returns whether it does. Raises `Refused`."""
+        device = self._registry.devices.get(device_id)
+        if device is None or tag_id not in device.tags:
+            raise Refused(f"no tag {tag_id!r} of {device_id}")
+        if not self._is_own(device) or not device.polled_as:
+            return False
+        try:
+            await commands.write(self._polling, device, device.tags[tag_id], text)
+        except Moved:
+            return False
+        return True
+
+    async def _forwarded(self, message: Msg) -> bytes:
+        """Carries out a command that another node has received."""
+        assert self._part is not None, "it is a node"
+        command = msgspec.json.decode(message.data, type=Command)
+        device = self._registry.devices.get(command.device)
+        try:
+            is_current = device is not None and self._part.is_current(device, command.epoch)
+            done = is_current and await self._write(command.device, command.tag, command.text)
+            executed = Executed(moved=not done)
+        except Refused as refused:
+            executed = Executed(error=str(refused))
+        return msgspec.json.encode(executed)
+
+    async def _browse_own(self, message: Msg) -> bytes:
+        """Reports devices that this node polls, to another node."""
+        about = msgspec.json.decode(message.data, type=About)
+        counters = self._polling.counters()
+        shown = self._shown_devices()
+        return self._told(
+            (id, browsing.report(*shown[id], counters, self._most()))
+            for id in about.devices
+            if id in shown
+        )
+
+    async def _variables_own(self, message: Msg) -> bytes:
+        """Tells another node the values of devices that this node polls."""
+        about = msgspec.json.decode(message.data, type=About)
+        shown = self._shown_devices()
+        prefix = self._settings.prefix
+        return self._told(
+            (id, list(of_device(*shown[id], prefix))) for id in about.devices if id in shown
+        )
+
+    def _told(self, found: Iterable[tuple[str, object]]) -> bytes:
+        """As many as fit into a message."""
+        texts: list[bytes] = []
+        room = self._most() - ENVELOPE
+        for id, content in found:
+            text = msgspec.json.encode(id) + b":" + msgspec.json.encode(content)
+            room -= len(text) + 1
+            if room < 0:
+                break
+            texts.append(text)
+        return b'{"devices":{' + b",".join(texts) + b"}}"
 
     async def _browse(self, message: Msg) -> BrowseAnswer:
         request = BrowseRequest()
         if message.data:
             request = decode(message.data, BrowseRequest, self._settings.limits.request)
+        if self._part is not None:
+            return await self._browse_all(request)
         async with self._in_order(message, is_large=True):
             return self._browsed(request)
 
@@ -577,6 +804,8 @@ class Scanner:
         request = VariablesRequest()
         if message.data:
             request = decode(message.data, VariablesRequest, self._settings.limits.request)
+        if self._part is not None:
+            return await self._all_variables(request)
         async with self._in_order(message, is_large=True):
             prefix = self._settings.prefix
             refused = () if self._configured is None else self._configured.refused
@@ -603,6 +832,9 @@ class Scanner:
             lost_scans=self._polling.dropped,
             other_scanners=self._rivals.current() or None,
         )
+        if self._part is not None:
+            fleet = self._part.fleet
+            service.fleet = FleetReport(fleet.settings.name, fleet.node, fleet.nodes)
         if self._configured is not None:
             service.enabled = self._is_enabled
             service.refused_entries = [
@@ -612,6 +844,86 @@ class Scanner:
         counters = self._polling.counters()
         return browsed(request, self._shown_devices(), counters, service, self._most())
 
+    async def _adopt(self, device: str, want: Want | None, renewed: set[str]) -> None:
+        """Makes the subscriptions of a device those of the fleet. Raises `Refused`."""
+        wanted: dict[str, list[SubscribeRequest]] = {}
+        for text in () if want is None else want.requests:
+            request = kept_entries.restored(bytes(text))
+            wanted.setdefault(request.subscriber_id, []).append(request)
+        known = self._registry.devices.get(device)
+        for subscriber in [] if known is None else list(known.subscribers):
+            if subscriber not in wanted:
+                self._remove(UnsubscribeRequest(device, subscriber))
+        for subscriber, requests in wanted.items():
+            tags: set[str] = set()
+            for request in requests:
+                asked = understood(request, self._rules)
+                await self._add(asked, kept=True, renewed=subscriber in renewed)
+                tags |= asked.tags.keys()
+            known = self._registry.devices.get(device)
+            found = None if known is None else known.subscribers.get(subscriber)
+            others = [] if found is None else [id for id in found.tags if id not in tags]
+            if others:
+                self._remove(UnsubscribeRequest(device, subscriber, others))
+
+    async def _browse_all(self, request: BrowseRequest) -> BrowseAnswer:
+        """Reports devices of all nodes."""
+        assert self._part is not None, "it is a node"
+        ids = sorted(self._registry.devices)
+        if request.device_id is not None:
+            ids = [id for id in ids if id == request.device_id]
+        page = ids[request.offset or 0 :][:BROWSED]
+        devices = [self._registry.devices[id] for id in page]
+        found = await self._part.told("browse", devices)
+        answer = self._browsed(request)
+        shown: list[DeviceReport] = []
+        room = self._most() - ENVELOPE
+        for report in answer.devices[: len(page)]:
+            with contextlib.suppress(msgspec.ValidationError):
+                if report.device_id in found and request.tag_offset is None:
+                    report = msgspec.convert(found[report.device_id], DeviceReport)
+            room -= len(msgspec.json.encode(report)) + 1
+            if room < 0 and shown:
+                break
+            shown.append(report)
+        if len(shown) < len(answer.devices):
+            answer.next = (request.offset or 0) + len(shown)
+        answer.devices = shown
+        return answer
+
+    async def _all_variables(self, request: VariablesRequest) -> bytes:
+        """Returns the latest values of devices of all nodes."""
+        assert self._part is not None, "it is a node"
+        left, texts = request.offset or 0, list[bytes]()
+        room = self._most() - ENVELOPE
+        ids = sorted(self._registry.devices)
+        for at in range(0, len(ids), BROWSED):
+            page = [
+                device
+                for id in ids[at : at + BROWSED]
+                if request.device_id in (None, id)
+                and (device := self._registry.devices.get(id)) is not None
+            ]
+            skipped = 0
+            while skipped < len(page) and left >= len(page[skipped].tags):
+                left -= len(page[skipped].tags)
+                skipped += 1
+            page = page[skipped:]
+            found = await self._part.told("variables", page)
+            shown = self._shown_devices()
+            for device in page:
+                values = found.get(device.id)
+                if values is None and device.id in shown:
+                    values = list(of_device(*shown[device.id], self._settings.prefix))
+                for value in (values or [])[left:]:
+                    text = msgspec.json.encode(value)
+                    room -= len(text) + 1
+                    if room < 0:
+                        return b"[" + b",".join(texts) + b"]"
+                    texts.append(text)
+                left = 0
+        return b"[" + b",".join(texts) + b"]"
+
     def _take(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
         """Publishes the results of a poll."""
         try:
@@ -620,6 +932,8 @@ class Scanner:
             logs.problem("scan_failed", device=device.id)
 
     def _publish(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
+        if not self._is_own(device):
+            return  # Another node may have published newer values.
         if device.health.judge(blocks):
             self._tell(device)
         if device.may_have_moved():
@@ -627,6 +941,9 @@ class Scanner:
         device.latest.take(blocks)
         id = device.id
         messages = self._publishers[id].messages(due, blocks)
+        if self._part is not None:
+            epoch = self._part.fleet.epoch(device.partition)
+            messages = [(tag, wire.leased(text, epoch)) for tag, text in messages]
         self.outbox.put([((id, tag), text) for tag, text in messages])
         if len(device.subjects) > 1:
             one, other = (f"{self._settings.prefix}.data.{name}" for name in device.subjects)
@@ -659,6 +976,8 @@ class Scanner:
         logs.write(level, f"device_{health.state}", device=device.id, **told)
 
     def _publish_state(self, device: ScannedDevice) -> None:
+        if not self._is_own(device):
+            return
         health = device.health
         status = Status(
             device_id=device.id,
@@ -671,13 +990,17 @@ class Scanner:
         self._kept.state_changed(device.id)
         for name in device.subjects:
             subject = f"{self._settings.prefix}.status.{name}"
-            self.outbox.put([((device.id, subject), wire.text(subject, device.status))])
+            text = wire.text(subject, device.status)
+            if self._part is not None:
+                text = wire.leased(text, self._part.fleet.epoch(device.partition))
+            self.outbox.put([((device.id, subject), text)])
 
     async def _beat(self) -> None:
         while True:
             self._due.clear()
             self._announce()
-            await self._heart.beat(self._broker.client)
+            if self._part is None or self._part.fleet.is_own(0):
+                await self._heart.beat(self._broker.client)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(EVERY):
                     await self._due.wait()
@@ -687,6 +1010,10 @@ class Scanner:
         for part in (self._enabling, self._configured):
             if part is not None:
                 part.connected(None)
+        if self._part is not None:
+            with contextlib.suppress(Exception):  # Whatever fails, the leases end by themselves.
+                async with asyncio.timeout(LEAVING):
+                    await self._part.leave()
         await _within(self._polling.stop())
         for request in list(self._tasks):
             request.cancel()
@@ -697,11 +1024,64 @@ class Scanner:
 
     async def _farewell(self) -> None:
         """Deletes heartbeat and states, and waits until all messages are sent."""
-        if self._settings.keep_subscriptions:
+        if self._part is None and self._settings.keep_subscriptions:
             with contextlib.suppress(Exception):
                 await self._kept.keeper.stop()
-        await self._heart.stop(self._broker.client)
+        if self._part is None or not self._part.fleet.has_others:
+            await self._heart.stop(self._broker.client)
         await self.outbox.flush()
+
+
+class _Host:
+    """What the scanner does for its fleet."""
+
+    def __init__(self, scanner: Scanner) -> None:
+        self._scanner = scanner
+
+    def turn(self, device: str) -> asyncio.Lock:
+        return self._scanner._turn(device)
+
+    async def adopt(self, device: str, want: Want | None, renewed: set[str]) -> None:
+        await self._scanner._adopt(device, want, renewed)
+
+    def want(self, device: str) -> list[bytes]:
+        known = self._scanner._registry.devices.get(device)
+        if known is None:
+            return []
+        return [text for each in known.subscribers for text in kept_entries.requests(known, each)]
+
+    def timed(self, device: str) -> Iterable[str]:
+        known = self._scanner._registry.devices.get(device)
+        subscribers = {} if known is None else known.subscribers
+        return [name for name, each in subscribers.items() if each.ttl is not None]
+
+    def begin(self, device: ScannedDevice) -> None:
+        scanner = self._scanner
+        device.health = Health()
+        scanner._publishers[device.id].renew()
+        scanner._publish_state(device)
+        with contextlib.suppress(Refused):  # It is stopping.
+            scanner._poll(device)
+
+    def end(self, device: ScannedDevice) -> None:
+        if device.polled_as:
+            self._scanner._polling.drop(device)
+            device.polled_as = ""
+
+
+def _terms(settings: Settings, fleet: FleetSettings) -> Terms:
+    """What the other nodes of the fleet must have, too."""
+    return Terms(
+        protocol=PROTOCOL,
+        partitions=fleet.partitions,
+        prefix=settings.prefix,
+        allow=sorted(map(written_pollable, settings.allow)),
+        writes=settings.writes,
+        strict=settings.strict,
+        defaults=str(settings.defaults),
+        limits=str(settings.limits),
+        profiles=",".join(sorted(settings.profiles)),
+    )
 
 
 async def _within(step: Awaitable[object]) -> None:

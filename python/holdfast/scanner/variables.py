@@ -53,6 +53,14 @@ def variables(
     return b"[" + b",".join(texts) + b"]"
 
 
+def of_device(
+    device: ScannedDevice, undecoded: Mapping[str, str], module: str
+) -> Iterator[Variable]:
+    """Yields the latest value of each tag of a device."""
+    for tag in list(device.tags.values()):
+        yield _variable(device, undecoded, tag, module)
+
+
 def _requested(
     request: VariablesRequest, devices: Mapping[str, tuple[ScannedDevice, Mapping[str, str]]]
 ) -> Iterator[tuple[ScannedDevice, Mapping[str, str], Tag]]:

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 _encode = msgspec.json.Encoder().encode
 
+LEASE = b"Holdfast-Lease"
+"""The header with the revision of the lease of a device, in a fleet."""
+
 
 def text(subject: str, payload: bytes) -> bytes:
     """Returns the text that publishes one message."""
@@ -40,6 +43,15 @@ def message(subject: str, content: msgspec.Struct) -> bytes:
 def readdressed(text: bytes, subject: str, other: str) -> bytes:
     """Returns the text of a message to `subject` with another subject."""
     return b"PUB %b" % other.encode() + text.removeprefix(b"PUB %b" % subject.encode())
+
+
+def leased(text: bytes, epoch: int) -> bytes:
+    """Returns the text of a message with the revision of the lease under which it is published."""
+    head, _, payload = text.partition(b"\r\n")
+    _, subject, size = head.split(b" ")
+    header = b"NATS/1.0\r\n%b: %d\r\n\r\n" % (LEASE, epoch)
+    sizes = (len(header), len(header) + int(size))
+    return b"HPUB %b %d %d\r\n%b%b" % (subject, *sizes, header, payload)
 
 
 async def send(client: Client, texts: bytes, count: int) -> None:

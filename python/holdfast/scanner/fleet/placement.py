@@ -13,9 +13,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-PARTITIONS = 256
-"""The default number of partitions."""
-
 
 def partition_of(link: str, partitions: int) -> int:
     """The partition of a link: devices behind one address stay together."""

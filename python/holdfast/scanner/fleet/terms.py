@@ -1,0 +1,48 @@
+"""What all nodes of a fleet have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgspec
+
+from holdfast.config.scanning import PARTITIONS
+
+PROTOCOL = 1
+"""The version of what nodes tell each other, in buckets and messages."""
+
+
+class FleetRefused(Exception):
+    """The node can't be a part of the fleet with these settings."""
+
+
+@dataclass(frozen=True)
+class FleetSettings:
+    """The fleet that a scanner is a part of."""
+
+    name: str
+    node: str
+    """The name of this scanner in the fleet; unique."""
+    partitions: int = PARTITIONS
+
+
+class Terms(msgspec.Struct, frozen=True, kw_only=True):
+    """The settings that all nodes have in common: any of them answers any request."""
+
+    protocol: int
+    partitions: int
+    prefix: str
+    allow: list[str]
+    writes: str
+    strict: bool
+    defaults: str
+    limits: str
+    profiles: str
+
+    def difference(self, other: Terms) -> str | None:
+        """The first setting in which the other terms differ, with both values."""
+        for key in self.__struct_fields__:
+            own, theirs = getattr(self, key), getattr(other, key)
+            if own != theirs:
+                return f"{key} is {own}, and {theirs} in the fleet"
+        return None

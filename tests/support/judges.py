@@ -1,0 +1,111 @@
+"""Devices that judge a fleet: they know which connection every poll came over, and when."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from types import TracebackType
+    from typing import Self
+
+
+@dataclass
+class Judge:
+    """One device. It takes `delay` seconds to answer, as a slow device does."""
+
+    delay: float = 0.005
+    port: int = 0
+    polls: list[tuple[float, int]] = field(default_factory=list)
+    """The time of each request, and the number of its connection."""
+    writes: list[tuple[int, int]] = field(default_factory=list)
+    """The number of the connection of each write, and the value."""
+    peers: list[int] = field(default_factory=list)
+    """The port of the other side of each connection."""
+    overlaps: int = 0
+    """Requests that came while one of another connection was being answered."""
+    busy: int | None = None
+
+    async def serve(self) -> asyncio.Server:
+        server = await asyncio.start_server(self._talk, "127.0.0.1", 0)
+        self.port = server.sockets[0].getsockname()[1]
+        return server
+
+    async def _talk(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        number = len(self.peers)
+        self.peers.append(writer.get_extra_info("peername")[1])
+        with contextlib.suppress(OSError, asyncio.IncompleteReadError, asyncio.CancelledError):
+            while True:
+                frame = await reader.readexactly(12)
+                if self.busy not in (None, number):
+                    self.overlaps += 1
+                self.busy = number
+                self.polls.append((time.monotonic(), number))
+                await asyncio.sleep(self.delay)
+                self.busy = None
+                if frame[7] == 6:
+                    self.writes.append((number, int.from_bytes(frame[10:12])))
+                    writer.write(frame)
+                else:
+                    count = 2 * int.from_bytes(frame[10:12])
+                    head = frame[:4] + (3 + count).to_bytes(2) + frame[6:8]
+                    writer.write(head + bytes([count]) + bytes(count))
+        writer.close()
+
+    def returns(self) -> list[tuple[int, int]]:
+        """Connections that were used again after another one was, with that other one."""
+        found, last, left = [], -1, set[int]()
+        for _, number in self.polls:
+            if number != last:
+                if number in left:
+                    found.append((number, last))
+                left.add(last)
+                last = number
+        return found
+
+    def longest_gap(self, since: float) -> float:
+        times = [at for at, _ in self.polls if at >= since]
+        ends = [since, *times, time.monotonic()]
+        return max(after - before for before, after in itertools.pairwise(ends))
+
+
+class Judges:
+    """Devices, in a thread of their own."""
+
+    def __init__(self, count: int) -> None:
+        self.devices = [Judge() for _ in range(count)]
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+
+        async def start() -> None:
+            self._servers = [await device.serve() for device in self.devices]
+
+        asyncio.run_coroutine_threadsafe(start(), self._loop).result()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        async def end() -> None:
+            for server in self._servers:
+                server.close()
+            tasks = asyncio.all_tasks() - {asyncio.current_task()}
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+        asyncio.run_coroutine_threadsafe(end(), self._loop).result()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
