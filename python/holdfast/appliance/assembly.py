@@ -419,8 +419,9 @@ def scanner(
     settings: NatsConfig, profiles: Mapping[str, ProfileConfig] | None = None
 ) -> ScannerSettings:
     """Returns the settings of the scanner."""
-    from holdfast.scanner import Defaults, Ping, ScannerLimits, Settings
+    from holdfast.scanner import Defaults, FleetSettings, Ping, ScannerLimits, Settings
 
+    fleet = settings.fleet
     limits = ScannerLimits(devices=settings.limits.devices, tags=settings.limits.tags)
     trust = NO_FILES if settings.device_tls is None else settings.device_tls.files
     given = settings.defaults
@@ -438,6 +439,7 @@ def scanner(
         keep_subscriptions=settings.keep_subscriptions,
         dialect=settings.dialect,
         profiles=_tag_lists(profiles),
+        fleet=None if fleet is None else FleetSettings(fleet.name, fleet.node, fleet.partitions),
     )
 
 

@@ -59,6 +59,10 @@ GROUPS = {
             "holdfast.cli.sessions:sessions",
             "List the connections of a running appliance.",
         ),
+        "fleet": (
+            "holdfast.cli.fleet:fleet",
+            "Show and drain scanners that share devices.",
+        ),
         "replicas": (
             "holdfast.cli.replicas:replicas",
             "Show the logs of a running appliance, and their nodes.",

@@ -23,6 +23,7 @@ from holdfast.cli.tls_options import DEVICES, tls_of, tls_options
 from holdfast.config.fingerprint import fingerprint
 from holdfast.config.scanning import (
     MAX_DEADBAND,
+    MAX_PARTITIONS,
     MAX_PING_INTERVAL,
     MAX_PINGS,
     MAX_SCAN_RATE,
@@ -30,6 +31,7 @@ from holdfast.config.scanning import (
     MIN_PING_INTERVAL,
     MIN_SCAN_RATE,
     MIN_TIMEOUT,
+    PARTITIONS,
     PING_INTERVAL,
     PINGS_OUTSTANDING,
     PREFIX,
@@ -40,13 +42,24 @@ from holdfast.config.scanning import (
     Publish,
     Writes,
     check_dialect,
+    parse_member,
     parse_pollable,
     parse_prefix,
     parse_server,
     written_pollable,
 )
 from holdfast.net.allow_list import AllowedNetwork
-from holdfast.scanner import Defaults, Ping, Scanner, ScannerLimits, Servers, Settings, device_tls
+from holdfast.scanner import (
+    Defaults,
+    FleetRefused,
+    FleetSettings,
+    Ping,
+    Scanner,
+    ScannerLimits,
+    Servers,
+    Settings,
+    device_tls,
+)
 from holdfast.scanner.configured import BUCKET
 from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
 from holdfast.scanner.hosts import PRIVATE
@@ -61,11 +74,12 @@ if TYPE_CHECKING:
 
 DEFAULT_URL = f"nats://127.0.0.1:{SERVER_PORT}"
 FAILED = 1
+REFUSED = 2
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 
-def _servers(text: str) -> list[str]:
+def server_urls(text: str) -> list[str]:
     """Parses a comma-separated list of server URLs. Default scheme: nats://."""
     urls = []
     for part in filter(None, map(str.strip, text.split(","))):
@@ -91,6 +105,14 @@ def _prefix(text: str) -> str:
         raise click.BadParameter(f"{error}.") from None
 
 
+def member(text: str) -> str:
+    """Parses the name of a fleet or of a node."""
+    try:
+        return parse_member(text)
+    except ValueError as error:
+        raise click.BadParameter(f"{error}.") from None
+
+
 def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     if wanted:
         click.echo(json.dumps(json_schema(), indent=2))
@@ -102,7 +124,7 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     "--nats",
     "nats",
     multiple=True,
-    type=_servers,
+    type=server_urls,
     metavar="URL",
     help=f"NATS server; repeatable. [env: NATS_SERVERS, comma-separated; default: {DEFAULT_URL}]",
 )
@@ -208,6 +230,23 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     show_default=True,
     help="Keep subscriptions in JetStream, and restore them after a restart.",
 )
+@click.option(
+    "--fleet",
+    type=member,
+    metavar="NAME",
+    help="Share the devices with the scanners of this fleet.",
+)
+@click.option(
+    "--node", type=member, metavar="NAME", help="Name of this scanner in the fleet; unique."
+)
+@click.option(
+    "--partitions",
+    type=click.IntRange(1, MAX_PARTITIONS),
+    default=PARTITIONS,
+    show_default=True,
+    metavar="N",
+    help="Parts of the devices in a fleet: 20 times the number of scanners, or more.",
+)
 @click.option("--user", metavar="NAME", help="User name for the NATS server.")
 @click.option("--password-file", type=FILE, metavar="FILE", help="File with the user's password.")
 @click.option(
@@ -251,9 +290,10 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
 
     Connects to a device when a client subscribes to its tags, and disconnects after the last
     subscriber leaves. Runs until Ctrl-C, SIGTERM or a message to PREFIX.shutdown. On SIGHUP, the
-    files of the options are read anew. Exit codes: 0 stopped, 1 failed, 2 wrong usage.
+    files of the options are read anew. Exit codes: 0 stopped, 1 failed, 2 wrong usage, or refused
+    by the other nodes of the fleet.
     """
-    urls = [url for each in nats for url in each] or _servers(os.environ.get("NATS_SERVERS", ""))
+    urls = [url for each in nats for url in each] or server_urls(os.environ.get("NATS_SERVERS", ""))
     servers = _identity(tuple(urls) or (DEFAULT_URL,), options)
     trust = _tls("device", options)
     allow = _allowed(options["allow"])
@@ -263,6 +303,7 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
         check_dialect(options["dialect"], options["prefix"])
     except ValueError as error:
         raise click.BadParameter(f"{error}.", param_hint="'--prefix'") from None
+    _check_fleet(options)
     if store is not None and not embedded:
         raise click.UsageError("--store requires --embedded.")
     logs.configure(options["log_level"], options["log_format"])
@@ -278,9 +319,24 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
             settings = _settings(options, servers, allow, limits, trust)
             click.echo(_greeting(settings))
             asyncio.run(_serve(settings, check))
+        except FleetRefused as refused:
+            click.echo(f"holdfast: fleet {options['fleet']}: {refused}", err=True)
+            sys.exit(REFUSED)
         except (EmbeddedFailed, OSError) as error:
             click.echo(f"holdfast: {error}", err=True)
             sys.exit(FAILED)
+
+
+def _check_fleet(options: dict[str, Any]) -> None:
+    """Raises a usage error for options that a fleet does not allow."""
+    if options["fleet"] is None and options["node"] is None:
+        return
+    if options["fleet"] is None or options["node"] is None:
+        raise click.UsageError("--fleet requires --node, and --node requires --fleet.")
+    if options["dialect"] != "tentacle":
+        raise click.UsageError(f"--dialect {options['dialect']} can't be used with --fleet.")
+    if not options["keep_subscriptions"]:
+        raise click.UsageError("--no-keep-subscriptions can't be used with --fleet.")
 
 
 def _settings(
@@ -305,6 +361,9 @@ def _settings(
         publish_logs=options["publish_logs"],
         keep_subscriptions=options["keep_subscriptions"],
         dialect=options["dialect"],
+        fleet=None
+        if options["fleet"] is None
+        else FleetSettings(options["fleet"], options["node"], options["partitions"]),
     )
 
 
@@ -408,7 +467,7 @@ def _is_reloaded(settings: Settings, known: str) -> bool:
 
 
 def _greeting(settings: Settings) -> str:
-    prefix = settings.prefix
+    prefix, fleet = settings.prefix, settings.fleet
     is_next = settings.dialect == "tentacle-next"
     data = f"{prefix}.data.DEVICE.TAG" if is_next else f"{prefix}.data.DEVICE"
     lines = [
@@ -419,6 +478,7 @@ def _greeting(settings: Settings) -> str:
         f"  commands   {prefix}.command.TAG, {prefix}.command.DEVICE.TAG",
         f"  published  {data}, {prefix}.status.DEVICE",
         *([f"  entries    bucket {BUCKET}{prefix}"] if is_next else []),
+        *([] if fleet is None else [f"  fleet      {fleet.name}, as node {fleet.node}"]),
         f"  devices    {_places(settings.allow)}",
         "",
         "Ctrl-C stops it.",

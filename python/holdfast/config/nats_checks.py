@@ -36,6 +36,13 @@ def check_nats(path: KeyPath, nats: dict[Any, Any], folder: Path, report: Report
         message = "found with servers that begin with nats://, allowed: only with tls://"
         report.add((*path, "tls"), message, of_key=True)
     check_client_tls((*path, "tls"), mapping(nats.get("tls")), folder, report)
+    for key, found, allowed in (
+        ("dialect", "tentacle-next", "tentacle"),
+        ("keep_subscriptions", False, "true"),
+    ):
+        if "fleet" in nats and nats.get(key) == found:
+            shown = str(found).lower() if found is False else found
+            report.add((*path, key), f"found {shown} together with fleet, allowed: {allowed}")
     if nats.get("dialect") == "tentacle-next" and isinstance(nats.get("prefix"), str):
         try:
             check_dialect("tentacle-next", nats["prefix"])

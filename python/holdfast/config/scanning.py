@@ -32,6 +32,13 @@ Publish = Literal["scan", "change"]
 Writes = Literal["tags", "explicit", "none"]
 """Tags that may be written: all not declared read-only, those declared writable, or none."""
 
+_MEMBER = re.compile("[A-Za-z0-9_-]{1,32}")
+"""Names of fleets are parts of names of buckets, which have no dots."""
+
+PARTITIONS = 256
+MAX_PARTITIONS = 4096
+"""The partitions of a fleet: the default, and the most."""
+
 SCAN_RATE = 1000
 TIMEOUT = 3000
 """Defaults of subscribe requests in milliseconds."""
@@ -56,6 +63,13 @@ _SERIAL = re.compile(r"/[^\0]+|COM[0-9]+|\\\\\.\\[^\0]+", re.ASCII)
 def parse_server(text: object, *, least_port: int = 1) -> Remote:
     """Parses a server's URL. Raises `ValueError`, without the URL in the message."""
     return parse_remote(text, _PORTS, SERVER_FORM, least_port=least_port)
+
+
+def parse_member(text: str) -> str:
+    """Parses the name of a fleet or of a node. Raises `ValueError`."""
+    if not _MEMBER.fullmatch(text):
+        raise ValueError(f"{text!r} is not 1 to 32 letters, digits, - and _")
+    return text
 
 
 def parse_prefix(text: object) -> str:

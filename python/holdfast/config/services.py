@@ -36,6 +36,7 @@ from holdfast.config.scalars import (
 from holdfast.config.scanning import (
     MAX_DEADBAND,
     MAX_DEVICES,
+    MAX_PARTITIONS,
     MAX_PING_INTERVAL,
     MAX_PINGS,
     MAX_SCAN_RATE,
@@ -44,6 +45,7 @@ from holdfast.config.scanning import (
     MIN_PING_INTERVAL,
     MIN_SCAN_RATE,
     MIN_TIMEOUT,
+    PARTITIONS,
     PING_INTERVAL,
     PINGS_OUTSTANDING,
     PREFIX,
@@ -277,6 +279,21 @@ class NatsServersConfig(Model):
     """Certificates for the NATS servers; requires tls://."""
 
 
+Member: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,32}$")]
+"""The name of a fleet or of a node."""
+
+
+class NatsFleetConfig(Model):
+    """The fleet of scanners that share the devices."""
+
+    name: Member
+    """The name of the fleet."""
+    node: Member
+    """The name of this scanner in the fleet; unique."""
+    partitions: Annotated[int, Field(ge=1, le=MAX_PARTITIONS)] = PARTITIONS
+    """Parts of the devices that one scanner has; 20 times the number of scanners or more."""
+
+
 class NatsConfig(NatsServersConfig):
     """The scanner: polls devices for NATS subscribers."""
 
@@ -302,6 +319,8 @@ class NatsConfig(NatsServersConfig):
     """Whether subscriptions are kept in JetStream, and restored after a restart."""
     limits: NatsLimitsConfig = Field(default_factory=NatsLimitsConfig)
     """Limits on what subscribers can request."""
+    fleet: Annotated[NatsFleetConfig | None, NotNull()] = None
+    """The fleet of scanners that share the devices. Default: none."""
 
 
 class GatewayConfig(Model):
