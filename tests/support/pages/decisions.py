@@ -130,6 +130,7 @@ NOT_RUN: dict[tuple[str, str], str] = {
     ("docs/containers.md", "kubectl "): "needs a cluster",
     ("docs/service.md", "sudo"): "changes the system; releases are tried by hand",
     ("docs/service.md", "holdfast check /etc"): "has no configuration there",
+    ("docs/fleet.md", "holdfast scan"): "the stage has started it",
     ("docs/gateway.md", "holdfast gateway --allow 192.168.0.0/24 --https-cert"): "as the first one",
     ("docs/gateway.md", "holdfast gateway --allow 10.0.0.0/24 --tls-ca"): "as the first one",
     ("docs/gateway.md", "curl -s http://127.0.0.1:8090/api/modbus/connect"): "needs 10.0.0.5",

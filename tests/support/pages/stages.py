@@ -526,6 +526,14 @@ def scanner(stage: Stage) -> None:
     stage.replaced["4222"] = str(server.port)
 
 
+def fleet(stage: Stage) -> None:
+    """The two nodes of the page."""
+    scanner(stage)
+    for node in ("scan-a", "scan-b"):
+        url = f"nats://127.0.0.1:{stage.replaced['4222']}"
+        stage.serve("scan", "--nats", url, "--fleet", "plant", "--node", node)
+
+
 def durability(stage: Stage) -> None:
     memory = holdfast.Memory(holding_registers=1000)
     memory.write("holding_registers", 10, [7, 8])
@@ -593,6 +601,7 @@ STAGES: dict[str, Callable[[Stage], None]] = {
     "docs/describe.md": plant,
     "docs/devices.md": devices,
     "docs/durability.md": durability,
+    "docs/fleet.md": fleet,
     "docs/gateway.md": gateway,
     "docs/library.md": library,
     "docs/metrics.md": metrics,

@@ -1,0 +1,348 @@
+"""Scanners of one fleet: any of them answers any request, and one of them polls each device."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from nats.errors import TimeoutError as NoAnswer
+
+from holdfast.scanner import FleetSettings
+from support import wire
+from support.cli import invoke
+from support.judges import Judges
+from support.nats_bus import Caller
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from support.brokers import NatsServer
+    from support.judges import Judge
+    from support.nats_bus import Run, Running
+
+Node = "Callable[..., Running]"
+PARTITIONS = 16
+
+
+@pytest.fixture
+def judges() -> Iterator[Judges]:
+    with Judges(4) as judges:
+        yield judges
+
+
+@pytest.fixture
+def node(own_nats: NatsServer, run_scanner: Run) -> Callable[..., Running]:
+    def start(name: str, **more: Any) -> Running:
+        fleet = FleetSettings("plant", name, more.pop("partitions", PARTITIONS))
+        return run_scanner(own_nats, fleet=fleet, **more)
+
+    return start
+
+
+@pytest.fixture
+def caller(own_nats: NatsServer) -> Iterator[Caller]:
+    with Caller(own_nats.url) as caller:
+        yield caller
+
+
+def wanted(judge: Judge, number: int = 0, **more: Any) -> dict[str, Any]:
+    tag = {"id": f"t{number}", "address": 0, "functionCode": "holding", "datatype": "uint16"}
+    return {
+        "deviceId": f"d{number}",
+        "host": "127.0.0.1",
+        "port": judge.port,
+        "scanRate": 100,
+        "subscriberId": "hmi",
+        "tags": [tag],
+        **more,
+    }
+
+
+def partitions(running: Running) -> int:
+    part = running.scanner._part
+    assert part is not None
+    return len(part.fleet.partitions)
+
+
+def subscribe_all(caller: Caller, judges: Judges) -> None:
+    for number, judge in enumerate(judges.devices):
+        reply = caller.request("modbus.subscribe", wanted(judge, number))
+        assert reply == {"success": True, "count": 1}
+
+
+def is_polled(judge: Judge, more_than: int) -> bool:
+    return len(judge.polls) > more_than
+
+
+def share(*nodes: Running) -> None:
+    """Waits until all partitions have a node, and each node has its share."""
+    wire.until(
+        lambda: sorted(map(partitions, nodes)) == [PARTITIONS // len(nodes)] * len(nodes),
+        "the partitions are shared",
+    )
+
+
+def test_each_device_is_polled_by_one_node(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    one, two = node("a"), node("b")
+    share(one, two)
+    subscribe_all(caller, judges)
+    for judge in judges.devices:
+        wire.until(partial(is_polled, judge, 5), "it is polled")
+        assert len(judge.peers) == 1
+
+
+def test_a_third_node_takes_its_share_and_no_device_is_polled_twice(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    one = node("a")
+    share(one)
+    subscribe_all(caller, judges)
+    two = node("b")
+    share(one, two)
+    before = [len(judge.polls) for judge in judges.devices]
+    for judge, count in zip(judges.devices, before, strict=True):
+        wire.until(partial(is_polled, judge, count + 5), "it is polled")
+        assert not judge.overlaps
+        assert not judge.returns()
+    two.stop()
+    share(one)
+    before = [len(judge.polls) for judge in judges.devices]
+    for judge, count in zip(judges.devices, before, strict=True):
+        wire.until(partial(is_polled, judge, count + 5), "it is polled")
+        assert not judge.overlaps
+        assert not judge.returns()
+
+
+def test_a_subscription_is_known_to_all_and_survives_all(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    one, two = node("a"), node("b")
+    [judge, *_] = judges.devices
+    caller.request("modbus.subscribe", wanted(judge))
+    wire.until(lambda: len(judge.polls) > 2, "it is polled")
+    one.stop()
+    two.stop()
+    polls = len(judge.polls)
+    node("c")
+    wire.until(lambda: len(judge.polls) > polls + 2, "it is polled again")
+    # Both requests may reach any node.
+    node("d")
+    assert caller.request("modbus.unsubscribe", {"deviceId": "d0", "subscriberId": "hmi"}) == {
+        "success": True
+    }
+    wire.until(lambda: caller.request("modbus.browse", "")["count"] == 0, "it is gone")
+    wire.until(lambda: judge.busy is None, "its last poll has ended")
+
+
+def test_requests_for_one_device_at_once_lose_nothing(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    node("a"), node("b"), node("c")
+    [judge, *_] = judges.devices
+
+    async def all_at_once() -> list[Any]:
+        requests = [wanted(judge, subscriberId=f"hmi{number}") for number in range(12)]
+        messages = await asyncio.gather(
+            *(
+                caller.client.request(
+                    "modbus.subscribe", json.dumps(request).encode(), timeout=wire.DEADLINE
+                )
+                for request in requests
+            )
+        )
+        return [json.loads(message.data) for message in messages]
+
+    assert caller.do(all_at_once()) == [{"success": True, "count": 1}] * 12
+    wire.until(
+        lambda: len(caller.request("modbus.browse", "")["devices"][0]["subscribers"]) == 12,
+        "all are known",
+    )
+
+
+def test_a_request_that_is_refused_changes_nothing_anywhere(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    node("a"), node("b")
+    one, other, *_ = judges.devices
+    caller.request("modbus.subscribe", wanted(one))
+    for _ in range(6):
+        refused = caller.request("modbus.subscribe", wanted(other, subscriberId="x"))
+        assert not refused["success"]
+        assert "hmi" in refused["error"]
+    [device] = caller.request("modbus.browse", "")["devices"]
+    assert [each["id"] for each in device["subscribers"]] == ["hmi"]
+
+
+def test_a_command_reaches_the_device_whoever_receives_it(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    nodes = [node(name) for name in "abc"]
+    wire.until(lambda: sum(map(partitions, nodes)) == PARTITIONS, "all have a node")
+    subscribe_all(caller, judges)
+    for value in range(12):
+        for number in range(len(judges.devices)):
+            assert caller.request(f"modbus.command.t{number}", str(value)) == {"success": True}
+    for judge in judges.devices:
+        assert [value for _, value in judge.writes] == list(range(12))
+        assert len({number for number, _ in judge.writes}) == 1
+    refused = caller.request("modbus.command.t0", "70000")
+    assert "outside" in refused["error"]
+
+
+def test_browse_and_variables_tell_of_all_nodes(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    one, two = node("a"), node("b")
+    share(one, two)
+    subscribe_all(caller, judges)
+    wire.until(lambda: all(len(judge.polls) > 3 for judge in judges.devices), "all are polled")
+    for _ in range(6):
+        found = caller.request("modbus.browse", "")
+        assert found["count"] == 4
+        assert [each["state"] for each in found["devices"]] == ["online"] * 4
+        assert all(each["scans"] > 1 for each in found["devices"])
+        assert found["service"]["fleet"]["nodes"] == ["a", "b"]
+        values = caller.request("modbus.variables", "")
+        assert [each["quality"] for each in values] == ["good"] * 4
+        assert len(caller.request("modbus.variables", {"offset": 3})) == 1
+        [value] = caller.request("modbus.variables", {"deviceId": "d2"})
+        assert (value["variableId"], value["quality"]) == ("t2", "good")
+
+
+def test_messages_have_the_revision_of_the_lease(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    headers: list[Any] = []
+
+    async def listen() -> None:
+        async def take(message: Any) -> None:
+            headers.append(message.headers)
+
+        await caller.client.subscribe("modbus.data.>", cb=take)
+        await caller.client.flush()
+
+    caller.do(listen())
+    one = node("a")
+    caller.request("modbus.subscribe", wanted(judges.devices[0]))
+    wire.until(lambda: len(headers) > 3, "values come")
+    first = int(headers[-1]["Holdfast-Lease"])
+    assert first > 0
+    one.stop()
+    headers.clear()
+    node("b")
+    wire.until(lambda: headers, "values come from the other node")
+    assert int(headers[-1]["Holdfast-Lease"]) > first
+
+
+def test_a_subscription_ends_by_its_ttl_unless_any_node_renews_it(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    one, two = node("a"), node("b")
+    share(one, two)
+    timed, kept, *_ = judges.devices
+    caller.request("modbus.subscribe", wanted(kept, 1))
+    caller.request("modbus.subscribe", wanted(timed, 0, ttl=2))
+    for _ in range(3):
+        polls = len(timed.polls)
+        wire.until(partial(is_polled, timed, polls + 5), "it is polled")
+        assert caller.request("modbus.subscribe", wanted(timed, 0, ttl=2))["success"]
+    wire.until(lambda: caller.request("modbus.browse", "")["count"] == 1, "it has ended")
+    registries = [running.scanner._registry for running in (one, two)]
+    wire.until(lambda: all(len(each.devices) == 1 for each in registries), "for all")
+
+
+def test_one_node_or_all_are_shut_down(node: Callable[..., Running], caller: Caller) -> None:
+    one, two = node("a"), node("b")
+    share(one, two)
+    caller.publish("modbus.shutdown", {"node": "nobody"})
+    caller.publish("modbus.shutdown", {"node": "a"})
+    wire.until(one.ended.done, "the node ends")
+    share(two)
+    assert not two.ended.done()
+    caller.publish("modbus.shutdown")
+    wire.until(two.ended.done, "the other node ends")
+    with pytest.raises((NoAnswer, Exception)):
+        caller.request("modbus.browse", "")
+
+
+def refused(server: NatsServer, *options: str) -> str:
+    """Starts a scanner that the fleet refuses. Returns what it says."""
+    command = [sys.executable, "-m", "holdfast", "scan", "--nats", server.url, "--fleet", "plant"]
+    found = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
+    assert found.returncode == 2, found
+    return found.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--prefix", "other", "prefix is other, and modbus in the fleet"),
+        ("--partitions", "8", "partitions is 8, and 16 in the fleet"),
+        ("--writes", "none", "writes is none, and tags in the fleet"),
+        ("--allow", "10.0.0.0/8", "allow is ['10.0.0.0/8'], and [] in the fleet"),
+    ],
+)
+def test_other_settings_are_refused_and_named(
+    node: Callable[..., Running], own_nats: NatsServer, option: str, value: str, said: str
+) -> None:
+    node("a")
+    options = {"--node": "b", "--partitions": str(PARTITIONS), option: value}
+    shown = refused(own_nats, *(word for pair in options.items() for word in pair))
+    assert shown == f"holdfast: fleet plant: {said}"
+
+
+def test_a_name_that_is_in_use_is_refused(
+    node: Callable[..., Running], own_nats: NatsServer
+) -> None:
+    node("a")
+    shown = refused(own_nats, "--node", "a", "--partitions", str(PARTITIONS))
+    assert shown == ("holdfast: fleet plant: another process is the node a: give it another name")
+
+
+def test_without_nats_devices_rest_and_come_back(
+    node: Callable[..., Running], caller: Caller, judges: Judges, own_nats: NatsServer
+) -> None:
+    running = node("a")
+    [judge, *_] = judges.devices
+    caller.request("modbus.subscribe", wanted(judge))
+    wire.until(lambda: len(judge.polls) > 3, "it is polled")
+    own_nats.kill()
+    wire.until(lambda: partitions(running) == 0, "the leases are lost")
+    polls = len(judge.polls)
+    own_nats.start()
+    wire.until(lambda: partitions(running) == PARTITIONS, "the leases are back")
+    wire.until(lambda: len(judge.polls) > polls + 3, "it is polled again")
+    wire.until(lambda: running.serves, "it serves")
+    assert caller.request("modbus.browse", "")["count"] == 1
+
+
+def test_the_command_line_shows_and_drains_nodes(
+    node: Callable[..., Running], caller: Caller, judges: Judges, own_nats: NatsServer
+) -> None:
+    one, two = node("a"), node("b")
+    share(one, two)
+    subscribe_all(caller, judges)
+    result = invoke("fleet", "status", "plant", "--nats", own_nats.url)
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines()[0] == f"fleet plant: 2 nodes, {PARTITIONS} partitions"
+    result = invoke("fleet", "drain", "plant", "a", "--nats", own_nats.url)
+    assert (result.exit_code, result.stdout) == (0, "a has left the fleet plant.\n")
+    wire.until(one.ended.done, "it has ended")
+    share(two)
+    result = invoke("fleet", "status", "plant", "--nats", own_nats.url, "--json")
+    found = json.loads(result.stdout)
+    assert [each["node"] for each in found["nodes"]] == ["b"]
+    assert found["nodes"][0]["devices"] == 4
+    result = invoke("fleet", "drain", "plant", "a", "--nats", own_nats.url)
+    assert result.exit_code == 1
+    assert "there is no node a" in result.stderr
+    result = invoke("fleet", "status", "none", "--nats", own_nats.url)
+    assert result.exit_code == 1
+    assert "no fleet none" in result.stderr
