@@ -35,16 +35,16 @@ SETTLING = 2.0
 class Bench:
     """One scanner with its devices and a subscriber."""
 
-    def __init__(self, options: argparse.Namespace, stack: ExitStack) -> None:
+    def __init__(self, options: argparse.Namespace, stack: ExitStack, *fleet: str) -> None:
+        """With the name of a `fleet`, the scanner is its only node."""
         core, other = options.core, options.other
         devices = common.started("devices", common.python("scanner_devices.py"), other)
         self.devices = stack.enter_context(devices)
         self.nats = stack.enter_context(
             common.started("nats", common.python("scanner_nats.py"), other)
         )
-        self.scanner = stack.enter_context(
-            common.started("scanner", common.python("scanner_service.py", self.nats.address), core)
-        )
+        service = common.python("scanner_service.py", self.nats.address, *fleet)
+        self.scanner = stack.enter_context(common.started("scanner", service, core))
         listener = common.python("scanner_listener.py", self.nats.address, "modbus.data.>")
         self.listener = stack.enter_context(common.started("listener", listener, other))
 
@@ -126,10 +126,12 @@ async def _connected(bench: Bench) -> Client:
     return client
 
 
-def measured(options: argparse.Namespace, devices: int, rate: int, seconds: float) -> Any:
+def measured(
+    options: argparse.Namespace, devices: int, rate: int, seconds: float, *fleet: str
+) -> Any:
     """Measures throughput and processor time for some seconds."""
     with ExitStack() as stack:
-        bench = Bench(options, stack)
+        bench = Bench(options, stack, *fleet)
         asyncio.run(subscribe(bench, devices, rate))
         time.sleep(SETTLING)
         before, missed_before = asyncio.run(browse(bench))
@@ -219,12 +221,14 @@ def main() -> None:
         handed = results["us_per_message"] = asyncio.run(publishing(server.url))
     print(f"\nBytes to messages: {scan:.2f} us per value, {change:.2f} us if unchanged.")
     print(f"To NATS: {handed['publish']:.2f} us each by publish, {handed['batch']:.2f} in batches.")
-    for title, devices, rate in (
-        (f"{options.devices} devices of {TAGS} tags, once a second", options.devices, 1000),
+    once = f"{options.devices} devices of {TAGS} tags, once a second"
+    for title, devices, rate, *fleet in (
+        (once, options.devices, 1000),
+        (f"{once}, in a fleet of one", options.devices, 1000, "bench"),
         (f"100 devices of {TAGS} tags, 20 times a second: 200,000 values/s", 100, 50),
         (f"300 devices of {TAGS} tags, 20 times a second: 600,000 values/s", 300, 50),
     ):
-        results[title] = found = measured(options, devices, rate, seconds)
+        results[title] = found = measured(options, devices, rate, seconds, *fleet)
         show(title, found)
         sys.stdout.flush()
     if options.json:

@@ -1,4 +1,7 @@
-"""Runs the scanner under test, with the NATS server in the first argument."""
+"""Runs the scanner under test, with the NATS server in the first argument.
+
+With a second argument, it is the only node of the fleet of that name.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import asyncio
 import resource
 import sys
 
-from holdfast.scanner import Scanner, Servers, Settings
+from holdfast.scanner import FleetSettings, Scanner, Servers, Settings
 
 hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
 resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
@@ -14,7 +17,8 @@ resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 async def main() -> None:
     """Serves until it is killed."""
-    scanner = Scanner(Settings(Servers((f"nats://{sys.argv[1]}",))))
+    fleet = FleetSettings(sys.argv[2], "only") if len(sys.argv) > 2 else None
+    scanner = Scanner(Settings(Servers((f"nats://{sys.argv[1]}",)), fleet=fleet))
     running = asyncio.create_task(scanner.run())
     while not scanner.serves:
         await asyncio.sleep(0.01)
