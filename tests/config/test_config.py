@@ -719,6 +719,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "MqttConfig": ["url", "client_id"],
         "MqttOutputConfig": ["url", "type"],
         "NatsConfig": ["servers", "devices"],
+        "NatsFleetConfig": ["name", "node"],
         "NatsDefaultsConfig": None,
         "NatsLimitsConfig": None,
         "NatsOutputConfig": ["servers", "type"],

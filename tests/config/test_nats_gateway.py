@@ -293,7 +293,15 @@ def test_everything_else_needs_memories(
          "3: limits.tag: unknown key, allowed: devices, tags; did you mean 'tags'?"),
         ("  devices", "  embedded: true\n  devices", "3: embedded: unknown key, allowed: servers, "
          "username, password_file, token_file, credentials_file, tls, devices, device_tls, prefix, "
-         "dialect, defaults, writes, strict, ping, publish_logs, keep_subscriptions, limits"),
+         "dialect, defaults, writes, strict, ping, publish_logs, keep_subscriptions, limits, "
+         "fleet"),
+        ("  devices", "  fleet: {name: plant}\n  devices", "3: fleet.node: missing, allowed: text"),
+        ("  devices", "  fleet: {name: a.b, node: x}\n  devices",
+         "3: fleet.name: found 'a.b', allowed: 1 to 32 letters, digits, - and _"),
+        ("  devices", "  fleet: {name: a, node: x}\n  dialect: tentacle-next\n  devices",
+         "4: dialect: found tentacle-next together with fleet, allowed: tentacle"),
+        ("  devices", "  fleet: {name: a, node: x}\n  keep_subscriptions: false\n  devices",
+         "4: keep_subscriptions: found false together with fleet, allowed: true"),
         ("  devices", "  defaults: {timeout: 3}\n  devices",
          "3: defaults.timeout: found 3, allowed: an integer from 10 to 30000"),
         ("  devices", "  defaults: {scan_rate: 49}\n  devices",

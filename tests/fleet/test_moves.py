@@ -29,6 +29,8 @@ from support.nats_bus import Caller
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from nats.aio.msg import Msg
+
     from support.brokers import NatsServer
     from support.judges import Judge
 
@@ -148,6 +150,7 @@ def test_devices_are_scanned_by_one_node_at_a_time_whatever_happens_to_nodes(
         for number, judge in enumerate(judges.devices):
             reply = caller.request("modbus.subscribe", wanted(judge, number))
             assert reply["success"], reply
+        published = Published(caller)
         commands = Commands(caller, judges)
         ending.callback(commands.stop)
         kinds = ["freeze", "kill", "drain", "start"] * (ROUNDS // 4)
@@ -185,6 +188,31 @@ def test_devices_are_scanned_by_one_node_at_a_time_whatever_happens_to_nodes(
             assert not judge.returns()
         assert caller.request("modbus.browse", "")["count"] == DEVICES
         commands.check()
+        assert published.count
+        assert not published.returns
+
+
+class Published:
+    """Notes values of a node after those of one that has taken the device over from it."""
+
+    def __init__(self, caller: Caller) -> None:
+        self._leases: dict[str, int] = {}
+        self.count = 0
+        self.returns: list[tuple[str, int, int]] = []
+
+        async def listen() -> None:
+            await caller.client.subscribe("modbus.data.>", cb=self._take)
+            await caller.client.flush()
+
+        caller.do(listen())
+
+    async def _take(self, message: Msg) -> None:
+        self.count += 1
+        assert message.headers is not None
+        lease, latest = int(message.headers["Holdfast-Lease"]), self._leases.get(message.subject, 0)
+        if lease < latest:
+            self.returns.append((message.subject, lease, latest))
+        self._leases[message.subject] = max(lease, latest)
 
 
 class Commands:

@@ -41,6 +41,7 @@ from holdfast.config.http_url import parse_http
 from holdfast.config.ip_addresses import Bind, parse_bind, parse_peer, parse_source
 from holdfast.config.scanning import (
     PREFIX,
+    parse_member,
     parse_pollable,
     parse_prefix,
     parse_server,
@@ -366,6 +367,11 @@ NatsUrl = Annotated[
     str,
     PlainValidator(_nats_url),
     WithJsonSchema({"type": "string", "examples": ["nats://127.0.0.1:4222", "tls://nats.example"]}),
+]
+FleetMember = Annotated[
+    str,
+    PlainValidator(parse_member),
+    WithJsonSchema({"type": "string", "pattern": "^[A-Za-z0-9_-]{1,32}$"}),
 ]
 SubjectPrefix = Annotated[
     str,

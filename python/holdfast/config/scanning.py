@@ -65,11 +65,11 @@ def parse_server(text: object, *, least_port: int = 1) -> Remote:
     return parse_remote(text, _PORTS, SERVER_FORM, least_port=least_port)
 
 
-def parse_member(text: str) -> str:
-    """Parses the name of a fleet or of a node. Raises `ValueError`."""
-    if not _MEMBER.fullmatch(text):
-        raise ValueError(f"{text!r} is not 1 to 32 letters, digits, - and _")
-    return text
+def parse_member(text: object) -> str:
+    """Checks the name of a fleet or of a node. Raises `ValueError` for anything else."""
+    if isinstance(text, str) and _MEMBER.fullmatch(text):
+        return text
+    raise ValueError(f"found {show(text)}, allowed: 1 to 32 letters, digits, - and _")
 
 
 def parse_prefix(text: object) -> str:

@@ -16,6 +16,7 @@ from holdfast.config.scalars import (
     Duration,
     EgressEntry,
     FilePath,
+    FleetMember,
     MemoryNames,
     MqttText,
     MqttVersion,
@@ -279,16 +280,12 @@ class NatsServersConfig(Model):
     """Certificates for the NATS servers; requires tls://."""
 
 
-Member: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,32}$")]
-"""The name of a fleet or of a node."""
-
-
 class NatsFleetConfig(Model):
     """The fleet of scanners that share the devices."""
 
-    name: Member
+    name: FleetMember
     """The name of the fleet."""
-    node: Member
+    node: FleetMember
     """The name of this scanner in the fleet; unique."""
     partitions: Annotated[int, Field(ge=1, le=MAX_PARTITIONS)] = PARTITIONS
     """Parts of the devices that one scanner has; 20 times the number of scanners or more."""

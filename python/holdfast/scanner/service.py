@@ -107,6 +107,9 @@ MAX_REFUSED_SHOWN = 100
 ENDING = 2.0
 """Timeout in seconds of each step of a stop."""
 
+COUNTED = 10.0
+"""Seconds between two counts of missed scans for other nodes: many devices take milliseconds."""
+
 LEAVING = 10.0
 """Timeout in seconds of handing devices over to other nodes of a fleet."""
 
@@ -175,6 +178,10 @@ class Scanner:
         self._publishers: dict[str, Publisher] = {}
         self._heart = Heart(settings.prefix, self._metadata, self._rival)
         self._rivals = Rivals(self._heart.started)
+        self._scans = 0
+        """Polls that were published."""
+        self._counted = (-COUNTED, 0)
+        """When missed scans were counted, and how many there were."""
         self._part: FleetPart | None = None
         if settings.fleet is not None:
             self._part = FleetPart(
@@ -356,14 +363,16 @@ class Scanner:
         """What other nodes are shown of this one."""
         assert self._part is not None, "it is a node"
         own = list(self._part.own)
-        counters = self._polling.counters()
-        missed = sum(each["missed"] for each in counters.values())
+        now = time.monotonic()
+        if now - self._counted[0] > COUNTED:
+            missed = sum(each["missed"] for each in self._polling.counters().values())
+            self._counted = now, missed
         return {
             "version": _core.__version__,
             "devices": len(own),
             "tags": sum(len(device.tags) for device in own),
-            "scans": sum(device.health.scans for device in own),
-            "missed": missed,
+            "scans": self._scans,
+            "missed": self._counted[1],
             "lost": self._polling.dropped,
             "published": self.outbox.sent,
         }
@@ -934,6 +943,7 @@ class Scanner:
     def _publish(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
         if not self._is_own(device):
             return  # Another node may have published newer values.
+        self._scans += 1
         if device.health.judge(blocks):
             self._tell(device)
         if device.may_have_moved():

@@ -30,9 +30,6 @@ PARTITION = "partition."
 TOGETHER = 4
 """Partitions that are handed over at once."""
 
-LEAVING = 16
-"""The same for a node that leaves."""
-
 ENDING = 5.0
 """Seconds to wait for polls and writes of a partition before it is given back."""
 
@@ -185,6 +182,8 @@ class Fleet:
             self._place(nodes)
 
     def _place(self, nodes: list[str]) -> None:
+        if self._is_leaving:
+            return
         held = {
             partition: owner
             for partition in range(self.settings.partitions)
@@ -214,8 +213,8 @@ class Fleet:
         node = f"{NODE}{self.node}"
         with contextlib.suppress(Error, OSError):
             await self.leases.renew_now(node)
-        may_end = asyncio.Semaphore(LEAVING)
         keys = [key for key in self.leases.held if key.startswith(PARTITION)]
+        may_end = asyncio.Semaphore(len(keys))
         await asyncio.gather(*(self._give_back(key, may_end) for key in keys))
         await self.leases.give_back(node, 0.0)
         logs.write(logging.INFO, "fleet_left", fleet=self.settings.name, node=self.node)
