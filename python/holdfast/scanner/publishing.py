@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
 
+from holdfast.scanner import wire
 from holdfast.scanner.groups import Group
 from holdfast.scanner.subjects import data_subject
 from holdfast.scanner.tags import clean
@@ -47,7 +48,11 @@ _encode = msgspec.json.Encoder().encode
 class Publisher:
     """Creates the messages of one device."""
 
-    def __init__(self, prefix: str, device: str, dialect: Dialect = "tentacle") -> None:
+    def __init__(
+        self, prefix: str, device: str, dialect: Dialect = "tentacle", lease: int | None = None
+    ) -> None:
+        """In a fleet, messages have the revision of the `lease` of the device."""
+        self._header = b"" if lease is None else wire.lease_header(lease)
         self._prefix = prefix
         self._device = device
         self._dialect = dialect
@@ -228,8 +233,12 @@ class Publisher:
         after = b',"datatype":"%b","timestamp":' % tag.datatype.encode()
         text = before.replace(b"%", b"%%") + b"%b" + after + b"%b}"
         subject = data_subject(self._prefix, self._device, tag.id, self._dialect).encode()
-        head_line = b"PUB %b %%d\r\n" % subject.replace(b"%", b"%%")
-        return head_line + text + b"\r\n", len(before) + len(after) + 1
+        size, header = len(before) + len(after) + 1, self._header
+        escaped = subject.replace(b"%", b"%%")
+        head_line = b"PUB %b %%d\r\n" % escaped
+        if header:
+            head_line = b"HPUB %b %d %%d\r\n%b" % (escaped, len(header), header)
+        return head_line + text + b"\r\n", size + len(header)
 
 
 _INFALLIBLE = {

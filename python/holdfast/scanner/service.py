@@ -604,13 +604,16 @@ class Scanner:
             logs.write(logging.WARNING, kind, subscriber=subscriber, device=device, found=what)
 
     def _begin_publishing(self, device: ScannedDevice, asked: Subscription) -> None:
-        publisher = self._publishers.get(device.id)
-        if publisher is None:
-            publisher = Publisher(self._settings.prefix, device.id, self._settings.dialect)
-            self._publishers[device.id] = publisher
         if self._part is not None:
             self._part.added(device)
+        publisher = self._publishers.get(device.id)
+        if publisher is None:
+            publisher = self._publishers[device.id] = self._publisher(device)
         publisher.want(lambda: grouped(device), asked.tags)
+
+    def _publisher(self, device: ScannedDevice) -> Publisher:
+        lease = None if self._part is None else self._part.fleet.epoch(device.partition)
+        return Publisher(self._settings.prefix, device.id, self._settings.dialect, lease)
 
     async def _place(self, asked: Subscription) -> tuple[Target, Endpoint | None]:
         """Returns the address of a device: the known one, or the result of a lookup."""
@@ -951,9 +954,6 @@ class Scanner:
         device.latest.take(blocks)
         id = device.id
         messages = self._publishers[id].messages(due, blocks)
-        if self._part is not None:
-            epoch = self._part.fleet.epoch(device.partition)
-            messages = [(tag, wire.leased(text, epoch)) for tag, text in messages]
         self.outbox.put([((id, tag), text) for tag, text in messages])
         if len(device.subjects) > 1:
             one, other = (f"{self._settings.prefix}.data.{name}" for name in device.subjects)
@@ -1068,7 +1068,8 @@ class _Host:
     def begin(self, device: ScannedDevice) -> None:
         scanner = self._scanner
         device.health = Health()
-        scanner._publishers[device.id].renew()
+        publisher = scanner._publishers[device.id] = scanner._publisher(device)
+        publisher.want(lambda: grouped(device), device.tags)
         scanner._publish_state(device)
         with contextlib.suppress(Refused):  # It is stopping.
             scanner._poll(device)

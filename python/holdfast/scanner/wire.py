@@ -45,11 +45,16 @@ def readdressed(text: bytes, subject: str, other: str) -> bytes:
     return b"PUB %b" % other.encode() + text.removeprefix(b"PUB %b" % subject.encode())
 
 
+def lease_header(epoch: int) -> bytes:
+    """Returns the headers of a message with the revision of a lease."""
+    return b"NATS/1.0\r\n%b: %d\r\n\r\n" % (LEASE, epoch)
+
+
 def leased(text: bytes, epoch: int) -> bytes:
     """Returns the text of a message with the revision of the lease under which it is published."""
     head, _, payload = text.partition(b"\r\n")
     _, subject, size = head.split(b" ")
-    header = b"NATS/1.0\r\n%b: %d\r\n\r\n" % (LEASE, epoch)
+    header = lease_header(epoch)
     sizes = (len(header), len(header) + int(size))
     return b"HPUB %b %d %d\r\n%b%b" % (subject, *sizes, header, payload)
 
