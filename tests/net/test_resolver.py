@@ -27,8 +27,9 @@ class Slow:
         self._lock = threading.Lock()
 
     def __call__(self, host: str, port: int | None, **_: Any) -> list[tuple[Any, ...]]:
-        with self._lock:
-            self.asked.append(host)
+        if host != "127.0.0.1":  # A thread of another test may still connect.
+            with self._lock:
+                self.asked.append(host)
         self.answers.wait(wire.DEADLINE)
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("10.0.0.1", port or 0))]
 

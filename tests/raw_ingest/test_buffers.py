@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import signal
 import socket
 import subprocess
 import sys
@@ -171,7 +173,9 @@ def test_the_system_keeps_a_bounded_number_of_bytes_that_nobody_has_read(
         client = socket.create_connection(process.address, wire.DEADLINE)
         with client:
             wire.until(lambda: process.open() == 1, "it is there")
-            subprocess.run(["kill", "-STOP", str(process.pid)], check=True)
+            os.kill(process.pid, signal.SIGSTOP)
+            # Its threads run on until the system has stopped them all.
+            os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
             try:
                 client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 64 * 1024)
                 client.settimeout(0.5)
@@ -180,6 +184,6 @@ def test_the_system_keeps_a_bounded_number_of_bytes_that_nobody_has_read(
                     while taken < 8_000_000:
                         taken += client.send(bytes(64 * 1024))
             finally:
-                subprocess.run(["kill", "-CONT", str(process.pid)], check=True)
+                os.kill(process.pid, signal.SIGCONT)
             # What the system of the sender keeps is in it too.
             assert taken < 1_500_000
