@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from holdfast.cli.scan import DEFAULT_URL, member, server_urls
-from holdfast.cli.showing import table
+from holdfast.cli.showing import counted, table
 from holdfast.cli.tls_options import tls_of, tls_options
 from holdfast.config.scanning import PREFIX
 from holdfast.scanner import Servers
@@ -125,7 +125,7 @@ def _lines(shown: dict[str, Any]) -> list[str]:
     ]
     free = shown["free_partitions"]
     lines = [
-        f"fleet {shown['fleet']}: {len(rows)} nodes, {shown['partitions']} partitions"
+        f"fleet {shown['fleet']}: {counted(len(rows), 'node')}, {shown['partitions']} partitions"
         + (f", {free} of them without a node" if free else "")
     ]
     return [*lines, *(f"  {line}" for line in table(_HEAD, rows))]
