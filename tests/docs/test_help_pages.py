@@ -105,7 +105,7 @@ def test_the_figures_of_the_readme_are_those_of_the_benchmarks() -> None:
 
 
 def test_each_log_event_is_explained() -> None:
-    pages = ("operations", "scanner", "mqtt", "outputs", "durability")
+    pages = ("operations", "scanner", "mqtt", "outputs", "durability", "fleet")
     explained = {
         word for page in pages for word in re.findall(r"`(\w+)`", (DOCS / f"{page}.md").read_text())
     }

@@ -14,6 +14,7 @@ import click
 
 from holdfast.cli.scan import DEFAULT_URL, member, server_urls
 from holdfast.cli.showing import counted, table
+from holdfast.cli.suggesting import SuggestingGroup
 from holdfast.cli.tls_options import tls_of, tls_options
 from holdfast.config.scanning import PREFIX
 from holdfast.scanner import Servers
@@ -31,7 +32,7 @@ _BETWEEN = 1.0
 """Seconds between two looks, from which rates are calculated."""
 
 
-@click.group()
+@click.group(cls=SuggestingGroup, epilog="Example: holdfast fleet status plant")
 def fleet() -> None:
     """Show and drain the scanners of a fleet."""
 
