@@ -277,7 +277,8 @@ def refused(server: NatsServer, *options: str) -> str:
     command = [sys.executable, "-m", "holdfast", "scan", "--nats", server.url, "--fleet", "plant"]
     found = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
     assert found.returncode == 2, found
-    return found.stderr.splitlines()[-1]
+    [said] = [line for line in found.stderr.splitlines() if line.startswith("holdfast: ")]
+    return said
 
 
 @pytest.mark.parametrize(
