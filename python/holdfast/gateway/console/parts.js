@@ -26,8 +26,15 @@ export function asked(part) {
   return { functionCode: area, address, quantity, ...typed };
 }
 
-/** Returns a part for the link. */
-export async function spelled(part) {
+const spellings = new WeakMap();
+
+/** Returns a part for the link. It is spelled once: later changes of the view are in the link before a reload. */
+export function spelled(part) {
+  if (!spellings.has(part)) spellings.set(part, spell(part));
+  return spellings.get(part);
+}
+
+async function spell(part) {
   if (part.kind === "range") {
     const { area, address, quantity, type, order } = part;
     return [area, address, quantity, type.name, order].join();
