@@ -3,14 +3,17 @@
 use holdfast_memory::{Area, Read, Refusal, Write};
 use holdfast_protocol::pdu::{ExceptionCode, Range};
 
+#[inline]
 pub(super) fn reading<const MAX: u16>(area: Area, range: Range<MAX>, out: &mut [u8]) -> Read<'_> {
     Read { area, address: range.address(), count: usize::from(range.quantity()), out }
 }
 
+#[inline]
 pub(super) fn writing(area: Area, address: u16, count: u16, bytes: &[u8]) -> Write<'_> {
     Write { area, address, count: usize::from(count), bytes }
 }
 
+#[cold]
 pub(super) fn exception_of(refusal: Refusal) -> ExceptionCode {
     match refusal {
         Refusal::Sealed => ExceptionCode::ServerDeviceBusy,
