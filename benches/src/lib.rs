@@ -15,6 +15,7 @@ mod outcome;
 mod polite;
 mod poller;
 mod post;
+mod publish;
 
 use std::time::Duration;
 
@@ -37,6 +38,7 @@ pub fn main() -> Result<(), Failure> {
         "load-once" => load_once::main(arguments),
         "polite" => polite::main(arguments),
         "post" => post::main(arguments),
+        "publish" => publish::main(arguments),
         other => Err(format!("unknown load or loop {other}").into()),
     }
 }
