@@ -71,7 +71,7 @@ def settings(tmp_path: Path, server: NatsServer, device: Device) -> Callable[...
         meter = {
             "url": device.url,
             "interval": 0.05,
-            "timeout": 0.5,
+            "timeout": 3,
             "writes": "pass",
             "reads": [
                 {
@@ -85,7 +85,7 @@ def settings(tmp_path: Path, server: NatsServer, device: Device) -> Callable[...
         rules = [{"sources": ["127.0.0.0/8"], "units": {1: "plant"}, "access": "read-write"}]
         parts = {
             "memories": {"plant": {"holding_registers": 100, "replicate": {"log": "site"}}},
-            "logs": {"site": {"servers": [server.url], "node": name}},
+            "logs": {"site": {"servers": [server.url], "node": name, "write_timeout": 10}},
             "devices": {"meter": meter | more},
             "listeners": {"scada": {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": rules}},
         }
@@ -257,6 +257,7 @@ def test_without_its_log_a_node_stops_polling_and_comes_back(
     wire.until(lambda: health(one) == "ok", "it polls")
     server.kill()
     wire.until(lambda: health(one) == "standby", "it stands by")
+    wire.until(lambda: device.sources() and not device._peers, "the device has no connection")
     polls = len(device.peers)
     wire.until(lambda: not one.replicas()["site"]["connected"], "the log is gone")
     assert len(device.peers) == polls

@@ -52,7 +52,8 @@ def configuration(folder: Path, port: int, name: str = "plant", more: str = "") 
         f"""
 memories: {{plant: {{holding_registers: 100, replicate: {{log: site}}}}}}
 logs:
-  site: {{embedded: log, node: scada-a, servers: ["nats://127.0.0.1:{port}"]{more}}}
+  site:
+    {{embedded: log, node: scada-a, servers: ["nats://127.0.0.1:{port}"], write_timeout: 10{more}}}
 listeners:
   scada:
     type: modbus-tcp

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 Settings = dict[str, Any]
 
+SHORT = {"write_timeout": 1}
+"""For tests in which nothing is confirmed."""
+
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[NatsServer]:
@@ -44,14 +47,17 @@ def config(
     devices: Settings | None = None,
     **memory: Any,
 ) -> Config:
-    """A node. `audit` is a file name, `log` has settings of the log, `memory` of the memory."""
+    """A node. `audit` is a file name, `log` has settings of the log, `memory` of the memory.
+
+    Unless the test is about the timeout of writes, a loaded machine has the time to confirm them.
+    """
     audit, log = memory.pop("audit", None), memory.pop("log", {})
     plant = {"holding_registers": 100, "coils": 16, "replicate": {"log": "site"}} | memory
     rules = [{"sources": ["127.0.0.0/8"], "units": {1: "plant"}, "access": "read-write"}]
     parts = {
         "devices": devices or {},
         "memories": {"plant": plant, "alone": {"holding_registers": 10}},
-        "logs": {"site": {"servers": servers, "node": name} | log},
+        "logs": {"site": {"servers": servers, "node": name, "write_timeout": 10} | log},
         "listeners": {"scada": {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": rules}},
         "rest": {"bind": "127.0.0.1:0", "sources": ["127.0.0.0/8"], "tokens": "none"},
     } | ({} if audit is None else {"audit": {"file": audit}})
@@ -134,7 +140,7 @@ def test_the_audit_log_names_the_sequence_of_each_write(
 def test_the_audit_log_says_which_writes_were_not_confirmed(
     node: Callable[..., Appliance], server: NatsServer, tmp_path: Path
 ) -> None:
-    one = node("a", audit="a.log")
+    one = node("a", audit="a.log", log=SHORT)
     server.freeze()
     try:
         assert ingest(one, ("plant", 7), ("plant", 8)) == 504
@@ -155,7 +161,7 @@ def test_the_audit_log_says_which_writes_were_not_confirmed(
 def test_a_change_stream_of_a_node_that_is_behind_says_so(
     node: Callable[..., Appliance], server: NatsServer
 ) -> None:
-    one = node("a", log={"when_behind": "refuse", "max_lag": 1})
+    one = node("a", log={"when_behind": "refuse", "max_lag": 4})
     ask(one, "060003002a")
     place = "memory=plant&area=holding_registers&address=3&count=1&min_interval=0.05"
     path = f"/api/v1/memory/changes?{place}"
@@ -223,7 +229,7 @@ def test_without_its_log_a_node_reads_and_does_not_write(
 def test_a_server_that_does_not_answer_confirms_nothing(
     node: Callable[..., Appliance], server: NatsServer
 ) -> None:
-    one = node("a")
+    one = node("a", log=SHORT)
     server.freeze()
     try:
         assert ask(one, "0600030002") == "8604"
@@ -248,7 +254,7 @@ def test_a_log_that_does_not_answer_does_not_hold_up_devices(
             return {"url": url, "unit": 1, "interval": 0.02, "reads": [read]}
 
         devices = {"shared": polled("plant"), "local": polled("alone")}
-        with Appliance(config(tmp_path, [server.url], devices=devices)) as one:
+        with Appliance(config(tmp_path, [server.url], devices=devices, log=SHORT)) as one:
 
             def told(name: str) -> dict[str, Any]:
                 return one.diagnostics.devices()[name]

@@ -70,7 +70,7 @@ def test_errors_are_counted_by_kind() -> None:
         return HANG_UP if number in (9, 10) else registers(pdu)
 
     with FakeDevice(answers) as device:
-        options = ("--timeout", "1", "--seconds", "2")
+        options = ("--timeout", "2", "--seconds", "4")
         found = answer("bench", device.url, *options)
         assert found["errors"] == {
             "exception 06 (Server Device Busy)": 1,

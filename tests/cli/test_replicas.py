@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 CONFIGURATION = """
 memories: {{plant: {{holding_registers: 100, replicate: {{log: site}}}}}}
-logs: {{site: {{servers: ["{url}"], node: scada-a}}}}
+logs: {{site: {{servers: ["{url}"], node: scada-a, write_timeout: 10}}}}
 listeners:
   scada:
     type: modbus-tcp

@@ -117,7 +117,7 @@ def test_csv_has_a_line_for_every_reading(server: holdfast.Server, tmp_path: Pat
 def test_an_error_is_one_line_and_watching_continues() -> None:
     with (
         FakeDevice(registers) as device,
-        Watching(device.url, "hr:0", "hr:9", "--timeout", "0.05") as watching,
+        Watching(device.url, "hr:0", "hr:9", "--timeout", "2") as watching,
     ):
         assert [watching.line().split()[1:] for _ in range(2)] == [["hr:0:", "0"], ["hr:9:", "0"]]
         device.answer = lambda pdu: exception(pdu, 6) if pdu[2] == 9 else registers(pdu, 5)

@@ -819,13 +819,14 @@ def test_a_call_may_be_cancelled_while_its_reply_is_read() -> None:
 def test_a_call_in_a_thread_may_be_cancelled(kind: str) -> None:
     async def main() -> None:
         with device_of(kind, silent) as device:
-            async with holdfast.Client(device.url, timeout=0.3) as plc:
+            async with holdfast.Client(device.url, timeout=3) as plc:
                 under_way = asyncio.create_task(plc.write_register(1, 1))
                 await asyncio.to_thread(device.await_requests, 1)
                 waiting = asyncio.create_task(plc.write_register(2, 1))
                 await asyncio.sleep(0)
                 await cancelled(waiting)
                 await cancelled(under_way)
+                plc.timeout = wire.DEADLINE
                 assert await plc.read_holding_registers(7, 1) == [7]
                 assert [asked.pdu[2] for asked in device.requests] == [1, 7]
 
@@ -839,7 +840,7 @@ def device_of(kind: str, *script: Behaviour, **options: Any) -> ScriptedDevice:
 def test_timeouts_of_others_leave_a_cancelled_call_alone() -> None:
     async def main() -> None:
         with Stream("tcp", then=silent) as device:
-            async with holdfast.Client(device.url, timeout=0.1, max_in_flight=3) as plc:
+            async with holdfast.Client(device.url, timeout=2, max_in_flight=3) as plc:
                 tasks = [asyncio.create_task(plc.read_coils(at, 1)) for at in range(3)]
                 await asyncio.to_thread(device.await_requests, 3)
                 await cancelled(tasks[0])

@@ -902,7 +902,8 @@ def test_a_line_that_is_gone_is_opened_again(kind: str, make: Make, dial: Dial) 
 
 def test_a_read_whose_datagram_was_lost_is_sent_again(make: Make, dial: Dial) -> None:
     device = make("udp", silent, silent)
-    client = dial(device.url, timeout=0.6)
+    # It is sent three times in this time.
+    client = dial(device.url, timeout=6)
 
     assert client.read_holding_registers(7, 2) == [7, 8]
     assert [asked.raw for asked in device.requests] == [device.requests[0].raw] * 3

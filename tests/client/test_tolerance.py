@@ -354,7 +354,7 @@ def test_a_read_that_fails_is_retried_as_often_as_allowed(
         wire.until(partial(is_sent, 1 + retries, kind, make, dial), "all are sent")
 
     device = make(kind, silent)
-    client = dial(f"{device.url}?retries=1", timeout=5 * SHORT)
+    client = dial(f"{device.url}?retries=1", timeout=10 * SHORT)
     assert client.read_holding_registers(7, 1) == [7]
 
 
@@ -541,16 +541,16 @@ def elapsed(seconds: float) -> Callable[[], bool]:
 
 
 def test_a_gateway_that_answers_one_after_the_other_has_the_whole_timeout_for_each() -> None:
-    """Ten requests at once, which take longer than the timeout together."""
+    """Six requests at once, which take longer than the timeout together."""
     waiting: list[Asked] = []
 
     async def main() -> None:
         with Stream("tcp", then=waiting.append) as device:
-            async with holdfast.Client(device.url, timeout=2, max_in_flight=10) as plc:
-                tasks = [asyncio.create_task(plc.read_holding_registers(at, 1)) for at in range(10)]
-                await asyncio.to_thread(device.await_requests, 10)
+            async with holdfast.Client(device.url, timeout=5, max_in_flight=6) as plc:
+                tasks = [asyncio.create_task(plc.read_holding_registers(at, 1)) for at in range(6)]
+                await asyncio.to_thread(device.await_requests, 6)
                 for task, asked in zip(tasks, waiting, strict=True):
-                    await asyncio.to_thread(wire.until, elapsed(0.25), "the gateway has worked")
+                    await asyncio.to_thread(wire.until, elapsed(1), "the gateway has worked")
                     asked.answer()
                     assert await task == [asked.pdu[2]]
                 assert (device.connections, plc.late) == (1, 0)

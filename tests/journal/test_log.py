@@ -86,7 +86,7 @@ def test_without_a_server_writes_are_refused_and_reads_are_not(
 def test_a_write_that_is_not_confirmed_in_time_gets_exception_4(
     node: Start, nats: NatsServer
 ) -> None:
-    a = node("a", write_timeout=0.2)
+    a = node("a", write_timeout=1.0)
     nats.freeze()
     assert refusal(lambda: a.client.write_register(0, 1)) == 4
     assert a.log.status()["not_confirmed"] == 1

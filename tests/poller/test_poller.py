@@ -476,7 +476,7 @@ def test_a_dead_unit_behind_a_gateway_does_not_delay_the_others(
     devices = {
         f"unit {unit}".replace(" ", "-"): device(
             "", read("holding_registers", 0, 4, ("holding_registers", unit * 10)), unit=unit,
-            status=block(slot), timeout=1, in_flight=8,
+            status=block(slot), timeout=5 if unit > 2 else wire.DEADLINE, in_flight=8,
         )
         for slot, unit in enumerate((1, 2, 7, 8, 9))
     }  # fmt: skip
@@ -513,7 +513,7 @@ def test_many_dead_units_behind_a_gateway_leave_room_for_the_others(run: Run) ->
         dead = sum(fake.by_unit[unit] - before[unit] for unit in range(1, 28))
         # Four at once, half a second each.
         assert dead <= 4 * (2 * (time.monotonic() - began) + 1)
-        assert counters(appliance, "d29")["last_error"] == 0
+        wire.until(lambda: counters(appliance, "d29")["last_error"] == 0, "it answers")
 
 
 def test_a_unit_that_was_dead_is_read_when_it_answers(run: Run) -> None:
@@ -538,7 +538,7 @@ def test_a_connection_that_has_gone_silent_is_made_anew(run: Run) -> None:
     )
     reads = [read("holding_registers", 0, 2, ("holding_registers", 0))]
     with fake:
-        meter = device(fake.url, *reads, timeout=0.5, status=block(0))
+        meter = device(fake.url, *reads, timeout=3, status=block(0))
         appliance = run(configuration({"meter": meter}))
         until_told(appliance, health=OK)
         silent.set()
@@ -560,7 +560,7 @@ def test_a_late_reply_is_not_taken_for_the_next(run: Run) -> None:
 
     reads = [read("holding_registers", 0, 4, ("holding_registers", 0))]
     with Fake(answer) as fake:
-        appliance = run(configuration({"meter": device(fake.url, *reads, timeout=0.2)}))
+        appliance = run(configuration({"meter": device(fake.url, *reads, timeout=1)}))
         mirror = appliance.memories["mirror"]
         seen: set[int] = set()
 
@@ -568,7 +568,7 @@ def test_a_late_reply_is_not_taken_for_the_next(run: Run) -> None:
             seen.update(mirror.read("holding_registers", 0, 4))
 
         with in_background(look):
-            wire.until(lambda: len(seen) >= 10, "many replies were seen")
+            wire.until(lambda: len(seen) >= 5, "many replies were seen")
         assert 0xDEAD not in seen
         told = counters(appliance, "meter")
         assert told["timeouts"] > 0
@@ -593,7 +593,7 @@ def test_a_slow_device_is_not_asked_more_often_afterwards(run: Run) -> None:
         wire.until(lambda: counters(appliance, "meter")["missed"] >= 12, "polls were missed")
         slow.clear()
         patience.set()
-        before, then = counters(appliance, "meter")["polls"], time.monotonic()
+        then, before = time.monotonic(), counters(appliance, "meter")["polls"]
         wire.until(lambda: counters(appliance, "meter")["polls"] >= before + 10, "it is fast now")
         told, now = counters(appliance, "meter"), time.monotonic()
         # One that was due before, and one that begins as this is looked at.
@@ -613,9 +613,7 @@ def test_a_unit_that_waits_too_long_for_its_turn_is_out_of_date(run: Run) -> Non
 
     with Datagrams(answer) as fake:
         devices = {
-            "one": device(
-                fake.url, read("coils", 0, 1, ("coils", 0)), timeout=0.1, status=block(0)
-            ),
+            "one": device(fake.url, read("coils", 0, 1, ("coils", 0)), timeout=2, status=block(0)),
             "two": device(fake.url, read("coils", 9, 1, ("coils", 9)), unit=2, timeout=60),
         }
         appliance = run(configuration(devices))

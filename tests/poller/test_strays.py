@@ -116,7 +116,7 @@ def test_a_late_reply_is_no_unexpected_one(run: Run) -> None:
         return b"".join([*held, data(request)])
 
     with Fake(answer) as fake:
-        appliance = polled(run, fake.url, timeout=0.2)
+        appliance = polled(run, fake.url, timeout=2)
         until_counted(appliance, "timeouts")
         until_counted(appliance, "late_replies")
         told = counters(appliance, "meter")

@@ -101,7 +101,8 @@ def test_a_device_that_needs_tolerance_is_polled_with_it(
         wire.until(lambda: counters(appliance, "meter")["failures"], "it fails without tolerance")
         appliance.stop()
     with made(kind, behaviour()) as fake:
-        meter = device(fake.url, READ, status=block(0), timeout=0.5, tolerance=tolerance)
+        # Only a try that is not answered takes this long.
+        meter = device(fake.url, READ, status=block(0), timeout=2, tolerance=tolerance)
         appliance = run(configuration({"meter": meter}))
         until_polled(appliance, "meter", 5)
         assert status(appliance.memories["status"]).most_failures == 0

@@ -418,7 +418,7 @@ def test_a_packet_is_written_though_nobody_waits_for_the_reply(plant: Plant, kin
 
 
 def test_a_packet_that_takes_too_long_is_refused(start: Start, kind: str) -> None:
-    plant = Plant(start(listener(kind, request_timeout=0.2)))
+    plant = Plant(start(listener(kind, request_timeout=1)))
     before = plant.fill()
     packet = good(kind, "coils", 0, [0] * 20)
     for length in (1, 9, 12, len(packet) - 1):
@@ -429,7 +429,7 @@ def test_a_packet_that_takes_too_long_is_refused(start: Start, kind: str) -> Non
 
 def test_no_byte_of_a_packet_extends_its_deadline(start: Start) -> None:
     """A byte every 20 ms would take 20 s for this packet."""
-    plant = Plant(start(listener("v1", request_timeout=0.3)))
+    plant = Plant(start(listener("v1", request_timeout=1)))
     packet = good("v1", "coils", 0, [1])[:10] + bytes(1000)
     packet = packet[:3] + b"\x03" + packet[4:8] + b"\x00\x64" + packet[10:]
     between = threading.Event()

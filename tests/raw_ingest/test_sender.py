@@ -549,7 +549,7 @@ def test_a_dead_address_of_a_host_leaves_time_for_the_next(
     with contextlib.ExitStack() as opened:
         for each in (listening, *queued):
             opened.enter_context(each)
-        send("plant", there.port, timeout=1)
+        send("plant", there.port, timeout=6)
 
 
 def test_a_name_that_is_not_known_raises(send: Send, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -220,7 +220,7 @@ def test_refusals_sessions_and_the_audit_log_name_the_sender(
 def test_half_a_packet_and_half_a_record_end_in_time(
     run: Run, party: Party, caplog: pytest.LogCaptureFixture
 ) -> None:
-    plant = run(secured(party, request_timeout=0.3, packets="many"))
+    plant = run(secured(party, request_timeout=2, packets="many"))
     with connected(party, plant, party.line) as client:
         client.sendall(PACKET[:5])
         assert client.recv(2) == REFUSED
@@ -304,7 +304,7 @@ def test_refusals_have_the_words_of_modbus_over_tls(
     rules = [{"sources": ["127.0.0.1"], "access": "read-only"}]
     files: Any = party.files
     found: list[list[str]] = []
-    for text in (configuration(files, rules, request_timeout=1), secured(party, request_timeout=1)):
+    for text in (configuration(files, rules, request_timeout=2), secured(party, request_timeout=2)):
         caplog.clear()
         with Appliance(_loaded(tmp_path, text)) as appliance:
             to = address(appliance)

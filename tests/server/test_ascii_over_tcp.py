@@ -359,7 +359,7 @@ def test_half_a_request_ends_the_connection_after_the_request_timeout(
     client.send(begun)
 
     assert client.rest() == b""
-    assert counters(appliance)["connections"]["request_timeout"] == 1
+    wire.until(lambda: counters(appliance)["connections"]["request_timeout"] == 1, "it is counted")
     assert appliance.memories["plant"].read("holding_registers", 0, 1) == [0]
 
 

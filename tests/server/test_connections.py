@@ -431,7 +431,7 @@ def test_a_stop_does_not_wait_for_a_peer_that_does_not_read(
                 client.socket.send(longest)
         stopper = threading.Thread(target=server.stop)
         stopper.start()
-        stopper.join(3)
+        stopper.join(wire.DEADLINE)
 
         assert not stopper.is_alive()
 

@@ -294,7 +294,7 @@ def test_what_comes_from_a_device_is_told_apart() -> None:
         return registers(pdu) if address + count <= 10 else exception(pdu, 2)
 
     survey = Survey(HR, exact=True, span=range(12))
-    with FakeDevice(answers) as model, holdfast.SyncClient(model.url, timeout=0.5) as client:
+    with FakeDevice(answers) as model, holdfast.SyncClient(model.url, timeout=2) as client:
         discovery.run_sync(survey, client)
     [found] = survey.areas
     assert found.ranges == [range(3), range(4, 5), range(8, 10)]

@@ -12,7 +12,7 @@ from holdfast.errors import ConnectFailed, ModbusException, RequestTimeout
 from holdfast.tags import Tag
 from holdfast.tools.tag_reading import REFUSED_FOR, TagReader
 from holdfast.values import ConversionError
-from support import cli
+from support import cli, wire
 from support.fake_device import FakeDevice, exception, registers
 
 if TYPE_CHECKING:
@@ -129,8 +129,8 @@ def test_other_exceptions_are_not_searched_and_not_remembered() -> None:
 
 def test_a_device_that_does_not_answer_is_not_asked_for_everything() -> None:
     with FakeDevice(lambda _: None) as device:
-        found = read(device, TagReader([tag(f"t{at}", 2 * at) for at in range(20)]), timeout=0.02)
-        assert len(device.asked) == 3
+        found = read(device, TagReader([tag(f"t{at}", 2 * at) for at in range(20)]), timeout=1)
+        wire.until(lambda: len(device.asked) == 3, "three requests have come")
     assert {type(each) for each in found} == {RequestTimeout}
 
 
@@ -141,12 +141,12 @@ def test_blocks_without_an_answer_do_not_keep_others_from_being_read() -> None:
 
     with FakeDevice(answer) as device:
         reader = TagReader([tag(f"t{at}", 2 * at) for at in range(6)])
-        assert all(isinstance(each, RequestTimeout) for each in read(device, reader, 0.3))
-        *silent, fourth, fifth = read(device, reader, 0.3)
+        assert all(isinstance(each, RequestTimeout) for each in read(device, reader, 1))
+        *silent, fourth, fifth = read(device, reader, 1)
         assert (fourth, fifth) == (7, 7)
         assert all(isinstance(each, RequestTimeout) for each in silent)
         before = len(device.asked)
-        read(device, reader, 0.3)
+        read(device, reader, 1)
         assert asked(device)[before : before + 2] == [(8, 1), (10, 1)]
 
 

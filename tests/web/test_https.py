@@ -253,7 +253,7 @@ def test_peers_without_a_handshake_lock_nobody_out(start: Start, files: Files) -
 
 
 def test_a_client_that_reads_nothing_is_given_up(start: Start, files: Files) -> None:
-    service = start(files.https(), request_timeout=2)
+    service = start(files.https(), request_timeout=5)
     path = f"{web.READ}?memory=plant_a&area=holding_registers&address=0&count=65536"
     with Peer(service.address, files.trust(), receive_buffer=4096) as peer:
         peer.shake()
