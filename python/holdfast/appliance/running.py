@@ -310,7 +310,7 @@ class _Running:
         """Requests the stop of all parts, then waits for each.
 
         Links stop after all that use them: listeners and the gateway still answer the requests that
-        they have passed on. Metrics stop last, so that probes are told of the stop.
+        they have passed on. Metrics stop last, so that probes see the stop.
         """
         self.health.stopping = True
         metrics = self._supervisors.get("metrics")

@@ -483,7 +483,7 @@ class App:
         await self._reply(request, send, msgspec.json.encode(status))
 
     async def _probe(self, request: Request, send: Send) -> None:
-        """Answers a probe. It needs no token, so it is told no names."""
+        """Answers a probe. It needs no token, so the answer has no names."""
         assert self._health is not None, "there is a route"
         status, body = probes.answer(self._health, request.path, details=False)
         await self._reply(request, send, body, status=status)

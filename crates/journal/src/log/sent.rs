@@ -128,7 +128,7 @@ impl Sent {
         }
     }
 
-    /// Messages whose outcome nobody was told, to send them again in a new session. The others are
+    /// Messages whose outcome was not reported, to send them again in a new session. The others are
     /// forgotten: they are never sent again.
     pub(super) fn again(&mut self) -> Vec<(u64, Bytes)> {
         self.messages.retain(|message| !message.is_told());
