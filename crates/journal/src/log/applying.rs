@@ -50,9 +50,10 @@ impl Node {
         let counters = &self.shared.counters;
         let (mut compared, mut for_snapshot) = (false, false);
         session.last_applied = Instant::now();
-        match self.state.apply(place, payload)? {
+        let applied = self.state.apply(place, payload)?;
+        counters.sequence.set(place.sequence);
+        match applied {
             Applied::Fresh { origin, compares, outcomes } => {
-                self.shared.counters.sequence.set(place.sequence);
                 compared = compares;
                 if origin.node == self.origin.node {
                     if origin.start > self.origin.start {
@@ -78,7 +79,6 @@ impl Node {
                 self.shared.event(Event::new("log_message_ignored", &fields));
             }
         }
-        self.shared.counters.sequence.set(place.sequence);
         if compared || place.sequence.is_multiple_of(self.settings.digest_every) {
             self.tell_digest(session, for_snapshot)?;
         }
