@@ -172,7 +172,8 @@ impl Fence {
             stage.mark_unchanged();
             found.announce();
             let until = found.zero + Duration::from_nanos(found.until.load(Ordering::Acquire));
-            let is_closed = found.stage() == Stage::Closed;
+            // Not the clock: if the end passes now, it still has to be announced.
+            let is_closed = *stage.borrow() == Stage::Closed;
             drop(found);
             if is_closed {
                 if stage.changed().await.is_err() {
