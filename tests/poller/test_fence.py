@@ -70,12 +70,14 @@ def test_an_end_that_is_not_moved_ends_polls_and_closes_the_connection(
     # The device is polled once an hour: nothing else would close its connection.
     fence.open(time.monotonic() + 0.3)
     poller.add(device(fake, interval=3600.0, fence=fence))
-    taken(poller, lambda polls, _: polls)
+    # The end is moved until the device was polled, however long that takes.
+    taken(poller, lambda polls, _: polls or fence.renew(time.monotonic() + 0.3))
+    wire.until(lambda: health(poller) == "standby", "it stands by")
     wire.until(lambda: is_disconnected(fake), "the connection is closed")
-    assert health(poller) == "standby"
     assert not fence.allows
+    connections = fake.connections
     fence.renew(time.monotonic() + FAR)
-    wire.until(lambda: fake.connections == 2, "it goes on when the end has moved")
+    wire.until(lambda: fake.connections > connections, "it goes on when the end has moved")
 
 
 def test_a_lease_that_was_taken_too_late_to_be_used_can_be_renewed() -> None:
@@ -139,14 +141,14 @@ def test_writes_wait_for_what_a_former_holder_has_sent_and_keep_their_order(
     poller: ReportingPoller, fake: Fake
 ) -> None:
     fence = Fence()
-    poller.add(device(fake, interval=0.01, timeout=0.3, fence=fence))
+    poller.add(device(fake, interval=0.01, timeout=2.0, fence=fence))
     opened = time.monotonic()
     fence.open(opened + FAR, settle=0.5)
     tickets = [poller.write("a", Request.write_register(3, value)) for value in range(5)]
     polls, writes = taken(poller, lambda _, writes: len(writes) == 5)
     assert polls, "it is polled meanwhile"
     # Half a second, and the timeout of the device.
-    assert time.monotonic() >= opened + 0.8
+    assert time.monotonic() >= opened + 2.5
     assert writes == [(ticket, 0) for ticket in tickets]
     sent = [asked.pdu for asked in fake.requests if asked.pdu[0] == 6]
     assert [pdu[-1] for pdu in sent] == list(range(5))
@@ -206,3 +208,14 @@ def test_a_device_that_is_replaced_while_it_stands_by_stands_by(
     assert fake.connections == 0
     fence.open(time.monotonic() + FAR)
     taken(poller, lambda polls, _: any(poll[0] == "b" for poll in polls))
+
+
+def test_a_device_that_loses_its_fence_while_it_stands_by_is_polled(
+    poller: ReportingPoller, fake: Fake
+) -> None:
+    poller.add(device(fake, fence=Fence()))
+    wire.until(lambda: health(poller) == "standby", "it stands by")
+    poller.replace("a", device(fake))
+    taken(poller, lambda polls, _: polls)
+    assert health(poller) == "ok"
+    assert poller.counters()["a"]["missed"] == 0

@@ -109,8 +109,6 @@ pub(super) struct Device {
     first: Cell<usize>,
     strategy: Cell<Strategy>,
     samples: Cell<Samples>,
-    /// Whether another node polls the device.
-    stands_by: Cell<bool>,
     silent: Cell<u32>,
     /// The due time of the next poll.
     due: Cell<Instant>,
@@ -216,7 +214,6 @@ impl Device {
             first: Cell::new(0),
             strategy: Cell::new(settings.strategy),
             samples: Cell::default(),
-            stands_by: Cell::new(false),
             silent: Cell::new(0),
             due: Cell::new(Instant::now()),
             backing_off: Cell::new(false),
@@ -327,29 +324,30 @@ impl Device {
 
     /// Waits while another node polls the device. Returns the device that replaces it meanwhile.
     async fn stand_by(&self, inbox: &Inbox) -> Option<Box<Device>> {
-        let fence = self.settings.fence.as_ref()?;
-        if fence.stage() == Stage::Open && self.settled(fence).is_none() {
-            return None;
-        }
-        self.link.release();
-        self.stands_by.set(true);
-        self.state.set_standby(true);
-        self.tell();
-        loop {
-            tokio::select! {
-                biased;
-                told = inbox.next() => if let Told::Successor(successor) = told {
-                    return Some(successor);
-                },
-                () = self.admitted(fence) => break,
+        if let Some(fence) = &self.settings.fence
+            && (fence.stage() != Stage::Open || self.settled(fence).is_some())
+        {
+            self.link.release();
+            self.state.set_standby(true);
+            self.tell();
+            loop {
+                tokio::select! {
+                    biased;
+                    told = inbox.next() => if let Told::Successor(successor) = told {
+                        return Some(successor);
+                    },
+                    () = self.admitted(fence) => break,
+                }
             }
         }
-        self.stands_by.set(false);
-        self.state.set_standby(false);
-        self.silent.set(0);
-        self.backing_off.set(false);
-        self.off_schedule.set(None);
-        self.due.set(Instant::now());
+        // The device before this one may have stood by, with another fence.
+        if self.state.stands_by() {
+            self.state.set_standby(false);
+            self.silent.set(0);
+            self.backing_off.set(false);
+            self.off_schedule.set(None);
+            self.due.set(Instant::now());
+        }
         None
     }
 
@@ -708,12 +706,12 @@ impl Device {
     fn tell(&self) {
         let status = self.state.status();
         if let Some(to) = &self.settings.status
-            && !(self.stands_by.get() && to.memory.has_journal())
+            && !(self.state.stands_by() && to.memory.has_journal())
             && status.write_by(to, |write| self.store(&to.memory, Access::Ingest, write)).is_err()
         {
             self.state.count_unstored();
         }
-        if self.stands_by.get() {
+        if self.state.stands_by() {
             return;
         }
         for forward in &self.forwards {

@@ -29,7 +29,6 @@ pub struct DeviceState {
     unstored: AtomicBool,
     /// Whether a task of the device has panicked since the device was created or replaced.
     broken: AtomicBool,
-    /// Whether another node polls the device.
     standby: AtomicBool,
     /// What the connection to its address has received without a request, or late.
     strays: Mutex<Arc<StrayCounters>>,
@@ -72,7 +71,7 @@ impl DeviceState {
         if self.broken.load(Ordering::Relaxed) {
             return Health::Error;
         }
-        if self.standby.load(Ordering::Relaxed) {
+        if self.stands_by() {
             return Health::Standby;
         }
         let health = Health::from_code(self.health.load(Ordering::Relaxed));
@@ -124,6 +123,11 @@ impl DeviceState {
     /// share it.
     pub fn strays(&self) -> Arc<StrayCounters> {
         Arc::clone(&self.strays.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Whether another node polls the device.
+    pub(super) fn stands_by(&self) -> bool {
+        self.standby.load(Ordering::Relaxed)
     }
 
     /// Records whether another node polls the device. What was known before is old when it comes back.
