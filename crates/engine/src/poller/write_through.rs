@@ -8,11 +8,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use holdfast_memory::{Access, Area, Memory, Refusal, Write};
+use holdfast_memory::{Access, Area, Memory, Operation, Outcome, Refusal, Write};
 use holdfast_protocol::pdu::{
     self, EncodedRequest, ExceptionCode, Function, Range, Request, reply,
 };
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 
 use crate::items::{Items, touched};
 use crate::link::{Coming, Fault, Fence, Link, Priority, ReplyTo, coming, exception};
@@ -245,7 +245,7 @@ impl PassedWrite {
             None => call(&self.request).await,
         };
         let pdu = match answered {
-            Ok(answer) => return self.confirm(&answer, value),
+            Ok(answer) => return self.confirm(&answer, value).await,
             Err(fault) => exception(&self.pdu, fault.exception(link.retry_at().is_some())),
         };
         self.reply.send(pdu);
@@ -254,10 +254,10 @@ impl PassedWrite {
 
     /// Takes what the device has confirmed into memory, then replies. `value` is what the device holds
     /// after function 22.
-    fn confirm(self, answer: &[u8], value: Option<u16>) -> Option<Change> {
+    async fn confirm(self, answer: &[u8], value: Option<u16>) -> Option<Change> {
         let change = self.change(value);
         if let Some(change) = &change {
-            self.store(change);
+            self.store(change).await;
         }
         let mut buffer = [0; pdu::MAX_LEN];
         let reply = match Request::parse(&self.pdu) {
@@ -265,7 +265,7 @@ impl PassedWrite {
                 if let Some(bytes) = answer.get(2..) {
                     let (address, count) = (self.there(read.address()), read.quantity().into());
                     let area = Area::HoldingRegisters;
-                    self.store(&Change { area, address, count, bytes: bytes.to_vec() });
+                    self.store(&Change { area, address, count, bytes: bytes.to_vec() }).await;
                 }
                 answer
             }
@@ -304,11 +304,22 @@ impl PassedWrite {
         address - self.range.address + self.range.device_address
     }
 
-    fn store(&self, change: &Change) {
+    /// Waits for the journal of the memory, if it has one, without holding up other devices.
+    async fn store(&self, change: &Change) {
         let address = change.address - self.range.device_address + self.range.address;
         let Change { area, count, ref bytes, .. } = *change;
         let write = Write { area, address, count: count as usize, bytes };
-        let stored = self.memory.write(Access::Mirror, write);
+        let stored = if self.memory.has_journal() {
+            let (done, outcome) = oneshot::channel();
+            let kept = Box::new(|outcome: Outcome| {
+                let _ = done.send(outcome);
+            });
+            let submitted = self.memory.submit(Access::Mirror, Operation::Write(write), kept);
+            let _ = outcome.await;
+            submitted
+        } else {
+            self.memory.write(Access::Mirror, write)
+        };
         // A journal may refuse what the device has confirmed. The next poll tells the memory again.
         let fits = !matches!(stored, Err(Refusal::OutOfRange | Refusal::WrongLength));
         debug_assert!(fits, "a mirrored range is inside its memory: {stored:?}");
