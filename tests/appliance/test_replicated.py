@@ -16,7 +16,7 @@ from holdfast.appliance.shared_logs import LogNotJoined
 from holdfast.config import load
 from support import audits, event_streams, web, wire
 from support.brokers import NatsServer, free_port
-from support.cli import done, invoke
+from support.cli import done, invoke, usage_error
 from support.config_folder import Folder, written
 from support.running import endpoint
 
@@ -350,3 +350,10 @@ def test_a_log_that_is_not_there_can_not_be_replayed(tmp_path: Path) -> None:
     result = invoke("replay", str(tmp_path / "a.yaml"))
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr.startswith("holdfast: logs.site: ")
+
+
+@pytest.mark.parametrize("to", ["yesterday", "9" * 30, "3000-01-01T00:00Z", "1900-01-01T00:00Z"])
+def test_a_moment_that_no_log_can_have_is_wrong_usage(tmp_path: Path, to: str) -> None:
+    config(tmp_path, ["nats://127.0.0.1:1"])
+    told = usage_error("replay", str(tmp_path / "a.yaml"), "--to", to)
+    assert f"found '{to}', allowed: a sequence, or a time as in 2026-11-20T14:05:00Z" in told

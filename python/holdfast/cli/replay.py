@@ -15,7 +15,7 @@ import click
 from holdfast import _core, logs
 from holdfast.appliance import assembly, embedded
 from holdfast.appliance.shared_logs import credentials, servers
-from holdfast.cli.configuration import WRONG, load_or_exit
+from holdfast.cli.configuration import load_or_exit
 from holdfast.cli.logs_of import chosen_log
 from holdfast.cli.signals import Signals
 from holdfast.config.words import listing
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
 NOTICE = 0.1
 """Seconds within which a signal is noticed."""
+
+MAX_SEQUENCE = 2**64 - 1
+MAX_TIME = 2**63 - 1
+"""In nanoseconds since 1970: in the year 2262."""
 
 
 @click.command(epilog="Example: holdfast replay plant.yaml --to 2026-11-20T14:05:00Z --values")
@@ -103,14 +107,19 @@ def _end(to: str | None) -> tuple[int | None, int | None]:
     """The sequence or the time, in nanoseconds since 1970."""
     if to is None:
         return None, None
-    if to.isascii() and to.isdigit():
-        return int(to), None
     try:
-        at = datetime.fromisoformat(to)
-    except ValueError:
+        if to.isascii() and to.isdigit():
+            return _within(int(to), MAX_SEQUENCE), None
+        return None, _within(int(datetime.fromisoformat(to).timestamp() * 1e9), MAX_TIME)
+    except (ValueError, OverflowError):
         message = f"found {to!r}, allowed: a sequence, or a time as in 2026-11-20T14:05:00Z"
         raise click.BadParameter(message, param_hint="'--to'") from None
-    return None, int(at.timestamp() * 1e9)
+
+
+def _within(number: int, most: int) -> int:
+    if 0 <= number <= most:
+        return number
+    raise ValueError
 
 
 def _tell(
@@ -176,4 +185,4 @@ def _serve(memories: list[tuple[str, _core.Memory]], port: int, signals: Signals
 
 def _fail(message: str) -> NoReturn:
     click.echo(f"holdfast: {message}", err=True)
-    sys.exit(WRONG if "allowed" in message else 1)
+    sys.exit(1)
