@@ -218,8 +218,10 @@ async def _restore(
     done: list[str] = []
     try:
         for name in streams(log):
+            subject = await _begin(client, name, replicas, kept[name])
+            # Only now: a stream that the servers have refused to restore may belong to a node.
             done.append(name)
-            await _send(client, name, replicas, folder / name, kept[name])
+            await _send(client, name, subject, folder / name, kept[name])
     except BaseException:
         for name in done:
             await client.request(f"$JS.API.STREAM.DELETE.{name}", b"", timeout=SILENCE)
@@ -227,13 +229,17 @@ async def _restore(
     return int(kept[streams(log)[-1]]["state"]["messages"])
 
 
-async def _send(
-    client: SafeClient, name: str, replicas: int, file: Path, kept: dict[str, Any]
-) -> None:
+async def _begin(client: SafeClient, name: str, replicas: int, kept: dict[str, Any]) -> str:
+    """Has the servers make a stream. Returns where they expect its content."""
     config = kept["config"] | {"num_replicas": replicas}
     request = {"config": config, "state": kept["state"]}
     answer = await _ask(client, f"STREAM.RESTORE.{name}", request)
-    subject = answer["deliver_subject"]
+    return str(answer["deliver_subject"])
+
+
+async def _send(
+    client: SafeClient, name: str, subject: str, file: Path, kept: dict[str, Any]
+) -> None:
     with file.open("rb") as data:
         while part := data.read(CHUNK):
             reply = await client.request(subject, part, timeout=SILENCE)
