@@ -145,4 +145,7 @@ def _write_secret(file: Path, text: str) -> None:
     descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "w", encoding="utf-8") as out:
         out.write(f"{text}\n")
+        out.flush()
+        # After a power cut, an empty file would take the place of the token for good.
+        os.fsync(out.fileno())
     new.replace(file)
