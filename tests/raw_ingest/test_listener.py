@@ -54,6 +54,8 @@ def listener(kind: str = "v1", **settings: Any) -> dict[str, Any]:
         "type": "raw-ingest",
         "bind": "127.0.0.1:0",
         "rules": [rule | target],
+        # A packet that comes byte by byte takes long on a loaded machine.
+        "request_timeout": wire.DEADLINE,
         **KINDS[kind],
         **settings,
     }
