@@ -190,6 +190,7 @@ class Scanner:
                 settings.prefix,
                 _Host(self),
                 self._about,
+                self._connect_leases,
             )
         part = self._part
         self.outbox = (
@@ -351,6 +352,12 @@ class Scanner:
             done = wire.text(message.reply, msgspec.json.encode(Answer(success=True)))
             await self.outbox.answer(message.reply, done)
         self.end()
+
+    async def _connect_leases(self, connected: Callable[[Client | None], None]) -> None:
+        """Keeps a connection that only the leases of a fleet use."""
+        settings = self._settings
+        broker = Broker(settings.servers, {}, connected, settings.ping, name="holdfast leases")
+        await broker.run()
 
     def _fence(self, device: ScannedDevice) -> _core.Fence | None:
         return None if self._part is None else self._part.fence(device)
