@@ -57,8 +57,8 @@ class Node:
     def works(self, reason: str | None) -> None:
         pass
 
-    def has(self, key: str) -> None:
-        wire.until(lambda: self.leases.is_held(key), "it is held")
+    def has(self, *keys: str) -> None:
+        wire.until(lambda: all(map(self.leases.is_held, keys)), "they are held")
 
     def renews(self, key: str) -> None:
         """Waits for more renewals than a lease lasts without one."""
@@ -109,12 +109,12 @@ def test_the_end_of_the_thread_gives_everything_back(
     monkeypatch.setattr(entries, "TTL", 1000.0)
     first, second = node("a"), node("b")
     first.thread.want(["x", "y"])
-    first.has("x"), first.has("y")
+    first.has("x", "y")
     second.thread.want(["x", "y"])
     first.thread.stop(LIMIT)
     assert threads() == ["leases of b"]
     assert not first.leases.fence("x").allows
-    second.has("x"), second.has("y")
+    second.has("x", "y")
 
 
 def test_what_is_asked_of_a_thread_that_has_ended_has_no_effect(

@@ -616,7 +616,8 @@ class Scanner:
         publisher = self._publishers.get(device.id)
         if publisher is None:
             publisher = self._publishers[device.id] = self._publisher(device)
-        publisher.want(lambda: grouped(device), asked.tags)
+        # Where a device is only known, `begin` makes all of its tags new.
+        publisher.want(lambda: grouped(device), asked.tags if self._is_own(device) else ())
 
     def _publisher(self, device: ScannedDevice) -> Publisher:
         lease = None if self._part is None else self._part.fleet.epoch(device.partition)

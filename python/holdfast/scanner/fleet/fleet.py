@@ -265,6 +265,7 @@ class Fleet:
         if since:
             self._begun[partition] = since
             self._gained(partition)
+        self._shown_at = 0.0
 
     def taken(self, key: str) -> None:
         """A lease was taken."""
