@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import TimeoutError as NoAnswer
 
-from holdfast.scanner import FleetSettings
+from holdfast.scanner import FleetSettings, service
 from support import wire
 from support.cli import invoke
 from support.judges import Judges
@@ -194,6 +194,26 @@ def test_a_command_reaches_the_device_whoever_receives_it(
         assert len({number for number, _ in judge.writes}) == 1
     refused = caller.request("modbus.command.t0", "70000")
     assert "outside" in refused["error"]
+
+
+def test_many_devices_are_browsed_in_pages(
+    node: Callable[..., Running],
+    caller: Caller,
+    judges: Judges,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(service, "BROWSED", 3)
+    share(node("a"), node("b"))
+    subscribe_all(caller, judges)
+
+    def page(offset: int) -> tuple[list[str], int, int | None]:
+        found = caller.request("modbus.browse", {"offset": offset})
+        return [each["deviceId"] for each in found["devices"]], found["count"], found.get("next")
+
+    # The nodes know a subscription at different times.
+    wire.until(lambda: page(0) == (["d0", "d1", "d2"], 4, 3), "the first page")
+    wire.until(lambda: page(3) == (["d3"], 4, None), "the second page")
+    wire.until(lambda: page(4) == ([], 4, None), "nothing is left")
 
 
 def test_browse_and_variables_tell_of_all_nodes(
