@@ -197,7 +197,7 @@ async def missed(client: Client) -> int:
         asked = json.dumps({"offset": offset}).encode()
         answer = await client.request("modbus.browse", asked, timeout=common.TIMEOUT)
         found = json.loads(answer.data)
-        total += sum(device["missed"] for device in found["devices"])
+        total += sum(int(device["missed"]) for device in found["devices"])
         if "next" not in found:
             return total
         offset = found["next"]

@@ -97,7 +97,7 @@ class Connection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Answers a request, of which the scanner sends one at a time."""
         device, judge = self._device, self._judge
-        judge.overlaps += device.asking is not None
+        judge.overlaps += device.asking not in (None, self)
         device.asking = self
         judge.polled(device, time.monotonic())
         size = 2 * int.from_bytes(data[10:12])
