@@ -37,6 +37,9 @@ OF_A_PROCESS = 10_000
 IN_FLIGHT = 64
 """Subscribe requests at once."""
 
+ATTEMPTS = 10
+"""Attempts to subscribe while the NATS server does not confirm in time."""
+
 SETTLED = 2 * INTERVAL
 """Seconds between the last subscription and the measurement."""
 
@@ -173,9 +176,12 @@ async def subscribe(bench: Bench, client: Client, devices: int) -> None:
                 "subscriberId": "bench",
                 "tags": tags,
             }
-            answer = await client.request(
-                "modbus.subscribe", json.dumps(request).encode(), timeout=common.TIMEOUT
-            )
+            for _ in range(ATTEMPTS):
+                answer = await client.request(
+                    "modbus.subscribe", json.dumps(request).encode(), timeout=common.TIMEOUT
+                )
+                if b"not stored" not in answer.data:
+                    break
             if not json.loads(answer.data)["success"]:
                 raise RuntimeError(answer.data.decode())
 
