@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import TimeoutError as NoAnswer
 
-from holdfast.scanner import FleetSettings
+from holdfast.scanner import FleetSettings, service
 from support import wire
 from support.cli import invoke
 from support.judges import Judges
@@ -196,6 +196,26 @@ def test_a_command_reaches_the_device_whoever_receives_it(
     assert "outside" in refused["error"]
 
 
+def test_many_devices_are_browsed_in_pages(
+    node: Callable[..., Running],
+    caller: Caller,
+    judges: Judges,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(service, "BROWSED", 3)
+    share(node("a"), node("b"))
+    subscribe_all(caller, judges)
+
+    def page(offset: int) -> tuple[list[str], int, int | None]:
+        found = caller.request("modbus.browse", {"offset": offset})
+        return [each["deviceId"] for each in found["devices"]], found["count"], found.get("next")
+
+    # The nodes know a subscription at different times.
+    wire.until(lambda: page(0) == (["d0", "d1", "d2"], 4, 3), "the first page")
+    wire.until(lambda: page(3) == (["d3"], 4, None), "the second page")
+    wire.until(lambda: page(4) == ([], 4, None), "nothing is left")
+
+
 def test_browse_and_variables_tell_of_all_nodes(
     node: Callable[..., Running], caller: Caller, judges: Judges
 ) -> None:
@@ -337,10 +357,13 @@ def test_the_command_line_shows_and_drains_nodes(
     assert (result.exit_code, result.stdout) == (0, "a has left the fleet plant.\n")
     wire.until(one.ended.done, "it has ended")
     share(two)
-    result = invoke("fleet", "status", "plant", "--nats", own_nats.url, "--json")
-    found = json.loads(result.stdout)
-    assert [each["node"] for each in found["nodes"]] == ["b"]
-    assert found["nodes"][0]["devices"] == 4
+
+    def shown() -> list[tuple[str, int]]:
+        result = invoke("fleet", "status", "plant", "--nats", own_nats.url, "--json")
+        return [(each["node"], each["devices"]) for each in json.loads(result.stdout)["nodes"]]
+
+    # A node tells how many devices it has when it renews its lease.
+    wire.until(lambda: shown() == [("b", 4)], "all devices are shown")
     result = invoke("fleet", "drain", "plant", "a", "--nats", own_nats.url)
     assert result.exit_code == 1
     assert "there is no node a" in result.stderr

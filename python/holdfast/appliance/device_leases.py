@@ -6,28 +6,23 @@ others stand by. The thread of a log holds the leases; the native poller obeys t
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import logging
-import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from holdfast import logs
 from holdfast.appliance import assembly
 from holdfast.client.url import connection_of
-from holdfast.heartbeat import Heartbeat
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from holdfast import _core
     from holdfast.config import Config
     from holdfast.types import ThreadHeartbeat
 
 ENDING = 2.0
 """Seconds to wait for polls and writes in progress before a lease is given back."""
-
-RETRIED = 5.0
-"""Seconds before an unusable file for NATS is read again."""
 
 
 def leased(config: Config) -> dict[str, str]:
@@ -107,7 +102,7 @@ class _LogLeases:
 
     def __post_init__(self) -> None:
         # Only an appliance with logs loads the client of NATS.
-        from holdfast.leases import Leases
+        from holdfast.leases import Leases, LeaseThread
 
         settings = self.config.logs[self.log]
         self.leases = Leases(
@@ -117,50 +112,34 @@ class _LogLeases:
             replicas=settings.replicas,
             about=lambda key: {"devices": self._devices.get(key, [])},
         )
-        self._heartbeat = Heartbeat()
         self._servers = assembly.nats_servers(settings)
+        self._thread = LeaseThread(self.leases, self._connect, f"holdfast-leases-{self.log}")
         self._devices: dict[str, list[str]] = {}
-        self._ending: set[asyncio.Future[bool]] = set()
         self._missing: set[tuple[str, str]] = set()
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._stopping: asyncio.Event | None = None
-        self._thread: threading.Thread | None = None
-        self._is_started = self._is_stopped = False
+        self._is_started = self._is_running = False
 
     def adopt(self, devices: dict[str, list[str]]) -> None:
         before, self._devices = self._devices, devices
-        if self._is_started and self._thread is None:
+        if self._is_running:
+            self._thread.want(devices)
+            for key in set(before) - set(devices):
+                self._thread.give_back_soon(key, ENDING)
+        elif self._is_started:
             self.start()
-        elif self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # The thread has ended.
-                self._loop.call_soon_threadsafe(self._want, set(before) - set(devices))
-
-    def _want(self, gone: set[str]) -> None:
-        self.leases.want(self._devices)
-        for key in gone:
-            task = asyncio.ensure_future(self.leases.give_back(key, ENDING))
-            self._ending.add(task)
-            task.add_done_callback(self._ending.discard)
 
     def start(self) -> None:
         self._is_started = True
         if self._devices:
-            name = f"holdfast-leases-{self.log}"
-            self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+            self._is_running = True
             self._thread.start()
+            self._thread.want(self._devices)
 
     def stop(self) -> None:
-        self._is_stopped = True
-        if self._loop is not None and self._stopping is not None:
-            with contextlib.suppress(RuntimeError):  # The thread has ended.
-                self._loop.call_soon_threadsafe(self._stopping.set)
-        if self._thread is not None:
-            self._thread.join()
+        self._is_started = False
+        self._thread.stop(ENDING)
 
     def heartbeat(self) -> ThreadHeartbeat | None:
-        if self._thread is None:
-            return None
-        return self._thread.name, self._heartbeat.age, self._thread.native_id
+        return self._thread.heartbeat
 
     def status(self) -> dict[str, dict[str, Any]]:
         found = {}
@@ -203,32 +182,7 @@ class _LogLeases:
                     fields = {"device": device, "log": self.log, "node": holder.node}
                     logs.write(logging.WARNING, "device_not_polled", **fields)
 
-    def _run(self) -> None:
-        asyncio.run(self._hold())
-
-    async def _hold(self) -> None:
-        stopping = self._stopping = asyncio.Event()
-        self._loop = asyncio.get_running_loop()
-        if self._is_stopped:
-            return
-        self.leases.want(self._devices)
-        async with self._heartbeat.kept(), asyncio.TaskGroup() as tasks:
-            running = [tasks.create_task(self._connect()), tasks.create_task(self.leases.run())]
-            await stopping.wait()
-            self.leases.want(())
-            await asyncio.gather(
-                *(self.leases.give_back(key, ENDING) for key in list(self.leases.held))
-            )
-            for task in running:
-                task.cancel()
-
-    async def _connect(self) -> None:
+    async def _connect(self, connected: Callable[[Any], None]) -> None:
         from holdfast.scanner.broker import Broker, Ping
 
-        broker = Broker(self._servers, {}, self.leases.connected, Ping(), name="holdfast leases")
-        while True:
-            try:
-                await broker.run()
-            except OSError as error:
-                self.works(str(error))
-                await asyncio.sleep(RETRIED)
+        await Broker(self._servers, {}, connected, Ping(), name="holdfast leases").run()

@@ -6,6 +6,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from holdfast._core import BlockingClient, Endpoint
+from holdfast.client.tolerance import STRICT
 from holdfast.client.url import NetworkTarget, SerialTarget
 from holdfast.protocol import TLS_PORT
 
@@ -21,7 +22,10 @@ def blocking(target: Target) -> BlockingClient:
 
 def endpoint(target: Target) -> Endpoint:
     """A target as the native core has it."""
-    return _place(target).tolerating(**asdict(target.tolerance))
+    place = _place(target)
+    if target.tolerance == STRICT:
+        return place
+    return place.tolerating(**asdict(target.tolerance))
 
 
 def _place(target: Target) -> Endpoint:

@@ -9,17 +9,21 @@ from __future__ import annotations
 from holdfast.leases.bucket import LeaseBucket, NotALeaseBucket, Outdated, made
 from holdfast.leases.entries import HELD, RENEWED, TTL, Entry, Holding
 from holdfast.leases.leases import Leases, Watcher
+from holdfast.leases.thread import Connect, LeaseThread, Relay
 
 __all__ = [
     "HELD",
     "RENEWED",
     "TTL",
+    "Connect",
     "Entry",
     "Holding",
     "LeaseBucket",
+    "LeaseThread",
     "Leases",
     "NotALeaseBucket",
     "Outdated",
+    "Relay",
     "Watcher",
     "made",
 ]

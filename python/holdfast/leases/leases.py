@@ -5,6 +5,8 @@ others wait until they have not seen a renewal for `TTL` seconds, which is longe
 exactly the revision that they have seen. If it was renewed meanwhile, that fails. So it does not
 matter when the server deletes a key, whether a message about it is late, or how long a process was
 stopped.
+
+One event loop changes leases; what is held, and by whom, may be read from every thread.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ USED = 0.01
 
 
 class Watcher(Protocol):
-    """Who is told of changes, in the event loop."""
+    """Who is told of changes, in the event loop that changes leases."""
 
     def taken(self, key: str) -> None:
         """A lease was taken."""
@@ -83,16 +85,21 @@ class Leases:
         *,
         replicas: int = 1,
         about: Callable[[str], dict[str, Any]] = lambda _: {},
+        withheld: Callable[[], str | None] = lambda: None,
     ) -> None:
-        """`about` returns what the value of a lease says besides its holder, at each renewal."""
+        """`about` returns what the value of a lease says besides its holder, at each renewal.
+
+        `withheld` returns why leases are not renewed or taken now; `None` if they are.
+        """
         self.node = node
         self.process = secrets.token_hex(8)
         self.seen: dict[str, Entry] = {}
         """All keys of the bucket, as last seen."""
-        self.is_read = asyncio.Event()
-        """Set when all keys are known that there were at the start."""
-        self._bucket_name = bucket
+        self.is_read = False
+        """Whether all keys are known that there were at the start."""
+        self.bucket = bucket
         self._watcher = watcher
+        self._withheld = withheld
         self._replicas = replicas
         self._about = about
         self._fences: dict[str, _core.Fence] = {}
@@ -127,7 +134,12 @@ class Leases:
     @property
     def held(self) -> Mapping[str, int]:
         """The leases that are held, with the revision with which each was taken."""
-        return {key: held.since for key, held in self._held.items()}
+        return {key: held.since for key, held in self._held.copy().items()}
+
+    def since(self, key: str) -> int:
+        """The revision with which a lease that is held was taken; 0 of another one."""
+        held = self._held.get(key)
+        return 0 if held is None else held.since
 
     def revision(self, key: str) -> int:
         """The latest revision of a lease that is held; 0 of another one."""
@@ -158,21 +170,29 @@ class Leases:
                 if self._client is not None and self._bucket is None:
                     await self._open(self._client)
                 now = time.monotonic()
+                withheld = self._withheld()
                 if now >= due:
                     due = now + RENEWED
-                    for key, held in list(self._held.items()):
-                        self._begin(self._renew(key, held))
+                    if withheld is None:
+                        for key, held in self._held.items():
+                            self._begin(self._renew(key, held))
                     await self._follow_again(now)
-                self._take_free(now)
-                self._note_lapsed(now)
+                if withheld is None:
+                    self._take_free(now)
+                self._note_lapsed(now, withheld or "it could not be renewed")
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(min(TICK, max(due - now, 0.0))):
                         await self._news.wait()
                 self._news.clear()
+        except Exception:
+            for key in self._held.copy():
+                self._give_up(key, "an internal error")
+            raise
         finally:
             for task in self._tasks:
                 task.cancel()
-            for fence in self._fences.values():
+            self._taking.clear()
+            for fence in self._fences.copy().values():
                 fence.close()
 
     async def renew_now(self, key: str) -> None:
@@ -211,20 +231,24 @@ class Leases:
             self._watcher.changed()
 
     async def _open(self, client: Client) -> None:
-        bucket = LeaseBucket(client, self._bucket_name)
+        bucket = LeaseBucket(client, self.bucket)
         try:
             await bucket.open(self._replicas)
-            await bucket.follow(self._saw, self.is_read.set)
+            await bucket.follow(self._saw, self._note_read)
         except (Error, OSError, NotALeaseBucket) as error:
-            self._works(str(error) or type(error).__name__)
+            self.works(str(error) or type(error).__name__)
             await asyncio.sleep(RETRIED)
             return
         if self._client is client:
             self._bucket = bucket
             self._heard = self._acknowledged = time.monotonic()
-            self._works(None)
+            self.works(None)
 
-    def _works(self, reason: str | None) -> None:
+    def _note_read(self) -> None:
+        self.is_read = True
+
+    def works(self, reason: str | None) -> None:
+        """Sets why the bucket does not work; `None` if it does."""
         if reason != self._reason:
             self._reason = reason
             self._watcher.works(reason)
@@ -237,7 +261,7 @@ class Leases:
             self._heard = now
             with contextlib.suppress(Error, OSError):
                 await self._bucket.unfollow()
-                await self._bucket.follow(self._saw, self.is_read.set)
+                await self._bucket.follow(self._saw, self._note_read)
 
     def _saw(self, key: str, entry: Entry) -> None:
         self._heard = time.monotonic()
@@ -337,20 +361,21 @@ class Leases:
         ):
             held.revision = entry.revision
             return
-        self._fences[key].close()
-        self._held.pop(key, None)
         if entry is not None:
             self._saw(key, entry)
         ended = entry is None or entry.holding is None
-        self._watcher.lost(key, "it has ended" if ended else "another node holds it")
+        self._give_up(key, "it has ended" if ended else "another node holds it")
 
-    def _note_lapsed(self, now: float) -> None:
+    def _note_lapsed(self, now: float, reason: str) -> None:
         """Gives up leases that could not be renewed for so long that others may have taken them."""
-        for key, held in list(self._held.items()):
+        for key, held in self._held.copy().items():
             if now >= held.until - HELD + TTL and not held.lock.locked():
-                self._fences[key].close()
-                del self._held[key]
-                self._watcher.lost(key, "it could not be renewed")
+                self._give_up(key, reason)
+
+    def _give_up(self, key: str, reason: str) -> None:
+        self._fences[key].close()
+        if self._held.pop(key, None) is not None:
+            self._watcher.lost(key, reason)
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)

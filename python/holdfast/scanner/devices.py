@@ -29,7 +29,7 @@ LOOK_UP = 10.0
 """Seconds between lookups of the name of a device that does not respond."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Plan:
     """The rules for combining tags into requests."""
 
@@ -46,7 +46,7 @@ class Plan:
     def of(request: PlanRequest | None) -> Plan:
         """Creates the plan of a request. Raises `Refused`."""
         if request is None:
-            return Plan()
+            return USUAL_PLAN
         return Plan(
             MAX_GAP if request.max_gap is None else request.max_gap,
             request.max_registers or READ_REGISTERS,
@@ -81,6 +81,10 @@ class Plan:
                     raise Refused(f"tag {tag.id!r} from address {tag.address}: {found}")
 
 
+USUAL_PLAN = Plan()
+"""One object for nearly all devices."""
+
+
 def _ranges(where: str, ranges: Iterable[Range]) -> Iterable[tuple[Area, int, int]]:
     for index, given in enumerate(ranges):
         *area, start, end = given
@@ -95,7 +99,7 @@ def _ranges(where: str, ranges: Iterable[Range]) -> Iterable[tuple[Area, int, in
                 yield name, start, end + 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Source:
     """The address and the settings of a device, common to all of its subscribers."""
 
@@ -110,7 +114,7 @@ class Source:
     """The URL in the request, if it has one."""
 
 
-@dataclass
+@dataclass(slots=True)
 class Subscriber:
     """A subscriber of a device: its tags, and how they are published."""
 
@@ -123,13 +127,17 @@ class Subscriber:
     """Seconds after which the subscription ends, unless a request renews it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Wanted:
     """The properties of a tag that each subscriber sets for itself."""
 
     writable: bool | None
     """`None` if the request leaves it out."""
     description: str | None
+
+
+USUALLY_WANTED = Wanted(None, None)
+"""One object for nearly all tags."""
 
 
 class ScannedDevice:

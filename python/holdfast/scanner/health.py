@@ -49,7 +49,7 @@ def is_unwritten(fault: int) -> bool:
     return fault in UNWRITTEN
 
 
-@dataclass
+@dataclass(slots=True)
 class Health:
     """The state of a device, its failures and its last errors."""
 

@@ -16,7 +16,14 @@ from holdfast.client.url import NetworkTarget, SerialTarget
 from holdfast.net.addresses import address_in, unbracketed
 from holdfast.protocol import usual_port
 from holdfast.scanner.adjusting import Adjustments
-from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wanted
+from holdfast.scanner.devices import (
+    USUALLY_WANTED,
+    Plan,
+    ScannedDevice,
+    Source,
+    Subscriber,
+    Wanted,
+)
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import Health
 from holdfast.scanner.subjects import next_name, subject_id
@@ -29,7 +36,7 @@ if TYPE_CHECKING:
     from holdfast.client.url import Target
     from holdfast.config.scanning import Dialect, Publish, Writes
     from holdfast.scanner.limits import ScannerLimits
-    from holdfast.scanner.messages import SubscribeRequest, UnsubscribeRequest
+    from holdfast.scanner.messages import SubscribeRequest, TagRequest, UnsubscribeRequest
     from holdfast.scanner.rules import Rules
     from holdfast.scanner.tags import Tag
 
@@ -122,15 +129,18 @@ def understood(
         source,
         frozenset(said),
         tags,
-        {
-            entry.id: Wanted(entry.writable, entry.description)
-            for entry in (*of_profile.values(), *request.tags)
-        },
+        {entry.id: _wanted(entry) for entry in (*of_profile.values(), *request.tags)},
         _rate(request, rules, changes),
         publish,
         deadband if publish == "change" else 0.0,
         request.ttl,
     )
+
+
+def _wanted(entry: TagRequest) -> Wanted:
+    if entry.writable is None and entry.description is None:
+        return USUALLY_WANTED
+    return Wanted(entry.writable, entry.description)
 
 
 def _check_id(id: str) -> None:
@@ -196,6 +206,8 @@ class Registry:
         """The tag ids, by their names in subjects; only with dialect `tentacle-next`."""
         self._subjects: dict[str, str] = {}
         """The ids of the devices, by their names in subjects."""
+        self._sharing: dict[str, list[str]] = {}
+        """The ids of the devices that share a connection, by its address or line."""
 
     @property
     def tags(self) -> int:
@@ -247,15 +259,22 @@ class Registry:
         subscriber.publish = asked.publish
         subscriber.deadband = asked.deadband
         subscriber.ttl = asked.ttl
-        subscriber.tags |= asked.wanted
         redefined = any(device.tags.get(id, tag) != tag for id, tag in asked.tags.items())
-        device.tags |= asked.tags
+        for kept in map(self._alike, asked.tags.values()):
+            device.tags[kept.id] = kept
+            subscriber.tags[kept.id] = asked.wanted[kept.id]
         for id in new:
             self._holders.setdefault(id, set()).add(device.id)
             if self._dialect == "tentacle-next":
                 self._spelled.setdefault(next_name(id), set()).add(id)
         self._tags += len(new)
         return Change(device, bool(new) or redefined or device.rate != before, former)
+
+    def _alike(self, tag: Tag) -> Tag:
+        """Returns the same tag of another device, if there is one: many devices are of one kind."""
+        holder = next(iter(self._holders.get(tag.id, ())), None)
+        known = None if holder is None else self.devices[holder].tags.get(tag.id)
+        return known if known is not None and known == tag else tag
 
     def _made(
         self, asked: Subscription, source: Source, address: Target, former: ScannedDevice | None
@@ -264,7 +283,9 @@ class Registry:
         device = ScannedDevice(asked.device, source, address, Health(), self._writes, self._dialect)
         if former is not None:
             device.subscribers, device.tags = dict(former.subscribers), dict(former.tags)
+            self._leave(former)
         self.devices[device.id] = device
+        self._sharing.setdefault(_place(source.target), []).append(device.id)
         self._subjects |= dict.fromkeys(_subjects(device), device.id)
         return device
 
@@ -292,6 +313,7 @@ class Registry:
         self._tags -= len(unwanted)
         if not device.subscribers:
             del self.devices[device.id]
+            self._leave(device)
             for name in _subjects(device):
                 del self._subjects[name]
             return device, True
@@ -340,21 +362,27 @@ class Registry:
     def _check_shared(self, asked: Subscription) -> None:
         """Checks that a new device has the settings of the devices that share its connection."""
         target = asked.source.target
-        place, settings = _place(target), _settings(target)
-        for device in self.devices.values():
-            if device.id == asked.device or _place(device.source.target) != place:
-                continue
-            for key, known in _settings(device.source.target).items():
-                if known != settings[key]:
-                    at = (
-                        "on one serial line"
-                        if isinstance(target, SerialTarget)
-                        else "at one address"
-                    )
-                    raise Refused(
-                        f"{key} of {place} is already {_shown(known)} for {device.id}, "
-                        f"not {_shown(settings[key])}; devices {at} have the same settings"
-                    )
+        place = _place(target)
+        others = (id for id in self._sharing.get(place, ()) if id != asked.device)
+        id = next(others, None)
+        if id is None:
+            return
+        settings = _settings(target)
+        # All others are like this one.
+        for key, known in _settings(self.devices[id].source.target).items():
+            if known != settings[key]:
+                at = "on one serial line" if isinstance(target, SerialTarget) else "at one address"
+                raise Refused(
+                    f"{key} of {place} is already {_shown(known)} for {id}, "
+                    f"not {_shown(settings[key])}; devices {at} have the same settings"
+                )
+
+    def _leave(self, device: ScannedDevice) -> None:
+        """Notes that a device does not use its connection any more."""
+        place = _place(device.source.target)
+        self._sharing[place].remove(device.id)
+        if not self._sharing[place]:
+            del self._sharing[place]
 
     def _check_limits(self, device: ScannedDevice | None, asked: Subscription, new: int) -> None:
         limits = self._limits

@@ -190,6 +190,7 @@ class Scanner:
                 settings.prefix,
                 _Host(self),
                 self._about,
+                self._connect_leases,
             )
         part = self._part
         self.outbox = (
@@ -351,6 +352,12 @@ class Scanner:
             done = wire.text(message.reply, msgspec.json.encode(Answer(success=True)))
             await self.outbox.answer(message.reply, done)
         self.end()
+
+    async def _connect_leases(self, connected: Callable[[Client | None], None]) -> None:
+        """Keeps a connection that only the leases of a fleet use."""
+        settings = self._settings
+        broker = Broker(settings.servers, {}, connected, settings.ping, name="holdfast leases")
+        await broker.run()
 
     def _fence(self, device: ScannedDevice) -> _core.Fence | None:
         return None if self._part is None else self._part.fence(device)
@@ -609,7 +616,8 @@ class Scanner:
         publisher = self._publishers.get(device.id)
         if publisher is None:
             publisher = self._publishers[device.id] = self._publisher(device)
-        publisher.want(lambda: grouped(device), asked.tags)
+        # Where a device is only known, `begin` makes all of its tags new.
+        publisher.want(lambda: grouped(device), asked.tags if self._is_own(device) else ())
 
     def _publisher(self, device: ScannedDevice) -> Publisher:
         lease = None if self._part is None else self._part.fleet.epoch(device.partition)
@@ -775,7 +783,7 @@ class Scanner:
         """Reports devices that this node polls, to another node."""
         about = msgspec.json.decode(message.data, type=About)
         counters = self._polling.counters()
-        shown = self._shown_devices()
+        shown = self._shown_devices(about.devices)
         return self._told(
             (id, browsing.report(*shown[id], counters, self._most()))
             for id in about.devices
@@ -785,7 +793,7 @@ class Scanner:
     async def _variables_own(self, message: Msg) -> bytes:
         """Tells another node the values of devices that this node polls."""
         about = msgspec.json.decode(message.data, type=About)
-        shown = self._shown_devices()
+        shown = self._shown_devices(about.devices)
         prefix = self._settings.prefix
         return self._told(
             (id, list(of_device(*shown[id], prefix))) for id in about.devices if id in shown
@@ -823,11 +831,18 @@ class Scanner:
             refused = () if self._configured is None else self._configured.refused
             return variables(request, self._shown_devices(), refused, prefix, self._most())
 
-    def _shown_devices(self) -> dict[str, tuple[ScannedDevice, Mapping[str, str]]]:
-        """Returns each device with the errors of its tags that could not be decoded."""
+    def _shown_devices(
+        self, ids: Iterable[str] | None = None
+    ) -> dict[str, tuple[ScannedDevice, Mapping[str, str]]]:
+        """Returns each device with the errors of its tags that could not be decoded.
+
+        With `ids`, only these devices, as far as they are known.
+        """
+        known = self._registry.devices
         return {
-            id: (device, self._publishers[id].undecoded)
-            for id, device in self._registry.devices.items()
+            id: (known[id], self._publishers[id].undecoded)
+            for id in (known if ids is None else ids)
+            if id in known
         }
 
     def _most(self) -> int:
@@ -835,7 +850,7 @@ class Scanner:
         client = self._broker.client
         return MAX_PAYLOAD if client is None else client.max_payload
 
-    def _browsed(self, request: BrowseRequest) -> BrowseAnswer:
+    def _browsed(self, request: BrowseRequest, ids: Iterable[str] | None = None) -> BrowseAnswer:
         service = ServiceReport(
             started_at=self._heart.started,
             published=self.outbox.sent,
@@ -854,7 +869,7 @@ class Scanner:
                 for entry in self._configured.refused[:MAX_REFUSED_SHOWN]
             ] or None
         counters = self._polling.counters()
-        return browsed(request, self._shown_devices(), counters, service, self._most())
+        return browsed(request, self._shown_devices(ids), counters, service, self._most())
 
     async def _adopt(self, device: str, want: Want | None, renewed: set[str]) -> None:
         """Makes the subscriptions of a device those of the fleet. Raises `Refused`."""
@@ -884,13 +899,15 @@ class Scanner:
         ids = sorted(self._registry.devices)
         if request.device_id is not None:
             ids = [id for id in ids if id == request.device_id]
-        page = ids[request.offset or 0 :][:BROWSED]
+        offset = request.offset or 0
+        page = ids[offset : offset + BROWSED]
         devices = [self._registry.devices[id] for id in page]
         found = await self._part.told("browse", devices)
-        answer = self._browsed(request)
+        answer = self._browsed(msgspec.structs.replace(request, offset=None), page)
+        answer.count = len(self._registry.devices)
         shown: list[DeviceReport] = []
         room = self._most() - ENVELOPE
-        for report in answer.devices[: len(page)]:
+        for report in answer.devices:
             with contextlib.suppress(msgspec.ValidationError):
                 if report.device_id in found and request.tag_offset is None:
                     report = msgspec.convert(found[report.device_id], DeviceReport)
@@ -898,8 +915,10 @@ class Scanner:
             if room < 0 and shown:
                 break
             shown.append(report)
-        if len(shown) < len(answer.devices):
-            answer.next = (request.offset or 0) + len(shown)
+        if answer.next is not None or len(shown) < len(answer.devices):
+            answer.next = offset + len(shown)
+        elif offset + len(page) < len(ids):
+            answer.next = offset + len(page)
         answer.devices = shown
         return answer
 
@@ -922,7 +941,7 @@ class Scanner:
                 skipped += 1
             page = page[skipped:]
             found = await self._part.told("variables", page)
-            shown = self._shown_devices()
+            shown = self._shown_devices(device.id for device in page)
             for device in page:
                 values = found.get(device.id)
                 if values is None and device.id in shown:

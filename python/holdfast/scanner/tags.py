@@ -34,6 +34,9 @@ ORDERS = {"big": "ABCD", "little": "DCBA"}
 NUMERIC = ("bcd", "float", "int", "uint")
 """What the names of numeric types begin with."""
 
+NO_MARKERS: frozenset[Marker] = frozenset()
+"""One object for nearly all tags."""
+
 KINDS: dict[str, DataType] = {
     "bool": "boolean",
     "bit": "boolean",
@@ -149,9 +152,9 @@ def tag(request: TagRequest, order: str, where: str, changes: Adjustments, rules
             f"{where}: {name} from address {request.address}: the last address is {LAST_ADDRESS}"
         )
     try:
-        null = frozenset(
-            as_decoded(marker, type, request.encoding) for marker in request.null or ()
-        )
+        null = NO_MARKERS
+        if request.null:
+            null = frozenset(as_decoded(each, type, request.encoding) for each in request.null)
     except ValueError as error:
         raise Refused(f"{where}.null: {error}") from None
     made = Tag(request.id, area, request.address, name, order, null, request.encoding)

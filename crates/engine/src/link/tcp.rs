@@ -11,7 +11,6 @@ use holdfast_protocol::client::{
     Attempt, Closed, Connection, Done, Failure, Ticket, Tolerance, Transport,
 };
 use holdfast_protocol::pdu::EncodedRequest;
-use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
 use tokio::net::tcp::OwnedReadHalf;
 use tokio::sync::{Mutex, oneshot};
@@ -31,8 +30,13 @@ use crate::tls::{Channel, TlsFailure};
 /// The connection has ended before a request could be sent, or before its reply.
 const LOST: Failure = Failure::Closed(Closed::ByPeer);
 
-/// Bytes per read of a socket.
-const CHUNK: usize = 16 * 1024;
+/// Bytes that a socket may leave unsent before its connection is given up.
+const UNSENT: usize = 16 * 1024;
+
+thread_local! {
+    /// What is read from a socket at once. All connections of a thread share it: most are idle.
+    static CHUNK: RefCell<Box<[u8]>> = RefCell::new(vec![0; 16 * 1024].into_boxed_slice());
+}
 
 pub(super) struct TcpLink {
     host: String,
@@ -371,8 +375,27 @@ impl Open {
                 true
             }
             // If a device does not read, its requests time out. Their number is limited.
-            Err(error) => error.kind() == ErrorKind::WouldBlock && self.unsent.len() < CHUNK,
+            Err(error) => error.kind() == ErrorKind::WouldBlock && self.unsent.len() < UNSENT,
         }
+    }
+}
+
+impl Open {
+    /// Takes what was received. Returns whether the connection still works.
+    fn receive(&mut self, received: &[u8], plain: &mut Vec<u8>) -> bool {
+        let Open { connection, waiting, tls, unsent, strays, late, .. } = self;
+        let (received, lasts) = match tls {
+            None => (received, true),
+            Some(tls) => {
+                plain.clear();
+                let intact = tls.receive(received, plain, unsent).is_ok();
+                (&plain[..], intact && !tls.has_ended())
+            }
+        };
+        let now = self.epoch.elapsed();
+        connection.receive(received, now, |done| hand_on(waiting, &done));
+        strays.take(connection, late);
+        lasts && connection.closed().is_none()
     }
 }
 
@@ -393,31 +416,18 @@ impl Drop for Open {
 }
 
 /// Reads replies until the connection ends.
-async fn receive(link: Rc<RefCell<Option<Open>>>, mut reader: OwnedReadHalf) {
-    let mut chunk = vec![0; CHUNK].into_boxed_slice();
+async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
     let mut plain = Vec::new();
     loop {
-        let read = reader.read(&mut chunk).await;
+        let ready = reader.readable().await;
         let mut open = link.borrow_mut();
         let Some(found) = open.as_mut() else { return };
-        let Open { connection, waiting, tls, unsent, strays, late, .. } = found;
-        let intact = match read {
-            Ok(0) | Err(_) => false,
-            Ok(len) => {
-                let (received, lasts) = match tls {
-                    None => (&chunk[..len], true),
-                    Some(tls) => {
-                        plain.clear();
-                        let intact = tls.receive(&chunk[..len], &mut plain, unsent).is_ok();
-                        (&plain[..], intact && !tls.has_ended())
-                    }
-                };
-                let now = found.epoch.elapsed();
-                connection.receive(received, now, |done| hand_on(waiting, &done));
-                strays.take(connection, late);
-                lasts && connection.closed().is_none()
-            }
-        };
+        let intact =
+            CHUNK.with_borrow_mut(|chunk| match ready.and_then(|()| reader.try_read(chunk)) {
+                Ok(0) => false,
+                Ok(len) => found.receive(&chunk[..len], &mut plain),
+                Err(error) => error.kind() == ErrorKind::WouldBlock,
+            });
         // The socket may now accept bytes that it did not accept before.
         if intact && (found.unsent.is_empty() || found.write()) {
             continue;
@@ -437,7 +447,7 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, mut reader: OwnedReadHalf) {
 #[cfg(test)]
 mod tests {
     use holdfast_protocol::pdu::{Range, Request};
-    use tokio::io::AsyncWriteExt;
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
     use tokio::net::TcpListener;
     use tokio::runtime::Builder;
     use tokio::task::{LocalSet, spawn_local};

@@ -2,7 +2,7 @@
 
 use std::future::poll_fn;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::pin::pin;
+use std::pin::Pin;
 use std::sync::Arc;
 
 use tokio::task::{AbortHandle, spawn_local};
@@ -14,8 +14,9 @@ use super::state::DeviceState;
 pub(super) struct Panicked;
 
 /// Awaits a future and catches its panic.
-pub(super) async fn caught<F: Future>(future: F) -> Result<F::Output, Panicked> {
-    let mut future = pin!(future);
+///
+/// The future is pinned elsewhere: this one would have it twice, as an argument and in a pin.
+pub(super) async fn caught<F: Future>(mut future: Pin<&mut F>) -> Result<F::Output, Panicked> {
     poll_fn(|context| match catch_unwind(AssertUnwindSafe(|| future.as_mut().poll(context))) {
         Ok(polled) => polled.map(Ok),
         Err(_) => Err(Panicked).into(),
@@ -28,8 +29,9 @@ pub(super) fn spawn_watched(
     task: impl Future<Output = ()> + 'static,
     state: Arc<DeviceState>,
 ) -> AbortHandle {
+    let mut task = Box::pin(task);
     let watched = async move {
-        if caught(task).await.is_err() {
+        if caught(task.as_mut()).await.is_err() {
             state.set_broken(true);
         }
     };

@@ -14,6 +14,7 @@ use std::collections::HashMap;
 use std::convert::Infallible;
 use std::future::pending;
 use std::num::NonZeroU16;
+use std::pin::pin;
 use std::rc::Rc;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -234,13 +235,14 @@ impl Device {
         self.due.set(Instant::now() + phase);
         loop {
             self.tell();
-            let polled = async {
+            let polled = caught(pin!(async {
                 tokio::select! {
                     successor = self.poll_until_replaced(&inbox) => successor,
                     never = self.tell_for_ever() => match never {},
                 }
-            };
-            self = match caught(polled).await {
+            }))
+            .await;
+            self = match polled {
                 Ok(successor) => {
                     successor.follow(self);
                     *successor
@@ -294,14 +296,16 @@ impl Device {
                 due += interval;
             }
             self.turn.polls(true);
+            // In a box: a device takes the memory of a poll only while it polls.
+            let poll = Box::pin(self.poll(began));
             match &self.settings.fence {
-                None => self.poll(began).await,
+                None => poll.await,
                 Some(fence) => {
                     let _pass = fence.pass();
                     tokio::select! {
                         biased;
                         () = fence.closed() => {}
-                        () = self.poll(began) => {}
+                        () = poll => {}
                     }
                 }
             }

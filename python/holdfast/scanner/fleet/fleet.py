@@ -9,20 +9,16 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from nats.errors import Error
-
 from holdfast import logs
-from holdfast.leases import TTL, Leases
+from holdfast.leases import RENEWED, TTL, Leases, LeaseThread, Relay
 from holdfast.scanner.fleet.placement import partition_of, placed
 from holdfast.scanner.fleet.terms import FleetRefused, FleetSettings, Terms
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from nats.aio.client import Client
-
     from holdfast import _core
-    from holdfast.leases import Holding
+    from holdfast.leases import Connect, Holding
 
 NODE = "node."
 PARTITION = "partition."
@@ -49,7 +45,10 @@ def leases_of(fleet: str) -> str:
 
 
 class Fleet:
-    """A node. `gained` and `lost` are called with partitions."""
+    """A node. `gained` and `lost` are called with partitions, in the event loop of `start`.
+
+    The leases are held by a thread of their own: this loop may be busy for seconds.
+    """
 
     def __init__(
         self,
@@ -58,8 +57,15 @@ class Fleet:
         about: Callable[[], dict[str, Any]],
         gained: Callable[[int], None],
         lost: Callable[[int], None],
+        *,
+        connect: Connect,
+        withheld: Callable[[], str | None],
     ) -> None:
-        """`about` returns what others are shown of this node."""
+        """`about` returns what others are shown of this node.
+
+        `connect` makes the connection of the leases. `withheld` returns why this node can't use its
+        devices, though it could renew their leases; it is called in their thread.
+        """
         self.settings = settings
         self.terms = terms
         self._node_about = about
@@ -70,9 +76,20 @@ class Fleet:
         self._ending: dict[str, asyncio.Task[None]] = {}
         self._may_end = asyncio.Semaphore(TOGETHER)
         self._started = int(time.time() * 1000)
+        self._begun: dict[int, int] = {}
+        """The partitions whose devices are used, with the revision of the lease."""
+        self._shown: dict[str, Any] = {}
+        self._shown_at = 0.0
+        self._relay = Relay(self)
         self.leases = Leases(
-            leases_of(settings.name), settings.node, self, replicas=3, about=self._about
+            leases_of(settings.name),
+            settings.node,
+            self._relay,
+            replicas=3,
+            about=self._about,
+            withheld=withheld,
         )
+        self._thread = LeaseThread(self.leases, connect, "holdfast-leases")
 
     @property
     def node(self) -> str:
@@ -92,7 +109,7 @@ class Fleet:
         return any(name != self.node for name, _ in self._live_nodes())
 
     def _live_nodes(self) -> Iterable[tuple[str, Holding]]:
-        for key in list(self.leases.seen):
+        for key in self.leases.seen.copy():
             if key.startswith(NODE) and (holder := self.leases.holder(key)) is not None:
                 yield key.removeprefix(NODE), holder
 
@@ -106,7 +123,9 @@ class Fleet:
 
     def is_own(self, partition: int) -> bool:
         """Whether this node may use the devices of a partition now. Ask at the last moment."""
-        return self.leases.is_held(f"{PARTITION}{partition}")
+        key, begun = f"{PARTITION}{partition}", self._begun.get(partition)
+        # It may have been lost and taken again since this loop has heard of it.
+        return begun is not None and self.leases.since(key) == begun and self.leases.is_held(key)
 
     @property
     def may_publish(self) -> bool:
@@ -115,7 +134,7 @@ class Fleet:
 
     def epoch(self, partition: int) -> int:
         """The revision with which this node took the lease of a partition; 0 without it."""
-        return self.leases.held.get(f"{PARTITION}{partition}", 0)
+        return self._begun.get(partition, 0)
 
     def revision(self, partition: int) -> int:
         """The latest revision of the lease of a partition that this node has; 0 without it."""
@@ -129,28 +148,37 @@ class Fleet:
     @property
     def partitions(self) -> list[int]:
         """The partitions of this node."""
-        return [
-            int(key.removeprefix(PARTITION))
-            for key in self.leases.held
-            if key.startswith(PARTITION)
-        ]
+        return list(self._begun)
 
     def _about(self, key: str) -> dict[str, Any]:
-        if not key.startswith(NODE):
-            return {}
-        return {
+        return self._shown if key.startswith(NODE) else {}
+
+    def _show(self) -> None:
+        """Prepares what others are shown, for the thread of the leases."""
+        self._shown_at = time.monotonic()
+        self._shown = {
             "started": self._started,
             "leaving": self._is_leaving,
             "total": self.settings.partitions,
             **self._node_about(),
         }
 
+    def start(self) -> None:
+        """Starts the thread of the leases."""
+        self._relay.attach(asyncio.get_running_loop())
+        self._show()
+        self._thread.start()
+
+    async def stop(self) -> None:
+        """Ends the thread of the leases. What is still held is given back if nothing uses it."""
+        await asyncio.to_thread(self._thread.stop, 0.0)
+
     async def join(self) -> None:
         """Takes the lease of the node. Raises `FleetRefused` if its name is in use."""
         key = f"{NODE}{self.node}"
-        self.leases.want([key])
+        self._thread.want([key])
         until = time.monotonic() + JOINING
-        while key not in self.leases.held:
+        while not self.leases.since(key):
             holder = self.leases.holder(key)
             if holder is None or self.leases.reason is not None:
                 until = time.monotonic() + JOINING
@@ -180,6 +208,8 @@ class Fleet:
                 logs.write(logging.INFO, "fleet_changed", **fields)
                 known = nodes
             self._place(nodes)
+            if time.monotonic() > self._shown_at + RENEWED:
+                self._show()
 
     def _place(self, nodes: list[str]) -> None:
         if self._is_leaving:
@@ -191,7 +221,7 @@ class Fleet:
         }
         target = placed(self.settings.partitions, nodes, held)
         mine = {f"{PARTITION}{each}" for each, node in target.items() if node == self.node}
-        self.leases.want([f"{NODE}{self.node}", *mine])
+        self._thread.want([f"{NODE}{self.node}", *mine])
         for key in self.leases.held:
             if key.startswith(PARTITION) and key not in mine and key not in self._ending:
                 task = asyncio.create_task(self._give_back(key, self._may_end))
@@ -203,38 +233,50 @@ class Fleet:
 
     async def _give_back(self, key: str, may_end: asyncio.Semaphore) -> None:
         async with may_end:
-            await self.leases.give_back(key, ENDING)
-        self._lost(int(key.removeprefix(PARTITION)))
+            await self._thread.give_back(key, ENDING)
+        self._settle(key)
 
     async def leave(self) -> None:
         """Hands all partitions over, and ends the lease of the node."""
         self._is_leaving = True
-        self.leases.want([])
+        self._show()
+        self._thread.want([])
         node = f"{NODE}{self.node}"
-        with contextlib.suppress(Error, OSError):
-            await self.leases.renew_now(node)
+        await self._thread.renew_now(node)
         keys = [key for key in self.leases.held if key.startswith(PARTITION)]
         may_end = asyncio.Semaphore(len(keys))
         await asyncio.gather(*(self._give_back(key, may_end) for key in keys))
-        await self.leases.give_back(node, 0.0)
+        await self._thread.give_back(node, 0.0)
         logs.write(logging.INFO, "fleet_left", fleet=self.settings.name, node=self.node)
 
-    def connected(self, client: Client | None) -> None:
-        """Sets the client; `None` while there is no connection."""
-        self.leases.connected(client)
+    def _settle(self, key: str) -> None:
+        """Begins or ends with the devices of a partition, as its lease is now.
+
+        It may be another one than that of the event: the thread of the leases goes on meanwhile.
+        """
+        if not key.startswith(PARTITION):
+            return
+        partition = int(key.removeprefix(PARTITION))
+        since = self.leases.since(key)
+        if since == self._begun.get(partition, 0):
+            return
+        if self._begun.pop(partition, 0):
+            self._lost(partition)
+        if since:
+            self._begun[partition] = since
+            self._gained(partition)
+        self._shown_at = 0.0
 
     def taken(self, key: str) -> None:
         """A lease was taken."""
         self._news.set()
-        if key.startswith(PARTITION):
-            self._gained(int(key.removeprefix(PARTITION)))
+        self._settle(key)
 
     def lost(self, key: str, reason: str) -> None:
         """A lease is not held any more."""
         self._news.set()
         logs.refused("lease_lost", kind="lease", fleet=self.settings.name, lease=key, reason=reason)
-        if key.startswith(PARTITION):
-            self._lost(int(key.removeprefix(PARTITION)))
+        self._settle(key)
 
     def changed(self) -> None:
         """Somebody else has taken or left a lease."""

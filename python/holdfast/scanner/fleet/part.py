@@ -18,6 +18,7 @@ from nats.errors import TimeoutError as NoAnswer
 
 from holdfast import logs
 from holdfast.client.url import connection_of
+from holdfast.heartbeat import Heartbeat
 from holdfast.leases import TTL, Outdated
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.fleet.exchange import About, Command, Executed, Told, subject
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast import _core
+    from holdfast.leases import Connect
     from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.fleet.terms import FleetSettings, Terms
 
@@ -53,6 +55,9 @@ ASKED = 2.0
 
 AGAIN = 0.1
 """Seconds between attempts to find the node that polls a device."""
+
+HANGING = 5.0
+"""Seconds without a sign of life of the event loop after which leases are not renewed."""
 
 
 class Host(Protocol):
@@ -87,8 +92,19 @@ class FleetPart:
         prefix: str,
         host: Host,
         about: Callable[[], dict[str, Any]],
+        connect: Connect,
     ) -> None:
-        self.fleet = Fleet(settings, terms, about, self._gained, self._lost)
+        """`connect` makes a connection of its own for the leases."""
+        self.fleet = Fleet(
+            settings,
+            terms,
+            about,
+            self._gained,
+            self._lost,
+            connect=connect,
+            withheld=self._withheld,
+        )
+        self._heartbeat = Heartbeat()
         self.wants = Wants(settings.name, self._changed)
         self._prefix = prefix
         self._host = host
@@ -107,36 +123,45 @@ class FleetPart:
     def connected(self, client: Client | None) -> None:
         """Sets the client; `None` while there is no connection."""
         self._client = client
-        self.fleet.connected(client)
         self._is_new.set()
+
+    def _withheld(self) -> str | None:
+        """Why this node can't publish values; then others should have its devices."""
+        if self._client is None:
+            return "the other connection to NATS was lost"
+        if self._heartbeat.age > HANGING:
+            return f"the event loop hangs for {HANGING:g} s"
+        return None
 
     async def run(self, ready: asyncio.Event) -> None:
         """Is a node of the fleet until it is cancelled. Raises `FleetRefused`.
 
         Sets `ready` when it knows what is wanted.
         """
-        running = [asyncio.create_task(self.fleet.leases.run())]
+        running: list[asyncio.Task[None]] = []
+        self.fleet.start()
         try:
-            await self._open(ready)
-            works = (self.fleet.run(), self._open_again(), self._follow())
-            running += [asyncio.create_task(work) for work in works]
-            done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
+            async with self._heartbeat.kept():
+                await self._open(ready)
+                works = (self.fleet.run(), self._open_again(), self._follow())
+                running += [asyncio.create_task(work) for work in works]
+                done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    task.result()
         finally:
             for task in running:
                 task.cancel()
             await asyncio.gather(*running, return_exceptions=True)
+            await self.fleet.stop()
 
     async def _open(self, ready: asyncio.Event) -> None:
         """Joins the fleet, and reads what is wanted."""
         while not self.is_joined:
-            client = self._client
-            if client is None or self.fleet.leases.reason is not None:
+            client, leases = self._client, self.fleet.leases
+            if client is None or leases.reason is not None or not leases.is_read:
                 await asyncio.sleep(AGAIN)
                 continue
             try:
-                await self.fleet.leases.is_read.wait()
                 await self.wants.open(client, self.fleet.terms, self.fleet.has_others)
                 self._is_new.clear()
                 await self.fleet.join()

@@ -1,0 +1,173 @@
+"""A node whose event loop is busy or hangs, and one that loses one of its two connections."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import threading
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast.scanner import FleetSettings
+from holdfast.scanner.fleet import part as parts
+from support import wire
+from support.judges import Judges
+from support.nats_bus import Caller, logged
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from holdfast.scanner.fleet.part import FleetPart
+    from support.brokers import NatsServer
+    from support.judges import Judge
+    from support.nats_bus import Run, Running
+
+PARTITIONS = 8
+DEVICES = 4
+
+
+@pytest.fixture
+def node(own_nats: NatsServer, run_scanner: Run) -> Callable[[str], Running]:
+    def start(name: str) -> Running:
+        return run_scanner(own_nats, fleet=FleetSettings("plant", name, PARTITIONS))
+
+    return start
+
+
+@pytest.fixture
+def judges() -> Iterator[Judges]:
+    with Judges(DEVICES) as judges:
+        yield judges
+
+
+def part_of(running: Running) -> FleetPart:
+    part = running.scanner._part
+    assert part is not None
+    return part
+
+
+def share(*nodes: Running) -> None:
+    """Waits until each node has its share of the partitions."""
+    each = [PARTITIONS // len(nodes)] * len(nodes)
+    wire.until(
+        lambda: [len(part_of(node).fleet.partitions) for node in nodes] == each, "they are shared"
+    )
+
+
+def subscribe(server: NatsServer, judges: Judges) -> None:
+    with Caller(server.url) as caller:
+        for number, judge in enumerate(judges.devices):
+            tag = {"id": "t", "address": 0, "functionCode": "holding", "datatype": "uint16"}
+            request: dict[str, Any] = {
+                "deviceId": f"d{number}",
+                "host": "127.0.0.1",
+                "port": judge.port,
+                "scanRate": 100,
+                "subscriberId": "hmi",
+                "tags": [tag],
+            }
+            assert caller.request("modbus.subscribe", request)["success"]
+
+
+def is_polled(judge: Judge, more_than: int) -> bool:
+    return len(judge.polls) > more_than
+
+
+def polled(judges: Judges) -> None:
+    """Waits until every device is polled, and checks that one node does."""
+    before = [len(judge.polls) for judge in judges.devices]
+    for judge, count in zip(judges.devices, before, strict=True):
+        wire.until(partial(is_polled, judge, count + 5), "it is polled")
+        assert not judge.overlaps
+        assert not judge.returns()
+
+
+def test_a_busy_event_loop_loses_no_device(
+    node: Callable[[str], Running],
+    own_nats: NatsServer,
+    judges: Judges,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(parts, "HANGING", math.inf)
+    one, two = node("a"), node("b")
+    share(one, two)
+    subscribe(own_nats, judges)
+    polled(judges)
+    fleet, seen = part_of(one).fleet, part_of(two).fleet.leases.seen
+    held = dict(fleet.leases.held)
+
+    async def be_busy() -> None:
+        key = f"partition.{fleet.partitions[0]}"
+        revision = seen[key].revision
+        # Blocks the event loop for longer than a lease lasts.
+        wire.until(lambda: seen[key].revision > revision + 10 * len(held), "renewals go on")
+
+    one.do(be_busy())
+    polled(judges)
+    assert dict(fleet.leases.held) == held
+    assert all(len(judge.peers) == 1 for judge in judges.devices)
+    assert not logged(caplog, "lease_lost")
+
+
+def test_others_take_over_from_a_node_whose_event_loop_hangs(
+    node: Callable[[str], Running], own_nats: NatsServer, judges: Judges
+) -> None:
+    class Hangs:
+        age = math.inf
+
+    one, two = node("a"), node("b")
+    share(one, two)
+    subscribe(own_nats, judges)
+    part = part_of(one)
+    heartbeat, part._heartbeat = part._heartbeat, Hangs()  # type: ignore[assignment]
+    share(two)
+    polled(judges)
+    part._heartbeat = heartbeat
+    share(one, two)
+    polled(judges)
+
+
+def test_others_take_over_from_a_node_that_can_publish_nothing(
+    node: Callable[[str], Running], own_nats: NatsServer, judges: Judges
+) -> None:
+    one, two = node("a"), node("b")
+    share(one, two)
+    subscribe(own_nats, judges)
+    part, client = part_of(one), one.scanner._broker.client
+
+    async def connected(is_connected: bool) -> None:
+        part.connected(client if is_connected else None)
+
+    one.do(connected(False))
+    share(two)
+    polled(judges)
+    one.do(connected(True))
+    share(one, two)
+    polled(judges)
+
+
+def test_the_connection_of_leases_is_made_again(
+    node: Callable[[str], Running], own_nats: NatsServer, judges: Judges
+) -> None:
+    one, two = node("a"), node("b")
+    share(one, two)
+    subscribe(own_nats, judges)
+    leases, thread = part_of(one).fleet.leases, part_of(one).fleet._thread
+    client = leases._client
+    assert client is not None
+    assert thread._loop is not None
+    asyncio.run_coroutine_threadsafe(client.close(), thread._loop).result(wire.DEADLINE)
+    wire.until(lambda: leases._client not in (None, client), "there is another one")
+    share(one, two)
+    polled(judges)
+
+
+def test_the_thread_of_leases_ends_with_the_node(node: Callable[[str], Running]) -> None:
+    one = node("a")
+    share(one)
+    one.stop()
+    assert "holdfast-leases" not in [each.name for each in threading.enumerate()]
+    assert not part_of(one).fleet.leases.held

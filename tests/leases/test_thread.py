@@ -1,0 +1,220 @@
+"""The thread that holds leases: it renews them whatever the rest of the process does."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+import pytest
+
+from holdfast.leases import Leases, LeaseThread, Relay, entries, thread
+from holdfast.scanner.broker import Broker, Ping, Servers
+from support import wire
+from support.brokers import NatsServer
+from support.nats_bus import logged
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from nats.aio.client import Client
+
+BUCKET = "leases"
+LIMIT = 1.0
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[NatsServer]:
+    server = NatsServer(tmp_path)
+    yield server
+    server.kill()
+
+
+class Node:
+    """Leases in a thread."""
+
+    def __init__(self, server: NatsServer, name: str) -> None:
+        self.events: list[str] = []
+        self.withheld: str | None = None
+        self.leases = Leases(BUCKET, name, self, withheld=lambda: self.withheld)
+        self.thread = LeaseThread(self.leases, self._connect, f"leases of {name}")
+        self._servers = Servers((server.url,))
+
+    async def _connect(self, connected: Callable[[Client | None], None]) -> None:
+        await Broker(self._servers, {}, connected, Ping()).run()
+
+    def taken(self, key: str) -> None:
+        self.events.append(f"taken {key}")
+
+    def lost(self, key: str, reason: str) -> None:
+        self.events.append(f"lost {key}: {reason}")
+
+    def changed(self) -> None:
+        pass
+
+    def works(self, reason: str | None) -> None:
+        pass
+
+    def has(self, *keys: str) -> None:
+        wire.until(lambda: all(map(self.leases.is_held, keys)), "they are held")
+
+    def renews(self, key: str) -> None:
+        """Waits for more renewals than a lease lasts without one."""
+        revision = self.leases.revision(key)
+        wire.until(lambda: self.leases.revision(key) > revision + 4, "it is renewed")
+
+
+@pytest.fixture
+def node(server: NatsServer) -> Iterator[Callable[[str], Node]]:
+    with ExitStack() as running:
+
+        def start(name: str) -> Node:
+            node = Node(server, name)
+            node.thread.start()
+            running.callback(node.thread.stop, LIMIT)
+            return node
+
+        yield start
+
+
+def threads() -> list[str]:
+    return [each.name for each in threading.enumerate() if each.name.startswith("leases of")]
+
+
+def test_leases_are_renewed_while_the_event_loop_of_their_user_does_something_else(
+    node: Callable[[str], Node],
+) -> None:
+    first, second = node("a"), node("b")
+
+    async def work() -> None:
+        first.thread.want(["x"])
+        first.has("x")  # Blocks this loop, as everything below.
+        second.thread.want(["x"])
+        since = first.leases.since("x")
+        first.renews("x")
+        assert first.leases.since("x") == since
+        assert first.leases.fence("x").is_open
+        assert not second.leases.held
+
+    asyncio.run(work())
+    assert first.events == ["taken x"]
+
+
+def test_the_end_of_the_thread_gives_everything_back(
+    node: Callable[[str], Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Only the mark of its former holder can free a lease.
+    monkeypatch.setattr(entries, "TTL", 1000.0)
+    first, second = node("a"), node("b")
+    first.thread.want(["x", "y"])
+    first.has("x", "y")
+    second.thread.want(["x", "y"])
+    first.thread.stop(LIMIT)
+    assert threads() == ["leases of b"]
+    assert not first.leases.fence("x").allows
+    second.has("x", "y")
+
+
+def test_what_is_asked_of_a_thread_that_has_ended_has_no_effect(
+    node: Callable[[str], Node],
+) -> None:
+    ended = node("a")
+    ended.thread.stop(LIMIT)
+
+    async def work() -> None:
+        ended.thread.want(["x"])
+        ended.thread.give_back_soon("x", LIMIT)
+        await ended.thread.give_back("x", LIMIT)
+        await ended.thread.renew_now("x")
+
+    asyncio.run(work())
+    assert not ended.leases.held
+
+
+def test_an_error_in_the_thread_closes_all_fences_and_the_leases_are_taken_again(
+    node: Callable[[str], Node], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    fails = threading.Event()
+    original = Leases._take_free
+
+    def take_free(leases: Leases, now: float) -> None:
+        if fails.is_set():
+            raise RuntimeError("a mistake")
+        original(leases, now)
+
+    monkeypatch.setattr(Leases, "_take_free", take_free)
+    monkeypatch.setattr(thread, "RETRIED", 0.01)
+    one = node("a")
+    one.thread.want(["x"])
+    one.has("x")
+    fails.set()
+    wire.until(lambda: "lost x: an internal error" in one.events, "it is given up")
+    assert not one.leases.fence("x").allows
+    assert not one.leases.held
+    fails.clear()
+    one.has("x")
+    assert logged(caplog, "leases_failed")[0] == {"bucket": BUCKET}
+
+
+def test_a_node_that_can_not_use_its_devices_lets_others_have_them(
+    node: Callable[[str], Node],
+) -> None:
+    first, second = node("a"), node("b")
+    first.thread.want(["x"])
+    first.has("x")
+    second.thread.want(["x"])
+    first.withheld = "there is nobody to tell"
+    second.has("x")
+    assert not first.leases.fence("x").allows
+    wire.until(lambda: first.events[1:] == ["lost x: there is nobody to tell"], "it is told")
+    first.withheld = None
+    second.thread.want([])
+    second.thread.give_back_soon("x", LIMIT)
+    first.has("x")
+
+
+def test_another_event_loop_is_told_in_order_and_of_many_changes_once() -> None:
+    class Watcher:
+        def __init__(self) -> None:
+            self.events: list[str] = []
+
+        def taken(self, key: str) -> None:
+            self.events.append(f"taken {key}")
+
+        def lost(self, key: str, reason: str) -> None:
+            self.events.append(f"lost {key}: {reason}")
+
+        def changed(self) -> None:
+            self.events.append("changed")
+
+        def works(self, reason: str | None) -> None:
+            self.events.append(f"works: {reason}")
+
+    async def work() -> None:
+        watcher = Watcher()
+        relay = Relay(watcher)
+        relay.attach(asyncio.get_running_loop())
+
+        def tell() -> None:
+            relay.works(None)
+            relay.changed()
+            relay.taken("x")
+            relay.changed()
+            relay.lost("x", "it has ended")
+
+        telling = threading.Thread(target=tell)
+        telling.start()
+        telling.join()
+        assert not watcher.events
+        await asyncio.sleep(0)
+        assert watcher.events == ["works: None", "changed", "taken x", "lost x: it has ended"]
+        relay.changed()
+        await asyncio.sleep(0)
+        assert watcher.events[-1] == "changed"
+        relays.append(relay)
+
+    relays: list[Relay] = []
+    asyncio.run(work())
+    relays[0].taken("y")  # Nobody listens any more.
