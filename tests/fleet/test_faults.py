@@ -310,8 +310,8 @@ def part_of(running: Running) -> Any:
 
 
 def are_renewed(nodes: list[Running], revisions: list[int]) -> bool:
-    found = [part_of(each).fleet.leases.revision("partition.0") for each in nodes]
-    return sum(found) > sum(revisions)
+    found: int = sum(part_of(each).fleet.leases.revision("partition.0") for each in nodes)
+    return found > sum(revisions)
 
 
 def test_one_of_two_nodes_with_one_name_is_refused(
@@ -332,6 +332,30 @@ def test_one_of_two_nodes_with_one_name_is_refused(
                 each.kill()
                 each.wait()
     check(judges)
+
+
+def test_one_of_two_nodes_with_other_settings_is_refused(
+    own_nats: NatsServer, tmp_path: Path
+) -> None:
+    nodes = Nodes([own_nats.url], tmp_path, PARTITIONS)
+    # They may replace the settings of nodes that have ended.
+    nodes.start("former")
+    nodes.settle()
+    nodes.stop()
+    nodes.running.clear()
+    wire.until(lambda: not nodes.shown(), "nobody is left")
+    both = {name: nodes.begin(name, more=["--writes", name]) for name in ("explicit", "none")}
+    try:
+        wire.until(lambda: any(each.poll() is not None for each in both.values()), "one ends")
+        [refused] = [name for name, each in both.items() if each.poll() is not None]
+        assert both[refused].returncode == 2
+        [other] = set(both) - {refused}
+        assert f"writes is {refused}, and {other} in the fleet" in nodes.log(refused)
+        wire.until(lambda: nodes.shown() == [other], "the other one is the fleet")
+    finally:
+        for each in both.values():
+            each.kill()
+            each.wait()
 
 
 def test_a_stopped_node_ends_when_another_process_has_its_name(

@@ -142,6 +142,7 @@ class Plant:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.usefixtures("many_files")
+@pytest.mark.timeout(3600 if IS_LONG else 300)
 def test_devices_are_scanned_by_one_node_at_a_time_whatever_happens(
     cluster: NatsCluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import TimeoutError as NatsTimeout
 
-from holdfast.leases import LeaseBucket, Leases, entries
+from holdfast.leases import LeaseBucket, Leases, bucket, entries
 from holdfast.leases.bucket import Outdated
+from holdfast.leases.entries import SETTLED
 from holdfast.scanner.broker import Broker, Ping, Servers
 from support import wire
 from support.brokers import NatsServer
@@ -286,9 +287,9 @@ def test_a_lease_is_held_though_the_answer_was_lost(
     original = LeaseBucket.put
     lost = 0
 
-    async def put(bucket: LeaseBucket, key: str, value: bytes, revision: int) -> int:
+    async def put(on: LeaseBucket, key: str, value: bytes, revision: int) -> int:
         nonlocal lost
-        done = await original(bucket, key, value, revision)
+        done = await original(on, key, value, revision)
         if not lost:
             lost += 1
             raise NatsTimeout
@@ -296,10 +297,12 @@ def test_a_lease_is_held_though_the_answer_was_lost(
 
     async def work() -> None:
         async with running(server, "a") as node:
-            node.leases.want(["x"])
-            await until(lambda: lost, "an answer is lost")
+            await until(lambda: SETTLED in node.leases.seen, "leases may be taken")
             # A lease of another process would last for ever.
             monkeypatch.setattr(entries, "TTL", 1000.0)
+            monkeypatch.setattr(bucket, "TTL", 1000.0)
+            node.leases.want(["x"])
+            await until(lambda: lost, "an answer is lost")
             await until(lambda: node.leases.is_held("x"), "it is held")
 
     monkeypatch.setattr(LeaseBucket, "put", put)

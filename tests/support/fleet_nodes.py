@@ -47,12 +47,14 @@ class Nodes:
         self.running[name] = self.begin(name, urls)
         return name
 
-    def begin(self, name: str, urls: Sequence[str] | None = None) -> subprocess.Popen[bytes]:
+    def begin(
+        self, name: str, urls: Sequence[str] | None = None, more: Sequence[str] = ()
+    ) -> subprocess.Popen[bytes]:
         """Starts a process, which is not looked after."""
         options = ["--fleet", FLEET, "--node", name, "--partitions", str(self._partitions)]
         command = [sys.executable, "-m", "holdfast", "scan", *_servers(urls or self._urls)]
         with self._log(name).open("ab") as log:
-            return subprocess.Popen([*command, *options], stdout=log, stderr=log)
+            return subprocess.Popen([*command, *options, *more], stdout=log, stderr=log)
 
     def _log(self, name: str) -> Path:
         return self._folder / f"{name}.log"

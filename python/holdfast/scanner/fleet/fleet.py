@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast import logs
 from holdfast.leases import RENEWED, TTL, Leases, LeaseThread, Relay
 from holdfast.scanner.fleet.placement import partition_of, placed
-from holdfast.scanner.fleet.terms import FleetRefused, FleetSettings, Terms
+from holdfast.scanner.fleet.terms import FleetRefused, FleetSettings, Terms, digest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -68,6 +68,7 @@ class Fleet:
         """
         self.settings = settings
         self.terms = terms
+        self._terms_digest = digest(terms.encoded())
         self._node_about = about
         self._gained = gained
         self._lost = lost
@@ -109,6 +110,11 @@ class Fleet:
     def has_others(self) -> bool:
         """Whether there are other live nodes."""
         return any(name != self.node for name, _ in self._live_nodes())
+
+    def has_terms(self, terms: bytes) -> bool:
+        """Whether another live node has these terms."""
+        shown = (each.about.get("terms") for _, each in self._live_nodes() if self.is_other(each))
+        return digest(terms) in shown
 
     def _live_nodes(self) -> Iterable[tuple[str, Holding]]:
         for key in self.leases.seen.copy():
@@ -165,6 +171,7 @@ class Fleet:
             "started": self._started,
             "leaving": self._is_leaving,
             "total": self.settings.partitions,
+            "terms": self._terms_digest,
             **self._node_about(),
         }
 

@@ -166,9 +166,11 @@ class FleetPart:
                 await asyncio.sleep(AGAIN)
                 continue
             try:
-                await self.wants.open(client, self.fleet.terms, self.fleet.has_others)
+                fleet = self.fleet
+                await self.wants.open(client, fleet.terms, fleet.has_terms, has_joined=False)
                 self._is_new.clear()
-                await self.fleet.join()
+                await fleet.join()
+                await self.wants.agree(fleet.terms, fleet.has_terms, may_replace=True)
                 await self._read(ready)
                 self.is_joined = True
             except (Error, OSError) as error:
@@ -200,7 +202,7 @@ class FleetPart:
                         continue
             self._is_new.clear()
             try:
-                await self.wants.open(client, self.fleet.terms, has_nodes=True)
+                await self.wants.open(client, self.fleet.terms, lambda _: True, has_joined=True)
             except (Error, OSError) as error:
                 logs.refused("fleet_unavailable", kind="fleet", reason=str(error) or repr(error))
                 await asyncio.sleep(OPENED)

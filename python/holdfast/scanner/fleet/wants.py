@@ -36,6 +36,9 @@ WRONG_SEQUENCE = (10071, 10164)
 """Error codes of JetStream: the key has another revision than expected."""
 
 
+SEEN = 1.0
+"""Seconds in which nodes that start at the same time see each other."""
+
 TOGETHER = 32
 """Values of a lost bucket that are stored again at once."""
 
@@ -94,15 +97,22 @@ class Wants:
         self.is_read = asyncio.Event()
         """Set when all values that were stored at the start are known."""
 
-    async def open(self, client: Client, terms: Terms, has_nodes: bool) -> None:
+    async def open(
+        self,
+        client: Client,
+        terms: Terms,
+        is_in_force: Callable[[bytes], bool],
+        *,
+        has_joined: bool,
+    ) -> None:
         """Makes the bucket, agrees on the terms, and begins to follow the values.
 
-        Raises `FleetRefused` for other terms than those of the live nodes, and errors of nats-py.
+        Raises `FleetRefused` for terms in force that are others, and errors of nats-py.
         """
         self._client = client
         found = await self._make(client.jetstream(timeout=TIMEOUT))
         self._identify(str(found.created), found.state.last_seq)
-        await self._agree(terms, has_nodes)
+        await self.agree(terms, is_in_force, may_replace=has_joined)
         await self._restore()
         if self._following is not None:
             with contextlib.suppress(Error):
@@ -196,9 +206,15 @@ class Wants:
         await self._following.consumer_info()  # Its server may have ended.
         return True
 
-    async def _agree(self, terms: Terms, has_nodes: bool) -> None:
-        """The first node decides the terms; while there are none, another one may."""
-        value = msgspec.json.encode(terms)
+    async def agree(
+        self, terms: Terms, is_in_force: Callable[[bytes], bool], *, may_replace: bool
+    ) -> None:
+        """The first node decides the terms. Others replace those of nodes that have ended.
+
+        `is_in_force` returns whether a live node has these terms. Only a node that others see may
+        replace them: two may start at the same time. Raises `FleetRefused` for terms in force.
+        """
+        value, has_waited = terms.encoded(), False
         while True:
             revision, found = await self._get(TERMS)
             if found:
@@ -208,8 +224,14 @@ class Wants:
                     difference = "the protocol is another one"
                 if difference is None:
                     return
-                if has_nodes:
+                if is_in_force(found):
                     raise FleetRefused(difference)
+                if not may_replace:
+                    return
+                if not has_waited:
+                    await asyncio.sleep(SEEN)
+                    has_waited = True
+                    continue
             with contextlib.suppress(Outdated):
                 await self._put(TERMS, value, revision)
                 return
