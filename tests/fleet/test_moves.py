@@ -135,8 +135,8 @@ class Plant:
 
     def check(self) -> None:
         for number, judge in enumerate(self.judges.devices):
-            assert not judge.overlaps, number
             assert not judge.doubles, (number, judge.doubles)
+            assert not judge.overlaps, number
             assert not judge.returns(), number
 
 

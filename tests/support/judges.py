@@ -30,7 +30,8 @@ class Judge:
     peers: list[int] = field(default_factory=list)
     """The port of the other side of each connection."""
     overlaps: int = 0
-    """Requests that came while one of another connection was being answered."""
+    """Requests that came while one of another connection was being answered. If that connection has
+    been closed, nobody waits for the answer any more."""
     doubles: list[tuple[float, int, int]] = field(default_factory=list)
     """Connections beside another one: when, the port of the other one, and its own."""
     frozen: set[tuple[int, int]] = field(default_factory=set)
@@ -58,7 +59,7 @@ class Judge:
         with contextlib.suppress(OSError, asyncio.IncompleteReadError, asyncio.CancelledError):
             while True:
                 frame = await reader.readexactly(12)
-                if self.busy not in (None, number):
+                if self._is_used_beside(number):
                     self.overlaps += 1
                 self.busy = number
                 self.polls.append((time.monotonic(), number))
@@ -73,6 +74,10 @@ class Judge:
                     writer.write(head + bytes([count]) + bytes(count))
         del self.open[number]
         writer.close()
+
+    def _is_used_beside(self, number: int) -> bool:
+        other = None if self.busy is None else self.open.get(self.busy)
+        return self.busy != number and other is not None and _is_established(other)
 
     def returns(self) -> list[tuple[int, int]]:
         """Connections that were used again after another one was, with that other one."""
