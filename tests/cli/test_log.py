@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,13 +11,15 @@ import pytest
 
 from holdfast.appliance import Appliance
 from holdfast.config import load
-from support import wire
-from support.brokers import NatsServer, free_port
+from support import nats_cluster, wire
+from support.brokers import free_port
 from support.cli import done, invoke
 from support.machine import missing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from support.brokers import NatsServer
 
 
 @pytest.fixture(autouse=True)
@@ -44,21 +45,8 @@ def configuration(folder: Path, name: str = "plant", log: str = "site", **settin
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[list[NatsServer]]:
     """Three servers, which elect a leader."""
-    routes = [f"nats://127.0.0.1:{free_port()}" for _ in range(3)]
-    with ExitStack() as running:
-        servers = []
-        for number, route in enumerate(routes):
-            folder = tmp_path / f"server-{number}"
-            folder.mkdir()
-            options = ["--server_name", f"s{number}", "--cluster_name", "plant"]
-            options += ["--cluster", route, "--routes", ",".join(routes)]
-            servers.append(NatsServer(folder, *options))
-            running.callback(servers[-1].kill)
-        wire.until(
-            lambda: any("new metadata leader" in server.log for server in servers),
-            "there is a leader",
-        )
-        yield servers
+    for made in nats_cluster.running(tmp_path):
+        yield list(made.servers.values())
 
 
 def urls(servers: list[NatsServer]) -> list[str]:

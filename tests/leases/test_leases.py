@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import TimeoutError as NatsTimeout
 
-from holdfast.leases import LeaseBucket, Leases, entries
+from holdfast.leases import LeaseBucket, Leases, bucket, entries
 from holdfast.leases.bucket import Outdated
+from holdfast.leases.entries import SETTLED
 from holdfast.scanner.broker import Broker, Ping, Servers
 from support import wire
 from support.brokers import NatsServer
@@ -39,8 +40,11 @@ class Node:
         self.leases = Leases(BUCKET, name, self)
         self.events: list[str] = []
         self.client: Client | None = None
+        self.watch: Callable[[], None] = lambda: None
+        """Called when a lease was taken."""
 
     def taken(self, key: str) -> None:
+        self.watch()
         self.events.append(f"taken {key}")
 
     def lost(self, key: str, reason: str) -> None:
@@ -225,5 +229,106 @@ def test_a_bucket_that_was_deleted_is_made_again(server: NatsServer) -> None:
             await node.client.jetstream().delete_stream(f"KV_{BUCKET}")
             await until(lambda: "x" not in node.leases.held, "it is given up")
             await until(lambda: node.leases.is_held("x"), "it is held again")
+
+    asyncio.run(work())
+
+
+def test_nodes_agree_again_after_the_server_has_lost_its_storage(server: NatsServer) -> None:
+    async def work() -> None:
+        async with running(server, "a") as first, running(server, "b") as second:
+            for node in (first, second):
+                node.leases.want(["x"])
+            nodes = [first, second]
+            await until(lambda: any(node.leases.held for node in nodes), "one has it")
+            before = max(node.leases.since("x") for node in nodes)
+            server.kill()
+            server.lose_store()
+            server.start()
+            await until(lambda: not any(node.leases.held for node in nodes), "it was lost")
+            await until(lambda: any(node.leases.held for node in nodes), "one has it again")
+            [holder] = [node for node in nodes if node.leases.held]
+            [other] = [node for node in nodes if not node.leases.held]
+            await until(
+                lambda: (found := other.leases.holder("x")) and found.node == holder.leases.node,
+                "the other one knows",
+            )
+            # Consumers drop values with an earlier revision.
+            assert holder.leases.since("x") > before
+            holder.leases.want([])
+            assert await holder.leases.give_back("x", 1.0)
+            await until(lambda: other.leases.is_held("x"), "the other one takes over")
+
+    asyncio.run(work())
+
+
+def test_a_bucket_that_replaces_another_one_waits_for_leases_of_that_one(
+    server: NatsServer,
+) -> None:
+    async def work() -> None:
+        async with running(server, "a") as first:
+            first.leases.want(["x"])
+            await until(lambda: first.leases.is_held("x"), "it is held")
+            assert first.client is not None
+            await first.client.jetstream().delete_stream(f"KV_{BUCKET}")
+            first.leases.want([])
+            async with running(server, "b") as second:
+                were_open = []
+                second.watch = lambda: were_open.append(first.leases.fence("x").allows)
+                second.leases.want(["x"])
+                await until(lambda: second.leases.is_held("x"), "the other node has it")
+            assert were_open == [False]
+
+    asyncio.run(work())
+
+
+def test_a_lease_is_held_though_the_answer_was_lost(
+    server: NatsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = LeaseBucket.put
+    lost = 0
+
+    async def put(on: LeaseBucket, key: str, value: bytes, revision: int) -> int:
+        nonlocal lost
+        done = await original(on, key, value, revision)
+        if not lost:
+            lost += 1
+            raise NatsTimeout
+        return done
+
+    async def work() -> None:
+        async with running(server, "a") as node:
+            await until(lambda: SETTLED in node.leases.seen, "leases may be taken")
+            # A lease of another process would last for ever.
+            monkeypatch.setattr(entries, "TTL", 1000.0)
+            monkeypatch.setattr(bucket, "TTL", 1000.0)
+            node.leases.want(["x"])
+            await until(lambda: lost, "an answer is lost")
+            await until(lambda: node.leases.is_held("x"), "it is held")
+
+    monkeypatch.setattr(LeaseBucket, "put", put)
+    asyncio.run(work())
+
+
+def test_a_bucket_that_does_not_open_delays_no_renewal(
+    server: NatsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def never(*_: object) -> None:
+        await asyncio.Event().wait()
+
+    async def work() -> None:
+        async with running(server, "a") as node:
+            node.leases.want(["x"])
+            await until(lambda: node.leases.is_held("x"), "it is held")
+            monkeypatch.setattr(LeaseBucket, "open", never)
+            node.leases.connected(None)
+            node.leases.connected(node.client)
+            revisions = {node.leases.revision("x")}
+
+            def is_renewed() -> bool:
+                revisions.add(node.leases.revision("x"))
+                return len(revisions) > 4
+
+            await until(is_renewed, "it is renewed")
+            assert not [event for event in node.events if event.startswith("lost")]
 
     asyncio.run(work())

@@ -11,8 +11,8 @@ from holdfast.outputs import sending
 from holdfast.outputs.mqtt import session
 from support import wire
 from support.mqtt_plant import TAGS, Plant
-from support.mqtt_rig import Proxy
 from support.sparkplug_watch import SETTINGS, Said, Watch
+from support.tcp_proxy import Proxy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

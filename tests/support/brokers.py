@@ -9,6 +9,7 @@ import contextlib
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -142,6 +143,10 @@ class NatsServer(Broker):
     @property
     def url(self) -> str:
         return f"nats://{self.host}:{self.port}"
+
+    def lose_store(self) -> None:
+        """Removes everything that JetStream stored. The server must not run."""
+        shutil.rmtree(self._folder / "store")
 
     def clients(self) -> list[str]:
         """The names of the connected clients, of a server with the option `-m`."""

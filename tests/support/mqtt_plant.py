@@ -12,7 +12,8 @@ from holdfast.appliance import Appliance
 from support import wire
 from support.brokers import Mosquitto
 from support.config_folder import Folder, written
-from support.mqtt_rig import Message, Probe, Proxy
+from support.mqtt_rig import Message, Probe
+from support.tcp_proxy import Proxy
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -5,10 +5,8 @@ Everything stays on the loopback interface, and a `Rig` stops everything that it
 
 from __future__ import annotations
 
-import contextlib
 import json
 import queue
-import socket
 import threading
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,6 +24,7 @@ from holdfast.ingest import MemoryAccess
 from support import wire
 from support.brokers import Mosquitto
 from support.running import content
+from support.tcp_proxy import Proxy
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,80 +34,6 @@ if TYPE_CHECKING:
 
     from holdfast.config import MappedTag
     from holdfast.types import Area
-
-
-class Proxy:
-    """A proxy to a broker. It can cut connections while the broker keeps running."""
-
-    def __init__(self, port: int) -> None:
-        self._to = port
-        self._is_down = False
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self.url = f"mqtt://127.0.0.1:{self._server.getsockname()[1]}"
-        self._lock = threading.Lock()
-        self._open: list[socket.socket] = []
-        self.swallows = False
-        """Whether it reads from clients, but forwards nothing."""
-        self._threads = [threading.Thread(target=self._accept)]
-        self._threads[0].start()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                near = self._server.accept()[0]
-            except OSError:
-                return
-            if self._is_down:
-                near.close()
-                continue
-            try:
-                far = socket.create_connection(("127.0.0.1", self._to))
-            except OSError:
-                near.close()
-                continue
-            with self._lock:
-                self._open += [near, far]
-            for ends in ((near, far), (far, near)):
-                thread = threading.Thread(target=self._pump, args=ends)
-                self._threads.append(thread)
-                thread.start()
-
-    def _pump(self, here: socket.socket, there: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            while piece := here.recv(65536):
-                if not self.swallows:
-                    there.sendall(piece)
-        for end in (here, there):
-            with contextlib.suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-    def down(self) -> None:
-        """Closes every connection, and each new one, until `up`."""
-        self._is_down = True
-        self.cut()
-
-    def up(self) -> None:
-        """Lets connections through again."""
-        self._is_down = False
-
-    def cut(self) -> None:
-        """Closes every connection."""
-        with self._lock:
-            ends = list(self._open)
-        for end in ends:
-            with contextlib.suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        with contextlib.suppress(OSError):
-            self._server.shutdown(socket.SHUT_RDWR)
-        self._threads[0].join(wire.DEADLINE)
-        self._server.close()
-        self.cut()
-        for thread in self._threads:
-            thread.join(wire.DEADLINE)
-        for end in self._open:
-            end.close()
 
 
 class Message(NamedTuple):

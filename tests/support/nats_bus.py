@@ -103,7 +103,7 @@ class Inbox:
 class Caller:
     """A NATS client beside the scanner; `options` are for `Client.connect`."""
 
-    def __init__(self, url: str, **options: Any) -> None:
+    def __init__(self, url: str | list[str], **options: Any) -> None:
         self._loop = _Loop()
         self.client = Client()
         self._loop.do(

@@ -6,7 +6,7 @@ can't: everyone else waits longer than that before they take it.
 
 from __future__ import annotations
 
-from holdfast.leases.bucket import LeaseBucket, NotALeaseBucket, Outdated, made
+from holdfast.leases.bucket import LeaseBucket, NotALeaseBucket, Outdated, first_revision, made
 from holdfast.leases.entries import HELD, RENEWED, TTL, Entry, Holding
 from holdfast.leases.leases import Leases, Watcher
 from holdfast.leases.thread import Connect, LeaseThread, Relay
@@ -25,5 +25,6 @@ __all__ = [
     "Outdated",
     "Relay",
     "Watcher",
+    "first_revision",
     "made",
 ]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -23,16 +24,15 @@ from nats.js.api import (
 )
 from nats.js.errors import APIError, NoStreamResponseError, NotFoundError
 
-from holdfast.leases.entries import TTL, entry
+from holdfast.leases.entries import SETTLED, TTL, Entry, entry
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from datetime import datetime
 
     from nats.aio.client import Client
     from nats.aio.msg import Msg
     from nats.js import JetStreamContext
-
-    from holdfast.leases.entries import Entry
 
 TIMEOUT = 0.9
 """Seconds to wait for an answer of JetStream: less than between two renewals."""
@@ -64,11 +64,29 @@ class Outdated(Exception):
     """A key has another revision than expected."""
 
 
+@dataclass(frozen=True)
+class Made:
+    """Which bucket it is: one of the same name may have been lost, or deleted."""
+
+    at: datetime | None
+    last: int
+    """The last revision."""
+
+
 class _Ack(msgspec.Struct):
     """The answer of JetStream to a message."""
 
     seq: int = 0
     error: dict[str, Any] | None = None
+
+
+def first_revision(after: int) -> int:
+    """Where the revisions of a new bucket begin: after those of a lost one of the same name.
+
+    Who compares them, such as a consumer of values, may know only the lost one. No bucket has a
+    million changes a second, so the time in microseconds is later, if the clock is right.
+    """
+    return max(after + 1, time.time_ns() // 1000)
 
 
 async def made(jetstream: JetStreamContext, config: StreamConfig, replicas: int) -> None:
@@ -100,14 +118,15 @@ class LeaseBucket:
         self._waiting: dict[str, asyncio.Future[Msg]] = {}
         self._following: JetStreamContext.PushSubscription | None = None
 
-    async def open(self, replicas: int = 1) -> None:
-        """Makes the bucket, if there is none.
+    async def open(self, replicas: int = 1, after: int = 0) -> Made:
+        """Makes the bucket, if there is none, with revisions after that one.
 
         Raises `NotALeaseBucket` and the errors of nats-py.
         """
         jetstream = self.client.jetstream(timeout=OPENING)
         try:
-            info = await jetstream.stream_info(self._stream)
+            # Short, because it is not answered later if there was no leader.
+            info = await self._jetstream.stream_info(self._stream)
         except NotFoundError:
             config = StreamConfig(
                 name=self._stream,
@@ -121,6 +140,7 @@ class LeaseBucket:
                 allow_direct=True,
                 allow_msg_ttl=True,
                 subject_delete_marker_ttl=MARKER,
+                first_seq=first_revision(after),
             )
             await made(jetstream, config, replicas)
             info = await jetstream.stream_info(self._stream)
@@ -130,6 +150,15 @@ class LeaseBucket:
                 f"the bucket {self.name} exists without TTLs of keys or with a history: delete it, "
                 "so that it is made again"
             )
+        return Made(info.created, info.state.last_seq)
+
+    async def settle(self) -> Entry:
+        """Marks the bucket as one that is older than all leases of a former one.
+
+        Raises as `put` does.
+        """
+        revision = await self._publish(SETTLED, b"{}", 0, {})
+        return Entry(revision, None, time.monotonic())
 
     async def put(self, key: str, value: bytes, revision: int) -> int:
         """Replaces the revision of a key, 0 if there is none, for `TTL`. Returns the new revision.

@@ -18,6 +18,11 @@ RENEWED = 1.0
 """Seconds between renewals."""
 
 
+SETTLED = "_settled"
+"""The key that says that a bucket has existed for `TTL`: leases of a lost one of the same name may
+still be used when it is made."""
+
+
 class Holding(msgspec.Struct, frozen=True, kw_only=True):
     """The value of a lease."""
 

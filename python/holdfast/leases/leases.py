@@ -24,12 +24,15 @@ from nats.js.errors import NoStreamResponseError
 
 from holdfast import _core
 from holdfast.leases.bucket import LeaseBucket, NotALeaseBucket, Outdated
-from holdfast.leases.entries import HELD, RENEWED, TTL, Entry, Holding
+from holdfast.leases.entries import HELD, RENEWED, SETTLED, TTL, Entry, Holding
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Mapping
+    from datetime import datetime
 
     from nats.aio.client import Client
+
+    from holdfast.leases.bucket import Made
 
 TICK = 0.1
 """The longest time in seconds between two looks at what others hold."""
@@ -110,6 +113,9 @@ class Leases:
         self._client: Client | None = None
         self._bucket: LeaseBucket | None = None
         self._reason: str | None = "not connected"
+        self._is_opening = self._is_checked = self._is_settling = False
+        self._made_at: datetime | None = None
+        self._may_settle_at = 0.0
         self._news = asyncio.Event()
         self._heard = self._acknowledged = 0.0
         self._tasks: set[asyncio.Task[None]] = set()
@@ -119,7 +125,7 @@ class Leases:
         self._client = client
         if client is not None and self._bucket is not None and self._bucket.client is not client:
             self._bucket = None
-        self._heard = 0.0  # The server may have forgotten who follows.
+        self._is_checked = False  # The server may have forgotten who follows, or what is stored.
         self._news.set()
 
     def fence(self, key: str) -> _core.Fence:
@@ -167,16 +173,14 @@ class Leases:
         due = 0.0
         try:
             while True:
-                if self._client is not None and self._bucket is None:
-                    await self._open(self._client)
                 now = time.monotonic()
+                self._check_bucket(now)
                 withheld = self._withheld()
                 if now >= due:
                     due = now + RENEWED
                     if withheld is None:
                         for key, held in self._held.items():
                             self._begin(self._renew(key, held))
-                    await self._follow_again(now)
                 if withheld is None:
                     self._take_free(now)
                 self._note_lapsed(now, withheld or "it could not be renewed")
@@ -192,6 +196,7 @@ class Leases:
             for task in self._tasks:
                 task.cancel()
             self._taking.clear()
+            self._is_opening = self._is_settling = False
             for fence in self._fences.copy().values():
                 fence.close()
 
@@ -230,19 +235,53 @@ class Leases:
             self._ending.discard(key)
             self._watcher.changed()
 
+    def _check_bucket(self, now: float) -> None:
+        """Opens the bucket at first, after each connect, and when nothing is seen of it.
+
+        It may be another one than before. Renewals go on meanwhile.
+        """
+        if self._client is None or self._is_opening:
+            return
+        if self._bucket is not None and now - self._heard > SILENCE:
+            is_missing = any(key not in self._held for key in self._wanted)
+            if is_missing or now - self._acknowledged < SILENCE:
+                self._is_checked = False
+        if not self._is_checked:
+            self._is_opening = True
+            self._begin(self._open(self._client))
+
     async def _open(self, client: Client) -> None:
-        bucket = LeaseBucket(client, self.bucket)
+        bucket = self._bucket or LeaseBucket(client, self.bucket)
         try:
-            await bucket.open(self._replicas)
+            made = await bucket.open(self._replicas, self._latest)
+            await bucket.unfollow()
+            self._identify(made)
             await bucket.follow(self._saw, self._note_read)
         except (Error, OSError, NotALeaseBucket) as error:
             self.works(str(error) or type(error).__name__)
             await asyncio.sleep(RETRIED)
             return
+        finally:
+            self._is_opening = False
         if self._client is client:
             self._bucket = bucket
-            self._heard = self._acknowledged = time.monotonic()
+            self._is_checked = True
+            self._heard = time.monotonic()
             self.works(None)
+            self._news.set()
+
+    def _identify(self, made: Made) -> None:
+        """Forgets what is known of a bucket that is lost, or was set back: revisions begin anew."""
+        if made.at != self._made_at or made.last < self._latest:
+            self._made_at = made.at
+            self.seen.clear()
+            self.is_read = False
+            self._may_settle_at = time.monotonic() + TTL
+
+    @property
+    def _latest(self) -> int:
+        """The latest revision of all keys."""
+        return max((entry.revision for entry in self.seen.copy().values()), default=0)
 
     def _note_read(self) -> None:
         self.is_read = True
@@ -252,16 +291,6 @@ class Leases:
         if reason != self._reason:
             self._reason = reason
             self._watcher.works(reason)
-
-    async def _follow_again(self, now: float) -> None:
-        """Follows the keys anew if nothing is seen of renewals that are confirmed."""
-        if self._bucket is None or self._client is None or now - self._heard < SILENCE:
-            return
-        if self._heard == 0.0 or now - self._acknowledged < SILENCE:
-            self._heard = now
-            with contextlib.suppress(Error, OSError):
-                await self._bucket.unfollow()
-                await self._bucket.follow(self._saw, self._note_read)
 
     def _saw(self, key: str, entry: Entry) -> None:
         self._heard = time.monotonic()
@@ -276,15 +305,36 @@ class Leases:
             self._watcher.changed()
 
     def _take_free(self, now: float) -> None:
-        if self._bucket is None or self._client is None:
+        if self._bucket is None or not self._is_checked or not self.is_read:
+            return
+        if SETTLED not in self.seen:
+            if now >= self._may_settle_at and not self._is_settling:
+                self._is_settling = True
+                self._begin(self._settle(self._bucket))
             return
         for key in self._wanted:
             if key in self._held or key in self._taking or key in self._ending:
                 continue
             entry = self.seen.get(key)
-            if entry is None or not entry.is_live(now):
+            if entry is None or not entry.is_live(now) or self._is_own(entry):
                 self._taking.add(key)
                 self._begin(self._take(self._bucket, key, entry))
+
+    def _is_own(self, entry: Entry) -> bool:
+        """Whether nobody has taken a lease since this process had it, or tried to take it."""
+        return entry.holding is not None and entry.holding.process == self.process
+
+    async def _settle(self, bucket: LeaseBucket) -> None:
+        """Says that no lease of a former bucket can be in use any more."""
+        made_at = self._made_at
+        try:
+            with contextlib.suppress(Error, OSError, Outdated):
+                entry = await bucket.settle()
+                if made_at == self._made_at:
+                    self.seen.setdefault(SETTLED, entry)
+        finally:
+            self._is_settling = False
+            self._news.set()
 
     async def _take(self, bucket: LeaseBucket, key: str, entry: Entry | None) -> None:
         holding = Holding(
@@ -293,7 +343,7 @@ class Leases:
             taken=int(time.time() * 1000),
             about=self._about(key),
         )
-        sent = time.monotonic()
+        sent, made_at = time.monotonic(), self._made_at
         try:
             revision = await bucket.put(
                 key, msgspec.json.encode(holding), 0 if entry is None else entry.revision
@@ -302,16 +352,17 @@ class Leases:
             await self._read(bucket, key)
             return
         except NoStreamResponseError:
-            if not self._held:
-                self._bucket = None  # It is made again.
+            self._is_checked = False  # It is made again.
             return
         except (Error, OSError):
-            # If it was taken all the same, it ends by its TTL.
+            # If it was taken all the same, it is taken again.
             await self._read(bucket, key)
             return
         finally:
             self._taking.discard(key)
         self._acknowledged = time.monotonic()
+        if made_at != self._made_at:
+            return
         self.seen[key] = Entry(revision, holding, sent)
         self._held[key] = _Held(revision, holding, revision, sent + HELD)
         clean = entry is not None and entry.is_given_back

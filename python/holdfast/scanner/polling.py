@@ -170,6 +170,7 @@ class Polling:
         source, plan = device.source, device.source.plan
         assert device.endpoint is not None
         interval = device.rate / 1000
+        fence = self._fence(device)
         reads = dict.fromkeys(
             (tag.area, tag.address, tag.count, None) for tag in device.tags.values()
         )
@@ -185,10 +186,11 @@ class Polling:
             max_bits=plan.max_bits,
             readable=plan.readable,
             forbidden=plan.forbidden,
-            start_within=min(interval, FIRST_WITHIN),
+            # A device that was taken over has waited already.
+            start_within=min(interval if fence is None else interval / 2, FIRST_WITHIN),
             report=self._results,
             release=source.release,
-            fence=self._fence(device),
+            fence=fence,
         )
 
     def counters(self) -> dict[str, dict[str, Any]]:

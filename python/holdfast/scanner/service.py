@@ -324,7 +324,8 @@ class Scanner:
                 ("browse", self._browse_own),
                 ("variables", self._variables_own),
             ):
-                where = subject(prefix, self._part.fleet.node, what)
+                fleet = self._part.fleet
+                where = subject(prefix, fleet.node, what, fleet.leases.process)
                 handlers[where] = self._answering(what, handle)
             handlers[subject(prefix, self._part.fleet.node, "drain")] = self._drain
         return handlers

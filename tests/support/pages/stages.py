@@ -532,6 +532,8 @@ def fleet(stage: Stage) -> None:
     for node in ("scan-a", "scan-b"):
         url = f"nats://127.0.0.1:{stage.replaced['4222']}"
         stage.serve("scan", "--nats", url, "--fleet", "plant", "--node", node)
+    shown = ("fleet", "status", "plant", "--nats", url)
+    wire.until(lambda: invoke(*shown).exit_code == 0, "the nodes have joined")
 
 
 def durability(stage: Stage) -> None:

@@ -37,6 +37,6 @@ class Told(msgspec.Struct, kw_only=True):
     devices: dict[str, Any]
 
 
-def subject(prefix: str, node: str, what: str) -> str:
-    """Where a node is asked."""
-    return f"{prefix}.fleet.{node}.{what}"
+def subject(prefix: str, node: str, what: str, process: str = "") -> str:
+    """Where a node is asked; with `process`, only that one: two may have the same name."""
+    return ".".join((prefix, "fleet", node, *([process] if process else []), what))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast import logs
 from holdfast.leases import RENEWED, TTL, Leases, LeaseThread, Relay
 from holdfast.scanner.fleet.placement import partition_of, placed
-from holdfast.scanner.fleet.terms import FleetRefused, FleetSettings, Terms
+from holdfast.scanner.fleet.terms import FleetRefused, FleetSettings, Terms, digest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -68,6 +68,7 @@ class Fleet:
         """
         self.settings = settings
         self.terms = terms
+        self._terms_digest = digest(terms.encoded())
         self._node_about = about
         self._gained = gained
         self._lost = lost
@@ -76,6 +77,8 @@ class Fleet:
         self._ending: dict[str, asyncio.Task[None]] = {}
         self._may_end = asyncio.Semaphore(TOGETHER)
         self._started = int(time.time() * 1000)
+        self._named_since = time.monotonic()
+        """When this process was the node the last time, or nobody was."""
         self._begun: dict[int, int] = {}
         """The partitions whose devices are used, with the revision of the lease."""
         self._shown: dict[str, Any] = {}
@@ -107,6 +110,11 @@ class Fleet:
     def has_others(self) -> bool:
         """Whether there are other live nodes."""
         return any(name != self.node for name, _ in self._live_nodes())
+
+    def has_terms(self, terms: bytes) -> bool:
+        """Whether another live node has these terms."""
+        shown = (each.about.get("terms") for _, each in self._live_nodes() if self.is_other(each))
+        return digest(terms) in shown
 
     def _live_nodes(self) -> Iterable[tuple[str, Holding]]:
         for key in self.leases.seen.copy():
@@ -140,10 +148,13 @@ class Fleet:
         """The latest revision of the lease of a partition that this node has; 0 without it."""
         return self.leases.revision(f"{PARTITION}{partition}")
 
-    def owner(self, partition: int) -> str | None:
-        """The node that has the lease of a partition, as far as is known."""
-        holder = self.leases.holder(f"{PARTITION}{partition}")
-        return None if holder is None else holder.node
+    def holder(self, partition: int) -> Holding | None:
+        """Who has the lease of a partition, as far as is known."""
+        return self.leases.holder(f"{PARTITION}{partition}")
+
+    def is_other(self, holder: Holding) -> bool:
+        """Whether that is another process; it may have the name of this node."""
+        return holder.process != self.leases.process
 
     @property
     def partitions(self) -> list[int]:
@@ -160,6 +171,7 @@ class Fleet:
             "started": self._started,
             "leaving": self._is_leaving,
             "total": self.settings.partitions,
+            "terms": self._terms_digest,
             **self._node_about(),
         }
 
@@ -177,13 +189,9 @@ class Fleet:
         """Takes the lease of the node. Raises `FleetRefused` if its name is in use."""
         key = f"{NODE}{self.node}"
         self._thread.want([key])
-        until = time.monotonic() + JOINING
+        self._named_since = time.monotonic()
         while not self.leases.since(key):
-            holder = self.leases.holder(key)
-            if holder is None or self.leases.reason is not None:
-                until = time.monotonic() + JOINING
-            elif time.monotonic() > until:
-                raise FleetRefused(f"another process is the node {self.node}: give it another name")
+            self._check_name()
             await asyncio.sleep(SETTLED)
         logs.write(
             logging.INFO,
@@ -193,8 +201,20 @@ class Fleet:
             nodes=",".join(self.nodes),
         )
 
+    def _check_name(self) -> None:
+        """Raises `FleetRefused` if another process has had the name of this node for a while."""
+        holder = self.leases.holder(f"{NODE}{self.node}")
+        now = time.monotonic()
+        if holder is None or not self.is_other(holder) or self.leases.reason is not None:
+            self._named_since = now
+        elif now - self._named_since > JOINING:
+            raise FleetRefused(f"another process is the node {self.node}: give it another name")
+
     async def run(self) -> None:
-        """Holds the partitions that this node should have, until it is cancelled."""
+        """Holds the partitions that this node should have, until it is cancelled.
+
+        Raises `FleetRefused` if another process has taken its name, while this one was stopped.
+        """
         known: list[str] = []
         while True:
             with contextlib.suppress(TimeoutError):
@@ -202,6 +222,7 @@ class Fleet:
                     await self._news.wait()
             await asyncio.sleep(SETTLED)
             self._news.clear()
+            self._check_name()
             nodes = self.nodes
             if nodes != known:
                 fields = {"fleet": self.settings.name, "nodes": ",".join(nodes)}
@@ -215,9 +236,9 @@ class Fleet:
         if self._is_leaving:
             return
         held = {
-            partition: owner
+            partition: holder.node
             for partition in range(self.settings.partitions)
-            if (owner := self.owner(partition)) is not None
+            if (holder := self.holder(partition)) is not None
         }
         target = placed(self.settings.partitions, nodes, held)
         mine = {f"{PARTITION}{each}" for each, node in target.items() if node == self.node}

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import msgspec
 from nats.errors import Error, NoRespondersError
 from nats.errors import TimeoutError as NoAnswer
+from nats.js.errors import NoStreamResponseError
 
 from holdfast import logs
 from holdfast.client.url import connection_of
@@ -32,11 +33,14 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast import _core
-    from holdfast.leases import Connect
+    from holdfast.leases import Connect, Holding
     from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.fleet.terms import FleetSettings, Terms
 
 Reply = TypeVar("Reply", bound=msgspec.Struct)
+
+CHECKED = 5.0
+"""Seconds between looks whether changes of subscriptions still come."""
 
 OPENED = 0.5
 """Seconds between attempts to open the buckets."""
@@ -105,7 +109,7 @@ class FleetPart:
             withheld=self._withheld,
         )
         self._heartbeat = Heartbeat()
-        self.wants = Wants(settings.name, self._changed)
+        self.wants = Wants(settings.name, self._changed, self._replaced)
         self._prefix = prefix
         self._host = host
         self._client: Client | None = None
@@ -162,9 +166,11 @@ class FleetPart:
                 await asyncio.sleep(AGAIN)
                 continue
             try:
-                await self.wants.open(client, self.fleet.terms, self.fleet.has_others)
+                fleet = self.fleet
+                await self.wants.open(client, fleet.terms, fleet.has_terms, has_joined=False)
                 self._is_new.clear()
-                await self.fleet.join()
+                await fleet.join()
+                await self.wants.agree(fleet.terms, fleet.has_terms, may_replace=True)
                 await self._read(ready)
                 self.is_joined = True
             except (Error, OSError) as error:
@@ -178,15 +184,25 @@ class FleetPart:
         ready.set()
 
     async def _open_again(self) -> None:
-        """Follows the bucket anew after each reconnect: the server may have forgotten it."""
+        """Follows the bucket anew after each reconnect, and whenever nothing comes from it.
+
+        The server may have forgotten who follows it, or have lost the bucket.
+        """
         while True:
-            await self._is_new.wait()
-            self._is_new.clear()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(CHECKED):
+                    await self._is_new.wait()
             client = self._client
             if client is None:
+                await asyncio.sleep(AGAIN)
                 continue
+            if not self._is_new.is_set():
+                with contextlib.suppress(Error, OSError):
+                    if await self.wants.is_followed():
+                        continue
+            self._is_new.clear()
             try:
-                await self.wants.open(client, self.fleet.terms, has_nodes=True)
+                await self.wants.open(client, self.fleet.terms, lambda _: True, has_joined=True)
             except (Error, OSError) as error:
                 logs.refused("fleet_unavailable", kind="fleet", reason=str(error) or repr(error))
                 await asyncio.sleep(OPENED)
@@ -204,6 +220,9 @@ class FleetPart:
             touched, self._touched = self._touched, set()
             for device in touched:
                 await self._adopt(device)
+
+    def _replaced(self) -> None:
+        self._applied.clear()
 
     def _changed(self, device: str) -> None:
         self._touched.add(device)
@@ -259,9 +278,12 @@ class FleetPart:
                 await self._adopt_now(device)
                 raise
             except (Error, OSError) as error:
+                self._is_new.set()  # The bucket may be lost.
                 await self._adopt_now(device)
                 reason = str(error) or type(error).__name__
-                raise Refused(f"not stored in {self.wants.bucket}: {reason}") from None
+                is_certain = isinstance(error, NoStreamResponseError)
+                said = "not stored in" if is_certain else "not confirmed by"
+                raise Refused(f"{said} {self.wants.bucket}: {reason}") from None
             self._renewed |= {(device, each): at for each, at in renewed.items()}
             return
         raise Refused(f"{device} was changed by other nodes {CHANGES} times meanwhile: try again")
@@ -324,11 +346,11 @@ class FleetPart:
         end = time.monotonic() + MOVING
         why = f"no node polls {device.id} now"
         while True:
-            owner = self.fleet.owner(device.partition)
+            owner = self.fleet.holder(device.partition)
             if self.is_own(device):
                 if await own():
                     return
-            elif owner is not None and owner != self.fleet.node:
+            elif owner is not None and self.fleet.is_other(owner):
                 sent = await self._send(owner, device, tag, text)
                 if sent is None:
                     return
@@ -337,7 +359,7 @@ class FleetPart:
                 raise Refused(f"not written: {why}")
             await asyncio.sleep(AGAIN)
 
-    async def _send(self, owner: str, device: ScannedDevice, tag: str, text: str) -> str | None:
+    async def _send(self, owner: Holding, device: ScannedDevice, tag: str, text: str) -> str | None:
         """Returns why another node did not carry out a command. Raises `Refused` if it tried."""
         holding = self.fleet.leases.seen.get(f"partition.{device.partition}")
         command = Command(
@@ -350,45 +372,45 @@ class FleetPart:
         try:
             done = await self._ask(owner, "command", command, Executed, patience)
         except NoRespondersError:
-            return f"node {owner} is gone"
+            return f"node {owner.node} is gone"
         except (Error, OSError):
-            raise Refused(f"not confirmed: node {owner} did not answer") from None
+            raise Refused(f"not confirmed: node {owner.node} did not answer") from None
         if done.moved:
-            return f"{device.id} moves from node {owner} to another one"
+            return f"{device.id} moves from node {owner.node} to another one"
         if done.error is not None:
             raise Refused(done.error)
         return None
 
     async def told(self, what: str, devices: list[ScannedDevice]) -> dict[str, Any]:
         """What other nodes tell of their devices; nothing of nodes that don't answer."""
-        of_node: dict[str, list[str]] = {}
+        of_process: dict[str, tuple[Holding, list[str]]] = {}
         for device in devices:
-            owner = self.fleet.owner(device.partition)
-            if owner is not None and owner != self.fleet.node:
-                of_node.setdefault(owner, []).append(device.id)
-        found = await asyncio.gather(*(self._tell(what, *each) for each in of_node.items()))
+            owner = self.fleet.holder(device.partition)
+            if owner is not None and self.fleet.is_other(owner):
+                of_process.setdefault(owner.process, (owner, []))[1].append(device.id)
+        found = await asyncio.gather(*(self._tell(what, *each) for each in of_process.values()))
         return {device: report for each in found for device, report in each.items()}
 
-    async def _tell(self, what: str, node: str, devices: list[str]) -> dict[str, Any]:
+    async def _tell(self, what: str, node: Holding, devices: list[str]) -> dict[str, Any]:
         try:
             return (await self._ask(node, what, About(devices=devices), Told, ASKED)).devices
         except (Error, OSError) as error:
             reason = str(error) or type(error).__name__
-            logs.refused("node_silent", kind="fleet", node=node, reason=reason)
+            logs.refused("node_silent", kind="fleet", node=node.node, reason=reason)
             return {}
 
     async def _ask(
-        self, node: str, what: str, request: msgspec.Struct, kind: type[Reply], seconds: float
+        self, node: Holding, what: str, request: msgspec.Struct, kind: type[Reply], seconds: float
     ) -> Reply:
         client = self._client
         if client is None:
             raise NoAnswer
-        where = subject(self._prefix, node, what)
+        where = subject(self._prefix, node.node, what, node.process)
         answer: Msg = await client.request(where, msgspec.json.encode(request), timeout=seconds)
         try:
             return msgspec.json.decode(answer.data, type=kind)
         except msgspec.DecodeError as error:
-            raise OSError(f"node {node} sent a malformed answer: {error}") from None
+            raise OSError(f"node {node.node} sent a malformed answer: {error}") from None
 
     async def leave(self) -> None:
         """Hands everything over."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import msgspec
@@ -26,6 +27,11 @@ class FleetSettings:
     partitions: int = PARTITIONS
 
 
+def digest(terms: bytes) -> str:
+    """What a node shows of its terms."""
+    return hashlib.blake2b(terms, digest_size=8).hexdigest()
+
+
 class Terms(msgspec.Struct, frozen=True, kw_only=True):
     """The settings that all nodes have in common: any of them answers any request."""
 
@@ -38,6 +44,10 @@ class Terms(msgspec.Struct, frozen=True, kw_only=True):
     defaults: str
     limits: str
     profiles: str
+
+    def encoded(self) -> bytes:
+        """How they are stored."""
+        return msgspec.json.encode(self)
 
     def difference(self, other: Terms) -> str | None:
         """The first setting in which the other terms differ, with both values."""
