@@ -94,17 +94,11 @@ def test_a_message_ends_it(start: Start, nats: NatsServer, caller: Caller) -> No
     process = start("--nats", nats.url, "--log-format", "json")
     connected(process)
     # The subjects are subscribed to when the connection is there, a moment after it says so.
-    wire.until(lambda: _ended(process, caller), "it ends")
+    wire.until(lambda: _answers(caller), "it answers")
+    caller.publish("modbus.shutdown")
+    _, log = process.communicate(timeout=wire.DEADLINE)
     assert process.returncode == 0
-    assert process.stderr is not None
-    logged = [json.loads(line)["event"] for line in process.stderr]
-    assert "shutdown_asked" in logged
-
-
-def _ended(process: subprocess.Popen[str], caller: Caller) -> bool:
-    if process.poll() is None:
-        caller.publish("modbus.shutdown")
-    return process.poll() is not None
+    assert "shutdown_asked" in [json.loads(line)["event"] for line in log.splitlines()]
 
 
 def test_options_say_what_requests_leave_out_and_what_is_written(

@@ -71,7 +71,11 @@ def test_an_end_that_is_not_moved_ends_polls_and_closes_the_connection(
     fence.open(time.monotonic() + 0.3)
     poller.add(device(fake, interval=3600.0, fence=fence))
     # The end is moved until the device was polled, however long that takes.
-    taken(poller, lambda polls, _: polls or fence.renew(time.monotonic() + 0.3))
+    def is_polled(polls: list[Any], _: list[Any]) -> bool:
+        fence.renew(time.monotonic() + 0.3)
+        return bool(polls)
+
+    taken(poller, is_polled)
     wire.until(lambda: health(poller) == "standby", "it stands by")
     wire.until(lambda: is_disconnected(fake), "the connection is closed")
     assert not fence.allows

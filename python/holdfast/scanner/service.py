@@ -307,14 +307,15 @@ class Scanner:
             logs.write(logging.INFO, "shutdown_asked")
             self.end()
 
+        # Who gets an answer may send anything: what is not answered is subscribed to before.
         handlers = {
+            f"{prefix}.shutdown": shutdown,
+            f"{prefix}.scanner": self._announced,
             f"{prefix}.subscribe": self._answering("subscribe", self._subscribe),
             f"{prefix}.unsubscribe": self._answering("unsubscribe", self._unsubscribe),
             f"{prefix}.command.>": self._answering("command", self._command),
             f"{prefix}.browse": self._answering("browse", self._browse),
             f"{prefix}.variables": self._answering("variables", self._variables),
-            f"{prefix}.scanner": self._announced,
-            f"{prefix}.shutdown": shutdown,
         }
         if self._is_next:  # Its PLC library sends commands here.
             handlers[f"{prefix}.module.command.>"] = handlers[f"{prefix}.command.>"]
