@@ -70,6 +70,7 @@ def test_an_end_that_is_not_moved_ends_polls_and_closes_the_connection(
     # The device is polled once an hour: nothing else would close its connection.
     fence.open(time.monotonic() + 0.3)
     poller.add(device(fake, interval=3600.0, fence=fence))
+
     # The end is moved until the device was polled, however long that takes.
     def is_polled(polls: list[Any], _: list[Any]) -> bool:
         fence.renew(time.monotonic() + 0.3)
