@@ -6,6 +6,7 @@ A backup is a folder: `backup.json`, and one file for each stream, as the server
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import json
 import os
@@ -224,7 +225,8 @@ async def _restore(
             await _send(client, name, subject, folder / name, kept[name])
     except BaseException:
         for name in done:
-            await client.request(f"$JS.API.STREAM.DELETE.{name}", b"", timeout=SILENCE)
+            with contextlib.suppress(Error):  # What has failed before is the reason.
+                await client.request(f"$JS.API.STREAM.DELETE.{name}", b"", timeout=SILENCE)
         raise
     return int(kept[streams(log)[-1]]["state"]["messages"])
 

@@ -48,7 +48,7 @@ USED = 0.01
 
 
 class Watcher(Protocol):
-    """Who is told of changes, in the event loop that changes leases."""
+    """Receives changes, in the event loop that changes leases."""
 
     def taken(self, key: str) -> None:
         """A lease was taken."""
