@@ -210,9 +210,9 @@ def test_a_node_that_dies_is_replaced_and_the_first_write_waits(
 def test_after_a_lease_that_was_given_back_the_first_write_does_not_wait(
     node: Callable[..., Appliance], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(leases, "TTL", 3600.0)  # What the first write waits for otherwise.
     one = node("a")
     wire.until(lambda: health(one) == "ok", "the first node polls it")
+    monkeypatch.setattr(leases, "TTL", 3600.0)  # What the first write waits for otherwise.
     two = node("b")
     wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
     one.stop()

@@ -12,14 +12,12 @@ import pytest
 from holdfast.appliance import Appliance
 from holdfast.config import load
 from support import nats_cluster, wire
-from support.brokers import free_port
+from support.brokers import NatsServer, free_port
 from support.cli import done, invoke
 from support.machine import missing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from support.brokers import NatsServer
 
 
 @pytest.fixture(autouse=True)
