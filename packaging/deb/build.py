@@ -1,5 +1,6 @@
 """Builds a Debian package of each wheel in a folder that has the current version and glibc.
 
+Wheels for 32-bit ARM are left out: some libraries have no wheels for it.
 One package serves all versions of Python in PYTHONS. It is packed with debhelper.
 """
 
@@ -41,13 +42,19 @@ def main() -> None:
     folder = parser.parse_args().folder
     if shutil.which("dh") is None or shutil.which("dpkg-buildpackage") is None:
         sys.exit("debhelper is missing: apt-get install debhelper")
-    wheels = sorted(folder.glob(f"holdfast-{current_version()}-*manylinux*.whl"))
-    for wheel in wheels:
-        print(build(wheel))
-    if not wheels:
+    found = packable(folder, current_version())
+    for wheel in found:
+        print(build(wheel), flush=True)
+    if not found:
         sys.exit(
             f"{folder} has no wheel of Holdfast {current_version()} for Linux with glibc: make dist"
         )
+
+
+def packable(folder: Path, version: str) -> list[Path]:
+    """The wheels that packages are built of."""
+    wheels = sorted(folder.glob(f"holdfast-{version}-*manylinux*.whl"))
+    return [wheel for wheel in wheels if wheel.stem.endswith(tuple(ARCHITECTURES))]
 
 
 def current_version() -> str:

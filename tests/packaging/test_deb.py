@@ -91,6 +91,22 @@ def test_a_wheel_for_another_system_is_refused(wheel: str, monkeypatch: pytest.M
         program("deb/build", monkeypatch).described(wheel)
 
 
+def test_packages_are_built_of_wheels_for_amd64_and_arm64_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for tags in (
+        "manylinux2014_aarch64.manylinux_2_17_aarch64",
+        "manylinux2014_armv7l.manylinux_2_17_armv7l",
+        "manylinux2014_x86_64.manylinux_2_17_x86_64",
+        "musllinux_1_2_x86_64",
+        "win_amd64",
+    ):
+        (tmp_path / f"holdfast-1.2.3-cp311-abi3-{tags}.whl").touch()
+    (tmp_path / "holdfast-1.2.2-cp311-abi3-manylinux2014_x86_64.whl").touch()
+    found = program("deb/build", monkeypatch).packable(tmp_path, "1.2.3")
+    assert [wheel.stem.rpartition("manylinux_2_17_")[2] for wheel in found] == ["aarch64", "x86_64"]
+
+
 def test_libraries_of_several_versions_of_python_share_a_folder_only_if_they_agree(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
