@@ -75,7 +75,7 @@ def pack(folder: Path) -> Path:
     packed = DIST / f"{folder.name}.tar.gz"
     with (
         packed.open("wb") as file,
-        gzip.GzipFile("", "wb", 6, mtime=STAMP, fileobj=file) as zipped,
+        gzip.GzipFile("", "wb", 9, mtime=STAMP, fileobj=file) as zipped,
         tarfile.open(fileobj=zipped, mode="w", format=tarfile.PAX_FORMAT) as archive,
     ):
         for each in sorted(path for path in folder.rglob("*") if path.is_file()):

@@ -17,6 +17,13 @@ directory = "vendor"
 """
 
 
+NOT_BUILT = {
+    *("tests", "test", "test-macros", "testdata", "benches", "bench", "benchmarks", "examples"),
+    *("branding", "img", ".github", "Cargo.lock", "Cargo.toml.orig"),
+}
+"""Files and folders of a crate that no build reads. Documentation stays: code includes some."""
+
+
 class VendoringError(Exception):
     """The source distribution would not have what the checkout was tested with."""
 
@@ -39,17 +46,38 @@ def vendor(folder: Path, checkout: Path) -> None:
     settings.write_text((checkout / ".cargo" / "config.toml").read_text() + FROM_FOLDER)
     kept = {f"{name}-{version}" for name, version in used(folder, "normal,build")}
     for crate in (folder / "vendor").iterdir():
-        if crate.name not in kept:
+        if crate.name in kept:
+            prune(crate)
+        else:
             empty(crate)
 
 
 def used(folder: Path, edges: str) -> set[tuple[str, str]]:
     """Names and versions of the crates that a build for some system uses."""
-    tree = ["cargo", "tree", "--locked", "--offline", "-p", "holdfast-binding", "--target", "all"]
+    tree = ["cargo", "tree", "--locked", "--offline", "-p", "holdfast-binding"]
     tree += ["--edges", edges, "--prefix", "none", "--format", "{p}"]
+    # Not `all`, which adds crates for conditions that no system meets.
+    systems = subprocess.check_output(["rustc", "--print", "target-list"], text=True).split()
+    tree += [f"--target={system}" for system in systems]
     found = subprocess.check_output(tree, cwd=folder, text=True)
     words = [line.split() for line in found.splitlines() if line]
     return {(each[0], each[1].removeprefix("v")) for each in words if "holdfast" not in each[0]}
+
+
+def prune(crate: Path) -> None:
+    """Removes what no build reads from a crate."""
+    for name in NOT_BUILT:
+        path = crate / name
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+    for path in crate.rglob("*_test.cc"):
+        path.unlink()
+    file = crate / ".cargo-checksum.json"
+    sums = json.loads(file.read_text())
+    sums["files"] = {name: each for name, each in sums["files"].items() if (crate / name).exists()}
+    file.write_text(json.dumps(sums))
 
 
 def empty(crate: Path) -> None:

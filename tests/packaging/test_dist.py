@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+import vendoring
 from support.paths import EXAMPLES, ROOT
 
 FOLDER = os.environ.get("HOLDFAST_DIST")
@@ -28,6 +29,8 @@ each_wheel = pytest.mark.parametrize("wheel", WHEELS, ids=lambda wheel: wheel.st
 VERSION = tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]["package"]["version"]
 LARGEST = 12e6
 """Bytes of the largest wheel: a package that all can download in a moment."""
+LARGEST_SOURCE = 30e6
+"""Bytes of the source distribution, most of which are the crates of others."""
 
 
 @functools.cache
@@ -62,6 +65,7 @@ def test_a_wheel_has_the_package_the_core_and_the_licences(wheel: Path) -> None:
 
 def test_the_source_distribution_has_all_crates() -> None:
     packed = PACKAGES / f"holdfast-{VERSION}.tar.gz"
+    assert packed.stat().st_size < LARGEST_SOURCE
     with tarfile.open(packed) as archive:
         names = set(archive.getnames())
         lock = archive.extractfile(f"holdfast-{VERSION}/Cargo.lock")
@@ -71,6 +75,8 @@ def test_the_source_distribution_has_all_crates() -> None:
         if "source" in crate:
             folder = f"holdfast-{VERSION}/vendor/{crate['name']}-{crate['version']}"
             assert f"{folder}/Cargo.toml" in names, folder
+    below = {name.split("/")[3] for name in names if name.split("/")[1] == "vendor"}
+    assert not below & vendoring.NOT_BUILT
     for name in [".cargo/config.toml", "LICENSE", "LICENSE-third-party.txt", "PKG-INFO"]:
         assert f"holdfast-{VERSION}/{name}" in names
     assert {f"holdfast-{VERSION}/python/{name}" for name in package()} <= names

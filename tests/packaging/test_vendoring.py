@@ -56,3 +56,21 @@ def test_a_crate_that_no_build_uses_keeps_only_its_manifest(folder: Path) -> Non
         "files": {},
         "package": "1",
     }
+
+
+def test_a_crate_loses_what_no_build_reads(folder: Path) -> None:
+    crate = folder / "vendor" / "one-1.0.0"
+    kept = ["src/license.rs", "src/tests/case.rs", "docs/notes.md", "Cargo.toml", "LICENSE-MIT"]
+    removed = ["tests/data/large.txt", "benches/speed.rs", "Cargo.lock", "src/c/sum_test.cc"]
+    for name in kept + removed:
+        (crate / name).parent.mkdir(parents=True, exist_ok=True)
+        (crate / name).touch()
+    sums = {"files": dict.fromkeys(kept + removed, "0"), "package": "1"}
+    (crate / ".cargo-checksum.json").write_text(json.dumps(sums))
+    vendoring.prune(crate)
+    files = {str(each.relative_to(crate)) for each in crate.rglob("*") if each.is_file()}
+    assert files == {*kept, ".cargo-checksum.json"}
+    assert json.loads((crate / ".cargo-checksum.json").read_text()) == {
+        "files": dict.fromkeys(kept, "0"),
+        "package": "1",
+    }
