@@ -104,6 +104,8 @@ deb: .venv/dev.stamp
 # The container image of the wheel in dist (docs/containers.md). Only the format of docker has health checks.
 CONTAINER ?= $(firstword $(foreach tool,podman docker,$(shell command -v $(tool))) podman)
 container:
+	@ls dist/holdfast-$(VERSION)-*manylinux*.whl > /dev/null 2>&1 || \
+	  { echo "dist has no wheel of Holdfast $(VERSION) for Linux with glibc: make dist"; exit 1; }
 	$(CONTAINER) build $(if $(findstring podman,$(CONTAINER)),--format docker) \
 	  --tag holdfast:$(VERSION) --tag holdfast:latest --file packaging/container/Containerfile .
 
