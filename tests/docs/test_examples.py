@@ -47,6 +47,8 @@ def failures(page: list[Block], stage: Stage, skipped: list[str]) -> list[str]:
             chosen(block, stage)
         except pytest.skip.Exception as missing:
             skipped.append(f"{block.place}: {missing}")
+            if block.language in SHELL:
+                break  # The blocks below can show what it prints.
         except Exception as error:
             text = str(error) if isinstance(error, AssertionError) else repr(error)
             found.append(text if text.startswith(block.page) else f"{block.place}: {text}")

@@ -16,7 +16,7 @@ import click
 from holdfast.cli import main
 from support import wire
 from support.cli import invoke
-from support.machine import tool
+from support.machine import missing, tool
 from support.pages import blocks
 from support.pages.comparing import alike
 from support.paths import ROOT
@@ -97,6 +97,8 @@ def run_all(block: Block, stage: Stage, left_out: Callable[[Command], bool]) -> 
     if failures:
         raise AssertionError("\n".join(failures))
     chosen = [command for command in found if not left_out(command)]
+    for name in {program for command in chosen for program, *_ in command.programs}:
+        _needs(name, stage)
     if block.language == "sh" and len(chosen) > 1 and not all(map(_is_holdfast, chosen)):
         chosen = [replace(chosen[0], text="\n".join(["set -e", *(each.text for each in chosen)]))]
     for command in chosen:
@@ -104,6 +106,14 @@ def run_all(block: Block, stage: Stage, left_out: Callable[[Command], bool]) -> 
             stage.output += run(command, stage)
     if failures:
         raise AssertionError("\n".join(failures))
+
+
+def _needs(name: str, stage: Stage) -> None:
+    """Skips the test if the shell does not know a program."""
+    if re.fullmatch(r"[\w.+-]+", name) and name != "holdfast":
+        asked = [tool("sh"), "-c", 'command -v "$1"', "sh", name]
+        if subprocess.run(asked, env=stage.environment, stdout=subprocess.DEVNULL).returncode:
+            missing(f"the program {name}")
 
 
 @contextmanager
