@@ -119,7 +119,7 @@ class Broker:
         self._failures = 0
         self._told = ("", 0.0)
         self._worked = False
-        self.client: Client | None = None
+        self.client: SafeClient | None = None
         """The client while there is a connection."""
         self._subscribed = False
 
@@ -148,7 +148,7 @@ class Broker:
                 await _closed(client)
             await asyncio.sleep(FIRST_PAUSE)
 
-    async def _connect(self, client: Client, ended: asyncio.Event) -> None:
+    async def _connect(self, client: SafeClient, ended: asyncio.Event) -> None:
         """Connects and subscribes; returns when nats-py gives up, which sets `ended`."""
 
         async def lost() -> None:
@@ -205,7 +205,7 @@ class Broker:
             self._note(client, error)
             ended.set()
 
-    def _made(self, client: Client) -> None:
+    def _made(self, client: SafeClient) -> None:
         url = client.connected_url
         logs.write(
             logging.INFO,

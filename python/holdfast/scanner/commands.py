@@ -16,6 +16,8 @@ from holdfast.values import ConversionError, encode
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from holdfast import tags
     from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.polling import Polling
@@ -48,10 +50,12 @@ def _checked(made: Any, tag: Tag) -> Any:
     return made
 
 
-async def write(polling: Polling, device: ScannedDevice, tag: Tag, text: str) -> None:
+async def write(
+    polling: Polling, device: ScannedDevice, tag: Tag, text: str, check: Callable[[], None]
+) -> None:
     """Writes a value, given as text. Returns when the device has confirmed it.
 
-    Raises `Refused`.
+    `check` is called at the last moment: it refuses what is too late. Raises `Refused`.
     """
     if (flaw := device.unwritable(tag)) is not None:
         raise Refused(f"tag {tag.id!r} of {device.id} is not writable: {flaw}")
@@ -62,6 +66,7 @@ async def write(polling: Polling, device: ScannedDevice, tag: Tag, text: str) ->
         )
     except ValueError as error:
         raise Refused(f"not written: {error}") from None
+    check()
     fault = await polling.write(device, request)
     if fault == STANDBY:
         raise Moved(f"not written: {fault_text(fault)}")

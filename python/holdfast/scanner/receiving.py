@@ -2,30 +2,78 @@
 
 The server forwards subjects with invalid UTF-8 or vertical tabs, and malformed headers. nats-py
 stops receiving after any of them, permanently or for some time. This client skips such messages.
+
+It also notes what is known of the age of each message: NATS does not tell when one was sent.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
+import math
+from dataclasses import dataclass, field
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from nats.aio.client import Client
+from nats.aio.msg import Msg
 from nats.errors import Error, ProtocolError
 from nats.protocol.parser import AWAITING_CONTROL_LINE, AWAITING_MSG_PAYLOAD, Parser
 
 from holdfast import logs
+from holdfast.standstill import now
 
 END = b"\r\n"
 MAX_LINE = 1024 * 1024
 """The longest line of the protocol in bytes. INFO lines are the longest."""
 
 
+@dataclass
+class Received(Msg):
+    """A message, with times of `now`."""
+
+    sent_after: float = -math.inf
+    """When the last ping was sent that the server has answered before it sent the message."""
+    received: float = field(default_factory=now)
+
+
 class SafeClient(Client):
-    """Skips malformed messages, and logs them with a limited rate."""
+    """Skips malformed messages, and logs them with a limited rate. Messages are `Received`."""
+
+    msg_class = Received
 
     def __init__(self) -> None:
         super().__init__()
         self._ps = _Parser(self)
+        self._pinged: WeakKeyDictionary[asyncio.Future[Any], float] = WeakKeyDictionary()
+        self._last_ping = self._answered = -math.inf
+        """When the last ping was sent, and the last one that was answered."""
+
+    async def prove(self, since: float) -> None:
+        """Pings the server, unless that was done after `since`."""
+        if self.is_connected and self._last_ping < since:
+            await self._send_ping()
+
+    async def _process_connect_init(self) -> None:
+        began = now()
+        await super()._process_connect_init()
+        self._last_ping = self._answered = began  # It has exchanged a ping.
+
+    async def _send_ping(self, future: asyncio.Future[Any] | None = None) -> None:
+        if future is None:
+            future = asyncio.get_running_loop().create_future()
+        self._pinged[future] = self._last_ping = now()
+        await super()._send_ping(future)
+
+    async def _process_pong(self) -> None:
+        if self._pongs:
+            self._answered = self._pinged.get(self._pongs[0], self._answered)
+        await super()._process_pong()
+
+    def _build_message(self, *parts: Any) -> Received:
+        message: Received = super()._build_message(*parts)
+        message.sent_after = self._answered
+        return message
 
     async def _process_msg(
         self, sid: int, subject: bytes, reply: bytes, data: bytes, headers: bytes

@@ -44,6 +44,7 @@ from holdfast.scanner.health import Health
 from holdfast.scanner.heartbeat import EVERY, Heart
 from holdfast.scanner.hosts import Allowed
 from holdfast.scanner.kept import Kept
+from holdfast.scanner.lateness import Lateness
 from holdfast.scanner.limits import ScannerLimits
 from holdfast.scanner.messages import (
     Announcement,
@@ -202,6 +203,7 @@ class Scanner:
             )
         )
         self._expiring = Expiring()
+        self._lateness = Lateness()
         self._configured: Configured | None = None
         self._enabling: Enabling | None = None
         if self._is_next:
@@ -237,6 +239,7 @@ class Scanner:
         self._polling = Polling(self._take, self._poller, self._fence)
         works = [self._broker.run(), self.outbox.run(), self._beat(), self._ended.wait()]
         works.append(self._expiring.run(self._expire))
+        works.append(self._lateness.run(lambda: self._broker.client))
         if self._part is not None:
             works.append(self._part.run(self._ready))
         elif self._settings.keep_subscriptions:
@@ -748,14 +751,17 @@ class Scanner:
             text = tentacle_next.command(message.data)
         async with self._in_order(message):
             device, tag = self._registry.commanded(name)
+        check = partial(self._lateness.check, message)
         if self._part is None:
-            await commands.write(self._polling, device, tag, text)
+            await commands.write(self._polling, device, tag, text, check)
         else:
-            own = partial(self._write, device.id, tag.id, text)
-            await self._part.command(device, tag.id, text, own)
+            own = partial(self._write, device.id, tag.id, text, check)
+            await self._part.command(device, tag.id, text, own, check)
         return Answer(success=True)
 
-    async def _write(self, device_id: str, tag_id: str, text: str) -> bool:
+    async def _write(
+        self, device_id: str, tag_id: str, text: str, check: Callable[[], None]
+    ) -> bool:
         """Writes to a device that this node polls. Returns whether it does. Raises `Refused`."""
         device = self._registry.devices.get(device_id)
         if device is None or tag_id not in device.tags:
@@ -763,7 +769,7 @@ class Scanner:
         if not self._is_own(device) or not device.polled_as:
             return False
         try:
-            await commands.write(self._polling, device, device.tags[tag_id], text)
+            await commands.write(self._polling, device, device.tags[tag_id], text, check)
         except Moved:
             return False
         return True
@@ -775,7 +781,10 @@ class Scanner:
         device = self._registry.devices.get(command.device)
         try:
             is_current = device is not None and self._part.is_current(device, command.epoch)
-            done = is_current and await self._write(command.device, command.tag, command.text)
+            check = partial(self._lateness.check, message)
+            done = is_current and await self._write(
+                command.device, command.tag, command.text, check
+            )
             executed = Executed(moved=not done)
         except Refused as refused:
             executed = Executed(error=str(refused))

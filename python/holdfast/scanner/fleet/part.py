@@ -337,15 +337,22 @@ class FleetPart:
             self._host.end(device)
 
     async def command(
-        self, device: ScannedDevice, tag: str, text: str, own: Callable[[], Awaitable[bool]]
+        self,
+        device: ScannedDevice,
+        tag: str,
+        text: str,
+        own: Callable[[], Awaitable[bool]],
+        check: Callable[[], None],
     ) -> None:
         """Has a command carried out by whoever polls the device. Raises `Refused`.
 
         `own` carries it out here. It returns false, and writes nothing, if the device has moved.
+        `check` refuses it if it is too late.
         """
         end = time.monotonic() + MOVING
         why = f"no node polls {device.id} now"
         while True:
+            check()
             owner = self.fleet.holder(device.partition)
             if self.is_own(device):
                 if await own():

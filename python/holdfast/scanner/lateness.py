@@ -1,0 +1,63 @@
+"""Which commands come too late to be carried out.
+
+A command waits in the socket while the process is stopped, or its machine is suspended. Its caller
+has given up long before, so a late write could move a machine that nobody expects to move.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING
+
+from nats.errors import Error
+
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.receiving import Received
+from holdfast.standstill import LOOK, Standstill, now
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from nats.aio.msg import Msg
+
+    from holdfast.scanner.receiving import SafeClient
+
+WAITED = 10.0
+"""Seconds that a command may wait between the socket and the device's queue. In a fleet, it waits 6
+seconds for a node."""
+
+AGAIN = "send it again if it is still wanted"
+
+
+class Lateness:
+    """Refuses the commands that the server may have sent before the end of a standstill.
+
+    Afterwards the server is pinged: what it sends after its answer is new.
+    """
+
+    def __init__(self) -> None:
+        self._standstill = Standstill("scanner")
+
+    def check(self, message: Msg) -> None:
+        """Raises `Refused` for a command that must not be written any more.
+
+        Call it at the last moment before the write, since it may also wait in this process.
+        """
+        assert isinstance(message, Received), "it is from a SafeClient"
+        self._standstill.look()
+        if message.sent_after < self._standstill.ended:
+            seconds = self._standstill.lasted
+            raise Refused(f"not written: this scanner stood still for {seconds:.0f} s; {AGAIN}")
+        if (waited := now() - message.received) > WAITED:
+            raise Refused(f"not written: the command waited for {waited:.0f} s; {AGAIN}")
+
+    async def run(self, client: Callable[[], SafeClient | None]) -> None:
+        """Looks for standstills, and pings the server after each, until it is cancelled."""
+        while True:
+            self._standstill.look()
+            connected = client()
+            if connected is not None:
+                with contextlib.suppress(Error, OSError):  # A new connection is pinged, too.
+                    await connected.prove(since=self._standstill.ended)
+            await asyncio.sleep(LOOK)

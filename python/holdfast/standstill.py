@@ -1,0 +1,44 @@
+"""Detects that a thread or event loop did not run: its process was stopped, or its machine."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+
+from holdfast import logs
+
+LONG = 2.0
+"""Seconds between two looks that are a standstill. As long as a node of a fleet may use a device
+after it has renewed its lease."""
+
+LOOK = 0.5
+"""Seconds between two looks, at most, while the thread or event loop runs."""
+
+_CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", None)
+
+
+def now() -> float:
+    """Returns seconds of a clock that goes on while the machine is suspended, if it has one."""
+    return time.monotonic() if _CLOCK is None else time.clock_gettime(_CLOCK)
+
+
+class Standstill:
+    """The last standstill of a thread or event loop. Not thread-safe."""
+
+    def __init__(self, part: str) -> None:
+        """`part` is what the log calls it."""
+        self._part = part
+        self._looked: float | None = None
+        self.ended = -math.inf
+        """When the last standstill was detected, by `now`."""
+        self.lasted = 0.0
+        """How many seconds it lasted."""
+
+    def look(self) -> None:
+        """Detects a standstill. Call it every `LOOK` seconds, and before what may be too late."""
+        before, self._looked = self._looked, now()
+        if before is not None and self._looked - before > LONG:
+            self.ended, self.lasted = self._looked, self._looked - before
+            seconds = round(self.lasted, 1)
+            logs.write(logging.WARNING, "stood_still", part=self._part, seconds=seconds)

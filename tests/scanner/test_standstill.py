@@ -1,0 +1,240 @@
+"""Commands that waited while a scanner did not run, which must not be written late."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+
+from holdfast.scanner import FleetSettings, lateness
+from holdfast.scanner.fleet.exchange import Command, subject
+from holdfast.standstill import LONG
+from support import wire
+from support.fleet_nodes import Nodes, subscribed, wanted
+from support.judges import Judges
+from support.nats_bus import Caller, logged, subscription, tag
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from concurrent.futures import Future
+    from pathlib import Path
+
+    import holdfast
+    from support.brokers import NatsServer
+    from support.nats_bus import Run, Running
+
+LATE = "not written: this scanner stood still for"
+
+needs_stopping = pytest.mark.skipif(sys.platform == "win32", reason="can't stop a process")
+
+
+@pytest.fixture
+def judges() -> Iterator[Judges]:
+    with Judges(1) as judges:
+        yield judges
+
+
+@pytest.fixture
+def process(own_nats: NatsServer) -> Iterator[subprocess.Popen[bytes]]:
+    """A scanner as a process."""
+    command = [sys.executable, "-m", "holdfast", "scan", "--nats", own_nats.url]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as running:
+        yield running
+        running.kill()
+
+
+@pytest.fixture
+def nodes(own_nats: NatsServer, tmp_path: Path) -> Iterator[Nodes]:
+    nodes = Nodes([own_nats.url], tmp_path, 4)
+    yield nodes
+    nodes.stop()
+
+
+def send(caller: Caller, where: str, payload: bytes) -> Future[Any]:
+    """Sends a request. When it returns, the server has it."""
+
+    async def request() -> Any:
+        answer = await caller.client.request(where, payload, timeout=3 * wire.DEADLINE)
+        return json.loads(answer.data)
+
+    sent = asyncio.run_coroutine_threadsafe(request(), caller.loop)
+    caller.publish("nobody")
+    return sent
+
+
+def stand(pid: int, during: Callable[[], Sequence[Future[Any]]]) -> list[Any]:
+    """Stops a process, and returns the answers to what was sent to it meanwhile."""
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        os.waitid(os.P_PID, pid, os.WSTOPPED | os.WNOWAIT)
+        sent = during()
+        until_late()
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    return [each.result(3 * wire.DEADLINE) for each in sent]
+
+
+def until_late() -> None:
+    end = time.monotonic() + LONG + 0.5
+    wire.until(lambda: time.monotonic() > end, "it stood still for long enough")
+
+
+def is_done(caller: Caller, where: str, text: str) -> bool:
+    return bool(caller.request(where, text)["success"])
+
+
+@needs_stopping
+def test_commands_that_waited_for_a_stopped_scanner_are_refused(
+    process: subprocess.Popen[bytes], own_caller: Caller, judges: Judges
+) -> None:
+    [judge] = judges.devices
+    subscribed(own_caller, 0, judge)
+    wire.until(partial(is_done, own_caller, "modbus.command.t0", "1"), "it is written")
+
+    def during() -> list[Future[Any]]:
+        for _ in range(100):  # More than the loop handles at once, and nobody waits for an answer.
+            own_caller.publish("modbus.command.t0", "2")
+        return [send(own_caller, "modbus.command.d0.t0", b"3") for _ in range(3)]
+
+    for answer in stand(process.pid, during):
+        assert answer["success"] is False
+        assert answer["error"].startswith(LATE)
+        assert answer["error"].endswith("send it again if it is still wanted")
+    wire.until(partial(is_done, own_caller, "modbus.command.t0", "4"), "new ones are written")
+    assert {value for _, value in judge.writes} == {1, 4}
+
+
+@needs_stopping
+def test_commands_that_waited_for_a_stopped_node_are_refused(
+    nodes: Nodes, own_caller: Caller, judges: Judges
+) -> None:
+    [judge] = judges.devices
+    name = nodes.start()
+    subscribed(own_caller, 0, judge)
+    wire.until(partial(is_done, own_caller, "modbus.command.d0.t0", "1"), "it is written")
+
+    def during() -> list[Future[Any]]:
+        return [send(own_caller, "modbus.command.d0.t0", b"3") for _ in range(3)]
+
+    # It loses its leases, and takes them again.
+    for answer in stand(nodes.running[name].pid, during):
+        assert answer["success"] is False
+        assert answer["error"].startswith(LATE)
+    wire.until(partial(is_done, own_caller, "modbus.command.d0.t0", "4"), "it is written")
+    assert {value for _, value in judge.writes} == {1, 4}
+    assert "stood_still" in nodes.log(name)
+
+
+class Blocked:
+    """The event loop of a scanner, which does not run until it is released."""
+
+    def __init__(self, scanner: Running) -> None:
+        self._gate, is_blocked = threading.Event(), threading.Event()
+
+        async def block() -> None:
+            is_blocked.set()
+            self._gate.wait(3 * wire.DEADLINE)
+
+        assert scanner._loop is not None
+        asyncio.run_coroutine_threadsafe(block(), scanner._loop.loop)
+        assert is_blocked.wait(wire.DEADLINE)
+
+    def release(self) -> None:
+        self._gate.set()
+
+
+def test_a_command_of_another_node_is_refused_by_a_node_whose_loop_did_not_run(
+    run_scanner: Run, own_nats: NatsServer, own_caller: Caller, judges: Judges
+) -> None:
+    [judge] = judges.devices
+    running = run_scanner(own_nats, fleet=FleetSettings("plant", "a", 4))
+    subscribed(own_caller, 0, judge)
+    wire.until(partial(is_done, own_caller, "modbus.command.d0.t0", "1"), "it is written")
+    part = running.scanner._part
+    assert part is not None
+    where = subject("modbus", "a", "command", part.fleet.leases.process)
+    command = msgspec.json.encode(Command(device="d0", tag="t0", text="3", epoch=0))
+    # The thread of its leases goes on: the node has the device all the time.
+    blocked = Blocked(running)
+    try:
+        sent = [send(own_caller, where, command) for _ in range(3)]
+        until_late()
+    finally:
+        blocked.release()
+    for each in sent:
+        answer = each.result(wire.DEADLINE)
+        assert answer.get("moved") or answer["error"].startswith(LATE)
+    wire.until(partial(is_done, own_caller, "modbus.command.d0.t0", "4"), "it is written")
+    assert {value for _, value in judge.writes} == {1, 4}
+
+
+def test_a_standstill_is_logged_once(
+    run_scanner: Run, caller: Caller, caplog: pytest.LogCaptureFixture
+) -> None:
+    blocked = Blocked(run_scanner())
+    try:
+        until_late()
+    finally:
+        blocked.release()
+    assert caller.request("modbus.browse", b"")["devices"] == []
+    wire.until(lambda: logged(caplog, "stood_still"), "it is logged")
+    [first, *_] = logged(caplog, "stood_still")
+    assert first["part"] == "scanner"
+    assert first["seconds"] >= LONG
+
+
+def test_a_command_that_waited_for_long_in_the_scanner_is_refused(
+    run_scanner: Run,
+    caller: Caller,
+    server: holdfast.Server,
+    memory: holdfast.Memory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run_scanner()
+    caller.request("modbus.subscribe", subscription(server, tag("a", 10)))
+    with monkeypatch.context() as patched:
+        patched.setattr(lateness, "WAITED", -1.0)
+        answer = caller.request("modbus.command.a", "3")
+    assert answer["success"] is False
+    assert answer["error"].startswith("not written: the command waited for 0 s; send it again")
+    assert memory.read("holding_registers", 10, 1) == [0]
+    assert caller.request("modbus.command.a", "4") == {"success": True}
+
+
+def test_a_node_passes_no_command_on_that_waited_for_long(
+    run_scanner: Run, own_nats: NatsServer, own_caller: Caller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running = run_scanner(own_nats, fleet=FleetSettings("plant", "a", 4))
+    part = running.scanner._part
+    assert part is not None
+    with Judges(1) as judges:
+        subscribed(own_caller, 0, judges.devices[0])
+        monkeypatch.setattr(part, "is_own", lambda _: False)  # It waits for a node that has it.
+        monkeypatch.setattr(lateness, "WAITED", 0.5)
+        answer = own_caller.request("modbus.command.d0.t0", "3")
+        assert answer["error"].startswith("not written: the command waited for")
+        assert not judges.devices[0].writes
+
+
+def test_requests_that_change_nothing_of_a_device_are_answered_after_a_standstill(
+    run_scanner: Run, own_nats: NatsServer, own_caller: Caller, judges: Judges
+) -> None:
+    running = run_scanner(own_nats)
+    blocked = Blocked(running)
+    try:
+        request = json.dumps(wanted(judges.devices[0], 0)).encode()
+        sent = send(own_caller, "modbus.subscribe", request)
+        until_late()
+    finally:
+        blocked.release()
+    assert sent.result(wire.DEADLINE) == {"success": True, "count": 1}
