@@ -22,7 +22,7 @@ from holdfast.appliance.kept import KeptMemories
 from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.output_site import OutputSite
 from holdfast.appliance.shared_logs import SharedLogs
-from holdfast.appliance.supervision import STOP_TIMEOUT, Supervisor
+from holdfast.appliance.supervision import STOP_TIMEOUT, Starter, Supervisor
 from holdfast.appliance.tag_values import TagValues
 from holdfast.appliance.tag_writes import TagWrites
 from holdfast.client.endpoint import check_files
@@ -210,6 +210,7 @@ class _Part:
     access: MemoryAccess | None = None
     may_end: bool = False
     port: Port | None = None
+    starter: Starter | None = None
 
 
 class _Running:
@@ -724,10 +725,14 @@ class _Running:
             from holdfast.scanner.adapter import ScannerAdapter
 
             scanner = assembly.scanner(config.nats, config.profiles)
+            starter = Starter()
             part = add(
-                "nats", lambda: ScannerAdapter(scanner, poller), config.nats, config.profiles
+                "nats",
+                lambda: ScannerAdapter(scanner, poller, starter.start),
+                config.nats,
+                config.profiles,
             )
-            parts["nats"] = replace(part, may_end=True)
+            parts["nats"] = replace(part, may_end=True, starter=starter)
         if config.gateway is not None:
             from holdfast.gateway import Gateway
 
@@ -785,7 +790,9 @@ class _Running:
         return self._accesses[name]
 
     def _add(self, name: str, part: _Part) -> None:
-        supervisor = Supervisor(name, part.factory, may_end=part.may_end, port=part.port)
+        supervisor = Supervisor(
+            name, part.factory, may_end=part.may_end, port=part.port, starter=part.starter
+        )
         self._supervisors[name] = supervisor
         self._fingerprint_of[name] = part.fingerprint
         self.diagnostics.adapters[name] = (supervisor, part.access)

@@ -9,9 +9,11 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import queue
 import sys
 import threading
 import time
+from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
 from holdfast import logs
@@ -49,11 +51,48 @@ def give_way() -> None:
     sys.setswitchinterval(SWITCH_INTERVAL)
 
 
+class Starter:
+    """Starts threads for an adapter that have the priority of the process.
+
+    A thread has the priority of the thread that starts it, and may not raise it. So a thread that
+    has not lowered its own starts them.
+    """
+
+    def __init__(self) -> None:
+        self._asked: queue.SimpleQueue[tuple[threading.Thread, Future[None]] | None]
+        self._asked = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="holdfast-starter", daemon=True)
+
+    def open(self) -> None:
+        """Begins. To be called by a thread that has the priority of the process."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ends. The threads that it has started go on."""
+        self._asked.put(None)
+
+    def start(self, thread: threading.Thread) -> None:
+        """Starts a thread. Raises `RuntimeError` as `Thread.start` does."""
+        done: Future[None] = Future()
+        self._asked.put((thread, done))
+        done.result()
+
+    def _run(self) -> None:
+        while (asked := self._asked.get()) is not None:
+            thread, done = asked
+            try:
+                thread.start()
+            except RuntimeError as error:
+                done.set_exception(error)
+            else:
+                done.set_result(None)
+
+
 class Supervisor:
     """Supervises one adapter from `start` to `stop`.
 
     With `may_end`, an adapter that returns is not restarted. With `port`, the adapter is created
-    once that port is bound.
+    once that port is bound. The adapter may use `starter` while it runs.
     """
 
     def __init__(
@@ -63,11 +102,13 @@ class Supervisor:
         *,
         may_end: bool = False,
         port: Port | None = None,
+        starter: Starter | None = None,
     ) -> None:
         self.name = name
         self._factory = factory
         self._may_end = may_end
         self._port = port
+        self._starter = starter
         self._stop = Stop()
         self._thread = threading.Thread(target=self._run, name=f"holdfast-{name}", daemon=True)
         self._adapter: Adapter | None = None
@@ -79,6 +120,8 @@ class Supervisor:
 
     def start(self) -> None:
         """Starts the thread."""
+        if self._starter is not None:
+            self._starter.open()
         self._thread.start()
 
     def stop(self) -> None:
@@ -158,6 +201,8 @@ class Supervisor:
             self._restarts += 1
             self._stop.wait(pause)
             pause = min(2 * pause, MAX_PAUSE)
+        if self._starter is not None:
+            self._starter.close()
         self._state = "stopped"
         self._has_ended = True
 

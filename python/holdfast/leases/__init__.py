@@ -9,7 +9,7 @@ from __future__ import annotations
 from holdfast.leases.bucket import LeaseBucket, NotALeaseBucket, Outdated, first_revision, made
 from holdfast.leases.entries import HELD, RENEWED, TTL, Entry, Holding
 from holdfast.leases.leases import Leases, Watcher
-from holdfast.leases.thread import Connect, LeaseThread, Relay
+from holdfast.leases.thread import Connect, LeaseThread, Relay, StartThread
 
 __all__ = [
     "HELD",
@@ -24,6 +24,7 @@ __all__ = [
     "NotALeaseBucket",
     "Outdated",
     "Relay",
+    "StartThread",
     "Watcher",
     "first_revision",
     "made",

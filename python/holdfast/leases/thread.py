@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 Connect: TypeAlias = "Callable[[Callable[[Client | None], None]], Coroutine[Any, Any, None]]"
 """Keeps a connection until it is cancelled, and passes on the client, or `None` without one."""
 
+StartThread: TypeAlias = "Callable[[threading.Thread], None]"
+"""Starts a thread, with a priority that does not delay renewals."""
+
 RETRIED = 5.0
 """Seconds before another attempt after a failure that is not of the network."""
 
@@ -31,8 +34,15 @@ RETRIED = 5.0
 class LeaseThread:
     """The thread of the leases of one bucket, from `start` to `stop`."""
 
-    def __init__(self, leases: Leases, connect: Connect, name: str) -> None:
+    def __init__(
+        self,
+        leases: Leases,
+        connect: Connect,
+        name: str,
+        start_thread: StartThread = threading.Thread.start,
+    ) -> None:
         self._leases = leases
+        self._start_thread = start_thread
         self._connect = connect
         self._name = name
         self._heartbeat = Heartbeat()
@@ -46,7 +56,7 @@ class LeaseThread:
         """Begins to hold what is wanted."""
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-        self._thread.start()
+        self._start_thread(self._thread)
 
     def stop(self, limit: float) -> None:
         """Gives all leases back, each after `limit` seconds at the latest, and ends the thread.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import threading
 from typing import TYPE_CHECKING
 
 from holdfast.heartbeat import Heartbeat
@@ -11,6 +12,7 @@ from holdfast.scanner.service import Scanner
 
 if TYPE_CHECKING:
     from holdfast._core import Poller
+    from holdfast.leases import StartThread
     from holdfast.scanner.service import Settings
     from holdfast.stop import Stop
 
@@ -20,12 +22,17 @@ class ScannerAdapter:
 
     It returns when a shutdown message arrives. The URLs in `settings.servers` must not contain
     secrets, because `status` shows them. Devices are polled by `poller`, if it is given; no other
-    scanner may use it then.
+    scanner may use it then. The thread of leases is started by `start_thread`.
     """
 
-    def __init__(self, settings: Settings, poller: Poller | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        poller: Poller | None = None,
+        start_thread: StartThread = threading.Thread.start,
+    ) -> None:
         self._settings = settings
-        self._scanner = Scanner(settings, poller)
+        self._scanner = Scanner(settings, poller, start_thread)
         self.heartbeat = Heartbeat()
 
     def run(self, stop: Stop) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import threading
 import time
 from collections.abc import (
     AsyncIterator,
@@ -77,6 +78,7 @@ if TYPE_CHECKING:
     from holdfast._core import Endpoint, Poller
     from holdfast.client.url import Target
     from holdfast.config.scanning import Dialect, Writes
+    from holdfast.leases import StartThread
     from holdfast.net.allow_list import AllowEntry
     from holdfast.scanner.adjusting import Asked
     from holdfast.scanner.devices import ScannedDevice
@@ -156,8 +158,13 @@ class Settings:
 class Scanner:
     """One service, from `run` to its end."""
 
-    def __init__(self, settings: Settings, poller: Poller | None = None) -> None:
-        """Without `poller`, it has a poller of its own."""
+    def __init__(
+        self,
+        settings: Settings,
+        poller: Poller | None = None,
+        start_thread: StartThread = threading.Thread.start,
+    ) -> None:
+        """Without `poller`, it has a poller of its own. `start_thread` is for leases."""
         self._poller = poller
         self._settings = settings
         self._allowed = Allowed(settings.allow)
@@ -192,6 +199,7 @@ class Scanner:
                 _Host(self),
                 self._about,
                 self._connect_leases,
+                start_thread,
             )
         part = self._part
         self.outbox = (

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from holdfast import _core
-    from holdfast.leases import Connect, Holding
+    from holdfast.leases import Connect, Holding, StartThread
 
 NODE = "node."
 PARTITION = "partition."
@@ -60,11 +60,13 @@ class Fleet:
         *,
         connect: Connect,
         withheld: Callable[[], str | None],
+        start_thread: StartThread,
     ) -> None:
         """`about` returns what others are shown of this node.
 
         `connect` makes the connection of the leases. `withheld` returns why this node can't use its
-        devices, though it could renew their leases; it is called in their thread.
+        devices, though it could renew their leases; it is called in their thread, which
+        `start_thread` starts.
         """
         self.settings = settings
         self.terms = terms
@@ -92,7 +94,7 @@ class Fleet:
             about=self._about,
             withheld=withheld,
         )
-        self._thread = LeaseThread(self.leases, connect, "holdfast-leases")
+        self._thread = LeaseThread(self.leases, connect, "holdfast-leases", start_thread)
 
     @property
     def node(self) -> str:

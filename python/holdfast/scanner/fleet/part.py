@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast import _core
-    from holdfast.leases import Connect, Holding
+    from holdfast.leases import Connect, Holding, StartThread
     from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.fleet.terms import FleetSettings, Terms
 
@@ -97,8 +97,9 @@ class FleetPart:
         host: Host,
         about: Callable[[], dict[str, Any]],
         connect: Connect,
+        start_thread: StartThread,
     ) -> None:
-        """`connect` makes a connection of its own for the leases."""
+        """`connect` makes a connection for the leases alone, `start_thread` starts their thread."""
         self.fleet = Fleet(
             settings,
             terms,
@@ -107,6 +108,7 @@ class FleetPart:
             self._lost,
             connect=connect,
             withheld=self._withheld,
+            start_thread=start_thread,
         )
         self._heartbeat = Heartbeat()
         self.wants = Wants(settings.name, self._changed, self._replaced)
