@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import threading
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from holdfast.appliance import Appliance
+from holdfast.appliance.output_site import OutputSite
 from holdfast.outputs import sending
+from holdfast.standstill import LONG
 from support import wire
 from support.mqtt_plant import TAGS, Client, Plant
 
@@ -203,3 +207,39 @@ def test_a_reload_brings_new_set_topics(plant: Plant) -> None:
     wire.until(lambda: "plant/pump/valve/set" in plant.broker.log, "subscribed")
     probe.publish("plant/pump/valve/set", "true")
     assert reply(probe, "valve")["status"] == "accepted"
+
+
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+def test_commands_that_waited_while_the_output_stood_still_are_not_written(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch, version: str
+) -> None:
+    written: list[str] = []
+    goes_on = threading.Event()
+    write = OutputSite.write
+
+    def wait_and_write(site: OutputSite, device: str, tag: str, text: str, *more: Any) -> None:
+        written.append(text)
+        if text == "1":
+            goes_on.wait(3 * wire.DEADLINE)
+        write(site, device, tag, text, *more)
+
+    monkeypatch.setattr(OutputSite, "write", wait_and_write)
+    plant.device()
+    probe = plant.probe("plant/#")
+    plant.run(writes=True, version=version)
+    probe.until("plant/holdfast/status/pump", "online")
+    probe.publish("plant/pump/temperature/set", "1")
+    wire.until(lambda: written, "it is being written")
+    for _ in range(50):  # More than the broker sends before it has confirmations.
+        probe.publish("plant/pump/temperature/set", "2")
+    end = time.monotonic() + LONG + 0.5
+    wire.until(lambda: time.monotonic() > end, "it stood still for long enough")
+    goes_on.set()
+
+    def is_written() -> bool:
+        probe.publish("plant/pump/temperature/set", "3")
+        return "3" in written
+
+    wire.until(is_written, "new commands are written")
+    assert "2" not in written
+    assert plant.status()["reconnects"] >= 1

@@ -114,6 +114,7 @@ class MqttOutput:
                 self._on_message,
                 self._stop,
                 qos=self._settings.qos,
+                writes=self._settings.writes,
             )
             self._connects += 1
             self._greet(self._session)

@@ -16,6 +16,7 @@ from holdfast.mqtt.waiting import Ended, Waiter
 from holdfast.net.tls import NO_FILES, broker_context
 from holdfast.outputs.mqtt.connection import Connection
 from holdfast.outputs.mqtt.messages import Delivery, Message
+from holdfast.standstill import LOOK, Standstill
 from holdfast.stop import Stop
 
 if TYPE_CHECKING:
@@ -40,9 +41,6 @@ SLICE = 0.2
 LAST = 1.0
 """Seconds for what is published at the end."""
 
-TICK = 1.0
-"""Seconds between checks of the keep-alive."""
-
 
 class Session:
     """A connection. Raises `OSError` if it can't be opened. Methods are thread-safe."""
@@ -57,11 +55,17 @@ class Session:
         *,
         qos: int,
         will_qos: int | None = None,
+        writes: bool,
         proves: bool = False,
     ) -> None:
         """`qos` is of all messages, and of the will unless it has its own. For `proves`, see
         `Connection`.
+
+        With `writes`, messages are commands. If this process stood still, the connection ends, and
+        the broker drops the commands that waited: they are too late.
         """
+        self._standstill = Standstill("output") if writes else None
+        self._on_command = on_command
         self._settings, self._qos, self._proves = settings, qos, proves
         self._will_qos = qos if will_qos is None else will_qos
         self._ends_with_will = self._is_cut = False
@@ -75,7 +79,7 @@ class Session:
         self._is_over = False
         self._waiter = Waiter(self._end)
         try:
-            self._connection = self._opened(client_id, will, on_command)
+            self._connection = self._opened(client_id, will)
         except BaseException:
             self._waiter.close()
             raise
@@ -135,12 +139,7 @@ class Session:
         self._end.set()
         self._thread.join()
 
-    def _opened(
-        self,
-        client_id: str,
-        will: Message | None,
-        on_command: Callable[[Publish, bool], None],
-    ) -> Connection:
+    def _opened(self, client_id: str, will: Message | None) -> Connection:
         """Connects, and waits for the broker's consent. A stop interrupts it."""
         settings = self._settings
         tls = NO_FILES if settings.tls is None else settings.tls.files
@@ -156,7 +155,7 @@ class Session:
                 client_id,
                 password,
                 open_socket,
-                on_command,
+                self._take,
                 qos=self._qos,
                 proves=self._proves,
             )
@@ -230,13 +229,26 @@ class Session:
             open_socket,  # type: ignore[arg-type]
             read=True,
             write=connection.want_write(),
-            seconds=0.0 if pending else min(TICK, self._settings.keep_alive / 2),
+            seconds=0.0 if pending else min(LOOK, self._settings.keep_alive / 2),
         )
+        self._check()
         if writable:
             connection.loop_write()
         if (readable or pending) and connection.read_more():
             self._tell()
         connection.loop_misc()
+
+    def _take(self, message: Publish, is_retained: bool) -> None:
+        self._check()
+        self._on_command(message, is_retained)
+
+    def _check(self) -> None:
+        """Raises `ConnectionError` after a standstill."""
+        if self._standstill is not None:
+            self._standstill.look()
+            if self._standstill.lasted:
+                seconds = self._standstill.lasted
+                raise ConnectionError(f"this output stood still for {seconds:.0f} s")
 
     def _tell(self) -> None:
         with self._news:

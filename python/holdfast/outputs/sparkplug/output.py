@@ -128,6 +128,7 @@ class SparkplugOutput:
                 self._stop,
                 qos=0,
                 will_qos=1,
+                writes=self._settings.writes,
                 proves=True,
             )
             self._connects += 1
