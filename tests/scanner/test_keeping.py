@@ -86,12 +86,13 @@ def test_a_state_that_is_being_stored_is_removed_when_the_scanner_stops(
 
     async def late(key: str, value: bytes) -> int:
         bucket = await caller.client.jetstream().key_value(BUCKET)
-        if "status" in key:
-            begun.set()
-            assert await asyncio.to_thread(stopping.wait, wire.DEADLINE)
+        begun.set()
+        assert await asyncio.to_thread(stopping.wait, wire.DEADLINE)
         return await put(bucket, key, value)
 
-    async def put_late(_: KeyValue, key: str, value: bytes) -> int:
+    async def put_late(bucket: KeyValue, key: str, value: bytes) -> int:
+        if "status" not in key:
+            return await put(bucket, key, value)
         # What is on its way arrives, also if nobody waits for it.
         sent.append(asyncio.run_coroutine_threadsafe(late(key, value), caller.loop))
         return await asyncio.shield(asyncio.wrap_future(sent[-1]))

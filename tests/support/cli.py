@@ -37,7 +37,7 @@ def invoke(*arguments: str) -> Result:
 def done(*arguments: str) -> list[str]:
     """Returns the lines that a command prints. It must succeed without warnings."""
     result = invoke(*arguments)
-    assert (result.exit_code, result.stderr) == (0, "")
+    assert (result.exit_code, result.stderr) == (0, ""), result.output
     return result.stdout.splitlines()
 
 

@@ -31,6 +31,9 @@ FLEET = "plant"
 PATIENCE = 20.0
 """Seconds to wait for the answer to a command: longer than the fleet looks for its node."""
 
+ANSWERED = 10.0
+"""Seconds to wait for the answer to a request that is sent again."""
+
 
 class Nodes:
     """The nodes, as processes."""
@@ -151,8 +154,9 @@ def subscribed(caller: Caller, number: int, judge: Judge, **more: object) -> Non
     request = wanted(judge, number, **more)
 
     def is_subscribed() -> bool:
+        # With a server that ends, a request or its answer may be lost.
         with suppress(Error, TimeoutError):
-            return bool(caller.request("modbus.subscribe", request)["success"])
+            return bool(caller.request("modbus.subscribe", request, ANSWERED)["success"])
         return False
 
     wire.until(is_subscribed, f"d{number} is subscribed")

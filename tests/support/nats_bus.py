@@ -128,11 +128,9 @@ class Caller:
         self._loop.do(self.client.close())
         self._loop.close()
 
-    def request(self, subject: str, payload: object) -> Any:
+    def request(self, subject: str, payload: object, seconds: float = wire.DEADLINE) -> Any:
         """Sends a request and returns the answer. A string is sent as is, other values as JSON."""
-        message = self._loop.do(
-            self.client.request(subject, _bytes(payload), timeout=wire.DEADLINE)
-        )
+        message = self._loop.do(self.client.request(subject, _bytes(payload), timeout=seconds))
         return json.loads(message.data)
 
     def publish(self, subject: str, payload: object = b"") -> None:

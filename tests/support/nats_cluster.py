@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from nats.aio.client import Client
 from nats.errors import Error
@@ -14,13 +14,19 @@ from support import wire
 from support.brokers import NatsServer, free_port
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Coroutine, Iterator
     from pathlib import Path
 
+    from nats.js import JetStreamContext
     from nats.js.api import StreamInfo
+
+Answer = TypeVar("Answer")
 
 ASKED = 2.0
 """Seconds to wait for the cluster to tell of a stream."""
+
+TRIED = "tried"
+"""A stream that is made to see whether the cluster works."""
 
 
 class NatsCluster:
@@ -41,6 +47,7 @@ class NatsCluster:
                 lambda: any("new metadata leader" in each.log for each in self.servers.values()),
                 "there is a leader",
             )
+            wire.until(self._stores, "the leader knows all servers")
         except BaseException:
             self.kill()
             raise
@@ -81,17 +88,28 @@ class NatsCluster:
 
         wire.until(is_whole, f"{stream} has all replicas")
 
-    def _info(self, stream: str) -> StreamInfo | None:
-        return asyncio.run(self._asked(stream))
+    def _stores(self) -> bool:
+        """Whether a stream can have a replica on each server."""
 
-    async def _asked(self, stream: str) -> StreamInfo | None:
+        async def stores(jetstream: JetStreamContext) -> bool:
+            await jetstream.add_stream(name=TRIED, subjects=[TRIED], num_replicas=3)
+            return await jetstream.delete_stream(TRIED)
+
+        return bool(asyncio.run(self._asked(stores)))
+
+    def _info(self, stream: str) -> StreamInfo | None:
+        return asyncio.run(self._asked(lambda jetstream: jetstream.stream_info(stream)))
+
+    async def _asked(
+        self, request: Callable[[JetStreamContext], Coroutine[Any, Any, Answer]]
+    ) -> Answer | None:
         async def ignore(_: Exception) -> None:
             pass
 
         client = Client()
         try:
             await client.connect(list(self.urls), allow_reconnect=False, error_cb=ignore)
-            return await client.jetstream(timeout=ASKED).stream_info(stream)
+            return await request(client.jetstream(timeout=ASKED))
         except (Error, JetStreamError, OSError):
             return None
         finally:
