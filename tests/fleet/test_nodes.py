@@ -319,14 +319,6 @@ def test_other_settings_are_refused_and_named(
     assert shown == f"holdfast: fleet plant: {said}"
 
 
-def test_a_name_that_is_in_use_is_refused(
-    node: Callable[..., Running], own_nats: NatsServer
-) -> None:
-    node("a")
-    shown = refused(own_nats, "--node", "a", "--partitions", str(PARTITIONS))
-    assert shown == ("holdfast: fleet plant: another process is the node a: give it another name")
-
-
 def test_without_nats_devices_rest_and_come_back(
     node: Callable[..., Running], caller: Caller, judges: Judges, own_nats: NatsServer
 ) -> None:
