@@ -41,24 +41,38 @@ def lower(monkeypatch: pytest.MonkeyPatch) -> int:
     return own + 1
 
 
-def nice(name: str) -> int:
-    """The nice value of a thread of this process."""
-    [thread] = [each for each in threading.enumerate() if each.name == name]
-    stat = Path(f"/proc/self/task/{thread.native_id}/stat").read_text()
-    return int(stat.rpartition(")")[2].split()[16])
+class Threads:
+    """The threads that the test has started: others of its process may not have ended yet."""
+
+    def __init__(self) -> None:
+        self._before = set(threading.enumerate())
+
+    def named(self, name: str) -> list[threading.Thread]:
+        return [
+            each for each in threading.enumerate() if each.name == name and each not in self._before
+        ]
+
+    def nice(self, name: str) -> int:
+        """The nice value of a thread."""
+        [thread] = self.named(name)
+        stat = Path(f"/proc/self/task/{thread.native_id}/stat").read_text()
+        return int(stat.rpartition(")")[2].split()[16])
 
 
-def has(name: str) -> bool:
-    return any(each.name == name for each in threading.enumerate())
+@pytest.fixture
+def threads() -> Threads:
+    return Threads()
 
 
 def test_leases_have_the_priority_of_the_process(
-    run: Run, own_nats: NatsServer, server: holdfast.Server, lower: int
+    run: Run, own_nats: NatsServer, server: holdfast.Server, lower: int, threads: Threads
 ) -> None:
     run(NODE.format(url=own_nats.url))
-    wire.until(lambda: has("holdfast-leases"), "the leases have their thread")
-    assert nice("holdfast-leases") == lower - 1
-    wire.until(lambda: nice("holdfast-nats") == lower, "the adapter has lowered its priority")
+    wire.until(lambda: threads.named("holdfast-leases"), "the leases have their thread")
+    assert threads.nice("holdfast-leases") == lower - 1
+    wire.until(
+        lambda: threads.nice("holdfast-nats") == lower, "the adapter has lowered its priority"
+    )
     with Caller(own_nats.url) as caller:
         request = subscription(server, tag("a", 10))
         wire.until(lambda: is_done(caller, request), "the node has its leases")
@@ -70,7 +84,7 @@ def is_done(caller: Caller, request: dict[str, object]) -> bool:
     return False
 
 
-def test_a_starter_tells_that_a_thread_can_not_be_started() -> None:
+def test_a_starter_tells_that_a_thread_can_not_be_started(threads: Threads) -> None:
     starter = supervision.Starter()
     starter.open()
     started = threading.Thread(target=int)
@@ -78,12 +92,14 @@ def test_a_starter_tells_that_a_thread_can_not_be_started() -> None:
     with pytest.raises(RuntimeError, match="once"):
         starter.start(started)
     starter.close()
-    wire.until(lambda: not has("holdfast-starter"), "it has ended")
+    wire.until(lambda: not threads.named("holdfast-starter"), "it has ended")
 
 
-def test_the_starter_ends_with_the_adapter(run: Run, own_nats: NatsServer) -> None:
+def test_the_starter_ends_with_the_adapter(
+    run: Run, own_nats: NatsServer, threads: Threads
+) -> None:
     appliance = run(NODE.format(url=own_nats.url))
-    wire.until(lambda: has("holdfast-leases"), "the leases have their thread")
-    assert has("holdfast-starter")
+    wire.until(lambda: threads.named("holdfast-leases"), "the leases have their thread")
+    assert threads.named("holdfast-starter")
     appliance.stop()
-    wire.until(lambda: not has("holdfast-starter"), "it has ended")
+    wire.until(lambda: not threads.named("holdfast-starter"), "it has ended")
