@@ -85,7 +85,7 @@ def sections(folder: Path, nats: str, device: tuple[str, int]) -> dict[str, Any]
     }
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
     folder = tmp_path_factory.mktemp("plant")
     memory = holdfast.Memory(holding_registers=10)
@@ -116,7 +116,7 @@ def scraped(appliance: Appliance) -> dict[str, dict[str, set[str]]]:
     return found
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def metrics(appliance: Appliance) -> Labels:
     """The metrics of an appliance in which what is counted by its reason has happened."""
     host, port = endpoint(appliance, "scada")
