@@ -18,7 +18,7 @@ function refuse(text) {
 
 function integer(name, value, least) {
     if (!Number.isInteger(value) || value < least || value > 65535) {
-        refuse(`${name} is ${shown(value)}, allowed are ${least} to 65535`);
+        refuse(`${name} is ${shown(value)}, allowed: ${least} to 65535`);
     }
     return value;
 }
@@ -34,7 +34,7 @@ function packed(values, bits) {
         const value = bits && typeof values[i] === 'boolean' ? Number(values[i]) : values[i];
         if (!Number.isInteger(value) || value < 0 || value > (bits ? 1 : 65535)) {
             const allowed = bits ? '0, 1, false, true' : 'integers 0 to 65535';
-            refuse(`payload[${i}] is ${shown(values[i])}, allowed are ${allowed}`);
+            refuse(`payload[${i}] is ${shown(values[i])}, allowed: ${allowed}`);
         }
         if (bits) {
             payload[i >> 3] |= value << (i & 7);
@@ -64,7 +64,7 @@ const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, byte) => {
 function packet() {
     const area = AREAS.indexOf(msg.area) + 1;
     if (area === 0) {
-        refuse(`area is ${shown(msg.area)}, allowed are ${AREAS.join(', ')}`);
+        refuse(`area is ${shown(msg.area)}, allowed: ${AREAS.join(', ')}`);
     }
     const bits = area <= 2;
     const v1 = msg.unit !== undefined;
@@ -72,14 +72,14 @@ function packet() {
         refuse('give either unit (format v1) or memoryId (format crc)');
     }
     if (msg.crc !== undefined && (v1 || !['required', 'none'].includes(msg.crc))) {
-        refuse(`crc is ${shown(msg.crc)}, allowed is 'required' or 'none' with memoryId`);
+        refuse(`crc is ${shown(msg.crc)}, allowed: 'required' or 'none' with memoryId`);
     }
     const target = v1 ? integer('unit', msg.unit, 0) : integer('memoryId', msg.memoryId, 0);
     const address = integer('address', msg.address, 0);
 
     const ready = Buffer.isBuffer(msg.payload);
     if (!ready && !Array.isArray(msg.payload)) {
-        refuse(`payload is ${shown(msg.payload)}, allowed are an array and a Buffer`);
+        refuse(`payload is ${shown(msg.payload)}, allowed: an array and a Buffer`);
     }
     let count = msg.payload.length;
     if (ready) {

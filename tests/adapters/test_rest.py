@@ -389,7 +389,7 @@ def test_identity_is_no_coding(client: web.Client) -> None:
         ("memory=plant_a&area=coils&address=0&count=1&count=2", ["count", "more than once"]),
         (
             "memory=plant_a&area=coils&address=0&count=1&offset=2",
-            ['"offset"', "allowed are memory"],
+            ['"offset"', "allowed: memory"],
         ),
         ("memory=plant_a&area=coils&address=0&count=1&x", ['"x"']),
         ("memory=plant_a&area=coils&address=0&count=" + "1&a=" * 9, ["more than 8"]),

@@ -241,7 +241,7 @@ def test_devices_outside_the_list_are_not_polled(
     run(nats_section(nats.url).replace("127.0.0.0/8", "/dev/ttyUSB9, 10.0.0.0/8"))
     assert subscribed(caller, server) == {
         "success": False,
-        "error": "127.0.0.1 is not allowed, allowed are 10.0.0.0/8",
+        "error": "127.0.0.1 is not allowed, allowed: 10.0.0.0/8",
     }
 
 
@@ -251,9 +251,7 @@ def test_limits_are_those_of_the_configuration(
     run(nats_section(nats.url) + "  limits: {tags: 1}\n")
     assert subscribed(caller, server)["success"] is True
     more = subscription(server, tag("b", 5), tag("c", 6))
-    assert caller.request("plant.subscribe", more)["error"] == (
-        "there would be 3 tags, allowed are 1"
-    )
+    assert caller.request("plant.subscribe", more)["error"] == ("there would be 3 tags, allowed: 1")
 
 
 def test_a_server_that_is_not_there_yet_is_waited_for(

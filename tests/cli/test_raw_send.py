@@ -176,7 +176,7 @@ def test_a_file_has_a_whole_area(tmp_path: Path) -> None:
         (b"1\n2.5\n", "Error: <stdin>:2: '2.5' is not an integer, decimal or 0x."),
         (b"-1\n", "Error: <stdin>:1: '-1' is not an integer, decimal or 0x."),
         (b"1\n\xff\n", "Error: <stdin> is not UTF-8 text."),
-        (b"1\n65536\n", "Error: values[1] is 65536, allowed are integers 0 to 65535."),
+        (b"1\n65536\n", "Error: values[1] is 65536, allowed: integers 0 to 65535."),
         (b"", "Error: found 0 values, allowed: 1 to 65535."),
     ],
 )
@@ -200,7 +200,7 @@ RIGHT = ("127.0.0.1:9000", "coils", "0", "1", "--unit", "1")
         ((*RIGHT, "--count", "1"), "Error: --count requires --hex."),
         ((*RIGHT, "--hex", "01"), "Error: Give exactly one of VALUEs, --file and --hex."),
         ((*RIGHT[:3], "--unit", "1"), "Error: Give exactly one of VALUEs, --file and --hex."),
-        ((*RIGHT[:3], "2", "--unit", "1"), "Error: values[0] is 2, allowed are 0, 1, False, True."),
+        ((*RIGHT[:3], "2", "--unit", "1"), "Error: values[0] is 2, allowed: 0, 1, False, True."),
         ((*RIGHT[:3], "1.0", "--unit", "1"), "Error: Invalid value for '[VALUE]...': '1.0' is not"),
         ((*RIGHT[:3], "1_0", "--unit", "1"), "Error: Invalid value for '[VALUE]...': '1_0' is not"),
         (

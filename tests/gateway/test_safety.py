@@ -138,7 +138,7 @@ def test_what_is_neither_an_address_nor_a_name_is_refused(host: str) -> None:
         answer = running.ask("/connect", {"host": host})
     assert (answer.status, answer.headers["holdfast-reason"]) == (400, "malformed")
     allowed = "a name or an IP address; the port is a field of its own"
-    assert answer.json["error"] == f'host is "{host}", allowed is {allowed}'
+    assert answer.json["error"] == f'host is "{host}", allowed: {allowed}'
     assert dialed.calls == []
 
 

@@ -145,7 +145,7 @@ def test_a_device_that_is_not_there_is_no_stream(gateway: Running) -> None:
 @pytest.mark.parametrize(
     ("query", "says"),
     [
-        ({"interval": 9}, "interval is 9, allowed is an integer 10 to 3600000"),
+        ({"interval": 9}, "interval is 9, allowed: an integer 10 to 3600000"),
         ({"interval": "1e3"}, "interval"),
         ({"address": "0x0"}, "address"),
         ({"quantity": 126}, "Quantity must be between 1 and 125"),

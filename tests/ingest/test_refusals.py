@@ -69,13 +69,13 @@ def refused(memory_access: MemoryAccess, *batch: Any, grant: Grant = GRANT) -> R
             BAD_RANGE,
             "out_of_range",
             None,
-            "2 from address 99 of holding_registers, allowed are 1 to 1",
+            "2 from address 99 of holding_registers, allowed: 1 to 1",
         ),
         (
             command(9, [1]),
             "out_of_range",
             None,
-            "1 from address 9 of holding_registers, allowed are addresses 10 to 99",
+            "1 from address 9 of holding_registers, allowed: addresses 10 to 99",
         ),
         (
             command(0, [1], "input_registers"),
@@ -147,8 +147,7 @@ def test_of_several_refusals_values_come_last(
         (
             {"area": "relays"},
             "invalid_area",
-            'area is "relays", allowed are coils, discrete_inputs, holding_registers, '
-            "input_registers",
+            'area is "relays", allowed: coils, discrete_inputs, holding_registers, input_registers',
         ),
         ({"area": "coils"}, "not_granted", "area coils is not granted to edge"),
     ],
@@ -168,13 +167,13 @@ def test_what_is_not_granted_is_refused_for_writes_and_reads(
 @pytest.mark.parametrize(
     ("address", "count", "allowed"),
     [
-        (10, 91, "allowed are 1 to 90"),
-        (20, 0, "allowed are 1 to 80"),
-        (20, -5, "allowed are 1 to 80"),
-        (100, 1, "allowed are addresses 10 to 99"),
-        (9, 0, "allowed are addresses 10 to 99"),
-        (-1, 1, "allowed are addresses 10 to 99"),
-        (20, 10**30, "allowed are 1 to 80"),
+        (10, 91, "allowed: 1 to 90"),
+        (20, 0, "allowed: 1 to 80"),
+        (20, -5, "allowed: 1 to 80"),
+        (100, 1, "allowed: addresses 10 to 99"),
+        (9, 0, "allowed: addresses 10 to 99"),
+        (-1, 1, "allowed: addresses 10 to 99"),
+        (20, 10**30, "allowed: 1 to 80"),
     ],
 )
 def test_a_read_outside_is_refused_and_counted(

@@ -162,7 +162,7 @@ def test_a_signal_ends_the_start() -> None:
         ({"name": "a.b"}, "name is"),
         ({"node": ""}, "node is"),
         ({"servers": []}, "servers are empty"),
-        ({"replicas": 2}, "replicas is 2, allowed are 1, 3, 5"),
+        ({"replicas": 2}, "replicas is 2, allowed: 1, 3, 5"),
         ({"replicas": 7}, "replicas is 7"),
         ({"write_timeout": 0.0}, "write_timeout is 0 s, at least 0.05 s"),
         ({"write_timeout": -1.0}, "write_timeout"),

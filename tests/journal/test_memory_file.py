@@ -173,7 +173,7 @@ def test_memories_that_cannot_be_kept_together_are_errors(path: Path) -> None:
     memory = plant()
     with pytest.raises(ValueError, match="memory a is given twice"):
         MemoryFile(path, [("a", memory), ("a", plant())], 0)
-    with pytest.raises(ValueError, match='sync is "-1", allowed are 0 to 31622400 seconds'):
+    with pytest.raises(ValueError, match='sync is "-1", allowed: 0 to 31622400 seconds'):
         MemoryFile(path, [("a", memory)], -1)
 
 

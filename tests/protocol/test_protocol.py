@@ -61,7 +61,7 @@ def test_the_limits_are_those_of_the_standard() -> None:
 def test_a_request_beyond_a_limit_is_refused() -> None:
     for area, most in protocol.READ_LIMITS.items():
         _core.Request.read(area, 0, most)
-        with pytest.raises(ValueError, match=f"allowed are 1 to {most}"):
+        with pytest.raises(ValueError, match=f"allowed: 1 to {most}"):
             _core.Request.read(area, 0, most + 1)
     read, written = protocol.READ_WRITE.most_read, protocol.READ_WRITE.most_written
     for make, most in (
@@ -70,7 +70,7 @@ def test_a_request_beyond_a_limit_is_refused() -> None:
         (lambda at, values: _core.Request.read_write(at, read, at, values), written),
     ):
         make(0, [0] * most)
-        with pytest.raises(ValueError, match=f"allowed are 1 to {most}"):
+        with pytest.raises(ValueError, match=f"allowed: 1 to {most}"):
             make(0, [0] * (most + 1))
 
 

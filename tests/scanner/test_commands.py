@@ -104,12 +104,12 @@ def test_a_coil_is_written(
         ("int16", "32768", "32768 is outside -32768 to 32767 of int16"),
         ("uint16", "-1", "-1 is outside 0 to 65535 of uint16"),
         ("uint16", "12.5", "'12.5' is not a valid uint16"),
-        ("uint16", "true", "'true' is not a valid uint16, allowed is a JSON number"),
+        ("uint16", "true", "'true' is not a valid uint16, allowed: a JSON number"),
         ("uint16", "0x10", "'0x10' is not a valid uint16"),
         ("uint16", "1e999", "'1e999' is not a valid uint16"),
         ("uint16", "", "'' is not a valid uint16"),
         ("uint16", "١", "is not a valid uint16"),
-        ("boolean", "2", "'2' is not a valid boolean, allowed are true, false, 1 and 0"),
+        ("boolean", "2", "'2' is not a valid boolean, allowed: true, false, 1 and 0"),
         ("boolean", "on", "'on' is not a valid boolean"),
         ("float32", "nan", "'nan' is not a valid float32"),
         ("float32", "inf", "'inf' is not a valid float32"),
@@ -118,10 +118,10 @@ def test_a_coil_is_written(
         ("bcd16", "10000", "bcd16"),
         ("string:4", "ABCDE", "string:4"),
         ("string:4", "ü", "can't be encoded in ascii"),
-        ("bytes:4", "AQI", "'AQI' is not a valid bytes:4, allowed is base64"),
+        ("bytes:4", "AQI", "'AQI' is not a valid bytes:4, allowed: base64"),
         ("bytes:4", "AQI=", "bytes:4"),
         ("uint16[2]", "[1]", "uint16[2]"),
-        ("uint16[2]", "1", "'1' is not a valid uint16[2], allowed is a JSON array"),
+        ("uint16[2]", "1", "'1' is not a valid uint16[2], allowed: a JSON array"),
         ("uint16[2]", "[1, 70000]", "70000"),
     ],
 )
@@ -154,7 +154,7 @@ def test_what_is_not_writable_is_not_written(
     unknown = caller.request("modbus.command.c", "1")
     assert unknown["error"] == "no tag 'c'"
     long = caller.request("modbus.command.a", "1" * 101)
-    assert long["error"] == "the value has 101 bytes, allowed are 100"
+    assert long["error"] == "the value has 101 bytes, allowed: 100"
     assert caller.request("modbus.command.a", b"\xff")["error"] == "the value is not UTF-8 text"
 
     # A subscriber that leaves it out does not change it, one that declares it writable does.

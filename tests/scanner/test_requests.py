@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"deviceId": None}, "Expected `str`, got `null` - at `$.deviceId`"),
     ({"deviceId": ""}, "Expected `str` of length >= 1 - at `$.deviceId`"),
-    ({"deviceId": "a\r\nPUB x 0"}, "deviceId is 'a\\r\\nPUB x 0', allowed are printable"),
+    ({"deviceId": "a\r\nPUB x 0"}, "deviceId is 'a\\r\\nPUB x 0', allowed: printable"),
     ({"port": "502.5"}, "Expected `int | null`, got `"),
     ({"port": "0x1f6"}, "Expected `int | null`, got `str` - at `$.port`"),
     ({"port": "1e99"}, "Expected `int"),
@@ -42,7 +42,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"host": None}, "host is missing: give host or url"),
     ({"host": 5}, "Expected `str | null`, got `int` - at `$.host`"),
     ({"port": 0}, "Expected `int` >= 1 - at `$.port`"),
-    ({"url": "tcp://127.0.0.1"}, "both url and host are given, allowed is only one"),
+    ({"url": "tcp://127.0.0.1"}, "both url and host are given, allowed: only one"),
     (
         {"host": None, "port": None, "url": "http://127.0.0.1"},
         "url: 'http://127.0.0.1' is not the URL",
@@ -56,18 +56,18 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"transport": "rtu+tcp", "unitId": 0}, "unitId is 0, which is the broadcast of a serial line"),
     (
         {"transport": "can"},
-        "at `$.transport`, allowed are tcp, tls, udp, rtu+tcp, ascii+tcp, rtu+udp",
+        "at `$.transport`, allowed: tcp, tls, udp, rtu+tcp, ascii+tcp, rtu+udp",
     ),
     ({"byteOrder": "ABDC"}, "tags[0]: order 'ABDC' is unknown, allowed: ABCD"),
     ({"scanRate": 86_400_001}, "scanRate is 86400001, allowed are"),
     ({"scanRate": 100.5}, "Expected `int | null`, got `float` - at `$.scanRate`"),
-    ({"timeout": 5}, "timeout is 5, allowed are 10 to 30000 ms"),
-    ({"publish": "always"}, "at `$.publish`, allowed are scan, change"),
+    ({"timeout": 5}, "timeout is 5, allowed: 10 to 30000 ms"),
+    ({"publish": "always"}, "at `$.publish`, allowed: scan, change"),
     ({"deadband": 1}, 'deadband requires "publish": "change"'),
     ({"deadband": -1, "publish": "change"}, "Expected `float` >= 0.0 - at `$.deadband`"),
     ({"plan": {"max_registers": 126}}, "Expected `int` <= 125 - at `$.plan.max_registers`"),
     ({"plan": {"maxGap": 1}}, "Object contains unknown field `maxGap` - at `$.plan`"),
-    ({"plan": {"readable": [[5, 4]]}}, "plan.readable[0] is [5, 4], allowed are first and last"),
+    ({"plan": {"readable": [[5, 4]]}}, "plan.readable[0] is [5, 4], allowed: first and last"),
     ({"plan": {"readable": [["coil", 4]]}}, "plan.readable[0] is ['coil', 4], allowed are"),
     ({"plan": {"readable": [[1, 2, 3]]}}, "plan.readable[0] is [1, 2, 3], allowed are"),
     ({"plan": {"forbidden": [[0, 9]]}}, "tag 'a' from address 5: plan.forbidden contains 0 to 9"),
@@ -102,7 +102,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ),
     ({"tags": [tag("a", 0, "int8")]}, "tags[0]: type 'int8' is unknown, allowed:"),
     ({"tags": [tag("a", 0, "string:252")]}, "tag 'a': string:252 has 126 registers, one request"),
-    ({"tags": [tag("a", 0, functionCode="coils")]}, "allowed are coil, discrete, holding, input"),
+    ({"tags": [tag("a", 0, functionCode="coils")]}, "allowed: coil, discrete, holding, input"),
     ({"tags": [tag("a", 0, byteOrder="CDABGHEF")]}, "order CDABGHEF is for 8 bytes"),
     ({"tags": [tag("a", 0, null=[70000])]}, "tags[0].null: 70000 is outside 0 to 65535 of uint16"),
     ({"tags": [tag("a", 0, null=["nan"])]}, "tags[0].null: 'nan'"),
@@ -110,8 +110,8 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 ]
 
 SLOPPY: list[tuple[dict[str, Any], str]] = [
-    ({"scanRate": 49}, "scanRate is 49, allowed are 50 to 86400000 ms"),
-    ({"scanRate": 0}, "scanRate is 0, allowed are 50 to 86400000 ms"),
+    ({"scanRate": 49}, "scanRate is 49, allowed: 50 to 86400000 ms"),
+    ({"scanRate": 0}, "scanRate is 0, allowed: 50 to 86400000 ms"),
     ({"port": "502"}, "Expected `int | null`, got `str` - at `$.port`"),
     ({"unitId": "1"}, "Expected `int | null`, got `str` - at `$.unitId`"),
     ({"scanrate": 100}, "Object contains unknown field `scanrate`"),
@@ -208,15 +208,15 @@ def test_limits_are_kept_and_told(
         request = subscription(server, *tags, deviceId=device, subscriberId=who, scanRate=60_000)
         return caller.request("modbus.subscribe", request)
 
-    assert ask("d1", "a", "1", "2", "3", "4")["error"] == "d1 would have 4 tags, allowed are 3"
+    assert ask("d1", "a", "1", "2", "3", "4")["error"] == "d1 would have 4 tags, allowed: 3"
     assert ask("d1", "a", "1", "2")["success"]
     assert ask("d1", "b", "3")["success"]
-    assert ask("d1", "b", "4")["error"] == "d1 would have 4 tags, allowed are 3"
+    assert ask("d1", "b", "4")["error"] == "d1 would have 4 tags, allowed: 3"
     assert ask("d1", "c", "3")["error"] == "d1 already has 2 subscribers, which is the limit"
-    assert ask("d2", "a", "1", "2", "3")["error"] == "there would be 6 tags, allowed are 5"
+    assert ask("d2", "a", "1", "2", "3")["error"] == "there would be 6 tags, allowed: 5"
     assert ask("d2", "a", "1", "2")["success"]
     assert ask("d3", "a", "1")["error"] == "there are already 2 devices, which is the limit"
-    assert "allowed are 2000" in ask("d2", "a", "x" * 2000)["error"]
+    assert "allowed: 2000" in ask("d2", "a", "x" * 2000)["error"]
 
     left = leaving("1", "2", deviceId="d2", subscriberId="a")
     assert caller.request("modbus.unsubscribe", left)["success"]
@@ -237,7 +237,7 @@ def test_hosts_beyond_private_and_loopback_addresses_are_refused_after_they_are_
     for host in ("93.184.216.34", "evil.test", "169.254.169.254", "0.0.0.0", "::ffff:8.8.8.8"):
         answer = caller.request("modbus.subscribe", subscription(server, tag("a", 0), host=host))
         assert f"{host}" in answer["error"]
-        assert "is not allowed, allowed are 127.0.0.0/8, 10.0.0.0/8" in answer["error"]
+        assert "is not allowed, allowed: 127.0.0.0/8, 10.0.0.0/8" in answer["error"]
     missing = subscription(server, tag("a", 0), host="nobody.invalid")
     assert "host nobody.invalid: " in caller.request("modbus.subscribe", missing)["error"]
 
@@ -255,7 +255,7 @@ def test_networks_that_are_given_take_the_place_of_the_private_ones(
 ) -> None:
     run_scanner(allow=("192.0.2.0/24", "2001:db8::/32"))
     answer = caller.request("modbus.subscribe", subscription(server, tag("a", 0)))
-    assert answer["error"] == "127.0.0.1 is not allowed, allowed are 192.0.2.0/24, 2001:db8::/32"
+    assert answer["error"] == "127.0.0.1 is not allowed, allowed: 192.0.2.0/24, 2001:db8::/32"
     for host in ("192.0.2.7", "2001:db8::7", "::ffff:192.0.2.8"):
         request = subscription(server, tag("a", 0), host=host, deviceId=host)
         assert caller.request("modbus.subscribe", request)["success"]
@@ -358,9 +358,7 @@ def test_serial_devices_beside_networks(caller: Caller) -> None:
         caller.do(allowed.address(SerialTarget("rtu", "/etc/passwd")))
     device = NetworkTarget("tcp", "10.1.2.3", 502)
     assert caller.do(allowed.address(device)) == device
-    with pytest.raises(
-        Refused, match=r"10\.1\.2\.3 is not allowed, allowed are serial devices only"
-    ):
+    with pytest.raises(Refused, match=r"10\.1\.2\.3 is not allowed, allowed: serial devices only"):
         caller.do(Allowed(line_only).address(device))
 
 

@@ -195,7 +195,7 @@ def test_a_write_outside_the_allow_list_is_impossible(
 ) -> None:
     run_scanner(allow=("192.0.2.0/24",))
     answer = caller.request("modbus.subscribe", plc_subscribe(server, plc_tag("a", 0)))
-    assert answer["error"] == "127.0.0.1 is not allowed, allowed are 192.0.2.0/24"
+    assert answer["error"] == "127.0.0.1 is not allowed, allowed: 192.0.2.0/24"
     assert caller.request("modbus.command.a", "1") == {"success": False, "error": "no tag 'a'"}
 
 

@@ -387,7 +387,7 @@ def test_the_key_and_the_value_must_name_the_same_subscription(
     caller.put(BUCKET, key("plc2"), gateway_entry(server, gateway_tag("a", 0)))
     wire.until(lambda: key("plc2") in refused(caller), "it is refused")
     assert refused(caller)[key("plc2")] == (
-        "the key is 'gateway-gateway.plc2', allowed is SUBSCRIBER.DEVICE of its value: "
+        "the key is 'gateway-gateway.plc2', allowed: SUBSCRIBER.DEVICE of its value: "
         "'gateway-gateway.plc1'"
     )
     assert devices(caller) == {}
@@ -530,9 +530,9 @@ def test_commands_are_json(
     [
         (command(12.7), "'12.7' is not a valid uint16"),
         (command(70_000), "70000 is outside 0 to 65535 of uint16"),
-        (command(True), "'true' is not a valid uint16, allowed is a JSON number"),
-        (command(None), "the value is null, allowed are numbers, booleans, texts and arrays"),
-        (command({"a": 1}), "the value is an object, allowed are numbers, booleans, texts and"),
+        (command(True), "'true' is not a valid uint16, allowed: a JSON number"),
+        (command(None), "the value is null, allowed: numbers, booleans, texts and arrays"),
+        (command({"a": 1}), "the value is an object, allowed: numbers, booleans, texts and"),
         ('{"values":1}', "Object missing required field `value`, allowed is"),
         ("seven", "not JSON: "),
         ('{"value":', "not JSON: "),
@@ -671,7 +671,7 @@ def test_an_unknown_number_of_a_function_is_not_guessed() -> None:
 
 
 def test_a_request_that_is_too_large_is_refused() -> None:
-    with pytest.raises(Refused, match="has 13 bytes, allowed are 12"):
+    with pytest.raises(Refused, match="has 13 bytes, allowed: 12"):
         tentacle_next.request(b'{"tags":null}', 12)
 
 

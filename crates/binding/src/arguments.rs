@@ -12,7 +12,7 @@ use pyo3::prelude::*;
 pub fn within(what: &str, found: i128, allowed: RangeInclusive<usize>) -> PyResult<usize> {
     usize::try_from(found).ok().filter(|number| allowed.contains(number)).ok_or_else(|| {
         let (least, most) = (allowed.start(), allowed.end());
-        PyValueError::new_err(format!("{what} is {found}, allowed are {least} to {most}"))
+        PyValueError::new_err(format!("{what} is {found}, allowed: {least} to {most}"))
     })
 }
 
@@ -21,7 +21,7 @@ pub fn byte(what: &str, found: i128) -> PyResult<u8> {
 }
 
 pub fn unknown(what: &str, found: &str, allowed: &str) -> PyErr {
-    PyValueError::new_err(format!("{what} is {found:?}, allowed are {allowed}"))
+    PyValueError::new_err(format!("{what} is {found:?}, allowed: {allowed}"))
 }
 
 /// Parses a network or a single address.

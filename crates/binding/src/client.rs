@@ -172,7 +172,7 @@ impl Request {
         #[pyo3(from_py_with = integer)] object_id: i128,
     ) -> PyResult<Request> {
         let code = ReadCode::from_code(byte("code", code)?)
-            .ok_or_else(|| PyValueError::new_err(format!("code is {code}, allowed are 1 to 4")))?;
+            .ok_or_else(|| PyValueError::new_err(format!("code is {code}, allowed: 1 to 4")))?;
         let object_id = byte("object id", object_id)?;
         Ok(encoded(&CoreRequest::ReadDeviceIdentification { code, object_id }))
     }
@@ -202,7 +202,7 @@ impl Endpoint {
             "rtu+udp" => Place::RtuOverUdp { host, port },
             _ => {
                 let allowed = "tcp, rtu+tcp, ascii+tcp, udp, rtu+udp";
-                let message = format!("transport is {transport:?}, allowed are {allowed}");
+                let message = format!("transport is {transport:?}, allowed: {allowed}");
                 return Err(PyValueError::new_err(message));
             }
         };

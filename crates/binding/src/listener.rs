@@ -201,7 +201,7 @@ impl Listener {
             }
             Some(_) => {
                 let message =
-                    "raw_ingest: allowed is a Raw Ingest listener, with framing mbap and no tls";
+                    "raw_ingest takes a Raw Ingest listener, with framing mbap and no tls";
                 return Err(PyValueError::new_err(message));
             }
         };

@@ -302,7 +302,7 @@ impl Range {
 pub fn named(area: &str) -> PyResult<Area> {
     Area::from_name(area).ok_or_else(|| {
         let known = Area::ALL.map(Area::name).join(", ");
-        PyValueError::new_err(format!("unknown area {area:?}, allowed are {known}"))
+        PyValueError::new_err(format!("unknown area {area:?}, allowed: {known}"))
     })
 }
 
@@ -313,7 +313,7 @@ fn gate(seal: Seal) -> PyResult<Gate> {
             "once" => (area, address, GateMode::Once),
             "level" => (area, address, GateMode::Level),
             _ => {
-                let message = format!("unknown seal mode {mode:?}, allowed are once, level");
+                let message = format!("unknown seal mode {mode:?}, allowed: once, level");
                 return Err(PyValueError::new_err(message));
             }
         },
@@ -329,7 +329,7 @@ fn out_of_range(memory: &Core, area: Area, address: i128, count: i128) -> PyErr 
         0 => format!("{name}: {found}, but this memory has no {name}"),
         _ => {
             let last = span.end() - 1;
-            format!("{name}: {found}, allowed are addresses {} to {last}", span.start())
+            format!("{name}: {found}, allowed: addresses {} to {last}", span.start())
         }
     })
 }
@@ -407,7 +407,7 @@ fn is_numpy_bool(value: &Bound<'_, PyAny>) -> bool {
 fn number(area: Area, index: usize, value: &Bound<'_, PyAny>) -> PyResult<u16> {
     item(area, value).or_else(|unfit| {
         let allowed = if area.is_bits() { "0, 1, False, True" } else { "integers 0 to 65535" };
-        let message = format!("values[{index}] is {}, allowed are {allowed}", value.repr()?);
+        let message = format!("values[{index}] is {}, allowed: {allowed}", value.repr()?);
         Err(match unfit {
             Unfit::Value => PyValueError::new_err(message),
             Unfit::Type => PyTypeError::new_err(message),

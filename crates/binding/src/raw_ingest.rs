@@ -67,7 +67,7 @@ fn item(area: Area, index: usize, value: &Bound<'_, PyAny>) -> PyResult<u16> {
     memory::item(area, value).or_else(|unfit| {
         let allowed = if area.is_bits() { "0, 1, False, True" } else { "integers 0 to 65535" };
         let shown = value.py().import("reprlib")?.call_method1("repr", (value,))?;
-        let message = format!("values[{index}] is {shown}, allowed are {allowed}");
+        let message = format!("values[{index}] is {shown}, allowed: {allowed}");
         Err(match unfit {
             Unfit::Value => PyValueError::new_err(message),
             Unfit::Type => PyTypeError::new_err(message),

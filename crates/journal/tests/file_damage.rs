@@ -203,7 +203,7 @@ fn files_of_newer_releases_are_refused() {
         assert_eq!(found.get("format").unwrap().unwrap().value(), version);
     };
     set_version(2);
-    let expected = "the file has format version 2, allowed is 1: it is of a newer release";
+    let expected = "the file is of a newer release: its format version is 2, allowed: 1";
     assert_eq!(refusal(&path), expected);
     set_version(0);
     assert!(refusal(&path).contains("damaged"));

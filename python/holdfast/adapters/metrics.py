@@ -139,7 +139,7 @@ class Metrics:
         elif scope["method"] == "OPTIONS":
             await respond(send, 204, [ALLOWED, *SAFE])
         elif scope["method"] not in ("GET", "HEAD"):
-            headers, body = rejection("method_not_allowed", "allowed are GET, HEAD, OPTIONS")
+            headers, body = rejection("method_not_allowed", "allowed: GET, HEAD, OPTIONS")
             await respond(send, 405, [*headers, ALLOWED], body)
         elif path == PATH:
             await self._export(scope, send)

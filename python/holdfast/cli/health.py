@@ -120,7 +120,7 @@ def _checked(url: str) -> str:
     except ValueError:
         valid = False
     if not valid or parts.path not in ("", "/") or parts.query or parts.fragment or parts.username:
-        allowed = "allowed is http://HOST:PORT or https://HOST:PORT"
+        allowed = "allowed: http://HOST:PORT or https://HOST:PORT"
         raise click.BadParameter(f"found {url!r}, {allowed}.", param_hint="'--url'")
     return url.removesuffix("/")
 

@@ -182,7 +182,7 @@ class App:
             methods = "GET, HEAD, OPTIONS"
         request.more_headers.append((b"allow", methods.encode()))
         if request.method != "OPTIONS":
-            raise BadRequest("method_not_allowed", f"Method not allowed: allowed are {methods}")
+            raise BadRequest("method_not_allowed", f"Method not allowed; allowed: {methods}")
         await respond(send, 204, [*SAFE, *request.more_headers])
 
     async def _refuse(self, request: Request, send: Send, unfit: BadRequest) -> None:

@@ -54,7 +54,7 @@ class Field:
         if flaw is None and self.fits(value):
             return value
         if self.allowed:
-            flaw = f" is {told(value)}, allowed is {self.allowed}"
+            flaw = f" is {told(value)}, allowed: {self.allowed}"
         raise malformed(f"{self.name}{flaw}" if self.refusal is None else self.refusal(value))
 
     def read(self, text: str) -> Any:
@@ -219,7 +219,7 @@ def filled(given: Mapping[str, Any], fields: Sequence[Field]) -> dict[str, Any]:
     names = [field.name for field in fields]
     for name in given:
         if name not in names:
-            raise malformed(f"{shown(name)} is not a parameter, allowed are {', '.join(names)}")
+            raise malformed(f"{shown(name)} is not a parameter, allowed: {', '.join(names)}")
     return {
         field.name: field.check(given[field.name]) if field.name in given else field.default
         for field in fields
@@ -234,13 +234,13 @@ def _flaw(value: Any, schema: Schema) -> str | None:
     if "enum" in schema:
         allowed = schema["enum"]
         fits = any(type(value) is type(each) and value == each for each in allowed)
-        return None if fits else f" is {told(value)}, allowed are {_words(allowed)}"
+        return None if fits else f" is {told(value)}, allowed: {_words(allowed)}"
     if kind == "integer":
         least, most = schema["minimum"], schema["maximum"]
         fits = type(value) is int and least <= value <= most
-        return None if fits else f" is {told(value)}, allowed is an integer {least} to {most}"
+        return None if fits else f" is {told(value)}, allowed: an integer {least} to {most}"
     if kind == "boolean":
-        return None if type(value) is bool else f" is {told(value)}, allowed are true and false"
+        return None if type(value) is bool else f" is {told(value)}, allowed: true and false"
     if kind != "string":
         return None
     fits = isinstance(value, str) and re.fullmatch(schema.get("pattern", ".*"), value) is not None
@@ -251,10 +251,10 @@ def _flaw(value: Any, schema: Schema) -> str | None:
 
 def _flaw_of_array(value: Any, schema: Schema) -> str | None:
     if not isinstance(value, list):
-        return f" is {told(value)}, allowed is an array"
+        return f" is {told(value)}, allowed: an array"
     least, most = schema["minItems"], schema["maxItems"]
     if not least <= len(value) <= most:
-        return f" has {len(value)} elements, allowed are {least} to {most}"
+        return f" has {len(value)} elements, allowed: {least} to {most}"
     if schema.get("uniqueItems") and any(value.count(each) > 1 for each in value):
         return " has duplicate elements"
     for index, item in enumerate(value):

@@ -9,7 +9,7 @@ REFUSALS = Refusals(
         400,
         ("malformed",),
         "The request is malformed",
-        "port is 0, allowed is an integer 1 to 65535",
+        "port is 0, allowed: an integer 1 to 65535",
     ),
     Refusal(
         401,
@@ -29,7 +29,7 @@ REFUSALS = Refusals(
         405,
         ("method_not_allowed",),
         "The resource does not support this method",
-        "Method not allowed: allowed are POST, OPTIONS",
+        "Method not allowed; allowed: POST, OPTIONS",
     ),
     Refusal(
         408,
@@ -48,7 +48,7 @@ REFUSALS = Refusals(
         ("not_json",),
         "The body is not `application/json` or `application/x-www-form-urlencoded`, or is "
         "compressed",
-        'Content-Type is "text/plain", allowed is application/json',
+        'Content-Type is "text/plain", allowed: application/json',
     ),
     Refusal(
         503,

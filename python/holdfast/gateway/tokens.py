@@ -42,14 +42,14 @@ def load(file: Path) -> list[Token]:
                 raise WrongTokens(f"{file}:{number}: duplicate name or token")
         tokens.append(token)
     if not tokens:
-        raise WrongTokens(f"{file}: no token, allowed are lines {FORM}")
+        raise WrongTokens(f"{file}: no token, allowed: lines {FORM}")
     return tokens
 
 
 def _token(words: list[str], number: int) -> Token:
     *names, digest = words
     if len(names) > 1 or not _HASH.fullmatch(digest):
-        raise ValueError(f"no token, allowed is {FORM}")
+        raise ValueError(f"no token, allowed: {FORM}")
     name = names[0] if names else f"token-{number}"
     if not is_name(name):
         raise ValueError(f"the name of a token is {NAME_FORM}")

@@ -82,7 +82,7 @@ async def _write_register(given: Given, device: RequestedDevice) -> Answer:
 async def _write_registers(given: Given, device: RequestedDevice) -> Answer:
     address, values = given["address"], _registers(given)
     if len(values) > WRITE_REGISTERS:
-        raise malformed(f"{len(values)} registers, allowed are {WRITE_REGISTERS} in a request")
+        raise malformed(f"{len(values)} registers, allowed: {WRITE_REGISTERS} in a request")
     _check_end(address, len(values))
     await device.ask(lambda client: client.write_registers(address, values, unit=device.unit))
     return _written(device, address, len(values))

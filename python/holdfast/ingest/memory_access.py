@@ -362,7 +362,7 @@ class MemoryAccess:
         if memory not in grant.memories:
             detail = f"memory {memory} is not granted to {grant.name}"
         elif area not in AREAS:
-            detail = f"area is {_shown(area)}, allowed are {', '.join(AREAS)}"
+            detail = f"area is {_shown(area)}, allowed: {', '.join(AREAS)}"
             raise Refused("invalid_area", f"{of}{detail}", **where)
         else:
             detail = f"area {area} is not granted to {grant.name}"
@@ -410,9 +410,9 @@ class MemoryAccess:
         if addresses is None:
             allowed = f"but {memory} has no {area}"
         elif address in addresses:
-            allowed = f"allowed are 1 to {addresses.stop - address}"
+            allowed = f"allowed: 1 to {addresses.stop - address}"
         else:
-            allowed = f"allowed are addresses {addresses.start} to {addresses.stop - 1}"
+            allowed = f"allowed: addresses {addresses.start} to {addresses.stop - 1}"
         found = f"{_of(index)}{count} from address {_shown(address)} of {area}"
         where = _where(index, memory, area, address)
         return Refused("out_of_range", f"{found}, {allowed}", **where)
@@ -430,7 +430,7 @@ def _keys_wrong(command: Mapping[str, object]) -> str:
     if unknown:
         return f"has the unknown key {_shown(unknown[0])}"
     if "values" in command and "bools" in command:
-        return "has both values and bools, allowed is only one"
+        return "has both values and bools, allowed: only one"
     missing = [key for key in ("memory", "area", "address", "values") if key not in command]
     return f"lacks {missing[0]}"
 

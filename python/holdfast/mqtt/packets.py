@@ -76,7 +76,7 @@ def parse_publish(flags: int, body: bytes | bytearray, length: int, *, five: boo
 def _properties(view: memoryview, size: int) -> dict[int, bytes]:
     """Returns the last value of each length-prefixed property."""
     if size > MAX_PROPERTIES:
-        raise ValueError(f"{size} bytes, allowed are {MAX_PROPERTIES}")
+        raise ValueError(f"{size} bytes, allowed: {MAX_PROPERTIES}")
     if len(view) < size:
         raise ValueError("cut off")
     found = {}

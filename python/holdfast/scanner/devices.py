@@ -90,7 +90,7 @@ def _ranges(where: str, ranges: Iterable[Range]) -> Iterable[tuple[Area, int, in
         *area, start, end = given
         addresses = isinstance(start, int) and isinstance(end, int) and start <= end
         if not addresses or any(word not in AREA_OF_CODE for word in area):
-            allowed = "allowed are first and last address, with an optional area before them"
+            allowed = "allowed: first and last address, with an optional area before them"
             raise Refused(f"{where}[{index}] is {given}, {allowed}")
         assert isinstance(start, int)
         assert isinstance(end, int)

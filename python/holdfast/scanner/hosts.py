@@ -70,4 +70,4 @@ class Allowed:
             told = f" ({', '.join(error.found)})" if error.found else ""
             networks = ", ".join(str(each.network) for each in self._list.networks)
             allowed = networks or "serial devices only"
-            raise Refused(f"{host}{told} is not allowed, allowed are {allowed}") from None
+            raise Refused(f"{host}{told} is not allowed, allowed: {allowed}") from None

@@ -413,7 +413,7 @@ def decode(data: bytes, kind: type[Asked], most: int) -> Asked:
 def check_size(data: bytes, most: int) -> None:
     """Raises `Refused` for a request of more than `most` bytes."""
     if len(data) > most:
-        raise Refused(f"the request has {len(data)} bytes, allowed are {most}")
+        raise Refused(f"the request has {len(data)} bytes, allowed: {most}")
 
 
 def converted(value: object, kind: type[Asked]) -> Asked:
@@ -440,5 +440,5 @@ def _explained(text: str) -> str:
     if "enum" in text:
         for key, words in CHOICES.items():
             if f".{key}`" in text:
-                return f"{text}, allowed are {', '.join(words)}"
+                return f"{text}, allowed: {', '.join(words)}"
     return text

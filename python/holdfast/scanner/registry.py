@@ -146,7 +146,7 @@ def _wanted(entry: TagRequest) -> Wanted:
 def _check_id(id: str) -> None:
     """Checks a device id, which becomes a part of subjects. Raises `Refused`."""
     if not id.isprintable():
-        raise Refused(f"deviceId is {id!r}, allowed are printable characters and blanks")
+        raise Refused(f"deviceId is {id!r}, allowed: printable characters and blanks")
 
 
 def _rate(request: SubscribeRequest, rules: Rules, changes: Adjustments) -> int:
@@ -164,12 +164,12 @@ def _target(request: SubscribeRequest) -> Target:
     beside = [key for key in ("host", "port", "transport") if getattr(request, key) is not None]
     if request.url is not None:
         if beside:
-            raise Refused(f"both url and {beside[0]} are given, allowed is only one")
+            raise Refused(f"both url and {beside[0]} are given, allowed: only one")
         try:
             parts = urlsplit(request.url)
             for key in dict(parse_qsl(parts.query, keep_blank_values=True)):
                 if parts.scheme == "tls" and key != "name" and key not in asdict(STRICT):
-                    allowed = "allowed are name and the tolerance options; files are the scanner's"
+                    allowed = "allowed: name and the tolerance options; files are the scanner's"
                     raise Refused(f"url: {key} is given, {allowed}")
             return urls.parse(request.url)
         except ValueError as error:
@@ -185,7 +185,7 @@ def _target(request: SubscribeRequest) -> Target:
 
 def _within(key: str, value: int, least: int, most: int) -> int:
     if not least <= value <= most:
-        raise Refused(f"{key} is {value}, allowed are {least} to {most} ms")
+        raise Refused(f"{key} is {value}, allowed: {least} to {most} ms")
     return value
 
 
@@ -395,11 +395,9 @@ class Registry:
             )
         tags = new + (0 if device is None else len(device.tags))
         if tags > limits.device_tags:
-            raise Refused(
-                f"{asked.device} would have {tags} tags, allowed are {limits.device_tags}"
-            )
+            raise Refused(f"{asked.device} would have {tags} tags, allowed: {limits.device_tags}")
         if self._tags + new > limits.tags:
-            raise Refused(f"there would be {self._tags + new} tags, allowed are {limits.tags}")
+            raise Refused(f"there would be {self._tags + new} tags, allowed: {limits.tags}")
 
 
 def _replaces(device: ScannedDevice, asked: Subscription) -> bool:
@@ -447,7 +445,7 @@ def _check_tag_names(known: Iterable[str], asked: Subscription) -> None:
     names = {next_name(id): id for id in known}
     for id in asked.tags:
         if not id.isprintable():
-            raise Refused(f"the tag id is {id!r}, allowed are printable characters and blanks")
+            raise Refused(f"the tag id is {id!r}, allowed: printable characters and blanks")
         other = names.setdefault(next_name(id), id)
         if other != id:
             raise Refused(

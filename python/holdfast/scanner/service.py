@@ -750,7 +750,7 @@ class Scanner:
         name = name.removeprefix("module.").removeprefix("command.")
         most = self._settings.limits.command
         if len(message.data) > most:
-            raise Refused(f"the value has {len(message.data)} bytes, allowed are {most}")
+            raise Refused(f"the value has {len(message.data)} bytes, allowed: {most}")
         try:
             text = message.data.decode()
         except UnicodeDecodeError:

@@ -24,7 +24,7 @@ TAG_DEFAULTS = {"functionCode": "holding", "datatype": "uint16"}
 REGISTER_KEYS = {"tag": "id", "modbusDatatype": "datatype"}
 """The keys of `registers`, which its PLC library sends instead of `tags`."""
 
-COMMAND_FORM = 'allowed is {"value": …} or a JSON value'
+COMMAND_FORM = 'allowed: {"value": …} or a JSON value'
 
 
 class _Command(msgspec.Struct):
@@ -82,7 +82,7 @@ def command(data: bytes) -> str:
         raise Refused(f"not JSON: {error}; {COMMAND_FORM}") from None
     if value is None or type(value) is dict:
         found = "null" if value is None else "an object"
-        raise Refused(f"the value is {found}, allowed are numbers, booleans, texts and arrays")
+        raise Refused(f"the value is {found}, allowed: numbers, booleans, texts and arrays")
     return value if type(value) is str else raw.decode()
 
 
@@ -90,6 +90,6 @@ def check_entry(key: str, request: SubscribeRequest) -> None:
     """Checks what only entries of the bucket must fulfil. Raises `Refused`."""
     named = f"{request.subscriber_id}.{request.device_id}"
     if key != named:
-        raise Refused(f"the key is {key!r}, allowed is SUBSCRIBER.DEVICE of its value: {named!r}")
+        raise Refused(f"the key is {key!r}, allowed: SUBSCRIBER.DEVICE of its value: {named!r}")
     if request.ttl is not None:
         raise Refused("ttl is given; an entry lasts until it is deleted")

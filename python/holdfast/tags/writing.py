@@ -57,13 +57,13 @@ def from_text(text: str, type: Type, named: str) -> Any:
 def _boolean(text: str, named: str) -> bool:
     found = BOOLEANS.get(text.strip().lower())
     if found is None:
-        raise ValueError(f"{_shown(text)} is not a valid {named}, allowed are true, false, 1 and 0")
+        raise ValueError(f"{_shown(text)} is not a valid {named}, allowed: true, false, 1 and 0")
     return found
 
 
 def _number(text: str, named: str, is_float: bool) -> int | float:
     if _NUMBER.fullmatch(text) is None:
-        raise ValueError(f"{_shown(text)} is not a valid {named}, allowed is a JSON number")
+        raise ValueError(f"{_shown(text)} is not a valid {named}, allowed: a JSON number")
     if is_float:
         number = float(text)
         if math.isinf(number):
@@ -79,7 +79,7 @@ def _bytes(text: str, named: str) -> bytes:
     try:
         return base64.b64decode(text.strip(), validate=True)
     except (binascii.Error, ValueError):
-        raise ValueError(f"{_shown(text)} is not a valid {named}, allowed is base64") from None
+        raise ValueError(f"{_shown(text)} is not a valid {named}, allowed: base64") from None
 
 
 def _array(text: str, type: Type, named: str) -> list[Any]:
@@ -88,7 +88,7 @@ def _array(text: str, type: Type, named: str) -> list[Any]:
     except (msgspec.DecodeError, RecursionError):
         items = None
     if not isinstance(items, list):
-        raise ValueError(f"{_shown(text)} is not a valid {named}, allowed is a JSON array")
+        raise ValueError(f"{_shown(text)} is not a valid {named}, allowed: a JSON array")
     if type.base == "bytes":
         return [_bytes(item, named) if isinstance(item, str) else item for item in items]
     return items

@@ -84,7 +84,7 @@ class Request:
         form = _JSON_WITH_PARAMETERS if parameters else _JSON
         if (kind is None or not form.fullmatch(kind)) and (kind or b"") not in also:
             raise BadRequest(
-                "not_json", f"Content-Type is {_found(kind)}, allowed is application/json"
+                "not_json", f"Content-Type is {_found(kind)}, allowed: application/json"
             )
         coding = self.header(b"content-encoding")
         if coding is not None and coding.lower() != b"identity":

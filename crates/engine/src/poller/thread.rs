@@ -48,7 +48,7 @@ pub enum PollerError {
     Offset { device: String, forward: usize, read: usize },
     #[error("device {device}: the status block of forward {forward} ends beyond address 65535")]
     ForwardedStatus { device: String, forward: usize },
-    #[error("device {device}: max_{items} is {found}, allowed are 1 to {most}")]
+    #[error("device {device}: max_{items} is {found}, allowed: 1 to {most}")]
     Limit { device: String, items: &'static str, found: u16, most: u16 },
     #[error("device {device}: the name is already in use")]
     Taken { device: String },
@@ -739,11 +739,11 @@ mod tests {
     #[test]
     fn limits_above_those_of_a_request_are_refused() {
         for limit in [0, 126, u16::MAX] {
-            let expected = format!("device meter: max_registers is {limit}, allowed are 1 to 125");
+            let expected = format!("device meter: max_registers is {limit}, allowed: 1 to 125");
             assert_eq!(refused(|device| device.limits.max_registers = limit), expected);
         }
         for limit in [0, 2001] {
-            let expected = format!("device meter: max_bits is {limit}, allowed are 1 to 2000");
+            let expected = format!("device meter: max_bits is {limit}, allowed: 1 to 2000");
             assert_eq!(refused(|device| device.limits.max_bits = limit), expected);
         }
     }

@@ -17,7 +17,7 @@ pub enum FileError {
     Locked,
     #[error("not a file of memories: {0}")]
     Foreign(String),
-    #[error("the file has format version {found}, allowed is {allowed}: it is of a newer release")]
+    #[error("the file is of a newer release: its format version is {found}, allowed: {allowed}")]
     Newer { found: u64, allowed: u64 },
     #[error("{0}")]
     Io(#[from] io::Error),

@@ -109,7 +109,7 @@ impl Settings {
         for (what, name) in [("name", &self.name), ("node", &self.node)] {
             if !is_word(name) {
                 return refused(format!(
-                    "{what} is {name:?}, allowed are 1 to {MAX_NAME} letters, digits, - and _"
+                    "{what} is {name:?}, allowed: 1 to {MAX_NAME} letters, digits, - and _"
                 ));
             }
         }
@@ -117,7 +117,7 @@ impl Settings {
             return refused("servers are empty, at least one URL is required".to_owned());
         }
         if !matches!(self.replicas, 1 | 3 | 5) {
-            return refused(format!("replicas is {}, allowed are 1, 3, 5", self.replicas));
+            return refused(format!("replicas is {}, allowed: 1, 3, 5", self.replicas));
         }
         for (what, found) in [
             ("snapshot_steps", self.snapshot_steps),

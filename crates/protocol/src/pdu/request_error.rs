@@ -10,13 +10,13 @@ use super::SubFunction;
 /// use holdfast_protocol::pdu::BitRange;
 ///
 /// let error = BitRange::new(0, 2001).unwrap_err();
-/// assert_eq!(error.to_string(), "quantity is 2001, allowed are 1 to 2000");
+/// assert_eq!(error.to_string(), "quantity is 2001, allowed: 1 to 2000");
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Error)]
 #[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
 pub enum RequestError {
     /// The quantity is 0, or beyond the limit of the function.
-    #[error("quantity is {found}, allowed are 1 to {max}")]
+    #[error("quantity is {found}, allowed: 1 to {max}")]
     Quantity {
         /// The quantity that was given.
         found: usize,

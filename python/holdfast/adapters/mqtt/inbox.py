@@ -66,7 +66,7 @@ def _refused_unread(message: Publish, grant: Grant) -> Refused | None:
     if grant is _NOBODY:
         return Refused("not_granted", "no configured subscription matches this topic")
     if message.size > MAX_BYTES:
-        return Refused("too_large", f"{message.size} bytes, allowed are {MAX_BYTES}")
+        return Refused("too_large", f"{message.size} bytes, allowed: {MAX_BYTES}")
     if message.problem is not None:
         return Refused("malformed", message.problem)
     return None

@@ -38,7 +38,7 @@ class Value:
         """The command that writes a payload. Raises `BadValue`."""
         try:
             if len(payload) > MAX_BYTES:
-                raise ValueError(f"{len(payload)} bytes, allowed are {MAX_BYTES}")
+                raise ValueError(f"{len(payload)} bytes, allowed: {MAX_BYTES}")
             text = bytes(payload).decode()
             values = self._codec.encode(self._tag.raw(value_from(self._tag, text)))
         except UnicodeDecodeError:

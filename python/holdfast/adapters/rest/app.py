@@ -158,7 +158,7 @@ class App:
         request.more_headers.append((b"allow", methods.encode()))
         if method == "OPTIONS":
             return JSON, b""
-        raise Declined("method_not_allowed", f"allowed are {methods}")
+        raise Declined("method_not_allowed", f"allowed: {methods}")
 
     async def _refuse(self, request: Request, refused: Refused, send: Send) -> None:
         """Sends the refusal, and counts it unless the memory access has."""
@@ -282,11 +282,11 @@ def _given(query: bytes, parameters: Sequence[Parameter]) -> dict[str, Any]:
     try:
         pairs = parse_qsl(query.decode("latin-1"), keep_blank_values=True, max_num_fields=most)
     except ValueError:
-        raise _malformed(f"more than {most} parameters, allowed are {names}") from None
+        raise _malformed(f"more than {most} parameters, allowed: {names}") from None
     given: dict[str, list[str]] = {}
     for name, value in pairs:
         if name not in known:
-            raise _malformed(f"{shown(name)} is not a parameter, allowed are {names}")
+            raise _malformed(f"{shown(name)} is not a parameter, allowed: {names}")
         values = given.setdefault(name, [])
         values.append(value)
         if len(values) > known[name].most:
@@ -304,9 +304,9 @@ def _ranges(given: Mapping[str, Any]) -> list[tuple[str, int, int]]:
     areas, addresses, counts = (given[key] for key in ("area", "address", "count"))
     if not len(areas) == len(addresses) == len(counts):
         found = f"{len(areas)} area, {len(addresses)} address and {len(counts)} count"
-        raise _malformed(f"the query has {found}, allowed is the same number of each")
+        raise _malformed(f"the query has {found}, allowed: the same number of each")
     if sum(counts) > MAX_VALUES:
-        raise _malformed(f"the ranges have {sum(counts)} values, allowed are {MAX_VALUES}")
+        raise _malformed(f"the ranges have {sum(counts)} values, allowed: {MAX_VALUES}")
     return list(zip(areas, addresses, counts, strict=True))
 
 

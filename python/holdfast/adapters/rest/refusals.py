@@ -34,7 +34,7 @@ REFUSALS = Refusals(
         405,
         ("method_not_allowed",),
         "The resource does not support this method",
-        "allowed are POST, OPTIONS",
+        "allowed: POST, OPTIONS",
     ),
     Refusal(
         408,
@@ -77,7 +77,7 @@ REFUSALS = Refusals(
         415,
         ("not_json",),
         "The body is not `application/json`, or is compressed",
-        'Content-Type is "text/plain", allowed is application/json',
+        'Content-Type is "text/plain", allowed: application/json',
     ),
 )
 

@@ -69,7 +69,7 @@ class Parameter:
         if re.fullmatch(form, given) and least <= convert(given) <= most:
             return convert(given)
         named = "an integer" if kind == "integer" else "a number"
-        allowed = f"allowed is {named} from {least} to {most}"
+        allowed = f"allowed: {named} from {least} to {most}"
         raise BadRequest("malformed", f"{self.name} is {shown(given)}, {allowed}")
 
     def described(self) -> Schema:
