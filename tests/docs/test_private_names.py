@@ -39,7 +39,10 @@ VARIABLES = {
         "server_state": "uvicorn.server.ServerState",
     },
     "scanner/receiving.py": {"nc": "nats.aio.client.Client"},
-    "scanner/wire.py": {"client": "nats.aio.client.Client"},
+    "scanner/wire.py": {
+        "client": "nats.aio.client.Client",
+        "transport": "nats.aio.transport.TcpTransport",
+    },
 }
 """What variables hold that a file takes private names of, by their names."""
 

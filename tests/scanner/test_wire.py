@@ -13,6 +13,7 @@ from nats.errors import ProtocolError
 
 from holdfast.scanner import wire
 from holdfast.scanner.messages import Answer
+from holdfast.scanner.outbox import Outbox
 from holdfast.scanner.receiving import SafeClient
 from support.nats_bus import Caller
 from support.wire import until as wire_until
@@ -64,6 +65,48 @@ def test_what_waits_when_the_connection_breaks_goes_with_the_next(own_nats: Nats
         caller.do(wire.send(caller.client, wire.text("wire.a", b"1") * 10, 10))
         own_nats.start()
         assert [inbox.next() for _ in range(10)] == [1] * 10
+
+
+def test_what_a_node_may_send_is_sent_before_anything_else_runs(caller: Caller) -> None:
+    """What waits in a process that is stopped would be sent when it goes on, by a former owner."""
+    left: list[int] = []
+
+    async def work() -> None:
+        loop = asyncio.get_running_loop()
+
+        def may_send() -> bool:
+            loop.call_soon(lambda: left.append(wire.unsent(caller.client)))
+            return True
+
+        outbox = Outbox(may_send=may_send, at_once=True)
+        outbox.connected(caller.client)
+        running = asyncio.create_task(outbox.run())
+        for number in range(100):
+            outbox.put([("a", wire.text("wire.a", b"%d" % number))])
+            while outbox.sent <= number:
+                await asyncio.sleep(0)
+        running.cancel()
+
+    inbox = caller.listen("wire.>")
+    caller.do(work())
+    assert [inbox.next() for _ in range(100)] == list(range(100))
+    assert left == [0] * 100
+
+
+def test_a_node_waits_for_what_its_client_has_not_sent(caller: Caller) -> None:
+    async def work() -> None:
+        outbox = Outbox(at_once=True)
+        outbox.connected(caller.client)
+        running = asyncio.create_task(outbox.run())
+        await caller.client.publish("wire.a", b"1")
+        outbox.put([("a", wire.text("wire.a", b"2"))])
+        while not outbox.sent:
+            await asyncio.sleep(0)
+        running.cancel()
+
+    inbox = caller.listen("wire.>")
+    caller.do(work())
+    assert [inbox.next() for _ in range(2)] == [1, 2]
 
 
 class _Heard(SafeClient):

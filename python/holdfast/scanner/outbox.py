@@ -43,13 +43,15 @@ class Outbox:
         *,
         may_send: Callable[[], bool] = lambda: True,
         lost: Callable[[], None] = lambda: None,
+        at_once: bool = False,
     ) -> None:
         """While `may_send` returns false, messages are dropped, and `lost` is called.
 
-        It is asked before each sending.
+        It is asked before each sending. With `at_once`, nothing waits in this process afterwards.
         """
         self._may_send = may_send
         self._lost = lost
+        self._at_once = at_once
         self._client: Client | None = None
         self._flowing: list[bytes] = []
         self._size = 0
@@ -99,7 +101,7 @@ class Outbox:
                     self._kept.clear()
                     self._lost()
                     continue
-                if not self._takes():
+                if not self._takes() or (self._at_once and wire.unsent(self._client) > 0):
                     await asyncio.sleep(CHECK_INTERVAL)
                     continue
                 await self._send(self._client)
@@ -118,7 +120,10 @@ class Outbox:
         if not texts:
             texts = self._oldest()
         self.sent += len(texts)
-        await wire.send(client, b"".join(texts), len(texts))
+        if self._at_once:
+            wire.send_at_once(client, b"".join(texts), len(texts))
+        else:
+            await wire.send(client, b"".join(texts), len(texts))
 
     def _oldest(self) -> list[bytes]:
         """Removes and returns the oldest kept messages, about `PIECE` bytes."""

@@ -208,6 +208,7 @@ class Scanner:
             else Outbox(
                 may_send=lambda: not part.is_joined or part.fleet.may_publish,
                 lost=self._publish_again,
+                at_once=True,
             )
         )
         self._expiring = Expiring()

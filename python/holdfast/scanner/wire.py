@@ -7,18 +7,22 @@ message. In the end `publish` appends the text
     PUB subject size␍␊payload␍␊
 
 to the client's send buffer, and wakes its flusher. Any number of such texts can be appended
-together, so a batch costs as much as one message. This uses private names of nats-py (see
-docs/dependencies.md); `tests/scanner/test_wire.py` checks them with the real server.
+together, so a batch costs as much as one message. `send_at_once` does not leave the batch to the
+flusher: a process that is stopped in between would send it when it goes on. This uses private
+names of nats-py (see docs/dependencies.md); `tests/scanner/test_wire.py` checks them with the real
+server.
 
 The texts are not checked here. `publishing` creates them from device ids that `registry` checked.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from typing import TYPE_CHECKING
 
 import msgspec
+from nats.aio.transport import TcpTransport
 from nats.errors import Error
 
 if TYPE_CHECKING:
@@ -73,6 +77,28 @@ async def send(client: Client, texts: bytes, count: int) -> None:
             await client._flush_pending()
 
 
+def send_at_once(client: Client, texts: bytes, count: int) -> None:
+    """Hands the texts of `count` messages to the system, before the event loop runs anything else.
+
+    Only if `unsent` is 0, else they wait. They are lost if the connection breaks.
+    """
+    client.stats["out_msgs"] += count
+    client.stats["out_bytes"] += len(texts)
+    _writer(client).write(texts)
+
+
 def backlog(client: Client) -> int:
     """Returns the number of bytes in the client's send buffer."""
     return client.pending_data_size
+
+
+def unsent(client: Client) -> int:
+    """Returns the number of bytes that this process has not handed to the system."""
+    return client.pending_data_size + _writer(client).transport.get_write_buffer_size()
+
+
+def _writer(client: Client) -> asyncio.StreamWriter:
+    transport = client._transport
+    assert isinstance(transport, TcpTransport), "servers are nats:// or tls://"
+    assert transport._io_writer is not None, "it was connected"
+    return transport._io_writer
