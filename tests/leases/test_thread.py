@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
 import pytest
 
+from holdfast import tasks
 from holdfast.leases import Leases, LeaseThread, Relay, entries, thread
 from holdfast.scanner.broker import Broker, Ping, Servers
 from support import wire
@@ -81,6 +82,31 @@ def node(server: NatsServer) -> Iterator[Callable[[str], Node]]:
 
 def threads() -> list[str]:
     return [each.name for each in threading.enumerate() if each.name.startswith("leases of")]
+
+
+class LosesCancellation(Node):
+    """Goes on connecting after its cancellation, as nats-py may do with Python 3.11."""
+
+    connecting = False
+
+    async def _connect(self, _: Callable[[Client | None], None]) -> None:
+        self.connecting = True
+        with suppress(asyncio.CancelledError):
+            await asyncio.sleep(3600)
+        await asyncio.sleep(3600)
+
+
+def test_a_thread_ends_while_it_connects(
+    server: NatsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tasks, "AGAIN", 0.01)
+    node = LosesCancellation(server, "a")
+    node.thread.start()
+    wire.until(lambda: node.connecting, "it connects")
+    stopping = threading.Thread(target=node.thread.stop, args=(LIMIT,), daemon=True)
+    stopping.start()
+    stopping.join(wire.DEADLINE)
+    assert not stopping.is_alive()
 
 
 def test_leases_are_renewed_while_the_event_loop_of_their_user_does_something_else(

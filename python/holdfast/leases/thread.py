@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Coroutine, Iterable
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast import logs
+from holdfast import logs, tasks
 from holdfast.heartbeat import Heartbeat
 
 if TYPE_CHECKING:
@@ -129,9 +129,7 @@ class LeaseThread:
             self._leases.want(())
             returned = (self._leases.give_back(key, self._ending) for key in self._leases.held)
             await asyncio.gather(*returned, return_exceptions=True)
-            for task in running:
-                task.cancel()
-            await asyncio.gather(*running, return_exceptions=True)
+            await tasks.end(running)
 
     async def _keep_connected(self) -> None:
         while True:

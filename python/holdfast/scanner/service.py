@@ -26,7 +26,7 @@ from weakref import WeakValueDictionary
 
 import msgspec
 
-from holdfast import _core, logs
+from holdfast import _core, logs, tasks
 from holdfast.config.scanning import written_pollable
 from holdfast.net.tls import NO_FILES, Tls
 from holdfast.scanner import browsing, commands, device_tls, kept_entries, tentacle_next, wire
@@ -1067,9 +1067,7 @@ class Scanner:
         for request in list(self._tasks):
             request.cancel()
         await _within(self._farewell())
-        for task in running:
-            task.cancel()
-        await _within(asyncio.wait(running))
+        await _within(tasks.end(running))
 
     async def _farewell(self) -> None:
         """Deletes heartbeat and states, and waits until all messages are sent."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
-from holdfast import logs
+from holdfast import logs, tasks
 from holdfast.scanner.heartbeat import JETSTREAM_TIMEOUT, reason_of
 from holdfast.scanner.keeping import FETCHED, FIRST_RETRY, READING, RETRIED
 
@@ -100,13 +100,11 @@ class Watch:
             if self._client is None:
                 continue
             works = (self._keep_following(self._client), self._news.wait())
-            tasks = [asyncio.create_task(work) for work in works]
+            running = [asyncio.create_task(work) for work in works]
             try:
-                await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
             finally:
-                for task in tasks:
-                    task.cancel()
-                await asyncio.gather(*tasks, return_exceptions=True)
+                await tasks.end(running)
 
     async def _keep_following(self, client: Client) -> None:
         while not client.is_closed:  # nats-py then replaces a cancellation by an error.

@@ -17,7 +17,7 @@ from nats.errors import Error, NoRespondersError
 from nats.errors import TimeoutError as NoAnswer
 from nats.js.errors import NoStreamResponseError
 
-from holdfast import logs
+from holdfast import logs, tasks
 from holdfast.client.url import connection_of
 from holdfast.heartbeat import Heartbeat
 from holdfast.leases import TTL, Outdated
@@ -155,9 +155,7 @@ class FleetPart:
                 for task in done:
                     task.result()
         finally:
-            for task in running:
-                task.cancel()
-            await asyncio.gather(*running, return_exceptions=True)
+            await tasks.end(running)
             await self.fleet.stop()
 
     async def _open(self, ready: asyncio.Event) -> None:
