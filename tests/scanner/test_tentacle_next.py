@@ -155,8 +155,8 @@ def test_an_entry_is_the_whole_subscription(
 ) -> None:
     memory.write("holding_registers", 0, [10, 11, 12])
     entry = gateway_entry(server, gateway_tag("a", 0), gateway_tag("b", 1))
-    caller.put(BUCKET, key(), entry)
     data = caller.listen("modbus.data.plc1.>")
+    caller.put(BUCKET, key(), entry)
     wire.until(lambda: {each["variableId"] for each in data.take()} != set(), "it is published")
     wire.until(lambda: variables(caller) == {"a": (10, "good"), "b": (11, "good")}, "it is read")
     data.take()
@@ -533,7 +533,7 @@ def test_commands_are_json(
         (command(True), "'true' is not a valid uint16, allowed: a JSON number"),
         (command(None), "the value is null, allowed: numbers, booleans, texts and arrays"),
         (command({"a": 1}), "the value is an object, allowed: numbers, booleans, texts and"),
-        ('{"values":1}', "Object missing required field `value`, allowed is"),
+        ('{"values":1}', "Object missing required field `value`, allowed: "),
         ("seven", "not JSON: "),
         ('{"value":', "not JSON: "),
     ],
