@@ -28,7 +28,7 @@ run: .venv/core.stamp
 test: .venv/core.stamp .venv/dev.stamp
 	cargo test --locked --quiet $(CRATES)
 	cargo test --locked --quiet $(PROTOCOL) --no-default-features
-	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
+	$(BIN)/pytest -n 4 --dist loadfile
 
 lint: no-std .venv/core.stamp .venv/dev.stamp
 	cargo fmt --check
