@@ -39,6 +39,7 @@ class Judge:
     open: dict[int, socket.socket] = field(default_factory=dict)
     """The connections that have not ended."""
     busy: int | None = None
+    talking: set[asyncio.Task[None] | None] = field(default_factory=set)
 
     async def serve(self) -> asyncio.Server:
         server = await asyncio.start_server(self._talk, "127.0.0.1", 0)
@@ -46,6 +47,7 @@ class Judge:
         return server
 
     async def _talk(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.talking.add(asyncio.current_task())
         number = len(self.peers)
         port = writer.get_extra_info("peername")[1]
         others = [self.peers[each] for each, made in self.open.items() if _is_established(made)]
@@ -143,12 +145,16 @@ class Judges:
         async def end() -> None:
             for server in self._servers:
                 server.close()
-            tasks = asyncio.all_tasks() - {asyncio.current_task()}
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            # A connection that has just come is closed only by a task that has begun.
+            while tasks := asyncio.all_tasks() - {asyncio.current_task()}:
+                for task in tasks & self._talking():
+                    task.cancel()
+                await asyncio.wait(tasks, timeout=0.01)
 
         asyncio.run_coroutine_threadsafe(end(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
+
+    def _talking(self) -> set[asyncio.Task[None] | None]:
+        return set().union(*(device.talking for device in self.devices))
