@@ -10,10 +10,11 @@ import contextlib
 import hashlib
 import json
 import os
+import time
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
-from nats.errors import Error
+from nats.errors import Error, NoRespondersError
 
 from holdfast.scanner.receiving import SafeClient, TlsClient
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine
     from pathlib import Path
     from typing import TypeVar
+
+    from nats.aio.msg import Msg
 
     from holdfast.scanner import Servers
 
@@ -36,6 +39,13 @@ CONNECTING = 3.0
 
 SILENCE = 30.0
 """Seconds within which a server must answer, or send the next part."""
+
+SETTLING = 10.0
+"""Seconds within which servers must know where a request goes. They elect leaders, and one makes a
+stream before the others know of it."""
+
+AGAIN = 0.1
+"""Seconds between two attempts."""
 
 PENDING = 64
 """Parts that may wait here, before the server waits."""
@@ -133,13 +143,28 @@ async def _client(servers: Servers) -> AsyncIterator[SafeClient]:
 async def _ask(client: SafeClient, subject: str, request: Any = None) -> dict[str, Any]:
     """A request to JetStream. Raises `BackupFailed` with the error of the servers."""
     payload = b"" if request is None else json.dumps(request).encode()
-    reply = await client.request(f"$JS.API.{subject}", payload, timeout=SILENCE)
+    reply = await _request(client, f"$JS.API.{subject}", payload)
     answer: dict[str, Any] = json.loads(reply.data)
     if "error" in answer:
         error = answer["error"]
         kind = _NotFound if error.get("err_code") == NOT_FOUND else BackupFailed
         raise kind(str(error.get("description", error)))
     return answer
+
+
+async def _request(client: SafeClient, subject: str, payload: bytes) -> Msg:
+    """A request that is sent again while nobody is there to take it."""
+    until = time.monotonic() + SETTLING
+    while True:
+        try:
+            return await client.request(subject, payload, timeout=SILENCE)
+        except NoRespondersError as error:
+            if time.monotonic() > until:
+                reason = (
+                    f"{subject}: nobody answers; JetStream is off, or its servers have no leader"
+                )
+                raise BackupFailed(reason) from error
+            await asyncio.sleep(AGAIN)
 
 
 async def _config(client: SafeClient, name: str) -> dict[str, Any] | None:
@@ -244,10 +269,10 @@ async def _send(
 ) -> None:
     with file.open("rb") as data:
         while part := data.read(CHUNK):
-            reply = await client.request(subject, part, timeout=SILENCE)
+            reply = await _request(client, subject, part)
             if reply.data:
                 raise BackupFailed(f"{name}: {_error(reply.data)}")
-    reply = await client.request(subject, b"", timeout=SILENCE)
+    reply = await _request(client, subject, b"")
     found = json.loads(reply.data)
     if "error" in found:
         raise BackupFailed(f"{name}: {_error(reply.data)}")

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from nats.errors import NoRespondersError
 
+from holdfast import log_backup
 from holdfast.appliance import Appliance
 from holdfast.config import load
 from support import nats_cluster, wire
@@ -148,6 +152,31 @@ def test_a_part_that_a_server_refuses_leaves_nothing_behind(tmp_path: Path) -> N
             assert register(appliance, 1) == 7
     finally:
         server.kill()
+
+
+class Servers:
+    """A client whose servers know only after some attempts where a request goes."""
+
+    def __init__(self, attempts: int) -> None:
+        self.left = attempts
+
+    async def request(self, *_: object, **__: object) -> Any:
+        self.left -= 1
+        if self.left >= 0:
+            raise NoRespondersError
+        return SimpleNamespace(data=b'{"config": {"num_replicas": 3}}')
+
+
+def test_a_request_that_nobody_takes_yet_is_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log_backup, "AGAIN", 0.001)
+    config = log_backup._config(Servers(3), "site")  # type: ignore[arg-type]
+    assert asyncio.run(config) == {"num_replicas": 3}
+    monkeypatch.setattr(log_backup, "SETTLING", 0.0)
+    config = log_backup._config(Servers(10**6), "site")  # type: ignore[arg-type]
+    with pytest.raises(
+        log_backup.BackupFailed, match=r"STREAM\.INFO\.site: nobody answers; JetStream"
+    ):
+        asyncio.run(config)
 
 
 def test_servers_without_the_log_are_told(tmp_path: Path) -> None:
