@@ -180,6 +180,7 @@ def test_states_and_bits_of_tags_are_written(opened: Opened, plant: holdfast.Mem
     view.button("Read").click()
     for name, text in (("state", "fault"), ("lamp", "off")):
         view.button(f"Write {name}").click()
+        expect(view.page.get_by_text("Written and read back")).to_be_hidden()
         view.page.locator("#write-value").fill(text)
         view.button("Review").click()
         view.button("Write it").click()

@@ -270,6 +270,8 @@ export class Values {
   }
 
   async write(panel, cell) {
+    // The outcome of another write must not be taken for that of this one.
+    if (!this.watching) say($("outcome"));
     const outcome = await this.writer.ask(panel.target(cell));
     if (outcome === null) return;
     const told = WRITTEN[outcome];
