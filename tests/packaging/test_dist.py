@@ -22,7 +22,7 @@ from support.paths import EXAMPLES, ROOT
 
 FOLDER = os.environ.get("HOLDFAST_DIST")
 pytestmark = pytest.mark.skipif(FOLDER is None, reason="`make dist-check` runs it")
-PACKAGES = Path(FOLDER or ROOT / "dist")
+PACKAGES = Path(FOLDER or ROOT / "dist").resolve()
 WHEELS = sorted(PACKAGES.glob("*.whl")) if FOLDER else []
 each_wheel = pytest.mark.parametrize("wheel", WHEELS, ids=lambda wheel: wheel.stem)
 
