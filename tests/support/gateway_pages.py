@@ -133,10 +133,10 @@ class Opened:
 @contextlib.contextmanager
 def browsing() -> Iterator[Browser]:
     """A browser."""
+    # Before Playwright, which requires libraries that come with it.
+    chromium = tool("chromium")
     with sync_playwright() as playwright:
-        launched = playwright.chromium.launch(
-            executable_path=tool("chromium"), args=["--no-sandbox"]
-        )
+        launched = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         yield launched
         launched.close()
 
