@@ -631,6 +631,9 @@ class Request:
     def pdu(self) -> bytes:
         """The encoded request, without transport framing."""
 
+    def rtu_frame(self, unit: int) -> bytes:
+        """The RTU frame to one unit id (Modbus over Serial Line V1.02, 2.5.1)."""
+
 @final
 class Endpoint:
     """The target of a client or the poller. Raises `ValueError` for invalid arguments."""

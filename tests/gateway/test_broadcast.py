@@ -6,10 +6,7 @@ import queue
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from holdfast.gateway.broadcasting import crc
 from support import gateways, lines, wire
 from support.fake_device import HANG_UP, FakeDevice, Stream
 
@@ -149,8 +146,3 @@ def test_over_tcp_unit_0_is_a_unit_as_any(gateway: Running) -> None:
     assert answer.json["error"] == (
         "Connection timeout: unit id 0 is the broadcast of serial lines, which has no response"
     )
-
-
-@given(st.binary(max_size=256))
-def test_the_crc_is_that_of_the_standard(body: bytes) -> None:
-    assert crc(body) == lines.crc(body)

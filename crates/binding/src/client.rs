@@ -12,6 +12,7 @@ use holdfast_engine::tls::FileError;
 use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
 use holdfast_engine::{LineDirection, LineMode, LineParity, SerialLine};
 use holdfast_protocol::client::{AcceptUnit, Tolerance};
+use holdfast_protocol::frame::rtu;
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
     self, Bits, Diagnostics, EncodedRequest, Function, Range, Registers, Request as CoreRequest,
@@ -180,6 +181,17 @@ impl Request {
     #[getter]
     fn pdu<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
         PyBytes::new(py, self.encoded.pdu())
+    }
+
+    fn rtu_frame<'py>(
+        &self,
+        py: Python<'py>,
+        #[pyo3(from_py_with = integer)] unit: i128,
+    ) -> PyResult<Bound<'py, PyBytes>> {
+        let unit = byte("unit id", unit)?;
+        let mut frame = [0; rtu::MAX_LEN];
+        let len = rtu::encode(unit, self.encoded.pdu(), &mut frame).expect("a request is a PDU");
+        Ok(PyBytes::new(py, &frame[..len]))
     }
 }
 

@@ -56,8 +56,7 @@ class _Broadcaster(Client):
         except OSError as error:
             raise ConnectFailed(str(target), explained(error)) from error
         try:
-            body = bytes([unit]) + request.pdu
-            writer.write(body + crc(body))
+            writer.write(request.rtu_frame(unit))
             await writer.drain()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(TURNAROUND):
@@ -74,13 +73,3 @@ def _judge(reply: bytes) -> None:
         raise ConnectionLost("connection lost: closed by the peer")
     if len(reply) > 1 and reply[1] & 0x80:
         raise InvalidResponse(f"the peer answered a broadcast with an exception: {reply.hex(' ')}")
-
-
-def crc(body: bytes) -> bytes:
-    """The CRC of an RTU frame, low byte first (Modbus over Serial Line V1.02, 6.2.2)."""
-    remainder = 0xFFFF
-    for byte in body:
-        remainder ^= byte
-        for _ in range(8):
-            remainder = remainder >> 1 ^ (0xA001 if remainder & 1 else 0)
-    return remainder.to_bytes(2, "little")
