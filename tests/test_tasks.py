@@ -14,8 +14,8 @@ async def loses(cancellations: int) -> None:
     """Goes on after so many cancellations, as `asyncio.wait_for` of Python 3.11 may do."""
     for _ in range(cancellations):
         with contextlib.suppress(asyncio.CancelledError):
-            await asyncio.sleep(3600)
-    await asyncio.sleep(3600)
+            await asyncio.Event().wait()
+    await asyncio.Event().wait()
 
 
 async def fails() -> None:

@@ -48,9 +48,9 @@ class Threads:
         self._before = set(threading.enumerate())
 
     def named(self, name: str) -> list[threading.Thread]:
-        return [
-            each for each in threading.enumerate() if each.name == name and each not in self._before
-        ]
+        """The threads of that name that run already."""
+        running = [each for each in threading.enumerate() if each.native_id is not None]
+        return [each for each in running if each.name == name and each not in self._before]
 
     def nice(self, name: str) -> int:
         """The nice value of a thread."""

@@ -92,8 +92,8 @@ class LosesCancellation(Node):
     async def _connect(self, _: Callable[[Client | None], None]) -> None:
         self.connecting = True
         with suppress(asyncio.CancelledError):
-            await asyncio.sleep(3600)
-        await asyncio.sleep(3600)
+            await asyncio.Event().wait()
+        await asyncio.Event().wait()
 
 
 def test_a_thread_ends_while_it_connects(

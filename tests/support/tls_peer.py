@@ -32,6 +32,8 @@ def context(
 ) -> ssl.SSLContext:
     """Trusts `ca`, and presents a certificate; with `weak`, even one that OpenSSL refuses."""
     made = ssl.create_default_context(cafile=str(ca))
+    # Debian's Python 3.11 sets it, and then takes a cut connection for one with close_notify.
+    made.options &= ~ssl.OP_IGNORE_UNEXPECTED_EOF
     if weak:
         made.set_ciphers("DEFAULT:@SECLEVEL=0")
     if issued is not None:
@@ -174,7 +176,9 @@ class Peer:
             except ssl.SSLEOFError:
                 raise Refused("cut") from None
             except ssl.SSLError as error:
-                raise Refused(error.reason) from None
+                # Some versions of Python have this reason instead of SSLEOFError.
+                cut = error.reason == "UNEXPECTED_EOF_WHILE_READING"
+                raise Refused("cut" if cut else error.reason) from None
 
     def _fill(self) -> None:
         self.wire.socket.settimeout(wire.DEADLINE)

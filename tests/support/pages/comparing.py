@@ -27,7 +27,8 @@ def alike(shown: str, told: str) -> None:
 
 def masked(text: str) -> set[str]:
     """The lines, without numbers, states and widths."""
-    text = re.sub(r"\b[0-9a-f]{64}\b|\b[\w-]{43}\b", "#", text)  # A digest, a secret.
+    # A digest, a secret.
+    text = re.sub(r"\b[0-9a-f]{64}\b|(?<![\w-])[\w-]{43}(?![\w-])", "#", text)
     text = re.sub(r"\b(?=[0-9]*[A-F])(?=[A-F]*[0-9])[0-9A-F]{4}\b", "#", text)
     text = re.sub(r"[+-]?\d[\d.:TZ-]*(?:e[+-]\d+)?|\btrue\b|\bfalse\b", "#", text)
     text = re.sub(r"\b(off|heating|fault) \(#\)", "STATE", text)
