@@ -141,7 +141,7 @@ def test_an_address_in_use_is_told(simulate: Callable[..., tuple[ServingCommand,
         (("--drop", "5%"), "'5%' is not a share from 0 to 1, as in 0.05."),
         (("--drop", "0.6", "--exception", "0.6"), "--drop and --exception are more than 1"),
         (("--exception", "0.1:0"), "is not SHARE[:CODE] with a code from 1 to 255"),
-        (("--latency", "2-1"), "'2-1' is not SECONDS or LEAST-MOST up to 60"),
+        (("--latency", "2-1"), "'2-1' is not SECONDS or MIN-MAX up to 60"),
         (("--play", "/nonexistent.csv"), "/nonexistent.csv: No such file or directory."),
     ],
 )

@@ -12,7 +12,7 @@ import pytest
 
 import holdfast
 from holdfast.errors import ConnectionLost, ModbusException, RequestTimeout
-from holdfast.simulation.faults import Faults, Front
+from holdfast.simulation.faults import FaultProxy, Faults
 from support import wire
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def front(
     server: holdfast.Server, faults: Faults, sources: list[str] | None = None
 ) -> Iterator[str]:
     networks = EVERYONE if sources is None else [ip_network(each) for each in sources]
-    behind = Front(("127.0.0.1", 0), server.address, faults, Random("1"), networks)
+    behind = FaultProxy(("127.0.0.1", 0), server.address, faults, Random("1"), networks)
     with behind as running:
         yield f"tcp://127.0.0.1:{running.address[1]}"
 
@@ -102,6 +102,6 @@ def test_bytes_that_are_no_frame_end_the_connection(server: holdfast.Server, dat
 
 
 def test_an_address_in_use_is_an_error(server: holdfast.Server) -> None:
-    taken = Front(server.address, server.address, Faults(drop=1), Random(1), EVERYONE)
+    taken = FaultProxy(server.address, server.address, Faults(drop=1), Random(1), EVERYONE)
     with pytest.raises(OSError, match="in use"):
         taken.start()

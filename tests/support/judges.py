@@ -12,6 +12,8 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from holdfast.net.closing import close
+
 if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
@@ -144,7 +146,7 @@ class Judges:
     ) -> None:
         async def end() -> None:
             for server in self._servers:
-                server.close()
+                await close(server)
             # A connection that has just come is closed only by a task that has begun.
             while tasks := asyncio.all_tasks() - {asyncio.current_task()}:
                 for task in tasks & self._talking():

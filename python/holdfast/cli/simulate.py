@@ -26,7 +26,7 @@ from holdfast.protocol import MAX_UNIT
 from holdfast.server import Server
 from holdfast.simulation import HEATER, generators, playback
 from holdfast.simulation.device import Refused, SimulatedDevice
-from holdfast.simulation.faults import Faults, Front
+from holdfast.simulation.faults import FaultProxy, Faults
 from holdfast.tags.text import text_of
 
 if TYPE_CHECKING:
@@ -62,14 +62,14 @@ def parse_exception(text: str) -> tuple[float, int]:
 
 
 def parse_latency(text: str) -> tuple[float, float]:
-    """Parses SECONDS or LEAST-MOST. Raises `ValueError`."""
+    """Parses SECONDS or MIN-MAX. Raises `ValueError`."""
     words = text.split("-")
     try:
         low, high = float(words[0]), float(words[-1])
     except ValueError:
         low = high = math.nan
     if len(words) > 2 or not 0 <= low <= high <= 60:
-        raise ValueError(f"{text!r} is not SECONDS or LEAST-MOST up to 60, as in 0.05-0.2")
+        raise ValueError(f"{text!r} is not SECONDS or MIN-MAX up to 60, as in 0.05-0.2")
     return low, high
 
 
@@ -138,7 +138,7 @@ def parse_latency(text: str) -> tuple[float, float]:
     type=by(parse_latency),
     default="0",
     metavar="SECONDS",
-    help="Delay of every reply, or LEAST-MOST.",
+    help="Delay of every reply, or MIN-MAX.",
 )
 @click.option(
     "--drop",
@@ -269,7 +269,7 @@ def _serve(
     server = running.enter_context(Server(rules=[rule], bind=joined(*bind)))
     if not faults.any:
         return server.address
-    front = Front(place, server.address, faults, Random(f"{seed}:faults"), sources)
+    front = FaultProxy(place, server.address, faults, Random(f"{seed}:faults"), sources)
     return running.enter_context(front).address
 
 

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 from holdfast.net.addresses import holds, parse_address
+from holdfast.net.closing import close
+from holdfast.tasks import end
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,7 +46,7 @@ class Faults:
         return self.latency[1] > 0 or self.drop > 0 or self.refuse > 0
 
 
-class Front:
+class FaultProxy:
     """Serves Modbus TCP at `address`, and asks the device at `behind`, from `start` to `stop`.
 
     Peers that are in none of the networks `sources` are disconnected. The requests of a connection
@@ -66,7 +68,7 @@ class Front:
         self._sources = sources
         self._loop = asyncio.new_event_loop()
         self._server: asyncio.Server | None = None
-        self._connections: set[asyncio.Task[None]] = set()
+        self._connections: dict[asyncio.StreamWriter, asyncio.Task[None]] = {}
         self._thread = threading.Thread(target=self._loop.run_forever, name="faults", daemon=True)
 
     def start(self) -> Self:
@@ -100,25 +102,29 @@ class Front:
 
     async def _close(self) -> None:
         if self._server is not None:
-            self._server.close()
-        for task in self._connections:
-            task.cancel()
-        await asyncio.gather(*self._connections, return_exceptions=True)
+            await close(self._server)
+        for writer in self._connections:
+            writer.transport.abort()
+        await end(self._connections.values())
 
-    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self._connections.add(task)
+    def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Begins to serve a connection, which `_close` can end from now on."""
+        serving = self._loop.create_task(self._serve(reader, writer))
+        self._connections[writer] = serving
+        serving.add_done_callback(lambda _: self._connections.pop(writer))
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             peer = parse_address(writer.get_extra_info("peername")[0].partition("%")[0])
             if holds(self._sources, peer) and len(self._connections) <= MAX_CONNECTIONS:
-                with contextlib.suppress(OSError, EOFError, TimeoutError, asyncio.CancelledError):
-                    await self._serve(reader, writer)
+                with contextlib.suppress(OSError, EOFError, TimeoutError):
+                    await self._pass_on(reader, writer)
         finally:
-            self._connections.discard(task)
             writer.close()
+            with contextlib.suppress(OSError):
+                await writer.wait_closed()
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _pass_on(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         behind, to_behind = await asyncio.open_connection(*self._behind)
         try:
             while True:
@@ -128,7 +134,7 @@ class Front:
                     writer.write(reply)
                     await asyncio.wait_for(writer.drain(), IDLE)
         finally:
-            to_behind.close()
+            to_behind.transport.abort()
 
     async def _reply(
         self, request: bytes, behind: asyncio.StreamReader, to_behind: asyncio.StreamWriter

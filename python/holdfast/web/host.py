@@ -26,6 +26,7 @@ from uvicorn.server import ServerState
 from holdfast import logs
 from holdfast.heartbeat import PERIOD, Heartbeat
 from holdfast.net.addresses import holds, joined, parse_address
+from holdfast.net.closing import close
 from holdfast.web.admission import Admission, Full, Waiting
 from holdfast.web.port import BACKLOG
 from holdfast.web.tls import TlsTransport
@@ -226,7 +227,7 @@ class Host:
                 state.default_headers = [(b"date", formatdate(usegmt=True).encode())]
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stopped.wait(), PERIOD)
-            server.close()
+            await close(server)
             await _end(cast("set[_Connection]", state.connections))
 
     async def _guarded(self, scope: Scope, receive: Receive, send: Send) -> None:
