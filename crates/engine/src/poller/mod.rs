@@ -14,6 +14,7 @@ mod learned;
 pub mod plan;
 mod raw_ingest;
 mod results;
+mod roster;
 mod search;
 mod sink;
 mod state;

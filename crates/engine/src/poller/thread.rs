@@ -21,6 +21,7 @@ use super::device::{Device, DeviceSettings, Inbox, Planned};
 use super::plan::{PlanError, PlanLimits};
 use super::raw_ingest::{Forward, ForwardCounters, ForwardSettings};
 use super::results::{Receivers, Results, Written};
+use super::roster::Roster;
 use super::state::DeviceState;
 use super::turn::Turn;
 use super::write_through::{Passage, PassedRange, PassedWrite};
@@ -90,7 +91,7 @@ impl Polled {
 
 /// A running poller, until it is stopped or dropped. Devices can be added and removed.
 pub struct Poller {
-    polled: Mutex<Vec<Polled>>,
+    polled: Mutex<Roster<Polled>>,
     orders: mpsc::UnboundedSender<Order>,
     receivers: Arc<Receivers>,
     tickets: AtomicU64,
@@ -186,12 +187,12 @@ impl Poller {
     fn begin(&self, device: Planned) -> Result<(), PollerError> {
         let mut all = self.polled();
         let settings = &device.settings;
-        if all.iter().any(|other| other.name == settings.name) {
+        if all.has(&settings.name) {
             return Err(PollerError::Taken { device: settings.name.clone() });
         }
         let polled = Polled::new(settings, Arc::default());
         self.order(Order::Add(Box::new(device), polled.clone()))?;
-        all.push(polled);
+        all.add(polled.name.clone(), polled);
         Ok(())
     }
 
@@ -214,16 +215,17 @@ impl Poller {
         let device = checked(device)?;
         let settings = &device.settings;
         let mut all = self.polled();
-        if settings.name != name && all.iter().any(|other| other.name == settings.name) {
+        if settings.name != name && all.has(&settings.name) {
             return Err(PollerError::Taken { device: settings.name.clone() });
         }
-        let Some(before) = all.iter_mut().find(|other| other.name == name) else {
+        let Some(before) = all.get(name) else {
             return Err(PollerError::Unknown { device: name.to_owned() });
         };
         let polled = Polled::new(settings, Arc::clone(&before.state));
-        let (name, device) = (name.to_owned(), Box::new(device));
-        self.order(Order::Replace { name, device, polled: polled.clone(), at_once })?;
-        *before = polled;
+        let device = Box::new(device);
+        let ordered = polled.clone();
+        self.order(Order::Replace { name: name.to_owned(), device, polled: ordered, at_once })?;
+        all.replace(name, polled.name.clone(), polled);
         Ok(())
     }
 
@@ -297,7 +299,7 @@ impl Poller {
             let function = request.pdu()[0];
             return Err(PollerError::NoWrite { device: name.to_owned(), function });
         }
-        if !self.polled().iter().any(|device| device.name == name) {
+        if !self.polled().has(name) {
             return Err(PollerError::Unknown { device: name.to_owned() });
         }
         let ticket = self.tickets.fetch_add(1, Ordering::Relaxed);
@@ -310,9 +312,7 @@ impl Poller {
     /// whether there was a device of that name.
     pub fn remove(&self, name: &str) -> bool {
         let mut all = self.polled();
-        let before = all.len();
-        all.retain(|device| device.name != name);
-        let known = all.len() < before;
+        let known = all.remove(name);
         if known {
             // A stopped poller polls nothing.
             let _ = self.order(Order::Remove(name.to_owned()));
@@ -322,10 +322,10 @@ impl Poller {
 
     /// The current devices.
     pub fn devices(&self) -> Vec<Polled> {
-        self.polled().clone()
+        self.polled().iter().cloned().collect()
     }
 
-    fn polled(&self) -> MutexGuard<'_, Vec<Polled>> {
+    fn polled(&self) -> MutexGuard<'_, Roster<Polled>> {
         self.polled.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -796,6 +796,23 @@ mod tests {
         fits.reads[0].into = Some(Destination { memory: memory(), area: AREA, address: 76 });
         fits.status = Some(StatusSettings { memory: memory(), block: block(AREA, 1) });
         assert!(checked(fits).is_ok());
+    }
+
+    #[test]
+    fn devices_have_the_order_in_which_they_were_added_and_a_replacement_the_place_of_the_other() {
+        let named = |name: &str| DeviceSettings { name: name.into(), ..settings() };
+        let poller = Poller::start(["c", "b", "a"].map(named).into()).unwrap();
+        let names = || poller.devices().into_iter().map(|device| device.name).collect::<Vec<_>>();
+        assert!(matches!(poller.add(named("b")), Err(PollerError::Taken { .. })));
+        assert!(matches!(poller.replace("b", named("a"), false), Err(PollerError::Taken { .. })));
+        assert!(matches!(poller.replace("x", named("y"), false), Err(PollerError::Unknown { .. })));
+        poller.replace("b", named("d"), false).unwrap();
+        poller.replace("a", named("a"), false).unwrap();
+        poller.add(named("b")).unwrap();
+        assert_eq!(names(), ["c", "d", "a", "b"]);
+        assert!(poller.remove("c") && !poller.remove("c"));
+        poller.add(named("c")).unwrap();
+        assert_eq!(names(), ["d", "a", "b", "c"]);
     }
 
     #[test]
