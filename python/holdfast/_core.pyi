@@ -1127,11 +1127,15 @@ class Poller:
         changes nothing.
         """
 
-    def write(self, name: str, request: Request, to: Results) -> int:
+    def write(
+        self, name: str, request: Request, to: Results, *, within: float | None = None
+    ) -> int:
         """Sends a write to a device over its own connection, between two reads.
 
-        Returns the number under which `to` has the result. Raises `ValueError` for an unknown
-        device or a request that does not write, `RuntimeError` after `stop`.
+        Returns the number under which `to` has the result. What can't be sent `within` seconds,
+        and one timeout of the device, is not sent any more: its fault is `expired`. Raises
+        `ValueError` for an unknown device or a request that does not write, `RuntimeError` after
+        `stop`.
         """
 
     def link(

@@ -12,6 +12,11 @@ another code is an exception of the device.
 
 NO_CONNECTION = FAULTS["refused"]
 STANDBY = FAULTS["standby"]
+EXPIRED = FAULTS["expired"]
+
+EXPIRES_AFTER = 10.0
+"""Seconds that a write may wait for its device, but for one timeout of that. Later, nobody expects
+it any more."""
 
 _WORDS = {code: word for word, code in FAULTS.items()}
 _TEXTS = {
@@ -24,6 +29,7 @@ _TEXTS = {
     FAULTS["internal error"]: "an internal error",
     FAULTS["flooded"]: "a flood of data that was not requested",
     STANDBY: "another node uses the device",
+    EXPIRED: "the device was busy for too long",
 }
 
 

@@ -123,7 +123,7 @@ def test_a_reply_after_the_end_is_not_passed_on(poller: ReportingPoller) -> None
     with Stream("tcp", then=waiting.append) as slow:
         fence = Fence()
         fence.open(time.monotonic() + FAR)
-        poller.add(device(slow, interval=0.0, fence=fence))  # type: ignore[arg-type]
+        poller.add(device(slow, interval=0.0, fence=fence))
         wire.until(lambda: len(waiting) == 1, "it is asked")
         fence.close()
         waiting[0].answer(bytes.fromhex("03020007"))

@@ -20,6 +20,7 @@ from holdfast.scanner import FleetSettings, lateness
 from holdfast.scanner.fleet.exchange import Command, subject
 from holdfast.standstill import LONG
 from support import wire
+from support.fake_device import FakeDevice, registers
 from support.fleet_nodes import Nodes, subscribed, wanted
 from support.judges import Judges
 from support.nats_bus import Caller, logged, subscription, tag
@@ -178,6 +179,32 @@ def test_a_command_of_another_node_is_refused_by_a_node_whose_loop_did_not_run(
     assert {value for _, value in judge.writes} == {1, 4}
 
 
+def test_a_command_of_another_node_waits_as_long_as_that_node_allows(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    judges: Judges,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    running = run_scanner(own_nats, fleet=FleetSettings("plant", "a", 4))
+    subscribed(own_caller, 0, judges.devices[0])
+    wire.until(partial(is_done, own_caller, "modbus.command.d0.t0", "1"), "it is written")
+    part, allowed = running.scanner._part, list[float]()
+    assert part is not None
+
+    async def write(_device: object, _request: object, *, within: float) -> int:
+        allowed.append(within)
+        return 0
+
+    monkeypatch.setattr(running.scanner._polling, "write", write)
+    where = subject("modbus", "a", "command", part.fleet.leases.process)
+    for within in (4.0, 60.0):
+        command = Command(device="d0", tag="t0", text="3", epoch=0, within=within)
+        assert send(own_caller, where, msgspec.json.encode(command)).result(wire.DEADLINE) == {}
+    assert allowed[0] == 4.0
+    assert 4.0 < allowed[1] <= lateness.WAITED
+
+
 def test_a_standstill_is_logged_once(
     run_scanner: Run, caller: Caller, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -209,6 +236,40 @@ def test_a_command_that_waited_for_long_in_the_scanner_is_refused(
     assert answer["error"].startswith("not written: the command waited for 0 s; send it again")
     assert memory.read("holding_registers", 10, 1) == [0]
     assert caller.request("modbus.command.a", "4") == {"success": True}
+
+
+def test_a_command_that_waited_for_long_for_its_device_is_refused(
+    run_scanner: Run, caller: Caller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_scanner()
+    is_reading, go_on = threading.Event(), threading.Event()
+
+    def answer(pdu: bytes) -> bytes:
+        if pdu[0] == 3 and not is_reading.is_set():
+            is_reading.set()
+            assert go_on.wait(wire.DEADLINE)
+        return registers(pdu) if pdu[0] == 3 else pdu
+
+    with FakeDevice(answer) as line:
+        of = {"subscriberId": "x", "url": line.url, "scanRate": 60_000}
+        slow = {**of, "deviceId": "slow", "timeout": 30_000, "tags": [tag("b", 0)]}
+        other = {**of, "deviceId": "a", "unitId": 2, "tags": [tag("a", 0)]}
+        try:
+            assert caller.request("modbus.subscribe", slow)["success"]
+            assert is_reading.wait(wire.DEADLINE)
+            assert caller.request("modbus.subscribe", other)["success"]
+            with monkeypatch.context() as patched:
+                patched.setattr(lateness, "WAITED", 2.0)
+                refused = caller.request("modbus.command.a", "3")
+        finally:
+            go_on.set()
+        assert refused == {
+            "success": False,
+            "error": "not written: the device was busy for too long; "
+            "send it again if it is still wanted",
+        }
+        assert caller.request("modbus.command.a", "4") == {"success": True}
+        assert [pdu for pdu in line.asked if pdu[0] == 6] == [bytes.fromhex("0600000004")]
 
 
 def test_a_node_passes_no_command_on_that_waited_for_long(

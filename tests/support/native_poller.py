@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from holdfast._core import Request
-    from support.polled import Fake
+    from support.fake_device import Stream
 
 Made: TypeAlias = "partial[PolledDevice]"
 """A device, but for the receiver of its polls."""
 
-TIMEOUT, REFUSED, RESET, INVALID = 0x8001, 0x8002, 0x8003, 0x8004
+TIMEOUT, REFUSED, RESET, INVALID, EXPIRED = 0x8001, 0x8002, 0x8003, 0x8004, 0x800A
 
 
 class ReportingPoller:
@@ -33,8 +33,8 @@ class ReportingPoller:
     def replace(self, name: str, device: Made, *, at_once: bool = True) -> None:
         self._poller.replace(name, device(report=self.results), at_once=at_once)
 
-    def write(self, name: str, request: Request) -> int:
-        return self._poller.write(name, request, self.results)
+    def write(self, name: str, request: Request, *, within: float | None = None) -> int:
+        return self._poller.write(name, request, self.results, within=within)
 
     def remove(self, name: str) -> bool:
         return self._poller.remove(name)
@@ -46,7 +46,7 @@ class ReportingPoller:
         self._poller.stop()
 
 
-def device(fake: Fake, name: str = "a", **more: Any) -> Made:
+def device(fake: Stream, name: str = "a", *, transport: Any = "tcp", **more: Any) -> Made:
     settings: dict[str, Any] = {
         "unit": 1,
         "interval": 3600.0,
@@ -54,7 +54,7 @@ def device(fake: Fake, name: str = "a", **more: Any) -> Made:
         "reads": [("holding_registers", 0, 1, None)],
         "start_within": 0.0,
     }
-    endpoint = Endpoint.network("tcp", "127.0.0.1", fake.port)
+    endpoint = Endpoint.network(transport, "127.0.0.1", fake.port)
     return partial(PolledDevice, name, endpoint, **(settings | more))
 
 

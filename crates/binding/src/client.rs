@@ -493,7 +493,9 @@ fn mapped(error: &ClientError) -> PyErr {
             let of = (failure.reason(), to.clone(), failure.to_string(), *maybe_sent);
             TlsFailed::new_err(of)
         }
-        ClientError::Lost(_) | ClientError::Fenced => ConnectionLost::new_err(text),
+        ClientError::Lost(_) | ClientError::Fenced | ClientError::Expired => {
+            ConnectionLost::new_err(text)
+        }
         ClientError::Invalid(invalid) => InvalidResponse::new_err((text, invalid.reason())),
     }
 }

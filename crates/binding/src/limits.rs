@@ -41,6 +41,7 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
         Fault::Internal,
         Fault::Flooded,
         Fault::Standby,
+        Fault::Expired,
     ];
     for fault in all {
         if let Some(word) = word(fault) {
@@ -63,6 +64,7 @@ fn word(fault: Fault) -> Option<&'static str> {
         Fault::Internal => Some("internal error"),
         Fault::Flooded => Some("flooded"),
         Fault::Standby => Some("standby"),
+        Fault::Expired => Some("expired"),
     }
 }
 

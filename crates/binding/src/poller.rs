@@ -1,7 +1,7 @@
 //! `PolledDevice` and `Poller`: polling, its results and counters; `plan_blocks`: plans.
 
 use std::sync::Arc;
-use std::time::SystemTime;
+use std::time::{Instant, SystemTime};
 
 use holdfast_engine::client::Place as HostPlace;
 use holdfast_engine::link::Fault;
@@ -142,13 +142,17 @@ impl Poller {
         self.core.replace(name, device.core.clone(), at_once).map_err(raised)
     }
 
+    #[pyo3(signature = (name, request, to, *, within=None))]
     fn write(
         &self,
         name: &str,
         request: PyRef<'_, Request>,
         to: PyRef<'_, Results>,
+        within: Option<f64>,
     ) -> PyResult<u64> {
-        self.core.write(name, Box::new(request.encoded.clone()), &to.core).map_err(raised)
+        let within = within.map(|within| seconds("within", within)).transpose()?;
+        let until = within.map(|within| Instant::now() + within);
+        self.core.write(name, Box::new(request.encoded.clone()), until, &to.core).map_err(raised)
     }
 
     fn receiver(&self) -> Results {

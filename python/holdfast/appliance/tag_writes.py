@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from holdfast import logs
 from holdfast.audit import Unrecorded
 from holdfast.client.requests import write_typed
-from holdfast.faults import fault_text, fault_word
+from holdfast.faults import EXPIRES_AFTER, fault_text, fault_word
 from holdfast.outputs.site import NotWritten
 from holdfast.tags.text import value_from
 from holdfast.values import ConversionError, codec_for
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from holdfast.audit import Audit
     from holdfast.tags import Tag
 
-MOST = 1000
+MAX_WAITING = 1000
 """The most writes that wait for their devices."""
 
 WAIT = 1.0
@@ -85,10 +85,10 @@ class TagWrites:
                 detail = "the audit log can't be written, and no write is carried out without it"
                 raise NotWritten("unrecorded", detail) from None
         with self._lock:
-            if len(self._pending) >= MOST:
-                raise NotWritten("busy", f"{MOST} writes wait for their devices")
+            if len(self._pending) >= MAX_WAITING:
+                raise NotWritten("busy", f"{MAX_WAITING} writes wait for their devices")
             try:
-                number = self._poller.write(device, request, self._results)
+                number = self._poller.write(device, request, self._results, within=EXPIRES_AFTER)
             except (ValueError, RuntimeError) as error:
                 raise NotWritten("unknown_device", str(error)) from None
             self._pending[number] = write

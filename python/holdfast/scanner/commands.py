@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast import logs
 from holdfast.client.requests import write_typed
-from holdfast.faults import STANDBY, fault_text
+from holdfast.faults import EXPIRED, STANDBY, fault_text
 from holdfast.scanner.errors import Moved, Refused
 from holdfast.scanner.health import is_unwritten
+from holdfast.scanner.lateness import AGAIN
 from holdfast.tags.text import value_from
 from holdfast.tags.writing import from_text
 from holdfast.values import ConversionError, encode
@@ -51,11 +52,12 @@ def _checked(made: Any, tag: Tag) -> Any:
 
 
 async def write(
-    polling: Polling, device: ScannedDevice, tag: Tag, text: str, check: Callable[[], None]
+    polling: Polling, device: ScannedDevice, tag: Tag, text: str, check: Callable[[], float]
 ) -> None:
     """Writes a value, given as text. Returns when the device has confirmed it.
 
-    `check` is called at the last moment: it refuses what is too late. Raises `Refused`.
+    `check` is called at the last moment: it refuses what is too late, and returns how many seconds
+    the write may wait for the device. Raises `Refused`.
     """
     if (flaw := device.unwritable(tag)) is not None:
         raise Refused(f"tag {tag.id!r} of {device.id} is not writable: {flaw}")
@@ -66,11 +68,11 @@ async def write(
         )
     except ValueError as error:
         raise Refused(f"not written: {error}") from None
-    check()
-    fault = await polling.write(device, request)
+    fault = await polling.write(device, request, within=check())
     if fault == STANDBY:
         raise Moved(f"not written: {fault_text(fault)}")
     if fault:
         said = "not written" if is_unwritten(fault) else "not confirmed"
-        raise Refused(f"{said}: {fault_text(fault)}")
+        again = f"; {AGAIN}" if fault == EXPIRED else ""
+        raise Refused(f"{said}: {fault_text(fault)}{again}")
     logs.write(logging.INFO, "tag_written", device=device.id, tag=tag.id)

@@ -7,7 +7,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from holdfast.faults import NO_CONNECTION, STANDBY, fault_text, is_exception
+from holdfast.faults import EXPIRED, NO_CONNECTION, STANDBY, fault_text, is_exception
 from holdfast.protocol import (
     BUSY,
     ILLEGAL_ADDRESS,
@@ -40,6 +40,7 @@ UNWRITTEN = (
     PATH_UNAVAILABLE,
     NO_CONNECTION,
     STANDBY,
+    EXPIRED,
 )
 """Faults of a write that the device certainly has not carried out."""
 

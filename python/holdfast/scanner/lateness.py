@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from nats.errors import Error
 
+from holdfast.faults import EXPIRES_AFTER
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.receiving import Received
 from holdfast.standstill import LOOK, Standstill, now
@@ -23,9 +24,9 @@ if TYPE_CHECKING:
 
     from holdfast.scanner.receiving import SafeClient
 
-WAITED = 10.0
-"""Seconds that a command may wait between the socket and the device's queue. In a fleet, it waits 6
-seconds for a node."""
+WAITED = EXPIRES_AFTER
+"""Seconds that a command may wait between the socket and the device, but for one timeout of that.
+In a fleet, it waits 6 seconds for a node."""
 
 AGAIN = "send it again if it is still wanted"
 
@@ -39,10 +40,11 @@ class Lateness:
     def __init__(self) -> None:
         self._standstill = Standstill("scanner")
 
-    def check(self, message: Msg) -> None:
-        """Raises `Refused` for a command that must not be written any more.
+    def check(self, message: Msg) -> float:
+        """Returns how many seconds a command may wait now.
 
-        Call it at the last moment before the write, since it may also wait in this process.
+        Call it at the last moment before the write, since it may also wait in this process. Raises
+        `Refused` for a command that must not be written any more.
         """
         assert isinstance(message, Received), "it is from a SafeClient"
         self._standstill.look()
@@ -51,6 +53,7 @@ class Lateness:
             raise Refused(f"not written: this scanner stood still for {seconds:.0f} s; {AGAIN}")
         if (waited := now() - message.received) > WAITED:
             raise Refused(f"not written: the command waited for {waited:.0f} s; {AGAIN}")
+        return WAITED - waited
 
     async def run(self, client: Callable[[], SafeClient | None]) -> None:
         """Looks for standstills, and pings the server after each, until it is cancelled."""

@@ -149,8 +149,10 @@ class Polling:
             for device in devices:
                 self.renew(device)
 
-    async def write(self, device: ScannedDevice, request: _core.Request) -> int:
+    async def write(self, device: ScannedDevice, request: _core.Request, *, within: float) -> int:
         """Sends a write between two reads. Returns the fault, or 0 when the device confirmed it.
+
+        What can't be sent `within` seconds, and one timeout of the device, is not sent.
 
         Raises `Refused` while polling is paused, and after `stop`.
         """
@@ -158,7 +160,7 @@ class Polling:
             raise Refused("the scanner is stopping")
         if self._paused is not None:
             raise Refused("not written: the scanner is disabled")
-        number = self._poller.write(device.polled_as, request, self._results)
+        number = self._poller.write(device.polled_as, request, self._results, within=within)
         done: asyncio.Future[int] = self._loop.create_future()
         self._writes[number] = done
         try:

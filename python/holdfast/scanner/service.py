@@ -769,7 +769,7 @@ class Scanner:
         return Answer(success=True)
 
     async def _write(
-        self, device_id: str, tag_id: str, text: str, check: Callable[[], None]
+        self, device_id: str, tag_id: str, text: str, check: Callable[[], float]
     ) -> bool:
         """Writes to a device that this node polls. Returns whether it does. Raises `Refused`."""
         device = self._registry.devices.get(device_id)
@@ -790,9 +790,11 @@ class Scanner:
         device = self._registry.devices.get(command.device)
         try:
             is_current = device is not None and self._part.is_current(device, command.epoch)
-            check = partial(self._lateness.check, message)
             done = is_current and await self._write(
-                command.device, command.tag, command.text, check
+                command.device,
+                command.tag,
+                command.text,
+                lambda: min(self._lateness.check(message), command.within),
             )
             executed = Executed(moved=not done)
         except Refused as refused:

@@ -60,8 +60,27 @@ struct Call<'r> {
     unit_id: u8,
     request: &'r EncodedRequest,
     attempt: Attempt,
-    /// Asked at the last moment before something is sent.
-    may_send: &'r dyn Fn() -> bool,
+    conditions: &'r Conditions<'r>,
+    /// Why it was not sent.
+    refused: Option<ClientError>,
+}
+
+/// What a call depends on.
+pub struct Conditions<'c> {
+    /// Asked before a connection is made for the request, and at the last moment before its first bytes
+    /// are sent.
+    pub to_begin: &'c dyn Fn() -> Result<(), ClientError>,
+    /// Asked before bytes are sent, and then at most every 0.1 s. If it is false, the connection is
+    /// closed.
+    pub to_go_on: Option<&'c dyn Fn() -> bool>,
+}
+
+impl Conditions<'_> {
+    const NONE: Conditions<'static> = Conditions { to_begin: &|| Ok(()), to_go_on: None };
+
+    fn may_go_on(&self) -> bool {
+        self.to_go_on.is_none_or(|may_go_on| may_go_on())
+    }
 }
 
 impl BlockingClient {
@@ -88,9 +107,7 @@ impl BlockingClient {
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Result<T, ClientError> {
-        let interrupt = Interrupt::new(None);
-        let called = self.call_unless(interrupt, (unit_id, request, &|| true), timeout, take);
-        called.unwrap_or_else(|| unreachable!("nobody interrupts this call"))
+        self.call_under(&Conditions::NONE, unit_id, request, timeout, take)
     }
 
     /// The same, unless `interrupted` returns true. It is asked at most every 0.1 s. Returns `None`
@@ -104,32 +121,37 @@ impl BlockingClient {
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Option<Result<T, ClientError>> {
         let interrupt = Interrupt::new(Some(interrupted));
-        self.call_unless(interrupt, (unit_id, request, &|| true), timeout, take)
+        self.call_unless(interrupt, (unit_id, request, &Conditions::NONE), timeout, take)
     }
 
-    /// The same as [`BlockingClient::call`], while it is allowed: this is asked at the last moment before
-    /// the request is sent, and then at most every 0.1 s. If it no longer is, the connection is closed.
+    /// The same as [`BlockingClient::call`], under conditions.
     ///
     /// # Errors
-    /// [`ClientError::Fenced`] if nothing was sent.
-    pub fn call_while<T>(
+    /// Also that of [`Conditions::to_begin`], if nothing was sent.
+    pub fn call_under<T>(
         &self,
-        allowed: &dyn Fn() -> bool,
+        conditions: &Conditions<'_>,
         unit_id: u8,
         request: &EncodedRequest,
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Result<T, ClientError> {
-        let mut interrupted = || !allowed();
-        let interrupt = Interrupt::new(Some(&mut interrupted));
-        let called = self.call_unless(interrupt, (unit_id, request, allowed), timeout, take);
-        called.unwrap_or(Err(ClientError::Lost(Lost::Closed(Closed::BySelf))))
+        let mut interrupted = || !conditions.may_go_on();
+        let interrupt = Interrupt::new(match conditions.to_go_on {
+            None => None,
+            Some(_) => Some(&mut interrupted),
+        });
+        let called = self.call_unless(interrupt, (unit_id, request, conditions), timeout, take);
+        called.unwrap_or_else(|| {
+            assert!(conditions.to_go_on.is_some(), "nobody interrupts this call");
+            Err(ClientError::Lost(Lost::Closed(Closed::BySelf)))
+        })
     }
 
     fn call_unless<T>(
         &self,
         mut interrupt: Interrupt<'_>,
-        (unit_id, request, may_send): (u8, &EncodedRequest, &dyn Fn() -> bool),
+        (unit_id, request, conditions): (u8, &EncodedRequest, &Conditions<'_>),
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Option<Result<T, ClientError>> {
@@ -137,12 +159,15 @@ impl BlockingClient {
         let _turn = self.turns.take(interrupt)?;
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let mut take = Some(take);
-        let mut call = Call { unit_id, request, attempt: Attempt::default(), may_send };
+        let mut call =
+            Call { unit_id, request, attempt: Attempt::default(), conditions, refused: None };
         let mut deadline = Instant::now() + timeout;
         loop {
-            if !may_send() {
-                state.end();
-                return Some(Err(ClientError::Fenced));
+            if let Err(error) = (conditions.to_begin)() {
+                if !conditions.may_go_on() {
+                    state.end();
+                }
+                return Some(Err(error));
             }
             let open = match self.connected(&mut state, deadline, timeout, interrupt)? {
                 Ok(open) => open,
@@ -150,7 +175,7 @@ impl BlockingClient {
             };
             let late = open.connection.late();
             let (mut result, mut again) = (None, None);
-            let lost = open.call(&call, deadline, interrupt, &mut |done: Done<'_>| {
+            let lost = open.call(&mut call, deadline, interrupt, &mut |done: Done<'_>| {
                 let Some(take) = take.take_if(|_| done.outcome.is_ok() || done.again.is_none())
                 else {
                     assert!(done.again.is_some(), "a call has one result");
@@ -166,6 +191,9 @@ impl BlockingClient {
             open.count_strays(&self.strays);
             if open.connection.closed().is_some() {
                 state.end();
+            }
+            if let Some(error) = call.refused.take() {
+                return Some(Err(error));
             }
             // A reply that has come is returned in spite of an interrupt.
             if interrupt.is_hit() && !matches!(result, Some(Ok(_))) {
@@ -341,7 +369,7 @@ impl Open {
     /// Carries out a request. Returns the I/O error, if there was one.
     fn call(
         &mut self,
-        call: &Call<'_>,
+        call: &mut Call<'_>,
         deadline: Instant,
         interrupt: &mut Interrupt<'_>,
         sink: &mut impl FnMut(Done<'_>),
@@ -355,7 +383,7 @@ impl Open {
 
     fn exchange(
         &mut self,
-        call: &Call<'_>,
+        call: &mut Call<'_>,
         deadline: Instant,
         interrupt: &mut Interrupt<'_>,
         sink: &mut impl FnMut(Done<'_>),
@@ -378,13 +406,16 @@ impl Open {
             self.connection.close(why, sink);
             return Ok(());
         }
+        let mut has_begun = false;
         loop {
             let outgoing = self.connection.outgoing();
             if !outgoing.is_empty() {
-                if !(call.may_send)() {
+                call.refused = if has_begun { None } else { (call.conditions.to_begin)().err() };
+                if call.refused.is_some() || !call.conditions.may_go_on() {
                     self.connection.close(Closed::BySelf, sink);
                     return Ok(());
                 }
+                has_begun = true;
                 let until = self.epoch + self.connection.deadline().unwrap_or(now - self.epoch);
                 match self.stream.send(outgoing, until) {
                     // Part of the request may have been sent.
@@ -416,5 +447,39 @@ impl Open {
                 Err(error) => return Err(error),
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+    use std::io::Read;
+    use std::net::TcpListener;
+
+    use holdfast_protocol::client::Tolerance;
+    use holdfast_protocol::pdu::Request;
+
+    use super::*;
+    use crate::client::Place;
+
+    #[test]
+    fn what_may_no_longer_begin_after_the_connect_is_not_sent() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let (host, port) = ("127.0.0.1".to_owned(), listener.local_addr().unwrap().port());
+        let place = Place::Tcp { host, port, tls: None };
+        let client = BlockingClient::new(Endpoint { place, tolerance: Tolerance::default() });
+        let asked = Cell::new(0);
+        let to_begin = || {
+            asked.set(asked.get() + 1);
+            if asked.get() == 1 { Ok(()) } else { Err(ClientError::Expired) }
+        };
+        let conditions = Conditions { to_begin: &to_begin, to_go_on: None };
+        let write = EncodedRequest::new(&Request::WriteSingleRegister { address: 0, value: 1 });
+        let answer = client.call_under(&conditions, 1, &write, Duration::from_secs(60), |_, _| ());
+        assert!(matches!(answer, Err(ClientError::Expired)), "{answer:?}");
+        drop(client);
+        let mut received = Vec::new();
+        listener.accept().unwrap().0.read_to_end(&mut received).unwrap();
+        assert_eq!(received, []);
     }
 }

@@ -12,7 +12,7 @@ mod strays;
 mod tls_stream;
 mod turns;
 
-pub use blocking::BlockingClient;
+pub use blocking::{BlockingClient, Conditions};
 pub use endpoint::{Endpoint, Place};
 pub use strays::StrayCounters;
 
@@ -52,6 +52,9 @@ pub enum ClientError {
     /// The device may not be used now: another process may use it. Nothing was sent.
     #[error("another node uses the device")]
     Fenced,
+    /// The request was not sent in time. Nothing was sent.
+    #[error("it has waited too long")]
+    Expired,
 }
 
 /// Why a connection was lost.

@@ -10,9 +10,9 @@ use tokio::time::Instant;
 
 use super::backoff::Retry;
 use super::blocking::BlockingLink;
-use super::fault::{Answer, Exchanged, fault};
-use super::fence::Fence;
+use super::fault::{Answer, Exchanged, Fault, fault};
 use super::pace::{InFlight, Pace, Place as Turn};
+use super::permit::Permit;
 use super::queue::Priority;
 use super::tcp::TcpLink;
 use crate::client::{Endpoint, Place, StrayCounters};
@@ -58,11 +58,18 @@ impl Link {
         request: &EncodedRequest,
         timeout: Duration,
         priority: Priority,
-        fence: Option<&Arc<Fence>>,
+        permit: &Permit,
     ) -> Answer {
-        let _turn = self.turn(POLLER, priority).await;
+        let _turn = match permit.until {
+            None => self.turn(POLLER, priority).await,
+            // In a box, so that polls do not carry the room for it.
+            Some(_) => {
+                let turn = Box::pin(self.turn(POLLER, priority));
+                permit.in_time(turn).await.ok_or(Fault::Expired)?
+            }
+        };
         let eager = priority == Priority::Urgent;
-        let answer = self.exchange(unit_id, request, timeout, eager, fence).await;
+        let answer = self.exchange(unit_id, request, timeout, eager, permit).await;
         answer.map_err(|error| fault(&error))
     }
 
@@ -79,14 +86,14 @@ impl Link {
         request: &EncodedRequest,
         timeout: Duration,
         eager: bool,
-        fence: Option<&Arc<Fence>>,
+        permit: &Permit,
     ) -> Exchanged {
         self.note_change(request);
         let answer = match &self.wire {
             Wire::Tcp(link) => {
-                link.exchange(&self.pace, unit_id, request, timeout, eager, fence).await
+                link.exchange(&self.pace, unit_id, request, timeout, eager, permit).await
             }
-            Wire::Blocking(link) => link.exchange(unit_id, request, timeout, eager, fence).await,
+            Wire::Blocking(link) => link.exchange(unit_id, request, timeout, eager, permit).await,
         };
         self.note_change(request);
         answer

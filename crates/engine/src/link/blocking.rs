@@ -11,9 +11,12 @@ use tokio::time::Instant;
 
 use super::backoff::Retry;
 use super::fault::{Exchanged, FLOODED, Fault, fault};
-use super::fence::{Fence, Pass};
+use super::fence::Pass;
 use super::flood::Flood;
-use crate::client::{BlockingClient, ClientError, Endpoint, Lost, Place, StrayCounters};
+use super::permit::Permit;
+use crate::client::{
+    BlockingClient, ClientError, Conditions, Endpoint, Lost, Place, StrayCounters,
+};
 
 pub(super) struct BlockingLink {
     jobs: mpsc::Sender<Job>,
@@ -38,7 +41,7 @@ struct Call {
     request: Box<EncodedRequest>,
     timeout: Duration,
     eager: bool,
-    fence: Option<Arc<Fence>>,
+    permit: Permit,
     /// The result, and when an endpoint that could not be opened is tried again.
     answer: oneshot::Sender<(Exchanged, Option<Instant>)>,
 }
@@ -61,7 +64,7 @@ impl BlockingLink {
                     // A stopped device no longer waits for its read.
                     Job::Call(call) if call.answer.is_closed() => {}
                     Job::Call(call) => {
-                        if let Some(fence) = &call.fence {
+                        if let Some(fence) = &call.permit.fence {
                             pass.get_or_insert_with(|| fence.pass());
                         }
                         let answer = carried_out(&client, retry, &call, &mut failed);
@@ -92,13 +95,13 @@ impl BlockingLink {
         request: &EncodedRequest,
         timeout: Duration,
         eager: bool,
-        fence: Option<&Arc<Fence>>,
+        permit: &Permit,
     ) -> Exchanged {
         let ended = || Arc::new(ClientError::Lost(Lost::Closed(Closed::BySelf)));
         let (answer, answered) = oneshot::channel();
         let request = Box::new(request.clone());
-        let fence = fence.cloned();
-        let call = Call { unit_id, request, timeout, eager, fence, answer };
+        let permit = permit.clone();
+        let call = Call { unit_id, request, timeout, eager, permit, answer };
         self.jobs.send(Job::Call(call)).map_err(|_| ended())?;
         let (answer, retry_at) = answered.await.unwrap_or_else(|_| (Err(ended()), None));
         self.retry_at.set(retry_at);
@@ -132,20 +135,23 @@ fn carried_out(
     {
         return Err(Arc::clone(error));
     }
-    let Call { unit_id, ref request, timeout, ref fence, .. } = *call;
-    let answer = match fence {
-        None => client.call(unit_id, request, timeout, |_, pdu| pdu.to_vec()),
-        Some(fence) => {
-            let allowed = || fence.allows();
-            client.call_while(&allowed, unit_id, request, timeout, |_, pdu| pdu.to_vec())
-        }
+    let Call { unit_id, ref request, timeout, ref permit, .. } = *call;
+    let allows = permit.fence.as_ref().map(|fence| || fence.allows());
+    let conditions = Conditions {
+        to_begin: &|| permit.check(),
+        to_go_on: allows.as_ref().map(|allows| allows as &dyn Fn() -> bool),
     };
+    let answer = client.call_under(&conditions, unit_id, request, timeout, |_, pdu| pdu.to_vec());
     let answer = answer.map_err(Arc::new);
     *failed = match &answer {
         Err(error) if fault(error) == Fault::Refused => {
             let attempts = failed.take().map_or(0, |failed| failed.attempts).saturating_add(1);
             let until = Instant::now() + retry.pause(attempts);
             Some(Failed { attempts, until, error: Arc::clone(error) })
+        }
+        // It was not tried.
+        Err(error) if matches!(**error, ClientError::Fenced | ClientError::Expired) => {
+            failed.take()
         }
         _ => None,
     };

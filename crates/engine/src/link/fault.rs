@@ -28,6 +28,8 @@ pub enum Fault {
     Flooded,
     /// Another node uses the device. Nothing was sent.
     Standby,
+    /// A write that nobody expects any more, because it has waited too long. Nothing was sent.
+    Expired,
 }
 
 /// Exceptions of a gateway that could not reach the unit.
@@ -62,6 +64,7 @@ impl Fault {
             Fault::Internal => NO_EXCEPTION + 7,
             Fault::Flooded => NO_EXCEPTION + 8,
             Fault::Standby => NO_EXCEPTION + 9,
+            Fault::Expired => NO_EXCEPTION + 10,
         }
     }
 }
@@ -89,6 +92,7 @@ pub(super) fn fault(error: &ClientError) -> Fault {
         ClientError::Invalid(InvalidResponse::Flood) => Fault::Flooded,
         ClientError::Invalid(_) => Fault::Invalid,
         ClientError::Fenced => Fault::Standby,
+        ClientError::Expired => Fault::Expired,
         ClientError::Lost(_) | ClientError::Tls { .. } => Fault::Reset,
     }
 }

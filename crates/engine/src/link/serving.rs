@@ -11,6 +11,7 @@ use tokio::task::spawn_local;
 
 use super::access::Link;
 use super::fault::{Exchanged, Fault, exception, fault};
+use super::permit::Permit;
 use super::route::{Call, LinkCounters, LinkSettings, Reply, SharedLink};
 use super::shared_reads::{SharedReads, shareable};
 use super::silence::Silence;
@@ -69,7 +70,8 @@ impl Serving {
         let Some(timeout) = replies.iter().map(Reply::timeout).max() else { return };
         replies.iter().for_each(Reply::note_sent);
         let changes = self.link.changes.get();
-        let answered = self.link.exchange(unit_id, &request, timeout, true, None).await;
+        let answered =
+            self.link.exchange(unit_id, &request, timeout, true, &Permit::default()).await;
         drop(turn);
         self.learn(unit_id, &answered, replies.iter().any(Reply::is_of_listener));
         let error = match answered {

@@ -19,10 +19,11 @@ use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
 use super::backoff::Retry;
 use super::fault::{Exchanged, FLOODED};
-use super::fence::{Fence, Pass};
+use super::fence::Pass;
 use super::flood::Flood;
 use super::handshake;
 use super::pace::Pace;
+use super::permit::Permit;
 use crate::client::{ClientError, StrayCounters};
 use crate::tls::client::ClientTls;
 use crate::tls::{Channel, TlsFailure};
@@ -57,8 +58,8 @@ pub(super) struct TcpLink {
     open: Rc<RefCell<Option<Open>>>,
 }
 
-/// The result of a request, and its next attempt, if there is one.
-type Outcome = (Result<Vec<u8>, Failure>, Option<Attempt>);
+/// The result of a request, and its next attempt, if there is one; `None` if it was not sent in time.
+type Outcome = Option<(Result<Vec<u8>, Failure>, Option<Attempt>)>;
 
 /// An open connection.
 struct Open {
@@ -66,6 +67,8 @@ struct Open {
     /// The zero of the clock of the connection.
     epoch: Instant,
     waiting: HashMap<Ticket, oneshot::Sender<Outcome>>,
+    /// Requests that wait for a pause, and until when they may be sent.
+    held: Vec<(Ticket, Instant)>,
     ended: Rc<Cell<Option<Instant>>>,
     strays: Arc<StrayCounters>,
     /// Late replies that were counted.
@@ -111,26 +114,24 @@ impl TcpLink {
         request: &EncodedRequest,
         timeout: Duration,
         eager: bool,
-        fence: Option<&Arc<Fence>>,
+        permit: &Permit,
     ) -> Exchanged {
-        let check = || match fence {
-            Some(fence) if !fence.allows() => Err(Arc::new(ClientError::Fenced)),
-            _ => Ok(()),
-        };
         let mut deadline = Instant::now() + timeout;
         let failed = |failure| Arc::new(ClientError::new(failure, timeout));
         let mut attempt = Attempt::default();
         loop {
             if self.open.borrow().is_none() {
-                self.connect(deadline, timeout, eager, &check).await?;
+                self.connect(deadline, timeout, eager, permit).await?;
             }
-            if let (Some(open), Some(fence)) = (self.open.borrow_mut().as_mut(), fence) {
+            if let (Some(open), Some(fence)) = (self.open.borrow_mut().as_mut(), &permit.fence) {
                 open.pass.get_or_insert_with(|| fence.pass());
             }
-            check()?;
+            permit.check()?;
             let began = pace.began();
-            let (answer, again) =
-                self.carry_out(unit_id, request, deadline, attempt).await.map_err(failed)?;
+            let outcome = self.carry_out(unit_id, request, deadline, attempt, permit.until).await;
+            let Some((answer, again)) = outcome.map_err(failed)? else {
+                return Err(Arc::new(ClientError::Expired));
+            };
             if let Some(began) = began {
                 pace.ended(began, answer == Err(Failure::Timeout));
             }
@@ -150,8 +151,14 @@ impl TcpLink {
         request: &EncodedRequest,
         deadline: Instant,
         attempt: Attempt,
+        until: Option<std::time::Instant>,
     ) -> Result<Outcome, Failure> {
         let mut sent = self.send(unit_id, request, deadline, attempt)?;
+        if let (Some(until), Some(open)) = (until, self.open.borrow_mut().as_mut())
+            && open.connection.is_held()
+        {
+            open.held.push((sent.ticket, until.into()));
+        }
         loop {
             match timeout_at(self.due(), &mut sent.outcome).await {
                 Ok(outcome) => {
@@ -169,7 +176,7 @@ impl TcpLink {
         deadline: Instant,
         timeout: Duration,
         eager: bool,
-        check: &impl Fn() -> Result<(), Arc<ClientError>>,
+        permit: &Permit,
     ) -> Result<(), Arc<ClientError>> {
         let too_late = || ClientError::ConnectTimeout { to: self.url.clone(), after: timeout };
         let alone = timeout_at(deadline, self.connecting.lock()).await;
@@ -189,7 +196,7 @@ impl TcpLink {
         if let Some(ended) = self.ended.get() {
             sleep_until((ended + self.tolerance.reconnect).min(deadline)).await;
         }
-        check()?;
+        permit.check()?;
         let address = (self.host.as_str(), self.port);
         let connected = timeout_at(deadline, async {
             let mut stream = TcpStream::connect(address).await?;
@@ -232,6 +239,7 @@ impl TcpLink {
             connection: Connection::tolerant(Transport::Tcp, self.tolerance, Duration::ZERO),
             epoch: Instant::now(),
             waiting: HashMap::new(),
+            held: Vec::new(),
             ended: Rc::clone(&self.ended),
             strays: Arc::clone(&self.strays),
             late: 0,
@@ -295,7 +303,8 @@ impl TcpLink {
     fn due(&self) -> Instant {
         let open = self.open.borrow();
         let due = open.as_ref().and_then(|open| Some(open.epoch + open.connection.deadline()?));
-        due.unwrap_or_else(Instant::now)
+        let due = due.unwrap_or_else(Instant::now);
+        open.iter().flat_map(|open| &open.held).map(|(_, until)| *until).fold(due, Instant::min)
     }
 
     /// Ends the requests whose time is over, and the connection if that was too much; sends what has
@@ -303,6 +312,7 @@ impl TcpLink {
     fn advance(&self) {
         let mut open = self.open.borrow_mut();
         let Some(found) = open.as_mut() else { return };
+        found.give_up_held();
         let Open { connection, waiting, .. } = found;
         connection.advance(found.epoch.elapsed(), |done| hand_on(waiting, &done));
         if connection.closed().is_some() || !found.write() {
@@ -340,7 +350,7 @@ fn hand_on(waiting: &mut HashMap<Ticket, oneshot::Sender<Outcome>>, done: &Done<
     if let Some(sender) = waiting.remove(&done.ticket) {
         // A device that was stopped does not wait.
         let answer = done.outcome.map(|_| done.pdu.to_vec());
-        let _ = sender.send((answer, done.again));
+        let _ = sender.send(Some((answer, done.again)));
     }
 }
 
@@ -354,6 +364,26 @@ impl Drop for TcpLink {
 impl Open {
     fn is_fenced(&self) -> bool {
         self.pass.as_ref().is_some_and(|pass| !pass.fence().allows())
+    }
+
+    /// Drops the requests that have waited for a pause for too long.
+    fn give_up_held(&mut self) {
+        let now = Instant::now();
+        let Open { connection, waiting, held, .. } = self;
+        if !connection.is_held() {
+            held.clear();
+        }
+        held.retain(|(ticket, until)| {
+            if now < *until {
+                return true;
+            }
+            connection.cancel(*ticket);
+            if let Some(sender) = waiting.remove(ticket) {
+                // A device that was stopped does not wait.
+                let _ = sender.send(None);
+            }
+            false
+        });
     }
 
     /// Sends without waiting. Bytes that the socket does not accept are sent later. Returns whether
@@ -454,26 +484,39 @@ mod tests {
 
     use super::*;
     use crate::client::{Endpoint, Place};
-    use crate::link::{InFlight, Link, Priority};
+    use crate::link::fault::Answer;
+    use crate::link::{Fault, InFlight, Link, Priority};
 
     const TIMEOUT: Duration = Duration::from_secs(60);
+
+    /// A device, and a link to it with one request in flight.
+    async fn linked(tolerance: Tolerance) -> (TcpListener, Rc<Link>) {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let (host, port) = ("127.0.0.1".to_owned(), listener.local_addr().unwrap().port());
+        let place = Place::Tcp { host, port, tls: None };
+        let endpoint = Endpoint { place, tolerance };
+        (listener, Link::new(endpoint, InFlight::Fixed(1), Retry::default()))
+    }
+
+    async fn write_within(link: &Link, time: Duration) -> Answer {
+        let request = Request::WriteSingleRegister { address: 0, value: 1 };
+        let write = EncodedRequest::new(&request);
+        let permit = Permit { fence: None, until: Some((Instant::now() + time).into_std()) };
+        link.call(1, &write, TIMEOUT, Priority::Urgent, &permit).await
+    }
 
     #[test]
     fn a_request_whose_device_was_stopped_leaves_its_place() {
         let runtime = Builder::new_current_thread().enable_all().build().unwrap();
         LocalSet::new().block_on(&runtime, async {
-            let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-            let (host, port) = ("127.0.0.1".to_owned(), listener.local_addr().unwrap().port());
             let tolerance = Tolerance { close_after: 100, ..Tolerance::default() };
-            let place = Place::Tcp { host, port, tls: None };
-            let link =
-                Link::new(Endpoint { place, tolerance }, InFlight::Fixed(1), Retry::default());
+            let (listener, link) = linked(tolerance).await;
             let range = Range::new(0, 1).unwrap();
             let read = EncodedRequest::new(&Request::ReadHoldingRegisters(range));
 
             let (for_stopped, request) = (Rc::clone(&link), read.clone());
             let stopped = spawn_local(async move {
-                for_stopped.call(1, &request, TIMEOUT, Priority::Usual, None).await
+                for_stopped.call(1, &request, TIMEOUT, Priority::Usual, &Permit::default()).await
             });
             let (mut device, _) = listener.accept().await.unwrap();
             let mut request = [0; 12];
@@ -481,15 +524,41 @@ mod tests {
             stopped.abort();
             assert!(stopped.await.unwrap_err().is_cancelled());
 
-            let next =
-                spawn_local(
-                    async move { link.call(1, &read, TIMEOUT, Priority::Usual, None).await },
-                );
+            let next = spawn_local(async move {
+                link.call(1, &read, TIMEOUT, Priority::Usual, &Permit::default()).await
+            });
             let mut request = [0; 12];
             device.read_exact(&mut request).await.unwrap();
             let reply = [request[0], request[1], 0, 0, 0, 5, 1, 3, 2, 0, 7];
             device.write_all(&reply).await.unwrap();
             assert_eq!(next.await.unwrap(), Ok(vec![3, 2, 0, 7]));
+        });
+    }
+
+    #[test]
+    fn what_waits_for_a_pause_for_too_long_is_not_sent() {
+        let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let tolerance = Tolerance { pause_after_connect: TIMEOUT, ..Tolerance::default() };
+            let (listener, link) = linked(tolerance).await;
+            let answer = write_within(&link, Duration::from_millis(100)).await;
+            assert_eq!(answer, Err(Fault::Expired));
+            let (mut device, _) = listener.accept().await.unwrap();
+            drop(link);
+            let mut received = Vec::new();
+            device.read_to_end(&mut received).await.unwrap();
+            assert_eq!(received, []);
+        });
+    }
+
+    #[test]
+    fn what_is_sent_too_late_makes_no_connection() {
+        let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let (listener, link) = linked(Tolerance::default()).await;
+            assert_eq!(write_within(&link, Duration::ZERO).await, Err(Fault::Expired));
+            let none = tokio::time::timeout(Duration::ZERO, listener.accept()).await;
+            assert!(none.is_err(), "nobody connects");
         });
     }
 }

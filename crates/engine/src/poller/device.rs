@@ -36,7 +36,7 @@ use super::state::DeviceState;
 use super::status::StatusSettings;
 use super::turn::Turn;
 use crate::client::Endpoint;
-use crate::link::{Fault, Fence, InFlight, Link, Priority, Retry, Stage};
+use crate::link::{Fault, Fence, InFlight, Link, Permit, Priority, Retry, Stage};
 
 /// The longest interval between writes of the status block.
 const TELLING: Duration = Duration::from_secs(1);
@@ -628,7 +628,9 @@ impl Device {
         let priority = if self.silent.get() > 0 { Priority::Doubtful } else { Priority::Usual };
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
         let fence = self.settings.fence.as_ref();
-        let answer = self.link.call(*unit_id, &request, *timeout, priority, fence).await.map(data);
+        let permit = Permit { fence: fence.cloned(), until: None };
+        let answer =
+            self.link.call(*unit_id, &request, *timeout, priority, &permit).await.map(data);
         // After a stop of the process, a reply may be old, and another node may have read a newer one.
         if fence.is_some_and(|fence| !fence.allows()) {
             return Err(Fault::Standby);

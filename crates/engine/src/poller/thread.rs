@@ -7,7 +7,7 @@ use std::rc::{self, Rc};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use holdfast_memory::Memory;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, limit};
@@ -28,7 +28,8 @@ use super::write_through::{Passage, PassedRange, PassedWrite};
 use crate::client::{Endpoint, Place};
 use crate::heartbeat::Heartbeat;
 use crate::link::{
-    Call, Fault, Fence, InFlight, Link, LinkSettings, Priority, Retry, SharedLink, Stage, serve,
+    Call, Fault, Fence, InFlight, Link, LinkSettings, Permit, Priority, Retry, SharedLink, Stage,
+    serve,
 };
 use crate::own_threads::OwnThreads;
 use crate::tls::client::Identity;
@@ -120,6 +121,7 @@ enum Order {
         device: String,
         ticket: u64,
         request: Box<EncodedRequest>,
+        until: Option<Instant>,
         to: Arc<Results>,
     },
     Stop,
@@ -285,7 +287,8 @@ impl Poller {
     }
 
     /// Sends a write over the connection of a device. Returns a number, under which its result is
-    /// passed `to` a receiver.
+    /// passed `to` a receiver. What can't be sent until a time, and one timeout of the device, fails with
+    /// [`Fault::Expired`].
     ///
     /// # Errors
     /// [`PollerError`] if there is no such device, or the request is not a write.
@@ -293,6 +296,7 @@ impl Poller {
         &self,
         name: &str,
         request: Box<EncodedRequest>,
+        until: Option<Instant>,
         to: &Arc<Results>,
     ) -> Result<u64, PollerError> {
         if !request.request().is_some_and(|request| request.function().is_write()) {
@@ -304,7 +308,7 @@ impl Poller {
         }
         let ticket = self.tickets.fetch_add(1, Ordering::Relaxed);
         let to = Arc::clone(to);
-        self.order(Order::Write { device: name.to_owned(), ticket, request, to })?;
+        self.order(Order::Write { device: name.to_owned(), ticket, request, until, to })?;
         Ok(ticket)
     }
 
@@ -439,8 +443,8 @@ async fn obey(
                 running.insert(name, device);
                 links.retain(|_, link| link.strong_count() > 0);
             }
-            Order::Write { device, ticket, request, to } => match running.get(&device) {
-                Some(device) => device.write(ticket, request, to),
+            Order::Write { device, ticket, request, until, to } => match running.get(&device) {
+                Some(device) => device.write(ticket, request, until, to),
                 None => to.push_write(Written { ticket, outcome: Err(Fault::Reset) }),
             },
         }
@@ -497,19 +501,28 @@ impl Running {
 
     /// Sends a write between two reads, as soon as possible. Removing the device does not cancel
     /// it.
-    fn write(&self, ticket: u64, request: Box<EncodedRequest>, to: Arc<Results>) {
+    fn write(
+        &self,
+        ticket: u64,
+        request: Box<EncodedRequest>,
+        until: Option<Instant>,
+        to: Arc<Results>,
+    ) {
         let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
         let inbox = Rc::clone(&self.inbox);
         let Running { unit_id, timeout, release, .. } = *self;
-        let fence = self.fence.clone();
+        let until = until.map(|until| until + timeout);
+        let permit = Permit { fence: self.fence.clone(), until };
         spawn_local(async move {
-            let Some(taken) = turn.take_to_write(fence.as_ref(), timeout).await else {
-                return to.push_write(Written { ticket, outcome: Err(Fault::Standby) });
+            let fence = permit.fence.as_ref();
+            let refused = |fault| to.push_write(Written { ticket, outcome: Err(fault) });
+            let Some(taken) = permit.in_time(turn.take_to_write(fence, timeout)).await else {
+                return refused(Fault::Expired);
             };
-            let urgent = Priority::Urgent;
-            let answer = link.call(unit_id, &request, timeout, urgent, fence.as_ref()).await;
+            let Some(taken) = taken else { return refused(Fault::Standby) };
+            let answer = link.call(unit_id, &request, timeout, Priority::Urgent, &permit).await;
             drop(taken);
-            if release || has_ended(fence.as_ref()) {
+            if release || has_ended(fence) {
                 link.release();
             }
             if answer.is_ok() {
@@ -524,17 +537,18 @@ impl Running {
         let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
         let inbox = Rc::clone(&self.inbox);
         let Running { unit_id, timeout, release, .. } = *self;
-        let fence = self.fence.clone();
+        let permit = Permit { fence: self.fence.clone(), until: None };
         spawn_local(async move {
-            let Some(taken) = turn.take_to_write(fence.as_ref(), timeout).await else {
+            let fence = permit.fence.as_ref();
+            let Some(taken) = turn.take_to_write(fence, timeout).await else {
                 return write.refuse(ExceptionCode::GatewayPathUnavailable);
             };
-            if let Some(change) = write.carry_out(&link, unit_id, timeout, fence.as_ref()).await {
+            if let Some(change) = write.carry_out(&link, unit_id, timeout, &permit).await {
                 turn.note(change);
                 inbox.wake();
             }
             drop(taken);
-            if release || has_ended(fence.as_ref()) {
+            if release || has_ended(fence) {
                 link.release();
             }
         });
@@ -820,7 +834,7 @@ mod tests {
         let poller = Poller::start(Vec::new()).unwrap();
         let read = Request::ReadHoldingRegisters(Range::new(0, 1).unwrap());
         let error = poller
-            .write("meter", Box::new(EncodedRequest::new(&read)), &poller.receiver())
+            .write("meter", Box::new(EncodedRequest::new(&read)), None, &poller.receiver())
             .unwrap_err();
         assert_eq!(error.to_string(), "device meter: function 3 does not write");
     }

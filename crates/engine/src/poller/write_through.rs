@@ -15,7 +15,7 @@ use holdfast_protocol::pdu::{
 use tokio::sync::{mpsc, oneshot};
 
 use crate::items::{Items, touched};
-use crate::link::{Coming, Fault, Fence, Link, Priority, ReplyTo, coming, exception};
+use crate::link::{Coming, Fault, Link, Permit, Priority, ReplyTo, coming, exception};
 
 /// The most writes into one memory that wait for devices.
 const MAX_WAITING: usize = 256;
@@ -198,7 +198,7 @@ impl PassedWrite {
         link: &Link,
         unit_id: u8,
         timeout: Duration,
-        fence: Option<&Arc<Fence>>,
+        permit: &Permit,
     ) -> Option<Change> {
         if self.reply.is_unwanted() {
             return None;
@@ -208,7 +208,7 @@ impl PassedWrite {
             return None;
         }
         let call = async |request: &EncodedRequest| {
-            link.call(unit_id, request, timeout, Priority::Urgent, fence).await
+            link.call(unit_id, request, timeout, Priority::Urgent, permit).await
         };
         let mask = match self.request.request() {
             Some(Request::MaskWriteRegister { address, and_mask, or_mask }) => {

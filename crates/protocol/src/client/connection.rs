@@ -154,6 +154,12 @@ impl Connection {
         self.flights.deadline_of(ticket)
     }
 
+    /// Whether the requests in flight wait for a pause, so that none of them was sent. Not on transports
+    /// that carry one request at a time.
+    pub fn is_held(&self) -> bool {
+        self.flights.held.is_some()
+    }
+
     /// The bytes to send; over UDP, exactly one datagram.
     pub fn outgoing(&self) -> &[u8] {
         if self.flights.held.is_some() { &[] } else { &self.flights.out }

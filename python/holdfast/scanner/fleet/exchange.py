@@ -15,6 +15,8 @@ class Command(msgspec.Struct, kw_only=True):
     text: str
     epoch: int
     """The revision of the lease that the sender knows: whoever has an older one is not meant."""
+    within: float = 0.0
+    """Seconds that it may wait for the device, but for one timeout of that."""
 
 
 class Executed(msgspec.Struct, kw_only=True, omit_defaults=True):

@@ -342,23 +342,23 @@ class FleetPart:
         tag: str,
         text: str,
         own: Callable[[], Awaitable[bool]],
-        check: Callable[[], None],
+        check: Callable[[], float],
     ) -> None:
         """Has a command carried out by whoever polls the device. Raises `Refused`.
 
         `own` carries it out here. It returns false, and writes nothing, if the device has moved.
-        `check` refuses it if it is too late.
+        `check` refuses it if it is too late, and returns how many seconds it may wait.
         """
         end = time.monotonic() + MOVING
         why = f"no node polls {device.id} now"
         while True:
-            check()
+            left = check()
             owner = self.fleet.holder(device.partition)
             if self.is_own(device):
                 if await own():
                     return
             elif owner is not None and self.fleet.is_other(owner):
-                sent = await self._send(owner, device, tag, text)
+                sent = await self._send(owner, device, tag, text, left)
                 if sent is None:
                     return
                 why = sent
@@ -366,7 +366,9 @@ class FleetPart:
                 raise Refused(f"not written: {why}")
             await asyncio.sleep(AGAIN)
 
-    async def _send(self, owner: Holding, device: ScannedDevice, tag: str, text: str) -> str | None:
+    async def _send(
+        self, owner: Holding, device: ScannedDevice, tag: str, text: str, left: float
+    ) -> str | None:
         """Returns why another node did not carry out a command. Raises `Refused` if it tried."""
         holding = self.fleet.leases.seen.get(f"partition.{device.partition}")
         command = Command(
@@ -374,10 +376,12 @@ class FleetPart:
             tag=tag,
             text=text,
             epoch=0 if holding is None else holding.revision,
+            within=min(left, 2 * TTL),
         )
-        patience = 2 * (TTL + device.source.timeout / 1000) + ASKED
+        # After this, it waits one timeout of the device for its turn, and one for the reply.
+        timeout = 2 * (TTL + device.source.timeout / 1000) + ASKED
         try:
-            done = await self._ask(owner, "command", command, Executed, patience)
+            done = await self._ask(owner, "command", command, Executed, timeout)
         except NoRespondersError:
             return f"node {owner.node} is gone"
         except (Error, OSError):
