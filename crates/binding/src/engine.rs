@@ -6,7 +6,8 @@ use holdfast_engine::server::audit::Unrecordable;
 use holdfast_engine::server::counters::PacketCounters;
 use holdfast_engine::server::event::{Kind, Verbosity};
 use holdfast_engine::server::{
-    Engine as Core, ListenerCounters, Listening, ProtocolCounters, Session, Settings, StartError,
+    Engine as Core, ListenerCounters, Listening, OpenConnection, ProtocolCounters, Settings,
+    StartError,
 };
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
@@ -176,7 +177,11 @@ fn verbosity(events: &str) -> PyResult<Verbosity> {
     word("events", events, &verbosities)
 }
 
-fn shown<'py>(py: Python<'py>, listener: &str, session: &Session) -> PyResult<Bound<'py, PyDict>> {
+fn shown<'py>(
+    py: Python<'py>,
+    listener: &str,
+    session: &OpenConnection,
+) -> PyResult<Bound<'py, PyDict>> {
     let all = PyDict::new(py);
     all.set_item("listener", listener)?;
     all.set_item("id", session.id)?;

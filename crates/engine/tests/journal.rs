@@ -23,7 +23,7 @@ use holdfast_memory::{
 use holdfast_protocol::frame::mbap;
 use holdfast_protocol::raw_ingest::Format;
 
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Steps that wait for the test.
 #[derive(Default)]
@@ -49,7 +49,7 @@ impl Manual {
     fn wait_for(&self, count: usize) {
         let few = |waiting: &mut VecDeque<_>| waiting.len() < count;
         let waited =
-            self.arrived.wait_timeout_while(self.waiting.lock().unwrap(), PATIENCE, few).unwrap();
+            self.arrived.wait_timeout_while(self.waiting.lock().unwrap(), TIMEOUT, few).unwrap();
         assert!(!waited.1.timed_out(), "{} of {count} steps came", waited.0.len());
     }
 
@@ -63,15 +63,15 @@ impl Manual {
     }
 }
 
-struct Front {
+struct Setup {
     engine: Engine,
     journal: Arc<Manual>,
     memory: Arc<Memory>,
 }
 
-impl Front {
+impl Setup {
     /// Listeners for Modbus TCP, Modbus UDP, and Raw Ingest with one and with many packets.
-    fn new() -> Front {
+    fn new() -> Setup {
         let span = Span::new(0, 100).unwrap();
         let layout =
             Area::ALL.into_iter().fold(Layout::default(), |layout, area| layout.with(area, span));
@@ -101,7 +101,7 @@ impl Front {
             rates,
             limits,
             idle_timeout: None,
-            request_timeout: PATIENCE,
+            request_timeout: TIMEOUT,
             frame_timeout: None,
             listen_only: false,
             tls: None,
@@ -127,12 +127,11 @@ impl Front {
             }],
             limits,
             rates,
-            request_timeout: PATIENCE,
+            request_timeout: TIMEOUT,
             packets,
             tls: None,
         };
-        let many =
-            PacketsPerConnection::Many { idle: PATIENCE, after_refusal: AfterRefusal::Close };
+        let many = PacketsPerConnection::Many { idle: TIMEOUT, after_refusal: AfterRefusal::Close };
         let kinds = [
             ListenerKind::ModbusStream(stream),
             ListenerKind::ModbusUdp(udp),
@@ -152,13 +151,13 @@ impl Front {
             events: Verbosity::Nothing,
             audit: Some(Unrecordable::Write),
         });
-        Front { engine: engine.unwrap(), journal, memory }
+        Setup { engine: engine.unwrap(), journal, memory }
     }
 
     fn connect(&self, listener: usize) -> TcpStream {
         let stream = TcpStream::connect(self.engine.addresses()[listener].unwrap()).unwrap();
         stream.set_nodelay(true).unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        stream.set_read_timeout(Some(TIMEOUT)).unwrap();
         stream
     }
 
@@ -176,7 +175,7 @@ impl Front {
 
     /// The sequence in the record of the next write.
     fn recorded(&self) -> Option<u64> {
-        let records = self.engine.next_writes(PATIENCE, 1);
+        let records = self.engine.next_writes(TIMEOUT, 1);
         records.first().expect("a write was recorded").log_sequence
     }
 
@@ -218,8 +217,8 @@ fn packet(address: u16, value: u16) -> Vec<u8> {
 
 #[test]
 fn each_write_is_answered_when_it_is_carried_out() {
-    let front = Front::new();
-    let mut client = front.connect(0);
+    let setup = Setup::new();
+    let mut client = setup.connect(0);
     let cases: [(&[u8], &[u8]); 6] = [
         (&[5, 0, 1, 0xFF, 0], &[5, 0, 1, 0xFF, 0]),
         (&[6, 0, 1, 0, 0x12], &[6, 0, 1, 0, 0x12]),
@@ -230,82 +229,82 @@ fn each_write_is_answered_when_it_is_carried_out() {
     ];
     for (tag, (request, reply)) in (0..).zip(cases) {
         client.write_all(&frame(tag, request)).unwrap();
-        front.journal.wait_for(1);
+        setup.journal.wait_for(1);
         assert!(is_silent(&client));
-        front.carry_out();
+        setup.carry_out();
         expect(&mut client, tag, reply);
     }
-    front.engine.stop();
+    setup.engine.stop();
 }
 
 #[test]
 fn a_write_is_recorded_with_its_place_in_the_log() {
-    let front = Front::new();
-    let mut client = front.connect(0);
+    let setup = Setup::new();
+    let mut client = setup.connect(0);
     let request = [6, 0, 1, 0, 0x12];
     for sequence in [Some(41), None] {
         client.write_all(&frame(1, &request)).unwrap();
-        front.carry_out_at(sequence);
+        setup.carry_out_at(sequence);
         expect(&mut client, 1, &request);
-        assert_eq!(front.recorded(), sequence);
+        assert_eq!(setup.recorded(), sequence);
     }
     client.write_all(&frame(2, &request)).unwrap();
-    front.refuse(Refusal::NotConfirmed);
+    setup.refuse(Refusal::NotConfirmed);
     expect(&mut client, 2, &[0x86, 4]);
-    assert_eq!(front.recorded(), None);
+    assert_eq!(setup.recorded(), None);
     let datagrams = UdpSocket::bind("127.0.0.1:0").unwrap();
-    datagrams.send_to(&frame(3, &request), front.engine.addresses()[1].unwrap()).unwrap();
-    front.carry_out_at(Some(43));
-    assert_eq!(front.recorded(), Some(43));
+    datagrams.send_to(&frame(3, &request), setup.engine.addresses()[1].unwrap()).unwrap();
+    setup.carry_out_at(Some(43));
+    assert_eq!(setup.recorded(), Some(43));
     for listener in [2, 3] {
-        let mut sender = front.connect(listener);
+        let mut sender = setup.connect(listener);
         sender.write_all(&packet(5, 9)).unwrap();
-        front.carry_out_at(Some(44));
+        setup.carry_out_at(Some(44));
         sender.read_exact(&mut [0]).unwrap();
-        assert_eq!(front.recorded(), Some(44));
+        assert_eq!(setup.recorded(), Some(44));
     }
     // The client leaves before its write is carried out.
     client.write_all(&frame(4, &request)).unwrap();
-    front.journal.wait_for(1);
+    setup.journal.wait_for(1);
     drop(client);
-    front.carry_out_at(Some(45));
-    assert_eq!(front.recorded(), Some(45));
-    front.engine.stop();
+    setup.carry_out_at(Some(45));
+    assert_eq!(setup.recorded(), Some(45));
+    setup.engine.stop();
 }
 
 #[test]
 fn pipelined_writes_do_not_wait_for_each_other_and_reads_wait_for_them() {
-    let front = Front::new();
-    let mut client = front.connect(0);
+    let setup = Setup::new();
+    let mut client = setup.connect(0);
     let requests: Vec<u8> = (0..40)
         .flat_map(|tag| frame(tag, &[6, 0, 7, 0, tag as u8]))
         .chain(frame(40, &[3, 0, 7, 0, 1]))
         .collect();
     client.write_all(&requests).unwrap();
     // As many as a connection may leave waiting.
-    front.journal.wait_for(16);
+    setup.journal.wait_for(16);
     for tag in 0..40 {
-        assert_eq!(front.register(7), u16::saturating_sub(tag, 1));
+        assert_eq!(setup.register(7), u16::saturating_sub(tag, 1));
         assert!(is_silent(&client));
-        front.carry_out();
+        setup.carry_out();
         expect(&mut client, tag, &[6, 0, 7, 0, tag as u8]);
     }
     expect(&mut client, 40, &[3, 2, 0, 39]);
-    front.engine.stop();
+    setup.engine.stop();
 }
 
 #[test]
 fn a_write_that_is_not_kept_is_refused() {
-    let front = Front::new();
-    let mut client = front.connect(0);
+    let setup = Setup::new();
+    let mut client = setup.connect(0);
     let refusals = [(Refusal::Unavailable, 6), (Refusal::NotStored, 4), (Refusal::NotConfirmed, 4)];
     for (refusal, code) in refusals {
         client.write_all(&frame(1, &[6, 0, 7, 0, 1])).unwrap();
-        front.refuse(refusal);
+        setup.refuse(refusal);
         expect(&mut client, 1, &[0x86, code]);
     }
     client.write_all(&frame(2, &[16, 0, 7, 0, 1, 2, 0, 1])).unwrap();
-    drop(front.journal.next());
+    drop(setup.journal.next());
     expect(&mut client, 2, &[0x90, 4]);
     // What is wrong by itself does not reach the journal.
     for (request, reply) in [
@@ -317,75 +316,75 @@ fn a_write_that_is_not_kept_is_refused() {
         client.write_all(&frame(3, request)).unwrap();
         expect(&mut client, 3, reply);
     }
-    assert_eq!((front.journal.waiting(), front.register(7)), (0, 0));
-    front.engine.stop();
+    assert_eq!((setup.journal.waiting(), setup.register(7)), (0, 0));
+    setup.engine.stop();
 }
 
 #[test]
 fn writes_of_a_client_that_has_left_are_carried_out() {
-    let front = Front::new();
-    let mut client = front.connect(0);
+    let setup = Setup::new();
+    let mut client = setup.connect(0);
     client.write_all(&frame(1, &[6, 0, 7, 0, 5])).unwrap();
-    front.journal.wait_for(1);
+    setup.journal.wait_for(1);
     drop(client);
-    front.carry_out();
-    assert_eq!(front.register(7), 5);
-    front.engine.stop();
+    setup.carry_out();
+    assert_eq!(setup.register(7), 5);
+    setup.engine.stop();
 }
 
 #[test]
 fn datagrams_are_answered_when_they_are_carried_out() {
-    let front = Front::new();
+    let setup = Setup::new();
     let client = UdpSocket::bind("127.0.0.1:0").unwrap();
-    client.connect(front.engine.addresses()[1].unwrap()).unwrap();
-    client.set_read_timeout(Some(PATIENCE)).unwrap();
+    client.connect(setup.engine.addresses()[1].unwrap()).unwrap();
+    client.set_read_timeout(Some(TIMEOUT)).unwrap();
     client.send(&frame(1, &[6, 0, 7, 0, 5])).unwrap();
-    front.carry_out();
+    setup.carry_out();
     let mut found = [0; 300];
     let len = client.recv(&mut found).unwrap();
     assert_eq!(found[..len], frame(1, &[6, 0, 7, 0, 5]));
-    front.engine.stop();
+    setup.engine.stop();
 }
 
 #[test]
 fn packets_are_confirmed_when_they_are_carried_out() {
-    let front = Front::new();
+    let setup = Setup::new();
     let mut reply = [9; 1];
-    let mut one = front.connect(2);
+    let mut one = setup.connect(2);
     one.write_all(&packet(7, 5)).unwrap();
-    front.journal.wait_for(1);
+    setup.journal.wait_for(1);
     assert!(is_silent(&one));
-    front.carry_out();
+    setup.carry_out();
     one.read_exact(&mut reply).unwrap();
-    assert_eq!((reply, front.register(7)), ([0], 5));
+    assert_eq!((reply, setup.register(7)), ([0], 5));
 
-    let mut many = front.connect(3);
+    let mut many = setup.connect(3);
     for value in [6, 7] {
         many.write_all(&packet(7, value)).unwrap();
-        front.carry_out();
+        setup.carry_out();
         many.read_exact(&mut reply).unwrap();
-        assert_eq!((reply, front.register(7)), ([0], value));
+        assert_eq!((reply, setup.register(7)), ([0], value));
     }
-    front.engine.stop();
+    setup.engine.stop();
 }
 
 #[test]
 fn a_packet_that_is_not_confirmed_gets_no_reply() {
-    let front = Front::new();
+    let setup = Setup::new();
     for listener in [2, 3] {
         for (refusal, reply) in [
             (Refusal::NotStored, &[1][..]),
             (Refusal::Unavailable, &[1]),
             (Refusal::NotConfirmed, &[]),
         ] {
-            let mut sender = front.connect(listener);
+            let mut sender = setup.connect(listener);
             sender.write_all(&packet(7, 5)).unwrap();
-            front.refuse(refusal);
+            setup.refuse(refusal);
             let mut found = Vec::new();
             sender.read_to_end(&mut found).unwrap();
             assert_eq!(found, reply, "{refusal:?}");
         }
     }
-    assert_eq!(front.register(7), 0);
-    front.engine.stop();
+    assert_eq!(setup.register(7), 0);
+    setup.engine.stop();
 }

@@ -15,7 +15,7 @@ use holdfast_memory::{Access, Area, Done, Journal, Layout, Memory, Read, Span, S
 use holdfast_protocol::pdu::Request;
 
 const AREA: Area = Area::HoldingRegisters;
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Hands all steps to the test.
 #[derive(Debug)]
@@ -65,7 +65,7 @@ fn settings(name: &str, address: SocketAddr) -> DeviceSettings {
         retry: Retry::default(),
         unit_id: 1,
         interval: Duration::from_secs(3600),
-        timeout: PATIENCE,
+        timeout: TIMEOUT,
         reads: Vec::new(),
         limits: PlanLimits::default(),
         strategy: Strategy::Gap { max_gap: 0 },
@@ -109,13 +109,13 @@ fn a_journal_that_is_slow_holds_up_no_other_device() {
     kept.keep_in(Arc::new(Manual(Mutex::new(sender))), 0);
 
     let slow = written(passage("slow", &kept));
-    let Waiting(step, done) = steps.recv_timeout(PATIENCE).expect("the journal has the write");
+    let Waiting(step, done) = steps.recv_timeout(TIMEOUT).expect("the journal has the write");
     let other = written(passage("other", &volatile));
-    assert_eq!(other.recv_timeout(PATIENCE), Ok(Ok(())));
+    assert_eq!(other.recv_timeout(TIMEOUT), Ok(Ok(())));
     assert_eq!(register(&volatile), [0, 7]);
     assert!(slow.try_recv().is_err(), "it is not stored yet");
 
     done(Ok(step.carry_out(std::slice::from_ref(&kept)).unwrap()));
-    assert_eq!(slow.recv_timeout(PATIENCE), Ok(Ok(())));
+    assert_eq!(slow.recv_timeout(TIMEOUT), Ok(Ok(())));
     assert_eq!(register(&kept), [0, 7]);
 }

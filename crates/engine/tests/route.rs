@@ -22,7 +22,7 @@ use holdfast_engine::server::{
 use holdfast_protocol::frame::{mbap, rtu};
 
 const MASTERS: usize = 50;
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Bits of a character on a serial line.
 const CHARACTER: u32 = 11;
@@ -83,14 +83,14 @@ fn answer(stream: &mut TcpStream, baud: Option<u32>, seen: &Seen) {
 }
 
 /// A listener whose unit 1 is the device.
-struct Front {
+struct Setup {
     engine: Engine,
     poller: Poller,
     link: Arc<SharedLink>,
 }
 
-impl Front {
-    fn new(device: SocketAddr) -> Front {
+impl Setup {
+    fn new(device: SocketAddr) -> Setup {
         let poller = Poller::start(Vec::new()).unwrap();
         let place = Place::RtuOverTcp { host: "127.0.0.1".into(), port: device.port() };
         let link = LinkSettings {
@@ -104,7 +104,7 @@ impl Front {
             preferred: Vec::new(),
         };
         let link = poller.link(link).unwrap();
-        let (name, timeout) = ("device".into(), PATIENCE);
+        let (name, timeout) = ("device".into(), TIMEOUT);
         let route = Route { name, link: Arc::clone(&link), unit_id: None, timeout };
         let rule = Rule {
             sources: vec!["127.0.0.1/32".parse().unwrap()],
@@ -127,7 +127,7 @@ impl Front {
                 max_handshakes: None,
             },
             idle_timeout: None,
-            request_timeout: PATIENCE,
+            request_timeout: TIMEOUT,
             frame_timeout: None,
             listen_only: false,
             tls: None,
@@ -136,7 +136,7 @@ impl Front {
         let kind = ListenerKind::ModbusStream(stream);
         let engine = Engine::start(Settings {
             listening: Listening {
-                listeners: vec![ListenerSettings { name: "front".into(), kind }],
+                listeners: vec![ListenerSettings { name: "device".into(), kind }],
                 identity: vec![(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())],
                 unit_names: Vec::new(),
             },
@@ -144,14 +144,14 @@ impl Front {
             events: Verbosity::Nothing,
             audit: None,
         });
-        Front { engine: engine.unwrap(), poller, link }
+        Setup { engine: engine.unwrap(), poller, link }
     }
 
     fn connect(&self) -> TcpStream {
         let address = self.engine.addresses()[0].unwrap();
         let stream = TcpStream::connect(address).unwrap();
         stream.set_nodelay(true).unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        stream.set_read_timeout(Some(TIMEOUT)).unwrap();
         stream
     }
 
@@ -196,14 +196,14 @@ impl Master {
 
 /// Asks until each master has asked `each` times, or until `enough`. Returns how often each was answered,
 /// and its longest wait.
-fn crowd(front: &Front, each: u64, enough: Option<u64>) -> Vec<(u64, Duration)> {
+fn crowd(setup: &Setup, each: u64, enough: Option<u64>) -> Vec<(u64, Duration)> {
     let (start, all) = (Arc::new(Barrier::new(MASTERS)), Arc::new(AtomicU64::new(0)));
     let is_over = Arc::new(AtomicBool::new(false));
     let masters: Vec<_> = (0..MASTERS)
         .map(|number| {
             let (start, all, is_over) =
                 (Arc::clone(&start), Arc::clone(&all), Arc::clone(&is_over));
-            let stream = front.connect();
+            let stream = setup.connect();
             thread::spawn(move || {
                 let mut master =
                     Master { stream, number: number as u16, sent: 0, open: VecDeque::new() };
@@ -234,13 +234,13 @@ fn crowd(front: &Front, each: u64, enough: Option<u64>) -> Vec<(u64, Duration)> 
 fn no_master_gets_the_reply_of_another_and_the_device_gets_one_request_at_a_time() {
     let each = if is_torture() { 20_000 } else { 400 };
     let (address, seen) = device(None);
-    let front = Front::new(address);
-    let answered: u64 = crowd(&front, each, None).iter().map(|(answered, _)| answered).sum();
+    let setup = Setup::new(address);
+    let answered: u64 = crowd(&setup, each, None).iter().map(|(answered, _)| answered).sum();
     assert_eq!(answered, MASTERS as u64 * each);
     assert_eq!(seen.overlapping.load(Ordering::Relaxed), 0);
-    assert_eq!(front.link.counters.timeouts.get() + front.link.counters.failures.get(), 0);
-    assert_eq!(front.link.counters.refused_full.get(), 0);
-    front.stop();
+    assert_eq!(setup.link.counters.timeouts.get() + setup.link.counters.failures.get(), 0);
+    assert_eq!(setup.link.counters.refused_full.get(), 0);
+    setup.stop();
 }
 
 #[test]
@@ -248,39 +248,39 @@ fn fifty_masters_on_a_slow_line_have_equal_shares() {
     // 19,200 baud, or a line that is quicker so that the test ends soon.
     let (baud, enough) = if is_torture() { (19_200, 5_000) } else { (192_000, 1_000) };
     let (address, seen) = device(Some(baud));
-    let front = Front::new(address);
-    let shares = crowd(&front, u64::MAX, Some(enough));
+    let setup = Setup::new(address);
+    let shares = crowd(&setup, u64::MAX, Some(enough));
     let mean = shares.iter().map(|(answered, _)| answered).sum::<u64>() / MASTERS as u64;
     for (number, (answered, longest)) in shares.iter().enumerate() {
         assert!(2 * answered >= mean, "master {number}: {answered} of {mean}, waited {longest:?}");
     }
     assert_eq!(seen.overlapping.load(Ordering::Relaxed), 0);
-    front.stop();
+    setup.stop();
 }
 
 #[test]
 fn a_master_that_has_gone_is_not_asked_for() {
     let (address, seen) = device(Some(19_200));
-    let front = Front::new(address);
+    let setup = Setup::new(address);
     let waits: Mutex<Vec<Master>> = Mutex::default();
     for number in 0..10 {
-        let stream = front.connect();
+        let stream = setup.connect();
         let mut master = Master { stream, number, sent: 0, open: VecDeque::new() };
         (0..16).for_each(|_| master.ask());
         waits.lock().unwrap().push(master);
     }
     let mut masters = waits.into_inner().unwrap();
     let mut stays = masters.pop().unwrap();
-    while front.link.waiting() < 100 {
+    while setup.link.waiting() < 100 {
         thread::yield_now();
     }
     drop(masters);
     (0..16).for_each(|_| stays.receive());
-    while front.link.waiting() > 0 {
+    while setup.link.waiting() > 0 {
         thread::yield_now();
     }
     let asked = seen.requests.load(Ordering::Relaxed);
-    assert_eq!(asked + front.link.counters.withdrawn.get(), 160);
+    assert_eq!(asked + setup.link.counters.withdrawn.get(), 160);
     assert!(asked < 120, "{asked} requests were sent");
-    front.stop();
+    setup.stop();
 }

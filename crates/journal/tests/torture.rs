@@ -26,7 +26,7 @@ const CLIENTS: u64 = 4;
 const EPOCH: Duration = Duration::from_secs(3);
 
 /// How long a client waits for an answer. A stopped node answers later, or never.
-const PATIENCE: Duration = Duration::from_secs(2);
+const TIMEOUT: Duration = Duration::from_secs(2);
 
 struct Random(u64);
 
@@ -146,7 +146,7 @@ impl Run {
             None => format!("read {register}"),
         };
         let called = self.began.elapsed();
-        let answer = self.nodes[node].ask(&command, PATIENCE);
+        let answer = self.nodes[node].ask(&command, TIMEOUT);
         let returned = self.began.elapsed();
         let (is_write, refused) = (value.is_some(), answer == Answer::Refused);
         let (value, returned) = match &answer {

@@ -95,7 +95,7 @@ struct Activity {
 
 /// An open connection.
 #[derive(Debug, Clone)]
-pub struct Session {
+pub struct OpenConnection {
     /// Its number among the connections of its listener.
     pub id: u64,
     pub peer: Peer,
@@ -111,7 +111,7 @@ pub(crate) struct Full;
 /// A connection that was closed in favour of another.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Evicted {
-    Session(Peer),
+    Connection(Peer),
     Handshake(Peer),
 }
 
@@ -189,9 +189,9 @@ impl Admission {
     }
 
     /// The open connections, in the order in which they were opened.
-    pub(crate) fn sessions(&self) -> Vec<Session> {
+    pub(crate) fn sessions(&self) -> Vec<OpenConnection> {
         let now = self.since(Instant::now());
-        let session = |(id, held): (&u64, &Held)| Session {
+        let session = |(id, held): (&u64, &Held)| OpenConnection {
             id: *id,
             peer: held.peer.clone(),
             opened: held.opened,
@@ -199,7 +199,7 @@ impl Admission {
                 now.saturating_sub(held.activity.last_request.load(Ordering::Relaxed)),
             ),
         };
-        let mut sessions: Vec<Session> = self.table().held().map(session).collect();
+        let mut sessions: Vec<OpenConnection> = self.table().held().map(session).collect();
         sessions.sort_unstable_by_key(|session| session.id);
         sessions
     }
@@ -261,7 +261,7 @@ impl Table {
             self.sessions.iter().filter(|(_, held)| held.task.is_some() && held.is_of(source));
         let id = candidates.min_by_key(|(id, held)| held.rank(**id)).map(|(id, _)| *id);
         let held = self.end(id.ok_or(Full)?).ok_or(Full)?;
-        Ok(Evicted::Session(held.peer))
+        Ok(Evicted::Connection(held.peer))
     }
 
     /// Whether a source may not have more than this many places of a kind.
@@ -413,7 +413,7 @@ mod tests {
     }
 
     fn session(last: u8, port: u16) -> Evicted {
-        Evicted::Session(peer(last, port).into())
+        Evicted::Connection(peer(last, port).into())
     }
 
     fn admission(

@@ -29,7 +29,7 @@ use super::functions::is_write;
 use super::listener::ListenerContext;
 use super::peer::Peer;
 use super::policy::PeerRights;
-use super::rates::{Charge, LONGEST_PAUSE, Source};
+use super::rates::{Charge, MAX_PAUSE, Source};
 use super::refused_request::{RefusedRequest, Reported};
 use super::stream::{self, Stream};
 use super::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};
@@ -346,7 +346,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         let rates = &self.answering.context.rates;
         let wait =
             self.source.as_ref().and_then(|source| rates.wait(source, self.wrote, now.into_std()));
-        self.paused = wait.map(|(wait, _)| now + wait.min(LONGEST_PAUSE));
+        self.paused = wait.map(|(wait, _)| now + wait.min(MAX_PAUSE));
         self.wrote &= wait.is_some();
         wait.is_some()
     }
@@ -372,8 +372,8 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     /// Waits for the peer to read its replies.
     async fn send_unsent(&mut self) -> Result<(), Kind> {
         if !self.unsent.is_empty() {
-            let patience = self.timeouts.request;
-            stream::send_all(self.stream.socket(), &self.unsent, patience).await?;
+            let time_limit = self.timeouts.request;
+            stream::send_all(self.stream.socket(), &self.unsent, time_limit).await?;
             // Frees the buffer of a slow peer: most connections never need one.
             self.unsent = Vec::new();
         }

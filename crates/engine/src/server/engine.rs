@@ -14,7 +14,7 @@ use tokio::runtime::{Builder, Handle, Runtime};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
-use super::admission::{ConnectionLimits, Session};
+use super::admission::{ConnectionLimits, OpenConnection};
 use super::audit::{Auditor, Record, Records, Unrecordable, auditing};
 use super::counters::{ConnectionCounters, PacketCounters};
 use super::event::{Event, Events, Kind, Reporter, Verbosity, channel as event_channel};
@@ -311,7 +311,7 @@ impl Engine {
     }
 
     /// The open connections of each listener, by its name.
-    pub fn sessions(&self) -> Vec<(Arc<str>, Vec<Session>)> {
+    pub fn sessions(&self) -> Vec<(Arc<str>, Vec<OpenConnection>)> {
         let listeners = self.listeners();
         let sessions = |listener: &Arc<Listener>| {
             (Arc::clone(&listener.context.name), listener.context.admission.sessions())

@@ -16,7 +16,7 @@ use super::counters::PacketCounters;
 use super::stream::{End, Stream};
 
 /// The longest packet: a header of 12 bytes, 65,535 registers and a CRC.
-const LONGEST: usize = 12 + 2 * 65_535 + 4;
+const MAX_PACKET: usize = 12 + 2 * 65_535 + 4;
 
 /// The most bytes that a connection holds: a packet, and what arrives with its end.
 pub(crate) const ROOM: usize = 144 * 1024;
@@ -31,7 +31,7 @@ const SPARE: usize = 16;
 /// Bytes per read while few bytes are held.
 const CHUNK: usize = 16 * 1024;
 
-const _: () = assert!(LONGEST + SHORT < ROOM && SHORT + CHUNK < ROOM);
+const _: () = assert!(MAX_PACKET + SHORT < ROOM && SHORT + CHUNK < ROOM);
 
 thread_local! {
     /// Input of connections that hold few bytes, shared by all of a worker.
@@ -220,16 +220,16 @@ mod tests {
     #[test]
     fn bytes_keep_their_order_through_every_size() {
         let (mut incoming, counters) = incoming();
-        let sent: Vec<u8> = (0..LONGEST).map(|at| (at % 251) as u8).collect();
+        let sent: Vec<u8> = (0..MAX_PACKET).map(|at| (at % 251) as u8).collect();
         for piece in sent.chunks(777) {
             incoming.extend(piece);
             assert!(counters.held_bytes.get() <= (incoming.len() + SHORT) as u64);
         }
         assert_eq!(*incoming, *sent);
-        incoming.consume(LONGEST - 5);
-        assert_eq!(*incoming, sent[LONGEST - 5..]);
+        incoming.consume(MAX_PACKET - 5);
+        assert_eq!(*incoming, sent[MAX_PACKET - 5..]);
         incoming.shrink();
-        assert_eq!(*incoming, sent[LONGEST - 5..]);
+        assert_eq!(*incoming, sent[MAX_PACKET - 5..]);
         assert!(counters.held_bytes.get() <= SHORT as u64);
         incoming.extend(&sent);
         assert_eq!(incoming[5..], *sent);

@@ -19,7 +19,7 @@ use super::counters::ConnectionCounters;
 use super::event::{Kind, Reporter};
 use super::live::Live;
 use super::peer::Peer;
-use super::rates::{Charge, LONGEST_PAUSE, RateLimits, Rates, Source};
+use super::rates::{Charge, MAX_PAUSE, RateLimits, Rates, Source};
 use super::refused_request::RefusedRequest;
 
 /// The most connections that wait in the system to be accepted.
@@ -132,7 +132,7 @@ impl ListenerContext {
             }
             is_noted = true;
             tokio::select! {
-                () = sleep(wait.min(LONGEST_PAUSE)) => {}
+                () = sleep(wait.min(MAX_PAUSE)) => {}
                 _ = stop.wait_for(|stop| *stop) => return false,
             }
         }
@@ -172,7 +172,7 @@ impl ListenerContext {
     pub(crate) fn evicted(&self, evicted: Option<Evicted>) {
         match evicted {
             None => {}
-            Some(Evicted::Session(peer)) => {
+            Some(Evicted::Connection(peer)) => {
                 self.connections.evicted.add();
                 self.report(Kind::Evicted, Some(peer));
             }

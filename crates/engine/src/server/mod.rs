@@ -29,7 +29,7 @@ mod tls;
 mod udp;
 pub mod unit_server;
 
-pub use admission::{ConnectionLimits, Session, WhenFull};
+pub use admission::{ConnectionLimits, OpenConnection, WhenFull};
 pub use engine::{
     Engine, ListenerCounters, ListenerKind, ListenerSettings, Listening, ProtocolCounters,
     Settings, StartError,

@@ -49,7 +49,7 @@ pub enum Elsewhere {
 
 /// The rights of some peers.
 #[derive(Debug)]
-pub struct Grant<G> {
+pub struct PolicyEntry<G> {
     pub sources: Vec<IpNet>,
     /// As in [`Rule`].
     pub roles: Option<Vec<String>>,
@@ -59,14 +59,14 @@ pub struct Grant<G> {
 /// Which peers have which rights: the first entry that matches a peer applies.
 #[derive(Debug)]
 pub struct Grants<G> {
-    entries: Vec<Grant<Arc<G>>>,
+    entries: Vec<PolicyEntry<Arc<G>>>,
 }
 
 impl<G> Grants<G> {
-    pub fn new(entries: impl IntoIterator<Item = Grant<G>>) -> Grants<G> {
-        let shared = |Grant { sources, roles, rights }| {
+    pub fn new(entries: impl IntoIterator<Item = PolicyEntry<G>>) -> Grants<G> {
+        let shared = |PolicyEntry { sources, roles, rights }| {
             let rights = Arc::new(rights);
-            Grant { sources, roles, rights }
+            PolicyEntry { sources, roles, rights }
         };
         Grants { entries: entries.into_iter().map(shared).collect() }
     }
@@ -82,7 +82,7 @@ impl<G> Grants<G> {
     }
 
     fn find(&self, peer: IpAddr, allows: impl Fn(&[String]) -> bool) -> Option<Arc<G>> {
-        let matches = |entry: &&Grant<Arc<G>>| {
+        let matches = |entry: &&PolicyEntry<Arc<G>>| {
             contain(&entry.sources, peer) && entry.roles.as_deref().is_none_or(&allows)
         };
         self.entries.iter().find(matches).map(|entry| Arc::clone(&entry.rights))

@@ -16,7 +16,7 @@ use crate::counter::Counter;
 const BURST: Duration = Duration::from_secs(1);
 
 /// The longest pause before limits are looked up again: a reload may have changed them.
-pub(crate) const LONGEST_PAUSE: Duration = Duration::from_secs(1);
+pub(crate) const MAX_PAUSE: Duration = Duration::from_secs(1);
 
 /// The shortest time between two reports about the same source.
 const REPORT_INTERVAL: Duration = Duration::from_secs(60);

@@ -31,7 +31,7 @@ use super::incoming::Incoming;
 use super::listener::{Admitted, ListenerContext, Service, drain, set_options};
 use super::live::Live;
 use super::peer::Peer;
-use super::policy::{Grant, Grants};
+use super::policy::{Grants, PolicyEntry};
 use super::rates::RateLimits;
 use super::secure::secured;
 use super::stream::{self, End, Stream, send_all};
@@ -213,7 +213,7 @@ impl RawIngest {
         let rules = settings.rules.iter().map(|rule| {
             let targets = rule.targets.iter().cloned().collect();
             let rights = RawGrant { targets, areas: rule.areas.clone() };
-            Grant { sources: rule.sources.clone(), roles: rule.roles.clone(), rights }
+            PolicyEntry { sources: rule.sources.clone(), roles: rule.roles.clone(), rights }
         });
         let (many, after_refusal) = match settings.packets {
             PacketsPerConnection::One => (None, AfterRefusal::Close),
@@ -298,8 +298,8 @@ impl RawIngest {
         stop: watch::Receiver<bool>,
     ) {
         let Admitted { stream, peer, ticket, .. } = admitted;
-        let (patience, stopping) = (self.request_timeout, stop.clone());
-        let secured = secured(tls, &context, (stream, peer), &ticket, patience, stopping).await;
+        let (time_limit, stopping) = (self.request_timeout, stop.clone());
+        let secured = secured(tls, &context, (stream, peer), &ticket, time_limit, stopping).await;
         let Some((stream, peer)) = secured else { return };
         // A reload reviews connections by their roles. This one looks up its rights only now.
         let rights = live.get().granted(&peer).unwrap_or_else(|| {
@@ -553,9 +553,9 @@ impl RawIngest {
                     answered = 0;
                     let was_empty = !sending.is_amid_packet();
                     sending.ticket.set_amid_packet(!was_empty);
-                    let patience = if was_empty { idle } else { self.request_timeout };
+                    let time_limit = if was_empty { idle } else { self.request_timeout };
                     let read = tokio::select! {
-                        read = timeout_at(begun + patience, sending.read(usize::MAX)) => read,
+                        read = timeout_at(begun + time_limit, sending.read(usize::MAX)) => read,
                         _ = stop.wait_for(|stop| *stop) => break,
                     };
                     match read {

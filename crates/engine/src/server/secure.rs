@@ -23,7 +23,7 @@ pub(crate) async fn secured(
     context: &ListenerContext,
     (stream, peer): (TcpStream, SocketAddr),
     ticket: &Ticket,
-    patience: Duration,
+    time_limit: Duration,
     mut stop: watch::Receiver<bool>,
 ) -> Option<(ServerTlsStream, Peer)> {
     let ended = |end| {
@@ -37,7 +37,7 @@ pub(crate) async fn secured(
     let shaken = tokio::select! {
         biased;
         _ = stop.wait_for(|stop| *stop) => return ended(Kind::Closed),
-        shaken = timeout(patience, stream.handshake(patience)) => shaken,
+        shaken = timeout(time_limit, stream.handshake(time_limit)) => shaken,
     };
     let certificate = match shaken {
         Ok(Ok(())) => stream.peer_certificate(),

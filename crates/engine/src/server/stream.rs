@@ -113,15 +113,15 @@ pub(crate) fn send(socket: &TcpStream, output: &[u8], unsent: &mut Vec<u8>) -> R
     Ok(())
 }
 
-/// Sends all of `output`. Fails when nothing can be sent for the duration of `patience`.
+/// Sends all of `output`. Fails when nothing can be sent for the duration of `time_limit`.
 pub(crate) async fn send_all(
     socket: &TcpStream,
     output: &[u8],
-    patience: Duration,
+    time_limit: Duration,
 ) -> Result<(), Kind> {
     let mut sent = 0;
     while sent < output.len() {
-        match timeout(patience, socket.writable()).await {
+        match timeout(time_limit, socket.writable()).await {
             Err(_) => return Err(Kind::SlowReader),
             Ok(Err(_)) => return Err(Kind::Closed),
             Ok(Ok(())) => {}

@@ -151,8 +151,8 @@ impl ModbusStream {
         stop: watch::Receiver<bool>,
     ) {
         let Admitted { stream, peer, ticket, .. } = admitted;
-        let (patience, stopping) = (self.timeouts.request, stop.clone());
-        let secured = secured(tls, &context, (stream, peer), &ticket, patience, stopping).await;
+        let (time_limit, stopping) = (self.timeouts.request, stop.clone());
+        let secured = secured(tls, &context, (stream, peer), &ticket, time_limit, stopping).await;
         let Some((stream, peer)) = secured else { return };
         // A reload reviews connections by their roles. This one looks up its rights only now.
         let rights = live.get().terms(&peer).map(|terms| terms.rights).unwrap_or_else(|| {
@@ -215,8 +215,8 @@ impl ModbusStream {
                 }
             }
             let is_new = admitted.received.is_empty();
-            let patience = if is_new { self.timeouts.idle } else { Some(self.timeouts.request) };
-            let deadline = begun + patience.unwrap_or(FOREVER);
+            let time_limit = if is_new { self.timeouts.idle } else { Some(self.timeouts.request) };
+            let deadline = begun + time_limit.unwrap_or(FOREVER);
             let readable = tokio::select! {
                 readable = timeout_at(deadline, admitted.stream.readable()) => readable,
                 _ = stop.wait_for(|stop| *stop) => return context.ended(Kind::Closed, peer),

@@ -66,10 +66,10 @@ impl ServerTlsStream {
     ///
     /// # Errors
     /// The peer is not trusted, or closed the connection. An alert has been sent.
-    pub(crate) async fn handshake(&mut self, patience: Duration) -> Result<(), Kind> {
+    pub(crate) async fn handshake(&mut self, time_limit: Duration) -> Result<(), Kind> {
         let mut unsent = Vec::new();
         while self.channel.is_handshaking() || !unsent.is_empty() {
-            stream::send_all(&self.socket, &unsent, patience).await?;
+            stream::send_all(&self.socket, &unsent, time_limit).await?;
             unsent.clear();
             if self.channel.is_handshaking() {
                 poll_fn(|context| self.poll_read(context, &mut [], &mut unsent)).await?;

@@ -15,7 +15,7 @@ use super::disk::Disk;
 use super::error::FileError;
 use super::image::{Changes, Image, Kept, layout_of};
 use super::periodic::{Periodic, writes};
-use super::queue::{Limits, Queue};
+use super::queue::{Queue, QueueLimits};
 use super::status::Status;
 use super::steps::Steps;
 use super::store::Store;
@@ -99,7 +99,7 @@ impl MemoryFile {
             }
         }
         let memories: Vec<_> = members.iter().map(|member| Arc::clone(&member.memory)).collect();
-        let limits = Limits { steps: options.max_steps, bytes: options.max_bytes };
+        let limits = QueueLimits { steps: options.max_steps, bytes: options.max_bytes };
         let queue = Arc::new(Queue::new(memories, limits, Arc::clone(&status)));
         if options.sync.is_zero() {
             for (number, member) in (0..).zip(&members) {

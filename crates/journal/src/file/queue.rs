@@ -17,7 +17,7 @@ pub(super) type Waiting = (Step, Done);
 pub(super) struct Queue {
     state: Mutex<State>,
     changed: Condvar,
-    limits: Limits,
+    limits: QueueLimits,
     status: Arc<Mutex<Status>>,
     /// A forked child has no thread that takes steps.
     process: u32,
@@ -25,7 +25,7 @@ pub(super) struct Queue {
 
 /// How much may wait.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Limits {
+pub(super) struct QueueLimits {
     pub steps: usize,
     pub bytes: usize,
 }
@@ -56,7 +56,11 @@ pub(super) enum Next {
 }
 
 impl Queue {
-    pub fn new(memories: Vec<Arc<Memory>>, limits: Limits, status: Arc<Mutex<Status>>) -> Queue {
+    pub fn new(
+        memories: Vec<Arc<Memory>>,
+        limits: QueueLimits,
+        status: Arc<Mutex<Status>>,
+    ) -> Queue {
         let state = State { phase: Phase::Loading(memories), waiting: Vec::new(), bytes: 0 };
         let (state, process) = (Mutex::new(state), process::id());
         Queue { state, changed: Condvar::new(), limits, status, process }

@@ -8,14 +8,14 @@ use holdfast_memory::Outcome;
 
 use super::error::{End, LogError};
 use super::message::OVERHEAD;
-use super::node::{Node, Session};
+use super::node::{LogSession, Node};
 use super::state::{Applied, Place};
 use super::status::{Event, NodeView, Phase};
 
 impl Node {
     pub(super) fn received(
         &mut self,
-        session: &mut Session,
+        session: &mut LogSession,
         message: Option<Result<jetstream::Message, pull::MessagesError>>,
     ) -> Result<(), End> {
         let message = match message {
@@ -46,7 +46,7 @@ impl Node {
         self.apply(session, place, &message.payload)
     }
 
-    fn apply(&mut self, session: &mut Session, place: Place, payload: &[u8]) -> Result<(), End> {
+    fn apply(&mut self, session: &mut LogSession, place: Place, payload: &[u8]) -> Result<(), End> {
         let counters = &self.shared.counters;
         let (mut compared, mut for_snapshot) = (false, false);
         session.last_applied = Instant::now();
@@ -85,7 +85,7 @@ impl Node {
         Ok(())
     }
 
-    fn applied_own(&mut self, session: &mut Session, counter: u64, outcomes: Vec<Outcome>) {
+    fn applied_own(&mut self, session: &mut LogSession, counter: u64, outcomes: Vec<Outcome>) {
         let sent = self.sent.applied(counter, outcomes, &self.shared.counters);
         if let Some(at) = sent {
             self.shared.contact(at);

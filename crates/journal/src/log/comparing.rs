@@ -8,7 +8,7 @@ use super::digests::Verdict;
 use super::error::{End, LogError};
 use super::follower::digest_at;
 use super::layout::copies;
-use super::node::{Node, Prepared, Report, Session};
+use super::node::{LogSession, Node, Prepared, Report};
 use super::settings::is_word;
 use super::state::digest_of;
 use super::status::{Digest, Event};
@@ -27,7 +27,7 @@ struct Told {
 impl Node {
     pub(super) fn tell_digest(
         &mut self,
-        session: &mut Session,
+        session: &mut LogSession,
         for_snapshot: bool,
     ) -> Result<(), End> {
         let sequence = self.state.place.sequence;
@@ -52,7 +52,7 @@ impl Node {
 
     pub(super) fn watched(
         &mut self,
-        session: &mut Session,
+        session: &mut LogSession,
         key: &str,
         revision: u64,
         value: &[u8],
@@ -77,7 +77,7 @@ impl Node {
 
     fn judged(
         &mut self,
-        session: &mut Session,
+        session: &mut LogSession,
         sequence: u64,
         verdict: Verdict,
     ) -> Result<(), End> {
@@ -119,7 +119,7 @@ impl Node {
 
     /// Finds out what the log leads to, beside the session: no majority of nodes says it. Returns
     /// whether that has begun.
-    pub(super) fn replay(&mut self, session: &mut Session, sequence: u64) -> bool {
+    pub(super) fn replay(&mut self, session: &mut LogSession, sequence: u64) -> bool {
         let Some((_, pointer)) = self.pointer.clone() else { return false };
         if std::mem::replace(&mut session.replays, true) {
             return false;
@@ -139,7 +139,7 @@ impl Node {
 
     pub(super) fn replayed(
         &mut self,
-        session: &mut Session,
+        session: &mut LogSession,
         sequence: u64,
         digest: Result<String, String>,
     ) -> Result<(), End> {

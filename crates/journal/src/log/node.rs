@@ -42,7 +42,7 @@ pub(super) struct Node {
 }
 
 /// One connection, and what is under way on it.
-pub(super) struct Session {
+pub(super) struct LogSession {
     pub(super) client: Client,
     pub(super) store: Store,
     pub(super) subject: String,

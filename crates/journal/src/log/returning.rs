@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use super::digests::Digests;
 use super::error::LogError;
-use super::node::{Doubt, Node, Session};
+use super::node::{Doubt, LogSession, Node};
 use super::snapshots::ALONE;
 use super::status::Event;
 
@@ -39,7 +39,7 @@ impl Node {
     }
 
     /// If no other node compares itself, the log decides.
-    pub(super) fn consider_return(&mut self, session: &mut Session, now: Instant) {
+    pub(super) fn consider_return(&mut self, session: &mut LogSession, now: Instant) {
         let Some((sequence, since)) = self.doubt.as_ref().and_then(|doubt| doubt.compared) else {
             return;
         };

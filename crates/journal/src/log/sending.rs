@@ -9,7 +9,7 @@ use serde::Deserialize;
 
 use super::error::End;
 use super::message::{self, OVERHEAD, Origin};
-use super::node::{Node, Session};
+use super::node::{LogSession, Node};
 use super::status::Event;
 
 /// The most bytes of steps that travel in one message with others.
@@ -17,7 +17,7 @@ const TOGETHER: usize = 64 << 10;
 
 impl Node {
     /// Sends waiting steps, as long as there is room for them on the way.
-    pub(super) async fn send_waiting(&mut self, session: &mut Session) -> Result<(), End> {
+    pub(super) async fn send_waiting(&mut self, session: &mut LogSession) -> Result<(), End> {
         if self.shared.is_stopping() && self.sent.is_empty() {
             return Err(End::Stopped);
         }
@@ -33,7 +33,7 @@ impl Node {
 
     pub(super) async fn send(
         &mut self,
-        session: &mut Session,
+        session: &mut LogSession,
         compares: bool,
         steps: Vec<Vec<u8>>,
         mut dones: Vec<Done>,
@@ -51,7 +51,7 @@ impl Node {
 
     pub(super) async fn publish(
         &mut self,
-        session: &mut Session,
+        session: &mut LogSession,
         counter: u64,
         payload: Bytes,
     ) -> Result<(), End> {

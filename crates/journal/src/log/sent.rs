@@ -11,7 +11,7 @@ use super::shared::refuse;
 use super::status::Counters;
 
 /// The most messages with steps that are on their way. Further steps wait, and travel together.
-const MOST: usize = 16;
+const MAX_OPEN: usize = 16;
 
 /// The most messages whose time is over, or that have no steps, that are remembered.
 const REMEMBERED: usize = 4096;
@@ -35,7 +35,7 @@ struct Message {
 
 impl Sent {
     pub(super) fn has_room(&self) -> bool {
-        self.open < MOST
+        self.open < MAX_OPEN
     }
 
     pub(super) fn is_empty(&self) -> bool {

@@ -14,7 +14,7 @@ use tokio::time::MissedTickBehavior;
 
 use super::connection::connect;
 use super::error::{End, LogError};
-use super::node::{Node, Report, Session};
+use super::node::{LogSession, Node, Report};
 use super::sent::LOOK;
 use super::status::{Event, Phase};
 use super::store::{DIGEST, POINTER, Store, subject};
@@ -115,7 +115,7 @@ impl Node {
         let mut watch = watch.map_err(|error| lost(&error))?;
         let (reports, mut reported) = mpsc::unbounded_channel();
         let now = Instant::now();
-        let mut session = Session {
+        let mut session = LogSession {
             subject: subject(&settings.name),
             inbox,
             longest: client.server_info().max_payload.saturating_sub(1024),
@@ -174,7 +174,7 @@ impl Node {
         }
     }
 
-    async fn reported(&mut self, session: &mut Session, report: Report) -> Result<(), End> {
+    async fn reported(&mut self, session: &mut LogSession, report: Report) -> Result<(), End> {
         match report {
             Report::Leased(is) => self.leased(session, is).await?,
             Report::Stored(stored) => self.stored(session, stored),
@@ -183,7 +183,7 @@ impl Node {
         Ok(())
     }
 
-    async fn look(&mut self, session: &mut Session) -> Result<(), End> {
+    async fn look(&mut self, session: &mut LogSession) -> Result<(), End> {
         let now = Instant::now();
         self.sent.expire(now, &self.shared.counters);
         self.shared.expire(now);

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::error::End;
-use super::node::{Node, Prepared, Report, Session};
+use super::node::{LogSession, Node, Prepared, Report};
 use super::status::Event;
 use super::store::{Pointer, Snapshot, unique};
 
@@ -35,7 +35,7 @@ impl Node {
     }
 
     /// Stores the snapshot that was made at this sequence: its digest is right.
-    pub(super) fn store_snapshot(&mut self, session: &mut Session, sequence: u64) {
+    pub(super) fn store_snapshot(&mut self, session: &mut LogSession, sequence: u64) {
         let own = session.prepared.take_if(|own| own.snapshot.sequence == sequence);
         let Some(Prepared { encoded, snapshot, .. }) = own else { return };
         let (store, reports) = (session.store.clone(), session.reports.clone());
@@ -52,14 +52,14 @@ impl Node {
     }
 
     /// Gives up a snapshot that nodes don't agree on. There will be another one.
-    pub(super) fn drop_disputed(&self, session: &mut Session) {
+    pub(super) fn drop_disputed(&self, session: &mut LogSession) {
         if session.prepared.take_if(|own| own.is_disputed).is_some() {
             session.takes_snapshot = false;
             session.no_snapshot_before = Instant::now() + RETRY;
         }
     }
 
-    pub(super) fn consider_snapshot(&mut self, session: &mut Session, now: Instant) {
+    pub(super) fn consider_snapshot(&mut self, session: &mut LogSession, now: Instant) {
         self.store_undisputed(session, now);
         let Some((_, pointer)) = &self.pointer else { return };
         let newest = &pointer.newest;
@@ -80,7 +80,7 @@ impl Node {
         }
     }
 
-    pub(super) async fn leased(&mut self, session: &mut Session, is: bool) -> Result<(), End> {
+    pub(super) async fn leased(&mut self, session: &mut LogSession, is: bool) -> Result<(), End> {
         if !is {
             session.takes_snapshot = false;
             session.no_snapshot_before = Instant::now() + RETRY;
@@ -92,7 +92,11 @@ impl Node {
         Ok(())
     }
 
-    pub(super) fn stored(&mut self, session: &mut Session, stored: Result<(u64, Pointer), String>) {
+    pub(super) fn stored(
+        &mut self,
+        session: &mut LogSession,
+        stored: Result<(u64, Pointer), String>,
+    ) {
         session.takes_snapshot = false;
         match stored {
             Ok((revision, pointer)) => {
@@ -108,7 +112,7 @@ impl Node {
     }
 
     /// Stores a snapshot that no other node has compared itself with for some time.
-    fn store_undisputed(&mut self, session: &mut Session, now: Instant) {
+    fn store_undisputed(&mut self, session: &mut LogSession, now: Instant) {
         let is_alone =
             |own: &&Prepared| !own.is_disputed && now.saturating_duration_since(own.since) >= ALONE;
         if let Some(own) = session.prepared.as_ref().filter(is_alone) {

@@ -100,9 +100,9 @@ impl Process {
         Some(receiver)
     }
 
-    pub fn ask(&self, command: &str, patience: Duration) -> Answer {
+    pub fn ask(&self, command: &str, time_limit: Duration) -> Answer {
         match self.send(command) {
-            Some(receiver) => Answer::of(&receiver, patience),
+            Some(receiver) => Answer::of(&receiver, time_limit),
             None => Answer::Refused,
         }
     }
@@ -110,8 +110,8 @@ impl Process {
 
 impl Answer {
     /// The answer that comes, if it comes in time.
-    pub fn of(receiver: &Receiver<String>, patience: Duration) -> Answer {
-        let Ok(answer) = receiver.recv_timeout(patience) else { return Answer::Unknown };
+    pub fn of(receiver: &Receiver<String>, time_limit: Duration) -> Answer {
+        let Ok(answer) = receiver.recv_timeout(time_limit) else { return Answer::Unknown };
         match answer.split_once(' ') {
             Some(("ok", value)) => Answer::Ok(value.to_owned()),
             _ if answer == "refused" => Answer::Refused,
