@@ -35,7 +35,7 @@ from holdfast.stop import Stop
 from holdfast.tags import Tag
 
 DEVICES, TAGS = 100, 100
-PATIENCE = 120.0
+TIMEOUT = 120.0
 
 
 def main() -> None:
@@ -118,7 +118,7 @@ def connects(port: int) -> bool:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while not condition():
         if time.monotonic() > end:
             raise TimeoutError
@@ -194,7 +194,7 @@ def paho(port: int, count: int, payload: str) -> str:
     began, cpu = time.perf_counter(), time.process_time()
     for topic, text in messages:
         last = client.publish(topic, text, 1, retain=True)
-    last.wait_for_publish(PATIENCE)  # They are confirmed in order.
+    last.wait_for_publish(TIMEOUT)  # They are confirmed in order.
     took = time.perf_counter() - began
     used = time.process_time() - cpu
     client.disconnect()

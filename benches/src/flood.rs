@@ -5,7 +5,7 @@ use std::fs;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 
-use crate::{Failure, PATIENCE, options};
+use crate::{Failure, TIMEOUT, options};
 
 /// MQTT 3.1.1, a clean session, no keep-alive, client id `flood`.
 const CONNECT: &[u8] = b"\x10\x11\x00\x04MQTT\x04\x02\x00\x00\x00\x05flood";
@@ -29,7 +29,7 @@ pub(crate) fn main(arguments: lexopt::Parser) -> Result<(), Failure> {
         Ok(true)
     })?;
     let mut stream = TcpStream::connect(address)?;
-    stream.set_read_timeout(Some(PATIENCE))?;
+    stream.set_read_timeout(Some(TIMEOUT))?;
     stream.write_all(CONNECT)?;
     let mut answer = [0; 4];
     stream.read_exact(&mut answer)?;

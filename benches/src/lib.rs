@@ -25,7 +25,7 @@ use lexopt::ValueExt;
 pub type Failure = Box<dyn std::error::Error>;
 
 /// A run fails if the server does not answer within this time.
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Runs the load or the loop that the first argument names. The other arguments are its options.
 pub fn main() -> Result<(), Failure> {

@@ -14,7 +14,7 @@ use holdfast_protocol::pdu::{self, Range, Registers, Request};
 
 use crate::outcome::{Outcome, Period};
 use crate::poller::Poller;
-use crate::{Failure, PATIENCE, options};
+use crate::{Failure, TIMEOUT, options};
 
 /// The same for every request, so that all replies are equal.
 const TRANSACTION_ID: u16 = 0x1234;
@@ -82,8 +82,8 @@ impl Load {
         for number in 0..options.connections {
             let stream = TcpStream::connect(options.address)?;
             stream.set_nodelay(true)?;
-            stream.set_read_timeout(Some(PATIENCE))?;
-            stream.set_write_timeout(Some(PATIENCE))?;
+            stream.set_read_timeout(Some(TIMEOUT))?;
+            stream.set_write_timeout(Some(TIMEOUT))?;
             self.poller.add(&stream, number)?;
             let sent = VecDeque::with_capacity(options.in_flight);
             self.connections.push(Connection { stream, part: 0, open: 0, sent });
@@ -100,7 +100,7 @@ impl Load {
         let end = outcome.end();
         let mut now = Instant::now();
         while now < end {
-            let ready = self.poller.wait(Some(PATIENCE))?;
+            let ready = self.poller.wait(Some(TIMEOUT))?;
             if ready.len() == 0 {
                 return Err("the server does not answer".into());
             }
@@ -122,7 +122,7 @@ impl Load {
 
     /// Waits for the outstanding replies.
     fn finish(&mut self, outcome: &mut Outcome) -> Result<(), Failure> {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + TIMEOUT;
         let mut open: usize = self.connections.iter().map(|connection| connection.open).sum();
         while open > 0 {
             let patience = deadline.saturating_duration_since(Instant::now());
@@ -242,7 +242,7 @@ pub(crate) fn request(kind: &str, quantity: u16) -> Result<Vec<u8>, Failure> {
 /// The first reply of the server, which must not be an exception.
 pub(crate) fn first_reply(address: SocketAddr, request: &[u8]) -> Result<Vec<u8>, Failure> {
     let mut stream = TcpStream::connect(address)?;
-    stream.set_read_timeout(Some(PATIENCE))?;
+    stream.set_read_timeout(Some(TIMEOUT))?;
     stream.write_all(request)?;
     let mut reply = [0; mbap::MAX_LEN];
     let mut len = 0;

@@ -13,7 +13,7 @@ use rustix::net::sockopt::set_socket_linger;
 
 use crate::outcome::{Outcome, Period};
 use crate::poller::Poller;
-use crate::{Failure, PATIENCE, options, unhex};
+use crate::{Failure, TIMEOUT, options, unhex};
 
 const DONE: u8 = 0;
 
@@ -58,7 +58,7 @@ impl Load {
         }
         let (mut open, end) = (in_flight, outcome.end());
         while open > 0 {
-            let ready: Vec<usize> = self.poller.wait(Some(PATIENCE))?.collect();
+            let ready: Vec<usize> = self.poller.wait(Some(TIMEOUT))?.collect();
             if ready.is_empty() {
                 return Err(format!("{open} packets got no reply").into());
             }

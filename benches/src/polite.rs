@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use crate::load::{first_reply, request};
 use crate::outcome::{Outcome, Period};
-use crate::{Failure, PATIENCE, options};
+use crate::{Failure, TIMEOUT, options};
 
 /// `--address A --quantity Q --rate R --warmup S --seconds S`: without a rate, or with 0, it never
 /// pauses.
@@ -31,7 +31,7 @@ pub(crate) fn main(arguments: lexopt::Parser) -> Result<(), Failure> {
     let expected = first_reply(address, &request)?;
     let stream = TcpStream::connect(address)?;
     stream.set_nodelay(true)?;
-    stream.set_read_timeout(Some(PATIENCE))?;
+    stream.set_read_timeout(Some(TIMEOUT))?;
     let pause = if rate > 0.0 { Duration::try_from_secs_f64(1.0 / rate)? } else { Duration::ZERO };
     let mut outcome = Outcome::new(period)?;
     run(stream, &request, &expected, pause, &mut outcome)?;

@@ -8,7 +8,7 @@ use std::thread;
 use std::time::Instant;
 
 use crate::outcome::{Outcome, Period};
-use crate::{Failure, PATIENCE, options};
+use crate::{Failure, TIMEOUT, options};
 
 /// The length limit of a reply.
 const REPLY: usize = 4096;
@@ -70,8 +70,8 @@ impl Client {
     fn new(address: SocketAddr) -> Result<Client, Failure> {
         let stream = TcpStream::connect(address)?;
         stream.set_nodelay(true)?;
-        stream.set_read_timeout(Some(2 * PATIENCE))?;
-        stream.set_write_timeout(Some(2 * PATIENCE))?;
+        stream.set_read_timeout(Some(2 * TIMEOUT))?;
+        stream.set_write_timeout(Some(2 * TIMEOUT))?;
         Ok(Client { stream, buffer: vec![0; REPLY] })
     }
 
