@@ -395,12 +395,12 @@ class Listener:
     """The settings of a listener. The constructor makes a listener for Modbus over TCP connections.
 
     `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP, `ascii` for ASCII over TCP; `tls`
-    enables TLS, with at most `max_handshakes` connections that are not authenticated yet, beside
-    `max_connections`. Times are in seconds; `idle_timeout` 0 is unlimited. With `listen_only`,
-    function 8 may set a unit to listen only mode, for all peers. `raw_ingest`, only with `mbap` and
-    without TLS, is a listener for packets whose connections come to the same port: its own bind and
-    limits are ignored. `max_requests_per_source` and `max_writes_per_source` are per second. Raises
-    `ValueError` for an invalid address, limit or time.
+    enables TLS, with at most `max_handshakes` connections that are not authenticated yet, in
+    addition to `max_connections`. Times are in seconds; `idle_timeout` 0 is unlimited. With
+    `listen_only`, function 8 may set a unit to listen only mode, for all peers. `raw_ingest`, only
+    with `mbap` and without TLS, is a listener for packets whose connections come to the same port:
+    its own bind and limits are ignored. `max_requests_per_source` and `max_writes_per_source` are
+    per second. Raises `ValueError` for an invalid address, limit or time.
     """
 
     def __new__(

@@ -10,13 +10,13 @@ import time
 from collections import deque
 from typing import TextIO
 
-MOST = 10_000
+MAX_LINES = 10_000
 """Lines that wait at most. More are dropped and counted."""
 
 AT_A_TIME = 500
 """Lines of one write."""
 
-PATIENCE = 1.0
+TIMEOUT = 1.0
 """Seconds that the end of the program waits for the lines."""
 
 
@@ -41,7 +41,7 @@ class QueuedHandler(logging.Handler):
             self.handleError(record)
             return
         with self._changed:
-            if len(self._lines) >= MOST:
+            if len(self._lines) >= MAX_LINES:
                 self.dropped += 1
             else:
                 self._lines.append(line)
@@ -50,7 +50,7 @@ class QueuedHandler(logging.Handler):
     def flush(self) -> None:
         """Waits until all lines are written, up to a second."""
         with self._changed:
-            self._changed.wait_for(lambda: not self._lines and not self._writing, PATIENCE)
+            self._changed.wait_for(lambda: not self._lines and not self._writing, TIMEOUT)
 
     def _write_for_ever(self) -> None:
         while True:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 BATCH = 1000
 
 # Seconds that the thread waits for a write. The engine wakes it for each write, and when it stops.
-PATIENCE = PERIOD
+TIMEOUT = PERIOD
 
 # Seconds between attempts to write a log that fails.
 RETRY = 1.0
@@ -88,7 +88,7 @@ class WriteRecorder:
                 self._stopped.wait(RETRY)
                 self._audit.retry()
                 continue
-            writes = self._engine.next_writes(0 if ended else PATIENCE, BATCH)
+            writes = self._engine.next_writes(0 if ended else TIMEOUT, BATCH)
             self._audit.write_all(writes, done=True)
             self._tell_lost()
             if ended and not writes:

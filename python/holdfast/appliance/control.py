@@ -27,10 +27,10 @@ MAX_REQUEST = 64 * 1024
 MAX_ANSWER = 64 * 1024 * 1024
 """Bytes of a message."""
 
-PATIENCE = 5.0
+TIMEOUT = 5.0
 """Seconds in which a request must arrive."""
 
-LONGEST = 60.0
+MAX_WAIT = 60.0
 """Seconds that `ask` waits for the answer."""
 
 MODE = 0o700
@@ -56,7 +56,7 @@ class Control:
         self._closed = True
         with contextlib.suppress(OSError, EOFError), Client(self.address):
             pass  # Wakes the thread.
-        self._thread.join(PATIENCE)
+        self._thread.join(TIMEOUT)
         self._listener.close()
 
     def _accept(self) -> None:
@@ -71,7 +71,7 @@ class Control:
 
     def _serve(self, connection: Connection) -> None:
         with contextlib.suppress(OSError, EOFError), connection:
-            if not connection.poll(PATIENCE):
+            if not connection.poll(TIMEOUT):
                 return
             answer = self._answer(connection.recv_bytes(MAX_REQUEST))
             connection.send_bytes(json.dumps(answer).encode())
@@ -95,8 +95,8 @@ def ask(file: Path, do: str, **fields: object) -> dict[str, Any]:
         with connection:
             try:
                 connection.send_bytes(json.dumps({"do": do, **fields}).encode())
-                if not connection.poll(LONGEST):
-                    raise NotRunning(f"{file}: the appliance has not answered in {LONGEST:g} s")
+                if not connection.poll(MAX_WAIT):
+                    raise NotRunning(f"{file}: the appliance has not answered in {MAX_WAIT:g} s")
                 answer: dict[str, Any] = json.loads(connection.recv_bytes(MAX_ANSWER))
             except (OSError, EOFError) as error:
                 raise NotRunning(f"{file}: the appliance ended the connection") from error

@@ -24,7 +24,7 @@ MODE = 0o640
 
 CLOSED = -1
 CHUNK = 64 * 1024
-LONGEST_LINE = 4 * 2**20
+MAX_LINE = 4 * 2**20
 """A line that is longer is not a line of an audit log. Raw Ingest packets have up to 0.4 MB."""
 
 
@@ -186,7 +186,7 @@ def last_lines(file: Path) -> list[bytes]:
     data, wanted = b"", 3
     with file.open("rb") as opened:
         at = opened.seek(0, os.SEEK_END)
-        while at > 0 and data.count(b"\n") < wanted and len(data) < 2 * LONGEST_LINE:
+        while at > 0 and data.count(b"\n") < wanted and len(data) < 2 * MAX_LINE:
             before, at = at, max(0, at - CHUNK)
             opened.seek(at)
             data = opened.read(before - at) + data

@@ -13,7 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.audit.chain import Place, digest_of, place_of
-from holdfast.audit.file import LONGEST_LINE, last_lines
+from holdfast.audit.file import MAX_LINE, last_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -180,7 +180,7 @@ def _broken(files: Sequence[Path], before: Line, line: Line, after: Line | None)
 def _lines(files: Iterable[Path]) -> Iterator[Line]:
     for file in files:
         with file.open("rb") as opened:
-            read = partial(opened.readline, LONGEST_LINE)
+            read = partial(opened.readline, MAX_LINE)
             for number, data in enumerate(iter(read, b""), 1):
                 yield Line(file, number, data, place_of(data))
 

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from holdfast.client.url import Parity
     from holdfast.net.addresses import Network
 
-MANY = 1024
+MAX_ADDRESSES = 1024
 """The most addresses without `--large`, and with it."""
-MOST = 65_536
+MAX_LARGE = 65_536
 
 UNITS = tuple(range(1, 248))
 LINE_TIMEOUT = 0.5
@@ -66,7 +66,9 @@ def _parities(text: str) -> tuple[Parity, ...]:
     help="NETWORK: begin at most N connections a second.",
 )
 @click.option(
-    "--large", is_flag=True, help=f"NETWORK: allow more than {MANY} addresses, up to {MOST}."
+    "--large",
+    is_flag=True,
+    help=f"NETWORK: allow more than {MAX_ADDRESSES} addresses, up to {MAX_LARGE}.",
 )
 @click.option(
     "--units",
@@ -168,7 +170,7 @@ def _networks(texts: Iterable[str], large: bool) -> list[Network]:
                 f"(/dev/ttyUSB0). For the unit ids behind a host, type: holdfast find tcp://{text}"
             ) from error
     count = finding.size(networks)
-    most = MOST if large else MANY
+    most = MAX_LARGE if large else MAX_ADDRESSES
     if count > most:
         raise click.UsageError(
             f"{count} addresses, allowed: {most}"

@@ -51,10 +51,10 @@ def _stretch(text: str) -> tuple[Area, int, int]:
 
 def _cost(text: str) -> tuple[float, float]:
     match = re.fullmatch(r"([0-9]*\.?[0-9]+):([0-9]*\.?[0-9]+)", text)
-    prices = (float(match[1]), float(match[2])) if match else (math.inf, math.inf)
-    if not math.isfinite(sum(prices)):
+    milliseconds = (float(match[1]), float(match[2])) if match else (math.inf, math.inf)
+    if not math.isfinite(sum(milliseconds)):
         raise click.BadParameter(f"{text!r} is not REQUEST:REGISTER in milliseconds, as in 12:0.1.")
-    return prices
+    return milliseconds
 
 
 @click.command(epilog="Example: holdfast plan plant.yaml --preset max_insert --fill 10")
@@ -258,16 +258,18 @@ def _lines(shown: _Shown, compared: dict[str, Any] | None) -> list[str]:
     """A plan as text."""
     plan = shown.plan
     head = ["area", "address", "count", "reads", "gaps"]
-    priced = plan.cost is not None
+    has_cost = plan.cost is not None
     rows = [
-        [*_cells(block), *([f"{block.cost:g}"] if priced else []), block.ends]
+        [*_cells(block), *([f"{block.cost:g}"] if has_cost else []), block.ends]
         for block in plan.blocks
     ]
     lines = [
         showing.styled(shown.title, bold=True),
         "",
         *showing.table(
-            [*head, *(["ms"] if priced else []), "why it ends"], rows, "<>><<>" if priced else "<>>"
+            [*head, *(["ms"] if has_cost else []), "why it ends"],
+            rows,
+            "<>><<>" if has_cost else "<>>",
         ),
         "",
         _summary(plan),

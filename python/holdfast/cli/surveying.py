@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Command = TypeVar("Command", bound="Callable[..., Any]")
 
-MOST_REQUESTS = 20_000
+MAX_REQUESTS = 20_000
 """The default of `--max-requests`, without `--exact`."""
 
 
@@ -79,7 +79,7 @@ OPTIONS = (
         "--max-requests",
         type=click.IntRange(1),
         metavar="N",
-        help=f"Send at most N requests.  [default: {MOST_REQUESTS}, no limit with --exact]",
+        help=f"Send at most N requests.  [default: {MAX_REQUESTS}, no limit with --exact]",
     ),
     click.option(
         "--delay",
@@ -101,7 +101,7 @@ def survey_options(command: Command) -> Command:
 
 def planned(settings: Settings) -> Survey:
     """The survey of the options."""
-    limit = settings["max_requests"] or (None if settings["exact"] else MOST_REQUESTS)
+    limit = settings["max_requests"] or (None if settings["exact"] else MAX_REQUESTS)
     return Survey(
         settings["areas"] or AREAS,
         exact=settings["exact"],

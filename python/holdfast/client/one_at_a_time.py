@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from holdfast.client.url import Target
 
 
-PATIENCE = 0.2
+TIMEOUT = 0.2
 """Seconds after which a call is ended again that was not there before."""
 
 
@@ -52,7 +52,7 @@ class OneAtATime:
         while not closed.done():
             # A call may begin only now.
             self._core.end_call()
-            wait([closed], PATIENCE)
+            wait([closed], TIMEOUT)
         executor.shutdown()
 
     @property

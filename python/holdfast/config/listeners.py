@@ -277,8 +277,9 @@ class ModbusTlsListener(_ConnectionListener):
     tls: ServerTlsConfig
     """The server's certificate, and the clients it trusts."""
     max_handshakes: Connections = Field(default_factory=_handshakes)
-    """Maximum number of open connections that are not authenticated yet, beside max_connections; at
-    the limit, the oldest is closed. Default: as many as max_connections, at least 256."""
+    """Maximum number of open connections that are not authenticated yet, in addition to
+    max_connections; at the limit, the oldest is closed. Default: as many as max_connections, at
+    least 256."""
     request_timeout: Duration = 10.0
     """Seconds from the first byte of a request to its last, and for the handshake."""
     rules: Annotated[tuple[TlsRuleConfig, ...], Strict(False), Field(min_length=1)]
@@ -435,7 +436,7 @@ class RawIngestListener(Model):
     max_handshakes: Annotated[Connections | None, NotNull()] = Field(
         default_factory=_secure_handshakes
     )
-    """With tls: maximum number of open connections that are not authenticated yet, beside
+    """With tls: maximum number of open connections that are not authenticated yet, in addition to
     max_connections; at the limit, the oldest is closed. Default: as many as max_connections, at
     least 256."""
     max_writes_per_source: Rate | None = 50_000

@@ -26,7 +26,7 @@ from holdfast.config.scanning import PREFIX, Dialect
 from holdfast.config.services import BrokerConfig, ClientTlsConfig, NatsServersConfig
 from holdfast.config.topics import TopicNames
 
-MOST_VALUES = 1_000_000
+MAX_VALUES = 1_000_000
 MEASUREMENT = "modbus"
 
 
@@ -35,7 +35,7 @@ class BufferConfig(Model):
 
     own_files = ("file",)
 
-    values: Annotated[int, Field(ge=1000, le=10_000_000)] = MOST_VALUES
+    values: Annotated[int, Field(ge=1000, le=10_000_000)] = MAX_VALUES
     """The newest values that are kept in memory."""
     file: Annotated[FilePath | None, NotNull()] = None
     """A file for what can't be sent, in an existing folder; it survives a restart."""

@@ -97,7 +97,7 @@ class AddressChecks:
             return target
         where = (*path, "tolerance")
         if target.tolerance != STRICT:
-            message = "found beside options of the URL, allowed: one of both"
+            message = "found together with options of the URL, allowed: one of both"
             self.report.add(where, message, of_key=True)
         if mapping(block).get("echo") is True and not _has_echo(target):
             message = "found true, allowed with RTU and ASCII frames only"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
 
-MOST = 10_000
+MAX_DEVICES = 10_000
 """The most devices of one file."""
 
 _FIELD = re.compile(r"\{([A-Za-z_][A-Za-z0-9_]*)(?::(0[1-9]))?\}")
@@ -51,8 +51,11 @@ def expanded(report: Report) -> None:
                 known = ", ".join(f"{{{each}}}" for each in values)
                 report.add(path, f"found {{{error.args[0]}}}, allowed: {known}", of_key=True)
                 break
-            if len(made) >= MOST:
-                report.add((*path, "for"), f"makes more than {MOST} devices, allowed: up to {MOST}")
+            if len(made) >= MAX_DEVICES:
+                report.add(
+                    (*path, "for"),
+                    f"makes more than {MAX_DEVICES} devices, allowed: up to {MAX_DEVICES}",
+                )
                 break
             places.setdefault(named, places[name])
             report.templates[named] = name
@@ -83,7 +86,7 @@ def _values(report: Report, path: KeyPath, given: object) -> list[dict[str, int]
             report.add((*path, variable), f"found {show(span)}, {_ALLOWED}")
             return []
         numbers.append(found)
-    combined = itertools.islice(itertools.product(*numbers), MOST + 1)
+    combined = itertools.islice(itertools.product(*numbers), MAX_DEVICES + 1)
     return [dict(zip(given, each, strict=True)) for each in combined]
 
 

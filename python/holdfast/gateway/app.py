@@ -383,7 +383,7 @@ class App:
             survey = surveying.planned(given)
             stream = Stream(send, self._limits.heartbeat)
             work = surveying.survey(
-                survey, device, stream, step=given["step"], longest=self._limits.mapping
+                survey, device, stream, step=given["step"], longest=self._limits.discovery
             )
             await self._while_streaming(request, stream, work)
 

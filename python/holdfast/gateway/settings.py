@@ -32,7 +32,7 @@ class GatewayLimits:
     """Pending requests to one host and port, so that a dead device does not block others."""
     streams: int = 16
     """Open maps and watches; further ones get status 503."""
-    mapping: float = 900.0
+    discovery: float = 900.0
     """The longest duration of a map; then it ends unfinished."""
     interval: float = 0.1
     """The shortest polling interval of a watch."""

@@ -52,7 +52,7 @@ def touching(areas: Iterable[str]) -> frozenset[int]:
     return frozenset(each.code for each in FUNCTIONS if each.area in wanted)
 
 
-def beside(denied: Iterable[int]) -> list[int]:
+def with_same_effect(denied: Iterable[int]) -> list[int]:
     """Functions that must be denied too, because they have the effect of a denied function."""
     codes = set(denied)
     return [code for code, like in _CLOSE.items() if like & codes and code not in codes]

@@ -268,7 +268,7 @@ class FirstGeneration:
         """The rights with only a list of denied functions."""
         if codes is None or not deny:
             return {}
-        more = functions.beside(deny) if access == "read-write" else []
+        more = functions.with_same_effect(deny) if access == "read-write" else []
         if more:
             message = f"also denies {functions.spelled(more)}, with the same effect as denied ones"
             self.desk.note("changed", codes.at("deny"), f"{message}; the source had none of them")

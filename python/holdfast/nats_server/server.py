@@ -35,7 +35,7 @@ STARTING = 60.0
 ENDING = 10.0
 """Seconds that the server has to end, before it is killed."""
 
-LONGEST_LINE = 1000
+MAX_LINE = 1000
 """A longer line of the server is shown in parts."""
 
 _LINE = re.compile(r"\[\d+\] [\d/]+ [\d:.]+ \[(?P<level>[A-Z]{3})\] ?(?P<text>.*)")
@@ -146,7 +146,7 @@ class NatsServer:
         self._reason = ""
         assert process.stdout is not None
         with process.stdout as lines:
-            while line := lines.readline(LONGEST_LINE):
+            while line := lines.readline(MAX_LINE):
                 self._pass_on(line.rstrip())
         code = process.wait()
         with self._lock:

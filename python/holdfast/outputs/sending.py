@@ -21,7 +21,7 @@ FIRST_PAUSE = 1.0
 MAX_PAUSE = 10.0
 """Seconds between attempts to send. Each failure doubles the pause, up to the maximum."""
 
-MOST = 1000
+MAX_READINGS = 1000
 """The most readings that are sent in one step."""
 
 TICK = 1.0
@@ -124,7 +124,7 @@ class Sending:
     def _step(self, stop: Stop) -> bool:
         """Sends once. Returns whether to go on at once."""
         try:
-            readings = self._buffer.take(MOST, 0.0 if stop.is_set() else TICK)
+            readings = self._buffer.take(MAX_READINGS, 0.0 if stop.is_set() else TICK)
             if not readings:
                 self._receiver.idle()
                 return True
@@ -178,7 +178,7 @@ class Sending:
         if not self._is_failing:
             while len(self._buffer) and time.monotonic() < end:
                 try:
-                    self._receiver.send(self._buffer.take(MOST, 0.0))
+                    self._receiver.send(self._buffer.take(MAX_READINGS, 0.0))
                     self._buffer.done()
                 except (OSError, Refused):
                     break

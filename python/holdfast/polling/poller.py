@@ -26,7 +26,7 @@ SLICE = 0.1
 """Seconds of one wait, between which signal handlers run."""
 
 
-PATIENCE = 1.0
+TIMEOUT = 1.0
 """Seconds that a thread waits for a batch, for a task that may not want it any more."""
 
 
@@ -191,7 +191,7 @@ class Poller:
         while True:
             if self._pending is None:
                 loop = asyncio.get_running_loop()
-                self._pending = loop.run_in_executor(None, self.take, PATIENCE)
+                self._pending = loop.run_in_executor(None, self.take, TIMEOUT)
             # A batch that nobody waits for any more is the first of the next iteration.
             batch = await asyncio.shield(self._pending)
             self._pending = None

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from holdfast.types import Area, PolledBlock
 
 
-MOST_BLOCKS = 4096
+MAX_BLOCKS = 4096
 """Blocks whose decoders are kept. A device has few, but a plan that changes makes others."""
 
 
@@ -74,7 +74,7 @@ class Reader:
         key = (area, address, count)
         known = self._blocks.get(key)
         if known is None:
-            if len(self._blocks) >= MOST_BLOCKS:
+            if len(self._blocks) >= MAX_BLOCKS:
                 self._blocks.clear()
             tags = self._places.inside(*key)
             known = self._blocks[key] = (tags, decoder(tags, address, count) if tags else None)

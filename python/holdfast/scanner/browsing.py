@@ -8,7 +8,7 @@ import msgspec
 
 from holdfast.faults import fault_text
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.health import beside
+from holdfast.scanner.health import without_overlap
 from holdfast.scanner.messages import (
     BlockReport,
     BrowseAnswer,
@@ -174,7 +174,7 @@ class _Report:
         asked = self._device.health.blocks
         if self._device.health.state != "online":
             planned = self._device.source.plan.blocks(self._tags)
-            unasked = [(*block[:3], None, 0, 0.0) for block in beside(planned, asked)]
+            unasked = [(*block[:3], None, 0, 0.0) for block in without_overlap(planned, asked)]
             asked = [*asked, *unasked]
         for area, address, count, _, fault, _ in asked:
             inside = self._places.inside(area, address, count)

@@ -98,21 +98,21 @@ class Health:
             fault, self.last_error_at = faults[0]
             self.error = self.last_error = fault_text(fault)
         cut_short = not all(is_exception(fault) for fault, _ in faults)
-        self.blocks = [*beside(self.blocks, blocks), *blocks] if cut_short else blocks
+        self.blocks = [*without_overlap(self.blocks, blocks), *blocks] if cut_short else blocks
         return before != (self.state, self.error if self.state == "online" else None)
 
 
-def beside(blocks: Iterable[Found], others: Iterable[PolledBlock]) -> list[Found]:
+def without_overlap(blocks: Iterable[Found], others: Iterable[PolledBlock]) -> list[Found]:
     """Returns the blocks that overlap none of `others`, which must not overlap each other."""
     places = sorted(block[:3] for block in others)
 
-    def is_beside(block: Found) -> bool:
+    def is_apart(block: Found) -> bool:
         area, address, count = block[:3]
         at = bisect_left(places, (area, address + count, 0)) - 1
         before = places[at] if at >= 0 else None
         return before is None or before[0] != area or before[1] + before[2] <= address
 
-    return [block for block in blocks if is_beside(block)]
+    return [block for block in blocks if is_apart(block)]
 
 
 def _answered(fault: int) -> bool:

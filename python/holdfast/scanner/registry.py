@@ -161,10 +161,10 @@ def _rate(request: SubscribeRequest, rules: Rules, changes: Adjustments) -> int:
 
 
 def _target(request: SubscribeRequest) -> Target:
-    beside = [key for key in ("host", "port", "transport") if getattr(request, key) is not None]
+    given = [key for key in ("host", "port", "transport") if getattr(request, key) is not None]
     if request.url is not None:
-        if beside:
-            raise Refused(f"both url and {beside[0]} are given, allowed: only one")
+        if given:
+            raise Refused(f"both url and {given[0]} are given, allowed: only one")
         try:
             parts = urlsplit(request.url)
             for key in dict(parse_qsl(parts.query, keep_blank_values=True)):

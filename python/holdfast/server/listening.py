@@ -37,7 +37,7 @@ FORMS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
+class TransportOptions:
     """The options of a server that not every transport has, with their defaults."""
 
     max_connections: int = 256
@@ -59,44 +59,44 @@ class Limits:
                 raise ValueError(f"{option.name} has no effect with {scheme}: omit it")
 
 
-def listener(bind: str, rules: Sequence[Rule], limits: Limits) -> _core.Listener:
+def listener(bind: str, rules: Sequence[Rule], options: TransportOptions) -> _core.Listener:
     """Returns the listener for `bind`. Raises `ValueError` for what it can't be or have."""
     scheme, address = _split(bind)
     if scheme in SERIAL:
-        limits.check(scheme)
+        options.check(scheme)
         return _serial(bind, rules)
     if scheme in _DATAGRAMS:
-        limits.check(scheme, "listen_only", "max_requests_per_source", "max_writes_per_source")
+        options.check(scheme, "listen_only", "max_requests_per_source", "max_writes_per_source")
         return _core.Listener.udp(
             NAME,
             address,
             rules,
             framing=_DATAGRAMS[scheme],
-            listen_only=limits.listen_only,
-            max_requests_per_source=limits.max_requests_per_source,
-            max_writes_per_source=limits.max_writes_per_source,
+            listen_only=options.listen_only,
+            max_requests_per_source=options.max_requests_per_source,
+            max_writes_per_source=options.max_writes_per_source,
         )
     special = {"rtu+tcp": {"frame_timeout"}, "tls": {"tls", "max_handshakes"}}
     others = {"frame_timeout", "tls", "max_handshakes"} - special.get(scheme, set())
-    limits.check(scheme, *({each.name for each in fields(limits)} - others))
-    if scheme == "tls" and limits.tls is None:
+    options.check(scheme, *({each.name for each in fields(options)} - others))
+    if scheme == "tls" and options.tls is None:
         raise ValueError("tls:// requires tls, the certificates: holdfast.ServerTls(cert_file=…)")
     return _core.Listener(
         NAME,
         address,
         rules,
         framing=_CONNECTIONS[scheme],
-        max_connections=limits.max_connections,
-        max_connections_per_source=limits.max_connections_per_source,
-        max_requests_per_source=limits.max_requests_per_source,
-        max_writes_per_source=limits.max_writes_per_source,
-        when_full=limits.when_full,
-        idle_timeout=limits.idle_timeout,
-        request_timeout=limits.request_timeout,
-        frame_timeout=limits.frame_timeout if scheme == "rtu+tcp" else None,
-        listen_only=limits.listen_only,
-        tls=limits.tls,
-        max_handshakes=limits.max_handshakes,
+        max_connections=options.max_connections,
+        max_connections_per_source=options.max_connections_per_source,
+        max_requests_per_source=options.max_requests_per_source,
+        max_writes_per_source=options.max_writes_per_source,
+        when_full=options.when_full,
+        idle_timeout=options.idle_timeout,
+        request_timeout=options.request_timeout,
+        frame_timeout=options.frame_timeout if scheme == "rtu+tcp" else None,
+        listen_only=options.listen_only,
+        tls=options.tls,
+        max_handshakes=options.max_handshakes,
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self, cast
 from holdfast import _core
 from holdfast.net.addresses import LOOPBACK
 from holdfast.server.identity import Identity
-from holdfast.server.listening import NAME, Limits, listener
+from holdfast.server.listening import NAME, TransportOptions, listener
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -85,7 +85,7 @@ class Server:
             raise TypeError("a server requires units and access, or rules, not both")
         if not 1 <= workers <= MAX_WORKERS:
             raise ValueError(f"workers is {workers}, allowed: 1 to {MAX_WORKERS}")
-        limits = Limits(
+        options = TransportOptions(
             max_connections=max_connections,
             max_connections_per_source=max_connections_per_source,
             max_requests_per_source=max_requests_per_source,
@@ -98,7 +98,7 @@ class Server:
             tls=tls,
             max_handshakes=max_handshakes,
         )
-        self._listener = listener(bind, list(rules), limits)
+        self._listener = listener(bind, list(rules), options)
         self._identity = identity or Identity()
         self._workers = workers
         self._engine: _core.Engine | None = None

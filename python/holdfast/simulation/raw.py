@@ -6,12 +6,12 @@ import itertools
 from typing import TYPE_CHECKING, Any
 
 from holdfast.tags.linear import Linear
-from holdfast.values.numeric import LARGEST
+from holdfast.values.numeric import MAX
 
 if TYPE_CHECKING:
     from holdfast.tags import Tag
 
-LARGEST_BCD = {"bcd16": 9999, "bcd32": 99_999_999}
+MAX_BCD = {"bcd16": 9999, "bcd32": 99_999_999}
 
 
 def nearest(tag: Tag, value: Any) -> Any:
@@ -44,9 +44,9 @@ def extremes(tag: Tag) -> tuple[float, float]:
 
 def _limits(tag: Tag) -> tuple[float, float]:
     base = tag.of_type.base
-    if base in LARGEST:
-        return -LARGEST[base], LARGEST[base]
-    if base in LARGEST_BCD:
-        return 0, LARGEST_BCD[base]
+    if base in MAX:
+        return -MAX[base], MAX[base]
+    if base in MAX_BCD:
+        return 0, MAX_BCD[base]
     bits = int(base.lstrip("uint"))
     return (0, 2**bits - 1) if base.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)

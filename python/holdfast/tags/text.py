@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from holdfast.tags.tag import Tag
 
 SWITCHED = {"on": True, "off": False}
-MOST_PLACES = 6
+MAX_PLACES = 6
 """The most decimal places of scaled integers; with more, only those that are needed."""
 
 _INTEGER = re.compile(r"[+-]?[0-9]{1,40}")
@@ -137,4 +137,4 @@ def _places(scale: float, offset: float) -> int | None:
             return None
         places = 0 if text.endswith(".0") else len(text.partition(".")[2])
         found = max(found, places)
-    return found if found <= MOST_PLACES else None
+    return found if found <= MAX_PLACES else None

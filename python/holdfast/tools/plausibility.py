@@ -27,10 +27,10 @@ ANEW = 3.0
 SPREAD = {16: 3.5, 32: 4.5, 64: 5.5}
 """Bits for the size of an integer, by its width."""
 
-USUAL_MOST = {16: 10_000, 32: 100_000_000, 64: 1 << 40}
+USUAL_MAX = {16: 10_000, 32: 100_000_000, 64: 1 << 40}
 """The largest usual integer, by width. Each doubling beyond it costs `UNUSUAL` bits more."""
 
-USUAL_LEAST = {16: 3_000, 32: 1_000_000, 64: 1 << 40}
+USUAL_MIN = {16: 3_000, 32: 1_000_000, 64: 1 << 40}
 """The same for the amount of a negative integer."""
 
 UNUSUAL = {16: 2.4, 32: 0.8, 64: 1.0}
@@ -105,7 +105,7 @@ def _value(value: Any, kind: str, bits: int, now: float | None, reasons: list[st
 def _integer(value: int, bits: int, reasons: list[str]) -> float:
     if value == 0:
         return 2.5
-    cost = math.log2(value + 1) + SPREAD[bits] + _excess(value, USUAL_MOST[bits], bits)
+    cost = math.log2(value + 1) + SPREAD[bits] + _excess(value, USUAL_MAX[bits], bits)
     cost = min(cost, _round(value, bits))
     if bits == 16:
         if value == 0xFFFF:
@@ -121,16 +121,16 @@ def _integer(value: int, bits: int, reasons: list[str]) -> float:
             cost = min(cost, 14 if value % 4096 else 10)
         return cost
     small = value < 1 << (bits // 2)
-    reasons.append("small for its size" if small else "large" if value > USUAL_MOST[bits] else "")
+    reasons.append("small for its size" if small else "large" if value > USUAL_MAX[bits] else "")
     if not reasons[-1]:
         reasons.pop()
     return cost
 
 
 def _negative(amount: int, bits: int, reasons: list[str]) -> float:
-    if bits > 16 and amount > USUAL_LEAST[bits]:
+    if bits > 16 and amount > USUAL_MIN[bits]:
         reasons.append("large")
-    unusual = 1.5 * _excess(amount, USUAL_LEAST[bits], bits) / UNUSUAL[bits]
+    unusual = 1.5 * _excess(amount, USUAL_MIN[bits], bits) / UNUSUAL[bits]
     plain = math.log2(amount + 1) + SPREAD[bits] + unusual
     return NEGATIVE + min(plain, _round(amount, bits))
 

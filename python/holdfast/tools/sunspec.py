@@ -31,8 +31,8 @@ MARK = [0x5375, 0x6E53]
 END = 0xFFFF
 """The id after the last model."""
 
-MOST_MODELS = 100
-LARGEST_SCALE = 10
+MAX_MODELS = 100
+MAX_SCALE = 10
 
 TYPES = {
     "uint16": ("uint16", 0xFFFF),
@@ -136,7 +136,7 @@ def find(read: Read) -> SunSpec | None:
 def _models(read: Read, base: int) -> SunSpec:
     models: list[Model] = []
     at = base + len(MARK)
-    while len(models) < MOST_MODELS and at + 2 <= ADDRESSES:
+    while len(models) < MAX_MODELS and at + 2 <= ADDRESSES:
         try:
             number, length = read(at, 2)
             if number == END:
@@ -283,7 +283,7 @@ class _Group:
             return 1
         raw = self._number(factor) if isinstance(factor, str) else factor & 0xFFFF
         power = None if raw is None else raw - 0x10000 if raw & 0x8000 else raw
-        if power is None or abs(power) > LARGEST_SCALE:
+        if power is None or abs(power) > MAX_SCALE:
             return None
         return float(f"1e{power}") if power < 0 else 10**power
 

@@ -10,8 +10,8 @@ from typing import TypeVar
 
 from holdfast.integers import as_integer
 
-MAX_SHOWN = 40
-LARGEST_SHOWN = 1 << 128
+MAX_CHARACTERS = 40
+MAX_INTEGER = 1 << 128
 
 
 class ConversionError(ValueError):
@@ -68,11 +68,11 @@ def at(place: str, error: Error, field: str | None = None) -> Error:
 
 def shown(value: object) -> str:
     """A value for a message, shortened: values come from outside and can have any size."""
-    if isinstance(value, int) and not -LARGEST_SHOWN < value < LARGEST_SHOWN:
+    if isinstance(value, int) and not -MAX_INTEGER < value < MAX_INTEGER:
         return f"an integer of {value.bit_length()} bits"
     if isinstance(value, str | bytes):
-        cut = len(value) > MAX_SHOWN
-        return f"{value[:MAX_SHOWN]!r}{'…' if cut else ''}"
+        cut = len(value) > MAX_CHARACTERS
+        return f"{value[:MAX_CHARACTERS]!r}{'…' if cut else ''}"
     if value is None or isinstance(value, int | float):
         return repr(value)
     return f"a {type(value).__name__}"

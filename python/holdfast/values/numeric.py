@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 
 INTEGERS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q"}
 FLOATS = {"float16": "e", "float32": "f", "float64": "d"}
-LARGEST = {"float16": 65504.0, "float32": 3.4028234663852886e38, "float64": 1.7976931348623157e308}
+MAX = {
+    "float16": 65504.0,
+    "float32": 3.4028234663852886e38,
+    "float64": 1.7976931348623157e308,
+}
 
 
 class Number(Kind):
@@ -107,7 +111,7 @@ class Float(Number):
 
     def __init__(self, type: Type, order: Order) -> None:
         super().__init__(type, order, FLOATS[type.base])
-        self._most = LARGEST[type.base]
+        self._most = MAX[type.base]
 
     def _number(self, value: Any) -> float | int:
         if isinstance(value, bool) or not isinstance(value, Real):

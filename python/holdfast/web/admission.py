@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from holdfast.net.addresses import Address
     from holdfast.types import WhenFull
 
-PATIENCE = 1.0
+TIMEOUT = 1.0
 """Seconds that a peer has to send a request, or to take a response, before it can be evicted."""
 
 
@@ -100,4 +100,4 @@ class Admission(Generic[Connection]):
 
 
 def _may_go(waiting: Waiting, now: float) -> bool:
-    return not waiting.in_request or now - waiting.since >= PATIENCE
+    return not waiting.in_request or now - waiting.since >= TIMEOUT

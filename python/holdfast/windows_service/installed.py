@@ -22,7 +22,7 @@ Handle: TypeAlias = Any
 TRANSITION = 0.2
 """Seconds between two looks at a service that starts or stops."""
 
-LONGEST = 60.0
+TIMEOUT = 60.0
 """Seconds that a service may take to start or stop before a command gives up."""
 
 RESTART_DELAYS = (5, 5, 60)
@@ -101,12 +101,12 @@ class InstalledService:
         self._wait(service, win32service.SERVICE_STOPPED)
 
     def _wait(self, service: Handle, wanted: int) -> None:
-        over = time.monotonic() + LONGEST
+        over = time.monotonic() + TIMEOUT
         while (state := _state(service)) != wanted:
             if state == win32service.SERVICE_STOPPED:
                 raise ServiceError(f"the service {self.name} has ended: see its log")
             if time.monotonic() > over:
-                raise ServiceError(f"the service {self.name} is not done after {LONGEST:g} s")
+                raise ServiceError(f"the service {self.name} is not done after {TIMEOUT:g} s")
             time.sleep(TRANSITION)
 
     @contextmanager

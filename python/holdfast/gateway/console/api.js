@@ -31,7 +31,7 @@ export const post = async (path, body, signal) =>
     headers: JSON_TYPE,
     body: typeof body === "string" ? body : JSON.stringify(body),
     signal,
-    patience: typeof body === "string" ? JSON.parse(body).timeout : body.timeout,
+    extraTime: typeof body === "string" ? JSON.parse(body).timeout : body.timeout,
   }));
 
 /** Calls `onEvent(name, data)` for each event of a stream, until the stream ends. */
@@ -59,8 +59,8 @@ export async function stream(path, options, onEvent) {
   }
 }
 
-/** Sends a request, and waits for `patience` beyond the usual time for the answer to begin. */
-async function send(path, { patience = 0, signal, ...options } = {}) {
+/** Sends a request, and waits for `extraTime` beyond the usual time for the answer to begin. */
+async function send(path, { extraTime = 0, signal, ...options } = {}) {
   for (;;) {
     const token = sessionStorage.getItem(KEY);
     const headers = { ...options.headers, ...(token ? { Authorization: `Bearer ${token}` } : {}) };
@@ -68,13 +68,13 @@ async function send(path, { patience = 0, signal, ...options } = {}) {
     const end = () => ending.abort();
     signal?.addEventListener("abort", end);
     if (signal?.aborted) end();
-    const alarm = setTimeout(end, patience + GRACE);
+    const alarm = setTimeout(end, extraTime + GRACE);
     let reply;
     try {
       reply = await fetch(path, { ...options, headers, cache: "no-store", signal: ending.signal });
     } catch (error) {
       if (signal?.aborted) throw error;
-      if (error.name === "AbortError") throw new Problem("gateway_gone", `no answer within ${(patience + GRACE) / 1000} s; other tabs may use all connections of the browser`);
+      if (error.name === "AbortError") throw new Problem("gateway_gone", `no answer within ${(extraTime + GRACE) / 1000} s; other tabs may use all connections of the browser`);
       throw new Problem("gateway_gone", "the gateway does not answer");
     } finally {
       clearTimeout(alarm);

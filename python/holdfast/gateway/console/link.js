@@ -10,7 +10,7 @@ export async function packed(text) {
   return btoa(binary).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
 }
 
-const MOST = 65536;
+const MAX_LENGTH = 65536;
 
 /** Returns the text of a part of a URL. Throws an error if it is damaged or too long. */
 export async function unpacked(part) {
@@ -23,7 +23,7 @@ export async function unpacked(part) {
     const { value, done } = await reader.read();
     if (done) return text;
     text += value;
-    if (text.length > MOST) throw new Error("the tag list of the link is too long");
+    if (text.length > MAX_LENGTH) throw new Error("the tag list of the link is too long");
   }
 }
 

@@ -3,7 +3,7 @@
 import { forgetToken, get, hasToken, notice, post, unmark } from "./api.js";
 import { $, h, say, tabs } from "./dom.js";
 import * as link from "./link.js";
-import { Map_ } from "./mapping.js";
+import { Discovery } from "./discovery.js";
 import { Values } from "./values.js";
 
 const may = { write: false };
@@ -25,7 +25,7 @@ const target = () => ({
 
 const choose = tabs(document.querySelector("[role=tablist]"));
 const values = new Values(may);
-const map = new Map_((area, address, length) => {
+const map = new Discovery((area, address, length) => {
   choose($("tab-values"));
   $("read").focus();
   values.open(area, address, length);

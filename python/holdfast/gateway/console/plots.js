@@ -6,7 +6,7 @@ import { $, colour, h, onTheme } from "./dom.js";
 import { History } from "./history.js";
 
 const SPANS = { 120: "2 minutes", 600: "10 minutes", 3600: "1 hour" };
-const MOST = 8;
+const MAX_PLOTS = 8;
 const AUTOMATIC = 4;
 const HEIGHT = 96;
 const TICK = 250;
@@ -81,8 +81,8 @@ export class Plots {
   choose(key) {
     this.told.textContent = "";
     if (this.shown.has(key)) this.remove(key);
-    else if (this.shown.size < MOST) this.add(key);
-    else this.told.textContent = `There can be at most ${MOST} plots. Remove one first.`;
+    else if (this.shown.size < MAX_PLOTS) this.add(key);
+    else this.told.textContent = `There can be at most ${MAX_PLOTS} plots. Remove one first.`;
     this.chosen = true;
     this.onChoice();
   }

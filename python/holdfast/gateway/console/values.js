@@ -207,8 +207,8 @@ export class Values {
   /** Returns the options of a request for parts of the device. */
   sent(wanted, more, signal) {
     const body = JSON.stringify({ ...this.device, parts: wanted.map(parts.asked), ...more });
-    const patience = wanted.reduce((sum, part) => sum + (part.kind === "tags" ? LONG : this.device.timeout), 0);
-    return { method: "POST", body, signal, patience };
+    const extraTime = wanted.reduce((sum, part) => sum + (part.kind === "tags" ? LONG : this.device.timeout), 0);
+    return { method: "POST", body, signal, extraTime };
   }
 
   /** Reads parts once. Returns the data of the event. */
@@ -390,7 +390,7 @@ export class Values {
 
   /** Takes the values of an event. */
   take(data, mark) {
-    const late = this.heard !== null && Date.now() - this.heard > this.patience();
+    const late = this.heard !== null && Date.now() - this.heard > this.lateAfter();
     if (late) this.plots?.gap();
     this.heard = Date.now();
     this.took = data.rtt;
@@ -449,13 +449,13 @@ export class Values {
   }
 
   /** The time in milliseconds after which values without an event are old. */
-  patience() {
+  lateAfter() {
     return 3 * (this.interval + this.took) + (this.device?.timeout ?? 0) * Math.max(1, this.panels.length) + SLACK;
   }
 
   /** Marks the values as old if the gateway is silent. */
   check() {
-    if (!this.watching || !this.began || this.heard === null || Date.now() - this.heard <= this.patience()) return;
+    if (!this.watching || !this.began || this.heard === null || Date.now() - this.heard <= this.lateAfter()) return;
     this.panels.forEach((panel) => panel.stale("No news from the gateway."));
     this.plots?.gap();
   }

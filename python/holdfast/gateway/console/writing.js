@@ -14,7 +14,7 @@ const HELP = {
   bit: () => "0, 1, on or off. This uses function 22. If the device does not support it, write the whole register.",
 };
 const TYPED_HELP = () => "With a decimal point, as in 21.5. Separate values for consecutive registers with semicolons.";
-const MOST_REVIEWED = 16;
+const MAX_REVIEWED = 16;
 
 /** Reasons of errors that occur before anything is sent to the device. */
 const UNSENT = new Set(["no_connection", "no_such_name", "refused_target", "writes_off", "malformed", "busy", "unauthorized",
@@ -192,7 +192,7 @@ function tagHelp({ unit, min, max, states, type }) {
 async function readTag(part, tag) {
   const body = JSON.stringify({ ...part.device, parts: [{ ...part.source, only: [tag.name] }], once: true, describe: false });
   let own = null;
-  await stream("/api/modbus/watch/view", { method: "POST", body, patience: part.device.timeout }, (_, data) => ([own] = data.parts));
+  await stream("/api/modbus/watch/view", { method: "POST", body, extraTime: part.device.timeout }, (_, data) => ([own] = data.parts));
   const error = own?.error ?? own?.errors?.[0];
   if (own === null || error) throw new Problem(own?.reason ?? "exception", error ?? "the gateway sent no value");
   return own.texts;
@@ -256,7 +256,7 @@ function compared({ shown, before }, back) {
   const equals = (others) => back.every((value, at) => value === others[at]);
   if (equals(before)) return "Read back: unchanged.";
   if (equals(shown)) return "Read back: the new values are there.";
-  return `Read back: neither the old nor the new values, but ${back.slice(0, MOST_REVIEWED).map(inWords).join(", ")}.`;
+  return `Read back: neither the old nor the new values, but ${back.slice(0, MAX_REVIEWED).map(inWords).join(", ")}.`;
 }
 
 function inWords(value) {
@@ -272,7 +272,7 @@ function forms(before, after) {
 }
 
 function table(kind, head, rows) {
-  const lines = rows.slice(0, MOST_REVIEWED).map(([name, ...cells]) =>
+  const lines = rows.slice(0, MAX_REVIEWED).map(([name, ...cells]) =>
     h("tr", {}, h("th", { scope: "row" }, name), cells.map((cell) => h("td", {}, cell))));
   const more = rows.length - lines.length;
   return h("div", { class: "scroll" },

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from holdfast.outputs.site import Site
     from holdfast.tags import Tag
 
-MOST_REPLIES = 1000
+MAX_REPLIES = 1000
 """The most replies that the broker has not confirmed; more are dropped and counted."""
 
 
@@ -119,7 +119,7 @@ class Commands:
         answer = self._answer(message, msgspec.json.encode(reply))
         with self._lock:
             self._replies = [each for each in self._replies if not each.is_done]
-            if answer is None or len(self._replies) >= MOST_REPLIES or session.error is not None:
+            if answer is None or len(self._replies) >= MAX_REPLIES or session.error is not None:
                 self.replies_dropped += 1
                 return
             self._replies.append(session.publish([answer]))

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from holdfast.config.outputs import MqttOutputConfig
     from holdfast.tags import Tag
 
-LEAST_STEP = 0.001
+MIN_STEP = 0.001
 """The smallest step that Home Assistant accepts."""
 
-MOST = 1e9
+MAX_NUMBER = 1e9
 """The bounds of writable floats without `min` and `max`."""
 
 NONE = "None"
@@ -136,9 +136,9 @@ class Discovery:
 def _bounds(tag: Tag) -> dict[str, float]:
     """The bounds of a number, and its step."""
     if tag.is_float:
-        step, low, high = LEAST_STEP, -MOST, MOST
+        step, low, high = MIN_STEP, -MAX_NUMBER, MAX_NUMBER
     else:
-        step = max(abs(tag.scale), LEAST_STEP)
+        step = max(abs(tag.scale), MIN_STEP)
         ends = [limit * tag.scale + tag.offset for limit in _limits(tag)]
         low, high = min(ends), max(ends)
     low = low if tag.min is None else tag.min

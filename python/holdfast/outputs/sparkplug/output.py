@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from holdfast.polling import Reading
     from holdfast.stop import Stop
 
-PATIENCE = 2.0
+TIMEOUT = 2.0
 """Seconds to wait for the state of the primary host after connecting."""
 
 
@@ -136,7 +136,7 @@ class SparkplugOutput:
             if self._primary is not None:
                 assert self._settings.primary_host is not None, "there is one"
                 self._session.subscribe([state_topic(self._settings.primary_host)], retained=True)
-                self._primary.wait(PATIENCE)
+                self._primary.wait(TIMEOUT)
         return self._session
 
     def _adopt(self, session: Session) -> None:

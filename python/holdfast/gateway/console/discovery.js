@@ -7,16 +7,16 @@ import { AREAS } from "./standard.js";
 const FAILURES = { timeout: "no response", connection: "connection lost", invalid: "invalid response" };
 const CELLS = 1024;
 const NARROW = 640;
-const MOST_LISTED = 200;
+const MAX_LISTED = 200;
 const ZOOM = 8;
 /** The fewest addresses that a picture shows. */
-const LEAST = 64;
+const MIN_SIZE = 64;
 const LEGEND = { there: "valid", absent: "asked, absent", failed: "failed", unread: "not asked" };
 /** Streams of this browser, with this map: one connection is left for everything else. */
 const STREAMS = 5;
 
 /** The map view. `open` shows a range in the values view. */
-export class Map_ {
+export class Discovery {
   constructor(open) {
     this.open = open;
     this.device = null;
@@ -57,7 +57,7 @@ export class Map_ {
     this.prepare(areas, first, last);
     const body = JSON.stringify({ ...this.device, areas, first, last, exact: form.has("exact"), maxStreams: STREAMS });
     try {
-      await stream("/api/modbus/map", { method: "POST", body, signal: stopping.signal, patience: this.device.timeout * areas.length }, (name, data) => {
+      await stream("/api/modbus/map", { method: "POST", body, signal: stopping.signal, extraTime: this.device.timeout * areas.length }, (name, data) => {
         if (this.running === stopping) this.happened(name, data);
       });
     } catch (error) {
@@ -163,7 +163,7 @@ class Picture {
   /** Shows `factor` times as many addresses around one. */
   zoom(address, factor) {
     const [first, last] = this.whole;
-    const size = Math.min(last - first + 1, Math.max(LEAST, Math.ceil(this.size * factor)));
+    const size = Math.min(last - first + 1, Math.max(MIN_SIZE, Math.ceil(this.size * factor)));
     this.show(address - Math.floor(size / 2), size);
   }
 
@@ -261,12 +261,12 @@ class Picture {
 
   /** Lists the ranges; a click reads a range. */
   list() {
-    const items = this.ranges.slice(0, MOST_LISTED).map(([from, to]) => {
+    const items = this.ranges.slice(0, MAX_LISTED).map(([from, to]) => {
       const onclick = () => this.open(this.code, from, to - from + 1);
       const text = from === to ? `${from}` : `${from}–${to}`;
       return h("li", {}, h("button", { type: "button", "aria-label": `Read ${this.title.toLowerCase()} ${text}`, onclick }, text));
     });
-    if (this.ranges.length > MOST_LISTED) items.push(h("li", { class: "dim" }, `and ${this.ranges.length - MOST_LISTED} more`));
+    if (this.ranges.length > MAX_LISTED) items.push(h("li", { class: "dim" }, `and ${this.ranges.length - MAX_LISTED} more`));
     for (const [kind, ranges] of Object.entries(this.failures)) {
       const count = ranges.reduce((sum, [from, to]) => sum + to - from + 1, 0);
       items.push(h("li", { class: "wrong" }, `${count} with ${FAILURES[kind] ?? `exception ${kind}`}`));
