@@ -42,7 +42,7 @@ def test_lines_arrive_in_order(pipe: tuple[int, Any]) -> None:
 def test_a_reader_that_stops_loses_the_newest_lines_which_are_counted(
     pipe: tuple[int, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(log_output, "MOST", 100)
+    monkeypatch.setattr(log_output, "MAX_LINES", 100)
     reader, stream = pipe
     handler, text = QueuedHandler(stream), "x" * 999
     while handler.dropped < 5:

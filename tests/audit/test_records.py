@@ -184,7 +184,7 @@ def test_a_record_is_written_without_waiting_for_a_timeout(
     run: Run, connect: Connect, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither does the stop. The thread waits longer than the test unless it is woken."""
-    monkeypatch.setattr(auditing, "PATIENCE", 2 * wire.DEADLINE)
+    monkeypatch.setattr(auditing, "TIMEOUT", 2 * wire.DEADLINE)
     appliance = run(CONFIGURATION)
     client = connect(endpoint(appliance, "scada"))
     for count in range(1, 4):
@@ -198,7 +198,7 @@ def test_a_record_is_written_without_waiting_for_a_timeout(
 def test_the_thread_ends_although_the_engine_has_stopped_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(auditing, "PATIENCE", 2 * wire.DEADLINE)
+    monkeypatch.setattr(auditing, "TIMEOUT", 2 * wire.DEADLINE)
     engine = _core.Engine([], identity=[(0, "a"), (1, "b"), (2, "c")], audit="open")
     engine.stop()
     assert engine.next_writes(0, 1) == []

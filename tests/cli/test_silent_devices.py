@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 TIMEOUT = 30
 """Seconds that a command waits for the device: the most that all of them allow."""
 
-PATIENCE = TIMEOUT - 5
+END_TIMEOUT = TIMEOUT - 5
 """Seconds that a test waits for the command. One that waits for the device takes longer."""
 
 
@@ -71,7 +71,7 @@ def test_the_gateway_ends_and_answers_the_request_that_waits(
     with wire.Connection((found[1], int(found[2]))) as client:
         client.send(head + content)
         device.await_requests(1)
-        code, log = command.end(signal.SIGTERM, PATIENCE)
+        code, log = command.end(signal.SIGTERM, END_TIMEOUT)
         reply = client.rest()
     assert (code, "Traceback" in log) == (0, False)
     assert reply.startswith(b"HTTP/1.1 503 ")
@@ -85,7 +85,7 @@ def test_the_proxy_ends(device: ScriptedDevice, running: ExitStack) -> None:
     with wire.Connection(command.wait_until_it_serves()) as client:
         client.send(wire.frame(bytes.fromhex("0300000001")))
         device.await_requests(1)
-        code, log = command.end(signal.SIGTERM, PATIENCE)
+        code, log = command.end(signal.SIGTERM, END_TIMEOUT)
     assert (code, "Traceback" in log) == (0, False)
 
 
@@ -109,7 +109,7 @@ def test_the_scanner_ends(
 
     wire.until(is_subscribed, "it serves")
     device.await_requests(1)
-    code, log = command.end(signal.SIGTERM, PATIENCE)
+    code, log = command.end(signal.SIGTERM, END_TIMEOUT)
     assert (code, "Traceback" in log) == (0, False)
 
 
@@ -125,6 +125,6 @@ def test_a_command_for_one_device_ends(
     name, *more = words
     command = started(running, ServingCommand(name, device.url, *more, "--timeout", str(TIMEOUT)))
     device.await_requests(1)
-    code, log = command.end(number, PATIENCE)
+    code, log = command.end(number, END_TIMEOUT)
     assert code != 0 or name == "watch"
     assert "Traceback" not in log

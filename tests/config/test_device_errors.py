@@ -134,7 +134,7 @@ def test_a_right_device_is_right(folder: Folder) -> None:
         ("    reads", "    tolerance: {echo: true}\n    reads",
          "8: tolerance.echo: found true, allowed with RTU and ASCII frames only"),
         ("url: tcp://10.0.0.9\n", "url: tcp://10.0.0.9?pad=1\n    tolerance: {retries: 1}\n",
-         "6: tolerance: found beside options of the URL, allowed: one of both"),
+         "6: tolerance: found together with options of the URL, allowed: one of both"),
         ("    reads", "    max_gap: 1\n    cost: {per_request: 1, per_register: 1}\n    reads",
          "9: cost: found together with max_gap, allowed: only one of them"),
         ("    reads", "    cost: {per_request: 1}\n    reads",

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 FOLDER = EXAMPLES / "replicated"
 PORT = re.compile(r"\b(504[0-3]|[46]24[1-3])\b")
-PATIENCE = wire.DEADLINE
+TIMEOUT = wire.DEADLINE
 """Three servers elect leaders, three interpreters start."""
 
 
@@ -70,11 +70,11 @@ class Script:
             assert self.process.poll() is None, self.lines
             return sum(re.fullmatch(line, each) is not None for each in self.lines) >= times
 
-        wire.until(is_there, f"{line}, {times} times", PATIENCE)
+        wire.until(is_there, f"{line}, {times} times", TIMEOUT)
 
     def end(self, number: signal.Signals) -> int:
         self.process.send_signal(number)
-        return self.process.wait(PATIENCE)
+        return self.process.wait(TIMEOUT)
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def cluster(folder: Path) -> Iterator[Script]:
 def kill(folder: Path, *name: str) -> str:
     command = [sys.executable, "cluster.py", "kill", *name]
     return subprocess.run(
-        command, cwd=folder, check=True, capture_output=True, text=True, timeout=PATIENCE
+        command, cwd=folder, check=True, capture_output=True, text=True, timeout=TIMEOUT
     ).stdout.strip()
 
 
@@ -111,7 +111,7 @@ def test_a_client_finds_every_write_that_was_confirmed(
         cwd=folder,
         capture_output=True,
         text=True,
-        timeout=PATIENCE,
+        timeout=TIMEOUT,
     )
     assert again.stderr.endswith("is in use: does the example run already?\n")
     client = Script(folder, "client.py")
@@ -167,7 +167,7 @@ def test_a_program_that_is_missing_is_named(folder: Path, name: str, message: st
         env={**os.environ, "PATH": str(programs)},
         capture_output=True,
         text=True,
-        timeout=PATIENCE,
+        timeout=TIMEOUT,
     )
     assert done.returncode == 1
     assert done.stderr.startswith(message)

@@ -72,7 +72,7 @@ def gateway() -> Iterator[Running]:
             allow=["0.0.0.0/0:*"],
             resolve=anybody,
             dialed=Everywhere(server.address),
-            limits={"timeout": 0.2, "mapping": 0.02},
+            limits={"timeout": 0.2, "discovery": 0.02},
         ) as running,
     ):
         yield running

@@ -101,21 +101,21 @@ def test_all_writes_take_the_shared_connection(run: Run) -> None:
     assert counters(appliance)["requests"] == 6
 
 
-LONGEST = 60_000
+MAX_TIMEOUT = 60_000
 """The longest timeout of a request in milliseconds, for what does not wait for it."""
 
 FAULTS: dict[str, tuple[Callable[[Asked], object], int, int, str, str]] = {
     "silence": (silent, 300, 500, "timeout", "Connection timeout"),
     "the end of the connection": (
         lambda asked: asked.end_with(HANG_UP),
-        LONGEST,
+        MAX_TIMEOUT,
         500,
         "connection_lost",
         "connection lost: closed by the peer",
     ),
     "another function": (
         lambda asked: asked.answer(b"\x04\x02\0\7"),
-        LONGEST,
+        MAX_TIMEOUT,
         500,
         "invalid_reply",
         "invalid response: function code 0x04, expected 0x03",

@@ -307,7 +307,7 @@ def test_a_device_that_falls_silent_ends_its_map(gateway: Running) -> None:
 
 def test_a_map_has_a_longest_time() -> None:
     with (
-        gateways.running(limits={"mapping": 0.1}) as gateway,
+        gateways.running(limits={"discovery": 0.1}) as gateway,
         FakeDevice(lambda pdu: exception(pdu, 2)) as device,
     ):
         result = mapped(gateway, device.port, exact=True).next("result")

@@ -27,9 +27,9 @@ WHEELS = sorted(PACKAGES.glob("*.whl")) if FOLDER else []
 each_wheel = pytest.mark.parametrize("wheel", WHEELS, ids=lambda wheel: wheel.stem)
 
 VERSION = tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]["package"]["version"]
-LARGEST = 12e6
+MAX_WHEEL = 12e6
 """Bytes of the largest wheel: a package that all can download in a moment."""
-LARGEST_SOURCE = 30e6
+MAX_SOURCE = 30e6
 """Bytes of the source distribution, most of which are the crates of others."""
 
 
@@ -60,12 +60,12 @@ def test_a_wheel_has_the_package_the_core_and_the_licences(wheel: Path) -> None:
     for crate in ("aws-lc-sys", "rustls", "tokio", "pyo3"):
         assert f"\n{crate} " in notices, crate
     assert "-cp311-abi3-" in wheel.name
-    assert wheel.stat().st_size < LARGEST
+    assert wheel.stat().st_size < MAX_WHEEL
 
 
 def test_the_source_distribution_has_all_crates() -> None:
     packed = PACKAGES / f"holdfast-{VERSION}.tar.gz"
-    assert packed.stat().st_size < LARGEST_SOURCE
+    assert packed.stat().st_size < MAX_SOURCE
     with tarfile.open(packed) as archive:
         names = set(archive.getnames())
         lock = archive.extractfile(f"holdfast-{VERSION}/Cargo.lock")

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 CASES = json.loads((VECTORS / "raw_ingest.json").read_text())
 PACKET = raw_ingest.encode("holding_registers", 0, [1, 2], unit=1)
-LARGEST = raw_ingest.encode("holding_registers", 0, range(65535), unit=1)
+MAX_PACKET = raw_ingest.encode("holding_registers", 0, range(65535), unit=1)
 
 # More than the socket buffers of both sides hold.
 TOO_MUCH = bytes(64 << 20)
@@ -209,7 +209,7 @@ def test_values_may_come_as_any_integers_and_from_any_iterable() -> None:
 
 
 def test_a_packet_has_up_to_65535_values() -> None:
-    assert len(LARGEST) == 10 + 2 * 65535
+    assert len(MAX_PACKET) == 10 + 2 * 65535
     bits = raw_ingest.encode("coils", 1, [1] * 65535, memory_id=0)
     assert bits[12:-4] == b"\xff" * 8191 + b"\x7f"
 
@@ -308,14 +308,14 @@ def test_a_packet_is_sent_and_the_connection_closed(send: Send, receiver: Receiv
     got: list[bytes] = []
 
     def behave(connection: socket.socket) -> None:
-        got.append(take(connection, len(LARGEST)))
+        got.append(take(connection, len(MAX_PACKET)))
         connection.sendall(b"\x00")
         got.append(connection.recv(1))
 
     there = receiver(behave)
-    send(there.host, there.port, LARGEST)
+    send(there.host, there.port, MAX_PACKET)
     wire.until(there.ended.is_set, "the connection is closed")
-    assert got == [LARGEST, b""]
+    assert got == [MAX_PACKET, b""]
 
 
 @pytest.mark.parametrize("way", ["async", "sync"])
@@ -458,7 +458,7 @@ def test_a_refusal_is_heard_though_the_connection_is_reset_after_it(
     there = receiver(behave)
     for _ in range(50):
         with pytest.raises(raw_ingest.RawRefused):
-            send(there.host, there.port, LARGEST)
+            send(there.host, there.port, MAX_PACKET)
 
 
 def test_a_receiver_that_is_done_before_it_has_the_packet_is_not_believed(

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 FLEET = "plant"
 
-PATIENCE = 20.0
+TIMEOUT = 20.0
 """Seconds to wait for the answer to a command: longer than the fleet looks for its node."""
 
 ANSWERED = 10.0
@@ -223,7 +223,7 @@ class Commands:
     async def _send(self, number: int, value: int) -> None:
         subject, text = f"modbus.command.d{number}.t{number}", str(value).encode()
         try:
-            reply = await self._caller.client.request(subject, text, timeout=PATIENCE)
+            reply = await self._caller.client.request(subject, text, timeout=TIMEOUT)
             answer = json.loads(reply.data)
         except (Error, OSError) as error:
             answer = {"success": False, "error": f"not confirmed: {error!r}"}

@@ -30,7 +30,7 @@ INTEGERS = {
     for bits in (16, 32, 64)
     for sign in ("", "u")
 }
-LARGEST = {
+MAX_VALUE = {
     "float16": 65504.0,
     "float32": (2 - 2**-23) * 2.0**127,
     "float64": sys.float_info.max,
@@ -38,7 +38,7 @@ LARGEST = {
 SIZES = {
     "bool": 2,
     **{f"bit:{bit}": 2 for bit in range(16)},
-    **{name: int(name[-2:]) // 8 for name in INTEGERS | LARGEST},
+    **{name: int(name[-2:]) // 8 for name in INTEGERS | MAX_VALUE},
     "bcd16": 2,
     "bcd32": 4,
     **{f"string:{size}": size + size % 2 for size in (1, 5, 7, 8, 11)},
@@ -88,7 +88,7 @@ def single_values(name: str) -> st.SearchStrategy[Any]:
     base, _, size = name.partition(":")
     if base in INTEGERS:
         return st.integers(*INTEGERS[base])
-    if base in LARGEST:
+    if base in MAX_VALUE:
         return st.floats(width=int(base[-2:]), allow_nan=False)  # type: ignore[arg-type]
     if base in ("bool", "bit"):
         return st.booleans()
@@ -471,14 +471,14 @@ def test_what_is_no_integer_is_refused(name: str, value: Any) -> None:
         encode(value, name)
 
 
-@pytest.mark.parametrize("name", LARGEST)
+@pytest.mark.parametrize("name", MAX_VALUE)
 @pytest.mark.parametrize("value", [True, False, "1", b"1", None, [1.0], 1j], ids=repr)
 def test_what_is_no_number_is_refused(name: str, value: Any) -> None:
     with pytest.raises(values.DoesNotFit, match=f" is not a number, which {name} requires$"):
         encode(value, name)
 
 
-@pytest.mark.parametrize(("name", "most"), LARGEST.items())
+@pytest.mark.parametrize(("name", "most"), MAX_VALUE.items())
 def test_a_float_too_large_is_refused_and_no_infinity(name: str, most: float) -> None:
     beyond: list[float] = [10**400] if name == "float64" else [most * 1.01, 1e300, 10**400]
     for value in (most, -most):
@@ -492,7 +492,7 @@ def test_a_float_too_large_is_refused_and_no_infinity(name: str, most: float) ->
 
 
 @pytest.mark.parametrize("order", FOUR)
-@pytest.mark.parametrize("name", LARGEST)
+@pytest.mark.parametrize("name", MAX_VALUE)
 def test_floats_hold_infinities_and_nan(name: str, order: str) -> None:
     for value in (math.inf, -math.inf):
         assert decode(encode(value, name, order), name, order) == value

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.web.admission import PATIENCE, Admission, ConnectionLimits, Full, Waiting
+from holdfast.web.admission import TIMEOUT, Admission, ConnectionLimits, Full, Waiting
 from holdfast.web.host import Host, respond
 from holdfast.web.port import listen
 from support import web, wire
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 ONE, TWO = ip_address("10.0.0.1"), ip_address("10.0.0.2")
 NOW = 100.0
-LONG_AGO = NOW - PATIENCE
+LONG_AGO = NOW - TIMEOUT
 
 
 @dataclass(eq=False)
