@@ -14,6 +14,7 @@ from holdfast.client.url import Tls
 from support import gateway_pages
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
 from support.gateway_pages import DESK, PHONE, Opened, View, browsing, floats, opening
+from support.gateways import Names
 from support.secured import Authority, Relay, context
 
 if TYPE_CHECKING:
@@ -210,13 +211,15 @@ def test_a_map_is_a_picture_whose_ranges_can_be_read(
 
 
 def test_a_dead_device_is_told_in_plain_words(opened: Opened) -> None:
-    view = opened()
+    view = opened(resolve=Names())
+    timeout = view.page.get_by_role("spinbutton", name="Timeout")
     with FakeDevice(lambda _: None) as mute:
-        view.page.get_by_role("spinbutton", name="Timeout").fill("50")
+        timeout.fill("50")
         view.connect(port=mute.port)
         view.says("The device did not respond in time.")
         view.says("Is the unit id right?")
         port = mute.port
+    timeout.fill("5000")
     view.connect(port=port)
     view.says("The connection was refused or failed.")
     view.connect(host="no-such-name.invalid")

@@ -200,14 +200,18 @@ def test_a_name_is_looked_up_once_by_a_request(
     assert asked == [PLC, PLC]
 
 
-def test_a_name_that_takes_too_long_is_a_timeout() -> None:
+def test_a_name_that_takes_too_long_is_a_timeout_and_nothing_is_sent() -> None:
     async def slow(_: str) -> list[str]:
         never: asyncio.Future[list[str]] = asyncio.get_running_loop().create_future()
         return await never
 
     with gateways.running(resolve=slow) as running:
-        answer = running.ask("/connect", {"host": PLC, "timeout": 50})
-    assert (answer.status, answer.json["error"]) == (500, "Connection timeout")
+        for path, body in (("/connect", {}), ("/write/register", {"address": 0, "value": 1})):
+            answer = running.ask(path, {"host": PLC, "timeout": 50, **body})
+            told = f"Connection timeout: can't resolve {PLC}: no answer within 0.05 s"
+            assert (answer.status, answer.json["error"]) == (500, told)
+            assert answer.headers["holdfast-reason"] == "no_such_name"
+        assert running.gateway.status()["writes"] == 0
 
 
 def test_what_holds_a_watch_is_checked_at_every_poll(server: holdfast.Server) -> None:
@@ -281,12 +285,13 @@ def test_a_write_that_was_not_sent_is_told_apart(server: holdfast.Server, log: w
         port = gone.port
     with (
         FakeDevice(lambda _: None) as mute,
-        gateways.running(allow=["127.0.0.0/8:1024-65535"]) as running,
+        gateways.running(allow=["127.0.0.0/8:1024-65535"], resolve=Names()) as running,
     ):
-        body = {"host": "127.0.0.1", "address": 0, "value": 1, "timeout": 50}
+        body = {"host": "127.0.0.1", "address": 0, "value": 1}
         for each in (port, 502, mute.port, server.address[1]):
-            running.ask("/write/register", {**body, "port": each})
-        running.ask("/write/register", {**body, "host": "no-such-name.invalid", "timeout": 9000})
+            short = {"timeout": 500} if each == mute.port else {}
+            running.ask("/write/register", {**body, "port": each, **short})
+        running.ask("/write/register", {**body, "host": "no-such-name.invalid"})
         assert running.gateway.status()["writes"] == 2
     outcomes = [each["outcome"] for each in log.of("gateway_write")]
     assert outcomes == ["not sent", "refused", "failed", "done", "not sent"]

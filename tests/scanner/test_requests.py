@@ -231,6 +231,8 @@ def test_hosts_beyond_private_and_loopback_addresses_are_refused_after_they_are_
 
     def names(host: Any, *rest: Any, **more: Any) -> Any:
         known = {"plc.test": "127.0.0.1", "evil.test": "93.184.216.34"}
+        if host == "nobody.test":
+            raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
         return real(known.get(host, host), *rest, **more)
 
     monkeypatch.setattr(socket, "getaddrinfo", names)
@@ -238,8 +240,8 @@ def test_hosts_beyond_private_and_loopback_addresses_are_refused_after_they_are_
         answer = caller.request("modbus.subscribe", subscription(server, tag("a", 0), host=host))
         assert f"{host}" in answer["error"]
         assert "is not allowed, allowed: 127.0.0.0/8, 10.0.0.0/8" in answer["error"]
-    missing = subscription(server, tag("a", 0), host="nobody.invalid")
-    assert "host nobody.invalid: " in caller.request("modbus.subscribe", missing)["error"]
+    missing = subscription(server, tag("a", 0), host="nobody.test")
+    assert "host nobody.test: " in caller.request("modbus.subscribe", missing)["error"]
 
     data = caller.listen("modbus.data.plc1")
     named = subscription(server, tag("a", 0), host="plc.test")

@@ -113,7 +113,7 @@ class RequestedDevice:
     async def attempt(self, call: Callable[[Client], Awaitable[Result]]) -> Result:
         """As `ask`, but connection errors, timeouts and invalid responses raise `ModbusError`."""
         began = time.monotonic()
-        asked_before, shared = self.asked, None
+        asked_before, shared, route = self.asked, None, None
 
         def turn(client: Client) -> Awaitable[Result]:
             nonlocal shared
@@ -141,6 +141,9 @@ class RequestedDevice:
             detail = "the gateway's TLS files can't be used, see the log of the gateway"
             raise Failed("internal_error", detail) from None
         except TimeoutError:
+            if route is None:
+                late = NoSuchName.unanswered(self.host, self.timeout)
+                raise Failed("no_such_name", f"Connection timeout: {late}") from None
             raise RequestTimeout(f"no reply within {self.timeout} s") from None
         except ValueError as error:  # A check of the client, before anything is sent.
             raise malformed(str(error)) from None

@@ -39,6 +39,11 @@ class NoSuchName(Exception):
         self.why = why
         super().__init__(f"can't resolve {host}: {why}")
 
+    @classmethod
+    def unanswered(cls, host: str, timeout: float) -> NoSuchName:
+        """Returns the error of a lookup that had no result within `timeout` seconds."""
+        return cls(host, f"no answer within {timeout:g} s")
+
 
 class Resolver:
     """The system's resolver. Thread-safe.
@@ -60,7 +65,7 @@ class Resolver:
             async with asyncio.timeout(self._timeout):
                 found = await asyncio.wrap_future(self.look_up(host))
         except TimeoutError:
-            raise NoSuchName(host, f"no answer within {self._timeout:g} s") from None
+            raise NoSuchName.unanswered(host, self._timeout) from None
         except OSError as error:
             raise NoSuchName(host, error.strerror or str(error)) from error
         # Addresses with a scope are link-local. They are valid on one link only.
