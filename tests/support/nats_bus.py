@@ -154,20 +154,25 @@ class Caller:
 
     def kept(self, bucket: str) -> dict[str, Any]:
         """Returns the JSON values of a key-value bucket; nothing if there is no bucket."""
-        return self._loop.do(self._kept(bucket))
+        found = self._loop.do(self._values(bucket))
+        return {key: json.loads(value) for key, value in found.items()}
 
-    async def _kept(self, bucket: str) -> dict[str, Any]:
+    def keys(self, bucket: str) -> set[str]:
+        """Returns the keys of a bucket. `KeyValue.keys` of nats-py finds none now and then."""
+        return set(self._loop.do(self._values(bucket)))
+
+    async def _values(self, bucket: str) -> dict[str, bytes]:
         before = f"$KV.{bucket}."
         try:
             found = await self.client.jetstream().key_value(bucket)
             info = await self.client.jetstream().stream_info(f"KV_{bucket}", subjects_filter=">")
         except NotFoundError:
             return {}
-        entries: dict[str, Any] = {}
+        values: dict[str, bytes] = {}
         for key in (subject.removeprefix(before) for subject in info.state.subjects or {}):
             with contextlib.suppress(NotFoundError):  # It is deleted.
-                entries[key] = json.loads((await found.get(key)).value or b"")
-        return entries
+                values[key] = (await found.get(key)).value or b""
+        return values
 
     def text(self, bucket: str, key: str) -> str:
         """Returns the value of a key as text."""
