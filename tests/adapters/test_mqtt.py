@@ -678,9 +678,14 @@ def test_it_ends_at_once_while_an_address_does_not_answer(rig: Rig) -> None:
             assert running.status()["last_error"] is None
 
 
-def test_a_name_that_does_not_exist_is_a_failure_like_others(rig: Rig) -> None:
-    running = rig.run(settings("mqtt://nowhere.invalid:1883"))
+def test_a_name_that_does_not_exist_is_a_failure_like_others(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unknown(*_: object, **__: object) -> list[Any]:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    running = rig.run(settings("mqtt://broker.example:1883"))
     wire.until(lambda: running.status()["last_error"] is not None, "it failed")
     running.stop(1.0)
 
