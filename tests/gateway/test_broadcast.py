@@ -136,12 +136,12 @@ def test_what_needs_an_answer_is_no_broadcast(
 
 
 def test_over_tcp_unit_0_is_a_unit_as_any(gateway: Running) -> None:
-    body = {"host": "127.0.0.1", "unitId": 0, "address": 3, "value": 7, "timeout": 100}
+    body = {"host": "127.0.0.1", "unitId": 0, "address": 3, "value": 7}
     with FakeDevice(lambda pdu: pdu) as device:
         answer = gateway.ask("/write/register", {**body, "port": device.port})
         assert (answer.status, "note" in answer.json) == (200, False)
     with FakeDevice(lambda _: None) as mute:
-        answer = gateway.ask("/write/register", {**body, "port": mute.port})
+        answer = gateway.ask("/write/register", {**body, "port": mute.port, "timeout": 100})
     assert (answer.status, answer.headers["holdfast-reason"]) == (500, "timeout")
     assert answer.json["error"] == (
         "Connection timeout: unit id 0 is the broadcast of serial lines, which has no response"

@@ -537,7 +537,7 @@ def test_a_write_without_a_reply_is_told_as_unknown_and_read_back(
     device = Registers(silent)
     with FakeDevice(device) as mute:
         view = opened()
-        view.page.get_by_role("spinbutton", name="Timeout").fill("300")
+        view.page.get_by_role("spinbutton", name="Timeout").fill("1000")
         read_registers(view, mute.port)
         alert = write_4711(view).get_by_role("alert")
         expect(alert).to_contain_text("Unknown whether it was written.")
@@ -726,11 +726,11 @@ def test_a_device_without_function_3_can_be_read(opened: Opened, answer: str) ->
 
     with FakeDevice(inputs) as device:
         view = opened()
-        view.page.get_by_role("spinbutton", name="Timeout").fill("200")
+        view.page.get_by_role("spinbutton", name="Timeout").fill("1000")
         view.connect(port=device.port)
         if answer == "nothing":
             view.says("The device did not respond in time.")
-            view.page.get_by_role("spinbutton", name="Timeout").fill("201")
+            view.page.get_by_role("spinbutton", name="Timeout").fill("1001")
             expect(view.button("Continue anyway")).to_be_hidden()
             view.button("Connect").click()
             view.button("Continue anyway").click()

@@ -477,7 +477,7 @@ def test_a_write_is_never_repeated(client: web.Client) -> None:
 def test_after_a_timeout_the_next_request_has_a_new_connection(client: web.Client) -> None:
     replies = iter([b"", b"x"])
     with FakeDevice(lambda pdu: registers(pdu, 5) if next(replies) else None) as device:
-        assert read(client, device, timeout=50).json["error"] == "Connection timeout"
+        assert read(client, device, timeout=500).json["error"] == "Connection timeout"
         assert read(client, device).json["values"] == [5]
 
 

@@ -295,7 +295,7 @@ def test_a_device_that_falls_silent_ends_its_map(gateway: Running) -> None:
         return None if silent.is_set() else registers(pdu)
 
     with FakeDevice(answer) as device:
-        options = {"areas": ["holding_registers"], "timeout": 200}
+        options = {"areas": ["holding_registers"], "timeout": 1000}
         result = mapped(gateway, device.port, **options).next("result")
     assert result["success"] is False
     assert "stopped answering" in result["error"]

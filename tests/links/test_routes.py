@@ -403,7 +403,7 @@ def test_a_line_that_vanishes_is_opened_again(tmp_path: Path, run: Run, connect:
 
 def test_the_reply_of_another_unit_is_no_answer(tmp_path: Path, run: Run, connect: Connect) -> None:
     with Serial(RTU, tmp_path / "line", lambda asked: asked.answer(unit=9)) as device:
-        front = connect(scada(run(configuration(device.url, link={"timeout": 0.2}))))
+        front = connect(scada(run(configuration(device.url, link={"timeout": 1.0}))))
         assert front.ask(READ) == exception(READ, 0x0B)
         assert front.ask(READ) == FIVE
 
@@ -442,7 +442,7 @@ def test_a_silent_unit_is_exception_0b_and_the_others_are_served(
             good(asked)
 
     with Stream("tcp", then=only_one) as device:
-        appliance = run(configuration(device.url, link={"timeout": 0.2}))
+        appliance = run(configuration(device.url, link={"timeout": 1.0}))
         with wire.Connection(scada(appliance)) as other:
             front = connect(scada(appliance))
             for _ in range(4):
@@ -462,7 +462,7 @@ def test_a_late_reply_is_not_the_answer_to_the_next_request(run: Run, connect: C
 
     waiting: list[bytes] = []
     with Stream("tcp", late, next_one) as device:
-        front = connect(scada(run(configuration(device.url, link={"timeout": 0.2}))))
+        front = connect(scada(run(configuration(device.url, link={"timeout": 1.0}))))
         assert front.ask(READ) == exception(READ, 0x0B)
         six = bytes.fromhex("0300060001")
         assert front.ask(six) == bytes.fromhex("03020006")
