@@ -485,9 +485,9 @@ fn mapped(error: &ClientError) -> PyErr {
     let text = error.to_string();
     match error {
         ClientError::Exception(code) => ModbusException::new_err((*code, exception_name(*code))),
-        ClientError::Timeout(_) | ClientError::ConnectTimeout { .. } => {
-            RequestTimeout::new_err(text)
-        }
+        ClientError::Timeout(_)
+        | ClientError::ConnectTimeout { .. }
+        | ClientError::LookupTimeout { .. } => RequestTimeout::new_err(text),
         ClientError::Connect { to, error } => ConnectFailed::new_err((to.clone(), told(error))),
         ClientError::Tls { to, failure, maybe_sent } => {
             let of = (failure.reason(), to.clone(), failure.to_string(), *maybe_sent);

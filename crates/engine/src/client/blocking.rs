@@ -291,6 +291,7 @@ impl BlockingClient {
             }
             StreamError::Io(error) => Lost::Io(error),
             StreamError::TimedOut | StreamError::Ended => Lost::Closed(Closed::ByPeer),
+            StreamError::Unresolved => unreachable!("an open connection needs no lookup"),
         })
     }
 
@@ -332,6 +333,7 @@ impl Open {
         let to = || endpoint.to_string();
         let stream = connect(&endpoint.place, deadline).map_err(|error| match error {
             StreamError::TimedOut => ClientError::ConnectTimeout { to: to(), after: timeout },
+            StreamError::Unresolved => ClientError::LookupTimeout { to: to(), after: timeout },
             StreamError::Ended => {
                 ClientError::Connect { to: to(), error: ErrorKind::UnexpectedEof.into() }
             }

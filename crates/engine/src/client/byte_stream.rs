@@ -1,9 +1,10 @@
 //! Byte streams with deadlines: a TCP connection, datagrams, a serial port.
 
 use std::io::{self, ErrorKind, Read, Write};
-use std::net::{SocketAddr, TcpStream, ToSocketAddrs, UdpSocket};
+use std::net::{SocketAddr, TcpStream, UdpSocket};
 use std::time::{Duration, Instant};
 
+use super::lookup::{Unresolved, addresses};
 use crate::tls::TlsFailure;
 
 /// The shortest timeout that all systems accept.
@@ -14,6 +15,8 @@ const MIN_TIMEOUT: Duration = Duration::from_micros(1);
 pub(super) enum StreamError {
     /// The deadline passed.
     TimedOut,
+    /// The deadline passed while the name was looked up.
+    Unresolved,
     /// The peer has ended the stream.
     Ended,
     Io(io::Error),
@@ -48,6 +51,15 @@ impl From<io::Error> for StreamError {
             ErrorKind::TimedOut | ErrorKind::WouldBlock => StreamError::TimedOut,
             ErrorKind::UnexpectedEof => StreamError::Ended,
             _ => StreamError::Io(error),
+        }
+    }
+}
+
+impl From<Unresolved> for StreamError {
+    fn from(unresolved: Unresolved) -> StreamError {
+        match unresolved {
+            Unresolved::TooLate => StreamError::Unresolved,
+            Unresolved::Failed(error) => error.into(),
         }
     }
 }
@@ -92,10 +104,17 @@ pub(super) struct TcpByteStream {
 }
 
 impl TcpByteStream {
-    /// Connects to the first address of a name that accepts before the deadline.
-    pub(super) fn connect(host: &str, port: u16, deadline: Instant) -> io::Result<TcpByteStream> {
-        let socket =
-            first(host, port, |address| TcpStream::connect_timeout(&address, left(deadline)?))?;
+    /// Connects to the first address of a name that accepts before the deadline. Each gets a share of the
+    /// time that is left.
+    pub(super) fn connect(
+        host: &str,
+        port: u16,
+        deadline: Instant,
+    ) -> Result<TcpByteStream, StreamError> {
+        let found = addresses(host, port, deadline)?;
+        let socket = first(found, |address, others| {
+            TcpStream::connect_timeout(&address, (left(deadline)? / (others + 1)).max(MIN_TIMEOUT))
+        })?;
         socket.set_nodelay(true)?;
         Ok(TcpByteStream { socket, read_timeout: Duration::ZERO, write_timeout: Duration::ZERO })
     }
@@ -154,13 +173,18 @@ impl ByteStream for TcpByteStream {
 }
 
 /// Creates a UDP socket for the first reachable address of a name.
-pub(super) fn connect_udp(host: &str, port: u16) -> io::Result<UdpSocket> {
-    first(host, port, |address| {
+pub(super) fn connect_udp(
+    host: &str,
+    port: u16,
+    deadline: Instant,
+) -> Result<UdpSocket, StreamError> {
+    let found = addresses(host, port, deadline)?;
+    Ok(first(found, |address, _| {
         let any = if address.is_ipv6() { "[::]:0" } else { "0.0.0.0:0" };
         let socket = UdpSocket::bind(any)?;
         socket.connect(address)?;
         Ok(socket)
-    })
+    })?)
 }
 
 impl ByteStream for UdpSocket {
@@ -217,14 +241,50 @@ impl ByteStream for serial2::SerialPort {
     }
 }
 
-/// Tries the addresses of a name in order, until `open` succeeds.
-fn first<T>(host: &str, port: u16, open: impl Fn(SocketAddr) -> io::Result<T>) -> io::Result<T> {
+/// Tries the addresses of a name in order, until `open` succeeds. It gets the number of addresses after
+/// each, so that one dead address does not use up the time.
+fn first<T>(
+    addresses: Vec<SocketAddr>,
+    open: impl Fn(SocketAddr, u32) -> io::Result<T>,
+) -> io::Result<T> {
     let mut failure = io::Error::new(ErrorKind::NotFound, "the name has no address");
-    for address in (host, port).to_socket_addrs()? {
-        match open(address) {
+    let others = (0..u32::try_from(addresses.len()).unwrap_or(u32::MAX)).rev();
+    for (address, others) in addresses.into_iter().zip(others) {
+        match open(address, others) {
             Ok(opened) => return Ok(opened),
             Err(error) => failure = error,
         }
     }
     Err(failure)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn address(port: u16) -> SocketAddr {
+        ([127, 0, 0, 1], port).into()
+    }
+
+    #[test]
+    fn each_address_is_tried_and_knows_how_many_follow() {
+        let tried = std::cell::RefCell::default();
+        let opened = first(vec![address(1), address(2), address(3)], |at, others| {
+            Vec::push(&mut tried.borrow_mut(), (at.port(), others));
+            if at.port() == 2 { Ok(at) } else { Err(ErrorKind::ConnectionRefused.into()) }
+        });
+        assert_eq!(opened.unwrap(), address(2));
+        assert_eq!(tried.into_inner(), [(1, 2), (2, 1)]);
+    }
+
+    #[test]
+    fn the_failure_is_that_of_the_last_address() {
+        let kinds = [ErrorKind::TimedOut, ErrorKind::ConnectionRefused];
+        let failed = first(vec![address(0), address(1)], |at, _| {
+            io::Result::<()>::Err(kinds[usize::from(at.port())].into())
+        });
+        assert_eq!(failed.unwrap_err().kind(), ErrorKind::ConnectionRefused);
+        let none = first(Vec::new(), |_, _| io::Result::Ok(()));
+        assert_eq!(none.unwrap_err().kind(), ErrorKind::NotFound);
+    }
 }

@@ -22,7 +22,7 @@ pub(super) fn connect(
             Box::new(TlsStream::agree(stream, tls, deadline)?)
         }
         Place::Udp { host, port } | Place::RtuOverUdp { host, port } => {
-            Box::new(connect_udp(host, *port)?)
+            Box::new(connect_udp(host, *port, deadline)?)
         }
         Place::Serial(line) => Box::new(line.open_blocking()?),
     })

@@ -8,6 +8,7 @@ mod byte_stream;
 mod connect;
 mod endpoint;
 mod interrupt;
+mod lookup;
 mod strays;
 mod tls_stream;
 mod turns;
@@ -37,6 +38,9 @@ pub enum ClientError {
     /// The connection was not made within the timeout. Nothing was sent.
     #[error("no connection to {to} within {} s", .after.as_secs_f64())]
     ConnectTimeout { to: String, after: Duration },
+    /// The name was not resolved within the timeout. Nothing was sent.
+    #[error("no connection to {to} within {} s: its name was not resolved", .after.as_secs_f64())]
+    LookupTimeout { to: String, after: Duration },
     /// The connection could not be made. Nothing was sent.
     #[error("can't connect to {to}: {error}")]
     Connect { to: String, error: io::Error },

@@ -87,7 +87,9 @@ pub(super) const FLOODED: ClientError = ClientError::Invalid(InvalidResponse::Fl
 pub(super) fn fault(error: &ClientError) -> Fault {
     match error {
         ClientError::Exception(code) => Fault::Exception(*code),
-        ClientError::Timeout(_) | ClientError::ConnectTimeout { .. } => Fault::Timeout,
+        ClientError::Timeout(_)
+        | ClientError::ConnectTimeout { .. }
+        | ClientError::LookupTimeout { .. } => Fault::Timeout,
         ClientError::Connect { .. } | ClientError::Tls { maybe_sent: false, .. } => Fault::Refused,
         ClientError::Invalid(InvalidResponse::Flood) => Fault::Flooded,
         ClientError::Invalid(_) => Fault::Invalid,
