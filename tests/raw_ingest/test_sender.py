@@ -489,29 +489,12 @@ def test_nobody_listening_raises(send: Send) -> None:
     assert isinstance(raised.value.__cause__, ConnectionRefusedError)
 
 
-def full() -> tuple[socket.socket, list[socket.socket]]:
-    """A listening socket whose queue is full: further connections get no answer."""
-    listening = socket.socket()
-    listening.bind(("127.0.0.1", 0))
-    listening.listen(0)
-    queued = []
-    while True:
-        waiting = socket.socket()
-        waiting.settimeout(0.2)
-        queued.append(waiting)
-        try:
-            waiting.connect(listening.getsockname())
-        except TimeoutError:
-            return listening, queued
-
-
 def test_connecting_has_the_deadline_too(send: Send) -> None:
-    listening, queued = full()
-    with contextlib.ExitStack() as opened:
-        for each in (listening, *queued):
-            opened.enter_context(each)
-        with pytest.raises(raw_ingest.RawTimeout, match="no connection within") as raised:
-            send("127.0.0.1", listening.getsockname()[1], timeout=0.2)
+    with (
+        wire.dead_address() as (host, port),
+        pytest.raises(raw_ingest.RawTimeout, match="no connection within") as raised,
+    ):
+        send(host, port, timeout=0.2)
     assert raised.value.maybe_written is False
 
 
@@ -539,16 +522,13 @@ def test_the_next_address_of_a_host_is_tried(
 def test_a_dead_address_of_a_host_leaves_time_for_the_next(
     send: Send, receiver: Receive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    listening, queued = full()
     there = receiver(answering(b"\x00"))
-    found = [
-        (socket.AF_INET, socket.SOCK_STREAM, 6, "", address)
-        for address in (listening.getsockname(), (there.host, there.port))
-    ]
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
-    with contextlib.ExitStack() as opened:
-        for each in (listening, *queued):
-            opened.enter_context(each)
+    with wire.dead_address() as dead:
+        found = [
+            (socket.AF_INET, socket.SOCK_STREAM, 6, "", address)
+            for address in (dead, (there.host, there.port))
+        ]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
         send("plant", there.port, timeout=6)
 
 

@@ -241,3 +241,20 @@ def rounds(enough: threading.Event, least: int = 1) -> Iterator[int]:
         if time.monotonic() > deadline:
             raise AssertionError(f"the threads did not meet in {number} rounds")
         yield number
+
+
+@contextlib.contextmanager
+def dead_address() -> Iterator[tuple[str, int]]:
+    """A TCP address that does not answer: the queue of its listening socket is full."""
+    with contextlib.ExitStack() as opened:
+        listening = opened.enter_context(socket.socket())
+        listening.bind(("127.0.0.1", 0))
+        listening.listen(0)
+        while True:
+            waiting = opened.enter_context(socket.socket())
+            waiting.settimeout(0.2)
+            try:
+                waiting.connect(listening.getsockname())
+            except TimeoutError:
+                break
+        yield listening.getsockname()

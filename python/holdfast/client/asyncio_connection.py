@@ -17,6 +17,7 @@ from math import inf
 from typing import TYPE_CHECKING, Any
 
 from holdfast._core import Attempt, Connection
+from holdfast.client.connecting import addresses, connected
 from holdfast.errors import ConnectFailed, ConnectionLost, ModbusError, RequestTimeout
 
 if TYPE_CHECKING:
@@ -90,6 +91,8 @@ class _LoopConnection:
         self._queue: deque[asyncio.Future[None]] = deque()
         self._open: _Protocol | None = None
         self._connecting: asyncio.Task[_Protocol] | None = None
+        self._is_resolved = False
+        """Whether the attempt to connect has found the addresses of the host."""
         self._connect_at = -inf
         self._late = 0
 
@@ -186,13 +189,20 @@ class _LoopConnection:
         target = self._target
         if self._connect_at > self.loop.time():
             await asyncio.sleep(min(self._connect_at - self.loop.time(), timeout))
+        self._is_resolved = False
         core = Connection(self._endpoint, self.loop.time())
         protocol = _Protocol(self, core, has_pauses=target.tolerance.has_pauses)
+        deadline = self.loop.time() + timeout
         try:
-            async with asyncio.timeout(timeout):
+            async with asyncio.timeout_at(deadline):
                 try:
-                    await self.loop.create_connection(lambda: protocol, target.host, target.port)
-                except (OSError, UnicodeError) as error:
+                    found = await addresses(target.host, target.port)
+                    self._is_resolved = True
+                    connection = await connected(found, deadline)
+                    await self.loop.create_connection(lambda: protocol, sock=connection)
+                except OSError as error:
+                    if isinstance(error, TimeoutError) and error.errno is None:
+                        raise  # Of this side, not of the system.
                     raise ConnectFailed(str(target), explained(error)) from error
                 await protocol.ready
         except TimeoutError:
@@ -203,7 +213,8 @@ class _LoopConnection:
         return protocol
 
     def _not_in_time(self, timeout: float) -> RequestTimeout:
-        return RequestTimeout(f"no connection to {self._target} within {timeout:g} s")
+        why = "" if self._is_resolved else ": its name was not resolved"
+        return RequestTimeout(f"no connection to {self._target} within {timeout:g} s{why}")
 
     def _connect_ended(self, task: asyncio.Task[_Protocol]) -> None:
         self._connecting = None

@@ -6,7 +6,7 @@ import asyncio
 import selectors
 from typing import TYPE_CHECKING
 
-from holdfast.raw_ingest.connecting import left
+from holdfast.client.connecting import left
 
 if TYPE_CHECKING:
     import socket

@@ -11,7 +11,7 @@ import contextlib
 import selectors
 from typing import TYPE_CHECKING
 
-from holdfast.raw_ingest.connecting import left
+from holdfast.client.connecting import left
 from holdfast.raw_ingest.outcome import TlsLost
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ import time
 from typing import TYPE_CHECKING
 
 from holdfast._core import TlsChannel
+from holdfast.client.connecting import addresses, connected, connected_sync
 from holdfast.client.endpoint import receiver_endpoint
 from holdfast.client.receiver import Receiver
-from holdfast.raw_ingest.connecting import connected, connected_sync
 from holdfast.raw_ingest.encoding import encode
 from holdfast.raw_ingest.outcome import Attempt
 from holdfast.raw_ingest.plain import exchange, exchange_sync
@@ -75,9 +75,10 @@ async def send_packet(
     """
     attempt = Attempt(host, port, timeout)
     channel = None if tls is None else await asyncio.to_thread(_channel, host, port, tls)
+    deadline = asyncio.get_running_loop().time() + timeout
     try:
-        async with asyncio.timeout(timeout):
-            connection = await connected(host, port, asyncio.get_running_loop().time() + timeout)
+        async with asyncio.timeout_at(deadline):
+            connection = await connected(await addresses(host, port), deadline)
             with connection:
                 if channel is None:
                     reply = await exchange(attempt, connection, packet)

@@ -1,4 +1,7 @@
-"""Connects to receivers, within a deadline."""
+"""Connects over TCP to the first address of a host that accepts, before a deadline.
+
+Each address gets a share of the remaining time, so that one dead address does not use it up.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,22 @@ if TYPE_CHECKING:
 _RESOLVER = Resolver()
 
 
-async def connected(host: str, port: int, deadline: float) -> socket.socket:
-    """Connects to the first address of the host that accepts.
+async def addresses(host: str, port: int) -> list[SocketAddress]:
+    """Returns the addresses of a host, in the system's order. Raises `OSError`.
 
-    Each address gets a share of the remaining time, so that one dead address does not use it up.
+    A cancellation ends it at once, and no event loop waits for the lookup when it is closed.
+    """
+    found = _RESOLVER.look_up(host, port)
+    # An address needs no lookup.
+    return found.result() if found.done() else await asyncio.wrap_future(found)
+
+
+async def connected(found: Sequence[SocketAddress], deadline: float) -> socket.socket:
+    """Returns a connection to the first of the addresses that accepts.
+
+    `deadline` is a time of the clock of the event loop. Raises `OSError`.
     """
     loop = asyncio.get_running_loop()
-    found = await asyncio.wrap_future(_RESOLVER.look_up(host, port))
     for others, (family, address) in _countdown(found):
         try:
             connection = socket.socket(family)
@@ -42,7 +54,7 @@ async def connected(host: str, port: int, deadline: float) -> socket.socket:
 
 
 def connected_sync(host: str, port: int, deadline: float) -> socket.socket:
-    """Like `connected`, without an event loop."""
+    """Like `addresses` and `connected`, without an event loop."""
     found = _RESOLVER.wait_for(host, port, left(deadline))
     for others, (family, address) in _countdown(found):
         try:
