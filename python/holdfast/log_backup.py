@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from nats.errors import Error, NoRespondersError
 
+from holdfast.net import event_loop
 from holdfast.scanner.receiving import SafeClient, TlsClient
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def _run(servers: Servers, work: Callable[[SafeClient], Coroutine[Any, Any, T]])
             return await work(client)
 
     try:
-        return asyncio.run(connected())
+        return event_loop.run(connected())
     except (Error, OSError, TimeoutError) as error:
         reason = str(error).removeprefix("nats: ") or type(error).__name__
         raise BackupFailed(reason) from error

@@ -944,7 +944,6 @@ def test_a_stop_does_not_wait_for_those_who_hang(run: Run, tmp_path: Path) -> No
             f"rtu+tcp://127.0.0.1:{port}",
             f"udp://127.0.0.1:{free_port()}",
             f"rtu://{cable.devices[0]}?parity=none",
-            "tcp://name.invalid",
         ]
         devices = {
             f"d{number}": device(

@@ -17,6 +17,7 @@ from holdfast.cli.showing import counted, table
 from holdfast.cli.suggesting import SuggestingGroup
 from holdfast.cli.tls_options import tls_of, tls_options
 from holdfast.config.scanning import PREFIX
+from holdfast.net import event_loop
 from holdfast.scanner import Servers
 from holdfast.scanner.fleet.looking import FleetUnavailable, Looker
 
@@ -82,7 +83,7 @@ def status(name: str, as_json: bool, watch: bool, **options: Any) -> None:
     a partition has none.
     """
     try:
-        is_well = asyncio.run(_status(name, _servers(options), as_json, watch))
+        is_well = event_loop.run(_status(name, _servers(options), as_json, watch))
     except (FleetUnavailable, OSError) as error:
         click.echo(f"holdfast: {error}", err=True)
         sys.exit(FAILED)
@@ -144,7 +145,7 @@ def drain(name: str, node: str, prefix: str, **options: Any) -> None:
     not leave.
     """
     try:
-        asyncio.run(_drain(name, node, prefix, _servers(options)))
+        event_loop.run(_drain(name, node, prefix, _servers(options)))
     except (FleetUnavailable, OSError) as error:
         click.echo(f"holdfast: {error}", err=True)
         sys.exit(FAILED)

@@ -48,6 +48,7 @@ from holdfast.config.scanning import (
     parse_server,
     written_pollable,
 )
+from holdfast.net import event_loop
 from holdfast.net.allow_list import AllowedNetwork
 from holdfast.scanner import (
     Defaults,
@@ -318,7 +319,7 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
                 servers, check = Servers((server.url,)), server.check
             settings = _settings(options, servers, allow, limits, trust)
             click.echo(_greeting(settings))
-            asyncio.run(_serve(settings, check))
+            event_loop.run(_serve(settings, check))
         except FleetRefused as refused:
             click.echo(f"holdfast: fleet {options['fleet']}: {refused}", err=True)
             sys.exit(REFUSED)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast import logs, tasks
 from holdfast.heartbeat import Heartbeat
+from holdfast.net.event_loop import EventLoop
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -54,7 +55,7 @@ class LeaseThread:
 
     def start(self) -> None:
         """Begins to hold what is wanted."""
-        self._loop = asyncio.new_event_loop()
+        self._loop = EventLoop()
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
         self._start_thread(self._thread)
 

@@ -8,6 +8,7 @@ import threading
 from typing import TYPE_CHECKING
 
 from holdfast.heartbeat import Heartbeat
+from holdfast.net import event_loop
 from holdfast.scanner.service import Scanner
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class ScannerAdapter:
 
         Raises `OSError` for a file of the settings that can't be used.
         """
-        asyncio.run(self._serve(stop))
+        event_loop.run(self._serve(stop))
 
     async def _serve(self, stop: Stop) -> None:
         loop = asyncio.get_running_loop()

@@ -13,6 +13,7 @@ import msgspec
 from nats.errors import Error
 
 from holdfast.faults import fault_text, is_exception
+from holdfast.net.event_loop import EventLoop
 from holdfast.outputs.sending import soon_after
 from holdfast.scanner.receiving import SafeClient, TlsClient
 from holdfast.scanner.subjects import data_subject, names
@@ -47,7 +48,7 @@ class NatsOutput:
 
     def __init__(self, servers: Servers, prefix: str, dialect: Dialect) -> None:
         self._servers, self._prefix, self._dialect = servers, prefix, dialect
-        self._runner = asyncio.Runner()
+        self._runner = asyncio.Runner(loop_factory=EventLoop)
         self._client: SafeClient | None = None
         self._lost: asyncio.Event | None = None
         """Set when the connection of the client has ended."""

@@ -1,0 +1,56 @@
+"""An event loop that does not wait for lookups of names when it is closed.
+
+asyncio makes lookups in threads, and waits for them at its end: many seconds if no name server
+answers. Programs that hand names to asyncio, such as nats-py, run in this loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import sys
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from holdfast.net.resolver import Resolver
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+if sys.platform == "win32":
+    _Usual = asyncio.ProactorEventLoop
+else:
+    _Usual = asyncio.SelectorEventLoop
+
+Result = TypeVar("Result")
+
+_RESOLVER = Resolver()
+
+
+class EventLoop(_Usual):
+    """The usual event loop of the system, which looks names up with `Resolver`."""
+
+    async def getaddrinfo(
+        self,
+        host: Any,
+        port: Any,
+        *,
+        family: int = 0,
+        type: int = 0,
+        proto: int = 0,
+        flags: int = 0,
+    ) -> Any:
+        """As `socket.getaddrinfo`."""
+        if not isinstance(host, str) or type != socket.SOCK_STREAM or proto or flags:
+            return await super().getaddrinfo(
+                host, port, family=family, type=type, proto=proto, flags=flags
+            )
+        found = await asyncio.wrap_future(_RESOLVER.look_up(host, port))
+        return [
+            (each, type, socket.IPPROTO_TCP, "", at) for each, at in found if family in (0, each)
+        ]
+
+
+def run(main: Coroutine[Any, Any, Result]) -> Result:
+    """As `asyncio.run`, in such a loop."""
+    with asyncio.Runner(loop_factory=EventLoop) as runner:
+        return runner.run(main)

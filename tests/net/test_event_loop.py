@@ -1,0 +1,69 @@
+"""The event loop that does not wait for lookups of names."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+
+import pytest
+
+from holdfast.net import event_loop
+
+
+def test_its_end_does_not_wait_for_a_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, answers = threading.Event(), threading.Event()
+
+    def slow(*_: object, **__: object) -> list[object]:
+        begun.set()
+        answers.wait()
+        return []
+
+    async def main() -> None:
+        connecting = asyncio.create_task(asyncio.open_connection("broker.example", 4222))
+        while not begun.is_set():
+            await asyncio.sleep(0)
+        connecting.cancel()
+
+    monkeypatch.setattr(socket, "getaddrinfo", slow)
+    try:
+        event_loop.run(main())
+    finally:
+        answers.set()
+
+
+@pytest.mark.parametrize("host", ["localhost", "127.0.0.1"])
+def test_it_connects_to_names_and_addresses(host: str) -> None:
+    async def main() -> bytes:
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            reader, writer = await asyncio.open_connection(host, listener.getsockname()[1])
+            accepted, _ = listener.accept()
+            with accepted:
+                accepted.sendall(b"here")
+            received = await reader.read()
+            writer.close()
+            await writer.wait_closed()
+            return received
+
+    assert event_loop.run(main()) == b"here"
+
+
+def test_a_name_that_is_not_known_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(*_: object, **__: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    async def main() -> None:
+        await asyncio.open_connection("broker.example", 4222)
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    with pytest.raises(OSError, match="Name or service not known"):
+        event_loop.run(main())
+
+
+def test_what_is_no_lookup_for_a_connection_is_as_usual() -> None:
+    async def main() -> object:
+        loop = asyncio.get_running_loop()
+        return await loop.getaddrinfo(None, 502, family=socket.AF_INET, type=socket.SOCK_DGRAM)
+
+    usual = socket.getaddrinfo(None, 502, family=socket.AF_INET, type=socket.SOCK_DGRAM)
+    assert event_loop.run(main()) == usual
