@@ -20,6 +20,7 @@ mod counter;
 mod heartbeat;
 pub mod items;
 pub mod link;
+mod lookup;
 mod own_threads;
 pub mod packet_area;
 pub mod poller;

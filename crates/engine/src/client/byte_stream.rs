@@ -4,7 +4,7 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream, UdpSocket};
 use std::time::{Duration, Instant};
 
-use super::lookup::{Unresolved, addresses};
+use crate::lookup::{self, Unresolved};
 use crate::tls::TlsFailure;
 
 /// The shortest timeout that all systems accept.
@@ -59,7 +59,7 @@ impl From<Unresolved> for StreamError {
     fn from(unresolved: Unresolved) -> StreamError {
         match unresolved {
             Unresolved::TooLate => StreamError::Unresolved,
-            Unresolved::Failed(error) => error.into(),
+            Unresolved::Failed(error) => StreamError::Io(error),
         }
     }
 }
@@ -111,7 +111,7 @@ impl TcpByteStream {
         port: u16,
         deadline: Instant,
     ) -> Result<TcpByteStream, StreamError> {
-        let found = addresses(host, port, deadline)?;
+        let found = lookup::addresses(host, port, deadline)?;
         let socket = first(found, |address, others| {
             TcpStream::connect_timeout(&address, (left(deadline)? / (others + 1)).max(MIN_TIMEOUT))
         })?;
@@ -178,7 +178,7 @@ pub(super) fn connect_udp(
     port: u16,
     deadline: Instant,
 ) -> Result<UdpSocket, StreamError> {
-    let found = addresses(host, port, deadline)?;
+    let found = lookup::addresses(host, port, deadline)?;
     Ok(first(found, |address, _| {
         let any = if address.is_ipv6() { "[::]:0" } else { "0.0.0.0:0" };
         let socket = UdpSocket::bind(any)?;

@@ -8,7 +8,6 @@ mod byte_stream;
 mod connect;
 mod endpoint;
 mod interrupt;
-mod lookup;
 mod strays;
 mod tls_stream;
 mod turns;

@@ -18,6 +18,7 @@ use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
 use super::backoff::Retry;
+use super::dialing::dial;
 use super::fault::{Exchanged, FLOODED};
 use super::fence::Pass;
 use super::flood::Flood;
@@ -25,6 +26,7 @@ use super::handshake;
 use super::pace::Pace;
 use super::permit::Permit;
 use crate::client::{ClientError, StrayCounters};
+use crate::lookup;
 use crate::tls::client::ClientTls;
 use crate::tls::{Channel, TlsFailure};
 
@@ -197,9 +199,15 @@ impl TcpLink {
             sleep_until((ended + self.tolerance.reconnect).min(deadline)).await;
         }
         permit.check()?;
-        let address = (self.host.as_str(), self.port);
+        let found = match timeout_at(deadline, lookup::addresses_of(&self.host, self.port)).await {
+            Ok(found) => found,
+            Err(_) => {
+                let error = ClientError::LookupTimeout { to: self.url.clone(), after: timeout };
+                return Err(self.note_failed(error));
+            }
+        };
         let connected = timeout_at(deadline, async {
-            let mut stream = TcpStream::connect(address).await?;
+            let mut stream = dial(found?, deadline).await?;
             let tls = match &self.tls {
                 None => None,
                 Some(tls) => Some(handshake::agree(&mut stream, tls).await?),
@@ -216,11 +224,16 @@ impl TcpLink {
             Ok(Err(error)) => self.refused(error),
             Err(_) => too_late(),
         };
+        Err(self.note_failed(error))
+    }
+
+    /// Notes an attempt to connect that failed. The next one comes after a pause.
+    fn note_failed(&self, error: ClientError) -> Arc<ClientError> {
         let error = Arc::new(error);
         self.failures.set(self.failures.get().saturating_add(1));
         let pause = self.retry.pause(self.failures.get());
         self.failed.replace(Some((Instant::now() + pause, Arc::clone(&error))));
-        Err(error)
+        error
     }
 
     /// Why the connection could not be made.

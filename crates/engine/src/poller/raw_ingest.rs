@@ -14,11 +14,12 @@ use holdfast_protocol::raw_ingest::{DONE, Format, Header};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::Notify;
-use tokio::time::{sleep, timeout};
+use tokio::time::{Instant, sleep, timeout};
 
 use super::status::{BlockSettings, STATUS_BLOCK_LEN, Status};
 use crate::counter::Counter;
-use crate::link::{Retry, agree};
+use crate::link::{Retry, agree, dial};
+use crate::lookup;
 use crate::packet_area::in_packet;
 use crate::tls::TlsFailure;
 use crate::tls::client::ClientTls;
@@ -235,8 +236,9 @@ impl Forward {
     }
 
     async fn send(&self, packet: &[u8]) -> io::Result<u8> {
-        let address = (self.settings.host.as_str(), self.settings.port);
-        let mut stream = TcpStream::connect(address).await?;
+        let deadline = Instant::now() + self.settings.timeout;
+        let found = lookup::addresses_of(&self.settings.host, self.settings.port).await?;
+        let mut stream = dial(found, deadline).await?;
         if let Some(tls) = &self.settings.tls {
             return send_over_tls(stream, tls, packet).await;
         }

@@ -1,0 +1,213 @@
+//! Looks up the addresses of names.
+//!
+//! A call to the system's resolver can't be ended early. It runs in a thread, which callers leave behind when
+//! their time is over. Who asks for a name that is being looked up waits for the same thread.
+
+use std::collections::{HashMap, VecDeque};
+use std::io;
+use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
+use std::sync::mpsc::{RecvTimeoutError, sync_channel};
+use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+use std::{mem, process, thread};
+
+use tokio::sync::oneshot;
+
+/// Why a name has no addresses.
+#[derive(Debug)]
+pub(crate) enum Unresolved {
+    /// The deadline passed.
+    TooLate,
+    /// What the system says of the name.
+    Failed(io::Error),
+}
+
+/// The addresses have port 0.
+type Found = Result<Vec<SocketAddr>, Arc<io::Error>>;
+
+type Waiting = Box<dyn FnOnce(Found) + Send>;
+
+/// Threads at most; the lookups of further names wait.
+const MAX_THREADS: usize = 512;
+
+static LOOKUPS: LazyLock<Mutex<Lookups>> = LazyLock::new(Mutex::default);
+
+#[derive(Default)]
+struct Lookups {
+    /// A process that is forked from this one does not have the threads.
+    process: u32,
+    threads: usize,
+    /// Who waits for each name.
+    waiting: HashMap<String, Vec<Waiting>>,
+    /// What no thread has begun.
+    queue: VecDeque<Box<dyn FnOnce() + Send>>,
+}
+
+/// The addresses of a name or of an address in text, in the order of the system.
+///
+/// # Errors
+/// [`Unresolved`]: the deadline passed, or the system does not know the name.
+pub(crate) fn addresses(
+    host: &str,
+    port: u16,
+    deadline: Instant,
+) -> Result<Vec<SocketAddr>, Unresolved> {
+    match host.parse::<IpAddr>() {
+        Ok(address) => Ok(vec![SocketAddr::new(address, port)]),
+        Err(_) => addresses_by(host, port, deadline, resolve),
+    }
+}
+
+fn addresses_by(
+    host: &str,
+    port: u16,
+    deadline: Instant,
+    resolve: impl FnOnce(&str) -> io::Result<Vec<SocketAddr>> + Send + 'static,
+) -> Result<Vec<SocketAddr>, Unresolved> {
+    let (sender, found) = sync_channel(1);
+    // Whoever was too late does not receive it.
+    look_up(host, Box::new(move |found| drop(sender.send(found))), resolve);
+    let left = deadline.saturating_duration_since(Instant::now());
+    match found.recv_timeout(left) {
+        Ok(found) => with_port(found, port).map_err(Unresolved::Failed),
+        Err(RecvTimeoutError::Timeout) => Err(Unresolved::TooLate),
+        Err(RecvTimeoutError::Disconnected) => unreachable!("a lookup has a result"),
+    }
+}
+
+/// The same for tasks, without a deadline.
+///
+/// # Errors
+/// What the system says of the name.
+pub(crate) async fn addresses_of(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
+    if let Ok(address) = host.parse::<IpAddr>() {
+        return Ok(vec![SocketAddr::new(address, port)]);
+    }
+    let (sender, found) = oneshot::channel();
+    look_up(host, Box::new(move |found| drop(sender.send(found))), resolve);
+    with_port(found.await.expect("a lookup has a result"), port)
+}
+
+fn resolve(host: &str) -> io::Result<Vec<SocketAddr>> {
+    Ok((host, 0).to_socket_addrs()?.collect())
+}
+
+fn with_port(found: Found, port: u16) -> io::Result<Vec<SocketAddr>> {
+    let mut addresses = found.map_err(|error| io::Error::new(error.kind(), error))?;
+    addresses.iter_mut().for_each(|address| address.set_port(port));
+    Ok(addresses)
+}
+
+fn look_up(
+    host: &str,
+    waiting: Waiting,
+    resolve: impl FnOnce(&str) -> io::Result<Vec<SocketAddr>> + Send + 'static,
+) {
+    let mut all = lookups();
+    if mem::replace(&mut all.process, process::id()) != process::id() {
+        *all = Lookups { process: process::id(), ..Lookups::default() };
+    }
+    if let Some(others) = all.waiting.get_mut(host) {
+        return others.push(waiting);
+    }
+    all.waiting.insert(host.to_owned(), vec![waiting]);
+    let name = host.to_owned();
+    all.queue.push_back(Box::new(move || finish(&name, &resolve(&name).map_err(Arc::new))));
+    if all.threads == MAX_THREADS {
+        return;
+    }
+    all.threads += 1;
+    drop(all);
+    let thread = thread::Builder::new().name("holdfast-lookup".into());
+    if let Err(error) = thread.spawn(work) {
+        refuse(&error);
+    }
+}
+
+/// Carries out lookups until none waits.
+fn work() {
+    loop {
+        let mut all = lookups();
+        let Some(lookup) = all.queue.pop_front() else {
+            all.threads -= 1;
+            return;
+        };
+        drop(all);
+        lookup();
+    }
+}
+
+/// No thread could be started. If another one runs, it carries out what waits.
+fn refuse(error: &io::Error) {
+    let mut all = lookups();
+    all.threads -= 1;
+    if all.threads > 0 {
+        return;
+    }
+    all.queue.clear();
+    let waiting = mem::take(&mut all.waiting);
+    drop(all);
+    let error = io::Error::other(format!("can't start a thread to look up the name: {error}"));
+    let error = Arc::new(error);
+    waiting.into_values().flatten().for_each(|waiting| waiting(Err(Arc::clone(&error))));
+}
+
+/// Hands a result to all who wait for it.
+fn finish(host: &str, found: &Found) {
+    let waiting = lookups().waiting.remove(host).unwrap_or_default();
+    waiting.into_iter().for_each(|waiting| waiting(found.clone()));
+}
+
+fn lookups() -> MutexGuard<'static, Lookups> {
+    LOOKUPS.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc::channel;
+    use std::time::Duration;
+
+    use super::*;
+
+    fn later(seconds: u64) -> Instant {
+        Instant::now() + Duration::from_secs(seconds)
+    }
+
+    #[test]
+    fn an_address_needs_no_lookup() {
+        let found = addresses("::1", 502, Instant::now()).unwrap();
+        assert_eq!(found, ["[::1]:502".parse().unwrap()]);
+    }
+
+    #[test]
+    fn a_deadline_ends_the_wait_and_the_next_caller_has_the_result_of_the_same_lookup() {
+        let (go_on, held) = channel::<()>();
+        let slow = move |_: &str| {
+            held.recv().unwrap();
+            Ok(vec!["192.0.2.1:0".parse().unwrap()])
+        };
+        let late = addresses_by("slow.test", 502, Instant::now(), slow);
+        assert!(matches!(late, Err(Unresolved::TooLate)));
+        let again = thread::spawn(|| {
+            addresses_by("slow.test", 802, later(60), |_| unreachable!("it is looked up already"))
+        });
+        while lookups().waiting.get("slow.test").is_some_and(|waiting| waiting.len() < 2) {
+            thread::yield_now();
+        }
+        go_on.send(()).unwrap();
+        assert_eq!(again.join().unwrap().unwrap(), ["192.0.2.1:802".parse().unwrap()]);
+        let anew = addresses_by("slow.test", 1, later(60), |_| Ok(Vec::new()));
+        assert_eq!(anew.unwrap(), []);
+    }
+
+    #[test]
+    fn a_failed_lookup_is_what_the_system_says() {
+        let unknown = |_: &str| Err(io::Error::other("the name is not known"));
+        match addresses_by("unknown.test", 502, later(60), unknown) {
+            Err(Unresolved::Failed(error)) => {
+                assert_eq!(error.to_string(), "the name is not known")
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+}
