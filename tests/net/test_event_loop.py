@@ -60,6 +60,14 @@ def test_a_name_that_is_not_known_is_told(monkeypatch: pytest.MonkeyPatch) -> No
         event_loop.run(main())
 
 
+def test_a_name_without_an_address_of_the_family_is_told() -> None:
+    async def main() -> None:
+        await asyncio.open_connection("127.0.0.1", 4222, family=socket.AF_INET6)
+
+    with pytest.raises(OSError, match=r"family|Name or service not known"):
+        event_loop.run(main())
+
+
 def test_what_is_no_lookup_for_a_connection_is_as_usual() -> None:
     async def main() -> object:
         loop = asyncio.get_running_loop()

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import threading
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -99,11 +100,55 @@ def test_a_name_that_nobody_waits_for_any_more_is_not_looked_up(slow: Slow) -> N
         with pytest.raises(TimeoutError):
             resolve.wait_for("given-up", 502, 0.01)
     last = resolve.look_up("last")
-    assert len(resolve._waiting) == 1
+    assert [host for host, _ in resolve._queue] == ["last"]
     slow.answers.set()
     first.result(wire.DEADLINE)
     last.result(wire.DEADLINE)
     assert slow.asked == ["first", "last"]
+
+
+def test_a_name_is_looked_up_once_for_all_who_ask_meanwhile(slow: Slow) -> None:
+    """A client that tries a dead name again and again does not take the threads of others."""
+    resolve = Resolver(most=2)
+    for _ in range(5):
+        with pytest.raises(TimeoutError):
+            resolve.wait_for("dead", 502, 0.01)
+    waiting = [resolve.look_up("dead", 502), resolve.look_up("dead", 502)]
+    other = resolve.look_up("other", 502)
+    wire.until(lambda: slow.asked == ["dead", "other"], "both names are looked up")
+    slow.answers.set()
+    address = (socket.AF_INET, ("10.0.0.1", 502))
+    assert [each.result(wire.DEADLINE) for each in (*waiting, other)] == [[address]] * 3
+    assert resolve.look_up("dead", 502).result(wire.DEADLINE) == [address]
+    assert slow.asked == ["dead", "other", "dead"]
+
+
+def test_a_failure_is_an_exception_of_its_own_for_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    held = threading.Event()
+
+    def unknown(*_: object, **__: object) -> None:
+        held.wait(wire.DEADLINE)
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    resolve = Resolver()
+    waiting = [resolve.look_up("plc", 502) for _ in range(2)]
+    held.set()
+    first, second = (each.exception(wire.DEADLINE) for each in waiting)
+    assert isinstance(first, socket.gaierror)
+    assert str(first) == str(second) == f"[Errno {socket.EAI_NONAME}] Name or service not known"
+    assert first is not second
+
+
+def test_a_process_that_is_forked_looks_up_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The child has the state of a lookup, but not its thread."""
+    found(monkeypatch, "10.0.0.1")
+    resolve = Resolver(most=1)
+    resolve._process += 1
+    resolve._threads = 1
+    resolve._waiting["plc", 502] = [Future()]
+    address = (socket.AF_INET, ("10.0.0.1", 0))
+    assert resolve.look_up("plc", 502).result(wire.DEADLINE) == [address]
 
 
 def test_an_address_needs_no_thread(slow: Slow) -> None:

@@ -91,8 +91,8 @@ class _LoopConnection:
         self._queue: deque[asyncio.Future[None]] = deque()
         self._open: _Protocol | None = None
         self._connecting: asyncio.Task[_Protocol] | None = None
-        self._is_resolved = False
-        """Whether the attempt to connect has found the addresses of the host."""
+        self._is_looking_up = False
+        """Whether the attempt to connect waits, or has waited, for the addresses of the host."""
         self._connect_at = -inf
         self._late = 0
 
@@ -187,17 +187,18 @@ class _LoopConnection:
 
     async def _connect(self, timeout: float) -> _Protocol:
         target = self._target
+        self._is_looking_up = False
         if self._connect_at > self.loop.time():
             await asyncio.sleep(min(self._connect_at - self.loop.time(), timeout))
-        self._is_resolved = False
         core = Connection(self._endpoint, self.loop.time())
         protocol = _Protocol(self, core, has_pauses=target.tolerance.has_pauses)
         deadline = self.loop.time() + timeout
         try:
             async with asyncio.timeout_at(deadline):
                 try:
+                    self._is_looking_up = True
                     found = await addresses(target.host, target.port)
-                    self._is_resolved = True
+                    self._is_looking_up = False
                     connection = await connected(found, deadline)
                     await self.loop.create_connection(lambda: protocol, sock=connection)
                 except OSError as error:
@@ -213,7 +214,7 @@ class _LoopConnection:
         return protocol
 
     def _not_in_time(self, timeout: float) -> RequestTimeout:
-        why = "" if self._is_resolved else ": its name was not resolved"
+        why = ": its name was not resolved" if self._is_looking_up else ""
         return RequestTimeout(f"no connection to {self._target} within {timeout:g} s{why}")
 
     def _connect_ended(self, task: asyncio.Task[_Protocol]) -> None:

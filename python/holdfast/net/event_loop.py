@@ -39,15 +39,16 @@ class EventLoop(_Usual):
         proto: int = 0,
         flags: int = 0,
     ) -> Any:
-        """As `socket.getaddrinfo`."""
+        """As that of asyncio. For a connection, in the threads of the resolver."""
         if not isinstance(host, str) or type != socket.SOCK_STREAM or proto or flags:
             return await super().getaddrinfo(
                 host, port, family=family, type=type, proto=proto, flags=flags
             )
         found = await asyncio.wrap_future(_RESOLVER.look_up(host, port))
-        return [
-            (each, type, socket.IPPROTO_TCP, "", at) for each, at in found if family in (0, each)
-        ]
+        kept = [each for each in found if family in (0, each[0])]
+        if not kept:
+            raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+        return [(each, type, socket.IPPROTO_TCP, "", address) for each, address in kept]
 
 
 def run(main: Coroutine[Any, Any, Result]) -> Result:

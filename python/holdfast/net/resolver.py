@@ -1,17 +1,21 @@
 """Resolves names with the system's resolver.
 
 A call to the system's resolver cannot be interrupted. So it runs in daemon threads, which neither a
-stop, nor the exit of the process, nor a caller with a timeout has to wait for. The number of
-threads is limited; further lookups are queued until their callers give up.
+stop, nor the exit of the process, nor a caller with a timeout has to wait for. Whoever asks for a
+name that is being looked up waits for the same thread. The number of threads is limited; further
+lookups are queued until their callers give up.
 """
 
 from __future__ import annotations
 
 import asyncio
+import copy
+import os
 import socket
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from concurrent.futures import Future
+from functools import partial
 from typing import Any, TypeAlias
 
 from holdfast.net.addresses import address_in, unbracketed
@@ -23,6 +27,8 @@ SocketAddress: TypeAlias = tuple[int, Any]
 """An address family, and an address for `socket.connect`."""
 
 Lookup: TypeAlias = "Future[list[SocketAddress]]"
+Place: TypeAlias = tuple[str, int | None]
+"""A host and a port."""
 
 MAX_LOOKUPS = 32
 """Limit of concurrent lookups; further ones are queued."""
@@ -55,9 +61,12 @@ class Resolver:
         self._timeout = timeout
         self._most = most
         self._lock = threading.Lock()
+        self._process = os.getpid()
         self._threads = 0
-        self._waiting: dict[Lookup, tuple[str, int | None]] = {}
-        """The queued lookups, oldest first."""
+        self._waiting: dict[Place, list[Lookup]] = {}
+        """Who waits for a place, oldest first."""
+        self._queue: dict[Place, None] = {}
+        """The places that no thread looks up yet."""
 
     async def __call__(self, host: str) -> list[str]:
         """Returns the addresses of a name without duplicates. Raises `NoSuchName`."""
@@ -86,20 +95,31 @@ class Resolver:
         """
         asked: Lookup = Future()
         if address_in(host) is not None:  # Needs no name server, so it returns at once.
-            _settle(asked, unbracketed(host), port)
+            _end([asked], _outcome(unbracketed(host), port))
             return asked
-        asked.add_done_callback(self._forget)
+        place = host, port
+        asked.add_done_callback(partial(self._forget, place))
         with self._lock:
-            self._waiting[asked] = host, port
-            begins = self._threads < self._most
+            if self._process != os.getpid():  # A forked process does not have the threads.
+                self._process, self._threads = os.getpid(), 0
+                self._waiting.clear()
+                self._queue.clear()
+            if place not in self._waiting:
+                self._queue[place] = None
+            self._waiting.setdefault(place, []).append(asked)
+            begins = place in self._queue and self._threads < self._most
             self._threads += begins
         if begins:
             self._begin()
         return asked
 
-    def _forget(self, asked: Lookup) -> None:
+    def _forget(self, place: Place, asked: Lookup) -> None:
         with self._lock:
-            self._waiting.pop(asked, None)
+            waiting = self._waiting.get(place, [])
+            if asked in waiting:
+                waiting.remove(asked)
+            if not waiting and place in self._queue:
+                del self._queue[place], self._waiting[place]
 
     def _begin(self) -> None:
         try:
@@ -107,35 +127,45 @@ class Resolver:
         except RuntimeError:  # No new thread can start. Running ones go on with the queue.
             with self._lock:
                 self._threads -= 1
-                left = [] if self._threads else list(self._waiting)
-                for asked in left:
-                    del self._waiting[asked]
-            for asked in left:
-                if asked.set_running_or_notify_cancel():
-                    asked.set_exception(OSError("can't start a thread to look up the name"))
+                places = [] if self._threads else list(self._queue)
+                left = [asked for place in places for asked in self._waiting.pop(place)]
+                for place in places:
+                    del self._queue[place]
+            _end(left, OSError("can't start a thread to look up the name"))
 
     def _work(self) -> None:
         """Handles queued lookups until the queue is empty."""
         while True:
             with self._lock:
-                asked = next(iter(self._waiting), None)
-                if asked is None:
+                place = next(iter(self._queue), None)
+                if place is None:
                     self._threads -= 1
                     return
-                host, port = self._waiting.pop(asked)
-            _settle(asked, host, port)
+                del self._queue[place]
+            outcome = _outcome(*place)
+            with self._lock:
+                asked = self._waiting.pop(place)
+            _end(asked, outcome)
 
 
-def _settle(asked: Lookup, host: str, port: int | None) -> None:
-    if not asked.set_running_or_notify_cancel():
-        return
+def _outcome(host: str, port: int | None) -> list[SocketAddress] | OSError:
+    """What the system says of a name."""
     try:
         if "\0" in host:  # The system would look up only the part before the NUL.
             raise ValueError
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except OSError as error:
-        asked.set_exception(error)
+        return error
     except ValueError:  # IDNA or the system refuses the name, such as a label of 64 characters.
-        asked.set_exception(OSError(f"{host} is not a valid host name"))
-    else:
-        asked.set_result([(family, address) for family, *_, address in found])
+        return OSError(f"{host} is not a valid host name")
+    return [(family, address) for family, *_, address in found]
+
+
+def _end(waiting: Iterable[Lookup], outcome: list[SocketAddress] | OSError) -> None:
+    """Hands an outcome to all who still wait for it."""
+    for asked in waiting:
+        if asked.set_running_or_notify_cancel():
+            if isinstance(outcome, OSError):
+                asked.set_exception(copy.copy(outcome))
+            else:
+                asked.set_result(list(outcome))
