@@ -13,6 +13,7 @@ from holdfast.outputs.stored import Stored
 from support.readings import numbered, numbers, reading, tag
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from holdfast.polling import Reading
@@ -20,9 +21,27 @@ if TYPE_CHECKING:
 PLENTY = 2**30
 
 
-def opened(file: Path, max_bytes: int = PLENTY, known: list[Any] | None = None) -> Stored:
-    tags = {each.name: each for each in known or [tag()]}
-    return Stored(file, max_bytes, lambda _, name: tags.get(name))
+class Opened:
+    """Opens files, and closes them after the test."""
+
+    def __init__(self) -> None:
+        self.all: list[Stored] = []
+
+    def __call__(
+        self, file: Path, max_bytes: int = PLENTY, known: list[Any] | None = None
+    ) -> Stored:
+        tags = {each.name: each for each in known or [tag()]}
+        stored = Stored(file, max_bytes, lambda _, name: tags.get(name))
+        self.all.append(stored)
+        return stored
+
+
+@pytest.fixture
+def opened() -> Iterator[Opened]:
+    made = Opened()
+    yield made
+    for each in made.all:
+        each.close()
 
 
 def drained(buffer: Buffer, most: int = 3) -> list[int]:
@@ -49,7 +68,7 @@ def test_the_newest_stay_and_the_others_are_counted() -> None:
     assert (buffer.dropped, drained(buffer)) == (2, [2, 3, 4, 5])
 
 
-def test_a_file_comes_before_memory_and_survives(tmp_path: Path) -> None:
+def test_a_file_comes_before_memory_and_survives(opened: Opened, tmp_path: Path) -> None:
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
     buffer.offer(numbered(5))
@@ -66,7 +85,9 @@ def test_a_file_comes_before_memory_and_survives(tmp_path: Path) -> None:
     assert drained(buffer) == [5, 6]
 
 
-def test_what_was_taken_from_the_file_is_taken_again_after_a_crash(tmp_path: Path) -> None:
+def test_what_was_taken_from_the_file_is_taken_again_after_a_crash(
+    opened: Opened, tmp_path: Path
+) -> None:
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
     buffer.offer(numbered(3))
@@ -78,7 +99,7 @@ def test_what_was_taken_from_the_file_is_taken_again_after_a_crash(tmp_path: Pat
     assert drained(again) == [0, 1, 2]
 
 
-def test_values_of_every_kind_survive_in_a_file(tmp_path: Path) -> None:
+def test_values_of_every_kind_survive_in_a_file(opened: Opened, tmp_path: Path) -> None:
     values = [None, True, 0, -(2**63), 2**64 - 1, 0.1, "ä", b"\0\xff", [1, None, 2.5], ["a"]]
     stored = opened(tmp_path / "b.db")
     readings = [reading(value, fault=7, undecoded="why") for value in values]
@@ -92,7 +113,7 @@ def test_values_of_every_kind_survive_in_a_file(tmp_path: Path) -> None:
     [(True, "bool"), (1.5, "float64"), (None, "float64"), ("a", "string:2"), ([b"a"], "bytes:2")],
 )
 def test_a_tag_that_is_gone_is_replaced_by_one_of_its_kind(
-    tmp_path: Path, value: Any, kind: str
+    opened: Opened, tmp_path: Path, value: Any, kind: str
 ) -> None:
     stored = opened(tmp_path / "b.db", known=[])
     stored.add([reading(value, tag=tag("gone"))])
@@ -100,7 +121,7 @@ def test_a_tag_that_is_gone_is_replaced_by_one_of_its_kind(
     assert (found.name, found.tag.type, found.value) == ("gone", kind, value)
 
 
-def test_the_oldest_go_when_the_file_is_full(tmp_path: Path) -> None:
+def test_the_oldest_go_when_the_file_is_full(opened: Opened, tmp_path: Path) -> None:
     stored = opened(tmp_path / "b.db", max_bytes=1000)
     dropped = sum(stored.add(numbered(10, start)) for start in range(0, 100, 10))
     left = 0
@@ -112,7 +133,7 @@ def test_the_oldest_go_when_the_file_is_full(tmp_path: Path) -> None:
     assert stored.add(numbered(1000)) == 1000
 
 
-def test_a_file_that_is_in_use_is_an_error(tmp_path: Path) -> None:
+def test_a_file_that_is_in_use_is_an_error(opened: Opened, tmp_path: Path) -> None:
     first = opened(tmp_path / "b.db")
     with pytest.raises(OSError, match=r"b\.db: database is locked"):
         opened(tmp_path / "b.db")
@@ -120,14 +141,14 @@ def test_a_file_that_is_in_use_is_an_error(tmp_path: Path) -> None:
     opened(tmp_path / "b.db").close()
 
 
-def test_a_file_that_is_no_database_is_an_error(tmp_path: Path) -> None:
+def test_a_file_that_is_no_database_is_an_error(opened: Opened, tmp_path: Path) -> None:
     (tmp_path / "b.db").write_bytes(b"not a database" * 100)
     with pytest.raises(OSError, match=r"b\.db: file is not a database"):
         opened(tmp_path / "b.db")
 
 
 def test_what_a_full_disk_refuses_stays_in_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
@@ -146,7 +167,7 @@ def test_what_a_full_disk_refuses_stays_in_memory(
     assert drained(buffer) == [0, 1, 2]
 
 
-def test_a_full_disk_leaves_the_file_as_it_was(tmp_path: Path) -> None:
+def test_a_full_disk_leaves_the_file_as_it_was(opened: Opened, tmp_path: Path) -> None:
     stored = opened(tmp_path / "b.db")
     stored.add(numbered(3))
     pages = stored._db.execute("PRAGMA page_count").fetchone()[0]
@@ -165,7 +186,7 @@ def test_nothing_is_lost_or_reordered(
 ) -> None:
     """Whatever happens, what is sent is everything, in its order; only what was taken and not done
     may come twice."""
-    file = tmp_path_factory.mktemp("buffer") / "b.db"
+    file, opened = tmp_path_factory.mktemp("buffer") / "b.db", Opened()
     buffer = Buffer()
     buffer.stored = opened(file)
     sent: list[int] = []

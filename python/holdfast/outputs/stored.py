@@ -39,16 +39,19 @@ class Stored:
         """How many readings there are."""
         self._max_bytes, self._find = max_bytes, find
         self._bytes = 0
-        try:
-            self._db = sqlite3.connect(
-                file, timeout=1.0, isolation_level=None, check_same_thread=False
-            )
-            self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
-            self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
-            self._db.execute(_CREATE)
-            self._recount()
-        except sqlite3.Error as error:
-            raise OSError(f"{file}: {error}") from error
+        with contextlib.ExitStack() as failing:
+            try:
+                self._db = sqlite3.connect(
+                    file, timeout=1.0, isolation_level=None, check_same_thread=False
+                )
+                failing.callback(self._db.close)
+                self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
+                self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
+                self._db.execute(_CREATE)
+                self._recount()
+            except sqlite3.Error as error:
+                raise OSError(f"{file}: {error}") from error
+            failing.pop_all()
 
     def add(self, readings: Sequence[Reading]) -> int:
         """Stores readings durably. Returns how many old ones had to go for them."""
