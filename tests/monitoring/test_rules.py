@@ -116,6 +116,7 @@ def test_a_real_prometheus_evaluates_the_rules_against_an_appliance(
     class WithRules(Prometheus):
         target = endpoint(appliance, "metrics")
         rules = MONITORING / "alerts.yml"
+        interval = 5  # A loaded machine takes more than a second for all metrics.
 
     prometheus = WithRules(tmp_path)
 

@@ -85,17 +85,20 @@ class VictoriaMetrics(Database):
 
 
 class Prometheus(Database):
-    """Prometheus, which scrapes one address every second, and evaluates a file of rules."""
+    """Prometheus, which scrapes one address, and evaluates a file of rules every second."""
 
     name = "prometheus"
     target: tuple[str, int] = ("127.0.0.1", 9)
     rules: Path | None = None
+    interval = 1
+    """Seconds between scrapes, and the timeout of each."""
 
     def command(self) -> list[str]:
         file = self._folder / "prometheus.yml"
         host, port = self.target
         file.write_text(
-            "global: {scrape_interval: 1s, evaluation_interval: 1s}\n"
+            f"global: {{scrape_interval: {self.interval}s, scrape_timeout: {self.interval}s, "
+            "evaluation_interval: 1s}\n"
             f"rule_files: {json.dumps([] if self.rules is None else [str(self.rules)])}\n"
             "scrape_configs:\n"
             f"  - {{job_name: holdfast, static_configs: [{{targets: ['{host}:{port}']}}]}}\n"
