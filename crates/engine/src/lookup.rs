@@ -8,7 +8,7 @@ use std::io;
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
 use std::sync::mpsc::{RecvTimeoutError, sync_channel};
 use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use std::{mem, process, thread};
 
 use tokio::sync::oneshot;
@@ -88,6 +88,13 @@ pub(crate) async fn addresses_of(host: &str, port: u16) -> io::Result<Vec<Socket
     with_port(found.await.expect("a lookup has a result"), port)
 }
 
+/// The time for one address of a name, if so many follow it. Each gets the same share of what is left, so that
+/// one dead address does not use it up.
+pub(crate) fn share(deadline: Instant, others: usize) -> Duration {
+    let addresses = u32::try_from(others + 1).unwrap_or(u32::MAX);
+    deadline.saturating_duration_since(Instant::now()) / addresses
+}
+
 fn resolve(host: &str) -> io::Result<Vec<SocketAddr>> {
     Ok((host, 0).to_socket_addrs()?.collect())
 }
@@ -104,8 +111,11 @@ fn look_up(
     resolve: impl FnOnce(&str) -> io::Result<Vec<SocketAddr>> + Send + 'static,
 ) {
     let mut all = lookups();
-    if mem::replace(&mut all.process, process::id()) != process::id() {
-        *all = Lookups { process: process::id(), ..Lookups::default() };
+    if all.process != process::id() {
+        let of_parent =
+            mem::replace(&mut *all, Lookups { process: process::id(), ..Lookups::default() });
+        // To drop what waits would wake tasks of the parent's event loops.
+        mem::forget(of_parent);
     }
     if let Some(others) = all.waiting.get_mut(host) {
         return others.push(waiting);
@@ -165,7 +175,6 @@ fn lookups() -> MutexGuard<'static, Lookups> {
 #[cfg(test)]
 mod tests {
     use std::sync::mpsc::channel;
-    use std::time::Duration;
 
     use super::*;
 

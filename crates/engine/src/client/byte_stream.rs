@@ -113,7 +113,8 @@ impl TcpByteStream {
     ) -> Result<TcpByteStream, StreamError> {
         let found = lookup::addresses(host, port, deadline)?;
         let socket = first(found, |address, others| {
-            TcpStream::connect_timeout(&address, (left(deadline)? / (others + 1)).max(MIN_TIMEOUT))
+            let timeout = left(deadline)?.min(lookup::share(deadline, others));
+            TcpStream::connect_timeout(&address, timeout.max(MIN_TIMEOUT))
         })?;
         socket.set_nodelay(true)?;
         Ok(TcpByteStream { socket, read_timeout: Duration::ZERO, write_timeout: Duration::ZERO })
@@ -241,14 +242,14 @@ impl ByteStream for serial2::SerialPort {
     }
 }
 
-/// Tries the addresses of a name in order, until `open` succeeds. It gets the number of addresses after
-/// each, so that one dead address does not use up the time.
+/// Tries the addresses of a name in order, until `open` succeeds. It also gets the number of addresses that
+/// follow.
 fn first<T>(
     addresses: Vec<SocketAddr>,
-    open: impl Fn(SocketAddr, u32) -> io::Result<T>,
+    open: impl Fn(SocketAddr, usize) -> io::Result<T>,
 ) -> io::Result<T> {
     let mut failure = io::Error::new(ErrorKind::NotFound, "the name has no address");
-    let others = (0..u32::try_from(addresses.len()).unwrap_or(u32::MAX)).rev();
+    let others = (0..addresses.len()).rev();
     for (address, others) in addresses.into_iter().zip(others) {
         match open(address, others) {
             Ok(opened) => return Ok(opened),

@@ -6,19 +6,21 @@ use std::net::SocketAddr;
 use tokio::net::TcpStream;
 use tokio::time::{Instant, timeout};
 
-/// Tries the addresses in order. Each but the last gets a share of the time until the deadline, so that one
-/// dead address does not use it up. The caller limits the last one.
+use crate::lookup;
+
+/// Tries the addresses in order. Each but the last gets its share of the time until the deadline. The caller
+/// limits the last one.
 ///
 /// # Errors
 /// The error of the last address.
 pub(crate) async fn dial(addresses: Vec<SocketAddr>, deadline: Instant) -> io::Result<TcpStream> {
     let mut addresses = addresses.into_iter();
     while let Some(address) = addresses.next() {
-        let others = u32::try_from(addresses.len()).unwrap_or(u32::MAX);
+        let others = addresses.len();
         if others == 0 {
             return TcpStream::connect(address).await;
         }
-        let share = deadline.saturating_duration_since(Instant::now()) / others.saturating_add(1);
+        let share = lookup::share(deadline.into_std(), others);
         if let Ok(Ok(stream)) = timeout(share, TcpStream::connect(address)).await {
             return Ok(stream);
         }

@@ -14,7 +14,7 @@ use holdfast_protocol::raw_ingest::{DONE, Format, Header};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::Notify;
-use tokio::time::{Instant, sleep, timeout};
+use tokio::time::{Instant, sleep, timeout_at};
 
 use super::status::{BlockSettings, STATUS_BLOCK_LEN, Status};
 use crate::counter::Counter;
@@ -212,7 +212,8 @@ impl Forward {
                 self.news.notified().await;
                 continue;
             };
-            let sent = timeout(self.settings.timeout, self.send(&packet)).await;
+            let deadline = Instant::now() + self.settings.timeout;
+            let sent = timeout_at(deadline, self.send(&packet, deadline)).await;
             let too_late = || {
                 let seconds = self.settings.timeout.as_secs_f64();
                 io::Error::new(ErrorKind::TimedOut, format!("no reply within {seconds} s"))
@@ -235,8 +236,7 @@ impl Forward {
         }
     }
 
-    async fn send(&self, packet: &[u8]) -> io::Result<u8> {
-        let deadline = Instant::now() + self.settings.timeout;
+    async fn send(&self, packet: &[u8], deadline: Instant) -> io::Result<u8> {
         let found = lookup::addresses_of(&self.settings.host, self.settings.port).await?;
         let mut stream = dial(found, deadline).await?;
         if let Some(tls) = &self.settings.tls {
