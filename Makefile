@@ -101,13 +101,14 @@ dist-check: .venv/core.stamp .venv/dev.stamp
 deb: .venv/dev.stamp
 	$(BIN)/python packaging/deb/build.py dist
 
+IMAGE := localhost/holdfast-modbus
 # The container image of the wheel in dist (docs/containers.md). Only the format of docker has health checks.
 CONTAINER ?= $(firstword $(foreach tool,podman docker,$(shell command -v $(tool))) podman)
 container:
-	@ls dist/holdfast-$(VERSION)-*manylinux*.whl > /dev/null 2>&1 || \
+	@ls dist/holdfast_modbus-$(VERSION)-*manylinux*.whl > /dev/null 2>&1 || \
 	  { echo "dist has no wheel of Holdfast $(VERSION) for Linux with glibc: make dist"; exit 1; }
 	$(CONTAINER) build $(if $(findstring podman,$(CONTAINER)),--format docker) \
-	  --tag holdfast:$(VERSION) --tag holdfast:latest --file packaging/container/Containerfile .
+	  --tag $(IMAGE):$(VERSION) --tag $(IMAGE):latest --file packaging/container/Containerfile .
 
 # What can be checked before a release (docs/releasing.md), and the packages that it has. TAG is its tag.
 release-check: .venv/release.stamp deb

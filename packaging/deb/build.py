@@ -36,7 +36,7 @@ OLDEST_LIBC = (2, 28)
 
 
 def main() -> None:
-    """Writes `holdfast_VERSION_ARCHITECTURE.deb` into the folder of the wheels."""
+    """Writes `holdfast-modbus_VERSION_ARCHITECTURE.deb` into the folder of the wheels."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="the folder with the wheels")
     folder = parser.parse_args().folder
@@ -53,7 +53,7 @@ def main() -> None:
 
 def packable(folder: Path, version: str) -> list[Path]:
     """The wheels that packages are built of."""
-    wheels = sorted(folder.glob(f"holdfast-{version}-*manylinux*.whl"))
+    wheels = sorted(folder.glob(f"holdfast_modbus-{version}-*manylinux*.whl"))
     return [wheel for wheel in wheels if wheel.stem.endswith(tuple(ARCHITECTURES))]
 
 
@@ -73,14 +73,14 @@ def build(wheel: Path) -> Path:
     libraries.collect(wheel, architecture, PYTHONS, staged / "lib")
     fill(staged / "debian", version, libc)
     pack(staged, architecture)
-    name = f"holdfast_{version}_{architecture}.deb"
+    name = f"holdfast-modbus_{version}_{architecture}.deb"
     return Path(shutil.copyfile(staged.parent / name, wheel.parent / name))
 
 
 def described(wheel: str) -> tuple[str, str, tuple[int, int]]:
     """The Debian version, the architecture and the oldest C library of a wheel, by its name."""
     found = re.fullmatch(
-        r"holdfast-([0-9.]+)-cp311-abi3-(.*manylinux.*_(x86_64|aarch64))\.whl", wheel
+        r"holdfast_modbus-([0-9.]+)-cp311-abi3-(.*manylinux.*_(x86_64|aarch64))\.whl", wheel
     )
     if found is None:
         sys.exit(f"{wheel} is not a wheel of Holdfast for Linux with glibc on amd64 or arm64")
@@ -99,8 +99,8 @@ def fill(debian: Path, version: str, libc: tuple[int, int]) -> None:
     control = control.replace("@PYTHON@", python).replace("@LIBC@", ".".join(map(str, libc)))
     (debian / "control").write_text(control)
     (debian / "changelog").write_text(
-        f"holdfast ({version}) unstable; urgency=medium\n\n"
-        "  * See /usr/share/doc/holdfast/release-notes.md.gz.\n\n"
+        f"holdfast-modbus ({version}) unstable; urgency=medium\n\n"
+        "  * See /usr/share/doc/holdfast-modbus/release-notes.md.gz.\n\n"
         f" -- {maintainer(control)}  {formatdate(commit_time())}\n"
     )
     shutil.copyfile(ROOT / "CHANGELOG.md", debian / "release-notes.md")
@@ -116,7 +116,7 @@ def licences(folder: Path) -> Iterator[str]:
         if not licence or "\n" in licence:
             kinds = [kind for kind in about.get_all("Classifier", []) if kind.startswith("License")]
             licence = ", ".join(kind.rpartition(" :: ")[2] for kind in kinds)
-        if distribution.name != "holdfast":
+        if distribution.name != "holdfast-modbus":
             yield f"  {distribution.name} {distribution.version}: {licence}\n"
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import changelog
 
 ROOT = Path(__file__).resolve().parents[2]
-IMAGE = re.compile(r"image: holdfast:(\S+)")
+IMAGE = re.compile(r"image: localhost/holdfast-modbus:(\S+)")
 IN_WHEELS = (
     "holdfast/_core",
     "holdfast/py.typed",
@@ -28,7 +28,7 @@ IN_PACKAGES = (
     "./etc/holdfast/holdfast.yaml",
     "./usr/bin/holdfast",
     "./usr/lib/holdfast/holdfast/_core.abi3.so",
-    "./usr/share/doc/holdfast/copyright",
+    "./usr/share/doc/holdfast-modbus/copyright",
 )
 
 
@@ -86,7 +86,7 @@ def changes(version: str, tag: str | None) -> list[str]:
 def wheels(folder: Path, version: str) -> list[str]:
     """What the wheels lack."""
     found = []
-    made = sorted(folder.glob(f"holdfast-{version}-*.whl"))
+    made = sorted(folder.glob(f"holdfast_modbus-{version}-*.whl"))
     for wheel in made:
         with zipfile.ZipFile(wheel) as archive:
             names = archive.namelist()
@@ -97,7 +97,7 @@ def wheels(folder: Path, version: str) -> list[str]:
 
 def metadata(folder: Path, version: str) -> list[str]:
     """What an index would refuse."""
-    files = [*folder.glob(f"holdfast-{version}-*.whl"), *folder.glob(f"holdfast-{version}.tar.gz")]
+    files = [*folder.glob(f"holdfast_modbus-{version}-*.whl"), *folder.glob(f"holdfast_modbus-{version}.tar.gz")]
     command = [sys.executable, "-m", "twine", "--no-color", "check", "--strict", *map(str, files)]
     done = subprocess.run(command, capture_output=True, text=True)
     return [done.stdout + done.stderr] if done.returncode else []
@@ -106,7 +106,7 @@ def metadata(folder: Path, version: str) -> list[str]:
 def debian(folder: Path, version: str) -> list[str]:
     """What the Debian packages lack."""
     found = []
-    made = sorted(folder.glob(f"holdfast_{version}_*.deb"))
+    made = sorted(folder.glob(f"holdfast-modbus_{version}_*.deb"))
     for package in made:
         command = ["dpkg-deb", "--contents", str(package)]
         listed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
@@ -117,17 +117,17 @@ def debian(folder: Path, version: str) -> list[str]:
 
 def materials(folder: Path, version: str) -> None:
     """Writes what the native core and the packages are made of."""
-    python = folder / f"holdfast-{version}-python.cdx.json"
+    python = folder / f"holdfast-modbus-{version}-python.cdx.json"
     command = [sys.executable, "-m", "cyclonedx_py", "requirements", "--output-reproducible"]
     command += ["--pyproject", str(ROOT / "pyproject.toml"), "--output-file", str(python)]
     subprocess.run([*command, str(ROOT / "requirements/appliance.lock")], check=True)
-    for wheel in sorted(folder.glob(f"holdfast-{version}-*.whl"))[:1]:
+    for wheel in sorted(folder.glob(f"holdfast_modbus-{version}-*.whl"))[:1]:
         with zipfile.ZipFile(wheel) as archive:
             [name] = [
                 name for name in archive.namelist() if name.endswith("binding.cyclonedx.json")
             ]
             core = json.loads(archive.read(name))
-        (folder / f"holdfast-{version}-rust.cdx.json").write_text(json.dumps(core, indent=2))
+        (folder / f"holdfast-modbus-{version}-rust.cdx.json").write_text(json.dumps(core, indent=2))
 
 
 if __name__ == "__main__":

@@ -64,7 +64,7 @@ def test_every_configuration_is_valid(file: Path, tmp_path: Path) -> None:
 def test_appliances_have_no_rights_and_are_published_to_this_machine_only(file: Path) -> None:
     for service in services(file).values():
         assert all(port.startswith("127.0.0.1:") for port in service.get("ports", ()))
-        if service["image"] == "holdfast:latest":
+        if service["image"] == "localhost/holdfast-modbus:latest":
             assert service["read_only"] is True
             assert service["cap_drop"] == ["ALL"]
             assert service["security_opt"] == ["no-new-privileges:true"]

@@ -17,7 +17,7 @@ from support.packaging_programs import program
 from support.paths import ROOT
 
 DEB = ROOT / "packaging" / "deb"
-UNIT = (DEB / "debian" / "holdfast.service").read_text()
+UNIT = (DEB / "debian" / "holdfast-modbus.holdfast.service").read_text()
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="packages of Debian")
 
@@ -43,9 +43,8 @@ def test_the_exposure_of_the_unit_is_below_two_of_ten(unit: Path) -> None:
 
 
 def test_the_unit_runs_the_files_that_the_package_installs() -> None:
-    installed = dict(
-        line.split() for line in (DEB / "debian" / "holdfast.install").read_text().splitlines()
-    )
+    listed = (DEB / "debian" / "holdfast-modbus.install").read_text()
+    installed = dict(line.split() for line in listed.splitlines())
     assert installed["holdfast"] == "usr/bin"
     assert installed["holdfast.yaml"] == "etc/holdfast"
     for key, verb in (("ExecStart", "run"), ("ExecReload", "reload")):
@@ -65,11 +64,11 @@ def test_the_configuration_of_the_package_serves_this_machine_only() -> None:
     ("wheel", "expected"),
     [
         (
-            "holdfast-1.2.3-cp311-abi3-manylinux_2_17_x86_64.manylinux2014_x86_64.whl",
+            "holdfast_modbus-1.2.3-cp311-abi3-manylinux_2_17_x86_64.manylinux2014_x86_64.whl",
             ("1.2.3", "amd64", (2, 28)),
         ),
-        ("holdfast-1.2.3-cp311-abi3-manylinux2014_aarch64.whl", ("1.2.3", "arm64", (2, 28))),
-        ("holdfast-0.1.0-cp311-abi3-manylinux_2_34_x86_64.whl", ("0.1.0", "amd64", (2, 34))),
+        ("holdfast_modbus-1.2.3-cp311-abi3-manylinux2014_aarch64.whl", ("1.2.3", "arm64", (2, 28))),
+        ("holdfast_modbus-0.1.0-cp311-abi3-manylinux_2_34_x86_64.whl", ("0.1.0", "amd64", (2, 34))),
     ],
 )
 def test_a_package_is_for_the_machine_and_c_library_of_its_wheel(
@@ -81,9 +80,9 @@ def test_a_package_is_for_the_machine_and_c_library_of_its_wheel(
 @pytest.mark.parametrize(
     "wheel",
     [
-        "holdfast-1.2.3-cp311-abi3-musllinux_1_2_x86_64.whl",
-        "holdfast-1.2.3-cp311-abi3-win_amd64.whl",
-        "holdfast-1.2.3-cp311-abi3-manylinux_2_17_armv7l.whl",
+        "holdfast_modbus-1.2.3-cp311-abi3-musllinux_1_2_x86_64.whl",
+        "holdfast_modbus-1.2.3-cp311-abi3-win_amd64.whl",
+        "holdfast_modbus-1.2.3-cp311-abi3-manylinux_2_17_armv7l.whl",
     ],
 )
 def test_a_wheel_for_another_system_is_refused(wheel: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,8 +100,8 @@ def test_packages_are_built_of_wheels_for_amd64_and_arm64_only(
         "musllinux_1_2_x86_64",
         "win_amd64",
     ):
-        (tmp_path / f"holdfast-1.2.3-cp311-abi3-{tags}.whl").touch()
-    (tmp_path / "holdfast-1.2.2-cp311-abi3-manylinux2014_x86_64.whl").touch()
+        (tmp_path / f"holdfast_modbus-1.2.3-cp311-abi3-{tags}.whl").touch()
+    (tmp_path / "holdfast_modbus-1.2.2-cp311-abi3-manylinux2014_x86_64.whl").touch()
     found = program("deb/build", monkeypatch).packable(tmp_path, "1.2.3")
     assert [wheel.stem.rpartition("manylinux_2_17_")[2] for wheel in found] == ["aarch64", "x86_64"]
 

@@ -42,12 +42,13 @@ def package() -> set[str]:
 
 def test_there_are_packages() -> None:
     assert WHEELS
-    assert [each.name for each in PACKAGES.glob("*.tar.gz")] == [f"holdfast-{VERSION}.tar.gz"]
+    [source] = PACKAGES.glob("*.tar.gz")
+    assert source.name == f"holdfast_modbus-{VERSION}.tar.gz"
 
 
 @each_wheel
 def test_a_wheel_has_the_package_the_core_and_the_licences(wheel: Path) -> None:
-    about = f"holdfast-{VERSION}.dist-info"
+    about = f"holdfast_modbus-{VERSION}.dist-info"
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if not name.endswith("/")}
         metadata = archive.read(f"{about}/METADATA").decode()
@@ -64,22 +65,22 @@ def test_a_wheel_has_the_package_the_core_and_the_licences(wheel: Path) -> None:
 
 
 def test_the_source_distribution_has_all_crates() -> None:
-    packed = PACKAGES / f"holdfast-{VERSION}.tar.gz"
+    packed = PACKAGES / f"holdfast_modbus-{VERSION}.tar.gz"
     assert packed.stat().st_size < MAX_SOURCE
     with tarfile.open(packed) as archive:
         names = set(archive.getnames())
-        lock = archive.extractfile(f"holdfast-{VERSION}/Cargo.lock")
+        lock = archive.extractfile(f"holdfast_modbus-{VERSION}/Cargo.lock")
         assert lock is not None
         locked = tomllib.loads(lock.read().decode())["package"]
     for crate in locked:
         if "source" in crate:
-            folder = f"holdfast-{VERSION}/vendor/{crate['name']}-{crate['version']}"
+            folder = f"holdfast_modbus-{VERSION}/vendor/{crate['name']}-{crate['version']}"
             assert f"{folder}/Cargo.toml" in names, folder
     below = {name.split("/")[3] for name in names if name.split("/")[1] == "vendor"}
     assert not below & vendoring.NOT_BUILT
     for name in [".cargo/config.toml", "LICENSE", "LICENSE-third-party.txt", "PKG-INFO"]:
-        assert f"holdfast-{VERSION}/{name}" in names
-    assert {f"holdfast-{VERSION}/python/{name}" for name in package()} <= names
+        assert f"holdfast_modbus-{VERSION}/{name}" in names
+    assert {f"holdfast_modbus-{VERSION}/python/{name}" for name in package()} <= names
 
 
 @pytest.mark.skipif(

@@ -159,4 +159,4 @@ def test_without_windows_the_error_names_systemd(
     ]
     monkeypatch.setattr(sys, "platform", "win32")
     [told] = failure("service", command, str(file))
-    assert told.endswith('pip install "holdfast[windows-service]"')
+    assert told.endswith(": pip install pywin32")

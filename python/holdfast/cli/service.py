@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 def service() -> None:
     """Run an appliance as a service of Windows.
 
-    Requires Windows, and the package pywin32: pip install "holdfast[windows-service]". On Linux,
-    use systemd.
+    Requires Windows, and the package pywin32: pip install pywin32. On Linux, use systemd.
     """
 
 
@@ -131,7 +130,7 @@ def _unavailable() -> Iterator[None]:
         yield
     except ImportError as error:
         reason = (
-            f'{error}: pip install "holdfast[windows-service]"'
+            f"{error}: pip install pywin32"
             if sys.platform == "win32"
             else "services of Windows exist only there. On Linux, use systemd"
         )

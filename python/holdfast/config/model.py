@@ -7,11 +7,11 @@ of the keys, by way of the JSON Schema.
 
 from __future__ import annotations
 
-import importlib.metadata
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, PrivateAttr
 
+from holdfast._core import __version__
 from holdfast.config import dump
 from holdfast.config.base import Model
 from holdfast.config.devices import DeviceConfig
@@ -52,14 +52,6 @@ if TYPE_CHECKING:
     from holdfast.config.problems import Problem
 
 
-def installed_version() -> str:
-    """The version of this package, `0` if it is not installed."""
-    try:
-        return importlib.metadata.version("holdfast")
-    except importlib.metadata.PackageNotFoundError:
-        return "0"
-
-
 class IdentityConfig(Model):
     """The answers to functions 17 and 43/14."""
 
@@ -67,7 +59,7 @@ class IdentityConfig(Model):
     """Object 0, VendorName."""
     product_code: Text = "HF"
     """Object 1, ProductCode."""
-    revision: Text = Field(default_factory=installed_version)
+    revision: Text = Field(default_factory=lambda: __version__)
     """Object 2, MajorMinorRevision. Default: the version of Holdfast."""
     vendor_url: Annotated[Text | None, NotNull()] = None
     """Object 3, VendorUrl."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from holdfast._core import __version__
 from holdfast.outputs.mqtt.quantities import classes
 from holdfast.tags.text import text_of
 
@@ -35,10 +35,6 @@ class Discovery:
         self._settings, self._names = settings, settings.topics
         self._prefix = settings.discovery_prefix
         self._node = f"holdfast_{_escaped(output)}"
-        try:
-            self._version = version("holdfast")
-        except PackageNotFoundError:
-            self._version = "0"
 
     @property
     def birth_topic(self) -> str:
@@ -83,7 +79,7 @@ class Discovery:
             "availability": [{"topic": topic} for topic in topics],
             "availability_mode": "all",
             "device": {"identifiers": [f"{self._node}_{_escaped(device)}"], "name": device},
-            "origin": {"name": "Holdfast", "sw_version": self._version},
+            "origin": {"name": "Holdfast", "sw_version": __version__},
         }
 
     def _entity(self, device: str, tag: Tag) -> tuple[str, dict[str, Any]]:
