@@ -5,19 +5,21 @@
 PYTHON ?= python3
 BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 RUST := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name Cargo.toml)
-CRATES := --workspace --exclude holdfast-binding
+CRATES := -p holdfast-memory -p holdfast-protocol -p holdfast-journal -p holdfast-engine
 PROTOCOL := -p holdfast-protocol
 NO_STD := crates/protocol/tests/no_std/Cargo.toml
 BARE_METAL := thumbv7em-none-eabi
 PEERS := tests/peers/drivers
 VERSION := $(shell sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml)
 TOOLCHAIN := .cache/toolchain.stamp
+# Tests start hundreds of processes: without its cache, each would compile all modules again.
+unexport PYTHONDONTWRITEBYTECODE
 ifneq ($(OS),Windows_NT)
 export PATH := $(CURDIR)/.cache/toolchain/bin:$(PATH)
 endif
 
-.PHONY: build run test lint no-std format torture bench docs site pictures dist dist-check lock clean \
-  deb container release-check
+.PHONY: build run test test-python test-rust test-slow explore torture lint no-std format bench docs site \
+  pictures dist dist-check lock clean deb container release-check
 .DELETE_ON_ERROR:
 
 build: .venv/core.stamp
@@ -25,10 +27,34 @@ build: .venv/core.stamp
 run: .venv/core.stamp
 	@exec $(BIN)/holdfast run examples/plant.yaml
 
+# The same cases in every run, but for those of tests/slow.txt. Both parts mostly wait: they run side by side.
 test: .venv/core.stamp .venv/dev.stamp
-	cargo test --locked --quiet $(CRATES)
-	cargo test --locked --quiet $(PROTOCOL) --no-default-features
-	$(BIN)/pytest -n 4 --dist loadfile
+	@$(MAKE) --no-print-directory -j 2 test-rust test-python
+
+PYTEST := $(BIN)/pytest -n 4 --dist worksteal
+test-python: .venv/core.stamp .venv/dev.stamp
+	$(PYTEST) --slow without
+
+# What the Rust tests print is kept, and shown if one fails.
+RUST_LOG := .cache/test-rust.log
+test-rust: $(TOOLCHAIN)
+	@cargo test --locked --quiet $(CRATES) --lib --tests > $(RUST_LOG) 2>&1 && \
+	  cargo test --locked --quiet $(CRATES) --doc >> $(RUST_LOG) 2>&1 && \
+	  cargo test --locked --quiet $(PROTOCOL) --no-default-features >> $(RUST_LOG) 2>&1 || \
+	  { cat $(RUST_LOG); exit 1; }
+	@awk '/^test result/ {passed += $$4} END {print "Rust: " passed " passed"}' $(RUST_LOG)
+
+# The cases of tests/slow.txt.
+test-slow: .venv/core.stamp .venv/dev.stamp
+	cargo test --locked --quiet -p holdfast-journal --test torture
+	$(PYTEST) --slow only
+
+# New cases for all property tests, and more of them. A case that fails is printed and kept: as a patch of the
+# Python test (`git apply`), and for Rust as a line of a proptest-regressions file. Commit it with the mend.
+explore: .venv/core.stamp .venv/dev.stamp
+	PROPTEST_RNG_SEED=$${SEED:-$$(date +%s)} PROPTEST_CASES=5000 cargo test --locked --release --quiet $(CRATES) \
+	  --lib --tests; rust=$$?; \
+	HOLDFAST_EXPLORE=1 $(BIN)/pytest -m hypothesis && exit $$rust
 
 lint: no-std .venv/core.stamp .venv/dev.stamp
 	cargo fmt --check

@@ -15,7 +15,7 @@ import holdfast
 from holdfast import logs
 from holdfast.appliance import Appliance, supervision
 from holdfast.config import load
-from support import wire
+from support import cases, wire
 from support.machine import has_ipv6, missing
 from support.running import (
     Connect,
@@ -35,11 +35,37 @@ if TYPE_CHECKING:
 
 pytest_plugins = ("support.nats_bus",)
 
-# The time that an example takes depends on the load of the machine.
+# Property tests draw the same cases in every run; only `make explore` draws new ones.
+# There is no deadline: the time that a case takes depends on the load of the machine.
 settings.register_profile(
-    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    "holdfast",
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    derandomize=not cases.IS_EXPLORING,
+    print_blob=cases.IS_EXPLORING,
+    max_examples=cases.examples(100),
 )
-settings.load_profile("any machine")
+settings.load_profile("holdfast")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--slow",
+        choices=("with", "without", "only"),
+        default="with",
+        help="what to do with the cases of tests/slow.txt (default: with)",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leaves out the slow cases, or all others."""
+    which, ids = config.getoption("slow"), cases.slow_ids()
+    if which != "with":
+        parts: dict[bool, list[pytest.Item]] = {True: [], False: []}
+        for item in items:
+            parts[cases.is_listed(item.nodeid, ids)].append(item)
+        items[:] = parts[which == "only"]
+        config.hook.pytest_deselected(items=parts[which != "only"])
 
 
 @pytest.fixture(autouse=True)

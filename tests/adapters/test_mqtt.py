@@ -22,6 +22,7 @@ from holdfast.adapters.mqtt import backoff, inbox
 from holdfast.ingest import MemoryAccess
 from support import wire
 from support.brokers import free_port
+from support.cases import examples
 from support.machine import tool
 from support.mqtt_rig import Rig, command, handled, settings, subscription, text
 
@@ -554,7 +555,7 @@ def test_a_password_too_long_is_a_failure_like_others(rig: Rig, tmp_path: Path) 
     ),
 )
 @hypothesis_settings(
-    max_examples=50,
+    max_examples=examples(50),
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 def test_one_bad_command_at_the_end_of_a_batch_changes_nothing(

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 import holdfast
 from support import web, wire
+from support.cases import examples
 from support.wire import rounds
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def bad_batches(draw: st.DrawFn) -> tuple[list[dict[str, Any]], int]:
 
 
 random_requests = settings(
-    max_examples=150,
+    max_examples=examples(150),
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 

@@ -22,6 +22,7 @@ from holdfast.web import host as http_host
 from holdfast.web import requests
 from holdfast.web.port import listen
 from support import web, wire
+from support.cases import examples
 from support.machine import missing
 
 if TYPE_CHECKING:
@@ -436,7 +437,7 @@ def test_what_is_not_http_is_refused(service: web.Service, connect: Connect, sen
 
 
 @settings(
-    max_examples=100,
+    max_examples=examples(100),
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(st.data())
@@ -454,7 +455,7 @@ def test_bytes_of_any_kind_do_no_harm(hasty: web.Service, data: st.DataObject) -
 
 
 @settings(
-    max_examples=50,
+    max_examples=examples(50),
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(cuts=st.lists(st.integers(0, 400), max_size=12), way=st.sampled_from(["plain", "chunked"]))

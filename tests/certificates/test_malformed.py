@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from holdfast.certificates import authority, expiry, inspection, own, pem
+from support.cases import examples
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,7 +36,7 @@ def altered(draw: st.DrawFn) -> bytes:
 
 
 @pytest.mark.filterwarnings("ignore")  # cryptography warns of some certificates.
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(300))
 @given(text=altered())
 def test_a_file_is_either_usable_or_named_as_unusable(tmp_path: Path, text: bytes) -> None:
     file = tmp_path / "some.pem"

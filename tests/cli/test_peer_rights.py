@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from holdfast.cli import main
 from holdfast.protocol import ILLEGAL_ADDRESS, ILLEGAL_FUNCTION, PATH_UNAVAILABLE, TARGET_SILENT
 from holdfast.types import AREAS, WRITABLE_AREAS
+from support.cases import examples
 from support.config_folder import written
 from support.machine import needs_127_0_0_2
 from support.transports import address, client, is_stranger, running
@@ -269,7 +270,7 @@ def expected(
 
 
 @needs_127_0_0_2
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(listed=st.lists(rules(), min_size=1, max_size=4))
 def test_a_listener_does_what_is_printed(listed: list[dict[str, Any]]) -> None:
     scada = {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": listed}

@@ -24,6 +24,7 @@ from hypothesis import strategies as st
 
 import holdfast
 from support import lines, wire
+from support.cases import examples
 from support.certificates import Certificates
 from support.faces import FACES, Dial, dialling, run
 from support.fake_device import (
@@ -1180,7 +1181,7 @@ ANYTHING = st.tuples(st.lists(FRAMES, min_size=1, max_size=3), st.booleans())
 
 @pytest.mark.parametrize("kind", [*STREAMS, "udp"])
 @settings(
-    max_examples=100,
+    max_examples=examples(100),
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(ANYTHING)

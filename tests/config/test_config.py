@@ -40,6 +40,7 @@ from holdfast.config import (
     load,
 )
 from holdfast.config.dump import effective
+from support.cases import examples
 from support.config_folder import written
 from support.configurations import configurations
 from support.paths import EXAMPLES
@@ -614,7 +615,7 @@ def test_the_full_example_has_every_section_and_every_listener() -> None:
     assert {type(listener) for listener in config.listeners.values()} == set(get_args(Listener))
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(data=configurations())
 def test_every_dump_loads_as_an_equal_configuration(
     tmp_path_factory: pytest.TempPathFactory, data: dict[str, Any]

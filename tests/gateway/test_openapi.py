@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 import schemathesis
-from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from schemathesis import GenerationMode
 from schemathesis.checks import not_a_server_error
 from schemathesis.specs.openapi.checks import positive_data_acceptance
@@ -17,6 +17,7 @@ import holdfast
 from holdfast import __version__
 from holdfast.gateway import Settings, app, openapi
 from support import gateways
+from support.cases import examples
 from support.gateways import Dialed
 
 if TYPE_CHECKING:
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
 
     from holdfast.client.url import NetworkTarget
     from support.gateways import Running
-
-EXAMPLES = 25
 
 EXCLUDED: list[Any] = [
     # 500 says that there was no connection or no reply.
@@ -95,9 +94,8 @@ def test_what_is_answered_is_what_the_document_says(
     schema = schemathesis.openapi.from_url(f"{gateway.url}/openapi.json")
     strategy = schema[path][method].as_strategy(generation_mode=mode)
 
-    @seed(7)
     @settings(
-        max_examples=EXAMPLES,
+        max_examples=examples(25),
         database=None,
         phases=[Phase.explicit, Phase.generate],
         suppress_health_check=list(HealthCheck),

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from holdfast.outputs import Buffer
 from holdfast.outputs.stored import Stored
+from support.cases import examples
 from support.readings import numbered, numbers, reading, tag
 
 if TYPE_CHECKING:
@@ -179,7 +180,7 @@ def test_a_full_disk_leaves_the_file_as_it_was(opened: Opened, tmp_path: Path) -
     assert stored.count == 0
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(steps=st.lists(st.sampled_from(["offer", "take", "done", "keep", "restart"]), max_size=40))
 def test_nothing_is_lost_or_reordered(
     tmp_path_factory: pytest.TempPathFactory, steps: list[str]

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from holdfast._core import Request
 from support import wire
+from support.cases import examples
 from support.native_poller import INVALID, TIMEOUT, ReportingPoller, device, taken, written
 from support.polled import Fake, asked, data, exception, reply
 
@@ -185,7 +186,7 @@ def test_a_write_that_succeeds_ends_a_rest(poller: ReportingPoller) -> None:
         taken(poller, lambda polls, _: polls and polls[-1][2][0][4] == 0)
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(
     st.sets(st.integers(0, 60), min_size=1, max_size=40),
     st.sets(st.integers(0, 61), max_size=8),

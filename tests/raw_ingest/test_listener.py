@@ -22,6 +22,7 @@ from holdfast.appliance import Appliance
 from holdfast.config import load
 from holdfast.types import AREAS
 from support import wire
+from support.cases import examples
 from support.config_folder import written
 from support.machine import needs_127_0_0_2
 from support.paths import VECTORS
@@ -890,7 +891,7 @@ def packets(draw: st.DrawFn, kind: str) -> bytes:
 
 
 @settings(
-    max_examples=400,
+    max_examples=examples(400),
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(data=st.data())

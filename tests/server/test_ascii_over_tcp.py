@@ -17,6 +17,7 @@ from pymodbus.framer import FramerType
 import holdfast
 from holdfast.types import AREAS
 from support import lines, wire
+from support.cases import examples
 from support.machine import needs_127_0_0_2
 from support.pymodbus_peer import OPTIONS, Patient, connected, tour
 from support.running import content
@@ -113,7 +114,7 @@ def test_a_frame_is_served_as_its_vector_spells_it(
 # Pieces
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(data=st.data())
 def test_requests_may_arrive_cut_anywhere(data: st.DataObject, sturdy: Appliance) -> None:
     values = data.draw(st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=30))
@@ -258,7 +259,7 @@ pieces = st.one_of(
 )
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(garbage=st.lists(pieces, max_size=12), cut=st.integers(1, 3000))
 def test_of_any_characters_exactly_the_frames_are_answered(
     garbage: list[bytes], cut: int, sturdy: Appliance

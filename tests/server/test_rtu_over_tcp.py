@@ -16,6 +16,7 @@ from pymodbus.framer import FramerType
 
 from holdfast.types import AREAS
 from support import lines, wire
+from support.cases import examples
 from support.pymodbus_peer import OPTIONS, Patient, connected, tour
 from support.running import content
 from support.transports import ALL, RtuConnection, address, configuration, counters, rule, running
@@ -182,7 +183,7 @@ def test_requests_may_arrive_in_pieces_of_any_size(
     assert client.is_quiet()
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(data=st.data())
 def test_requests_may_arrive_cut_anywhere(data: st.DataObject, sturdy: Appliance) -> None:
     values = data.draw(st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=30))
@@ -342,7 +343,7 @@ def test_the_rest_of_a_request_may_come_late(client: RtuConnection) -> None:
     assert client.replies(1) == [(1, WRITE)]
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(garbage=st.binary(max_size=2000))
 def test_no_bytes_end_the_service(garbage: bytes, sturdy: Appliance) -> None:
     with RtuConnection(address(sturdy)) as noisy:

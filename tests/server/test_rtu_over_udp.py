@@ -15,6 +15,7 @@ from pymodbus.framer import FramerType
 import holdfast
 from holdfast.types import AREAS
 from support import lines, wire
+from support.cases import examples
 from support.machine import needs_127_0_0_2
 from support.pymodbus_peer import OPTIONS, Patient, connected, tour
 from support.running import content
@@ -183,7 +184,7 @@ def is_frame(datagram: bytes) -> bool:
     return 4 <= len(datagram) <= 256 and lines.crc(datagram[:-2]) == datagram[-2:]
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(200), suppress_health_check=[HealthCheck.too_slow])
 @given(garbage=st.lists(datagrams, max_size=20))
 def test_of_any_datagrams_exactly_the_frames_are_answered(
     garbage: list[bytes], sturdy: Appliance

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 import holdfast
 from holdfast.types import AREAS
 from support import wire
+from support.cases import examples
 from support.machine import resident
 from support.oracle import COUNTERS, Oracle
 from support.running import content
@@ -490,7 +491,7 @@ units = st.sampled_from([1] * 12 + [0, 2, 255])
 
 @pytest.mark.parametrize("access", ["read-write", "read-only"])
 @settings(
-    max_examples=150,
+    max_examples=examples(150),
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(asked=st.lists(st.tuples(units, requests), min_size=1, max_size=60), seed=st.integers(0, 99))

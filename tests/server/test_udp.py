@@ -20,6 +20,7 @@ from pymodbus.client import AsyncModbusUdpClient, ModbusUdpClient
 
 from holdfast.types import AREAS
 from support import wire
+from support.cases import examples
 from support.machine import needs_127_0_0_2
 from support.pymodbus_peer import OPTIONS, Patient, connected, tour
 from support.running import content
@@ -183,7 +184,7 @@ datagrams = st.one_of(
 )
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(200), suppress_health_check=[HealthCheck.too_slow])
 @given(garbage=st.lists(datagrams, max_size=20))
 def test_no_datagram_ends_the_service(garbage: list[bytes], sturdy: Appliance) -> None:
     with Datagrams(address(sturdy)) as client:

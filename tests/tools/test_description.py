@@ -15,6 +15,7 @@ from holdfast.tools import description
 from holdfast.tools.description import Description
 from holdfast.tools.discovery import LimitReached, Survey
 from support import cli, plant_data, sunspec_device
+from support.cases import examples
 
 if TYPE_CHECKING:
     from holdfast.tools.description import Described
@@ -93,7 +94,7 @@ def overlaps(tags: list[Described]) -> bool:
 
 
 @given(st.integers(0, 10_000), st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=60))
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 def test_tags_cover_every_address_once(seed: int, noise: list[int]) -> None:
     chosen = random.Random(seed)
     registers = [*plant_data.sample(chosen).reads[0], *noise, *[0] * chosen.randint(0, 90)]

@@ -16,6 +16,7 @@ from holdfast.tools import discovery
 from holdfast.tools.discovery import DeviceSilent, Survey
 from holdfast.types import AREAS
 from support import cli
+from support.cases import examples
 from support.fake_device import FakeDevice, exception, registers
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ def test_too_large_blocks_are_not_tried_for_ever() -> None:
 
 
 @given(layout=layouts(last=65536), step=st.integers(1, 3000))
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 def test_fast_finds_every_range_that_holds_a_sample_and_nothing_that_is_not_there(
     layout: list[range], step: int
 ) -> None:
@@ -141,7 +142,7 @@ def test_fast_finds_ranges_where_devices_like_to_have_them(layout: list[range]) 
 
 
 @given(layout=layouts(last=65536))
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 def test_fast_takes_few_reads(layout: list[range]) -> None:
     found = mapped(device(layout))
     assert found.requests <= 2200 + follow_cost(layout, 125) + 8 * len(layout)
@@ -250,7 +251,7 @@ def test_what_can_not_be_is_refused(options: dict[str, object], told: str) -> No
     sizes=st.lists(st.integers(1, 500), min_size=4, max_size=4),
     exact=st.booleans(),
 )
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 def test_a_real_server_is_mapped(starts: list[int], sizes: list[int], exact: bool) -> None:
     extents = dict(zip(AREAS, zip(starts, sizes, strict=True), strict=True))
     memory = holdfast.Memory(**extents)  # type: ignore[arg-type]

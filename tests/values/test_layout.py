@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from holdfast import values
 from holdfast.values import Field, Layout, decode, encode, register_count
+from support.cases import examples
 
 ORDERS = ("ABCD", "DCBA", "BADC", "CDAB")
 NUMBERS = (*(f"{sign}int{bits}" for sign in ("", "u") for bits in (16, 32, 64)), "float32")
@@ -35,7 +36,7 @@ def layouts(draw: st.DrawFn) -> list[Field]:
 blocks = st.lists(st.integers(0, 65535), min_size=SIZE, max_size=SIZE)
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(layouts(), blocks)
 def test_a_layout_decodes_as_its_fields_one_by_one(fields: list[Field], block: list[int]) -> None:
     layout = Layout(fields, size=SIZE)
@@ -54,7 +55,7 @@ def test_a_layout_decodes_as_its_fields_one_by_one(fields: list[Field], block: l
     assert repr(layout.decode(array("H", block))) == repr(expected)
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(layouts(), blocks)
 def test_a_layout_encodes_what_it_decodes(fields: list[Field], block: list[int]) -> None:
     layout = Layout(fields, size=SIZE)

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 from holdfast import values
 from holdfast.values import ConversionError, decode, encode, register_count
+from support.cases import examples
 from support.paths import VECTORS
 
 CASES = json.loads((VECTORS / "values.json").read_text())
@@ -150,7 +151,7 @@ def test_decode_undoes_encode(case: tuple[str, str, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", SIZES)
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(data=st.data())
 def test_every_order_puts_bytes_where_its_definition_says(name: str, data: st.DataObject) -> None:
     value = data.draw(single_values(name))

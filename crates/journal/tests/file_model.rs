@@ -195,8 +195,7 @@ fn event() -> impl Strategy<Value = Event> {
 
 proptest! {
     #![proptest_config(ProptestConfig {
-        cases: support::rounds(60, 3000) as u32,
-        failure_persistence: None,
+        cases: support::cases(60, 3000),
         ..ProptestConfig::default()
     })]
 

@@ -38,6 +38,12 @@ pub fn rounds(usual: u64, torture: u64) -> u64 {
     if std::env::var_os("HOLDFAST_TORTURE").is_some() { torture } else { usual }
 }
 
+/// How many cases a property test draws: in short, in `make torture`, and in `make explore`.
+pub fn cases(usual: u32, torture: u32) -> u32 {
+    let explored = std::env::var("PROPTEST_CASES").ok().map(|text| text.parse().unwrap());
+    explored.unwrap_or(rounds(usual.into(), torture.into()) as u32)
+}
+
 pub fn layout(coils: u32, registers: u32) -> Layout {
     let span = |size| Span::new(0, size).unwrap();
     Layout::default().with(Area::Coils, span(coils)).with(REGISTERS, span(registers))
