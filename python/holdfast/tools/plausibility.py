@@ -94,7 +94,7 @@ def _value(value: Any, kind: str, bits: int, now: float | None, reasons: list[st
         return _float(value, kind, reasons)
     if kind.startswith("bcd"):
         reasons.append("decimal digits only")
-        return _integer(value, bits, reasons) + 1
+        return _integer(value, bits, reasons, is_decimal=True) + 1
     if value < 0:
         return _negative(-value, bits, reasons)
     if kind == "uint32" and THIS_ERA[0] <= value < THIS_ERA[1]:
@@ -102,12 +102,12 @@ def _value(value: Any, kind: str, bits: int, now: float | None, reasons: list[st
     return _integer(value, bits, reasons)
 
 
-def _integer(value: int, bits: int, reasons: list[str]) -> float:
+def _integer(value: int, bits: int, reasons: list[str], *, is_decimal: bool = False) -> float:
     if value == 0:
         return 2.5
     cost = math.log2(value + 1) + SPREAD[bits] + _excess(value, USUAL_MAX[bits], bits)
     cost = min(cost, _round(value, bits))
-    if bits == 16:
+    if bits == 16 and not is_decimal:  # The bits of a decimal number are not those of its value.
         if value == 0xFFFF:
             reasons.append("all bits set: often no value")
             return ALL_SET
@@ -167,7 +167,9 @@ def _float(value: float, kind: str, reasons: list[str]) -> float:
         reasons.append("few digits")
     else:
         reasons.append("plausible magnitude")
-    mantissa = min(MANTISSAS[kind] + 1.7, 2 + BITS_A_DIGIT * digits)
+    mantissa = MANTISSAS[kind] + 1.7
+    if kind != "float16":  # Most of its values have few digits: that is no evidence.
+        mantissa = min(mantissa, 2 + BITS_A_DIGIT * digits)
     return sign + 2 + 0.72 * magnitude * magnitude + mantissa
 
 
