@@ -150,7 +150,7 @@ lock: .venv/dev.stamp
 	  --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate \
 	  --output-file requirements/$$set.lock requirements/$$set.in; done
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-	  --no-header --no-annotate --extra sparkplug --constraint requirements/dev.lock \
+	  --no-header --no-annotate --extra sparkplug --extra windows-service --constraint requirements/dev.lock \
 	  --output-file requirements/appliance.lock pyproject.toml
 	cargo update
 	cargo update --manifest-path $(NO_STD)

@@ -138,7 +138,7 @@ def unit_file(block: Block, _: Stage) -> None:
 
 def drop_in(block: Block, _: Stage) -> None:
     """The settings are of kinds that the unit of the package has."""
-    unit = (ROOT / "packaging/deb/debian/holdfast.service").read_text()
+    unit = (ROOT / "packaging/deb/debian/holdfast-modbus.holdfast.service").read_text()
     for name in re.findall(r"^(\w+)=", block.text, re.MULTILINE):
         assert f"\n{name}=" in unit, f"the unit has no {name}"
 
