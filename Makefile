@@ -18,7 +18,7 @@ ifneq ($(OS),Windows_NT)
 export PATH := $(CURDIR)/.cache/toolchain/bin:$(PATH)
 endif
 
-.PHONY: build run test test-python test-rust test-slow explore torture lint no-std format bench docs site \
+.PHONY: build run test test-python test-rust test-slow explore torture lint audit no-std format bench docs site \
   pictures dist dist-check lock clean deb container release-check
 .DELETE_ON_ERROR:
 
@@ -69,6 +69,15 @@ lint: no-std .venv/core.stamp .venv/dev.stamp
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/python -m mypy.stubtest holdfast._core
+
+# Licences, origins and known vulnerabilities of all dependencies.
+CARGO_DENY := 0.20.2
+audit: .venv/core.stamp .venv/dev.stamp .venv/release.stamp .cache/tools/cargo-deny-$(CARGO_DENY).stamp
+	PATH="$(CURDIR)/.cache/tools/bin:$$PATH" $(BIN)/python tools/audit.py
+
+.cache/tools/cargo-deny-$(CARGO_DENY).stamp: $(TOOLCHAIN)
+	cargo install --locked --quiet --root .cache/tools --version $(CARGO_DENY) cargo-deny
+	@touch $@
 
 # Links a program without the standard library with the protocol crate: for this machine, and for a
 # microcontroller if its target is installed (`rustup target add thumbv7em-none-eabi`).

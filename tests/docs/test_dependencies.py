@@ -12,7 +12,7 @@ from packaging.requirements import Requirement
 from support.paths import DOCS, ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-SETS = ("run", "dev", "docs", "rust", "zig")
+SETS = ("run", "dev", "docs", "release", "rust", "zig")
 
 
 def listed(name: str) -> list[str]:
