@@ -51,9 +51,10 @@ test-slow: .venv/core.stamp .venv/dev.stamp
 
 # New cases for all property tests, and more of them. A case that fails is printed and kept: as a patch of the
 # Python test (`git apply`), and for Rust as a line of a proptest-regressions file. Commit it with the mend.
+explore: export PROPTEST_RNG_SEED := $(shell date +%s)
 explore: .venv/core.stamp .venv/dev.stamp
-	PROPTEST_RNG_SEED=$${SEED:-$$(date +%s)} PROPTEST_CASES=5000 cargo test --locked --release --quiet $(CRATES) \
-	  --lib --tests; rust=$$?; \
+	@echo PROPTEST_RNG_SEED=$$PROPTEST_RNG_SEED
+	PROPTEST_CASES=5000 cargo test --locked --quiet $(CRATES) --lib --tests; rust=$$?; \
 	HOLDFAST_EXPLORE=1 $(BIN)/pytest -m hypothesis && exit $$rust
 
 lint: no-std .venv/core.stamp .venv/dev.stamp
