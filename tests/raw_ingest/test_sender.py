@@ -10,6 +10,7 @@ import socket
 import struct
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
@@ -421,17 +422,19 @@ def test_a_receiver_that_takes_nothing_ends_with_the_deadline(
 def test_a_receiver_that_takes_packets_slowly_has_the_same_deadline(
     send: Send, receiver: Receive
 ) -> None:
+    over = threading.Event()
+
     def behave(connection: socket.socket) -> None:
-        between = threading.Event()
         with contextlib.suppress(ConnectionError):
             while connection.recv(65536):
-                between.wait(0.02)
+                over.wait(0.02)
 
     there = receiver(behave)
     began = time.monotonic()
     with pytest.raises(raw_ingest.RawTimeout):
         send(there.host, there.port, TOO_MUCH, timeout=0.3)
     assert time.monotonic() - began < wire.DEADLINE
+    over.set()
 
 
 def test_a_refusal_is_heard_though_the_packet_is_never_taken(send: Send, receiver: Receive) -> None:
@@ -520,7 +523,7 @@ def test_the_next_address_of_a_host_is_tried(
 
 
 def test_a_dead_address_of_a_host_leaves_time_for_the_next(
-    send: Send, receiver: Receive, monkeypatch: pytest.MonkeyPatch
+    receiver: Receive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there = receiver(answering(b"\x00"))
     with wire.dead_address() as dead:
@@ -529,7 +532,13 @@ def test_a_dead_address_of_a_host_leaves_time_for_the_next(
             for address in (dead, (there.host, there.port))
         ]
         monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
-        send("plant", there.port, timeout=6)
+        with ThreadPoolExecutor(2) as threads:
+            sent = [
+                threads.submit(send, "plant", there.port, timeout=4)
+                for send in (send_async, send_sync)
+            ]
+        for each in sent:
+            each.result()
 
 
 def test_a_name_that_is_not_known_raises(send: Send, monkeypatch: pytest.MonkeyPatch) -> None:

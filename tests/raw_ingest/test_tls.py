@@ -8,6 +8,7 @@ import json
 import socket
 import ssl
 import threading
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
@@ -221,14 +222,16 @@ def test_half_a_packet_and_half_a_record_end_in_time(
     run: Run, party: Party, caplog: pytest.LogCaptureFixture
 ) -> None:
     plant = run(secured(party, request_timeout=2, packets="many"))
-    with connected(party, plant, party.line) as client:
-        client.sendall(PACKET[:5])
-        assert client.recv(2) == REFUSED
-    assert [told["reason"] for told in events(plant, caplog, "packet_refused")] == ["late"]
-    with TlsPeer(address(plant), party.trust(party.line)) as half:
+    with (
+        TlsPeer(address(plant), party.trust(party.line)) as half,
+        connected(party, plant, party.line) as client,
+    ):
         half.shake()
         half.wire.send(half.seal(PACKET)[:-3])
+        client.sendall(PACKET[:5])
+        assert client.recv(2) == REFUSED
         events(plant, caplog, "request_timeout")
+    assert [told["reason"] for told in events(plant, caplog, "packet_refused")] == ["late"]
     assert counted(plant)["accepted"] == 0
 
 
@@ -304,14 +307,19 @@ def test_refusals_have_the_words_of_modbus_over_tls(
     rules = [{"sources": ["127.0.0.1"], "access": "read-only"}]
     files: Any = party.files
     found: list[list[str]] = []
-    for text in (configuration(files, rules, request_timeout=2), secured(party, request_timeout=2)):
+    for made in (partial(configuration, files, rules), partial(secured, party)):
         caplog.clear()
-        with Appliance(_loaded(tmp_path, text)) as appliance:
+        with Appliance(_loaded(tmp_path, made(request_timeout=0.2))) as hasty:
+            with wire.Connection(address(hasty)) as client:
+                client.rest()
+            told = reasons(hasty, caplog)
+        caplog.clear()
+        with Appliance(_loaded(tmp_path, made())) as appliance:
             to = address(appliance)
             with wire.Connection(to) as client:
                 client.send(b"GET / HTTP/1.1\r\n\r\n")
                 client.rest()
-            told = [reasons(appliance, caplog)[-1]]
+            told.append(reasons(appliance, caplog)[-1])
             with wire.Connection(to) as client:
                 client.send(b"\x16\x03\x01")
                 client.finish()
@@ -320,25 +328,22 @@ def test_refusals_have_the_words_of_modbus_over_tls(
             for number, issued in enumerate((None, stranger), 3):
                 secure_reply(to, party.trust(issued), PACKET)
                 told.append(reasons(appliance, caplog, number)[-1])
-            with wire.Connection(to) as client:
-                client.rest()
-            told.append(reasons(appliance, caplog, 5)[-1])
             with TlsPeer(to, party.trust(party.line)) as altered:
                 altered.shake()
                 altered.wire.send(b"\x17\x03\x03\x00\x20" + bytes(32))
                 with contextlib.suppress(Refused, ConnectionError):
                     altered.wire.rest()
-            told.append(reasons(appliance, caplog, 6)[-1])
+            told.append(reasons(appliance, caplog, 5)[-1])
         found.append(told)
     assert (
         found[0]
         == found[1]
         == [
+            "timeout",
             "not_tls",
             "closed_during_handshake",
             "no_certificate",
             "unknown_issuer",
-            "timeout",
             "bad_record",
         ]
     )
