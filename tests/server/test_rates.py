@@ -75,11 +75,14 @@ def test_a_source_above_its_limit_waits_and_others_are_served(
 def test_what_is_delayed_is_answered_in_the_end(
     memory: holdfast.Memory, serve: Serve, connect: Connect
 ) -> None:
-    server = serve({1: memory}, max_requests_per_source=MANY // 2)
+    server = serve({1: memory}, max_requests_per_source=2 * MANY)
     client = connect(server)
-    for _ in range(3):
+
+    def is_delayed() -> bool:
         exceed(client)
-    assert server.counters()["rate_limited"]["paused"]["requests"] > 0
+        return server.counters()["rate_limited"]["paused"]["requests"] > 1
+
+    wire.until(is_delayed, "two pauses have begun")
     assert server.counters()["connections"]["idle"] == 0
 
 

@@ -10,6 +10,7 @@ import random
 import select
 import struct
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -251,7 +252,7 @@ def test_a_connection_without_a_request_ends_after_the_idle_timeout(
 def test_the_idle_timeout_begins_again_with_each_request(
     memory: holdfast.Memory, serve: Serve, connect: Connect
 ) -> None:
-    server = serve({1: memory}, idle_timeout=0.8)
+    server = serve({1: memory}, idle_timeout=0.5)
 
     def lives_as_long_as_it_asks() -> bool:
         """Asks for more than twice the timeout. The connection must not end sooner after a request.
@@ -260,7 +261,7 @@ def test_the_idle_timeout_begins_again_with_each_request(
         """
         began = last = time.monotonic()
         client = connect(server)
-        while is_open := last - began < 1.7:
+        while is_open := last - began < 1.1:
             asking = time.monotonic()
             try:
                 client.ask(READ)
@@ -270,7 +271,7 @@ def test_the_idle_timeout_begins_again_with_each_request(
             if select.select([client.socket], [], [], 0.1)[0]:
                 break
         assert client.rest() == b""
-        assert time.monotonic() - last >= 0.5
+        assert time.monotonic() - last >= 0.3
         return not is_open
 
     wire.until(lives_as_long_as_it_asks, "the requests were close together")
@@ -325,9 +326,12 @@ def test_peers_that_do_not_read_hold_up_nobody_and_cost_little_memory(
     requests = wire.frames([MAX_READ] * 5000)
 
     slow = [connect(process.address, receive_buffer=4096) for _ in range(20)]
-    for client in slow:
-        assert send_until_blocked(client, requests, 32_000_000) > 5000
-        assert len(good.ask(MAX_READ)) == 252
+    with ThreadPoolExecutor(len(slow)) as threads:
+        for sent in threads.map(
+            lambda client: send_until_blocked(client, requests, 32_000_000), slow
+        ):
+            assert sent > 5000
+            assert len(good.ask(MAX_READ)) == 252
 
     assert resident(process.pid) - before < 20 * 512 * 1024
 
@@ -536,9 +540,10 @@ def named(area: str) -> Area:
     return found
 
 
-# A million frames
+# Random frames
 
 BATCH = 2000
+BATCHES = examples(100)
 CODES = bytes([1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23, 43] * 12) + bytes(range(88))
 ALLOWED = frozenset(bytes([code | 0x80, reason]) for code in range(256) for reason in (1, 2, 3, 11))
 ECHOED = {5: 5, 6: 5, 11: 5, 15: 5, 16: 5, 22: 7}
@@ -582,15 +587,13 @@ def fits(request: bytes, reply: bytes) -> bool:
     return code == 43 and len(reply) > 7
 
 
-def test_a_million_random_frames_are_all_answered(
-    server: holdfast.Server, connect: Connect
-) -> None:
+def test_random_frames_are_all_answered(server: holdfast.Server, connect: Connect) -> None:
     chance = random.Random(SEED)
     client = connect(server)
     numbers = [struct.pack(">HH", index, 0) for index in range(BATCH)]
     tails = [struct.pack(">HB", size + 1, 1) for size in range(17)]
     good = 0
-    for _ in range(500):
+    for _ in range(BATCHES):
         asked = list(random_pdus(chance))
         stream = b"".join(
             [number + tails[len(pdu)] + pdu for number, pdu in zip(numbers, asked, strict=True)]
@@ -601,8 +604,8 @@ def test_a_million_random_frames_are_all_answered(
             assert fits(request, reply[2]), f"{request.hex()} was answered {reply[2].hex()}"
             good += reply[2][0] < 0x80
 
-    assert sum(server.counters()["requests"].values()) == 1_000_000
-    assert 100_000 < good < 900_000, "the frames are not a fair mixture"
+    assert sum(server.counters()["requests"].values()) == BATCHES * BATCH
+    assert 0.1 < good / (BATCHES * BATCH) < 0.9, "the frames are not a fair mixture"
 
 
 def test_random_frames_to_a_read_only_unit_change_nothing(

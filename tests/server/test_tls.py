@@ -593,17 +593,19 @@ def test_a_record_that_was_changed_ends_the_connection(
 # Deadlines, limits, stop
 
 
-@pytest.mark.parametrize("of", ["request", "record"])
 def test_half_a_request_and_half_a_record_end_the_connection_in_time(
-    run: Run, party: Party, of: str
+    run: Run, party: Party
 ) -> None:
     appliance = run(configuration(party.files(), BY_ROLE, request_timeout=2, idle_timeout=0))
-    with peer(appliance, context(party.authority.ca, party.engineer)) as client:
-        assert client.shake().ask(READ) == ZERO
+    trust = context(party.authority.ca, party.engineer)
+    with peer(appliance, trust) as half_request, peer(appliance, trust) as half_record:
+        for client in (half_request, half_record):
+            assert client.shake().ask(READ) == ZERO
         whole = wire.frame(READ)
-        client.wire.send(client.seal(whole[:5]) if of == "request" else client.seal(whole)[:9])
-        assert client.end() == "close_notify"
-    wire.until(lambda: connections(appliance)["request_timeout"] == 1, "it is counted")
+        half_request.wire.send(half_request.seal(whole[:5]))
+        half_record.wire.send(half_record.seal(whole)[:9])
+        assert [client.end() for client in (half_request, half_record)] == ["close_notify"] * 2
+    wire.until(lambda: connections(appliance)["request_timeout"] == 2, "they are counted")
 
 
 def test_a_connection_without_a_request_ends_after_the_idle_timeout(run: Run, party: Party) -> None:
