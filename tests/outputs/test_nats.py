@@ -109,6 +109,14 @@ def test_nothing_is_lost_when_the_server_is_away(
     assert sending.status()["readings"] == {"sent": 2004, "refused": 0, "dropped": 0}
 
 
+def test_a_lost_connection_is_an_error_at_once(own_nats: NatsServer, output: NatsOutput) -> None:
+    """Also if nothing was read from the connection since it ended."""
+    output.send(numbered(1))
+    own_nats.kill()
+    with pytest.raises(OSError, match=r"the connection was lost|connection closed"):
+        output.send(numbered(2000))
+
+
 def test_a_server_that_can_not_be_reached_is_an_error(own_nats: NatsServer) -> None:
     own_nats.kill()
     output = NatsOutput(Servers((own_nats.url,)), "modbus", "tentacle")

@@ -34,6 +34,9 @@ TIMEOUT = 5.0
 CONNECTING = 3.0
 """Seconds to connect."""
 
+CHECK_INTERVAL = 0.05
+"""Seconds between checks whether the connection has ended."""
+
 CLOSING = 1.0
 """Seconds to close a connection."""
 
@@ -102,9 +105,15 @@ class NatsOutput:
         flushing = asyncio.ensure_future(client.flush(timeout=int(TIMEOUT)))
         losing = asyncio.ensure_future(self._lost.wait())
         try:
-            await asyncio.wait({flushing, losing}, return_when=asyncio.FIRST_COMPLETED)
-            if not flushing.done():
-                raise ConnectionError("the connection was lost")
+            while not flushing.done():
+                # nats-py does not call `disconnected_cb` if it fails to send the last bytes.
+                if losing.done() or client.is_closed:
+                    raise ConnectionError("the connection was lost")
+                await asyncio.wait(
+                    {flushing, losing},
+                    timeout=CHECK_INTERVAL,
+                    return_when=asyncio.FIRST_COMPLETED,
+                )
             flushing.result()
         finally:
             for task in (flushing, losing):
