@@ -989,10 +989,8 @@ def test_the_curl_commands_of_the_page_do_what_they_say(
 # Start and stop.
 
 
-def test_stop_ends_it_at_once_also_with_a_connection_that_is_open(
-    start: Start, connect: Connect
-) -> None:
-    service = start()
+def test_stop_ends_it_also_with_connections_that_are_open(start: Start, connect: Connect) -> None:
+    service = start(stop_timeout=0.1)
     client = connect(service)
     client.get("/api/v1/health")
     with wire.Connection(service.address) as half:

@@ -21,6 +21,7 @@ from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.supervision import Supervisor
 from holdfast.config import RestConfig
+from holdfast.web.host import STOP_TIMEOUT
 from holdfast.web.port import listen
 from support import wire
 
@@ -162,9 +163,11 @@ class Service:
         audit: Audit | None = None,
         bind: str = "127.0.0.1:0",
         https: Https | None = None,
+        stop_timeout: float = STOP_TIMEOUT,
         **settings: Any,
     ) -> None:
         self.https = https
+        self.stop_timeout = stop_timeout
         given = {
             "bind": bind,
             "sources": LOOPBACK,
@@ -182,7 +185,8 @@ class Service:
 
     def made(self) -> Rest:
         parts = (self.settings, self.memory_access, self.diagnostics)
-        return Rest(*parts, NoSessions(), self.listener, https=self.https)
+        more: Any = {"https": self.https, "stop_timeout": self.stop_timeout}
+        return Rest(*parts, NoSessions(), self.listener, **more)
 
     @property
     def address(self) -> tuple[str, int]:

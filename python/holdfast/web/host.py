@@ -60,8 +60,8 @@ LATE_ANSWER_TIMEOUT = 1.0
 """Seconds for the application to answer a request that did not arrive in time."""
 
 STOP_TIMEOUT = 3.0
-"""Seconds for pending requests to finish when the host stops. Longer than applications need to end
-them, so that a loaded machine can still send the answers."""
+"""Seconds for pending requests to finish when the host stops, by default. Longer than applications
+need to end them, so that a loaded machine can still send the answers."""
 
 SAFE: Headers = [(b"cache-control", b"no-store"), (b"x-content-type-options", b"nosniff")]
 """Headers of every response: no caching, no guessing of content types."""
@@ -129,6 +129,7 @@ class Host:
         sources: Iterable[Network],
         limits: ConnectionLimits,
         request_timeout: float,
+        stop_timeout: float = STOP_TIMEOUT,
         leaving: bool = False,
         rejection: Rejection = rejection,
         https: Https | None = None,
@@ -138,6 +139,7 @@ class Host:
         self.rejection = rejection
         self.leaving = leaving
         self.request_timeout = request_timeout
+        self._stop_timeout = stop_timeout
         self.sources = tuple(sources)
         self.counted = Counts()
         self._tls_failures: dict[str, int] = {}
@@ -228,7 +230,7 @@ class Host:
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stopped.wait(), PERIOD)
             await close(server)
-            await _end(cast("set[_Connection]", state.connections))
+            await _end(cast("set[_Connection]", state.connections), self._stop_timeout)
 
     async def _guarded(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Runs the application. Exceptions are logged, and answered without details."""
@@ -257,11 +259,11 @@ async def respond(send: Send, status: int, headers: Headers, body: bytes = b"") 
     await send({"type": "http.response.body", "body": body})
 
 
-async def _end(connections: set[_Connection]) -> None:
-    """Closes connections; those with a pending request after at most `STOP_TIMEOUT`."""
+async def _end(connections: set[_Connection], timeout: float) -> None:
+    """Closes connections; those with a pending request after at most `timeout` seconds."""
     for connection in list(connections):
         connection.shutdown()
-    deadline = time.monotonic() + STOP_TIMEOUT
+    deadline = time.monotonic() + timeout
     while connections and time.monotonic() < deadline:
         await asyncio.sleep(0.01)
     for connection in list(connections):

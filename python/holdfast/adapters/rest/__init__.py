@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.adapters.rest.app import App
 from holdfast.web.admission import ConnectionLimits
-from holdfast.web.host import Host
+from holdfast.web.host import STOP_TIMEOUT, Host
 
 if TYPE_CHECKING:
     import socket
@@ -33,6 +33,7 @@ class Rest:
         listener: socket.socket,
         *,
         https: Https | None = None,
+        stop_timeout: float = STOP_TIMEOUT,
     ) -> None:
         scheme = "http" if https is None else "https"
         self._app = App(settings, memory_access, diagnostics, sessions, listener, scheme)
@@ -47,6 +48,7 @@ class Rest:
                 settings.when_full,
             ),
             request_timeout=settings.request_timeout,
+            stop_timeout=stop_timeout,
             https=https,
         )
         self.heartbeat = self._host.heartbeat
