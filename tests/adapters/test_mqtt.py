@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from holdfast.adapters.mqtt import backoff, inbox
+from holdfast.adapters.mqtt import inbox
 from holdfast.ingest import MemoryAccess
 from support import wire
 from support.brokers import free_port
@@ -35,9 +35,7 @@ VERSIONS = ["5", "3.1.1"]
 
 
 @pytest.fixture
-def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    monkeypatch.setattr(backoff, "FIRST_PAUSE", 0.02)
-    monkeypatch.setattr(backoff, "MAX_PAUSE", 0.2)
+def rig(tmp_path: Path) -> Iterator[Rig]:
     with Rig(tmp_path) as rig:
         yield rig
 
@@ -656,9 +654,8 @@ def test_it_ends_at_once_while_it_is_connected(rig: Rig) -> None:
     assert running.status()["connected"] is False
 
 
-def test_it_ends_at_once_while_nobody_listens(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backoff, "FIRST_PAUSE", 60.0)
-    running = rig.run(settings(f"mqtt://127.0.0.1:{free_port()}"))
+def test_it_ends_at_once_while_nobody_listens(rig: Rig) -> None:
+    running = rig.run(settings(f"mqtt://127.0.0.1:{free_port()}"), first_pause=60.0)
     wire.until(lambda: running.status()["last_error"] is not None, "it failed")
 
     running.stop(1.0)

@@ -6,11 +6,12 @@ import random
 import socket
 import struct
 import threading
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.adapters.mqtt import adapter, backoff, inbox, link
+from holdfast.adapters.mqtt import adapter, inbox, link
 from holdfast.ingest import MemoryAccess
 from holdfast.mqtt import dialing
 from support import mqtt_peer as mqtt
@@ -31,9 +32,7 @@ ACKNOWLEDGEMENTS = {1: mqtt.PUBACK, 2: mqtt.PUBREC}
 
 
 @pytest.fixture
-def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    monkeypatch.setattr(backoff, "FIRST_PAUSE", 0.02)
-    monkeypatch.setattr(backoff, "MAX_PAUSE", 0.05)
+def rig(tmp_path: Path) -> Iterator[Rig]:
     with Rig(tmp_path) as rig:
         yield rig
 
@@ -360,14 +359,18 @@ def welcomed(fake: FakeBroker) -> Peer:
             return peer
 
 
-def test_a_broker_that_does_not_answer_a_ping_is_left(rig: Rig, fake: FakeBroker) -> None:
-    running = run(rig, fake, keep_alive=1)
-    with fake.accept() as peer:
-        peer.welcome()
-        peer.expect(mqtt.PINGREQ)
-        peer.wait_until_closed()
-
-    wire.until(lambda: running.status()["last_error"] == "Keep alive timeout", "the reason")
+def test_a_broker_that_does_not_answer_a_ping_is_left(rig: Rig) -> None:
+    with ExitStack() as opened:
+        fakes = [opened.enter_context(FakeBroker(version)) for version in VERSIONS]
+        running = [run(rig, fake, keep_alive=1) for fake in fakes]
+        peers = [opened.enter_context(fake.accept()) for fake in fakes]
+        for peer in peers:
+            peer.welcome()
+        for peer in peers:
+            peer.expect(mqtt.PINGREQ)
+            peer.wait_until_closed()
+        reasons = ["Keep alive timeout"] * len(running)
+        wire.until(lambda: [each.status()["last_error"] for each in running] == reasons, "reasons")
 
 
 def test_a_broker_that_takes_leave_is_quoted(rig: Rig, fake5: FakeBroker) -> None:

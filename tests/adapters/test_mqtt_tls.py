@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.adapters.mqtt import backoff
 from holdfast.mqtt import dialing
 from holdfast.net.tls import NO_FILES, broker_context
 from support import wire
@@ -25,9 +24,7 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    monkeypatch.setattr(backoff, "FIRST_PAUSE", 0.02)
-    monkeypatch.setattr(backoff, "MAX_PAUSE", 0.2)
+def rig(tmp_path: Path) -> Iterator[Rig]:
     with Rig(tmp_path) as rig:
         yield rig
 

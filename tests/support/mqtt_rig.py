@@ -36,6 +36,10 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 
+PAUSE_S = 0.01
+"""The pause between attempts to connect."""
+
+
 class Message(NamedTuple):
     topic: str
     payload: bytes
@@ -137,8 +141,10 @@ class Running:
         config: MqttConfig,
         memory_access: MemoryAccess,
         mapped: Mapping[str, MappedTag] | None = None,
+        first_pause: float = PAUSE_S,
     ) -> None:
-        self.adapter = Mqtt(config, memory_access, mapped)
+        pauses = {"first_pause": first_pause, "max_pause": max(first_pause, PAUSE_S)}
+        self.adapter = Mqtt(config, memory_access, mapped, **pauses)
         self.memory_access = memory_access
         self._stop = Stop()
         self._failure: BaseException | None = None
@@ -222,9 +228,10 @@ class Rig:
         config: MqttConfig,
         memory_access: MemoryAccess | None = None,
         mapped: Mapping[str, MappedTag] | None = None,
+        first_pause: float = PAUSE_S,
     ) -> Running:
         """Starts an adapter without waiting for its connection."""
-        running = Running(config, memory_access or self.memory_access, mapped)
+        running = Running(config, memory_access or self.memory_access, mapped, first_pause)
         self._running.callback(running.stop)
         return running
 

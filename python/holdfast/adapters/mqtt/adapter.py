@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from holdfast import logs
 from holdfast.adapters.mqtt.answers import Answers
-from holdfast.adapters.mqtt.backoff import Backoff
+from holdfast.adapters.mqtt.backoff import FIRST_PAUSE, MAX_PAUSE, Backoff
 from holdfast.adapters.mqtt.filters import Filters
 from holdfast.adapters.mqtt.inbox import Inbox
 from holdfast.adapters.mqtt.link import MAX_UNSENT, BrokerConnection
@@ -50,9 +50,13 @@ class Mqtt:
         settings: MqttConfig,
         memory_access: MemoryAccess,
         mapped: Mapping[str, MappedTag] | None = None,
+        *,
+        first_pause: float = FIRST_PAUSE,
+        max_pause: float = MAX_PAUSE,
     ) -> None:
-        """`mapped` are the tags of topics with plain values."""
+        """`mapped` are the tags of topics with plain values. For the pauses, see `Backoff`."""
         self._settings = settings
+        self._pauses = first_pause, max_pause
         self._broker = joined(settings.host, settings.port)
         filters = Filters(settings.subscriptions)
         values = Values(mapped or {})
@@ -70,7 +74,7 @@ class Mqtt:
 
     def run(self, stop: Stop) -> None:
         """Stays connected until `stop` is set; reconnects when the connection ends."""
-        backoff = Backoff()
+        backoff = Backoff(*self._pauses)
         with Waiter(stop) as waiter, contextlib.suppress(Ended):
             while not stop.wait(backoff.pause(self._connection(waiter))):
                 pass
