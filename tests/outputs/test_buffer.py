@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -10,6 +12,7 @@ from hypothesis import strategies as st
 
 from holdfast.outputs import Buffer
 from holdfast.outputs.stored import Stored
+from support import wire
 from support.cases import examples
 from support.readings import numbered, numbers, reading, tag
 
@@ -32,7 +35,9 @@ class Opened:
         self, file: Path, max_bytes: int = PLENTY, known: list[Any] | None = None
     ) -> Stored:
         tags = {each.name: each for each in known or [tag()]}
-        stored = Stored(file, max_bytes, lambda _, name: tags.get(name))
+        stored = Stored(file, max_bytes, lambda _, name: tags.get(name), lock_timeout=0.05)
+        # No test ends the system: nothing has to wait for the disk.
+        stored._db.execute("PRAGMA synchronous=OFF")
         self.all.append(stored)
         return stored
 
@@ -60,6 +65,18 @@ def test_what_is_taken_stays_until_it_is_done() -> None:
     assert len(buffer) == 5
     buffer.done()
     assert (len(buffer), drained(buffer)) == (2, [3, 4])
+
+
+def test_a_wait_can_be_ended() -> None:
+    buffer = Buffer()
+    began = time.monotonic()
+    with ThreadPoolExecutor(1) as threads:
+        taken = threads.submit(buffer.take, 1, wire.DEADLINE)
+        buffer.wake()
+        assert taken.result() == []
+    assert time.monotonic() - began < wire.DEADLINE
+    buffer.offer(numbered(1))
+    assert numbers(buffer.take(1, 0)) == [0]
 
 
 def test_the_newest_stay_and_the_others_are_counted() -> None:

@@ -26,6 +26,7 @@ class Buffer:
         self._taken: list[Reading] = []
         self._of_file = False
         self._come = threading.Condition()
+        self._is_woken = False
         self.stored: Stored | None = None
         self.dropped = 0
         """Readings that were lost because there was no room."""
@@ -55,7 +56,8 @@ class Buffer:
             self._taken, self._of_file = self.stored.first(), True
             return self._taken
         with self._come:
-            self._come.wait_for(lambda: self._waiting, timeout)
+            self._come.wait_for(lambda: self._waiting or self._is_woken, timeout)
+            self._is_woken = False
             count = min(most, len(self._waiting))
             self._taken = [self._waiting.popleft() for _ in range(count)]
         return self._taken
@@ -67,8 +69,9 @@ class Buffer:
         self._taken, self._of_file = [], False
 
     def wake(self) -> None:
-        """Ends the wait of `take`."""
+        """Ends the current or the next wait of `take`. Thread-safe."""
         with self._come:
+            self._is_woken = True
             self._come.notify_all()
 
     def keep(self, step: int = 1000) -> None:

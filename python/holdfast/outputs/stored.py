@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
     FindTag = Callable[[str, str], Tag | None]
 
+LOCK_TIMEOUT = 1.0
+"""Seconds to wait for a file that is in use, by default."""
+
 _CREATE = """
 CREATE TABLE IF NOT EXISTS readings (
     id INTEGER PRIMARY KEY AUTOINCREMENT, count INTEGER NOT NULL, data BLOB NOT NULL
@@ -33,7 +36,9 @@ class Stored:
     `max_bytes` bounds the readings, not the file, which is a little larger.
     """
 
-    def __init__(self, file: Path, max_bytes: int, find: FindTag) -> None:
+    def __init__(
+        self, file: Path, max_bytes: int, find: FindTag, lock_timeout: float = LOCK_TIMEOUT
+    ) -> None:
         self.file = file
         self.count = 0
         """How many readings there are."""
@@ -42,7 +47,7 @@ class Stored:
         with contextlib.ExitStack() as failing:
             try:
                 self._db = sqlite3.connect(
-                    file, timeout=1.0, isolation_level=None, check_same_thread=False
+                    file, timeout=lock_timeout, isolation_level=None, check_same_thread=False
                 )
                 failing.callback(self._db.close)
                 self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
