@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -209,37 +210,47 @@ def test_a_reload_brings_new_set_topics(plant: Plant) -> None:
     assert reply(probe, "valve")["status"] == "accepted"
 
 
-@pytest.mark.parametrize("version", ["5", "3.1.1"])
 def test_commands_that_waited_while_the_output_stood_still_are_not_written(
-    plant: Plant, monkeypatch: pytest.MonkeyPatch, version: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    written: list[str] = []
+    devices = {"pump": "5", "fan": "3.1.1"}
+    """The version of MQTT for each of them, which has a broker of its own."""
+    written: dict[str, list[str]] = {device: [] for device in devices}
     goes_on = threading.Event()
     write = OutputSite.write
 
     def wait_and_write(site: OutputSite, device: str, tag: str, text: str, *more: Any) -> None:
-        written.append(text)
+        written[device].append(text)
         if text == "1":
             goes_on.wait(3 * wire.DEADLINE)
         write(site, device, tag, text, *more)
 
     monkeypatch.setattr(OutputSite, "write", wait_and_write)
-    plant.device()
-    probe = plant.probe("plant/#")
-    plant.run(writes=True, version=version)
-    probe.until("plant/holdfast/status/pump", "online")
-    probe.publish("plant/pump/temperature/set", "1")
-    wire.until(lambda: written, "it is being written")
-    for _ in range(50):  # More than the broker sends before it has confirmations.
-        probe.publish("plant/pump/temperature/set", "2")
-    end = time.monotonic() + LONG + 0.5
-    wire.until(lambda: time.monotonic() > end, "it stood still for long enough")
-    goes_on.set()
+    with ExitStack() as opened:
+        plants: dict[str, Plant] = {}
+        probes: dict[str, Client] = {}
+        for device, version in devices.items():
+            folder = tmp_path / device
+            folder.mkdir()
+            plant = plants[device] = opened.enter_context(Plant(folder))
+            plant.device(device)
+            probe = probes[device] = plant.probe("plant/#")
+            plant.run(writes=True, version=version)
+            probe.until(f"plant/holdfast/status/{device}", "online")
+            probe.publish(f"plant/{device}/temperature/set", "1")
+        wire.until(lambda: all(written.values()), "they are being written")
+        for device, probe in probes.items():
+            for _ in range(50):  # More than the broker sends before it has confirmations.
+                probe.publish(f"plant/{device}/temperature/set", "2")
+        end = time.monotonic() + LONG + 0.5
+        wire.until(lambda: time.monotonic() > end, "they stood still for long enough")
+        goes_on.set()
 
-    def is_written() -> bool:
-        probe.publish("plant/pump/temperature/set", "3")
-        return "3" in written
+        def are_written() -> bool:
+            for device, probe in probes.items():
+                probe.publish(f"plant/{device}/temperature/set", "3")
+            return all("3" in texts for texts in written.values())
 
-    wire.until(is_written, "new commands are written")
-    assert "2" not in written
-    assert plant.status()["reconnects"] >= 1
+        wire.until(are_written, "new commands are written")
+        assert not any("2" in texts for texts in written.values())
+        assert all(plant.status()["reconnects"] >= 1 for plant in plants.values())

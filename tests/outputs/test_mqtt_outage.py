@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 IS_LONG = bool(os.environ.get("HOLDFAST_TORTURE"))
-TAGS, CHANGES, INTERVAL = (10_000, 30, 1.0) if IS_LONG else (500, 20, 0.05)
+TAGS, CHANGES, INTERVAL = (10_000, 30, 1.0) if IS_LONG else (500, 10, 0.02)
 """How many tags, how often they change during the outage, and seconds between polls. A change takes
 two polls."""
 

@@ -9,6 +9,7 @@ import pytest
 
 from holdfast.outputs import sending
 from holdfast.outputs.mqtt import session
+from holdfast.outputs.sparkplug import output
 from support import wire
 from support.mqtt_plant import TAGS, Plant
 from support.sparkplug_watch import SETTINGS, Said, Watch
@@ -25,6 +26,7 @@ REBIRTH: dict[str, Any] = {"name": "Node Control/Rebirth", "datatype": 11, "bool
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("FIRST_PAUSE", "MAX_PAUSE", "TICK"):
         monkeypatch.setattr(sending, name, 0.05)
+    monkeypatch.setattr(output, "TIMEOUT", 0.05)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from holdfast.outputs.mqtt import session
 from holdfast.outputs.sparkplug.definition import parsed
 from support import mqtt_peer as mqtt
 from support import wire
@@ -31,7 +32,10 @@ def fake(request: pytest.FixtureRequest) -> Iterator[FakeBroker]:
         yield broker
 
 
-def test_the_session_is_clean_and_its_will_is_the_death(plant: Plant, fake: FakeBroker) -> None:
+def test_the_session_is_clean_and_its_will_is_the_death(
+    plant: Plant, fake: FakeBroker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "LAST", 0.05)
     plant.device()
     plant.run(**SETTINGS, url=fake.url, version=fake.version)
     with fake.accept() as peer:
@@ -75,4 +79,3 @@ def test_a_refused_subscription_is_logged(
         peer.suback(peer.expect(mqtt.SUBSCRIBE).identifier, 0x80)
         wire.until(refused, "the refusal is logged")
         assert refused() == ["spBv1.0/plant/NCMD/edge"]
-        plant.stop()

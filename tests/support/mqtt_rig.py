@@ -55,7 +55,10 @@ class Probe:
         self.messages: queue.Queue[Message] = queue.Queue()
         self._subscribed = threading.Event()
         self._client = Client(
-            CallbackAPIVersion.VERSION2, protocol=MQTTProtocolVersion.MQTTv5, client_id=""
+            CallbackAPIVersion.VERSION2,
+            protocol=MQTTProtocolVersion.MQTTv5,
+            client_id="",
+            reconnect_on_failure=False,
         )
         self._client.on_message = lambda _client, _data, message: self.messages.put(
             Message(
