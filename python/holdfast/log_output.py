@@ -17,15 +17,16 @@ AT_A_TIME = 500
 """Lines of one write."""
 
 TIMEOUT = 1.0
-"""Seconds that the end of the program waits for the lines."""
+"""Seconds that the end of the program waits for the lines, by default."""
 
 
 class QueuedHandler(logging.Handler):
     """Queues lines for a stream. `dropped` counts those that found the queue full."""
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: TextIO, timeout: float = TIMEOUT) -> None:
+        """`timeout` is that of `flush`, in seconds."""
         super().__init__()
-        self._stream = stream
+        self._stream, self._timeout = stream, timeout
         self._lines: deque[str] = deque()
         self._changed = threading.Condition()
         self._writing = False
@@ -48,9 +49,9 @@ class QueuedHandler(logging.Handler):
             self._changed.notify_all()
 
     def flush(self) -> None:
-        """Waits until all lines are written, up to a second."""
+        """Waits until all lines are written, up to the timeout."""
         with self._changed:
-            self._changed.wait_for(lambda: not self._lines and not self._writing, TIMEOUT)
+            self._changed.wait_for(lambda: not self._lines and not self._writing, self._timeout)
 
     def _write_for_ever(self) -> None:
         while True:

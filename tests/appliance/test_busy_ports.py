@@ -287,6 +287,7 @@ def test_a_closed_port_still_has_a_status() -> None:
     assert port.status() == {"address": "127.0.0.1:0", "listening": False, "failed_binds": 0}
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_wait_in_another_thread_ends_when_the_port_is_free(taken: Taken) -> None:
     port = Port("rest", *taken.addresses["rest"])
     assert not port.bind()

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.adapters import Stop
-from holdfast.appliance import Appliance, liveness
+from holdfast.appliance import Appliance, liveness, running
 from holdfast.appliance.health import Health
 from holdfast.appliance.liveness import MAIN_STALLED, STALLED, Liveness
 from holdfast.appliance.shared_logs import _obstacle
 from holdfast.appliance.supervision import Supervisor
 from holdfast.config import load
+from holdfast.web import port
 from holdfast.web.health import Check
 from holdfast.web.port import Port
 from support import web, wire
@@ -47,6 +48,12 @@ devices:
   down: {url: "tcp://127.0.0.1:1", interval: 0.05, reads: [{area: holding_registers, address: 0,
     count: 1, into: {memory: plant, area: holding_registers, address: 1}}]}
 """
+
+
+@pytest.fixture(autouse=True)
+def short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(running, "HEALTH_CHECK_INTERVAL", 0.0)
+    monkeypatch.setattr(port, "FIRST_PAUSE", 0.05)
 
 
 def probe(appliance: Appliance, path: str = "ready") -> tuple[int, dict[str, Any]]:

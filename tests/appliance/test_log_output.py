@@ -44,7 +44,7 @@ def test_a_reader_that_stops_loses_the_newest_lines_which_are_counted(
 ) -> None:
     monkeypatch.setattr(log_output, "MAX_LINES", 100)
     reader, stream = pipe
-    handler, text = QueuedHandler(stream), "x" * 999
+    handler, text = QueuedHandler(stream, timeout=0.05), "x" * 999
     while handler.dropped < 5:
         logged(handler, text)
     handler.flush()  # It does not wait for ever.

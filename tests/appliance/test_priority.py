@@ -18,6 +18,7 @@ from support.nats_bus import Caller, subscription, tag
 
 if TYPE_CHECKING:
     import holdfast
+    from holdfast.appliance import Appliance
     from support.brokers import NatsServer
     from support.running import Run
 
@@ -84,6 +85,11 @@ def is_done(caller: Caller, request: dict[str, object]) -> bool:
     return False
 
 
+def is_connected(appliance: Appliance) -> bool:
+    status = appliance.diagnostics.adapter("nats")
+    return status is not None and bool(status.get("connected"))
+
+
 def test_a_starter_tells_that_a_thread_can_not_be_started(threads: Threads) -> None:
     starter = supervision.Starter()
     starter.open()
@@ -101,5 +107,6 @@ def test_the_starter_ends_with_the_adapter(
     appliance = run(NODE.format(url=own_nats.url))
     wire.until(lambda: threads.named("holdfast-leases"), "the leases have their thread")
     assert threads.named("holdfast-starter")
+    wire.until(lambda: is_connected(appliance), "the scanner is connected")
     appliance.stop()
     wire.until(lambda: not threads.named("holdfast-starter"), "it has ended")

@@ -9,6 +9,7 @@ import socket
 import threading
 import urllib.error
 import urllib.request
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ import pytest
 
 import holdfast
 from holdfast import raw_ingest
-from holdfast.appliance import Appliance, assembly
+from holdfast.appliance import Appliance, assembly, running
 from holdfast.appliance.changes import ReloadIncomplete, ReloadRefused
 from holdfast.config import load
 from support import wire
@@ -346,11 +347,11 @@ def test_a_revoked_client_is_ended_and_the_others_stay(
     assert (fields[0]["reason"], fields[0]["role"]) == ("revoked", "lost")
 
 
-def test_an_expired_certificate_ends_its_open_session(rig: Rig, party: Party) -> None:
-    expiry = datetime.now(UTC) + timedelta(seconds=8)
-    dates = ("20200101000000Z", expiry.strftime("%Y%m%d%H%M%SZ"))
+def test_an_expired_certificate_ends_its_open_session(
+    rig: Rig, party: Party, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(running, "HEALTH_CHECK_INTERVAL", 0.0)
     extensions = ("extendedKeyUsage=clientAuth", named("laptop"))
-    guest = party.authority.issue("guest", "DNS:guest", extensions=extensions, dates=dates)
     settings = party.settings("engineer", "laptop")
     settings["listeners"]["scada"]["tls"]["review"] = 0.01
     rig.start(settings)
@@ -359,10 +360,25 @@ def test_an_expired_certificate_ends_its_open_session(rig: Rig, party: Party) ->
         rig.appliance.log_events(0.01)
         return [each["role"] for each in rig.appliance.sessions()]
 
-    with secured(rig, party, party.engineer) as stays, secured(rig, party, guest) as goes:
-        assert stays.ask(WRITE) == goes.ask(WRITE) == WRITE
+    def is_ended_by_expiry(stack: ExitStack, life_s: int) -> bool:
+        """Whether a session began before its certificate expired, and then was ended."""
+        expiry = datetime.now(UTC).replace(microsecond=0) + timedelta(seconds=life_s)
+        dates = ("20200101000000Z", expiry.strftime("%Y%m%d%H%M%SZ"))
+        guest = party.authority.issue("guest", "DNS:guest", extensions=extensions, dates=dates)
+        trust = context(party.authority.ca, guest)
+        goes = stack.enter_context(Peer(rig.address(), trust))
+        try:
+            assert goes.shake().ask(WRITE) == WRITE
+        except (Refused, ConnectionError):
+            return False
         wire.until(lambda: open_roles() == ["engineer"], "the session is ended")
-        assert datetime.now(UTC) >= expiry.replace(microsecond=0)
+        assert datetime.now(UTC) >= expiry
+        return True
+
+    with secured(rig, party, party.engineer) as stays, ExitStack() as opened:
+        assert stays.ask(WRITE) == WRITE
+        # A loaded machine may begin the session too late.
+        assert any(is_ended_by_expiry(opened, life_s) for life_s in (2, 4, 8, 16))
         assert stays.ask(READ) == READ_42
 
 

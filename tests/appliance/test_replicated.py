@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 Settings = dict[str, Any]
 
-SHORT = {"write_timeout": 1}
+SHORT = {"write_timeout": 0.3}
 """For tests in which nothing is confirmed."""
 
 
@@ -161,17 +161,20 @@ def test_the_audit_log_says_which_writes_were_not_confirmed(
 def test_a_change_stream_of_a_node_that_is_behind_says_so(
     node: Callable[..., Appliance], server: NatsServer
 ) -> None:
-    one = node("a", log={"when_behind": "refuse", "max_lag": 4})
-    ask(one, "060003002a")
+    one = node("a", log={"when_behind": "refuse", "max_lag": 1})
+    wire.until(lambda: ask(one, "060003002a") == "060003002a", "it is written")
     place = "memory=plant&area=holding_registers&address=3&count=1&min_interval=0.05"
     path = f"/api/v1/memory/changes?{place}"
     stream = event_streams.opened(endpoint(one, "rest"), path)
     try:
+        # On a loaded machine, the node may be behind now and then.
         events = iter(stream)
-        assert next(events).data["values"] == [42]
+        while next(events).name != "values":
+            pass
         server.kill()
-        event = next(events)
-        assert (event.name, event.data["reason"]) == ("unavailable", "log_unavailable")
+        while (event := next(events)).name != "unavailable":
+            assert event.data["values"] == [42]
+        assert event.data["reason"] == "log_unavailable"
         assert "contact" in event.data["detail"]
         server.start()
         event = next(events)
@@ -254,7 +257,9 @@ def test_a_log_that_does_not_answer_does_not_hold_up_devices(
             return {"url": url, "unit": 1, "interval": 0.02, "reads": [read]}
 
         devices = {"shared": polled("plant"), "local": polled("alone")}
-        with Appliance(config(tmp_path, [server.url], devices=devices, log=SHORT)) as one:
+        with Appliance(
+            config(tmp_path, [server.url], devices=devices, log={"write_timeout": 1})
+        ) as one:
 
             def told(name: str) -> dict[str, Any]:
                 return one.diagnostics.devices()[name]

@@ -86,7 +86,7 @@ def test_without_a_server_writes_are_refused_and_reads_are_not(
 def test_a_write_that_is_not_confirmed_in_time_gets_exception_4(
     node: Start, nats: NatsServer
 ) -> None:
-    a = node("a", write_timeout=1.0)
+    a = node("a", write_timeout=0.3)
     nats.freeze()
     assert refusal(lambda: a.client.write_register(0, 1)) == 4
     assert a.log.status()["not_confirmed"] == 1
@@ -94,8 +94,8 @@ def test_a_write_that_is_not_confirmed_in_time_gets_exception_4(
 
 
 def test_reads_are_refused_without_contact(node: Start, nats: NatsServer) -> None:
-    a = node("a", when_behind="refuse", max_lag=2.0)
-    a.client.write_register(0, 1)
+    a = node("a", when_behind="refuse", max_lag=1.0)
+    wire.until(lambda: refusal(lambda: a.client.write_register(0, 1)) is None, "it is written")
     nats.freeze()
     wire.until(lambda: refusal(lambda: a.read(0)) == 6, "reads are refused")
     with pytest.raises(OSError, match="no contact with its log"):
