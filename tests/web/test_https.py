@@ -253,13 +253,19 @@ def test_peers_without_a_handshake_lock_nobody_out(start: Start, files: Files) -
 
 
 def test_a_client_that_reads_nothing_is_given_up(start: Start, files: Files) -> None:
-    service = start(files.https(), request_timeout=5)
+    service = start(files.https(), request_timeout=1)
     path = f"{web.READ}?memory=plant_a&area=holding_registers&address=0&count=65536"
-    with Peer(service.address, files.trust(), receive_buffer=4096) as peer:
-        peer.shake()
-        peer.send(web.head("GET", path) * 64)
-        service.until_counted("slow_reader")
-    wire.until(lambda: service.connections()["open"] == 0, "its connection is closed")
+
+    def is_given_up() -> bool:
+        """A loaded machine may be too slow for the handshake."""
+        with Peer(service.address, files.trust(), receive_buffer=4096) as peer:
+            with contextlib.suppress(Refused, ConnectionError):
+                peer.shake()
+                peer.send(web.head("GET", path) * 64)
+            wire.until(lambda: service.connections()["open"] == 0, "its connection is closed")
+        return service.connections()["slow_reader"] == 1
+
+    wire.until(is_given_up, "its timeout is that of a slow reader")
 
 
 def test_a_client_that_does_not_trust_the_server_is_counted(
