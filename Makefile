@@ -74,7 +74,7 @@ lint: no-std .venv/core.stamp .venv/dev.stamp
 # Licences, origins and known vulnerabilities of all dependencies.
 CARGO_DENY := 0.20.2
 audit: .venv/core.stamp .venv/dev.stamp .venv/release.stamp .cache/tools/cargo-deny-$(CARGO_DENY).stamp
-	PATH="$(CURDIR)/.cache/tools/bin:$$PATH" $(BIN)/python tools/audit.py
+	PATH="$(CURDIR)/.cache/tools/bin:$$PATH" $(BIN)/python tools/dependencies.py
 
 .cache/tools/cargo-deny-$(CARGO_DENY).stamp: $(TOOLCHAIN)
 	cargo install --locked --quiet --root .cache/tools --version $(CARGO_DENY) cargo-deny

@@ -10,7 +10,7 @@ import pytest
 
 @pytest.fixture
 def audit() -> Any:
-    return importlib.import_module("audit")
+    return importlib.import_module("dependencies")
 
 
 @pytest.mark.parametrize(
