@@ -35,5 +35,29 @@ def test_tasks_that_lose_a_cancellation_are_ended(monkeypatch: pytest.MonkeyPatc
     assert asyncio.run(work()) == [True, True, True, False]
 
 
+def test_a_loop_can_notice_that_it_has_lost_a_cancellation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tasks, "AGAIN", 3600.0)
+    rounds = 0
+
+    async def loop() -> None:
+        nonlocal rounds
+        while True:
+            tasks.check()
+            rounds += 1
+            with contextlib.suppress(asyncio.CancelledError):
+                await asyncio.Event().wait()
+
+    async def work() -> bool:
+        running = asyncio.create_task(loop())
+        await asyncio.sleep(0)
+        await tasks.end([running])
+        return running.cancelled()
+
+    assert asyncio.run(work())
+    assert rounds == 1
+
+
 def test_no_tasks_are_ended_at_once() -> None:
     asyncio.run(tasks.end([]))

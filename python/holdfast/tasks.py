@@ -12,6 +12,16 @@ AGAIN = 2.0
 """Seconds after which a task that has not ended is cancelled again."""
 
 
+def check() -> None:
+    """Raises `CancelledError` if this task has lost a cancellation, see `end`.
+
+    A loop that calls it ends without a second cancellation.
+    """
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
+
+
 async def end(tasks: Iterable[asyncio.Task[Any]]) -> None:
     """Cancels tasks, and waits until they have ended. Ignores their errors.
 

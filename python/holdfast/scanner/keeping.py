@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
-from holdfast import logs
+from holdfast import logs, tasks
 from holdfast.scanner.heartbeat import JETSTREAM_TIMEOUT, reason_of
 
 if TYPE_CHECKING:
@@ -112,6 +112,7 @@ class Keeper:
         bucket: KeyValue | None = None
         client: Client | None = None
         while True:
+            tasks.check()
             await self._wait()
             if self._client is not client:
                 client, bucket = self._client, None

@@ -1052,6 +1052,7 @@ class Scanner:
             self._announce()
             if self._part is None or self._part.fleet.is_own(0):
                 await self._heart.beat(self._broker.client)
+            tasks.check()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(EVERY):
                     await self._due.wait()
