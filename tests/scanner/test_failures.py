@@ -14,6 +14,7 @@ import pytest
 
 import holdfast
 from holdfast.scanner import devices
+from holdfast.scanner.broker import MAX_PAUSE
 from support import wire
 from support.brokers import NatsServer
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
@@ -175,13 +176,14 @@ def test_what_nats_took_before_it_died_is_published_anew(
 
 
 def test_nats_that_was_away_for_long_is_tried_every_other_second(run_scanner: Run) -> None:
-    broker = run_scanner().scanner._broker
+    broker = run_scanner(max_pause_s=MAX_PAUSE).scanner._broker
     client = broker.client
     assert client is not None
     broker._lost("tested")
     for _ in range(50):
         broker._note(client, OSError("no route"))
         assert client.options["reconnect_time_wait"] <= 2
+    assert client.options["reconnect_time_wait"] == MAX_PAUSE
     broker._made(client)
 
 

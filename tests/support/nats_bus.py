@@ -322,6 +322,7 @@ def run_scanner(nats: NatsServer) -> Iterator[Run]:
 
         def start(server: NatsServer | None = None, *, wait: bool = True, **more: Any) -> Running:
             more.setdefault("servers", Servers(((server or nats).url,)))
+            more.setdefault("max_pause_s", 0.1)
             more["allow"] = tuple(map(parse_pollable, more.get("allow", ())))
             scanner = Running(Settings(**more))
             running.callback(scanner.stop)

@@ -105,11 +105,15 @@ class Broker:
         name: str = "holdfast scan",
         shared: Collection[str] = (),
         queue: str = "",
+        max_pause_s: float = MAX_PAUSE,
     ) -> None:
         """`name` is what the server shows of the connection.
 
-        Messages of `shared` subjects go to one of all members of `queue`.
+        Messages of `shared` subjects go to one of all members of `queue`. `max_pause_s` is between
+        attempts to connect.
         """
+        self._max_pause_s = max_pause_s
+        self._first_pause_s = min(FIRST_PAUSE, max_pause_s)
         self._shared, self._queue = shared, queue
         self._name = name
         self._ping = ping
@@ -146,7 +150,7 @@ class Broker:
                 self._subscribed = False
                 self._lost("stopped")
                 await _closed(client)
-            await asyncio.sleep(FIRST_PAUSE)
+            await asyncio.sleep(self._first_pause_s)
 
     async def _connect(self, client: SafeClient, ended: asyncio.Event) -> None:
         """Connects and subscribes; returns when nats-py gives up, which sets `ended`."""
@@ -174,7 +178,7 @@ class Broker:
                 reconnected_cb=again,
                 closed_cb=closed,
                 max_reconnect_attempts=-1,
-                reconnect_time_wait=FIRST_PAUSE,  # type: ignore[arg-type]
+                reconnect_time_wait=self._first_pause_s,  # type: ignore[arg-type]
                 ping_interval=self._ping.interval,  # type: ignore[arg-type]
                 max_outstanding_pings=self._ping.outstanding,
                 pending_size=PENDING,
@@ -214,7 +218,7 @@ class Broker:
             attempts=self._failures + 1,
         )
         self._failures, self._told, self._worked = 0, ("", 0.0), True
-        client.options["reconnect_time_wait"] = FIRST_PAUSE
+        client.options["reconnect_time_wait"] = self._first_pause_s
         self.client = client
         self._connected(client)
 
@@ -233,7 +237,7 @@ class Broker:
             logs.refused("nats_error", kind="nats", reason=reason)
             return
         self._failures += 1
-        pause = min(FIRST_PAUSE * 2 ** min(self._failures, 10), MAX_PAUSE)
+        pause = min(FIRST_PAUSE * 2 ** min(self._failures, 10), self._max_pause_s)
         client.options["reconnect_time_wait"] = pause
         now = time.monotonic()
         if reason == self._told[0] and now - self._told[1] < SILENCE:

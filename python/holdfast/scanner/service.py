@@ -31,7 +31,7 @@ from holdfast.config.scanning import written_pollable
 from holdfast.net.tls import NO_FILES, Tls
 from holdfast.scanner import browsing, commands, device_tls, kept_entries, tentacle_next, wire
 from holdfast.scanner.adjusting import Adjustments, adjusted
-from holdfast.scanner.broker import Broker, Ping, Servers
+from holdfast.scanner.broker import MAX_PAUSE, Broker, Ping, Servers
 from holdfast.scanner.browsing import browsed
 from holdfast.scanner.configured import Configured
 from holdfast.scanner.enabling import Enabling
@@ -143,6 +143,8 @@ class Settings:
     """Whether requests are refused that would otherwise be adjusted."""
     ping: Ping = field(default_factory=Ping)
     """How a NATS server that does not answer is detected."""
+    max_pause_s: float = MAX_PAUSE
+    """Between attempts to connect to NATS."""
     publish_logs: bool = True
     """Whether the log is also published."""
     keep_subscriptions: bool = True
@@ -235,6 +237,7 @@ class Scanner:
             settings.ping,
             shared=[] if part is None else self._shared(),
             queue="" if settings.fleet is None else f"holdfast-{settings.fleet.name}",
+            max_pause_s=settings.max_pause_s,
         )
         self._due = asyncio.Event()
         """Set when the next heartbeat is due immediately."""
@@ -370,7 +373,14 @@ class Scanner:
     async def _connect_leases(self, connected: Callable[[Client | None], None]) -> None:
         """Keeps a connection that only the leases of a fleet use."""
         settings = self._settings
-        broker = Broker(settings.servers, {}, connected, settings.ping, name="holdfast leases")
+        broker = Broker(
+            settings.servers,
+            {},
+            connected,
+            settings.ping,
+            name="holdfast leases",
+            max_pause_s=settings.max_pause_s,
+        )
         await broker.run()
 
     def _fence(self, device: ScannedDevice) -> _core.Fence | None:
