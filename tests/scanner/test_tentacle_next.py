@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.scanner import Defaults, tentacle_next, watching
-from holdfast.scanner import configured as configured_module
+from holdfast.scanner import Defaults, tentacle_next
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.keeping import BUCKET as KEPT
+from holdfast.scanner.watching import WATCH_TIMES, WatchTimes
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag
@@ -34,12 +34,11 @@ if TYPE_CHECKING:
 
     from support.nats_bus import Inbox, Run, Running
 
-NEXT: dict[str, Any] = {"dialect": "tentacle-next", "defaults": Defaults(publish="change")}
-
-
-@pytest.fixture(autouse=True)
-def _retried_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(configured_module, "RETRIED", 0.1)
+NEXT: dict[str, Any] = {
+    "dialect": "tentacle-next",
+    "defaults": Defaults(publish="change"),
+    "watch_times": WatchTimes(quiet_s=0.2, settle_s=0.02, retry_s=0.1),
+}
 
 
 @pytest.fixture
@@ -166,10 +165,10 @@ def test_an_entry_is_the_whole_subscription(
     assert found == {"b": 12, "c": 10}
 
 
-@pytest.mark.usefixtures("scanner")
 def test_its_gateway_gets_every_value_when_it_writes_its_entries_again(
-    caller: Caller, server: holdfast.Server
+    run_scanner: Run, caller: Caller, server: holdfast.Server
 ) -> None:
+    running = run_scanner(**NEXT | {"watch_times": WATCH_TIMES})
     entry = gateway_entry(server, gateway_tag("a", 0), gateway_tag("b", 1), rate=50)
     caller.put(BUCKET, key(), entry)
     wire.until(lambda: variables(caller).keys() == {"a", "b"}, "it is subscribed")
@@ -179,6 +178,8 @@ def test_its_gateway_gets_every_value_when_it_writes_its_entries_again(
     caller.delete(BUCKET, key())
     caller.put(BUCKET, key(), entry)
     assert {data.next()["variableId"], data.next()["variableId"]} == {"a", "b"}
+    running.stop()
+    caller.forget(BUCKET)
 
 
 @pytest.mark.usefixtures("scanner")
@@ -264,9 +265,7 @@ def test_entries_are_followed_when_the_server_has_lost_the_reader(
     own_nats: NatsServer,
     own_caller: Caller,
     server: holdfast.Server,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(watching, "QUIET", 0.2)
     run_scanner(own_nats, **NEXT)
     own_caller.put(BUCKET, key(), gateway_entry(server, gateway_tag("a", 0)))
     wire.until(lambda: tags(own_caller) == {"a"}, "it is subscribed")

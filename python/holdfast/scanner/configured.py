@@ -18,7 +18,7 @@ import msgspec
 
 from holdfast import logs
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.keeping import RETRIED, Unit
+from holdfast.scanner.keeping import Unit
 from holdfast.scanner.watching import Watch
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast.scanner.registry import Subscription
-    from holdfast.scanner.watching import Written
+    from holdfast.scanner.watching import WatchTimes, Written
 
 BUCKET = "scanner_config_"
 """The name of the bucket, before the prefix of all subjects."""
@@ -71,6 +71,7 @@ class Configured:
         understand: Callable[[str, bytes], Subscription],
         subscribe: Callable[[Subscription], Awaitable[None]],
         end: Callable[[Unit], Awaitable[None]],
+        times: WatchTimes,
     ) -> None:
         """`understand` checks the key and value of an entry, `subscribe` carries it out.
 
@@ -80,7 +81,8 @@ class Configured:
         self._understand = understand
         self._subscribe = subscribe
         self._end = end
-        self._watch = Watch(self.bucket, ">", self._changed)
+        self._retry_s = times.retry_s
+        self._watch = Watch(self.bucket, ">", self._changed, times)
         self._entries: dict[str, Entry] = {}
         self._keys: dict[Unit, str] = {}
         self._lock = asyncio.Lock()
@@ -158,7 +160,7 @@ class Configured:
 
     async def _try_again(self) -> None:
         while True:
-            await asyncio.sleep(RETRIED)
+            await asyncio.sleep(self._retry_s)
             async with self._lock:
                 await self._carry_out(self._held())
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from nats.aio.client import Client
 
-    from holdfast.scanner.watching import Written
+    from holdfast.scanner.watching import WatchTimes, Written
 
 BUCKET = "service_enabled"
 
@@ -31,11 +31,11 @@ class _State(msgspec.Struct):
 class Enabling:
     """Follows the key of the scanner."""
 
-    def __init__(self, key: str, enable: Callable[[bool], None]) -> None:
+    def __init__(self, key: str, enable: Callable[[bool], None], times: WatchTimes) -> None:
         """`enable` is called with the first state and each new one."""
         self._key = key
         self._enable = enable
-        self._watch = Watch(BUCKET, key, self._changed)
+        self._watch = Watch(BUCKET, key, self._changed, times)
         self._told: bool | None = None
         self.enabled = True
 

@@ -70,6 +70,7 @@ from holdfast.scanner.registry import Registry, understood
 from holdfast.scanner.rivals import Rivals
 from holdfast.scanner.rules import Defaults, Rules
 from holdfast.scanner.variables import of_device, variables
+from holdfast.scanner.watching import WATCH_TIMES, WatchTimes
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -155,6 +156,8 @@ class Settings:
     """The tags that requests can name by their profile."""
     fleet: FleetSettings | None = None
     """The fleet of scanners that it is a node of."""
+    watch_times: WatchTimes = WATCH_TIMES
+    """Those of the buckets of tentacle-next."""
 
 
 class Scanner:
@@ -219,9 +222,13 @@ class Scanner:
         self._enabling: Enabling | None = None
         if self._is_next:
             self._configured = Configured(
-                settings.prefix, self._understand, self._carry_out, self._end_configured
+                settings.prefix,
+                self._understand,
+                self._carry_out,
+                self._end_configured,
+                settings.watch_times,
             )
-            self._enabling = Enabling(settings.prefix, self._enable)
+            self._enabling = Enabling(settings.prefix, self._enable, settings.watch_times)
         self._kept = Kept(
             settings.prefix,
             self._registry,

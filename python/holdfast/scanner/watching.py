@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import logging
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
@@ -26,21 +27,30 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
     from nats.js import JetStreamContext
 
-QUIET = 5.0
-"""Seconds without a change after which it checks that the server still has the reader."""
-
 FIRST_READ = 2.0
 """Seconds that requests wait until the bucket is read. Reading goes on after that."""
-
-SETTLING = 0.2
-"""Seconds without a further change until changes are reported. Programs of tentacle-next delete an
-entry before they write it again."""
 
 MAX_SETTLING = 2.0
 """Seconds after which changes are reported, even if further ones follow."""
 
 MARKER_HEADERS = ("KV-Operation", "Nats-Marker-Reason")
 """The headers of messages that stand for deleted or expired keys."""
+
+
+@dataclass(frozen=True)
+class WatchTimes:
+    """When something is done about a bucket, in seconds."""
+
+    quiet_s: float = 5.0
+    """Without a change for so long, it is checked that the server still has the reader."""
+    settle_s: float = 0.2
+    """Without a further change for so long, changes are reported. Programs of tentacle-next delete
+    an entry before they write it again."""
+    retry_s: float = RETRIED
+    """Until what failed or was refused is tried again, at most."""
+
+
+WATCH_TIMES = WatchTimes()
 
 
 class Written(NamedTuple):
@@ -62,6 +72,7 @@ class Watch:
         bucket: str,
         keys: str,
         changed: Callable[[Mapping[str, Written | None], bool], Awaitable[None]],
+        times: WatchTimes,
     ) -> None:
         """`keys` is a key, or `>` for all.
 
@@ -73,6 +84,7 @@ class Watch:
         self._pre = f"$KV.{bucket}."
         self._keys = keys
         self._changed = changed
+        self._times = times
         self._client: Client | None = None
         self._news = asyncio.Event()
         self._works: bool | None = None
@@ -114,7 +126,7 @@ class Watch:
             except _Missed:
                 pass
             except Exception as error:  # JetStream may fail in any way; it is tried again.
-                pause = min(FIRST_RETRY * 2 ** min(self._failures, 10), RETRIED)
+                pause = min(FIRST_RETRY * 2 ** min(self._failures, 10), self._times.retry_s)
                 self._failures += 1
                 if self._client is client:  # Else the connection has ended, and not JetStream.
                     self._tell(False, reason_of(error))
@@ -126,7 +138,7 @@ class Watch:
         """Reads all keys, then reports changes. Raises `_Missed`, or an error of JetStream."""
         jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT)
         await self._open(jetstream)
-        reader = _Reader(self._stream, self._pre)
+        reader = _Reader(self._stream, self._pre, self._times)
         try:
             count = await reader.begin(jetstream, self._keys)
             found: dict[str, Written | None] = {}
@@ -168,9 +180,10 @@ class _Reader:
     pull consumer has is certain.
     """
 
-    def __init__(self, stream: str, pre: str) -> None:
+    def __init__(self, stream: str, pre: str, times: WatchTimes) -> None:
         self._stream = stream
         self._pre = pre
+        self._times = times
         self.received = 0
         """The number of the last message, counted by the server."""
 
@@ -192,14 +205,14 @@ class _Reader:
     async def changes(self) -> dict[str, Written | None]:
         """Waits for changes. Returns them when no more follow, or nothing after a while."""
         try:
-            found = await self.fetch(1, QUIET)
+            found = await self.fetch(1, self._times.quiet_s)
         except TimeoutError:
             await self._check()
             return {}
         end = time.monotonic() + MAX_SETTLING
         with contextlib.suppress(TimeoutError):
             while time.monotonic() < end:
-                found |= await self.fetch(FETCHED, SETTLING)
+                found |= await self.fetch(FETCHED, self._times.settle_s)
         return found
 
     async def fetch(self, most: int, timeout: float) -> dict[str, Written | None]:
