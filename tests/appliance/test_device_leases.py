@@ -19,12 +19,13 @@ import pytest
 from holdfast.appliance import Appliance
 from holdfast.client.url import connection_of, parse
 from holdfast.config import ConfigError, load
-from holdfast.leases import TTL, leases
+from holdfast.leases import LEASE_TIMES, LeaseTimes
 from support import wire
 from support.brokers import NatsServer
-from support.cli import invoke
+from support.cli import RunCommand, invoke
 from support.config_folder import written
 from support.fake_device import Stream
+from support.leases import BRIEF, ENDLESS, make_settled
 from support.running import endpoint
 
 if TYPE_CHECKING:
@@ -32,6 +33,17 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from support.fake_device import Asked, Peer
+
+
+RUN = f"""
+import sys
+from holdfast.appliance import Appliance
+from holdfast.config import load
+from holdfast.leases import LeaseTimes
+with Appliance(load(sys.argv[1]), lease_times={BRIEF}) as appliance:
+    while True:
+        appliance.log_events(1.0)
+"""
 
 
 class Device(Stream):
@@ -53,6 +65,7 @@ class Device(Stream):
 def server(tmp_path: Path) -> Iterator[NatsServer]:
     (tmp_path / "server").mkdir()
     server = NatsServer(tmp_path / "server")
+    make_settled(server.url, "holdfast-log-site-devices")
     yield server
     server.kill()
 
@@ -70,7 +83,7 @@ def settings(tmp_path: Path, server: NatsServer, device: Device) -> Callable[...
     def write(name: str, **more: Any) -> Path:
         meter = {
             "url": device.url,
-            "interval": 0.05,
+            "interval": 0.02,
             "timeout": 3,
             "writes": "pass",
             "reads": [
@@ -100,22 +113,21 @@ def settings(tmp_path: Path, server: NatsServer, device: Device) -> Callable[...
 def node(settings: Callable[..., Path]) -> Iterator[Callable[..., Appliance]]:
     with ExitStack() as running:
 
-        def start(name: str, **more: Any) -> Appliance:
-            return running.enter_context(Appliance(load(settings(name, **more))))
+        def start(name: str, lease_times: LeaseTimes = LEASE_TIMES, **more: Any) -> Appliance:
+            config = load(settings(name, **more))
+            return running.enter_context(Appliance(config, lease_times=lease_times))
 
         yield start
 
 
 @pytest.fixture
-def process(settings: Callable[..., Path]) -> Iterator[Callable[[str], subprocess.Popen[bytes]]]:
-    """Starts appliances as processes, which can be stopped and killed."""
+def process(settings: Callable[..., Path]) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    """Starts appliances as processes, which can be stopped and killed; their leases are `BRIEF`."""
     with ExitStack() as running:
 
-        def start(name: str) -> subprocess.Popen[bytes]:
-            command = [sys.executable, "-m", "holdfast", "run", str(settings(name))]
-            started = running.enter_context(
-                subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-            )
+        def start(name: str, **more: Any) -> subprocess.Popen[bytes]:
+            command = [sys.executable, "-c", RUN, str(settings(name, **more))]
+            started = running.enter_context(subprocess.Popen(command))
             running.callback(started.kill)
             return started
 
@@ -156,13 +168,13 @@ def test_one_node_polls_a_device_and_all_have_its_values(
 
 
 def test_a_node_that_was_stopped_sends_not_one_poll_when_it_goes_on(
-    process: Callable[[str], subprocess.Popen[bytes]],
+    process: Callable[..., subprocess.Popen[bytes]],
     node: Callable[..., Appliance],
     device: Device,
 ) -> None:
     one = process("a")
     wire.until(lambda: device.connections == 1, "the first node polls it")
-    two = node("b")
+    two = node("b", BRIEF)
     wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
     wire.until(lambda: len(device.peers) > 20, "it is polled")
     one.send_signal(signal.SIGSTOP)
@@ -183,13 +195,14 @@ def test_a_node_that_was_stopped_sends_not_one_poll_when_it_goes_on(
 
 
 def test_a_node_that_dies_is_replaced_and_the_first_write_waits(
-    process: Callable[[str], subprocess.Popen[bytes]],
+    process: Callable[..., subprocess.Popen[bytes]],
     node: Callable[..., Appliance],
     device: Device,
 ) -> None:
-    one = process("a")
+    timeout_s = 2
+    one = process("a", timeout=timeout_s)
     wire.until(lambda: device.connections == 1, "the first node polls it")
-    two = node("b")
+    two = node("b", BRIEF, timeout=timeout_s)
     wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
     # A node that stands by does not write to the device.
     assert ask(two, "06000a0063") == "860a"
@@ -201,19 +214,18 @@ def test_a_node_that_dies_is_replaced_and_the_first_write_waits(
     [(at, pdu)] = device.writes
     assert pdu.hex() == "0600070063"
     # The timeout of the device, and the TTL, of which a part has passed when it is first polled.
-    assert at - taken_over > TTL - 1.0
+    assert at - taken_over > BRIEF.ttl_s + timeout_s - 1.0
     assert ask(two, "03000a0001") == "03020063"
     # Polls went on meanwhile, and later writes do not wait.
     assert ask(two, "06000a0064") == "06000a0064"
 
 
 def test_after_a_lease_that_was_given_back_the_first_write_does_not_wait(
-    node: Callable[..., Appliance], monkeypatch: pytest.MonkeyPatch
+    node: Callable[..., Appliance],
 ) -> None:
-    one = node("a")
+    one = node("a", ENDLESS)
     wire.until(lambda: health(one) == "ok", "the first node polls it")
-    monkeypatch.setattr(leases, "TTL", 3600.0)  # What the first write waits for otherwise.
-    two = node("b")
+    two = node("b", ENDLESS)  # Otherwise, the first write waits for as long.
     wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
     one.stop()
     wire.until(lambda: health(two) == "ok", "the other node has taken over")
@@ -253,7 +265,7 @@ def test_a_device_whose_address_another_node_polls_without_it_is_named(
 def test_without_its_log_a_node_stops_polling_and_comes_back(
     node: Callable[..., Appliance], server: NatsServer, device: Device
 ) -> None:
-    one = node("a")
+    one = node("a", BRIEF)
     wire.until(lambda: health(one) == "ok", "it polls")
     server.kill()
     wire.until(lambda: health(one) == "standby", "it stands by")
@@ -265,17 +277,24 @@ def test_without_its_log_a_node_stops_polling_and_comes_back(
     wire.until(lambda: health(one) == "ok", "it polls again")
 
 
-def test_replicas_shows_who_polls_what(
-    process: Callable[[str], subprocess.Popen[bytes]], device: Device, tmp_path: Path
-) -> None:
-    process("a")
-    wire.until(lambda: device.connections == 1, "it polls")
-    result = invoke("replicas", str(tmp_path / "a.yaml"))
+def test_replicas_shows_who_polls_what(settings: Callable[..., Path], device: Device) -> None:
+    file = settings("a")
+    command = RunCommand(file)
+    try:
+        command.wait_for_greeting()
+        wire.until(lambda: device.connections == 1, "it polls")
+        check_replicas(file)
+    finally:
+        command.end(signal.SIGTERM)
+
+
+def check_replicas(file: Path) -> None:
+    result = invoke("replicas", str(file))
     assert result.exit_code == 0, result.output
     assert "polled by" in result.stdout
     [line] = [line for line in result.stdout.splitlines() if line.strip().startswith("meter")]
     assert line.split() == ["meter", "a"]
-    result = invoke("replicas", str(tmp_path / "a.yaml"), "--json")
+    result = invoke("replicas", str(file), "--json")
     [status] = json.loads(result.stdout)["logs"].values()
     assert status["devices"] == {"meter": {"node": "a", "polled_here": True}}
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.leases import TTL
+from holdfast.leases import LEASE_TIMES
 from support import nats_cluster, wire
 from support.fleet_nodes import Commands, Nodes, Published, are_polled, known, subscribed
 from support.judges import Judges
@@ -100,14 +100,14 @@ class Plant:
         connections = self.nodes.freeze(name)
         self.judges.frozen |= connections
         try:
-            if seconds > TTL:
+            if seconds > LEASE_TIMES.ttl_s:
                 wire.until(partial(self.nodes.have_replaced, name), "taken over")
             threading.Event().wait(max(began + seconds - time.monotonic(), 0))
             before = [len(judge.polls) for judge in self.scanned]
         finally:
             self.nodes.thaw(name)
         self.nodes.settle()
-        if seconds > TTL:
+        if seconds > LEASE_TIMES.ttl_s:
             # All that it has sent had been received when the others had taken over.
             for judge, count in zip(self.scanned, before, strict=True):
                 late = {judge.peers[number] for _, number in judge.polls[count:]}

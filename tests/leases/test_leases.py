@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import TimeoutError as NatsTimeout
 
-from holdfast.leases import LeaseBucket, Leases, bucket, entries
+from holdfast.leases import LeaseBucket, Leases, LeaseTimes
 from holdfast.leases.bucket import Outdated
 from holdfast.leases.entries import SETTLED
 from holdfast.scanner.broker import Broker, Ping, Servers
 from support import wire
 from support.brokers import NatsServer
+from support.leases import ENDLESS, LASTING, SHORT, make_settled
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
@@ -33,11 +34,18 @@ def server(tmp_path: Path) -> Iterator[NatsServer]:
     server.kill()
 
 
+@pytest.fixture
+def settled(server: NatsServer) -> NatsServer:
+    """A server with a bucket in which leases may be taken."""
+    make_settled(server.url, BUCKET)
+    return server
+
+
 class Node:
     """One holder of leases, with a connection of its own."""
 
-    def __init__(self, name: str) -> None:
-        self.leases = Leases(BUCKET, name, self)
+    def __init__(self, name: str, times: LeaseTimes) -> None:
+        self.leases = Leases(BUCKET, name, self, times=times)
         self.events: list[str] = []
         self.client: Client | None = None
         self.watch: Callable[[], None] = lambda: None
@@ -62,9 +70,9 @@ class Node:
 
 
 @contextlib.asynccontextmanager
-async def running(server: NatsServer, name: str) -> AsyncIterator[Node]:
+async def running(server: NatsServer, name: str, times: LeaseTimes) -> AsyncIterator[Node]:
     """A node that disappears at the end of the block, without giving anything back."""
-    node = Node(name)
+    node = Node(name, times)
     broker = Broker(Servers((server.url,)), {}, node.connected, Ping())
     tasks = [asyncio.create_task(broker.run()), asyncio.create_task(node.leases.run())]
     try:
@@ -82,12 +90,24 @@ async def until(condition: Callable[[], Any], what: str) -> None:
         await asyncio.sleep(0.01)
 
 
+def test_a_holder_stops_before_others_may_begin_and_renews_before_that() -> None:
+    with pytest.raises(AssertionError):
+        LeaseTimes(ttl_s=2.0, hold_s=2.0)
+    with pytest.raises(AssertionError):
+        LeaseTimes(hold_s=1.0, renewal_s=1.0)
+
+
+@pytest.mark.parametrize(("ttl_s", "of_server"), [(0.6, 1), (1.0, 1), (1.5, 2), (3.0, 3)])
+def test_a_server_deletes_no_key_before_its_lease_has_ended(ttl_s: float, of_server: int) -> None:
+    assert LeaseTimes(ttl_s, hold_s=0.4, renewal_s=0.2).server_ttl_s == of_server
+
+
 def test_the_holder_keeps_its_lease_and_another_takes_it_when_it_is_gone(
-    server: NatsServer,
+    settled: NatsServer,
 ) -> None:
     async def work() -> None:
-        async with running(server, "b") as second:
-            async with running(server, "a") as first:
+        async with running(settled, "b", LASTING) as second:
+            async with running(settled, "a", LASTING) as first:
                 first.leases.want(["x"])
                 await until(lambda: first.leases.is_held("x"), "the first node has it")
                 second.leases.want(["x"])
@@ -110,14 +130,12 @@ def test_the_holder_keeps_its_lease_and_another_takes_it_when_it_is_gone(
     asyncio.run(work())
 
 
-def test_a_lease_that_is_given_back_is_taken_at_once(
-    server: NatsServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Only the mark of its former holder can free it.
-    monkeypatch.setattr(entries, "TTL", 1000.0)
-
+def test_a_lease_that_is_given_back_is_taken_at_once(settled: NatsServer) -> None:
     async def work() -> None:
-        async with running(server, "a") as first, running(server, "b") as second:
+        async with (
+            running(settled, "a", ENDLESS) as first,
+            running(settled, "b", ENDLESS) as second,
+        ):
             first.leases.want(["x"])
             await until(lambda: first.leases.is_held("x"), "the first node has it")
             second.leases.want(["x"])
@@ -131,7 +149,7 @@ def test_a_lease_that_is_given_back_is_taken_at_once(
 
 
 def test_a_renewal_that_was_not_confirmed_is_found(
-    server: NatsServer, monkeypatch: pytest.MonkeyPatch
+    settled: NatsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original = LeaseBucket.put
     lost = 0
@@ -145,37 +163,40 @@ def test_a_renewal_that_was_not_confirmed_is_found(
         return done
 
     async def work() -> None:
-        async with running(server, "a") as node:
+        async with running(settled, "a", LASTING) as node:
             node.leases.want(["x"])
             await until(lambda: lost, "a confirmation is lost")
             revision = node.leases.seen["x"].revision
             await until(lambda: node.leases.seen["x"].revision > revision + 2, "renewals go on")
-            assert not [event for event in node.events if "another node" in event]
+            assert not [event for event in node.events if event.startswith("lost")]
 
     monkeypatch.setattr(LeaseBucket, "put", put)
     asyncio.run(work())
 
 
-def test_without_the_server_a_holder_stops_before_others_may_begin(server: NatsServer) -> None:
+def test_without_the_server_a_holder_stops_before_others_may_begin(settled: NatsServer) -> None:
     async def work() -> None:
-        async with running(server, "a") as node:
+        async with running(settled, "a", SHORT) as node:
             node.leases.want(["x"])
             await until(lambda: node.leases.is_held("x"), "it is held")
             fence = node.leases.fence("x")
-            server.kill()
+            settled.kill()
             await until(lambda: not fence.allows, "the fence has closed")
             await until(lambda: "x" not in node.leases.held, "the lease is given up")
             assert node.events[-1] == "lost x: it could not be renewed"
-            server.start()
+            settled.start()
             await until(lambda: node.leases.is_held("x"), "it is held again")
             assert fence.is_open
 
     asyncio.run(work())
 
 
-def test_a_former_holder_changes_nothing(server: NatsServer) -> None:
+def test_a_former_holder_changes_nothing(settled: NatsServer) -> None:
     async def work() -> None:
-        async with running(server, "a") as first, running(server, "b") as second:
+        async with (
+            running(settled, "a", LASTING) as first,
+            running(settled, "b", LASTING) as second,
+        ):
             first.leases.want(["x"])
             await until(lambda: first.leases.is_held("x"), "the first node has it")
             revision = first.leases.seen["x"].revision
@@ -205,14 +226,14 @@ def test_a_former_holder_changes_nothing(server: NatsServer) -> None:
 
 def test_a_bucket_of_another_kind_is_named(server: NatsServer) -> None:
     async def work() -> None:
-        async with running(server, "b") as node:
+        async with running(server, "b", SHORT) as node:
             await until(lambda: node.leases.reason is None, "the bucket is made")
             assert node.client is not None
             await node.client.jetstream().delete_stream(f"KV_{BUCKET}")
             await node.client.jetstream().add_stream(
                 name=f"KV_{BUCKET}", subjects=[f"$KV.{BUCKET}.>"]
             )
-        async with running(server, "a") as node:
+        async with running(server, "a", SHORT) as node:
             node.leases.want(["x"])
             await until(lambda: "exists without TTLs" in str(node.leases.reason), "it says so")
             assert not node.leases.held
@@ -220,9 +241,9 @@ def test_a_bucket_of_another_kind_is_named(server: NatsServer) -> None:
     asyncio.run(work())
 
 
-def test_a_bucket_that_was_deleted_is_made_again(server: NatsServer) -> None:
+def test_a_bucket_that_was_deleted_is_made_again(settled: NatsServer) -> None:
     async def work() -> None:
-        async with running(server, "a") as node:
+        async with running(settled, "a", SHORT) as node:
             node.leases.want(["x"])
             await until(lambda: node.leases.is_held("x"), "it is held")
             assert node.client is not None
@@ -233,17 +254,20 @@ def test_a_bucket_that_was_deleted_is_made_again(server: NatsServer) -> None:
     asyncio.run(work())
 
 
-def test_nodes_agree_again_after_the_server_has_lost_its_storage(server: NatsServer) -> None:
+def test_nodes_agree_again_after_the_server_has_lost_its_storage(settled: NatsServer) -> None:
     async def work() -> None:
-        async with running(server, "a") as first, running(server, "b") as second:
+        async with (
+            running(settled, "a", LASTING) as first,
+            running(settled, "b", LASTING) as second,
+        ):
             for node in (first, second):
                 node.leases.want(["x"])
             nodes = [first, second]
             await until(lambda: any(node.leases.held for node in nodes), "one has it")
             before = max(node.leases.since("x") for node in nodes)
-            server.kill()
-            server.lose_store()
-            server.start()
+            settled.kill()
+            settled.lose_store()
+            settled.start()
             await until(lambda: not any(node.leases.held for node in nodes), "it was lost")
             await until(lambda: any(node.leases.held for node in nodes), "one has it again")
             [holder] = [node for node in nodes if node.leases.held]
@@ -265,13 +289,13 @@ def test_a_bucket_that_replaces_another_one_waits_for_leases_of_that_one(
     server: NatsServer,
 ) -> None:
     async def work() -> None:
-        async with running(server, "a") as first:
+        async with running(server, "a", SHORT) as first:
             first.leases.want(["x"])
             await until(lambda: first.leases.is_held("x"), "it is held")
             assert first.client is not None
             await first.client.jetstream().delete_stream(f"KV_{BUCKET}")
             first.leases.want([])
-            async with running(server, "b") as second:
+            async with running(server, "b", SHORT) as second:
                 were_open = []
                 second.watch = lambda: were_open.append(first.leases.fence("x").allows)
                 second.leases.want(["x"])
@@ -282,7 +306,7 @@ def test_a_bucket_that_replaces_another_one_waits_for_leases_of_that_one(
 
 
 def test_a_lease_is_held_though_the_answer_was_lost(
-    server: NatsServer, monkeypatch: pytest.MonkeyPatch
+    settled: NatsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original = LeaseBucket.put
     lost = 0
@@ -296,11 +320,8 @@ def test_a_lease_is_held_though_the_answer_was_lost(
         return done
 
     async def work() -> None:
-        async with running(server, "a") as node:
+        async with running(settled, "a", ENDLESS) as node:
             await until(lambda: SETTLED in node.leases.seen, "leases may be taken")
-            # A lease of another process would last for ever.
-            monkeypatch.setattr(entries, "TTL", 1000.0)
-            monkeypatch.setattr(bucket, "TTL", 1000.0)
             node.leases.want(["x"])
             await until(lambda: lost, "an answer is lost")
             await until(lambda: node.leases.is_held("x"), "it is held")
@@ -310,13 +331,13 @@ def test_a_lease_is_held_though_the_answer_was_lost(
 
 
 def test_a_bucket_that_does_not_open_delays_no_renewal(
-    server: NatsServer, monkeypatch: pytest.MonkeyPatch
+    settled: NatsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def never(*_: object) -> None:
         await asyncio.Event().wait()
 
     async def work() -> None:
-        async with running(server, "a") as node:
+        async with running(settled, "a", LASTING) as node:
             node.leases.want(["x"])
             await until(lambda: node.leases.is_held("x"), "it is held")
             monkeypatch.setattr(LeaseBucket, "open", never)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
 import pytest
 
 from holdfast import tasks
-from holdfast.leases import Leases, LeaseThread, Relay, entries, thread
+from holdfast.leases import Leases, LeaseThread, LeaseTimes, Relay
 from holdfast.scanner.broker import Broker, Ping, Servers
 from support import wire
 from support.brokers import NatsServer
+from support.leases import ENDLESS, LASTING, make_settled
 from support.nats_bus import logged
 
 if TYPE_CHECKING:
@@ -29,6 +31,7 @@ LIMIT = 1.0
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[NatsServer]:
     server = NatsServer(tmp_path)
+    make_settled(server.url, BUCKET)
     yield server
     server.kill()
 
@@ -36,11 +39,11 @@ def server(tmp_path: Path) -> Iterator[NatsServer]:
 class Node:
     """Leases in a thread."""
 
-    def __init__(self, server: NatsServer, name: str) -> None:
+    def __init__(self, server: NatsServer, name: str, times: LeaseTimes = LASTING) -> None:
         self.events: list[str] = []
         self.withheld: str | None = None
-        self.leases = Leases(BUCKET, name, self, withheld=lambda: self.withheld)
-        self.thread = LeaseThread(self.leases, self._connect, f"leases of {name}")
+        self.leases = Leases(BUCKET, name, self, times=times, withheld=lambda: self.withheld)
+        self.thread = LeaseThread(self.leases, self._connect, f"leases of {name}", retry_s=0.01)
         self._servers = Servers((server.url,))
 
     async def _connect(self, connected: Callable[[Client | None], None]) -> None:
@@ -62,17 +65,18 @@ class Node:
         wire.until(lambda: all(map(self.leases.is_held, keys)), "they are held")
 
     def renews(self, key: str) -> None:
-        """Waits for more renewals than a lease lasts without one."""
-        revision = self.leases.revision(key)
+        """Waits for longer than a lease lasts without renewals."""
+        revision, end = self.leases.revision(key), time.monotonic() + self.leases.times.ttl_s
+        wire.until(lambda: time.monotonic() > end, "it would have ended")
         wire.until(lambda: self.leases.revision(key) > revision + 4, "it is renewed")
 
 
 @pytest.fixture
-def node(server: NatsServer) -> Iterator[Callable[[str], Node]]:
+def node(server: NatsServer) -> Iterator[Callable[..., Node]]:
     with ExitStack() as running:
 
-        def start(name: str) -> Node:
-            node = Node(server, name)
+        def start(name: str, times: LeaseTimes = LASTING) -> Node:
+            node = Node(server, name, times)
             node.thread.start()
             running.callback(node.thread.stop, LIMIT)
             return node
@@ -110,7 +114,7 @@ def test_a_thread_ends_while_it_connects(
 
 
 def test_leases_are_renewed_while_the_event_loop_of_their_user_does_something_else(
-    node: Callable[[str], Node],
+    node: Callable[..., Node],
 ) -> None:
     first, second = node("a"), node("b")
 
@@ -128,12 +132,8 @@ def test_leases_are_renewed_while_the_event_loop_of_their_user_does_something_el
     assert first.events == ["taken x"]
 
 
-def test_the_end_of_the_thread_gives_everything_back(
-    node: Callable[[str], Node], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Only the mark of its former holder can free a lease.
-    monkeypatch.setattr(entries, "TTL", 1000.0)
-    first, second = node("a"), node("b")
+def test_the_end_of_the_thread_gives_everything_back(node: Callable[..., Node]) -> None:
+    first, second = node("a", ENDLESS), node("b", ENDLESS)
     first.thread.want(["x", "y"])
     first.has("x", "y")
     second.thread.want(["x", "y"])
@@ -144,9 +144,10 @@ def test_the_end_of_the_thread_gives_everything_back(
 
 
 def test_what_is_asked_of_a_thread_that_has_ended_has_no_effect(
-    node: Callable[[str], Node],
+    node: Callable[..., Node],
 ) -> None:
     ended = node("a")
+    wire.until(lambda: ended.leases.reason is None, "it is connected")
     ended.thread.stop(LIMIT)
 
     async def work() -> None:
@@ -160,7 +161,7 @@ def test_what_is_asked_of_a_thread_that_has_ended_has_no_effect(
 
 
 def test_an_error_in_the_thread_closes_all_fences_and_the_leases_are_taken_again(
-    node: Callable[[str], Node], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     fails = threading.Event()
     original = Leases._take_free
@@ -171,7 +172,6 @@ def test_an_error_in_the_thread_closes_all_fences_and_the_leases_are_taken_again
         original(leases, now)
 
     monkeypatch.setattr(Leases, "_take_free", take_free)
-    monkeypatch.setattr(thread, "RETRIED", 0.01)
     one = node("a")
     one.thread.want(["x"])
     one.has("x")
@@ -185,7 +185,7 @@ def test_an_error_in_the_thread_closes_all_fences_and_the_leases_are_taken_again
 
 
 def test_a_node_that_can_not_use_its_devices_lets_others_have_them(
-    node: Callable[[str], Node],
+    node: Callable[..., Node],
 ) -> None:
     first, second = node("a"), node("b")
     first.thread.want(["x"])

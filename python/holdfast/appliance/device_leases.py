@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from holdfast import _core
     from holdfast.config import Config
+    from holdfast.leases import LeaseTimes
     from holdfast.types import ThreadHeartbeat
 
 ENDING = 2.0
@@ -49,11 +50,11 @@ def key_of(config: Config, device: str) -> str:
 class DeviceLeases:
     """The leases of all logs of a configuration."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, times: LeaseTimes | None) -> None:
         logs_used = set(leased(config).values()) | {
             memory.replicate.log for memory in config.memories.values() if memory.replicate
         }
-        self._of_log = {name: _LogLeases(name, config) for name in sorted(logs_used)}
+        self._of_log = {name: _LogLeases(name, config, times) for name in sorted(logs_used)}
         self._logs: dict[str, str] = {}
         self.adopt(config)
 
@@ -99,16 +100,18 @@ class _LogLeases:
 
     log: str
     config: Config
+    times: LeaseTimes | None
 
     def __post_init__(self) -> None:
         # Only an appliance with logs loads the client of NATS.
-        from holdfast.leases import Leases, LeaseThread
+        from holdfast.leases import LEASE_TIMES, Leases, LeaseThread
 
         settings = self.config.logs[self.log]
         self.leases = Leases(
             f"holdfast-log-{self.log}-devices",
             settings.node,
             self,
+            times=self.times or LEASE_TIMES,
             replicas=settings.replicas,
             about=lambda key: {"devices": self._devices.get(key, [])},
         )

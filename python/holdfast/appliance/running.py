@@ -52,6 +52,7 @@ if TYPE_CHECKING:
         RestConfig,
     )
     from holdfast.config.outputs import Output
+    from holdfast.leases import LeaseTimes
     from holdfast.types import ThreadHeartbeat
     from holdfast.web.https import Https
 
@@ -102,10 +103,19 @@ class Appliance:
     and `UnknownAdapter` if an adapter is not installed. Nothing is left running then. The ports of
     REST, gateway and metrics are tried again until they can be bound, because these services must
     not keep Modbus from starting. Without `retries_ports`, `start` raises `OSError` for them too.
+
+    `lease_times` are those of devices that several appliances could poll.
     """
 
-    def __init__(self, config: Config, *, retries_ports: bool = True) -> None:
+    def __init__(
+        self,
+        config: Config,
+        *,
+        retries_ports: bool = True,
+        lease_times: LeaseTimes | None = None,
+    ) -> None:
         self.config = config
+        self._lease_times = lease_times
         self._retries_ports = retries_ports
         self.memories = {name: kept.made(config, name) for name in config.memories}
         self._running: _Running | None = None
@@ -121,7 +131,12 @@ class Appliance:
                 if settings.keep is not None or settings.replicate is not None:
                     self.memories[name] = kept.made(self.config, name)
         self._was_started = True
-        self._running = _Running(self.config, self.memories, retries_ports=self._retries_ports)
+        self._running = _Running(
+            self.config,
+            self.memories,
+            retries_ports=self._retries_ports,
+            lease_times=self._lease_times,
+        )
         logs.write(
             logging.INFO, "started", version=_core.__version__, sha256=self.config.sha256 or "-"
         )
@@ -217,7 +232,12 @@ class _Running:
     """The parts of a running appliance. The constructor starts all of them or none."""
 
     def __init__(
-        self, config: Config, memories: dict[str, _core.Memory], *, retries_ports: bool
+        self,
+        config: Config,
+        memories: dict[str, _core.Memory],
+        *,
+        retries_ports: bool,
+        lease_times: LeaseTimes | None,
     ) -> None:
         self._config = config
         self._fingerprints = changes.fingerprints(config)
@@ -248,7 +268,7 @@ class _Running:
             undo.callback(self._kept.stop)
             self._logs = SharedLogs(config, memories)
             undo.callback(self._logs.stop)
-            self._leases = DeviceLeases(config)
+            self._leases = DeviceLeases(config, lease_times)
             assembly.mirror(config, memories)
             disabled = self._tell_disabled()
             self._audit = auditing.opened(config)

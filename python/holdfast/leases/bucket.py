@@ -24,7 +24,7 @@ from nats.js.api import (
 )
 from nats.js.errors import APIError, NoStreamResponseError, NotFoundError
 
-from holdfast.leases.entries import SETTLED, TTL, Entry, entry
+from holdfast.leases.entries import LEASE_TIMES, SETTLED, Entry, LeaseTimes, entry
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from nats.js import JetStreamContext
 
 TIMEOUT = 0.9
-"""Seconds to wait for an answer of JetStream: less than between two renewals."""
+"""Seconds to wait for an answer of JetStream that is not about a lease."""
 
 OPENING = 5.0
-"""The same while the bucket is opened."""
+"""The same while the bucket is made."""
 
 MARKER = 60.0
 """Seconds that the server keeps the mark of a key that has ended."""
@@ -106,10 +106,12 @@ async def made(jetstream: JetStreamContext, config: StreamConfig, replicas: int)
 class LeaseBucket:
     """One bucket, over one connection."""
 
-    def __init__(self, client: Client, name: str) -> None:
+    def __init__(self, client: Client, name: str, times: LeaseTimes = LEASE_TIMES) -> None:
         self.name = name
+        self._times = times
         self.client = client
         self._jetstream = client.jetstream(timeout=TIMEOUT)
+        self._reading = client.jetstream(timeout=times.answer_timeout_s)
         self._stream = f"KV_{name}"
         self._pre = f"$KV.{name}."
         self._opening = asyncio.Lock()
@@ -161,11 +163,12 @@ class LeaseBucket:
         return Entry(revision, None, time.monotonic())
 
     async def put(self, key: str, value: bytes, revision: int) -> int:
-        """Replaces the revision of a key, 0 if there is none, for `TTL`. Returns the new revision.
+        """Replaces the revision of a key, 0 if there is none, until its TTL ends.
 
-        Raises `Outdated` and the errors of nats-py.
+        Returns the new revision. Raises `Outdated` and the errors of nats-py.
         """
-        return await self._publish(key, value, revision, {"Nats-TTL": f"{TTL:.0f}s"})
+        ttl = {"Nats-TTL": f"{self._times.server_ttl_s}s"}
+        return await self._publish(key, value, revision, ttl)
 
     async def delete(self, key: str, revision: int) -> None:
         """Deletes a key, which is given back. Raises as `put` does."""
@@ -202,7 +205,7 @@ class LeaseBucket:
         try:
             reply = f"{self._inbox}.{number}"
             await self.client.publish(subject, value, reply=reply, headers=headers)
-            async with asyncio.timeout(TIMEOUT):
+            async with asyncio.timeout(self._times.answer_timeout_s):
                 return await answered
         except TimeoutError:
             raise NoAnswer from None
@@ -217,7 +220,7 @@ class LeaseBucket:
     async def get(self, key: str) -> Entry | None:
         """Reads a key. Raises the errors of nats-py."""
         try:
-            found = await self._jetstream.get_last_msg(self._stream, f"{self._pre}{key}")
+            found = await self._reading.get_last_msg(self._stream, f"{self._pre}{key}")
         except NotFoundError:
             return None
         return entry(found.seq or 0, found.headers, found.data or b"", time.monotonic())

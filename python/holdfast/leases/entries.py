@@ -2,25 +2,45 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 
-TTL = 3.0
-"""Seconds without a renewal after which others may take a lease. A whole number, for the server."""
-
-HELD = 2.0
-"""Seconds after the last renewal was sent after which its holder stops. The rest of `TTL` is for
-what is still on its way to a device."""
-
-RENEWED = 1.0
-"""Seconds between renewals."""
-
-
 SETTLED = "_settled"
-"""The key that says that a bucket has existed for `TTL`: leases of a lost one of the same name may
-still be used when it is made."""
+"""The key that says that a bucket has existed for `LeaseTimes.ttl_s`: leases of a lost one of the
+same name may still be used when it is made."""
+
+
+@dataclass(frozen=True)
+class LeaseTimes:
+    """The times of leases in seconds. All nodes of a bucket must have the same."""
+
+    ttl_s: float = 3.0
+    """Without a renewal for so long, others may take a lease."""
+    hold_s: float = 2.0
+    """So long after the last renewal was sent, its holder stops. The rest of `ttl_s` is for what is
+    still on its way to a device."""
+    renewal_s: float = 1.0
+    """Between renewals."""
+
+    def __post_init__(self) -> None:
+        assert 0 < self.renewal_s < self.hold_s < self.ttl_s, "each time leaves room for the next"
+
+    @property
+    def server_ttl_s(self) -> int:
+        """The TTL of a key, of which servers accept only whole numbers: not before `ttl_s`."""
+        return math.ceil(self.ttl_s)
+
+    @property
+    def answer_timeout_s(self) -> float:
+        """The time for one answer: if it is lost, the next renewal still comes in time."""
+        return 0.9 * (self.hold_s - self.renewal_s)
+
+
+LEASE_TIMES = LeaseTimes()
+"""The times of all leases, except in tests."""
 
 
 class Holding(msgspec.Struct, frozen=True, kw_only=True):
@@ -47,9 +67,9 @@ class Entry:
     is_given_back: bool = False
     """Whether its holder has ended all uses before it deleted the key."""
 
-    def is_live(self, now: float) -> bool:
+    def is_live(self, now: float, times: LeaseTimes) -> bool:
         """Whether somebody may still hold it. Clocks of other machines play no part."""
-        return self.holding is not None and now < self.seen + TTL
+        return self.holding is not None and now < self.seen + times.ttl_s
 
 
 def entry(revision: int, headers: dict[str, str] | None, value: bytes, now: float) -> Entry:

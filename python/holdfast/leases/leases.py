@@ -1,10 +1,9 @@
 """Holds leases: takes those that are free, renews them, and gives them back.
 
-Two clocks are never compared. A holder stops `HELD` seconds after it *sent* its last renewal; all
-others wait until they have not seen a renewal for `TTL` seconds, which is longer, and then replace
-exactly the revision that they have seen. If it was renewed meanwhile, that fails. So it does not
-matter when the server deletes a key, whether a message about it is late, or how long a process was
-stopped.
+Two clocks are never compared. A holder stops `hold_s` after it *sent* its last renewal; all others
+wait until they have not seen a renewal for `ttl_s`, which is longer, and then replace exactly the
+revision that they have seen. If it was renewed meanwhile, that fails. So it does not matter when
+the server deletes a key, whether a message about it is late, or how long a process was stopped.
 
 One event loop changes leases; what is held, and by whom, may be read from every thread.
 """
@@ -24,7 +23,7 @@ from nats.js.errors import NoStreamResponseError
 
 from holdfast import _core
 from holdfast.leases.bucket import LeaseBucket, NotALeaseBucket, Outdated
-from holdfast.leases.entries import HELD, RENEWED, SETTLED, TTL, Entry, Holding
+from holdfast.leases.entries import LEASE_TIMES, SETTLED, Entry, Holding, LeaseTimes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Mapping
@@ -37,8 +36,8 @@ if TYPE_CHECKING:
 TICK = 0.1
 """The longest time in seconds between two looks at what others hold."""
 
-SILENCE = 2.5
-"""Seconds without news, while renewals are confirmed, after which keys are followed anew."""
+SILENT_RENEWALS = 2.5
+"""Renewals without news, while they are confirmed, after which keys are followed anew."""
 
 RETRIED = 0.5
 """Seconds before the bucket is opened again after a failure."""
@@ -86,6 +85,7 @@ class Leases:
         node: str,
         watcher: Watcher,
         *,
+        times: LeaseTimes = LEASE_TIMES,
         replicas: int = 1,
         about: Callable[[str], dict[str, Any]] = lambda _: {},
         withheld: Callable[[], str | None] = lambda: None,
@@ -101,6 +101,7 @@ class Leases:
         self.is_read = False
         """Whether all keys are known that there were at the start."""
         self.bucket = bucket
+        self.times = times
         self._watcher = watcher
         self._withheld = withheld
         self._replicas = replicas
@@ -160,8 +161,8 @@ class Leases:
         """Who holds a lease, as far as is known."""
         if (own := self._held.get(key)) is not None:
             return own.holding
-        entry = self.seen.get(key)
-        return entry.holding if entry is not None and entry.is_live(time.monotonic()) else None
+        entry, now = self.seen.get(key), time.monotonic()
+        return entry.holding if entry is not None and entry.is_live(now, self.times) else None
 
     @property
     def reason(self) -> str | None:
@@ -177,7 +178,7 @@ class Leases:
                 self._check_bucket(now)
                 withheld = self._withheld()
                 if now >= due:
-                    due = now + RENEWED
+                    due = now + self.times.renewal_s
                     if withheld is None:
                         for key, held in self._held.items():
                             self._begin(self._renew(key, held))
@@ -242,16 +243,17 @@ class Leases:
         """
         if self._client is None or self._is_opening:
             return
-        if self._bucket is not None and now - self._heard > SILENCE:
+        silence_s = SILENT_RENEWALS * self.times.renewal_s
+        if self._bucket is not None and now - self._heard > silence_s:
             is_missing = any(key not in self._held for key in self._wanted)
-            if is_missing or now - self._acknowledged < SILENCE:
+            if is_missing or now - self._acknowledged < silence_s:
                 self._is_checked = False
         if not self._is_checked:
             self._is_opening = True
             self._begin(self._open(self._client))
 
     async def _open(self, client: Client) -> None:
-        bucket = self._bucket or LeaseBucket(client, self.bucket)
+        bucket = self._bucket or LeaseBucket(client, self.bucket, self.times)
         try:
             made = await bucket.open(self._replicas, self._latest)
             await bucket.unfollow()
@@ -276,7 +278,7 @@ class Leases:
             self._made_at = made.at
             self.seen.clear()
             self.is_read = False
-            self._may_settle_at = time.monotonic() + TTL
+            self._may_settle_at = time.monotonic() + self.times.ttl_s
 
     @property
     def _latest(self) -> int:
@@ -316,7 +318,7 @@ class Leases:
             if key in self._held or key in self._taking or key in self._ending:
                 continue
             entry = self.seen.get(key)
-            if entry is None or not entry.is_live(now) or self._is_own(entry):
+            if entry is None or not entry.is_live(now, self.times) or self._is_own(entry):
                 self._taking.add(key)
                 self._begin(self._take(self._bucket, key, entry))
 
@@ -364,9 +366,10 @@ class Leases:
         if made_at != self._made_at:
             return
         self.seen[key] = Entry(revision, holding, sent)
-        self._held[key] = _Held(revision, holding, revision, sent + HELD)
+        until = sent + self.times.hold_s
+        self._held[key] = _Held(revision, holding, revision, until)
         clean = entry is not None and entry.is_given_back
-        self.fence(key).open(sent + HELD, settle=0.0 if clean else TTL)
+        self.fence(key).open(until, settle=0.0 if clean else self.times.ttl_s)
         self._watcher.taken(key)
 
     async def _read(self, bucket: LeaseBucket, key: str) -> None:
@@ -396,7 +399,7 @@ class Leases:
             except (Error, OSError):
                 return  # The next renewal tries again, until the lease has lapsed.
             self._acknowledged = time.monotonic()
-            held.until = sent + HELD
+            held.until = sent + self.times.hold_s
             self._fences[key].renew(held.until)
 
     async def _look(self, bucket: LeaseBucket, key: str, held: _Held) -> None:
@@ -420,7 +423,8 @@ class Leases:
     def _note_lapsed(self, now: float, reason: str) -> None:
         """Gives up leases that could not be renewed for so long that others may have taken them."""
         for key, held in self._held.copy().items():
-            if now >= held.until - HELD + TTL and not held.lock.locked():
+            lapsed_at = held.until - self.times.hold_s + self.times.ttl_s
+            if now >= lapsed_at and not held.lock.locked():
                 self._give_up(key, reason)
 
     def _give_up(self, key: str, reason: str) -> None:

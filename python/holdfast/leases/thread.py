@@ -28,7 +28,7 @@ Connect: TypeAlias = "Callable[[Callable[[Client | None], None]], Coroutine[Any,
 StartThread: TypeAlias = "Callable[[threading.Thread], None]"
 """Starts a thread, with a priority that does not delay renewals."""
 
-RETRIED = 5.0
+RETRY_S = 5.0
 """Seconds before another attempt after a failure that is not of the network."""
 
 
@@ -41,8 +41,10 @@ class LeaseThread:
         connect: Connect,
         name: str,
         start_thread: StartThread = threading.Thread.start,
+        retry_s: float = RETRY_S,
     ) -> None:
         self._leases = leases
+        self._retry_s = retry_s
         self._start_thread = start_thread
         self._connect = connect
         self._name = name
@@ -141,7 +143,7 @@ class LeaseThread:
             except Exception as error:
                 logs.problem("leases_failed", bucket=self._leases.bucket)
                 self._leases.works(repr(error))
-            await asyncio.sleep(RETRIED)
+            await asyncio.sleep(self._retry_s)
 
     async def _keep(self) -> None:
         """Holds leases again after an error in this program: until then, others have them."""
@@ -150,7 +152,7 @@ class LeaseThread:
                 await self._leases.run()
             except Exception:
                 logs.problem("leases_failed", bucket=self._leases.bucket)
-            await asyncio.sleep(RETRIED)
+            await asyncio.sleep(self._retry_s)
 
 
 class Relay:

@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from holdfast import logs
-from holdfast.leases import RENEWED, TTL, Leases, LeaseThread, Relay
+from holdfast.leases import Leases, LeaseThread, Relay
 from holdfast.scanner.fleet.placement import partition_of, placed
 from holdfast.scanner.fleet.terms import FleetRefused, FleetSettings, Terms, digest
 
@@ -34,9 +34,6 @@ SETTLED = 0.05
 
 LOOKED = 0.5
 """The longest time in seconds between two looks at which leases have ended."""
-
-JOINING = 2 * TTL
-"""Seconds after which the name of a node is in use, if its lease is still renewed."""
 
 
 def leases_of(fleet: str) -> str:
@@ -90,6 +87,7 @@ class Fleet:
             leases_of(settings.name),
             settings.node,
             self._relay,
+            times=settings.lease_times,
             replicas=3,
             about=self._about,
             withheld=withheld,
@@ -204,12 +202,15 @@ class Fleet:
         )
 
     def _check_name(self) -> None:
-        """Raises `FleetRefused` if another process has had the name of this node for a while."""
+        """Raises `FleetRefused` if another process has the name of this node, and renews its lease.
+
+        One of a process that has died would have ended by then.
+        """
         holder = self.leases.holder(f"{NODE}{self.node}")
         now = time.monotonic()
         if holder is None or not self.is_other(holder) or self.leases.reason is not None:
             self._named_since = now
-        elif now - self._named_since > JOINING:
+        elif now - self._named_since > 2 * self.leases.times.ttl_s:
             raise FleetRefused(f"another process is the node {self.node}: give it another name")
 
     async def run(self) -> None:
@@ -231,7 +232,7 @@ class Fleet:
                 logs.write(logging.INFO, "fleet_changed", **fields)
                 known = nodes
             self._place(nodes)
-            if time.monotonic() > self._shown_at + RENEWED:
+            if time.monotonic() > self._shown_at + self.leases.times.renewal_s:
                 self._show()
 
     def _place(self, nodes: list[str]) -> None:

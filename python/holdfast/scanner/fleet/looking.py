@@ -12,7 +12,7 @@ import msgspec
 from nats.errors import Error, NoRespondersError
 from nats.js.errors import NotFoundError
 
-from holdfast.leases import Holding, LeaseBucket
+from holdfast.leases import LEASE_TIMES, Holding, LeaseBucket
 from holdfast.scanner.fleet.exchange import subject
 from holdfast.scanner.fleet.fleet import NODE, PARTITION, leases_of
 from holdfast.scanner.receiving import SafeClient, TlsClient
@@ -134,7 +134,7 @@ class Looker:
         live = {
             key: entry.holding
             for key, entry in self._seen.items()
-            if entry.is_live(now) and entry.holding is not None
+            if entry.is_live(now, LEASE_TIMES) and entry.holding is not None
         }
         nodes = {key.removeprefix(NODE): each for key, each in live.items() if key.startswith(NODE)}
         totals = [each.about.get("total", 0) for each in nodes.values()]

@@ -20,7 +20,7 @@ from nats.js.errors import NoStreamResponseError
 from holdfast import logs, tasks
 from holdfast.client.url import connection_of
 from holdfast.heartbeat import Heartbeat
-from holdfast.leases import TTL, Outdated
+from holdfast.leases import Outdated
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.fleet.exchange import About, Command, Executed, Told, subject
 from holdfast.scanner.fleet.fleet import Fleet
@@ -39,9 +39,6 @@ if TYPE_CHECKING:
 
 Reply = TypeVar("Reply", bound=msgspec.Struct)
 
-CHECKED = 5.0
-"""Seconds between looks whether changes of subscriptions still come."""
-
 OPENED = 0.5
 """Seconds between attempts to open the buckets."""
 
@@ -50,9 +47,6 @@ RETRIED = 10.0
 
 CHANGES = 20
 """Attempts to store a device that other nodes change at the same time."""
-
-MOVING = 6.0
-"""Seconds that a command waits for a node that polls its device: a takeover takes 3."""
 
 ASKED = 2.0
 """Seconds to wait for the answer of another node."""
@@ -112,6 +106,9 @@ class FleetPart:
         )
         self._heartbeat = Heartbeat()
         self.wants = Wants(settings.name, self._changed, self._replaced)
+        self._moving_s = 2 * settings.lease_times.ttl_s
+        """How long a command waits for a node that polls its device: twice a takeover."""
+        self._check_interval_s = settings.check_interval_s
         self._prefix = prefix
         self._host = host
         self._client: Client | None = None
@@ -190,7 +187,7 @@ class FleetPart:
         """
         while True:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(CHECKED):
+                async with asyncio.timeout(self._check_interval_s):
                     await self._is_new.wait()
             client = self._client
             if client is None:
@@ -349,7 +346,7 @@ class FleetPart:
         `own` carries it out here. It returns false, and writes nothing, if the device has moved.
         `check` refuses it if it is too late, and returns how many seconds it may wait.
         """
-        end = time.monotonic() + MOVING
+        end = time.monotonic() + self._moving_s
         why = f"no node polls {device.id} now"
         while True:
             left = check()
@@ -376,10 +373,10 @@ class FleetPart:
             tag=tag,
             text=text,
             epoch=0 if holding is None else holding.revision,
-            within=min(left, 2 * TTL),
+            within=min(left, self._moving_s),
         )
         # After this, it waits one timeout of the device for its turn, and one for the reply.
-        timeout = 2 * (TTL + device.source.timeout / 1000) + ASKED
+        timeout = self._moving_s + 2 * device.source.timeout / 1000 + ASKED
         try:
             done = await self._ask(owner, "command", command, Executed, timeout)
         except NoRespondersError:

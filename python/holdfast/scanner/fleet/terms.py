@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import msgspec
 
 from holdfast.config.scanning import PARTITIONS
+from holdfast.leases import LEASE_TIMES, LeaseTimes
 
 PROTOCOL = 1
 """The version of what nodes tell each other, in buckets and messages."""
@@ -25,6 +26,10 @@ class FleetSettings:
     node: str
     """The name of this scanner in the fleet; unique."""
     partitions: int = PARTITIONS
+    lease_times: LeaseTimes = LEASE_TIMES
+    """The same for all nodes, or two of them use a device."""
+    check_interval_s: float = 5.0
+    """Between looks whether changes of subscriptions still come."""
 
 
 def digest(terms: bytes) -> str:
