@@ -12,7 +12,7 @@ LONG = 2.0
 """Seconds between two looks that are a standstill. As long as a node of a fleet may use a device
 after it has renewed its lease."""
 
-LOOK = 0.5
+LOOK = LONG / 4
 """Seconds between two looks, at most, while the thread or event loop runs."""
 
 _CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", None)
@@ -26,9 +26,11 @@ def now() -> float:
 class Standstill:
     """The last standstill of a thread or event loop. Not thread-safe."""
 
-    def __init__(self, part: str) -> None:
-        """`part` is what the log calls it."""
+    def __init__(self, part: str, long_s: float = LONG) -> None:
+        """`part` is what the log calls it. `long_s` is the shortest standstill."""
         self._part = part
+        self._long_s = long_s
+        self.look_interval_s = min(long_s / 4, LOOK)
         self._looked: float | None = None
         self.ended = -math.inf
         """When the last standstill was detected, by `now`."""
@@ -36,9 +38,12 @@ class Standstill:
         """How many seconds it lasted."""
 
     def look(self) -> None:
-        """Detects a standstill. Call it every `LOOK` seconds, and before what may be too late."""
+        """Detects a standstill.
+
+        Call it every `look_interval_s`, and before what may be too late.
+        """
         before, self._looked = self._looked, now()
-        if before is not None and self._looked - before > LONG:
+        if before is not None and self._looked - before > self._long_s:
             self.ended, self.lasted = self._looked, self._looked - before
             seconds = round(self.lasted, 1)
             logs.write(logging.WARNING, "stood_still", part=self._part, seconds=seconds)

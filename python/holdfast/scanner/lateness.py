@@ -15,7 +15,7 @@ from nats.errors import Error
 from holdfast.faults import EXPIRES_AFTER
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.receiving import Received
-from holdfast.standstill import LOOK, Standstill, now
+from holdfast.standstill import Standstill, now
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,8 +37,8 @@ class Lateness:
     Afterwards the server is pinged: what it sends after its answer is new.
     """
 
-    def __init__(self) -> None:
-        self._standstill = Standstill("scanner")
+    def __init__(self, standstill_s: float) -> None:
+        self._standstill = Standstill("scanner", standstill_s)
 
     def check(self, message: Msg) -> float:
         """Returns how many seconds a command may wait now.
@@ -63,4 +63,4 @@ class Lateness:
             if connected is not None:
                 with contextlib.suppress(Error, OSError):  # A new connection is pinged, too.
                     await connected.prove(since=self._standstill.ended)
-            await asyncio.sleep(LOOK)
+            await asyncio.sleep(self._standstill.look_interval_s)

@@ -71,6 +71,7 @@ from holdfast.scanner.rivals import Rivals
 from holdfast.scanner.rules import Defaults, Rules
 from holdfast.scanner.variables import of_device, variables
 from holdfast.scanner.watching import WATCH_TIMES, WatchTimes
+from holdfast.standstill import LONG
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -158,6 +159,8 @@ class Settings:
     """The fleet of scanners that it is a node of."""
     watch_times: WatchTimes = WATCH_TIMES
     """Those of the buckets of tentacle-next."""
+    standstill_s: float = LONG
+    """The shortest time without the event loop after which commands that waited are refused."""
 
 
 class Scanner:
@@ -217,7 +220,7 @@ class Scanner:
             )
         )
         self._expiring = Expiring()
-        self._lateness = Lateness()
+        self._lateness = Lateness(settings.standstill_s)
         self._configured: Configured | None = None
         self._enabling: Enabling | None = None
         if self._is_next:
