@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import signal
 import sys
 import threading
 import time
@@ -12,20 +14,33 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.scanner import FleetSettings, Servers
+from holdfast.leases import LeaseTimes
+from holdfast.scanner import FleetRefused, FleetSettings, Servers, Settings
 from support import nats_cluster, wire
-from support.fleet_nodes import Commands, Nodes, are_polled, known, subscribed, wanted
+from support.fleet_nodes import (
+    FLEET,
+    Commands,
+    are_polled,
+    known,
+    ports_of,
+    prepare,
+    subscribed,
+    wanted,
+)
 from support.judges import Judges
-from support.nats_bus import Caller, logged
+from support.leases import BRIEF
+from support.nats_bus import Caller, Running, logged
+from support.scanner_process import begin_scanner, freeze
 from support.tcp_proxy import Proxy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
+    from holdfast.config.scanning import Writes
     from support.brokers import NatsServer
     from support.judges import Judge
-    from support.nats_bus import Run, Running
+    from support.nats_bus import Run
     from support.nats_cluster import NatsCluster
 
 IS_LONG = os.environ.get("HOLDFAST_TORTURE") == "1"
@@ -49,16 +64,39 @@ def judges() -> Iterator[Judges]:
 
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[NatsCluster]:
-    yield from nats_cluster.running(tmp_path)
+    for cluster in nats_cluster.running(tmp_path):
+        prepare(cluster.urls[0], PARTITIONS, replicas=3)
+        yield cluster
+
+
+@pytest.fixture
+def server(own_nats: NatsServer) -> NatsServer:
+    prepare(own_nats.url, PARTITIONS)
+    return own_nats
+
+
+@pytest.fixture
+def proxies(server: NatsServer) -> Iterator[list[Proxy]]:
+    proxies = [Proxy(server.port, "nats") for _ in range(2)]
+    yield proxies
+    for proxy in proxies:
+        proxy.close()
 
 
 @pytest.fixture
 def node(run_scanner: Run) -> Callable[..., Running]:
-    def start(name: str, *urls: str) -> Running:
-        fleet = FleetSettings("plant", name, PARTITIONS)
-        return run_scanner(servers=Servers(urls), fleet=fleet)
+    def start(name: str, *urls: str, lease_times: LeaseTimes = BRIEF) -> Running:
+        return run_scanner(servers=Servers(urls), fleet=fleet(name, lease_times))
 
     return start
+
+
+def fleet(name: str, lease_times: LeaseTimes = BRIEF) -> FleetSettings:
+    return FleetSettings(FLEET, name, PARTITIONS, lease_times, check_interval_s=0.5)
+
+
+def settings(name: str, url: str, writes: Writes = "tags") -> Settings:
+    return Settings(Servers((url,)), writes=writes, fleet=fleet(name))
 
 
 def partitions(running: Running) -> int:
@@ -104,21 +142,21 @@ EVERYTHING = {f"d{number}": ["hmi"] for number in range(DEVICES)}
 
 
 def test_servers_that_lose_their_storage_get_everything_again(
+    server: NatsServer,
     node: Callable[..., Running],
-    own_nats: NatsServer,
     judges: Judges,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO, "holdfast")
-    nodes = [node(name, own_nats.url) for name in "abc"]
+    nodes = [node(name, server.url) for name in "abc"]
     share(*nodes)
-    with Caller(own_nats.url) as caller:
+    with Caller(server.url) as caller:
         subscribe_all(caller, judges)
-        commands = Commands(caller, judges.devices, 20.0)
-        own_nats.kill()
+        commands = Commands(caller, judges.devices, 20.0, BRIEF)
+        server.kill()
         until_left(judges)
-        own_nats.lose_store()
-        own_nats.start()
+        server.lose_store()
+        server.start()
         wire.until(lambda: all(each.serves for each in nodes), "they serve")
         share(*nodes)
         until_scanned(judges)
@@ -133,7 +171,7 @@ def test_servers_that_lose_their_storage_get_everything_again(
         # A node that starts now finds them, and changes reach all.
         for each in nodes:
             each.stop()
-        share(node("d", own_nats.url))
+        share(node("d", server.url))
         until_scanned(judges)
         reply = caller.request("modbus.unsubscribe", {"deviceId": "d0", "subscriberId": "hmi"})
         assert reply == {"success": True}
@@ -142,11 +180,11 @@ def test_servers_that_lose_their_storage_get_everything_again(
 
 
 def test_buckets_that_are_deleted_are_made_again(
-    node: Callable[..., Running], own_nats: NatsServer, judges: Judges
+    server: NatsServer, node: Callable[..., Running], judges: Judges
 ) -> None:
-    nodes = [node(name, own_nats.url) for name in "ab"]
+    nodes = [node(name, server.url) for name in "ab"]
     share(*nodes)
-    with Caller(own_nats.url) as caller:
+    with Caller(server.url) as caller:
         subscribe_all(caller, judges)
         for bucket in (WANTS, LEASES):
             caller.do(caller.client.jetstream().delete_stream(f"KV_{bucket}"))
@@ -159,50 +197,50 @@ def test_buckets_that_are_deleted_are_made_again(
 
 
 def test_the_newest_of_what_nodes_know_is_restored(
-    node: Callable[..., Running], own_nats: NatsServer, judges: Judges
+    server: NatsServer, proxies: list[Proxy], node: Callable[..., Running], judges: Judges
 ) -> None:
     """One node was without NATS while subscriptions changed, and is the first to be back."""
-    proxies = [Proxy(own_nats.port, "nats") for _ in range(2)]
-    try:
-        late, other = (node(name, each.url) for name, each in zip("ab", proxies, strict=True))
-        share(late, other)
-        with Caller(own_nats.url) as caller:
-            subscribe_all(caller, judges)
-            registries = [running.scanner._registry for running in (late, other)]
-            wire.until(lambda: all(len(each.devices) == DEVICES for each in registries), "known")
-            proxies[0].down()
-            wire.until(lambda: partitions(other) == PARTITIONS, "the other node has all")
-            ended = {"deviceId": "d0", "subscriberId": "hmi"}
-            assert caller.request("modbus.unsubscribe", ended)["success"]
-            added = wanted(judges.devices[1], 1, subscriberId="trend")
-            assert caller.request("modbus.subscribe", added)["success"]
-            own_nats.kill()
-            proxies[1].down()
-            own_nats.lose_store()
-            own_nats.start()
-            proxies[0].up()
-            wire.until(lambda: len(caller.kept(WANTS)) > DEVICES, "what it knows is stored")
-            proxies[1].up()
-            expected = {**EVERYTHING, "d1": ["hmi", "trend"]}
-            del expected["d0"]
-            wire.until(lambda: late.serves and other.serves, "they serve")
-            for each in registries:
-                wire.until(
-                    partial(lambda of: subscribers(of) == expected, each), "the newest is known"
-                )
-    finally:
-        for proxy in proxies:
-            proxy.close()
+    late, other = (node(name, each.url) for name, each in zip("ab", proxies, strict=True))
+    share(late, other)
+    with Caller(server.url) as caller:
+        subscribe_all(caller, judges)
+        registries = [running.scanner._registry for running in (late, other)]
+        wire.until(lambda: all(len(each.devices) == DEVICES for each in registries), "known")
+        proxies[0].down()
+        wire.until(lambda: partitions(other) == PARTITIONS, "the other node has all")
+        ended = {"deviceId": "d0", "subscriberId": "hmi"}
+        assert caller.request("modbus.unsubscribe", ended)["success"]
+        added = wanted(judges.devices[1], 1, subscriberId="trend")
+        assert caller.request("modbus.subscribe", added)["success"]
+        server.kill()
+        proxies[1].down()
+        server.lose_store()
+        server.start()
+        proxies[0].up()
+        wire.until(lambda: len(caller.kept(WANTS)) > DEVICES, "what it knows is stored")
+        proxies[1].up()
+        expected = {**EVERYTHING, "d1": ["hmi", "trend"]}
+        del expected["d0"]
+        wire.until(lambda: late.serves and other.serves, "they serve")
+        for each in registries:
+            wire.until(partial(lambda of: subscribers(of) == expected, each), "the newest is known")
 
 
 def subscribers(registry: Any) -> dict[str, list[str]]:
     return {id: sorted(device.subscribers) for id, device in registry.devices.copy().items()}
 
 
+def first_of(cluster: NatsCluster, node: Callable[..., Running]) -> Running:
+    """A node that has made the buckets: servers may give others no answer meanwhile."""
+    first = node("a", *cluster.urls)
+    share(first)
+    return first
+
+
 def test_without_a_quorum_devices_rest(
-    node: Callable[..., Running], cluster: NatsCluster, judges: Judges
+    cluster: NatsCluster, node: Callable[..., Running], judges: Judges
 ) -> None:
-    nodes = [node(name, *cluster.urls) for name in "abc"]
+    nodes = [first_of(cluster, node), *(node(name, *cluster.urls) for name in "bc")]
     share(*nodes)
     with Caller(cluster.urls) as caller:
         subscribe_all(caller, judges)
@@ -226,9 +264,9 @@ def test_without_a_quorum_devices_rest(
 
 
 def test_a_subscription_reaches_all_nodes_after_a_server_has_ended(
-    node: Callable[..., Running], cluster: NatsCluster, judges: Judges
+    cluster: NatsCluster, node: Callable[..., Running], judges: Judges
 ) -> None:
-    nodes = [node(name, *cluster.urls) for name in "ab"]
+    nodes = [first_of(cluster, node), node("b", *cluster.urls)]
     share(*nodes)
     registries = [running.scanner._registry for running in nodes]
     with Caller(cluster.urls) as caller:
@@ -248,43 +286,45 @@ def has(registry: Any, device: str) -> bool:
 
 @pytest.mark.parametrize("comes_late", [True, False])
 def test_a_node_whose_connection_is_half_open_is_replaced(
-    node: Callable[..., Running], own_nats: NatsServer, judges: Judges, comes_late: bool
+    server: NatsServer,
+    proxies: list[Proxy],
+    node: Callable[..., Running],
+    judges: Judges,
+    comes_late: bool,
 ) -> None:
     """What it has sent meanwhile comes late, or never."""
-    proxy = Proxy(own_nats.port, "nats")
-    try:
-        half, other = node("a", proxy.url), node("b", own_nats.url)
+    [proxy, _] = proxies
+    half, other = node("a", proxy.url), node("b", server.url)
+    share(half, other)
+    with Caller(server.url) as caller:
+        subscribe_all(caller, judges)
+        commands = Commands(caller, judges.devices, 20.0, BRIEF)
+        proxy.hold()
+        wire.until(lambda: partitions(other) == PARTITIONS, "the other node has all")
+        wire.until(lambda: not partitions(half), "it has none")
+        until_scanned(judges)
+        if not comes_late:
+            proxy.down()
+        proxy.go_on()
+        proxy.up()
         share(half, other)
-        with Caller(own_nats.url) as caller:
-            subscribe_all(caller, judges)
-            commands = Commands(caller, judges.devices, 20.0)
-            proxy.hold()
-            wire.until(lambda: partitions(other) == PARTITIONS, "the other node has all")
-            wire.until(lambda: not partitions(half), "it has none")
-            until_scanned(judges)
-            if not comes_late:
-                proxy.down()
-            proxy.go_on()
-            proxy.up()
-            share(half, other)
-            until_scanned(judges)
-            commands.stop()
-            commands.check()
-    finally:
-        proxy.close()
+        until_scanned(judges)
+        commands.stop()
+        commands.check()
     check(judges)
 
 
 def test_wall_time_may_jump(
+    server: NatsServer,
     node: Callable[..., Running],
-    own_nats: NatsServer,
     judges: Judges,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    nodes = [node(name, own_nats.url) for name in "ab"]
+    times = LeaseTimes(renewal_s=0.2)
+    nodes = [node(name, server.url, lease_times=times) for name in "ab"]
     share(*nodes)
-    with Caller(own_nats.url) as caller:
+    with Caller(server.url) as caller:
         subscribe_all(caller, judges)
         [timed, *_] = judges.devices
         subscribed(caller, 0, timed, scanRate=100, ttl=3600)
@@ -314,76 +354,80 @@ def are_renewed(nodes: list[Running], revisions: list[int]) -> bool:
     return found > sum(revisions)
 
 
-def test_one_of_two_nodes_with_one_name_is_refused(
-    own_nats: NatsServer, judges: Judges, tmp_path: Path
-) -> None:
-    nodes = Nodes([own_nats.url], tmp_path, PARTITIONS)
-    with Caller(own_nats.url) as caller:
-        both = [nodes.begin("twin"), nodes.begin("twin")]
-        try:
-            wire.until(lambda: any(each.poll() is not None for each in both), "one ends")
-            [refused] = [each for each in both if each.poll() is not None]
-            assert refused.returncode == 2
-            assert "another process is the node twin: give it another name" in nodes.log("twin")
-            subscribe_all(caller, judges)
-            assert [each.poll() for each in both].count(None) == 1
-        finally:
-            for each in both:
-                each.kill()
-                each.wait()
+def test_one_of_two_nodes_with_one_name_is_refused(server: NatsServer, judges: Judges) -> None:
+    with Caller(server.url) as caller, both(twin(server), twin(server)) as nodes:
+        refused, other = one_refused(nodes)
+        assert str(refused) == "another process is the node twin: give it another name"
+        subscribe_all(caller, judges)
+        assert not other.ended.done()
     check(judges)
 
 
-def test_one_of_two_nodes_with_other_settings_is_refused(
-    own_nats: NatsServer, tmp_path: Path
-) -> None:
-    nodes = Nodes([own_nats.url], tmp_path, PARTITIONS)
-    # They may replace the settings of nodes that have ended.
-    nodes.start("former")
-    nodes.settle()
-    nodes.stop()
-    nodes.running.clear()
-    wire.until(lambda: not nodes.shown(), "nobody is left")
-    both = {name: nodes.begin(name, more=["--writes", name]) for name in ("explicit", "none")}
+def twin(server: NatsServer) -> Settings:
+    return settings("twin", server.url)
+
+
+@contextlib.contextmanager
+def both(*of_nodes: Settings) -> Iterator[list[Running]]:
+    """Nodes that start at the same time, and may be refused."""
+    nodes = list(map(Running, of_nodes))
     try:
-        wire.until(lambda: any(each.poll() is not None for each in both.values()), "one ends")
-        [refused] = [name for name, each in both.items() if each.poll() is not None]
-        assert both[refused].returncode == 2
-        [other] = set(both) - {refused}
-        assert f"writes is {refused}, and {other} in the fleet" in nodes.log(refused)
-        wire.until(lambda: nodes.shown() == [other], "the other one is the fleet")
+        yield nodes
     finally:
-        for each in both.values():
-            each.kill()
-            each.wait()
+        for each in nodes:
+            with contextlib.suppress(FleetRefused):
+                each.stop()
+
+
+def one_refused(nodes: list[Running]) -> tuple[BaseException | None, Running]:
+    """Waits until one of two nodes ends. Returns its error, and the other node."""
+    wire.until(lambda: any(each.ended.done() for each in nodes), "one ends")
+    [refused] = [each for each in nodes if each.ended.done()]
+    [other] = [each for each in nodes if each is not refused]
+    return refused.ended.exception(), other
+
+
+def test_one_of_two_nodes_with_other_settings_is_refused(
+    server: NatsServer, node: Callable[..., Running]
+) -> None:
+    # They may replace the settings of nodes that have ended.
+    former = node("former", server.url)
+    share(former)
+    former.stop()
+    names: tuple[Writes, Writes] = ("explicit", "none")
+    with both(*(settings(each, server.url, writes=each) for each in names)) as nodes:
+        refused, other = one_refused(nodes)
+        [own, theirs] = names if other is nodes[1] else reversed(names)
+        assert isinstance(refused, FleetRefused)
+        assert str(refused) == f"writes is {own}, and {theirs} in the fleet"
+        share(other)
 
 
 def test_a_stopped_node_ends_when_another_process_has_its_name(
-    own_nats: NatsServer, judges: Judges, tmp_path: Path
+    server: NatsServer, node: Callable[..., Running], judges: Judges, tmp_path: Path
 ) -> None:
-    nodes = Nodes([own_nats.url], tmp_path, PARTITIONS)
-    with Caller(own_nats.url) as caller:
-        try:
-            nodes.start("a")
-            nodes.start("b")
-            nodes.settle()
+    log = tmp_path / "former.log"
+    former = begin_scanner(settings("a", server.url), log)
+    try:
+        other = node("b", server.url)
+        wire.until(lambda: partitions(other) == PARTITIONS // 2, "they share the partitions")
+        with Caller(server.url) as caller:
             subscribe_all(caller, judges)
-            judges.frozen |= nodes.freeze("a")
-            former = nodes.running.pop("a")
-            wire.until(lambda: nodes.shown() == ["b"], "the other node has all")
-            nodes.start("a")
-            nodes.settle()
+            freeze(former)
+            judges.frozen |= ports_of(former.pid)
+            wire.until(lambda: partitions(other) == PARTITIONS, "the other node has all")
+            nodes = [node("a", server.url), other]
+            share(*nodes)
             until_scanned(judges)
-            commands = Commands(caller, judges.devices, 50.0)
-            nodes.resume(former)
-            assert former.wait(wire.DEADLINE) == 2
+            commands = Commands(caller, judges.devices, 50.0, BRIEF)
+            former.send_signal(signal.SIGCONT)
+            assert former.wait(wire.DEADLINE) == 1
             commands.stop()
             commands.check()
-            assert "another process is the node a" in nodes.log("a")
-            nodes.settle()
+            assert "another process is the node a" in log.read_text()
+            share(*nodes)
             until_scanned(judges)
-        finally:
-            former.kill()
-            former.wait()
-            nodes.stop()
+    finally:
+        former.kill()
+        former.wait()
     check(judges)

@@ -5,15 +5,19 @@ from __future__ import annotations
 import asyncio
 import math
 import threading
+import time
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from holdfast.leases import LEASE_TIMES, LeaseTimes
 from holdfast.scanner import FleetSettings
 from holdfast.scanner.fleet import part as parts
 from support import wire
+from support.fleet_nodes import FLEET, prepare
 from support.judges import Judges
+from support.leases import BRIEF
 from support.nats_bus import Caller, logged
 
 if TYPE_CHECKING:
@@ -29,9 +33,11 @@ DEVICES = 4
 
 
 @pytest.fixture
-def node(own_nats: NatsServer, run_scanner: Run) -> Callable[[str], Running]:
-    def start(name: str) -> Running:
-        return run_scanner(own_nats, fleet=FleetSettings("plant", name, PARTITIONS))
+def node(own_nats: NatsServer, run_scanner: Run) -> Callable[..., Running]:
+    prepare(own_nats.url, PARTITIONS)
+
+    def start(name: str, lease_times: LeaseTimes = LEASE_TIMES) -> Running:
+        return run_scanner(own_nats, fleet=FleetSettings(FLEET, name, PARTITIONS, lease_times))
 
     return start
 
@@ -85,14 +91,15 @@ def polled(judges: Judges) -> None:
 
 
 def test_a_busy_event_loop_loses_no_device(
-    node: Callable[[str], Running],
+    node: Callable[..., Running],
     own_nats: NatsServer,
     judges: Judges,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(parts, "HANGING", math.inf)
-    one, two = node("a"), node("b")
+    times = LeaseTimes(ttl_s=2.0, hold_s=1.5, renewal_s=0.2)
+    one, two = node("a", times), node("b", times)
     share(one, two)
     subscribe(own_nats, judges)
     polled(judges)
@@ -103,6 +110,8 @@ def test_a_busy_event_loop_loses_no_device(
         key = f"partition.{fleet.partitions[0]}"
         revision = seen[key].revision
         # Blocks the event loop for longer than a lease lasts.
+        end = time.monotonic() + times.ttl_s
+        wire.until(lambda: time.monotonic() > end, "it would have ended")
         wire.until(lambda: seen[key].revision > revision + 10 * len(held), "renewals go on")
 
     one.do(be_busy())
@@ -113,12 +122,12 @@ def test_a_busy_event_loop_loses_no_device(
 
 
 def test_others_take_over_from_a_node_whose_event_loop_hangs(
-    node: Callable[[str], Running], own_nats: NatsServer, judges: Judges
+    node: Callable[..., Running], own_nats: NatsServer, judges: Judges
 ) -> None:
     class Hangs:
         age = math.inf
 
-    one, two = node("a"), node("b")
+    one, two = node("a", BRIEF), node("b", BRIEF)
     share(one, two)
     subscribe(own_nats, judges)
     part = part_of(one)
@@ -131,9 +140,9 @@ def test_others_take_over_from_a_node_whose_event_loop_hangs(
 
 
 def test_others_take_over_from_a_node_that_can_publish_nothing(
-    node: Callable[[str], Running], own_nats: NatsServer, judges: Judges
+    node: Callable[..., Running], own_nats: NatsServer, judges: Judges
 ) -> None:
-    one, two = node("a"), node("b")
+    one, two = node("a", BRIEF), node("b", BRIEF)
     share(one, two)
     subscribe(own_nats, judges)
     part, client = part_of(one), one.scanner._broker.client
@@ -150,7 +159,7 @@ def test_others_take_over_from_a_node_that_can_publish_nothing(
 
 
 def test_the_connection_of_leases_is_made_again(
-    node: Callable[[str], Running], own_nats: NatsServer, judges: Judges
+    node: Callable[..., Running], own_nats: NatsServer, judges: Judges
 ) -> None:
     one, two = node("a"), node("b")
     share(one, two)
@@ -165,7 +174,7 @@ def test_the_connection_of_leases_is_made_again(
     polled(judges)
 
 
-def test_the_thread_of_leases_ends_with_the_node(node: Callable[[str], Running]) -> None:
+def test_the_thread_of_leases_ends_with_the_node(node: Callable[..., Running]) -> None:
     one = node("a")
     share(one)
     one.stop()

@@ -6,21 +6,28 @@ import asyncio
 import json
 import subprocess
 import sys
+import time
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from nats.errors import TimeoutError as NoAnswer
 
-from holdfast.scanner import FleetSettings, service
+from holdfast.config.scanning import parse_pollable
+from holdfast.leases import LEASE_TIMES, LeaseTimes
+from holdfast.scanner import FleetRefused, FleetSettings, Scanner, Servers, Settings, service
+from holdfast.scanner.keeping import Unit
 from support import wire
 from support.cli import invoke
+from support.fleet_nodes import FLEET, prepare
 from support.judges import Judges
+from support.leases import BRIEF
 from support.nats_bus import Caller
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from holdfast.scanner.expiring import Expiring
     from support.brokers import NatsServer
     from support.judges import Judge
     from support.nats_bus import Run, Running
@@ -37,9 +44,10 @@ def judges() -> Iterator[Judges]:
 
 @pytest.fixture
 def node(own_nats: NatsServer, run_scanner: Run) -> Callable[..., Running]:
-    def start(name: str, **more: Any) -> Running:
-        fleet = FleetSettings("plant", name, more.pop("partitions", PARTITIONS))
-        return run_scanner(own_nats, fleet=fleet, **more)
+    prepare(own_nats.url, PARTITIONS)
+
+    def start(name: str, lease_times: LeaseTimes = LEASE_TIMES) -> Running:
+        return run_scanner(own_nats, fleet=FleetSettings(FLEET, name, PARTITIONS, lease_times))
 
     return start
 
@@ -264,18 +272,33 @@ def test_messages_have_the_revision_of_the_lease(
 def test_a_subscription_ends_by_its_ttl_unless_any_node_renews_it(
     node: Callable[..., Running], caller: Caller, judges: Judges
 ) -> None:
-    one, two = node("a"), node("b")
-    share(one, two)
+    nodes = [node("a"), node("b")]
+    share(*nodes)
     timed, kept, *_ = judges.devices
-    caller.request("modbus.subscribe", wanted(kept, 1))
-    caller.request("modbus.subscribe", wanted(timed, 0, ttl=2))
+    assert caller.request("modbus.subscribe", wanted(kept, 1))["success"]
+    assert caller.request("modbus.subscribe", wanted(timed, 0, ttl=1000))["success"]
+    unit = Unit("d0", "hmi")
+    times = [running.scanner._expiring for running in nodes]
+    wire.until(lambda: all(unit in each._ends for each in times), "both nodes know it")
     for _ in range(3):
-        polls = len(timed.polls)
-        wire.until(partial(is_polled, timed, polls + 5), "it is polled")
-        assert caller.request("modbus.subscribe", wanted(timed, 0, ttl=2))["success"]
+        before = [each._ends[unit] for each in times]
+        assert caller.request("modbus.subscribe", wanted(timed, 0, ttl=1000))["success"]
+        wire.until(partial(are_later, times, unit, before), "both nodes have renewed it")
+    for running in nodes:
+        running.do(let_pass(running.scanner._expiring, 1000))
     wire.until(lambda: caller.request("modbus.browse", "")["count"] == 1, "it has ended")
-    registries = [running.scanner._registry for running in (one, two)]
+    registries = [running.scanner._registry for running in nodes]
     wire.until(lambda: all(len(each.devices) == 1 for each in registries), "for all")
+
+
+def are_later(times: list[Expiring], unit: Unit, before: list[float]) -> bool:
+    return all(each._ends[unit] > end for each, end in zip(times, before, strict=True))
+
+
+async def let_pass(expiring: Expiring, seconds: float) -> None:
+    """Moves the clock of the subscriptions of a node."""
+    expiring._clock = lambda: time.monotonic() + seconds
+    expiring._news.set()
 
 
 def test_one_node_or_all_are_shut_down(node: Callable[..., Running], caller: Caller) -> None:
@@ -292,37 +315,49 @@ def test_one_node_or_all_are_shut_down(node: Callable[..., Running], caller: Cal
         caller.request("modbus.browse", "")
 
 
-def refused(server: NatsServer, *options: str) -> str:
-    """Starts a scanner that the fleet refuses. Returns what it says."""
-    command = [sys.executable, "-m", "holdfast", "scan", "--nats", server.url, "--fleet", "plant"]
-    found = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
-    assert found.returncode == 2, found
-    [said] = [line for line in found.stderr.splitlines() if line.startswith("holdfast: ")]
-    return said
-
-
 @pytest.mark.parametrize(
-    ("option", "value", "said"),
+    ("other", "said"),
     [
-        ("--prefix", "other", "prefix is other, and modbus in the fleet"),
-        ("--partitions", "8", "partitions is 8, and 16 in the fleet"),
-        ("--writes", "none", "writes is none, and tags in the fleet"),
-        ("--allow", "10.0.0.0/8", "allow is ['10.0.0.0/8'], and [] in the fleet"),
+        ({"prefix": "other"}, "prefix is other, and modbus in the fleet"),
+        ({"writes": "none"}, "writes is none, and tags in the fleet"),
+        (
+            {"allow": (parse_pollable("10.0.0.0/8"),)},
+            "allow is ['10.0.0.0/8'], and [] in the fleet",
+        ),
     ],
 )
 def test_other_settings_are_refused_and_named(
-    node: Callable[..., Running], own_nats: NatsServer, option: str, value: str, said: str
+    node: Callable[..., Running], own_nats: NatsServer, other: dict[str, Any], said: str
 ) -> None:
-    node("a")
-    options = {"--node": "b", "--partitions": str(PARTITIONS), option: value}
-    shown = refused(own_nats, *(word for pair in options.items() for word in pair))
-    assert shown == f"holdfast: fleet plant: {said}"
+    share(node("a"))
+    fleet = FleetSettings(FLEET, "b", PARTITIONS)
+    settings = Settings(Servers((own_nats.url,)), fleet=fleet, **other)
+
+    async def run() -> None:
+        async with asyncio.timeout(wire.DEADLINE):
+            await Scanner(settings).run()
+
+    with pytest.raises(FleetRefused) as refused:
+        asyncio.run(run())
+    assert str(refused.value) == said
+
+
+def test_a_process_that_is_refused_says_why_and_ends(
+    node: Callable[..., Running], own_nats: NatsServer
+) -> None:
+    share(node("a"))
+    command = [sys.executable, "-m", "holdfast", "scan", "--nats", own_nats.url, "--fleet", FLEET]
+    command += ["--node", "b", "--partitions", "8"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert found.returncode == 2, found
+    [said] = [line for line in found.stderr.splitlines() if line.startswith("holdfast: ")]
+    assert said == f"holdfast: fleet plant: partitions is 8, and {PARTITIONS} in the fleet"
 
 
 def test_without_nats_devices_rest_and_come_back(
     node: Callable[..., Running], caller: Caller, judges: Judges, own_nats: NatsServer
 ) -> None:
-    running = node("a")
+    running = node("a", BRIEF)
     [judge, *_] = judges.devices
     caller.request("modbus.subscribe", wanted(judge))
     wire.until(lambda: len(judge.polls) > 3, "it is polled")

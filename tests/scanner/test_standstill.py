@@ -4,37 +4,44 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import signal
-import subprocess
 import sys
 import threading
 import time
+from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
 
-from holdfast.scanner import FleetSettings, lateness
+from holdfast.scanner import FleetSettings, Servers, Settings, lateness
 from holdfast.scanner.fleet.exchange import Command, subject
-from holdfast.standstill import LONG
 from support import wire
 from support.fake_device import FakeDevice, registers
-from support.fleet_nodes import Nodes, subscribed, wanted
+from support.fleet_nodes import FLEET, prepare, subscribed, wanted
 from support.judges import Judges
+from support.leases import BRIEF
 from support.nats_bus import Caller, logged, subscription, tag
+from support.scanner_process import begin_scanner, freeze
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from concurrent.futures import Future
     from pathlib import Path
+    from subprocess import Popen
 
     import holdfast
     from support.brokers import NatsServer
     from support.nats_bus import Run, Running
 
 LATE = "not written: this scanner stood still for"
+
+STANDSTILL_S = 0.5
+"""A loaded machine can cause one, too: what is sent after it has to be repeated."""
+
+PARTITIONS = 4
+LOG = "scanner.log"
 
 needs_stopping = pytest.mark.skipif(sys.platform == "win32", reason="can't stop a process")
 
@@ -46,19 +53,24 @@ def judges() -> Iterator[Judges]:
 
 
 @pytest.fixture
-def process(own_nats: NatsServer) -> Iterator[subprocess.Popen[bytes]]:
-    """A scanner as a process."""
-    command = [sys.executable, "-m", "holdfast", "scan", "--nats", own_nats.url]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as running:
-        yield running
-        running.kill()
+def process(own_nats: NatsServer, tmp_path: Path) -> Iterator[Callable[..., Popen[bytes]]]:
+    """Starts a scanner as a process."""
+    with ExitStack() as running:
+
+        def start(**more: Any) -> Popen[bytes]:
+            settings = Settings(Servers((own_nats.url,)), standstill_s=STANDSTILL_S, **more)
+            started = running.enter_context(begin_scanner(settings, tmp_path / LOG))
+            running.callback(started.kill)
+            return started
+
+        yield start
 
 
 @pytest.fixture
-def nodes(own_nats: NatsServer, tmp_path: Path) -> Iterator[Nodes]:
-    nodes = Nodes([own_nats.url], tmp_path, 4)
-    yield nodes
-    nodes.stop()
+def node(own_nats: NatsServer, run_scanner: Run) -> Callable[..., Running]:
+    """Starts a scanner that is the only node of a fleet."""
+    prepare(own_nats.url, PARTITIONS)
+    return lambda **more: run_scanner(own_nats, fleet=FleetSettings(FLEET, "a", PARTITIONS), **more)
 
 
 def send(caller: Caller, where: str, payload: bytes) -> Future[Any]:
@@ -73,20 +85,21 @@ def send(caller: Caller, where: str, payload: bytes) -> Future[Any]:
     return sent
 
 
-def stand(pid: int, during: Callable[[], Sequence[Future[Any]]]) -> list[Any]:
+def stand(
+    process: Popen[bytes], during: Callable[[], Sequence[Future[Any]]], seconds: float
+) -> list[Any]:
     """Stops a process, and returns the answers to what was sent to it meanwhile."""
-    os.kill(pid, signal.SIGSTOP)
+    freeze(process)
     try:
-        os.waitid(os.P_PID, pid, os.WSTOPPED | os.WNOWAIT)
         sent = during()
-        until_late()
+        until_late(seconds)
     finally:
-        os.kill(pid, signal.SIGCONT)
+        process.send_signal(signal.SIGCONT)
     return [each.result(3 * wire.DEADLINE) for each in sent]
 
 
-def until_late() -> None:
-    end = time.monotonic() + LONG + 0.5
+def until_late(seconds: float = STANDSTILL_S) -> None:
+    end = time.monotonic() + seconds + 0.1
     wire.until(lambda: time.monotonic() > end, "it stood still for long enough")
 
 
@@ -96,9 +109,10 @@ def is_done(caller: Caller, where: str, text: str) -> bool:
 
 @needs_stopping
 def test_commands_that_waited_for_a_stopped_scanner_are_refused(
-    process: subprocess.Popen[bytes], own_caller: Caller, judges: Judges
+    process: Callable[..., Popen[bytes]], own_caller: Caller, judges: Judges
 ) -> None:
     [judge] = judges.devices
+    running = process()
     subscribed(own_caller, 0, judge)
     wire.until(partial(is_done, own_caller, "modbus.command.t0", "1"), "it is written")
 
@@ -107,7 +121,7 @@ def test_commands_that_waited_for_a_stopped_scanner_are_refused(
             own_caller.publish("modbus.command.t0", "2")
         return [send(own_caller, "modbus.command.d0.t0", b"3") for _ in range(3)]
 
-    for answer in stand(process.pid, during):
+    for answer in stand(running, during, STANDSTILL_S):
         assert answer["success"] is False
         assert answer["error"].startswith(LATE)
         assert answer["error"].endswith("send it again if it is still wanted")
@@ -117,23 +131,28 @@ def test_commands_that_waited_for_a_stopped_scanner_are_refused(
 
 @needs_stopping
 def test_commands_that_waited_for_a_stopped_node_are_refused(
-    nodes: Nodes, own_caller: Caller, judges: Judges
+    process: Callable[..., Popen[bytes]],
+    own_nats: NatsServer,
+    own_caller: Caller,
+    judges: Judges,
+    tmp_path: Path,
 ) -> None:
     [judge] = judges.devices
-    name = nodes.start()
+    prepare(own_nats.url, PARTITIONS)
+    running = process(fleet=FleetSettings(FLEET, "a", PARTITIONS, BRIEF))
     subscribed(own_caller, 0, judge)
     wire.until(partial(is_done, own_caller, "modbus.command.d0.t0", "1"), "it is written")
 
     def during() -> list[Future[Any]]:
         return [send(own_caller, "modbus.command.d0.t0", b"3") for _ in range(3)]
 
-    # It loses its leases, and takes them again.
-    for answer in stand(nodes.running[name].pid, during):
+    # Its leases lapse, and it renews them.
+    for answer in stand(running, during, BRIEF.hold_s):
         assert answer["success"] is False
         assert answer["error"].startswith(LATE)
     wire.until(partial(is_done, own_caller, "modbus.command.d0.t0", "4"), "it is written")
     assert {value for _, value in judge.writes} == {1, 4}
-    assert "stood_still" in nodes.log(name)
+    assert "stood_still" in (tmp_path / LOG).read_text()
 
 
 class Blocked:
@@ -155,10 +174,10 @@ class Blocked:
 
 
 def test_a_command_of_another_node_is_refused_by_a_node_whose_loop_did_not_run(
-    run_scanner: Run, own_nats: NatsServer, own_caller: Caller, judges: Judges
+    node: Callable[..., Running], own_caller: Caller, judges: Judges
 ) -> None:
     [judge] = judges.devices
-    running = run_scanner(own_nats, fleet=FleetSettings("plant", "a", 4))
+    running = node(standstill_s=STANDSTILL_S)
     subscribed(own_caller, 0, judge)
     wire.until(partial(is_done, own_caller, "modbus.command.d0.t0", "1"), "it is written")
     part = running.scanner._part
@@ -180,13 +199,12 @@ def test_a_command_of_another_node_is_refused_by_a_node_whose_loop_did_not_run(
 
 
 def test_a_command_of_another_node_waits_as_long_as_that_node_allows(
-    run_scanner: Run,
-    own_nats: NatsServer,
+    node: Callable[..., Running],
     own_caller: Caller,
     judges: Judges,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    running = run_scanner(own_nats, fleet=FleetSettings("plant", "a", 4))
+    running = node()
     subscribed(own_caller, 0, judges.devices[0])
     wire.until(partial(is_done, own_caller, "modbus.command.d0.t0", "1"), "it is written")
     part, allowed = running.scanner._part, list[float]()
@@ -208,7 +226,7 @@ def test_a_command_of_another_node_waits_as_long_as_that_node_allows(
 def test_a_standstill_is_logged_once(
     run_scanner: Run, caller: Caller, caplog: pytest.LogCaptureFixture
 ) -> None:
-    blocked = Blocked(run_scanner())
+    blocked = Blocked(run_scanner(standstill_s=STANDSTILL_S))
     try:
         until_late()
     finally:
@@ -217,7 +235,7 @@ def test_a_standstill_is_logged_once(
     wire.until(lambda: logged(caplog, "stood_still"), "it is logged")
     [first, *_] = logged(caplog, "stood_still")
     assert first["part"] == "scanner"
-    assert first["seconds"] >= LONG
+    assert first["seconds"] >= STANDSTILL_S
 
 
 def test_a_command_that_waited_for_long_in_the_scanner_is_refused(
@@ -253,13 +271,13 @@ def test_a_command_that_waited_for_long_for_its_device_is_refused(
     with FakeDevice(answer) as line:
         of = {"subscriberId": "x", "url": line.url, "scanRate": 60_000}
         slow = {**of, "deviceId": "slow", "timeout": 30_000, "tags": [tag("b", 0)]}
-        other = {**of, "deviceId": "a", "unitId": 2, "tags": [tag("a", 0)]}
+        other = {**of, "deviceId": "a", "unitId": 2, "timeout": 1000, "tags": [tag("a", 0)]}
         try:
             assert caller.request("modbus.subscribe", slow)["success"]
             assert is_reading.wait(wire.DEADLINE)
             assert caller.request("modbus.subscribe", other)["success"]
             with monkeypatch.context() as patched:
-                patched.setattr(lateness, "WAITED", 2.0)
+                patched.setattr(lateness, "WAITED", 1.0)
                 refused = caller.request("modbus.command.a", "3")
         finally:
             go_on.set()
@@ -273,9 +291,9 @@ def test_a_command_that_waited_for_long_for_its_device_is_refused(
 
 
 def test_a_node_passes_no_command_on_that_waited_for_long(
-    run_scanner: Run, own_nats: NatsServer, own_caller: Caller, monkeypatch: pytest.MonkeyPatch
+    node: Callable[..., Running], own_caller: Caller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    running = run_scanner(own_nats, fleet=FleetSettings("plant", "a", 4))
+    running = node()
     part = running.scanner._part
     assert part is not None
     with Judges(1) as judges:
@@ -290,7 +308,7 @@ def test_a_node_passes_no_command_on_that_waited_for_long(
 def test_requests_that_change_nothing_of_a_device_are_answered_after_a_standstill(
     run_scanner: Run, own_nats: NatsServer, own_caller: Caller, judges: Judges
 ) -> None:
-    running = run_scanner(own_nats)
+    running = run_scanner(own_nats, standstill_s=STANDSTILL_S)
     blocked = Blocked(running)
     try:
         request = json.dumps(wanted(judges.devices[0], 0)).encode()

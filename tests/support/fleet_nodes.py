@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -15,8 +14,12 @@ from typing import TYPE_CHECKING
 
 from nats.errors import Error
 
+from holdfast.leases import LEASE_TIMES, LeaseTimes
+from holdfast.scanner.fleet.fleet import PARTITION, leases_of
 from support import wire
 from support.cli import invoke
+from support.leases import make_settled
+from support.scanner_process import freeze
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,11 +31,14 @@ if TYPE_CHECKING:
 
 FLEET = "plant"
 
-TIMEOUT = 20.0
-"""Seconds to wait for the answer to a command: longer than the fleet looks for its node."""
+REPEATED_S = 3.0
+"""Time for the answer to a request, before it is sent again."""
 
-ANSWERED = 10.0
-"""Seconds to wait for the answer to a request that is sent again."""
+
+def prepare(url: str, partitions: int, replicas: int = 1) -> None:
+    """Leaves a server as a fleet does that has ended: its next nodes wait for no former one."""
+    keys = (f"{PARTITION}{number}" for number in range(partitions))
+    make_settled(url, leases_of(FLEET), keys, replicas)
 
 
 class Nodes:
@@ -45,41 +51,20 @@ class Nodes:
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         self._numbers = itertools.count(1)
 
-    def start(self, name: str | None = None, urls: Sequence[str] | None = None) -> str:
+    def start(self, name: str | None = None) -> None:
         name = name or f"n{next(self._numbers)}"
-        self.running[name] = self.begin(name, urls)
-        return name
-
-    def begin(
-        self, name: str, urls: Sequence[str] | None = None, more: Sequence[str] = ()
-    ) -> subprocess.Popen[bytes]:
-        """Starts a process, which is not looked after."""
         options = ["--fleet", FLEET, "--node", name, "--partitions", str(self._partitions)]
-        command = [sys.executable, "-m", "holdfast", "scan", *_servers(urls or self._urls)]
-        with self._log(name).open("ab") as log:
-            return subprocess.Popen([*command, *options, *more], stdout=log, stderr=log)
-
-    def _log(self, name: str) -> Path:
-        return self._folder / f"{name}.log"
-
-    def log(self, name: str) -> str:
-        """What a node has logged."""
-        return self._log(name).read_text(errors="replace")
+        command = [sys.executable, "-m", "holdfast", "scan", *_servers(self._urls), *options]
+        with (self._folder / f"{name}.log").open("ab") as log:
+            self.running[name] = subprocess.Popen(command, stdout=log, stderr=log)
 
     def freeze(self, name: str) -> set[tuple[int, int]]:
         """Stops a process. Returns the ports of its connections: its own, and the other one."""
-        process = self.running[name]
-        process.send_signal(signal.SIGSTOP)
-        os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOWAIT)
-        return ports_of(process.pid)
+        freeze(self.running[name])
+        return ports_of(self.running[name].pid)
 
     def thaw(self, name: str) -> None:
         self.running[name].send_signal(signal.SIGCONT)
-
-    @staticmethod
-    def resume(process: subprocess.Popen[bytes]) -> None:
-        """Resumes a process that is not looked after any more."""
-        process.send_signal(signal.SIGCONT)
 
     def kill(self, name: str) -> None:
         process = self.running.pop(name)
@@ -156,7 +141,7 @@ def subscribed(caller: Caller, number: int, judge: Judge, **more: object) -> Non
     def is_subscribed() -> bool:
         # With a server that ends, a request or its answer may be lost.
         with suppress(Error, TimeoutError):
-            return bool(caller.request("modbus.subscribe", request, ANSWERED)["success"])
+            return bool(caller.request("modbus.subscribe", request, REPEATED_S)["success"])
         return False
 
     wire.until(is_subscribed, f"d{number} is subscribed")
@@ -200,7 +185,11 @@ class Published:
 class Commands:
     """Sends commands all the time, each with another value, and checks that answers are true."""
 
-    def __init__(self, caller: Caller, judges: Sequence[Judge], rate: float) -> None:
+    def __init__(
+        self, caller: Caller, judges: Sequence[Judge], rate: float, times: LeaseTimes = LEASE_TIMES
+    ) -> None:
+        """Sends `rate` commands a second to a fleet with these times."""
+        self._timeout_s = 4 * times.ttl_s  # The fleet looks for a node for half of it.
         self._caller = caller
         self._judges = judges
         self._pause = 1 / rate
@@ -223,7 +212,7 @@ class Commands:
     async def _send(self, number: int, value: int) -> None:
         subject, text = f"modbus.command.d{number}.t{number}", str(value).encode()
         try:
-            reply = await self._caller.client.request(subject, text, timeout=TIMEOUT)
+            reply = await self._caller.client.request(subject, text, timeout=self._timeout_s)
             answer = json.loads(reply.data)
         except (Error, OSError) as error:
             answer = {"success": False, "error": f"not confirmed: {error!r}"}
