@@ -22,8 +22,11 @@ if TYPE_CHECKING:
 
 Answer = TypeVar("Answer")
 
-ASKED = 2.0
-"""Seconds to wait for the cluster to tell of a stream."""
+TIMEOUT_S = 1.0
+"""Time for the cluster to tell of a stream. It may give no answer as long as it has no leader."""
+
+LOOKS = 50
+"""Looks at a stream over one connection."""
 
 TRIED = "tried"
 """A stream that is made to see whether the cluster works."""
@@ -65,28 +68,26 @@ class NatsCluster:
         """Waits until a stream has a leader. Returns the name of that server."""
         found: list[str] = []
 
-        def is_led() -> bool:
-            info = self._info(stream)
-            if info is not None and info.cluster is not None and info.cluster.leader:
+        def is_led(info: StreamInfo) -> bool:
+            if info.cluster is not None and info.cluster.leader:
                 found.append(info.cluster.leader)
             return bool(found)
 
-        wire.until(is_led, f"{stream} has a leader")
+        self._until(stream, is_led, f"{stream} has a leader")
         return found[-1]
 
     def until_whole(self, stream: str) -> None:
         """Waits until all replicas of a stream have all of it."""
 
-        def is_whole() -> bool:
-            info = self._info(stream)
-            if info is None or info.cluster is None or not info.cluster.leader:
+        def is_whole(info: StreamInfo) -> bool:
+            if info.cluster is None or not info.cluster.leader:
                 return False
             replicas = info.cluster.replicas or []
             return len(replicas) == 2 and all(
                 each.current and not each.offline for each in replicas
             )
 
-        wire.until(is_whole, f"{stream} has all replicas")
+        self._until(stream, is_whole, f"{stream} has all replicas")
 
     def _stores(self) -> bool:
         """Whether a stream can have a replica on each server."""
@@ -97,8 +98,16 @@ class NatsCluster:
 
         return bool(asyncio.run(self._asked(stores)))
 
-    def _info(self, stream: str) -> StreamInfo | None:
-        return asyncio.run(self._asked(lambda jetstream: jetstream.stream_info(stream)))
+    def _until(self, stream: str, condition: Callable[[StreamInfo], bool], what: str) -> None:
+        async def is_met(jetstream: JetStreamContext) -> bool:
+            for _ in range(LOOKS):
+                if condition(await jetstream.stream_info(stream)):
+                    return True
+                await asyncio.sleep(0.02)
+            return False
+
+        # The server that is asked may end, or have no answer.
+        wire.until(lambda: asyncio.run(self._asked(is_met)), what)
 
     async def _asked(
         self, request: Callable[[JetStreamContext], Coroutine[Any, Any, Answer]]
@@ -109,7 +118,7 @@ class NatsCluster:
         client = Client()
         try:
             await client.connect(list(self.urls), allow_reconnect=False, error_cb=ignore)
-            return await request(client.jetstream(timeout=ASKED))
+            return await request(client.jetstream(timeout=TIMEOUT_S))
         except (Error, JetStreamError, OSError):
             return None
         finally:
