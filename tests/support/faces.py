@@ -82,6 +82,17 @@ def dialling(name: str) -> Iterator[Dial]:
         yield dial
 
 
+def connected(dial: Dial, url: str, timeout: float) -> Face:
+    """A client with a connection: it sends its next request however short the timeout of that is.
+
+    The device must answer a first request.
+    """
+    client = dial(url)
+    client.read_coils(0, 1)
+    client.timeout = timeout
+    return client
+
+
 def run(main: Callable[[], Coroutine[Any, Any, Result]]) -> Result:
     """Runs a coroutine in debug mode, and checks that no exception was lost."""
     faults: list[dict[str, Any]] = []

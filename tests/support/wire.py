@@ -80,6 +80,20 @@ def until(condition: Callable[[], object], what: str, seconds: float = DEADLINE)
         between_looks.wait(0.002)
 
 
+def until_long_enough(
+    condition: Callable[[float], object], what: str, seconds: float = 0.1
+) -> None:
+    """Calls the condition with a time to wait for, until it holds; each has twice the time.
+
+    It is for what must happen before a timeout ends that the test waits for. A loaded machine may
+    need longer, any other one does not wait that long.
+    """
+    while not condition(seconds):
+        seconds *= 2
+        if seconds > DEADLINE:
+            raise AssertionError(f"not within {seconds / 2:g} s: {what}")
+
+
 def until_taken(client: socket.socket) -> None:
     """Waits until the peer on this machine has read all that was sent, where Linux tells (IPv4)."""
     if sys.platform != "linux":
