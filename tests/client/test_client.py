@@ -16,6 +16,7 @@ import time
 import warnings
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,7 @@ from holdfast.server import Identity
 from holdfast.types import AREAS
 from support import lines, transports, wire
 from support.faces import FACES, Awaited, Dial, Face, dialling, run
-from support.fake_device import ScriptedDevice, Stream, Udp, silent
+from support.fake_device import ScriptedDevice, Stream, Udp, good, silent
 from support.paths import DOCS
 from support.running import endpoint
 
@@ -817,20 +818,28 @@ def test_a_call_may_be_cancelled_while_its_reply_is_read() -> None:
 
 @pytest.mark.parametrize("kind", ["udp", "rtu+tcp"])
 def test_a_call_in_a_thread_may_be_cancelled(kind: str) -> None:
-    async def main() -> None:
-        with device_of(kind, silent) as device:
-            async with holdfast.Client(device.url, timeout=3) as plc:
+    async def is_cancelled(timeout: float) -> bool:
+        with device_of(kind, good, silent) as device:
+            async with holdfast.Client(device.url, timeout=wire.DEADLINE) as plc:
+                assert await plc.read_holding_registers(0, 1) == [0]
+                plc.timeout, began = timeout, time.monotonic()
                 under_way = asyncio.create_task(plc.write_register(1, 1))
-                await asyncio.to_thread(device.await_requests, 1)
+                await asyncio.to_thread(device.await_requests, 2)
                 waiting = asyncio.create_task(plc.write_register(2, 1))
                 await asyncio.sleep(0)
-                await cancelled(waiting)
-                await cancelled(under_way)
+                waiting.cancel()
+                under_way.cancel()
+                await asyncio.wait([waiting, under_way])
+                if time.monotonic() - began >= timeout:
+                    return False
+                assert waiting.cancelled()
+                assert under_way.cancelled()
                 plc.timeout = wire.DEADLINE
                 assert await plc.read_holding_registers(7, 1) == [7]
-                assert [asked.pdu[2] for asked in device.requests] == [1, 7]
+                assert [asked.pdu[2] for asked in device.requests] == [0, 1, 7]
+                return True
 
-    run(main)
+    wire.until_long_enough(lambda timeout: run(partial(is_cancelled, timeout)), "it is cancelled")
 
 
 def device_of(kind: str, *script: Behaviour, **options: Any) -> ScriptedDevice:
@@ -838,17 +847,22 @@ def device_of(kind: str, *script: Behaviour, **options: Any) -> ScriptedDevice:
 
 
 def test_timeouts_of_others_leave_a_cancelled_call_alone() -> None:
-    async def main() -> None:
-        with Stream("tcp", then=silent) as device:
-            async with holdfast.Client(device.url, timeout=2, max_in_flight=3) as plc:
+    async def is_cancelled(timeout: float) -> bool:
+        with Stream("tcp", good, then=silent) as device:
+            async with holdfast.Client(device.url, timeout=wire.DEADLINE, max_in_flight=3) as plc:
+                assert await plc.read_coils(0, 1) == [False]
+                plc.timeout, began = timeout, time.monotonic()
                 tasks = [asyncio.create_task(plc.read_coils(at, 1)) for at in range(3)]
-                await asyncio.to_thread(device.await_requests, 3)
-                await cancelled(tasks[0])
-                for task in tasks[1:]:
-                    with pytest.raises(holdfast.RequestTimeout):
-                        await task
+                await asyncio.to_thread(device.await_requests, 4)
+                tasks[0].cancel()
+                results = await asyncio.gather(*tasks, return_exceptions=True)
+                if not tasks[0].cancelled():
+                    assert time.monotonic() - began >= timeout
+                    return False
+                assert [type(result) for result in results[1:]] == 2 * [holdfast.RequestTimeout]
+                return True
 
-    run(main)
+    wire.until_long_enough(lambda timeout: run(partial(is_cancelled, timeout)), "it is cancelled")
 
 
 # Closing while calls wait
