@@ -10,7 +10,7 @@ import pytest
 from holdfast._core import Endpoint, Fence, PolledDevice, Request
 from support import wire
 from support.fake_device import Stream
-from support.native_poller import ReportingPoller, device, taken, written
+from support.native_poller import TIMEOUT, ReportingPoller, device, taken, written
 from support.polled import Fake, data
 
 if TYPE_CHECKING:
@@ -145,19 +145,27 @@ def test_a_write_without_the_lease_is_not_sent(poller: ReportingPoller, fake: Fa
 def test_writes_wait_for_what_a_former_holder_has_sent_and_keep_their_order(
     poller: ReportingPoller, fake: Fake
 ) -> None:
-    fence = Fence()
-    poller.add(device(fake, interval=0.01, timeout=2.0, fence=fence))
-    opened = time.monotonic()
-    fence.open(opened + FAR, settle=0.5)
-    tickets = [poller.write("a", Request.write_register(3, value)) for value in range(5)]
-    polls, writes = taken(poller, lambda _, writes: len(writes) == 5)
-    assert polls, "it is polled meanwhile"
-    # Half a second, and the timeout of the device.
-    assert time.monotonic() >= opened + 2.5
-    assert writes == [(ticket, 0) for ticket in tickets]
-    sent = [asked.pdu for asked in fake.requests if asked.pdu[0] == 6]
-    assert [pdu[-1] for pdu in sent] == list(range(5))
-    written(poller, poller.write("a", Request.write_register(3, 9)))
+    def are_written(timeout: float) -> bool:
+        fence = Fence()
+        before = len(fake.requests)
+        poller.add(device(fake, interval=0.01, timeout=timeout, fence=fence))
+        opened = time.monotonic()
+        fence.open(opened + FAR, settle=timeout)
+        tickets = [poller.write("a", Request.write_register(3, value)) for value in range(5)]
+        polls, writes = taken(poller, lambda _, writes: len(writes) == 5)
+        assert polls, "it is polled meanwhile"
+        # The time to settle, and the timeout of the device.
+        assert time.monotonic() >= opened + 2 * timeout
+        written(poller, poller.write("a", Request.write_register(3, 9)))
+        poller.remove("a")
+        if any(fault == TIMEOUT for _, fault in writes):
+            return False
+        assert writes == [(ticket, 0) for ticket in tickets]
+        sent = [asked.pdu for asked in fake.requests[before:] if asked.pdu[0] == 6]
+        assert [pdu[-1] for pdu in sent] == [*range(5), 9]
+        return True
+
+    wire.until_long_enough(are_written, "all are answered", 0.3)
 
 
 def test_a_write_that_waits_is_refused_when_the_lease_is_lost(

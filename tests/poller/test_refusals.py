@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
 
-INTERVAL = 0.02
+INTERVAL = 0.005
 
 
 def fields(addresses: Iterable[int], count: int = 1, area: str = "holding_registers") -> list[Any]:
@@ -177,7 +177,7 @@ def test_a_device_whose_replies_are_wrong_is_given_a_rest(poller: ReportingPolle
 def test_a_write_that_succeeds_ends_a_rest(poller: ReportingPoller) -> None:
     """The rest would take longer than a test waits."""
     with Fake(lambda _: None) as fake:
-        poller.add(device(fake, interval=0.02, timeout=1, retry=(3600, 3600)))
+        poller.add(device(fake, interval=0.02, timeout=0.2, retry=(3600, 3600)))
         polls, _ = taken(poller, lambda polls, _: len(polls) == 3)
         assert polls[-1][2][0][4] == TIMEOUT
         fake.answer = without([])

@@ -89,9 +89,9 @@ def until_long_enough(
     need longer, any other one does not wait that long.
     """
     while not condition(seconds):
+        if seconds > DEADLINE / 8:
+            raise AssertionError(f"not within {seconds:g} s: {what}")
         seconds *= 2
-        if seconds > DEADLINE:
-            raise AssertionError(f"not within {seconds / 2:g} s: {what}")
 
 
 def until_taken(client: socket.socket) -> None:
