@@ -159,7 +159,7 @@ def max_insert(fields: Sequence[Field], rules: Rules, fill: int) -> int:
     return count
 
 
-@settings(max_examples=examples(400))
+@settings(max_examples=examples(60))
 @given(problem=problems(), max_gap=st.integers(0, 60))
 def test_a_plan_by_gap_reads_every_field_and_no_larger_hole(
     problem: tuple[list[Field], Rules], max_gap: int
@@ -170,7 +170,7 @@ def test_a_plan_by_gap_reads_every_field_and_no_larger_hole(
     assert all(end - start <= max_gap for block in blocks for start, end in holes(fields, block))
 
 
-@settings(max_examples=examples(400))
+@settings(max_examples=examples(60))
 @given(problem=problems(), request=PRICES, register=PRICES)
 def test_a_plan_by_cost_reads_every_field(
     problem: tuple[list[Field], Rules], request: float, register: float
@@ -179,7 +179,7 @@ def test_a_plan_by_cost_reads_every_field(
     check(fields, rules, planned(fields, rules, cost=(request, register)))
 
 
-@settings(max_examples=examples(400))
+@settings(max_examples=examples(60))
 @given(problem=problems(), request=PRICES, register=PRICES, max_gap=st.integers(0, 60))
 def test_no_plan_is_cheaper_than_the_one_by_cost(
     problem: tuple[list[Field], Rules], request: float, register: float, max_gap: int
@@ -191,7 +191,7 @@ def test_no_plan_is_cheaper_than_the_one_by_cost(
     assert best <= cost(fields, request, register) + 1e-6
 
 
-@settings(max_examples=examples(300))
+@settings(max_examples=examples(60))
 @given(problem=problems(), request=PRICES, register=PRICES)
 def test_the_plan_by_cost_is_the_best_of_all_ways_to_cut(
     problem: tuple[list[Field], Rules], request: float, register: float
@@ -212,7 +212,7 @@ def test_the_plan_by_cost_is_the_best_of_all_ways_to_cut(
     assert found == pytest.approx(min(ways, default=0))
 
 
-@settings(max_examples=examples(400))
+@settings(max_examples=examples(60))
 @given(problem=problems(ranges=False), fill=st.integers(0, 125))
 def test_a_plan_by_gap_needs_no_more_requests_than_max_insert(
     problem: tuple[list[Field], Rules], fill: int
@@ -222,7 +222,7 @@ def test_a_plan_by_gap_needs_no_more_requests_than_max_insert(
     assert len(blocks) <= max_insert(fields, rules, fill)
 
 
-@settings(max_examples=examples(400))
+@settings(max_examples=examples(60))
 @given(problem=problems(ranges=False), request=st.sampled_from([0.0, 1.0, 50.0]))
 def test_where_registers_cost_nothing_no_rule_needs_fewer_requests(
     problem: tuple[list[Field], Rules], request: float
@@ -232,7 +232,7 @@ def test_where_registers_cost_nothing_no_rule_needs_fewer_requests(
     assert len(blocks) <= max_insert(fields, rules, 2000)
 
 
-@settings(max_examples=examples(200))
+@settings(max_examples=examples(60))
 @given(problem=problems(ranges=False), request=st.just(0.0))
 def test_where_requests_cost_nothing_no_hole_is_read(
     problem: tuple[list[Field], Rules], request: float
@@ -324,7 +324,7 @@ def test_a_forbidden_read_is_named() -> None:
         planning.plan(HOLDING, {"forbidden": [("coils", 1, 9)]})
 
 
-@settings(max_examples=examples(200))
+@settings(max_examples=examples(60))
 @given(problem=problems(ranges=False), fill=st.integers(0, 125))
 def test_the_preset_max_insert_is_telegrafs(problem: tuple[list[Field], Rules], fill: int) -> None:
     fields, rules = problem

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast import values
 from holdfast.tools.clock_fields import length
 from holdfast.tools.segments import divide
+from support.cases import examples
 
 
 @given(
     st.lists(st.lists(st.integers(0, 65535), min_size=9, max_size=9), min_size=1, max_size=3),
 )
+@settings(max_examples=examples(50))
 def test_every_register_belongs_to_one_value(reads: list[list[int]]) -> None:
     division = divide(reads)
     at = 0

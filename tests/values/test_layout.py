@@ -36,7 +36,7 @@ def layouts(draw: st.DrawFn) -> list[Field]:
 blocks = st.lists(st.integers(0, 65535), min_size=SIZE, max_size=SIZE)
 
 
-@settings(max_examples=examples(200))
+@settings(max_examples=examples(60))
 @given(layouts(), blocks)
 def test_a_layout_decodes_as_its_fields_one_by_one(fields: list[Field], block: list[int]) -> None:
     layout = Layout(fields, size=SIZE)
@@ -55,7 +55,7 @@ def test_a_layout_decodes_as_its_fields_one_by_one(fields: list[Field], block: l
     assert repr(layout.decode(array("H", block))) == repr(expected)
 
 
-@settings(max_examples=examples(200))
+@settings(max_examples=examples(60))
 @given(layouts(), blocks)
 def test_a_layout_encodes_what_it_decodes(fields: list[Field], block: list[int]) -> None:
     layout = Layout(fields, size=SIZE)
