@@ -441,31 +441,47 @@ def test_a_silent_unit_is_exception_0b_and_the_others_are_served(
         if asked.unit == 1:
             good(asked)
 
-    with Stream("tcp", then=only_one) as device:
-        appliance = run(configuration(device.url, link={"timeout": 1.0}))
-        with wire.Connection(scada(appliance)) as other:
-            front = connect(scada(appliance))
-            for _ in range(4):
-                assert front.ask(READ, unit=2) == exception(READ, 0x0B)
-                assert other.ask(READ, unit=1) == FIVE
-        assert counters(appliance)["timeouts"] + counters(appliance)["refused_down"] == 4
-        assert counters(appliance)["replies"] == 4
+    def are_served(timeout: float) -> bool:
+        with Stream("tcp", then=only_one) as device:
+            appliance = run(configuration(device.url, link={"timeout": timeout}))
+            with wire.Connection(scada(appliance)) as other:
+                front = connect(scada(appliance))
+                for _ in range(4):
+                    assert front.ask(READ, unit=2) == exception(READ, 0x0B)
+                    reply = other.ask(READ, unit=1)
+                    if reply == exception(READ, 0x0B):
+                        return False
+                    assert reply == FIVE
+            assert counters(appliance)["timeouts"] + counters(appliance)["refused_down"] == 4
+            assert counters(appliance)["replies"] == 4
+            return True
+
+    wire.until_long_enough(are_served, "the others have replies")
 
 
 def test_a_late_reply_is_not_the_answer_to_the_next_request(run: Run, connect: Connect) -> None:
-    def late(asked: Asked) -> None:
-        """Answers when the next request is there, before the reply to that one."""
-        waiting.append(asked.frame())
+    six = bytes.fromhex("0300060001")
 
-    def next_one(asked: Asked) -> None:
-        asked.send(*waiting, asked.frame())
+    def is_answered(timeout: float) -> bool:
+        waiting: list[bytes] = []
 
-    waiting: list[bytes] = []
-    with Stream("tcp", late, next_one) as device:
-        front = connect(scada(run(configuration(device.url, link={"timeout": 1.0}))))
-        assert front.ask(READ) == exception(READ, 0x0B)
-        six = bytes.fromhex("0300060001")
-        assert front.ask(six) == bytes.fromhex("03020006")
+        def late(asked: Asked) -> None:
+            """Answers when the next request is there, before the reply to that one."""
+            waiting.append(asked.frame())
+
+        def next_one(asked: Asked) -> None:
+            asked.send(*waiting, asked.frame())
+
+        with Stream("tcp", late, next_one) as device:
+            front = connect(scada(run(configuration(device.url, link={"timeout": timeout}))))
+            assert front.ask(READ) == exception(READ, 0x0B)
+            reply = front.ask(six)
+        if reply == exception(six, 0x0B):
+            return False
+        assert reply == bytes.fromhex("03020006")
+        return True
+
+    wire.until_long_enough(is_answered, "the next request has a reply")
 
 
 def test_a_full_queue_is_exception_06(device: Stream, run: Run, connect: Connect) -> None:
