@@ -6,8 +6,6 @@ import itertools
 import json
 import signal
 import struct
-import subprocess
-import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -16,8 +14,9 @@ import pytest
 from holdfast.cli import pace
 from support import cli, transports, wire
 from support.cli import answer, done, failure, invoke, usage_error
-from support.fake_device import FakeDevice, Stream, exception, registers, silent
-from support.terminal import Terminal, interruptible, plain
+from support.commands import Command
+from support.fake_device import FakeDevice, exception, registers
+from support.terminal import Terminal, plain
 
 if TYPE_CHECKING:
     import holdfast
@@ -298,14 +297,7 @@ def test_ticks_do_not_drift_and_leave_out_what_was_missed(
 
 
 def test_a_signal_ends_repeated_readings(server: holdfast.Server) -> None:
-    command = [sys.executable, "-m", "holdfast", "read", cli.url(server), "hr", "0"]
-    process = subprocess.Popen(
-        [*command, "--every", "0.01"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=interruptible,
-    )
+    process = Command("read", cli.url(server), "hr", "0", "--every", "0.01")
     try:
         assert process.stdout is not None
         assert process.stdout.readline().split() == ["time", "0"]
@@ -316,30 +308,6 @@ def test_a_signal_ends_repeated_readings(server: holdfast.Server) -> None:
         process.kill()
         process.communicate()
     assert (process.returncode, log) == (0, "")
-
-
-@pytest.mark.parametrize(
-    "command", [("read", "hr", "0"), ("identify",), ("watch", "hr", "0"), ("map",)]
-)
-def test_ctrl_c_ends_a_command_that_waits_for_a_silent_device(command: tuple[str, ...]) -> None:
-    name, *arguments = command
-    with Stream("tcp", silent) as device:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "holdfast", name, device.url, *arguments, "--timeout", "60"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            preexec_fn=interruptible,
-        )
-        try:
-            wire.until(lambda: len(device.requests) == 1, "the device has been asked")
-            process.send_signal(signal.SIGINT)
-            _, log = process.communicate(timeout=wire.DEADLINE)
-        finally:
-            process.kill()
-            process.communicate()
-    assert process.returncode == (0 if name == "watch" else 1)
-    assert "Traceback" not in log
 
 
 def test_changes_are_coloured_on_a_terminal_unless_that_is_not_wanted(

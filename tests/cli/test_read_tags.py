@@ -15,8 +15,8 @@ import pytest
 import holdfast
 from support import cli, wire
 from support.cli import answer, done, failure, invoke, usage_error
+from support.commands import Command
 from support.fake_device import FakeDevice, exception, registers
-from support.terminal import interruptible
 
 LIST = """
 order: CDAB
@@ -240,16 +240,11 @@ def test_a_recording_that_can_not_be_continued_ends_the_command(
 def test_ctrl_c_leaves_a_whole_recording(server: holdfast.Server, tmp_path: Path) -> None:
     record = tmp_path / "values.csv"
     arguments = ["read", cli.url(server), "hr:0", "--every", "0.001", "--record", str(record)]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "holdfast", *arguments],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        preexec_fn=interruptible,
-    )
+    process = Command(*arguments)
     wire.until(lambda: record.exists() and record.read_text().count("\n") > 20, "rows are written")
     process.send_signal(signal.SIGINT)
     _, log = process.communicate(timeout=wire.DEADLINE)
-    assert (process.returncode, log) == (0, b"")
+    assert (process.returncode, log) == (0, "")
     text = record.read_text()
     assert text.endswith("\n")
     assert {line.count(",") for line in text.splitlines()} == {1}

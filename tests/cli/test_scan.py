@@ -9,7 +9,6 @@ import re
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +20,7 @@ from holdfast.scanner.schema import json_schema
 from support import wire
 from support.brokers import NatsServer
 from support.cli import done, invoke, usage_error
+from support.commands import Command
 from support.nats_bus import Caller, subscription, tag
 from support.nats_keys import Operator, User
 
@@ -29,22 +29,16 @@ if TYPE_CHECKING:
 
     import holdfast
 
-    Start = Callable[..., subprocess.Popen[str]]
+    Start = Callable[..., Command]
 
 
 @pytest.fixture
 def start() -> Iterator[Start]:
     """Starts `holdfast scan`; it is killed when the test ends."""
-    started: list[subprocess.Popen[str]] = []
+    started: list[Command] = []
 
-    def scan(*options: str, **environment: str) -> subprocess.Popen[str]:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "holdfast", "scan", *options],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **environment},
-        )
+    def scan(*options: str, **environment: str) -> Command:
+        process = Command("scan", *options, environment={**os.environ, **environment})
         started.append(process)
         return process
 
@@ -54,7 +48,7 @@ def start() -> Iterator[Start]:
         process.communicate()
 
 
-def greeting(process: subprocess.Popen[str]) -> str:
+def greeting(process: Command) -> str:
     """What it says first."""
     assert process.stdout is not None
     text = ""
@@ -65,7 +59,7 @@ def greeting(process: subprocess.Popen[str]) -> str:
     return text
 
 
-def connected(process: subprocess.Popen[str]) -> None:
+def connected(process: Command) -> None:
     """Waits until it says that it is connected."""
     assert process.stderr is not None
     for line in process.stderr:
@@ -235,7 +229,7 @@ def test_a_new_password_is_used_after_sighup_and_a_wrong_file_changes_nothing(
         own.kill()
 
 
-def _await_line(process: subprocess.Popen[str], event: str) -> str:
+def _await_line(process: Command, event: str) -> str:
     """The next line of the log that has this event."""
     assert process.stderr is not None
     for line in process.stderr:

@@ -6,8 +6,6 @@ import contextlib
 import json
 import re
 import signal
-import subprocess
-import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -18,9 +16,10 @@ from holdfast.cli.watching import WINDOW, Tracker
 from holdfast.config import load
 from support import cli, wire
 from support.cli import answer, failure, invoke, usage_error
+from support.commands import Command
 from support.fake_device import FakeDevice, exception, registers
 from support.running import endpoint
-from support.terminal import Terminal, interruptible, plain
+from support.terminal import Terminal, plain
 from support.web import token
 
 if TYPE_CHECKING:
@@ -54,13 +53,7 @@ class Watch:
     """`holdfast watch` without a terminal."""
 
     def __init__(self, *arguments: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "holdfast", "watch", *arguments, *OFTEN],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            preexec_fn=interruptible,
-        )
+        self.process = Command("watch", *arguments, *OFTEN)
         assert self.process.stderr is not None
         self.greeting = self.process.stderr.readline()
 
@@ -72,7 +65,7 @@ class Watch:
         self.process.send_signal(signal.SIGINT)
         _, log = self.process.communicate(timeout=wire.DEADLINE)
         assert log == ""
-        return self.process.returncode
+        return self.process.wait()
 
 
 @pytest.fixture

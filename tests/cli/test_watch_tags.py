@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import re
 import signal
-import subprocess
-import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -19,8 +17,9 @@ from holdfast.tags import Tag
 from holdfast.tools.tag_reading import Reading
 from support import cli, wire
 from support.cli import failure, invoke, usage_error
+from support.commands import Command
 from support.fake_device import FakeDevice, exception, registers
-from support.terminal import Terminal, interruptible, plain
+from support.terminal import Terminal, plain
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,13 +47,7 @@ class Watching:
     """`holdfast watch` without a terminal."""
 
     def __init__(self, *arguments: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "holdfast", "watch", *arguments, "--every", "0.01"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            preexec_fn=interruptible,
-        )
+        self.process = Command("watch", *arguments, "--every", "0.01")
 
     def __enter__(self) -> Watching:
         return self
@@ -70,7 +63,7 @@ class Watching:
     def end(self) -> int:
         self.process.send_signal(signal.SIGINT)
         self.process.communicate(timeout=wire.DEADLINE)
-        return self.process.returncode
+        return self.process.wait()
 
 
 def test_every_change_of_a_tag_is_a_line(

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 import re
-import signal
-import subprocess
-import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from click.testing import CliRunner
 
 from holdfast.cli import main
 from support import wire
+from support.commands import Command
 
 if TYPE_CHECKING:
+    import signal
+    from pathlib import Path
+
     from click.testing import Result
 
     import holdfast
@@ -67,12 +67,7 @@ class ServingCommand:
     """A running command that serves until a signal."""
 
     def __init__(self, *arguments: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "holdfast", *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        self.process = Command(*arguments)
         self.greeting = ""
 
     def wait_for_greeting(self) -> str:
@@ -87,7 +82,7 @@ class ServingCommand:
         """Sends a signal. Returns the exit code and the log. The command must end in time."""
         self.process.send_signal(number)
         _, log = self.process.communicate(timeout=within)
-        return self.process.returncode, log
+        return self.process.wait(), log
 
 
 class RunCommand(ServingCommand):

@@ -10,13 +10,12 @@ import re
 import select
 import signal
 import struct
-import subprocess
-import sys
 import termios
 import time
 from typing import TYPE_CHECKING
 
 from support import wire
+from support.commands import Command
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -41,15 +40,8 @@ class Terminal:
             self._resize(lines, columns)
             unwanted = ("NO_COLOR", "COLUMNS", "LINES")
             settings = {k: v for k, v in os.environ.items() if k not in unwanted}
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "holdfast", *arguments],
-                stdin=theirs,
-                stdout=theirs,
-                stderr=theirs,
-                start_new_session=True,
-                preexec_fn=_take_terminal,
-                env=settings | {"TERM": "xterm-256color", "LANG": "C.UTF-8"} | environment,
-            )
+            settings |= {"TERM": "xterm-256color", "LANG": "C.UTF-8"} | environment
+            self.process = Command(*arguments, terminal=theirs, environment=settings)
         except BaseException:
             os.close(self._own)
             raise
@@ -108,14 +100,3 @@ class Terminal:
 
     def _resize(self, lines: int, columns: int) -> None:
         fcntl.ioctl(self._own, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
-
-
-def interruptible() -> None:
-    """For `preexec_fn`: lets Ctrl-C end the process even if SIGINT is ignored, as after `&`."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def _take_terminal() -> None:
-    """Makes standard input the controlling terminal of the new session."""
-    interruptible()
-    fcntl.ioctl(0, termios.TIOCSCTTY, 0)

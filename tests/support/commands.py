@@ -1,0 +1,194 @@
+"""Processes of `holdfast` that start fast: importing takes most of the time of a start.
+
+One process for each process of pytest imports all commands. It is forked for each start: signals,
+exit codes and terminals are those of a process.
+"""
+
+from __future__ import annotations
+
+import atexit
+import fcntl
+import functools
+import importlib
+import json
+import os
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import termios
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, TextIO
+
+from holdfast.cli import COMMANDS, main
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+NUMBER = struct.Struct("i")
+
+
+class Command:
+    """A running `holdfast`, with the methods of `subprocess.Popen` whose output is text in pipes.
+
+    With `terminal`, that is its input and output, and controls it.
+    """
+
+    def __init__(
+        self,
+        *arguments: str,
+        terminal: int | None = None,
+        environment: Mapping[str, str] = os.environ,
+    ) -> None:
+        request = {
+            "arguments": arguments,
+            "environment": dict(environment),
+            "folder": os.getcwd(),
+            "has_terminal": terminal is not None,
+        }
+        self.returncode: int | None = None
+        self.stdout: TextIO | None = None
+        self.stderr: TextIO | None = None
+        self._status, status = os.pipe()
+        if terminal is None:
+            ours, theirs = zip(os.pipe(), os.pipe(), strict=True)
+            self.stdout, self.stderr = (open(each, encoding="utf-8") for each in ours)
+            files = [os.open(os.devnull, os.O_RDONLY), *theirs]
+        else:
+            files = [os.dup(terminal) for _ in range(3)]
+        try:
+            socket.send_fds(_forked(), [json.dumps(request).encode() + b"\n"], [*files, status])
+        finally:
+            for each in (*files, status):
+                os.close(each)
+        self.pid = self._number()
+
+    def _number(self) -> int:
+        number: int
+        (number,) = NUMBER.unpack(os.read(self._status, NUMBER.size))
+        return number
+
+    def poll(self) -> int | None:
+        if self.returncode is None and select.select([self._status], [], [], 0)[0]:
+            self.returncode = self._number()
+            os.close(self._status)
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        if self.returncode is None:
+            select.select([self._status], [], [], timeout)
+        code = self.poll()
+        if code is None:
+            raise subprocess.TimeoutExpired("holdfast", timeout or 0)
+        return code
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
+        """Reads the rest of the output, and waits for the end."""
+        streams = [stream for stream in (self.stdout, self.stderr) if stream is not None]
+        with ThreadPoolExecutor(2) as threads:
+            reading = [threads.submit(stream.read) for stream in streams if not stream.closed]
+            try:
+                self.wait(timeout)
+            except subprocess.TimeoutExpired:
+                self.kill()
+                raise
+        for stream in streams:
+            stream.close()
+        output, log = (*(each.result() for each in reading), "", "")[:2]
+        return output, log
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
+@functools.cache
+def _forked() -> socket.socket:
+    """The connection to the process that is forked."""
+    ours, theirs = socket.socketpair()
+    with theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-P", __file__, str(theirs.fileno())],
+            stdin=subprocess.DEVNULL,
+            pass_fds=[theirs.fileno()],
+        )
+
+    def end() -> None:
+        ours.close()
+        process.wait()
+
+    atexit.register(end)
+    return ours
+
+
+def _serve(requests: socket.socket) -> None:
+    """Forks for each request. Returns in the children, which run a command."""
+    for place in COMMANDS.values():
+        importlib.import_module(place.partition(":")[0])
+    # Ctrl-C is for the tests.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    while True:
+        data, files = b"", list[int]()
+        while not data.endswith(b"\n"):
+            piece, more, _, _ = socket.recv_fds(requests, 1 << 20, 4)
+            if not piece:
+                sys.exit()
+            data, files = data + piece, files + more
+        if os.fork() == 0:
+            requests.close()
+            *standard, status = files
+            _fork_and_wait(standard, status)
+            _become(json.loads(data), standard)
+            return
+        for each in files:
+            os.close(each)
+
+
+def _fork_and_wait(standard: Sequence[int], status: int) -> None:
+    """Returns in a child, whose process id and exit code are written."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    child = os.fork()
+    if child == 0:
+        os.close(status)
+        return
+    for each in standard:
+        os.close(each)
+    os.write(status, NUMBER.pack(child))
+    _, ended = os.waitpid(child, 0)
+    os.write(status, NUMBER.pack(os.waitstatus_to_exitcode(ended)))
+    os._exit(0)
+
+
+def _become(request: dict[str, Any], standard: Sequence[int]) -> None:
+    """Takes over files, environment and arguments, as a new interpreter does."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if request["has_terminal"]:
+        os.setsid()
+        fcntl.ioctl(standard[0], termios.TIOCSCTTY, 0)
+    for number, each in enumerate(standard):
+        os.dup2(each, number)
+        os.close(each)
+    os.environ.clear()
+    os.environ.update(request["environment"])
+    os.chdir(request["folder"])
+    encoding = os.environ.get("PYTHONIOENCODING", "utf-8")
+    sys.stdin = open(0, encoding=encoding, closefd=False)
+    sys.stdout = open(1, "w", encoding=encoding, closefd=False)
+    sys.stderr = open(
+        2, "w", buffering=1, encoding=encoding, errors="backslashreplace", closefd=False
+    )
+    sys.argv = ["holdfast", *request["arguments"]]
+
+
+if __name__ == "__main__":
+    _serve(socket.socket(fileno=int(sys.argv[1])))
+    main(prog_name="python -m holdfast")
