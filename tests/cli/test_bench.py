@@ -56,22 +56,25 @@ def test_the_server_answers_as_many_as_are_counted(server: holdfast.Server) -> N
 
 
 def test_errors_are_counted_by_kind() -> None:
-    numbers = itertools.count()
+    def are_counted(timeout: float) -> bool:
+        numbers = itertools.count()
 
-    def answers(pdu: bytes) -> bytes | None:
-        number = next(numbers)
-        if number == 3:
-            return exception(pdu, 6)
-        if number == 5:
-            return None
-        if number == 7:
-            return b"\x03\x01\x00"
-        # A read is repeated once when a connection ends that was used before.
-        return HANG_UP if number in (9, 10) else registers(pdu)
+        def answers(pdu: bytes) -> bytes | None:
+            number = next(numbers)
+            if number == 3:
+                return exception(pdu, 6)
+            if number == 5:
+                return None
+            if number == 7:
+                return b"\x03\x01\x00"
+            # A read is repeated once when a connection ends that was used before.
+            return HANG_UP if number in (9, 10) else registers(pdu)
 
-    with FakeDevice(answers) as device:
-        options = ("--timeout", "2", "--seconds", "4")
-        found = answer("bench", device.url, *options)
+        with FakeDevice(answers) as device:
+            options = ("--timeout", str(timeout), "--seconds", str(3 * timeout))
+            found = answer("bench", device.url, *options)
+        if next(numbers) < 12 or found["errors"]["timeout"] > 1:
+            return False
         assert found["errors"] == {
             "exception 06 (Server Device Busy)": 1,
             "timeout": 1,
@@ -79,7 +82,9 @@ def test_errors_are_counted_by_kind() -> None:
             "connection lost": 1,
         }
         assert found["requests"] > 0
-        device.answer = lambda pdu: registers(pdu) if pdu[2] else exception(pdu, 6)
+        return True
+
+    wire.until_long_enough(are_counted, "one request is not answered")
 
 
 def test_a_device_that_refuses_is_told_at_once(server: holdfast.Server) -> None:

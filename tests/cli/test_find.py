@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import re
 import signal
 import socket
@@ -35,24 +36,37 @@ def test_hosts_that_answer_are_found_and_others_told_apart(serve: Serve) -> None
     identity = Identity(vendor_name="Acme", product_code="PLANT", revision="1.0")
     server = serve({1: holdfast.Memory(coils=8)}, identity=identity)
     port = server.address[1]
-    with socket.create_server(("127.0.0.2", port)):
-        options = ("--port", str(port), "--timeout", "2")
-        [head, modbus, other, empty, counts] = done("find", "127.0.0.0/29", *options)
-        found = answer("find", "127.0.0.1", "127.0.0.2", *options)
-    assert head.split() == ["url", "unit", "answer", "identification"]
-    assert re.fullmatch(
-        rf"tcp://127.0.0.1:{port} +1 +exception 02 \(Illegal Data Address\) +Acme PLANT 1.0", modbus
-    )
-    assert re.fullmatch(rf"tcp://127.0.0.2:{port} +no Modbus: .*", other)
-    assert empty == ""
-    assert counts == (
-        "6 addresses: 1 answer Modbus, 1 accept connections but do not answer Modbus, "
-        "4 refuse them, 0 do not respond"
-    )
-    assert (found["ok"], found["complete"], found["asked"]) == (True, True, 2)
-    assert found["counts"] == {"modbus": 1, "open": 1, "refused": 0, "silent": 0}
-    assert found["hosts"][0]["identification"]["vendor_name"] == "Acme"
-    assert (found["hosts"][0]["url"], found["hosts"][0]["unit"]) == (cli.url(server), 1)
+
+    def are_found(timeout: float) -> bool:
+        options = ("--port", str(port), "--timeout", str(timeout))
+        with socket.create_server(("127.0.0.2", port)):
+            shown = cli.invoke("find", "127.0.0.0/29", *options)
+            told = cli.invoke("find", "127.0.0.1", "127.0.0.2", *options, "--json")
+        if not ("Acme" in shown.stdout and "0 do not respond" in shown.stdout):
+            return False
+        if "Acme" not in told.stdout:
+            return False
+        assert (shown.exit_code, shown.stderr, told.exit_code, told.stderr) == (0, "", 0, "")
+        [head, modbus, other, empty, counts] = shown.stdout.splitlines()
+        assert head.split() == ["url", "unit", "answer", "identification"]
+        assert re.fullmatch(
+            rf"tcp://127.0.0.1:{port} +1 +exception 02 \(Illegal Data Address\) +Acme PLANT 1.0",
+            modbus,
+        )
+        assert re.fullmatch(rf"tcp://127.0.0.2:{port} +no Modbus: .*", other)
+        assert empty == ""
+        assert counts == (
+            "6 addresses: 1 answer Modbus, 1 accept connections but do not answer Modbus, "
+            "4 refuse them, 0 do not respond"
+        )
+        found = json.loads(told.stdout)
+        assert (found["ok"], found["complete"], found["asked"]) == (True, True, 2)
+        assert found["counts"] == {"modbus": 1, "open": 1, "refused": 0, "silent": 0}
+        assert found["hosts"][0]["identification"]["vendor_name"] == "Acme"
+        assert (found["hosts"][0]["url"], found["hosts"][0]["unit"]) == (cli.url(server), 1)
+        return True
+
+    wire.until_long_enough(are_found, "the device answers, and no host is silent")
 
 
 def test_a_host_that_answers_only_another_unit_id_is_found() -> None:
@@ -60,9 +74,13 @@ def test_a_host_that_answers_only_another_unit_id_is_found() -> None:
         if asked.unit == 255:
             asked.answer(exception(asked.pdu, 2))
 
-    with Stream("tcp", then=behave) as host:
-        found = answer("find", "127.0.0.1", "--port", str(host.port), "--timeout", "2")
-    assert found["hosts"][0]["unit"] == 255
+    def is_found(timeout: float) -> bool:
+        with Stream("tcp", then=behave) as host:
+            options = ("--port", str(host.port), "--timeout", str(timeout), "--json")
+            result = cli.invoke("find", "127.0.0.1", *options)
+        return result.exit_code == 0 and json.loads(result.stdout)["hosts"][0]["unit"] == 255
+
+    wire.until_long_enough(is_found, "unit id 255 answers")
 
 
 def test_a_gateway_without_its_device_is_found() -> None:
@@ -140,21 +158,29 @@ def behind_gateway(asked: Asked) -> None:
 
 
 def test_unit_ids_behind_a_gateway_are_found() -> None:
-    with Stream("tcp", then=behind_gateway) as host:
-        options = ("--units", "1-5,17,20", "--timeout", "2")
-        shown = done("find", host.url, *options)
-        found = answer("find", host.url, *options)
-    assert [line.split() for line in shown] == [
-        ["unit", "answer", "identification"],
-        ["3", "answers"],
-        ["17", "answers"],
-        [],
-        f"{host.url}: 2 unit ids of 7 asked answer".split(),
-        ["no", "device:", "1-2,", "4-5,", "20"],
-    ]
-    assert [each["unit"] for each in found["units"]] == [3, 17]
-    assert (found["asked"], found["not_asked"]) == ([1, 2, 3, 4, 5, 17, 20], [])
-    assert found["ignores_unit"] is False
+    def are_found(timeout: float) -> bool:
+        with Stream("tcp", then=behind_gateway) as host:
+            options = ("--units", "1-5,17,20", "--timeout", str(timeout))
+            shown = cli.invoke("find", host.url, *options)
+            told = cli.invoke("find", host.url, *options, "--json")
+        found = json.loads(told.stdout)
+        if "2 unit ids of 7" not in shown.stdout or len(found["units"]) < 2:
+            return False
+        assert (shown.exit_code, shown.stderr, told.exit_code, told.stderr) == (0, "", 0, "")
+        assert [line.split() for line in shown.stdout.splitlines()] == [
+            ["unit", "answer", "identification"],
+            ["3", "answers"],
+            ["17", "answers"],
+            [],
+            f"{host.url}: 2 unit ids of 7 asked answer".split(),
+            ["no", "device:", "1-2,", "4-5,", "20"],
+        ]
+        assert [each["unit"] for each in found["units"]] == [3, 17]
+        assert (found["asked"], found["not_asked"]) == ([1, 2, 3, 4, 5, 17, 20], [])
+        assert found["ignores_unit"] is False
+        return True
+
+    wire.until_long_enough(are_found, "two unit ids answer")
 
 
 def test_a_device_that_ignores_unit_ids_is_told() -> None:
@@ -204,19 +230,28 @@ def test_the_baud_of_a_line_is_found(tmp_path: Path) -> None:
         if baud(device.terminal) == 57600 and asked.unit == 2:
             asked.answer(registers(asked.pdu) if asked.pdu[0] == 3 else exception(asked.pdu, 1))
 
-    with Serial(lines.RTU, tmp_path / "line", then=behave) as device:
-        url = f"rtu://{tmp_path / 'line'}"
-        options = ("--baud", "9600,57600,1200", "--parity", "none", "--units", "1-2")
-        shown = done("find", url, *options, "--timeout", "1")
-        found = answer("find", url, *options, "--timeout", "1")
+    url = f"rtu://{tmp_path / 'line'}"
     line = f"{url}?baud=57600&parity=none&stop_bits=1"
-    assert shown[1].split() == ["2", line, "answers"]
-    assert shown[-1] == (
-        f"{tmp_path / 'line'}: 1 unit id found; unit ids asked: 1-2, 3 settings tried"
-    )
-    assert found["units"] == [
-        {"url": line, "unit": 2, "detail": "answers", "identification": {}},
-    ]
+    options = ("--baud", "9600,57600,1200", "--parity", "none", "--units", "1-2")
+
+    def is_found(timeout: float) -> bool:
+        shown = cli.invoke("find", url, *options, "--timeout", str(timeout))
+        told = cli.invoke("find", url, *options, "--timeout", str(timeout), "--json")
+        if shown.exit_code or told.exit_code:
+            return False
+        assert (shown.stderr, told.stderr) == ("", "")
+        _, found, *_, last = shown.stdout.splitlines()
+        assert found.split() == ["2", line, "answers"]
+        assert last == (
+            f"{tmp_path / 'line'}: 1 unit id found; unit ids asked: 1-2, 3 settings tried"
+        )
+        assert json.loads(told.stdout)["units"] == [
+            {"url": line, "unit": 2, "detail": "answers", "identification": {}},
+        ]
+        return True
+
+    with Serial(lines.RTU, tmp_path / "line", then=behave) as device:
+        wire.until_long_enough(is_found, "the device answers")
 
 
 def test_invalid_bytes_on_a_line_are_told(tmp_path: Path) -> None:

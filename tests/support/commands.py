@@ -20,6 +20,7 @@ import subprocess
 import sys
 import termios
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from holdfast.cli import COMMANDS, main
@@ -45,7 +46,7 @@ class Command:
         request = {
             "arguments": arguments,
             "environment": dict(environment),
-            "folder": os.getcwd(),
+            "folder": str(Path.cwd()),
             "has_terminal": terminal is not None,
         }
         self.returncode: int | None = None
@@ -54,7 +55,7 @@ class Command:
         self._status, status = os.pipe()
         if terminal is None:
             ours, theirs = zip(os.pipe(), os.pipe(), strict=True)
-            self.stdout, self.stderr = (open(each, encoding="utf-8") for each in ours)
+            self.stdout, self.stderr = (os.fdopen(each, encoding="utf-8") for each in ours)
             files = [os.open(os.devnull, os.O_RDONLY), *theirs]
         else:
             files = [os.dup(terminal) for _ in range(3)]
@@ -181,11 +182,9 @@ def _become(request: dict[str, Any], standard: Sequence[int]) -> None:
     os.environ.update(request["environment"])
     os.chdir(request["folder"])
     encoding = os.environ.get("PYTHONIOENCODING", "utf-8")
-    sys.stdin = open(0, encoding=encoding, closefd=False)
-    sys.stdout = open(1, "w", encoding=encoding, closefd=False)
-    sys.stderr = open(
-        2, "w", buffering=1, encoding=encoding, errors="backslashreplace", closefd=False
-    )
+    sys.stdin = os.fdopen(0, encoding=encoding, closefd=False)
+    sys.stdout = os.fdopen(1, "w", encoding=encoding, closefd=False)
+    sys.stderr = os.fdopen(2, "w", 1, encoding, "backslashreplace", closefd=False)
     sys.argv = ["holdfast", *request["arguments"]]
 
 
