@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.cli import COMMANDS
-from support.cli import done, usage_error
+from support.cli import done, invoke, usage_error
 from support.machine import tool
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def test_other_shells_are_wrong_usage() -> None:
     assert "'csh' is not one of 'bash', 'zsh', 'fish'." in usage_error("completion", "csh")
 
 
-def test_bash_completes_commands_areas_and_options(tmp_path: Path) -> None:
+def test_bash_completes_commands(tmp_path: Path) -> None:
     bash = tool("bash")
     script = tmp_path / "holdfast.bash"
     script.write_text("\n".join(done("completion", "bash")))
@@ -35,21 +35,27 @@ def test_bash_completes_commands_areas_and_options(tmp_path: Path) -> None:
     main = "from holdfast.cli import main; main(prog_name='holdfast')"
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -c "{main}" "$@"\n')
     program.chmod(0o755)
+    asked = f'. "{script}"; COMP_WORDS=(holdfast re); COMP_CWORD=1; _holdfast_completion holdfast'
+    result = subprocess.run(
+        [bash, "-c", f'{asked}; printf "%s\\n" "${{COMPREPLY[@]}}"'],
+        env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert result.stdout.split() == ["read", "reload", "replicas", "replay"]
+
+
+def test_commands_areas_and_options_are_completed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("_HOLDFAST_COMPLETE", "bash_complete")
 
     def completed(*words: str) -> list[str]:
-        line = f"COMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}"
-        asked = f'. "{script}"; {line}; _holdfast_completion holdfast; printf "%s\\n" '
-        result = subprocess.run(
-            [bash, "-c", f'{asked} "${{COMPREPLY[@]}}"'],
-            env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"},
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=True,
-        )
-        return result.stdout.split()
+        """What the script for bash gets."""
+        monkeypatch.setenv("COMP_WORDS", " ".join(words))
+        monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
+        return [line.partition(",")[2] for line in invoke().stdout.splitlines()]
 
-    assert completed("holdfast", "re") == ["read", "reload", "replicas", "replay"]
     assert set(completed("holdfast", '""')) == set(COMMANDS)
     assert completed("holdfast", "read", "tcp://plc", "hol") == ["holding_registers"]
     assert completed("holdfast", "map", "--ex") == ["--exact"]

@@ -270,7 +270,7 @@ def expected(
 
 
 @needs_127_0_0_2
-@settings(max_examples=examples(25))
+@settings(max_examples=examples(12))
 @given(listed=st.lists(rules(), min_size=1, max_size=4))
 def test_a_listener_does_what_is_printed(listed: list[dict[str, Any]]) -> None:
     scada = {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": listed}
