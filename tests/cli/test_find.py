@@ -40,14 +40,19 @@ def test_hosts_that_answer_are_found_and_others_told_apart(serve: Serve) -> None
     def are_found(timeout: float) -> bool:
         options = ("--port", str(port), "--timeout", str(timeout))
         with socket.create_server(("127.0.0.2", port)):
-            shown = cli.invoke("find", "127.0.0.0/29", *options)
-            told = cli.invoke("find", "127.0.0.1", "127.0.0.2", *options, "--json")
-        if not ("Acme" in shown.stdout and "0 do not respond" in shown.stdout):
+            table = cli.invoke("find", "127.0.0.0/29", *options)
+            document = cli.invoke("find", "127.0.0.1", "127.0.0.2", *options, "--json")
+        if not ("Acme" in table.stdout and "0 do not respond" in table.stdout):
             return False
-        if "Acme" not in told.stdout:
+        if "Acme" not in document.stdout:
             return False
-        assert (shown.exit_code, shown.stderr, told.exit_code, told.stderr) == (0, "", 0, "")
-        [head, modbus, other, empty, counts] = shown.stdout.splitlines()
+        assert (table.exit_code, table.stderr, document.exit_code, document.stderr) == (
+            0,
+            "",
+            0,
+            "",
+        )
+        [head, modbus, other, empty, counts] = table.stdout.splitlines()
         assert head.split() == ["url", "unit", "answer", "identification"]
         assert re.fullmatch(
             rf"tcp://127.0.0.1:{port} +1 +exception 02 \(Illegal Data Address\) +Acme PLANT 1.0",
@@ -59,7 +64,7 @@ def test_hosts_that_answer_are_found_and_others_told_apart(serve: Serve) -> None
             "6 addresses: 1 answer Modbus, 1 accept connections but do not answer Modbus, "
             "4 refuse them, 0 do not respond"
         )
-        found = json.loads(told.stdout)
+        found = json.loads(document.stdout)
         assert (found["ok"], found["complete"], found["asked"]) == (True, True, 2)
         assert found["counts"] == {"modbus": 1, "open": 1, "refused": 0, "silent": 0}
         assert found["hosts"][0]["identification"]["vendor_name"] == "Acme"
@@ -161,13 +166,18 @@ def test_unit_ids_behind_a_gateway_are_found() -> None:
     def are_found(timeout: float) -> bool:
         with Stream("tcp", then=behind_gateway) as host:
             options = ("--units", "1-5,17,20", "--timeout", str(timeout))
-            shown = cli.invoke("find", host.url, *options)
-            told = cli.invoke("find", host.url, *options, "--json")
-        found = json.loads(told.stdout)
-        if "2 unit ids of 7" not in shown.stdout or len(found["units"]) < 2:
+            table = cli.invoke("find", host.url, *options)
+            document = cli.invoke("find", host.url, *options, "--json")
+        found = json.loads(document.stdout)
+        if "2 unit ids of 7" not in table.stdout or len(found["units"]) < 2:
             return False
-        assert (shown.exit_code, shown.stderr, told.exit_code, told.stderr) == (0, "", 0, "")
-        assert [line.split() for line in shown.stdout.splitlines()] == [
+        assert (table.exit_code, table.stderr, document.exit_code, document.stderr) == (
+            0,
+            "",
+            0,
+            "",
+        )
+        assert [line.split() for line in table.stdout.splitlines()] == [
             ["unit", "answer", "identification"],
             ["3", "answers"],
             ["17", "answers"],
@@ -235,17 +245,17 @@ def test_the_baud_of_a_line_is_found(tmp_path: Path) -> None:
     options = ("--baud", "9600,57600,1200", "--parity", "none", "--units", "1-2")
 
     def is_found(timeout: float) -> bool:
-        shown = cli.invoke("find", url, *options, "--timeout", str(timeout))
-        told = cli.invoke("find", url, *options, "--timeout", str(timeout), "--json")
-        if shown.exit_code or told.exit_code:
+        table = cli.invoke("find", url, *options, "--timeout", str(timeout))
+        document = cli.invoke("find", url, *options, "--timeout", str(timeout), "--json")
+        if table.exit_code or document.exit_code:
             return False
-        assert (shown.stderr, told.stderr) == ("", "")
-        _, found, *_, last = shown.stdout.splitlines()
+        assert (table.stderr, document.stderr) == ("", "")
+        _, found, *_, last = table.stdout.splitlines()
         assert found.split() == ["2", line, "answers"]
         assert last == (
             f"{tmp_path / 'line'}: 1 unit id found; unit ids asked: 1-2, 3 settings tried"
         )
-        assert json.loads(told.stdout)["units"] == [
+        assert json.loads(document.stdout)["units"] == [
             {"url": line, "unit": 2, "detail": "answers", "identification": {}},
         ]
         return True

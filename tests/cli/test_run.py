@@ -33,19 +33,6 @@ listeners:
 READ_TWO = bytes.fromhex("0300000002")
 
 
-@pytest.fixture(autouse=True)
-def _signals_as_usual() -> Iterator[None]:
-    """Under `nohup`, the tests ignore some signals, and so would the programs that they start."""
-    numbers = (signal.SIGHUP, signal.SIGQUIT)
-    before = {number: signal.getsignal(number) for number in numbers}
-    for number, handler in before.items():
-        if handler == signal.SIG_IGN:
-            signal.signal(number, signal.SIG_DFL)
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
 @pytest.fixture
 def configure(tmp_path: Path) -> Callable[..., Path]:
     """Writes a configuration, in a folder whose name has a space."""

@@ -634,12 +634,12 @@ def test_a_reply_that_does_not_come_times_out(
     kind: str, silence: str, make: Make, dial: Dial
 ) -> None:
     def is_in_time(timeout: float) -> bool:
-        sent = inf
+        sent_at = inf
 
         def behave(asked: Asked) -> None:
-            nonlocal sent
+            nonlocal sent_at
             SILENCES[silence](asked)
-            sent = time.monotonic()
+            sent_at = time.monotonic()
 
         device = make(kind, good, behave)
         client = connected(dial, device.url, timeout)
@@ -649,7 +649,7 @@ def test_a_reply_that_does_not_come_times_out(
             client.write_register(7, 70)
 
         assert timeout <= time.monotonic() - began < wire.DEADLINE
-        if sent > began + timeout:
+        if sent_at > began + timeout:
             return False
         client.timeout = wire.DEADLINE
         assert client.read_holding_registers(8, 2) == [8, 9]
@@ -704,12 +704,12 @@ def test_a_connection_that_has_gone_silent_is_made_anew(
 
 def test_a_late_reply_shows_that_a_connection_is_alive(make: Make, dial: Dial) -> None:
     def is_alive(timeout: float) -> bool:
-        sent = inf
+        sent_at = inf
 
         def answer_late(_: Asked) -> None:
-            nonlocal sent
+            nonlocal sent_at
             device.requests[1].answer()
-            sent = time.monotonic()
+            sent_at = time.monotonic()
 
         device = make("tcp", good, silent, silent, answer_late, silent)
         client = connected(dial, device.url, timeout)
@@ -717,7 +717,7 @@ def test_a_late_reply_shows_that_a_connection_is_alive(make: Make, dial: Dial) -
             began = time.monotonic()
             with pytest.raises(holdfast.RequestTimeout):
                 client.read_holding_registers(7, 1)
-            if number == 2 and sent > began + timeout:
+            if number == 2 and sent_at > began + timeout:
                 return False
         client.timeout = wire.DEADLINE
 
@@ -1171,11 +1171,11 @@ def test_a_call_with_a_shorter_timeout_ends_first() -> None:
 
 def test_a_reply_that_breaks_off_ends_the_connection_of_all() -> None:
     async def breaks_off(timeout: float) -> bool:
-        sent = inf
+        sent_at = inf
 
         def note(_: Asked) -> None:
-            nonlocal sent
-            sent = time.monotonic()
+            nonlocal sent_at
+            sent_at = time.monotonic()
 
         with Stream("tcp", silent, half(note)) as device:
             async with holdfast.Client(device.url, timeout=wire.DEADLINE, max_in_flight=2) as plc:
@@ -1186,7 +1186,7 @@ def test_a_reply_that_breaks_off_ends_the_connection_of_all() -> None:
                 with pytest.raises(holdfast.RequestTimeout):
                     await plc.read_holding_registers(1, 1)
                 plc.timeout = wire.DEADLINE
-                if sent > began + timeout:
+                if sent_at > began + timeout:
                     patient.cancel()
                     return False
                 with pytest.raises(holdfast.ConnectionLost, match="a reply was cut off"):

@@ -110,11 +110,11 @@ def test_a_device_that_needs_tolerance_is_polled_with_it(
             meter = device(fake.url, READ, status=block(0, keep_last_error=True), **more)
             appliance = run(configuration({"meter": meter}))
             until_polled(appliance, "meter", 5)
-            told = status(appliance.memories["status"])
+            found = status(appliance.memories["status"])
             appliance.stop()
-        if told.last_error == TIMEOUT:
+        if found.last_error == TIMEOUT:
             return False
-        assert told.most_failures == 0
+        assert found.most_failures == 0
         assert appliance.memories["mirror"].read("holding_registers", 6, 4) == [0, 7, 8, 0]
         return True
 

@@ -1,7 +1,7 @@
-"""Processes of `holdfast` that start fast: importing takes most of the time of a start.
+"""Processes of `holdfast` that start fast: imports take most of the time of a start.
 
-One process for each process of pytest imports all commands. It is forked for each start: signals,
-exit codes and terminals are those of a process.
+Each process of pytest has a server that has imported all commands, and forks for each start.
+Signals, exit codes and terminals are those of any process.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ class Command:
         else:
             files = [os.dup(terminal) for _ in range(3)]
         try:
-            socket.send_fds(_forked(), [json.dumps(request).encode() + b"\n"], [*files, status])
+            socket.send_fds(
+                _fork_server(), [json.dumps(request).encode() + b"\n"], [*files, status]
+            )
         finally:
             for each in (*files, status):
                 os.close(each)
@@ -97,7 +99,7 @@ class Command:
                 raise
         for stream in streams:
             stream.close()
-        output, log = (*(each.result() for each in reading), "", "")[:2]
+        output, log = [each.result() for each in reading] or ("", "")
         return output, log
 
     def send_signal(self, number: int) -> None:
@@ -112,8 +114,8 @@ class Command:
 
 
 @functools.cache
-def _forked() -> socket.socket:
-    """The connection to the process that is forked."""
+def _fork_server() -> socket.socket:
+    """The connection to the server."""
     ours, theirs = socket.socketpair()
     with theirs:
         process = subprocess.Popen(
@@ -172,6 +174,9 @@ def _fork_and_wait(standard: Sequence[int], status: int) -> None:
 def _become(request: dict[str, Any], standard: Sequence[int]) -> None:
     """Takes over files, environment and arguments, as a new interpreter does."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    # The tests may run under `nohup` or in the background.
+    for ignored in (signal.SIGHUP, signal.SIGQUIT):
+        signal.signal(ignored, signal.SIG_DFL)
     if request["has_terminal"]:
         os.setsid()
         fcntl.ioctl(standard[0], termios.TIOCSCTTY, 0)
