@@ -23,6 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from holdfast.appliance import supervision
 from holdfast.cli import COMMANDS, main
 
 if TYPE_CHECKING:
@@ -136,6 +137,8 @@ def _serve(requests: socket.socket) -> None:
     """Forks for each request. Returns in the children, which run a command."""
     for place in COMMANDS.values():
         importlib.import_module(place.partition(":")[0])
+    # A loaded machine could leave threads of the lowest priority without any time for minutes.
+    supervision.POLITENESS = 0
     # Ctrl-C is for the tests.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
