@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from holdfast.cli import main
 from support import wire
-from support.commands import Command
+from support.commands import LONG_TIMEOUTS, Command
 
 if TYPE_CHECKING:
     import signal
@@ -28,7 +28,9 @@ def url(server: holdfast.Server) -> str:
 
 def invoke(*arguments: str) -> Result:
     """Returns the result of a command. Raises unexpected exceptions."""
-    result = CliRunner().invoke(main, list(arguments), prog_name="holdfast")
+    result = CliRunner().invoke(
+        main, list(arguments), prog_name="holdfast", default_map=LONG_TIMEOUTS
+    )
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result

@@ -29,6 +29,12 @@ from holdfast.cli import COMMANDS, main
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+LONG_TIMEOUTS = {
+    name: {"timeout": "60"}
+    for name in ("read", "write", "watch", "describe", "map", "identify", "bench")
+}
+"""Seconds to wait for a device: on a loaded machine, the default of 1 may not be enough."""
+
 NUMBER = struct.Struct("i")
 
 
@@ -198,4 +204,4 @@ def _become(request: dict[str, Any], standard: Sequence[int]) -> None:
 
 if __name__ == "__main__":
     _serve(socket.socket(fileno=int(sys.argv[1])))
-    main(prog_name="python -m holdfast")
+    main(prog_name="python -m holdfast", default_map=LONG_TIMEOUTS)
