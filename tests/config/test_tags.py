@@ -120,6 +120,17 @@ def test_problems_in_profile_files_name_file_line_and_tag(tmp_path: Path) -> Non
     ]
 
 
+def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
+    tags = (
+        "a: {area: input_registers, address: 1, null: [-5]}, "
+        "b: {area: coils, address: 1, scale: 2, null: [true]}"
+    )
+    assert problems(written(tmp_path, f"profiles: {{p: {{tags: {{{tags}}}}}}}\n{DEVICE}")) == [
+        "p.yaml:1: profiles.p.tags.a.null: -5 is outside 0 to 65535 of uint16",
+        "p.yaml:1: profiles.p.tags.b.scale: scale is 2.0, allowed: only with numbers",
+    ]
+
+
 @pytest.mark.parametrize(
     ("name", "text", "expected"),
     [

@@ -28,7 +28,7 @@ def entries(value: object) -> list[Any]:
 def fitting(kind: TypeAdapter[T], value: object) -> T | None:
     """The value if it is valid for `kind`, else `None`."""
     try:
-        return kind.validate_python(value, strict=True)
+        return kind.validate_python(value)
     except ValidationError:
         return None
 
