@@ -623,10 +623,11 @@ def test_every_dump_loads_as_an_equal_configuration(
     path = tmp_path_factory.mktemp("dump") / "plant.yaml"
     path.write_text(written(data), encoding="utf-8")
     config = load(path)
-    path.write_text(config.dump(), encoding="utf-8")
+    dump = config.dump()
+    path.write_text(dump, encoding="utf-8")
     again = load(path)
     assert again == config
-    assert again.dump() == config.dump()
+    assert again.dump() == dump
 
 
 def properties(schema: dict[str, Any]) -> dict[str, dict[str, Any]]:

@@ -42,13 +42,21 @@ def load(path: Path | str) -> Config:
     file = str(path)
     content = source.read_bytes(Path(path), file)
     document, problems = source.parse(source.decoded(content, file), file)
+    config = checked(document, problems, Path(path).absolute().parent)
+    return config.with_sha256(hashlib.sha256(content).hexdigest())
+
+
+def checked(document: source.Document, problems: list[Problem], folder: Path) -> Config:
+    """The configuration of a document that has these problems. It names files from `folder`.
+
+    Raises `ConfigError` with these problems, and all others.
+    """
     found = _foreign(document.data)
     if found is not None:
         message = f"found {found}, allowed: {allowed((), None)}"
-        raise ConfigError(file, problems or [Problem(file, 1, 1, "", message)])
+        raise ConfigError(document.file, problems or [Problem(document.file, 1, 1, "", message)])
     assert isinstance(document.data, dict), "anything else is foreign"
     report = Report(document)
-    folder = Path(path).absolute().parent
     profiles = ProfileFiles(folder, report)
     profiles.read()
     expanded(report)
@@ -58,17 +66,17 @@ def load(path: Path | str) -> Config:
     _check_others(data, folder, report)
     context = {"folder": folder, "initial_values": memories.values}
     config = build(data, context, report)
-    problems += [
+    problems = [
+        *problems,
         *report.problems,
         *memories.problems_elsewhere,
         *profiles.problems_elsewhere,
     ]
     if config is None or problems:
-        raise ConfigError(file, problems)
+        raise ConfigError(document.file, problems)
     doubt_grants(config, report)
     doubt_routes(config, report)
     config.with_profile_files(profiles.files)
-    config.with_sha256(hashlib.sha256(content).hexdigest())
     return config.with_warnings(sorted(report.doubts, key=lambda doubt: doubt.line or 0))
 
 

@@ -114,9 +114,11 @@ def table(file: str, data: Any, lines: Mapping[KeyPath, int]) -> Document:
 
     def spot(value: Any, path: KeyPath, line: int) -> _Spot:
         line = lines.get(path, line)
-        made = _Spot(Place(line, 1), is_scalar=not isinstance(value, dict))
-        if isinstance(value, dict):
-            for key, each in value.items():
+        is_list = isinstance(value, list)
+        inside = dict(enumerate(value)) if is_list else value
+        made = _Spot(Place(line, 1), is_list=is_list, is_scalar=not isinstance(inside, dict))
+        if isinstance(inside, dict):
+            for key, each in inside.items():
                 child = spot(each, (*path, key), line)
                 made.children[key] = (child.place, child)
         return made
