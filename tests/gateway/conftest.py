@@ -1,4 +1,4 @@
-"""The log of a gateway."""
+"""The log of a gateway, and pages of a browser."""
 
 from __future__ import annotations
 
@@ -8,9 +8,17 @@ import pytest
 
 from holdfast import logs
 from support import web
+from support.gateway_pages import Pages, browsing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+
+@pytest.fixture(scope="module")
+def pages() -> Iterator[Pages]:
+    # Not longer: while Playwright runs, a test in the same thread can't run an event loop.
+    with browsing() as browser:
+        yield Pages(browser)
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from playwright.sync_api import expect
 from holdfast.client.url import Tls
 from support import gateway_pages
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
-from support.gateway_pages import DESK, PHONE, Opened, View, browsing, floats, opening
+from support.gateway_pages import DESK, PHONE, Opened, Pages, View, floats, opening
 from support.gateways import Names
 from support.secured import Authority, Relay, context
 
@@ -21,18 +21,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from playwright.sync_api import Browser, Locator, Route
+    from playwright.sync_api import Locator, Route
 
     import holdfast
 
 HARMFUL = "<img src=x onerror=alert(1)>"
 SECRET = "correct-horse-battery-staple"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with browsing() as launched:
-        yield launched
 
 
 @pytest.fixture
@@ -41,9 +35,9 @@ def plant() -> holdfast.Memory:
 
 
 @pytest.fixture
-def opened(browser: Browser, plant: holdfast.Memory) -> Iterator[Opened]:
-    with opening(browser, plant, model=HARMFUL) as pages:
-        yield pages
+def opened(pages: Pages, plant: holdfast.Memory) -> Iterator[Opened]:
+    with opening(pages, plant, model=HARMFUL) as opened:
+        yield opened
 
 
 both = pytest.mark.parametrize(
@@ -477,10 +471,12 @@ class Registers:
                 return exception(pdu, 2)
             found = self.values[first : first + count]
             return bytes([3, 2 * count]) + b"".join(each.to_bytes(2) for each in found)
-        if pdu[0] == 6 and self.fault is None:
+        if pdu[0] == 6 and self.fault is not None:
+            return self.fault(pdu)
+        if pdu[0] == 6:
             self.values[first] = int.from_bytes(pdu[3:5])
             return pdu
-        return exception(pdu, 1) if self.fault is None else self.fault(pdu)
+        return exception(pdu, 1)
 
     @property
     def writes(self) -> list[bytes]:
@@ -726,11 +722,12 @@ def test_a_device_without_function_3_can_be_read(opened: Opened, answer: str) ->
 
     with FakeDevice(inputs) as device:
         view = opened()
-        view.page.get_by_role("spinbutton", name="Timeout").fill("1000")
+        timeout = view.page.get_by_role("spinbutton", name="Timeout")
+        timeout.fill("50" if answer == "nothing" else "1000")
         view.connect(port=device.port)
         if answer == "nothing":
             view.says("The device did not respond in time.")
-            view.page.get_by_role("spinbutton", name="Timeout").fill("1001")
+            timeout.fill("1000")
             expect(view.button("Continue anyway")).to_be_hidden()
             view.button("Connect").click()
             view.button("Continue anyway").click()
@@ -753,94 +750,93 @@ TYPES: list[tuple[dict[str, str], list[int], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("fields", "held", "text"), TYPES, ids=[each[0]["type"] for each in TYPES])
 def test_any_type_is_read(
-    opened: Opened, plant: holdfast.Memory, fields: dict[str, str], held: list[int], text: str
+    opened: Opened, plant: holdfast.Memory, subtests: pytest.Subtests
 ) -> None:
-    plant.write("holding_registers", 8, held)
     view = opened(PHONE)
     view.connect()
-    view.choose(address="8", quantity=str(len(held)), **fields)
-    view.button("Read").click()
-    view.says(f"Holding registers 8 to {7 + len(held)}: read in")
-    expect(view.row(8).locator(".typed")).to_have_text(text)
+    for fields, held, text in TYPES:
+        with subtests.test(fields["type"]):
+            plant.write("holding_registers", 8, held)
+            view.choose(address="8", quantity=str(len(held)), **{"order": "ABCD", **fields})
+            view.button("Read").click()
+            view.says(f"Holding registers 8 to {7 + len(held)}: read in")
+            expect(view.row(8).locator(".typed")).to_have_text(text)
 
 
-@pytest.mark.parametrize(
-    ("fields", "given", "held"),
-    [
-        ({"type": "string", "size": "6"}, "a, b", [0x612C, 0x2062, 0]),
-        ({"type": "string", "size": "4"}, "", [0, 0]),
-        ({"type": "bytes", "size": "4"}, "0a0B 0c0d", [0x0A0B, 0x0C0D]),
-        ({"type": "bit", "size": "3"}, "on", [0x0008]),
-        ({"type": "bit", "size": "3", "order": "BADC"}, "on", [0x0800]),
-        ({"type": "bool"}, "true", [1]),
-        ({"type": "bcd16"}, "1234", [0x1234]),
-        ({"type": "int64", "order": "letters"}, "1", [0, 1, 0, 0]),
-    ],
-    ids=["text", "no text", "bytes", "bit", "swapped bit", "bool", "bcd", "letters"],
-)
+WRITES: list[tuple[dict[str, str], str, list[int]]] = [
+    ({"type": "string", "size": "6"}, "a, b", [0x612C, 0x2062, 0]),
+    ({"type": "string", "size": "4"}, "", [0, 0]),
+    ({"type": "bytes", "size": "4"}, "0a0B 0c0d", [0x0A0B, 0x0C0D]),
+    ({"type": "bit", "size": "3"}, "on", [0x0008]),
+    ({"type": "bit", "size": "3", "order": "BADC"}, "on", [0x0800]),
+    ({"type": "bool"}, "true", [1]),
+    ({"type": "bcd16"}, "1234", [0x1234]),
+    ({"type": "int64", "order": "letters"}, "1", [0, 1, 0, 0]),
+]
+
+
 def test_any_type_is_written(
-    opened: Opened, plant: holdfast.Memory, fields: dict[str, str], given: str, held: list[int]
+    opened: Opened, plant: holdfast.Memory, subtests: pytest.Subtests
 ) -> None:
     view = opened()
     view.connect()
-    view.choose(address="8", quantity="4", **fields)
-    view.button("Read").click()
-    view.button("Write 8").click()
-    view.page.get_by_role("textbox", name="New value").fill(given)
-    view.button("Review").click()
-    view.button("Write it").click()
-    view.says("Written and read back")
-    assert plant.read("holding_registers", 8, len(held)) == held
+    for address, (fields, given, held) in zip(range(8, 256, 8), WRITES, strict=False):
+        with subtests.test(f"{fields} {given}"):
+            before = [0x4142 if fields["type"] == "string" else 0] * len(held)
+            plant.write("holding_registers", address, before)
+            view.read_four(address, **{"order": "ABCD", **fields})
+            view.button(f"Write {address}").click()
+            expect(view.page.get_by_text("Written and read back")).to_be_hidden()
+            view.page.get_by_role("textbox", name="New value").fill(given)
+            view.button("Review").click()
+            view.button("Write it").click()
+            view.says("Written and read back")
+            assert plant.read("holding_registers", address, len(held)) == held
 
 
-@pytest.mark.parametrize(
-    ("fields", "given", "says"),
-    [
+def test_a_value_that_is_none_of_a_type_is_told(opened: Opened, subtests: pytest.Subtests) -> None:
+    view = opened()
+    view.connect()
+    cases = (
         ({"type": "string", "size": "4"}, "abcde", "up to 4 ASCII characters"),
         ({"type": "string", "size": "4"}, "5 °C", "up to 4 ASCII characters"),
         ({"type": "bytes", "size": "4"}, "0a0b", "4 pairs of hexadecimal digits"),
         ({"type": "bit", "size": "3"}, "2", "is not a bit"),
         ({"type": "bit", "size": "3"}, "1, 0", "Write one bit at a time"),
-    ],
-)
-def test_a_value_that_is_none_of_a_type_is_told(
-    opened: Opened, fields: dict[str, str], given: str, says: str
-) -> None:
+    )
+    for address, (fields, given, says) in enumerate(cases, 8):
+        with subtests.test(f"{fields} {given}"):
+            view.read_four(address, **fields)
+            view.button(f"Write {address}").click()
+            alert = view.page.get_by_role("alert").filter(has_text=says)
+            expect(alert).to_be_hidden()
+            view.page.get_by_role("textbox", name="New value").fill(given)
+            view.button("Review").click()
+            expect(alert).to_be_visible()
+            view.button("Cancel").click()
+
+
+def test_letters_that_are_no_order_are_told(opened: Opened, subtests: pytest.Subtests) -> None:
     view = opened()
     view.connect()
-    view.choose(address="8", quantity="4", **fields)
-    view.button("Read").click()
-    view.button("Write 8").click()
-    view.page.get_by_role("textbox", name="New value").fill(given)
-    view.button("Review").click()
-    expect(view.page.get_by_role("alert").filter(has_text=says)).to_be_visible()
-
-
-@pytest.mark.parametrize(
-    ("kind", "letters", "says"),
-    [
+    view.says("The device responded")
+    cases = (
         ("int64", "ABCDEFGG", "contains each of A to H once"),
         ("int64", "ACBDEFGH", "The bytes of a register stay together"),
         ("int64", "CDEFGHAB", "applied twice"),
         ("int32", "EFGHABCD", "int32 has 4"),
-    ],
-)
-def test_letters_that_are_no_order_are_told(
-    opened: Opened, kind: str, letters: str, says: str
-) -> None:
-    view = opened()
-    view.connect()
-    view.says("The device responded")
-    view.choose(type=kind, order="letters", letters=letters)
-    told = view.page.locator("#letters").evaluate("(each) => each.validationMessage")
-    assert says in told
-    view.button("Read").click()
-    expect(view.page.locator("#letters")).to_be_focused()
-    view.choose(letters="GHEFCDAB", type="int64")
-    view.button("Read").click()
-    view.says("read in")
+    )
+    for first, (kind, letters, says) in enumerate(cases):
+        with subtests.test(f"{kind} {letters}"):
+            view.choose(address=str(first), type=kind, order="letters", letters=letters)
+            told = view.page.locator("#letters").evaluate("(each) => each.validationMessage")
+            assert says in told
+            view.button("Read").click()
+            expect(view.page.locator("#letters")).to_be_focused()
+            view.choose(letters="GHEFCDAB", type="int64")
+            view.button("Read").click()
+            view.says(f"Holding registers {first} to {first + 7}: read in")
 
 
 def test_all_orders_of_eight_bytes_are_shown(opened: Opened, plant: holdfast.Memory) -> None:

@@ -14,12 +14,12 @@ from playwright.sync_api import expect
 from holdfast.tags import Tag, TagList
 from support import gateway_pages
 from support.fake_device import HANG_UP, FakeDevice, registers
-from support.gateway_pages import DESK, Opened, View, browsing, floats, opening
+from support.gateway_pages import DESK, Opened, Pages, View, floats, opening
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from playwright.sync_api import Browser, Download, Page, Route
+    from playwright.sync_api import Download, Page, Route
 
     import holdfast
 
@@ -37,21 +37,15 @@ WATCHES = 7
 """More tabs than the connections that a browser opens to one host."""
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with browsing() as launched:
-        yield launched
-
-
 @pytest.fixture
 def plant() -> holdfast.Memory:
     return gateway_pages.plant()
 
 
 @pytest.fixture
-def opened(browser: Browser, plant: holdfast.Memory) -> Iterator[Opened]:
-    with opening(browser, plant, model="Feeder 7") as pages:
-        yield pages
+def opened(pages: Pages, plant: holdfast.Memory) -> Iterator[Opened]:
+    with opening(pages, plant, model="Feeder 7") as opened:
+        yield opened
 
 
 def add_tags(view: View, text: str) -> None:
@@ -229,9 +223,12 @@ def test_a_list_that_has_changed_is_shown_anew(opened: Opened) -> None:
     expect(tag(view, "former")).to_have_count(0)
 
 
-@pytest.mark.parametrize(
-    ("kind", "text", "says"),
-    [
+def test_a_value_is_checked_before_it_is_reviewed(
+    opened: Opened, plant: holdfast.Memory, subtests: pytest.Subtests
+) -> None:
+    before = plant.read("holding_registers", 8, 40)
+    view = connected(opened)
+    cases = (
         ("float32", "21,5", "“21,5” has a decimal comma. Write 21.5 for one value"),
         ("uint16", "21,5", "has a decimal comma"),
         ("float32", "1e40", "“1e40” does not fit float32"),
@@ -239,22 +236,20 @@ def test_a_list_that_has_changed_is_shown_anew(opened: Opened) -> None:
         ("float16", "65520", "does not fit float16"),
         ("float64", "1e400", "does not fit float64"),
         ("int16", "32768", "is not a valid int16"),
-    ],
-)
-def test_a_value_is_checked_before_it_is_reviewed(
-    opened: Opened, plant: holdfast.Memory, kind: str, text: str, says: str
-) -> None:
-    before = plant.read("holding_registers", 8, 8)
-    view = connected(opened)
-    view.choose(type=kind, address="8", quantity="4")
-    view.button("Read").click()
-    view.button("Write 8").click()
-    view.page.locator("#write-as").select_option("typed")
-    view.page.get_by_role("textbox", name="New value").fill(text)
-    view.button("Review").click()
-    expect(view.page.get_by_role("alert").filter(has_text=says)).to_be_visible()
-    expect(view.button("Write it")).to_be_hidden()
-    assert plant.read("holding_registers", 8, 8) == before
+    )
+    for address, (kind, text, says) in enumerate(cases, 8):
+        with subtests.test(f"{kind} {text}"):
+            view.read_four(address, type=kind)
+            view.button(f"Write {address}").click()
+            alert = view.page.get_by_role("alert").filter(has_text=says)
+            expect(alert).to_be_hidden()
+            view.page.locator("#write-as").select_option("typed")
+            view.page.get_by_role("textbox", name="New value").fill(text)
+            view.button("Review").click()
+            expect(alert).to_be_visible()
+            expect(view.button("Write it")).to_be_hidden()
+            view.button("Cancel").click()
+    assert plant.read("holding_registers", 8, 40) == before
 
 
 def test_values_are_separated_by_semicolons(opened: Opened, plant: holdfast.Memory) -> None:

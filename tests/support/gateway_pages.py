@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,7 +18,7 @@ from support.machine import tool
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from playwright.sync_api import Browser, Locator, Page, Request
+    from playwright.sync_api import Browser, ConsoleMessage, Error, Locator, Page, Request
 
 PHONE: Any = {"viewport": {"width": 360, "height": 740}, "has_touch": True}
 NO_NETWORK = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
@@ -39,16 +40,26 @@ class View:
 
     def __post_init__(self) -> None:
         self.page.on("request", self._requested)
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("console", lambda message: self._said(message.type, message.text))
+        self.page.on("pageerror", self._failed)
+        self.page.on("console", self._said)
+
+    def close(self) -> None:
+        """Ends the recording, so that the page can be used again."""
+        self.page.remove_listener("request", self._requested)
+        self.page.remove_listener("pageerror", self._failed)
+        self.page.remove_listener("console", self._said)
 
     def _requested(self, request: Request) -> None:
         self.requests.append(request.url)
 
-    def _said(self, kind: str, text: str) -> None:
+    def _failed(self, error: Error) -> None:
+        self.errors.append(str(error))
+
+    def _said(self, message: ConsoleMessage) -> None:
         # The browser logs every refusal of the gateway as such an error.
-        if kind in ("error", "warning") and not text.startswith("Failed to load resource"):
-            self.errors.append(text)
+        is_refusal = message.text.startswith("Failed to load resource")
+        if message.type in ("error", "warning") and not is_refusal:
+            self.errors.append(message.text)
 
     def check(self) -> None:
         """Checks for errors, requests to other hosts, and horizontal overflow."""
@@ -64,8 +75,8 @@ class View:
     def button(self, name: str) -> Locator:
         return self.page.get_by_role("button", name=name, exact=True)
 
-    def says(self, text: str) -> None:
-        expect(self.page.get_by_text(text)).to_be_visible()
+    def says(self, text: str | re.Pattern[str]) -> None:
+        self.page.get_by_text(text).wait_for()  # It looks more often than `expect`.
 
     def connect(self, host: str = "127.0.0.1", port: int | None = None) -> None:
         self.page.get_by_role("textbox", name="Device").fill(host)
@@ -80,6 +91,13 @@ class View:
                 place.select_option(value)
             else:
                 place.fill(value)
+
+    def read_four(self, address: int, **fields: str) -> None:
+        """Reads holding registers from another address than the one that is shown."""
+        self.choose(address=str(address), quantity="4", **fields)
+        self.button("Read").click()
+        # A multiple of the size of the type: not always four.
+        self.says(re.compile(rf"Holding registers {address} to \d+: read in"))
 
     def row(self, address: int) -> Locator:
         """Returns the row of a register."""
@@ -104,11 +122,37 @@ def plant() -> holdfast.Memory:
     return memory
 
 
+class Pages:
+    """Pages for one test after the other: a new window takes half a second of processor time."""
+
+    def __init__(self, browser: Browser) -> None:
+        self._browser = browser
+        self._free: dict[str, list[Page]] = {}
+
+    def take(self, size: Any) -> Page:
+        """Returns an empty page."""
+        if free := self._free.get(repr(size)):
+            return free.pop()
+        context = self._browser.new_context(**size)
+        context.set_default_timeout(1000 * wire.DEADLINE)
+        return context.new_page()
+
+    def give_back(self, size: Any, page: Page) -> None:
+        """Empties a page that `take` has returned, and closes those that it has opened."""
+        for other in page.context.pages:
+            if other != page:
+                other.close()
+        page.unroute_all()
+        page.evaluate("sessionStorage.clear()")
+        page.goto("about:blank")
+        self._free.setdefault(repr(size), []).append(page)
+
+
 @dataclass
 class Opened:
     """Opens the console of a gateway with some settings."""
 
-    browser: Browser
+    pages: Pages
     plant: holdfast.Memory
     port: int
     views: list[tuple[View, Any, Any]] = field(default_factory=list)
@@ -118,18 +162,19 @@ class Opened:
     ) -> View:
         running = gateways.running(**{"limits": {"interval": 0.05}, **settings})
         gateway = running.__enter__()
-        context = self.browser.new_context(**size, color_scheme=scheme)
-        context.set_default_timeout(1000 * wire.DEADLINE)
-        view = View(context.new_page(), gateway, self.port, self.plant)
-        self.views.append((view, context, running))
+        page = self.pages.take(size)
+        page.emulate_media(color_scheme=scheme, reduced_motion="no-preference")
+        view = View(page, gateway, self.port, self.plant)
+        self.views.append((view, size, running))
         return view.open()
 
     def close(self) -> None:
-        for view, context, running in self.views:
+        for view, size, running in self.views:
             try:
                 view.check()
             finally:
-                context.close()
+                view.close()
+                self.pages.give_back(size, view.page)
                 running.__exit__(None, None, None)
 
 
@@ -147,15 +192,15 @@ def browsing() -> Iterator[Browser]:
 
 
 @contextlib.contextmanager
-def opening(browser: Browser, memory: holdfast.Memory, model: str) -> Iterator[Opened]:
+def opening(pages: Pages, memory: holdfast.Memory, model: str) -> Iterator[Opened]:
     """Opens pages, with a device that has this memory and this model name."""
     expect.set_options(timeout=1000 * wire.DEADLINE)
     identity = Identity(vendor_name="Acme", product_code="F7", revision="2.1", model_name=model)
     with holdfast.Server(
         {1: memory}, bind="127.0.0.1:0", access="read-write", identity=identity
     ) as server:
-        pages = Opened(browser, memory, server.address[1])
+        opened = Opened(pages, memory, server.address[1])
         try:
-            yield pages
+            yield opened
         finally:
-            pages.close()
+            opened.close()

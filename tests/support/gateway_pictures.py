@@ -10,7 +10,7 @@ from playwright.sync_api import expect
 
 from support import gateway_pages
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
-from support.gateway_pages import DESK, PHONE, Opened, View, browsing, floats, opening
+from support.gateway_pages import DESK, PHONE, Opened, Pages, View, browsing, floats, opening
 from support.paths import DOCS
 
 if TYPE_CHECKING:
@@ -194,9 +194,10 @@ SCENES: dict[str, Scene] = {
 def main() -> None:
     """Takes the named pictures, or all."""
     with browsing() as browser:
+        pages = Pages(browser)
         for name in sys.argv[1:] or SCENES:
             for scheme in SCHEMES:
-                with opening(browser, gateway_pages.plant(), model="Feeder 7") as opened:
+                with opening(pages, gateway_pages.plant(), model="Feeder 7") as opened:
                     view = SCENES[name](opened, scheme)
                     file = IMAGES / f"gateway-{name}-{scheme}.png"
                     view.page.screenshot(
