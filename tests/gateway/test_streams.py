@@ -286,13 +286,14 @@ def test_a_device_that_is_silent_is_no_map(gateway: Running) -> None:
         assert (stream.status, stream.kind) == (500, "application/json")
 
 
-def test_a_device_that_falls_silent_ends_its_map(gateway: Running) -> None:
-    silent = threading.Event()
+@pytest.mark.parametrize("end", [HANG_UP, None], ids=["hangs-up", "silent"])
+def test_a_device_that_stops_answering_ends_its_map(gateway: Running, end: bytes | None) -> None:
+    stopped = threading.Event()
 
     def answer(pdu: bytes) -> bytes | None:
         if int.from_bytes(pdu[1:3]) >= 1000:
-            silent.set()
-        return None if silent.is_set() else registers(pdu)
+            stopped.set()
+        return end if stopped.is_set() else registers(pdu)
 
     with FakeDevice(answer) as device:
         options = {"areas": ["holding_registers"], "timeout": 1000}
