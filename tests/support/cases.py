@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import os
 from typing import TYPE_CHECKING
 
@@ -31,6 +32,10 @@ def slow_ids() -> list[str]:
 
 
 def is_listed(case: str, ids: Iterable[str]) -> bool:
-    """Whether a case is in the list, which has whole files, functions, and single cases."""
+    """Whether a case is in the list: whole files, functions, single cases, and patterns with *."""
     function = case.partition("[")[0]
-    return not {case, function, function.partition("::")[0]}.isdisjoint(ids)
+    names = {case, function, function.partition("::")[0]}
+    return any(
+        fnmatch.fnmatchcase(case, line.replace("[", "[[]")) if "*" in line else line in names
+        for line in ids
+    )
