@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ import pytest
 from holdfast.config import load
 from support import wire
 from support.brokers import free_port
+from support.commands import write_script
 from support.machine import tool
 from support.paths import EXAMPLES
 
@@ -37,8 +37,7 @@ def test_one_command_shows_what_the_page_says(tmp_path: Path, ports: dict[str, s
         (tmp_path / file.name).write_text(text)
     shutil.copymode(FOLDER / "run", tmp_path / "run")
     script = tmp_path / "holdfast"
-    script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m holdfast "$@"\n')
-    script.chmod(0o755)
+    write_script(script)
     done = subprocess.run(
         [tool("sh"), tmp_path / "run"],
         env={**os.environ, "HOLDFAST": str(script)},

@@ -18,6 +18,7 @@ import socket
 import struct
 import subprocess
 import sys
+import tempfile
 import termios
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -120,15 +121,58 @@ class Command:
         self.send_signal(signal.SIGKILL)
 
 
+SCRIPT = """\
+#!{python} -IS
+import json, os, signal, socket, struct, sys
+
+def forward(number, _):
+    os.kill(pid, number)
+
+server = socket.socket(socket.AF_UNIX)
+server.connect({address!r})
+request = {{
+    "arguments": sys.argv[1:],
+    "environment": dict(os.environ),
+    "folder": os.getcwd(),
+    "has_terminal": False,
+}}
+socket.send_fds(server, [json.dumps(request).encode() + b"\\n"], [0, 1, 2])
+[pid] = struct.unpack("i", server.recv(4))
+for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, forward)
+[code] = struct.unpack("i", server.recv(4))
+sys.exit(code if code >= 0 else 128 - code)
+"""
+
+
+def write_script(file: Path) -> None:
+    """Writes a program `holdfast` for shells, which starts as fast."""
+    _fork_server()
+    file.write_text(SCRIPT.format(python=sys.executable, address=str(_address())))
+    file.chmod(0o755)
+
+
+@functools.cache
+def _address() -> Path:
+    """Where the server listens for scripts."""
+    folder = tempfile.TemporaryDirectory(prefix="holdfast-")
+    atexit.register(folder.cleanup)
+    return Path(folder.name) / "server"
+
+
 @functools.cache
 def _fork_server() -> socket.socket:
     """The connection to the server."""
     ours, theirs = socket.socketpair()
-    with theirs:
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(_address()))
+    listener.listen()
+    with theirs, listener:
+        numbers = [theirs.fileno(), listener.fileno()]
         process = subprocess.Popen(
-            [sys.executable, "-P", __file__, str(theirs.fileno())],
+            [sys.executable, "-P", __file__, *map(str, numbers)],
             stdin=subprocess.DEVNULL,
-            pass_fds=[theirs.fileno()],
+            pass_fds=numbers,
         )
 
     def end() -> None:
@@ -139,7 +183,7 @@ def _fork_server() -> socket.socket:
     return ours
 
 
-def _serve(requests: socket.socket) -> None:
+def _serve(requests: socket.socket, listener: socket.socket) -> None:
     """Forks for each request. Returns in the children, which run a command."""
     for place in COMMANDS.values():
         importlib.import_module(place.partition(":")[0])
@@ -149,20 +193,33 @@ def _serve(requests: socket.socket) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     while True:
-        data, files = b"", list[int]()
-        while not data.endswith(b"\n"):
-            piece, more, _, _ = socket.recv_fds(requests, 1 << 20, 4)
-            if not piece:
-                sys.exit()
-            data, files = data + piece, files + more
+        ready, _, _ = select.select([requests, listener], [], [])
+        if requests in ready:
+            request, files = _received(requests)
+        else:
+            script, _ = listener.accept()
+            request, files = _received(script)
+            files.append(script.detach())
         if os.fork() == 0:
             requests.close()
+            listener.close()
             *standard, status = files
             _fork_and_wait(standard, status)
-            _become(json.loads(data), standard)
+            _become(request, standard)
             return
         for each in files:
             os.close(each)
+
+
+def _received(sender: socket.socket) -> tuple[dict[str, Any], list[int]]:
+    """A request, and its files. Ends the process with the one that has started it."""
+    data, files = b"", list[int]()
+    while not data.endswith(b"\n"):
+        piece, more, _, _ = socket.recv_fds(sender, 1 << 20, 4)
+        if not piece:
+            sys.exit()
+        data, files = data + piece, files + more
+    return json.loads(data), files
 
 
 def _fork_and_wait(standard: Sequence[int], status: int) -> None:
@@ -203,5 +260,5 @@ def _become(request: dict[str, Any], standard: Sequence[int]) -> None:
 
 
 if __name__ == "__main__":
-    _serve(socket.socket(fileno=int(sys.argv[1])))
+    _serve(*(socket.socket(fileno=int(number)) for number in sys.argv[1:]))
     main(prog_name="python -m holdfast", default_map=LONG_TIMEOUTS)

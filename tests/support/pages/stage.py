@@ -6,13 +6,13 @@ import contextlib
 import os
 import re
 import socket
-import sys
 import threading
 from typing import TYPE_CHECKING, Any
 
 from holdfast.appliance import Appliance
 from holdfast.config import load
 from support.cli import ServingCommand
+from support.commands import write_script
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -99,11 +99,9 @@ class Stage(contextlib.ExitStack):
 
     def program(self) -> None:
         """Puts `holdfast` into the `PATH` of the commands, and into `.venv/bin`."""
-        script = f'#!/bin/sh\nexec "{sys.executable}" -m holdfast "$@"\n'
         programs = self.folder / ".venv" / "bin"
         programs.mkdir(parents=True)
-        (programs / "holdfast").write_text(script)
-        (programs / "holdfast").chmod(0o755)
+        write_script(programs / "holdfast")
         self.environment["PATH"] = f"{programs}{os.pathsep}{os.environ['PATH']}"
 
 
