@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from typing import TYPE_CHECKING
 
@@ -38,7 +39,8 @@ PLACES = {"write": 1, "limited": 1, "refused": 0, "problem": 0}
 """The functions of `logs`, and the place of the name among their arguments."""
 
 
-def logged() -> set[str]:
+@functools.cache
+def logged() -> frozenset[str]:
     """The names of all events. Raises `AssertionError` for a name that can't be found."""
     found = {"log_dropped", *_of_listeners()}
     for file in PYTHON.rglob("*.py"):
@@ -50,7 +52,7 @@ def logged() -> set[str]:
                 assert place in BY_VARIABLE, f"{file}:{argument.lineno}: which events?"
                 known = BY_VARIABLE[place]
             found |= known
-    return found
+    return frozenset(found)
 
 
 def _of_listeners() -> Iterator[str]:

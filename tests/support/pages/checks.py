@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import functools
 import io
 import json
 import re
@@ -36,12 +35,7 @@ def log_lines(block: Block, _: Stage) -> None:
     for line in block.text.splitlines():
         found = re.fullmatch(r'\S+Z (info|warning|error) (\w+)((?: \w+=(?:"[^"]*"|\S+))*)', line)
         assert found, f"no line of the log: {line}"
-        assert found[2] in _events(), f"no event of the log: {found[2]}"
-
-
-@functools.cache
-def _events() -> set[str]:
-    return logged()
+        assert found[2] in logged(), f"no event of the log: {found[2]}"
 
 
 def audit_lines(block: Block, stage: Stage) -> None:
