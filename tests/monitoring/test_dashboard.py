@@ -147,11 +147,13 @@ def test_every_panel_has_data_of_an_appliance(prometheus: Prometheus) -> None:
     assert len(waiting) > len(QUERIES) / 2
 
     def are_answered() -> bool:
-        for title, query in list(waiting):
+        while waiting:
+            _, query = asked = next(iter(waiting))
             answer = json.loads(prometheus.get("/api/v1/query", query=with_values(query)))
-            if answer["data"]["result"]:
-                waiting.discard((title, query))
-        return not waiting
+            if not answer["data"]["result"]:
+                return False
+            waiting.discard(asked)
+        return True
 
     try:
         wire.until(are_answered, "each query has an answer", 3 * wire.DEADLINE)

@@ -72,12 +72,13 @@ def split(received: bytes) -> tuple[list[Frame], bytes]:
 
 def until(condition: Callable[[], object], what: str, seconds: float = DEADLINE) -> None:
     """Waits until the condition holds; fails after the deadline."""
-    deadline = time.monotonic() + seconds
+    start = time.monotonic()
     between_looks = threading.Event()
     while not condition():
-        if time.monotonic() > deadline:
+        waited = time.monotonic() - start
+        if waited > seconds:
             raise AssertionError(f"not within {seconds} s: {what}")
-        between_looks.wait(0.002)
+        between_looks.wait(min(0.002 + waited / 50, 0.01))
 
 
 def until_long_enough(
