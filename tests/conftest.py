@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 pytest_plugins = ("support.nats_bus",)
 
+COLLECTED = pytest.StashKey[list[str]]()
+
 # Property tests draw the same cases in every run; only `make explore` draws new ones.
 # There is no deadline: the time that a case takes depends on the load of the machine.
 settings.register_profile(
@@ -60,12 +62,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leaves out the slow cases, or all others."""
     which, ids = config.getoption("slow"), cases.slow_ids()
+    config.stash[COLLECTED] = [item.nodeid for item in items]
     if which != "with":
         parts: dict[bool, list[pytest.Item]] = {True: [], False: []}
         for item in items:
             parts[cases.is_listed(item.nodeid, ids)].append(item)
         items[:] = parts[which == "only"]
         config.hook.pytest_deselected(items=parts[which != "only"])
+
+
+@pytest.fixture
+def collected(request: pytest.FixtureRequest) -> list[str]:
+    """All cases, also those that this run leaves out. Skips if only a part is collected."""
+    if request.config.args != request.config.getini("testpaths"):
+        pytest.skip("pytest was called with a part of the tests")
+    return request.config.stash[COLLECTED]
 
 
 @pytest.fixture(autouse=True)

@@ -78,8 +78,11 @@ def test_a_process_that_hangs_does_not_answer_in_time(
     file = str(tmp_path / "plant.yaml")
     wire.until(lambda: invoke("health", file).exit_code == 0, "it is ready")
     process.send_signal(signal.SIGSTOP)
-    state = Path(f"/proc/{process.pid}/status")
-    wire.until(lambda: "\nState:\tT" in state.read_text(), "it has stopped")
+    threads = Path(f"/proc/{process.pid}/task")
+    wire.until(
+        lambda: all("\nState:\tT" in each.read_text() for each in threads.glob("*/status")),
+        "all its threads have stopped",
+    )
     result = invoke("health", file, "--live", "--timeout", "0.5")
     assert (result.exit_code, "no answer in 0.5 s" in result.stderr) == (1, True)
     process.send_signal(signal.SIGCONT)

@@ -127,6 +127,20 @@ impl Server {
 pub fn signal_to(process: u32, signal: &str) {
     let done = Command::new("kill").args([&format!("-{signal}"), &process.to_string()]).status();
     assert!(done.unwrap().success());
+    if signal == "STOP" {
+        // Its threads run on until the system has stopped them all.
+        until("all threads are stopped", || threads_are_stopped(process));
+    }
+}
+
+/// Always true where the system has no /proc.
+fn threads_are_stopped(process: u32) -> bool {
+    let Ok(threads) = std::fs::read_dir(format!("/proc/{process}/task")) else { return true };
+    threads.flatten().all(|thread| {
+        // The state follows the name, which is in parentheses.
+        let stat = std::fs::read_to_string(thread.path().join("stat"));
+        stat.map_or(true, |stat| stat.rsplit_once(") ").unwrap().1.starts_with('T'))
+    })
 }
 
 impl Drop for Server {
