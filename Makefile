@@ -31,7 +31,7 @@ run: .venv/core.stamp
 test: .venv/core.stamp .venv/dev.stamp
 	@$(MAKE) --no-print-directory -j 2 test-rust test-python
 
-PYTEST := $(BIN)/pytest -n 4 --dist worksteal
+PYTEST := $(BIN)/pytest -n 6 --dist worksteal
 test-python: .venv/core.stamp .venv/dev.stamp
 	$(PYTEST) --slow without
 
