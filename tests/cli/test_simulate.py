@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import signal
 from typing import TYPE_CHECKING
 
@@ -42,8 +43,9 @@ def test_the_example_is_simulated_read_and_written(
     simulate: Callable[..., tuple[ServingCommand, str]],
 ) -> None:
     command, url = simulate(HEATER)
-    assert f"  holdfast watch {url} --tags {HEATER}\n" in command.greeting
-    assert f"  holdfast write {url} setpoint=17.5 --tags {HEATER}\n" in command.greeting
+    quoted = shlex.quote(HEATER)
+    assert f"  holdfast watch {url} --tags {quoted}\n" in command.greeting
+    assert f"  holdfast write {url} setpoint=17.5 --tags {quoted}\n" in command.greeting
     tags = ("--tags", HEATER)
     first = answer("read", url, *tags)["values"]
     assert 225 <= first["voltage"] <= 235

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="packages of Deb
 def unit(tmp_path: Path) -> Path:
     """The unit, with a program that is there."""
     made = tmp_path / "holdfast.service"
-    made.write_text(UNIT.replace("/usr/bin/holdfast", sys.executable))
+    made.write_text(UNIT.replace("/usr/bin/holdfast", tool("true")))
     return made
 
 

@@ -13,6 +13,7 @@ import importlib
 import json
 import os
 import select
+import shlex
 import signal
 import socket
 import struct
@@ -122,7 +123,9 @@ class Command:
 
 
 SCRIPT = """\
-#!{python} -IS
+#!/bin/sh
+'''exec' {python} -IS "$0" "$@"
+'''
 import json, os, signal, socket, struct, sys
 
 def forward(number, _):
@@ -148,7 +151,7 @@ sys.exit(code if code >= 0 else 128 - code)
 def write_script(file: Path) -> None:
     """Writes a program `holdfast` for shells, which starts as fast."""
     _fork_server()
-    file.write_text(SCRIPT.format(python=sys.executable, address=str(_address())))
+    file.write_text(SCRIPT.format(python=shlex.quote(sys.executable), address=str(_address())))
     file.chmod(0o755)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -44,13 +45,14 @@ def test_a_service_runs_the_configuration_at_every_boot_without_a_privilege(
     assert told == "Installed: holdfast-my-plant, with the account NT SERVICE\\holdfast-my-plant"
     assert log == "Log: /data/Holdfast/holdfast-my-plant.log"
     service = windows.services["holdfast-my-plant"]
+    python = subprocess.list2cmdline([sys.executable])
     assert service.arguments == {
         "shown": "Holdfast (my plant.yaml)",
         "access": 0xF01FF,
         "type": 0x10,
         "start": 2,
         "error": 1,
-        "program": f'{sys.executable} -m holdfast service host "{file}" --name holdfast-my-plant',
+        "program": f'{python} -m holdfast service host "{file}" --name holdfast-my-plant',
         "group": None,
         "tag": False,
         "needs": ["Tcpip"],
