@@ -82,6 +82,7 @@ class Reloading:
     def _reload(self) -> Mapping[str, Any]:
         problems: list[str] = []
         changed: list[str] = []
+        before = self._signature()
         try:
             config = self._load()
             changed = self._appliance.reload(config)
@@ -99,7 +100,9 @@ class Reloading:
             logs.problem("reload_incomplete")
             return {"incomplete": self._placed(f"internal error: {error}")}
         finally:
-            self._known = self._seen = self._signature()
+            # A file that was written meanwhile still differs from what is known.
+            now = self._signature()
+            self._known = self._seen = {file: before.get(file, now[file]) for file in now}
         for problem in problems:
             logs.write(logging.ERROR, "reload_refused", problem=problem)
         if problems:
@@ -117,5 +120,5 @@ class Reloading:
     def _placed(self, problem: str) -> str:
         return problem if self._file is None else f"{self._file}: {problem}"
 
-    def _signature(self) -> object:
-        return None if self._file is None else signature(self._file, self._appliance.config)
+    def _signature(self) -> Mapping[Path, object]:
+        return {} if self._file is None else signature(self._file, self._appliance.config)

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from holdfast.net.tls import Tls
 
 
-def signature(file: Path, config: Config) -> tuple[object, ...]:
+def signature(file: Path, config: Config) -> dict[Path, object]:
     """What changes when a configuration, or a file that it names, is written."""
-    return tuple(map(_written, [file, *config.profile_files, *_files(config)]))
+    return {each: _written(each) for each in (file, *config.profile_files, *_files(config))}
 
 
 def _written(file: Path) -> object:
