@@ -135,7 +135,7 @@ def test_everything_of_a_subscription_is_restored(
         "host": None,
         "port": None,
         "url": url,
-        "timeout": 700,
+        "timeout": 20_700,
         "byteOrder": "little",
         "publish": "change",
         "deadband": 0.5,
@@ -145,7 +145,7 @@ def test_everything_of_a_subscription_is_restored(
     }
     ids = {"deviceId": "a b/ü", "subscriberId": "who ever.*"}
     assert caller.request("modbus.subscribe", subscription(server, *tags) | more | ids)["success"]
-    plain = subscription(server, tag("x", 5), timeout=900, deviceId="udp", transport="udp")
+    plain = subscription(server, tag("x", 5), timeout=20_900, deviceId="udp", transport="udp")
     assert caller.request("modbus.subscribe", plain)["success"]
     before = [device(caller, "a b/ü"), device(caller, "udp")]
     stored = caller.kept(BUCKET)
