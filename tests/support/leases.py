@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 SHORT = LeaseTimes(ttl_s=0.6, hold_s=0.4, renewal_s=0.2)
 """For leases that may end at any time: a loaded machine can be too late to renew them."""
 
-BRIEF = LeaseTimes(ttl_s=1.5, hold_s=0.75, renewal_s=0.25)
-"""The same, with devices: what is on its way to one when its node stops has as long to arrive."""
+BRIEF = LeaseTimes(ttl_s=2.0, hold_s=0.75, renewal_s=0.25)
+"""The same, with devices: what is on its way to one when its node stops has longer to arrive than
+by default, because a device of a test may be late to notice it."""
 
 LASTING = LeaseTimes(ttl_s=1.5, hold_s=1.0, renewal_s=0.1)
 """For leases that must not end while they are renewed."""
