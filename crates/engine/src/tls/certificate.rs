@@ -6,7 +6,7 @@ use webpki::KeyPurposeId;
 use x509_cert::certificate::{CertificateInner, Profile};
 use x509_cert::der::asn1::{AnyRef, ObjectIdentifier, UintRef, Utf8StringRef};
 use x509_cert::der::{self, Decode, Encode, Reader, SliceReader};
-use x509_cert::ext::pkix::{BasicConstraints, ExtendedKeyUsage, KeyUsage};
+use x509_cert::ext::pkix::{BasicConstraints, CrlDistributionPoints, ExtendedKeyUsage, KeyUsage};
 use x509_cert::name::Name;
 use x509_cert::serial_number::SerialNumber;
 use x509_cert::spki::{AlgorithmIdentifierOwned, SubjectPublicKeyInfoOwned};
@@ -261,6 +261,18 @@ impl Parsed {
     pub(super) fn may_sign_handshakes(&self) -> bool {
         let usage = self.0.tbs_certificate().get_extension::<KeyUsage>();
         usage.is_ok_and(|usage| usage.is_none_or(|(_, usage)| usage.digital_signature()))
+    }
+
+    /// Whether its key may sign revocation lists: `keyUsage`, if any, has `cRLSign`.
+    pub(super) fn may_sign_lists(&self) -> bool {
+        let usage = self.0.tbs_certificate().get_extension::<KeyUsage>();
+        usage.is_ok_and(|usage| usage.is_none_or(|(_, usage)| usage.crl_sign()))
+    }
+
+    /// Where its authority publishes revocation lists.
+    pub(super) fn distribution_points(&self) -> der::Result<Option<CrlDistributionPoints>> {
+        let found = self.0.tbs_certificate().get_extension();
+        found.map(|found| found.map(|(_, points)| points))
     }
 
     /// The subject, for the list of accepted issuers that a server sends to clients.

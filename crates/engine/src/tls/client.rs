@@ -20,6 +20,7 @@ use super::certificate::Purpose;
 use super::files::FileError;
 use super::own::own;
 use super::provider::{ALGORITHMS, provider, verify_tls12, verify_tls13};
+use super::revocation::Lists;
 use super::trust::{Listed, Trust};
 use super::{Channel, TlsFailure};
 
@@ -79,7 +80,7 @@ impl ClientTls {
         let own =
             settings.own.map(|(file, key_file)| own(file, key_file, settings.key)).transpose()?;
         let shown = own.as_ref().map_or_else(Vec::new, |own| own.cert.clone());
-        let verifier = Arc::new(Servers(Trust::new(Arc::clone(&trusted), Vec::new())));
+        let verifier = Arc::new(Servers(Trust::new(Arc::clone(&trusted), Lists::default())));
         let builder = ClientConfig::builder_with_provider(provider())
             .with_safe_default_protocol_versions()
             .map_err(|error| TlsError::Other(TlsFailure::from(error).to_string()))?

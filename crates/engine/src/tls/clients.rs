@@ -16,8 +16,8 @@ use super::doubts::Doubts;
 use super::files::FileError;
 use super::notes::{Chain, noted};
 use super::provider::{ALGORITHMS, verify_tls12, verify_tls13};
-use super::revocation::List;
-use super::server_files::{ExpiredLists, ServerFiles};
+use super::revocation::{List, Lists};
+use super::server_files::ServerFiles;
 use super::trust::{Listed, Trust};
 
 /// Verifies the certificates of clients.
@@ -32,7 +32,7 @@ impl Clients {
         let listed = listed(&files.ca_file)?;
         let subjects = listed.iter().filter_map(Listed::subject).collect();
         doubts.of_listed(&listed);
-        let revoked = match &files.crl_file {
+        let lists = match &files.crl_file {
             Some(file) if !listed.iter().any(Listed::is_authority) => {
                 let flaw = "crl_file requires an authority (CA:TRUE) in ca_file";
                 return Err(FileError::content(file, flaw));
@@ -40,15 +40,11 @@ impl Clients {
             Some(file) => {
                 let lists = List::of_file(file)?;
                 doubts.of_lists(file, &lists, &listed);
-                lists.into_iter().map(List::into_usable).collect()
+                lists
             }
             None => Vec::new(),
         };
-        let trust = Trust::new(listed, revoked);
-        let trust = match files.expired_lists {
-            ExpiredLists::Refuse => trust,
-            ExpiredLists::Accept => trust.accepting_expired_lists(),
-        };
+        let trust = Trust::new(listed, Lists { lists, expired: files.expired_lists });
         Ok(Clients { trust, subjects })
     }
 

@@ -86,6 +86,14 @@ impl<'f> Doubts<'f> {
                 ));
             }
             self.of_age(file, list, &name);
+            let missing = list.missing();
+            if !missing.is_empty() {
+                let missing = missing.join(" and no ");
+                self.add(file, &format!(
+                    "{name} has no {missing} (RFC 5280, 5.2): Holdfast uses it, other programs may \
+                     refuse it"
+                ));
+            }
         }
         for (each, number) in authorities {
             if !lists.iter().any(|list| each.parsed().has_subject(list.issuer())) {

@@ -1,26 +1,47 @@
-//! Reads revocation lists.
+//! Revocation lists: reads them, and judges certificates by them.
+//!
+//! webpki checks the form of a list, and finds certificates in it. It refuses lists without
+//! extensions, which OpenSSL writes unless its configuration names some, so the rest is done here, for
+//! lists of every form.
 
 use std::path::Path;
 
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateRevocationListDer, UnixTime};
-use webpki::{CertRevocationList, OwnedCertRevocationList};
-use x509_cert::crl::CertificateList;
-use x509_cert::der::{Decode, Encode};
+use webpki::{Cert, CertRevocationList, OwnedCertRevocationList, VerifiedPath};
+use x509_cert::certificate::Version;
+use x509_cert::crl::{CertificateList, TbsCertList};
+use x509_cert::der::asn1::{ContextSpecific, ObjectIdentifier, OctetString};
+use x509_cert::der::{self, Decode, Encode, Reader, SliceReader, TagNumber};
+use x509_cert::ext::Extension;
+use x509_cert::ext::pkix::IssuingDistributionPoint;
+use x509_cert::ext::pkix::name::{DistributionPointName, GeneralName};
 use x509_cert::name::Name;
 use x509_cert::time::Time;
 
 use super::certificate::{AnySerial, Parsed, algorithm_content};
 use super::files::FileError;
 use super::provider::ALGORITHMS;
+use super::server_files::ExpiredLists;
+
+/// The extensions that RFC 5280, 5.2 requires of every list. No judgement depends on them.
+const REQUIRED: [(ObjectIdentifier, &str); 2] = [
+    (ObjectIdentifier::new_unwrap("2.5.29.35"), "authority key identifier"),
+    (CRL_NUMBER, "CRL number"),
+];
+const CRL_NUMBER: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.29.20");
 
 /// A revocation list.
 #[derive(Debug)]
 pub(super) struct List {
     /// Its place in the file, from 1.
     pub(super) number: usize,
+    /// What is signed.
+    signed: Vec<u8>,
     parsed: CertificateList<AnySerial>,
     usable: CertRevocationList<'static>,
+    /// The certificates that the list is for; `None` for all of its issuer.
+    scope: Option<IssuingDistributionPoint>,
 }
 
 impl List {
@@ -41,22 +62,32 @@ impl List {
         }
         let numbered = found.iter().zip(1..);
         let lists = numbered.map(|(der, number)| {
-            let unreadable = |why: String| {
+            List::new(der, number).map_err(|why| {
                 FileError::content(file, format!("revocation list {number} can't be read: {why}"))
-            };
-            let usable = OwnedCertRevocationList::from_der(der);
-            let usable = usable.map_err(|error| unreadable(error.to_string()))?.into();
-            let parsed = CertificateList::from_der(der);
-            let parsed = parsed.map_err(|error| unreadable(error.to_string()))?;
-            Ok(List { number, parsed, usable })
+            })
         });
         let mut lists = lists.collect::<Result<Vec<_>, FileError>>()?;
         lists.sort_by_key(|list| std::cmp::Reverse(list.begins()));
         Ok(lists)
     }
 
-    pub(super) fn into_usable(self) -> CertRevocationList<'static> {
-        self.usable
+    /// # Errors
+    /// Why the list can't be used.
+    fn new(der: &[u8], number: usize) -> Result<List, String> {
+        let (signed, mut parsed) = read(der).map_err(|error| error.to_string())?;
+        let usable = match &parsed.tbs_cert_list.crl_extensions {
+            Some(_) => OwnedCertRevocationList::from_der(der),
+            None => {
+                let complete = completed(&parsed).map_err(|error| error.to_string())?;
+                OwnedCertRevocationList::from_der(&complete)
+            }
+        };
+        let usable = CertRevocationList::from(usable.map_err(|error| error.to_string())?);
+        let scope = usable.issuing_distribution_point().map(IssuingDistributionPoint::from_der);
+        let scope = scope.transpose().map_err(|error| error.to_string())?;
+        // They are in `usable`.
+        parsed.tbs_cert_list.revoked_certificates = None;
+        Ok(List { number, signed: signed.to_vec(), parsed, usable, scope })
     }
 
     pub(super) fn issuer(&self) -> &Name {
@@ -72,9 +103,15 @@ impl List {
         self.parsed.tbs_cert_list.next_update.as_ref().map(moment)
     }
 
+    /// The required extensions that it lacks, in words.
+    pub(super) fn missing(&self) -> Vec<&'static str> {
+        let found = self.parsed.tbs_cert_list.crl_extensions.as_deref().unwrap_or_default();
+        let lacks = |(id, _): &(ObjectIdentifier, _)| found.iter().all(|each| each.extn_id != *id);
+        REQUIRED.into_iter().filter(lacks).map(|(_, name)| name).collect()
+    }
+
     /// Whether an authority has signed it.
     pub(super) fn is_signed_by(&self, authority: &Parsed) -> bool {
-        let Ok(signed) = self.parsed.tbs_cert_list.to_der() else { return false };
         let with = algorithm_content(&self.parsed.signature_algorithm);
         let of = algorithm_content(&authority.key().algorithm);
         let key = authority.key().subject_public_key.raw_bytes();
@@ -82,11 +119,345 @@ impl List {
         ALGORITHMS.all.iter().any(|algorithm| {
             with.as_deref() == Some(algorithm.signature_alg_id().as_ref())
                 && of.as_deref() == Some(algorithm.public_key_alg_id().as_ref())
-                && algorithm.verify_signature(key, &signed, signature).is_ok()
+                && algorithm.verify_signature(key, &self.signed, signature).is_ok()
         })
     }
+
+    /// Whether the list is for a certificate: it has the same issuer, and the certificate is within its
+    /// scope (RFC 5280, 6.3.3).
+    fn is_for(&self, certificate: &Cert<'_>, parsed: &Parsed, is_end_entity: bool) -> bool {
+        if self.usable.issuer() != certificate.issuer() {
+            return false;
+        }
+        let Some(scope) = &self.scope else { return true };
+        let is_of_others = match is_end_entity {
+            true => scope.only_contains_ca_certs,
+            false => scope.only_contains_user_certs,
+        };
+        if is_of_others {
+            return false;
+        }
+        let own = scope.distribution_point.as_ref();
+        let own: Vec<&str> = own.into_iter().flat_map(uris).collect();
+        match parsed.distribution_points() {
+            Ok(None) => true,
+            Ok(Some(points)) => points
+                .0
+                .iter()
+                .filter(|point| point.crl_issuer.is_none() && point.reasons.is_none())
+                .filter_map(|point| point.distribution_point.as_ref())
+                .flat_map(uris)
+                .any(|uri| own.contains(&uri)),
+            Err(_) => false,
+        }
+    }
+}
+
+/// The lists that certificates are judged by, the newest first. If there are any, every authority
+/// requires one.
+#[derive(Debug, Default)]
+pub(super) struct Lists {
+    pub(super) lists: Vec<List>,
+    pub(super) expired: ExpiredLists,
+}
+
+impl Lists {
+    /// Judges every certificate of a path to a listed authority.
+    ///
+    /// # Errors
+    /// One is revoked, or no list tells that it is not.
+    pub(super) fn judge(
+        &self,
+        path: &VerifiedPath<'_>,
+        listed: &Parsed,
+        now: UnixTime,
+    ) -> Result<(), webpki::Error> {
+        if self.lists.is_empty() {
+            return Ok(());
+        }
+        let parsed = |each: &Cert<'_>| Parsed::new(&each.der()).map_err(|_| webpki::Error::BadDer);
+        let mut presented = None;
+        for each in path.intermediate_certificates().rev() {
+            let own = parsed(each)?;
+            let list = self.list_of(each, &own, false)?;
+            self.judge_one(each, list, presented.as_ref(), listed, now)?;
+            presented = Some(own);
+        }
+        let end_entity: &Cert<'_> = path.end_entity();
+        let list = self.list_of(end_entity, &parsed(end_entity)?, true)?;
+        self.judge_one(end_entity, list, presented.as_ref(), listed, now)
+    }
+
+    fn list_of(
+        &self,
+        certificate: &Cert<'_>,
+        parsed: &Parsed,
+        is_end_entity: bool,
+    ) -> Result<&List, webpki::Error> {
+        let found = self.lists.iter().find(|list| list.is_for(certificate, parsed, is_end_entity));
+        found.ok_or(webpki::Error::UnknownRevocationStatus)
+    }
+
+    /// Judges a certificate by its list. Its issuer was presented, or is the listed authority, whose
+    /// `keyUsage` does not matter.
+    fn judge_one(
+        &self,
+        certificate: &Cert<'_>,
+        list: &List,
+        presented: Option<&Parsed>,
+        listed: &Parsed,
+        now: UnixTime,
+    ) -> Result<(), webpki::Error> {
+        if !list.is_signed_by(presented.unwrap_or(listed)) {
+            return Err(webpki::Error::InvalidCrlSignatureForPublicKey);
+        }
+        if self.expired == ExpiredLists::Refuse
+            && let Some(next_update) = list.ends().filter(|ends| now >= *ends)
+        {
+            return Err(webpki::Error::CrlExpired { time: now, next_update });
+        }
+        if presented.is_some_and(|issuer| !issuer.may_sign_lists()) {
+            return Err(webpki::Error::IssuerNotCrlSigner);
+        }
+        match list.usable.find_serial(certificate.serial())? {
+            Some(_) => Err(webpki::Error::CertRevoked),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Reads a list: what is signed, and all of it. [`CertificateList`] can't read version 1, which has
+/// no number of its version.
+fn read(der: &[u8]) -> der::Result<(&[u8], CertificateList<AnySerial>)> {
+    let mut reader = SliceReader::new(der)?;
+    let (signed, signature_algorithm, signature) = reader.sequence(|list| {
+        Ok::<_, der::Error>((list.tlv_bytes()?, list.decode()?, list.decode()?))
+    })?;
+    reader.finish()?;
+    let tbs_cert_list = SliceReader::new(signed)?.sequence(|list| {
+        let version = match list.decode()? {
+            None => Version::V1,
+            Some(Version::V2) => Version::V2,
+            Some(_) => return Err(der::Tag::Integer.value_error().into()),
+        };
+        Ok::<_, der::Error>(TbsCertList {
+            version,
+            signature: list.decode()?,
+            issuer: list.decode()?,
+            this_update: list.decode()?,
+            next_update: list.decode()?,
+            revoked_certificates: list.decode()?,
+            crl_extensions: ContextSpecific::decode_explicit(list, TagNumber(0))?
+                .map(|field| field.value),
+        })
+    })?;
+    Ok((signed, CertificateList { tbs_cert_list, signature_algorithm, signature }))
+}
+
+/// A list without extensions as webpki requires it: of version 2, and with an extension that does
+/// not change its meaning.
+fn completed(list: &CertificateList<AnySerial>) -> der::Result<Vec<u8>> {
+    let mut list = list.clone();
+    list.tbs_cert_list.version = Version::V2;
+    let number = OctetString::new(0u8.to_der()?)?;
+    list.tbs_cert_list.crl_extensions =
+        Some(vec![Extension { extn_id: CRL_NUMBER, critical: false, extn_value: number }]);
+    list.to_der()
+}
+
+/// The URIs of a distribution point.
+fn uris(name: &DistributionPointName) -> Vec<&str> {
+    let DistributionPointName::FullName(names) = name else { return Vec::new() };
+    let found = names.iter().map(|name| match name {
+        GeneralName::UniformResourceIdentifier(uri) => Some(uri.as_str()),
+        _ => None,
+    });
+    found.flatten().collect()
 }
 
 fn moment(time: &Time) -> UnixTime {
     UnixTime::since_unix_epoch(time.to_unix_duration())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::time::Duration;
+
+    use rcgen::{
+        CertificateParams, CertificateRevocationListParams, CrlDistributionPoint,
+        CrlIssuingDistributionPoint, CrlScope, KeyIdMethod, KeyUsagePurpose, RevokedCertParams,
+        SigningKey, date_time_ymd,
+    };
+
+    use super::*;
+    use crate::tls::TlsFailure;
+    use crate::tls::certificate::Purpose;
+    use crate::tls::test_party::Owner;
+    use crate::tls::trust::{Listed, Trust};
+
+    /// Within the dates of every certificate and list.
+    const NOW: UnixTime = UnixTime::since_unix_epoch(Duration::from_secs(1_800_000_000));
+
+    fn serial(owner: &Owner) -> rcgen::SerialNumber {
+        owner.params.serial_number.clone().unwrap()
+    }
+
+    fn numbered(number: u8) -> impl Fn(&mut CertificateParams) {
+        move |params| params.serial_number = Some(rcgen::SerialNumber::from(vec![number]))
+    }
+
+    fn intermediate(by: &Owner, usages: &[KeyUsagePurpose]) -> Owner {
+        Owner::new("between", Some(by), |params| {
+            numbered(3)(params);
+            params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+            params.key_usages = usages.to_vec();
+        })
+    }
+
+    /// The list of an authority, as DER.
+    fn list(by: &Owner, revoked: &[&Owner], scope: Option<(CrlScope, &str)>) -> Vec<u8> {
+        let entry = |owner: &&Owner| RevokedCertParams {
+            serial_number: serial(owner),
+            revocation_time: date_time_ymd(2026, 1, 1),
+            reason_code: None,
+            invalidity_date: None,
+        };
+        let list = CertificateRevocationListParams {
+            this_update: date_time_ymd(2026, 1, 1),
+            next_update: date_time_ymd(2090, 1, 1),
+            crl_number: 1.into(),
+            issuing_distribution_point: scope.map(|(scope, uri)| CrlIssuingDistributionPoint {
+                distribution_point: CrlDistributionPoint { uris: vec![uri.to_owned()] },
+                scope: Some(scope),
+            }),
+            revoked_certs: revoked.iter().map(entry).collect(),
+            key_identifier_method: KeyIdMethod::Sha256,
+        };
+        // Also an authority that may not sign lists signs this one.
+        let mut issuer = by.params.clone();
+        issuer.key_usages = Vec::new();
+        let issuer = rcgen::Issuer::from_params(&issuer, &by.key);
+        list.signed_by(&issuer).unwrap().der().to_vec()
+    }
+
+    /// The same list in version 1, as OpenSSL writes it.
+    fn version_1(by: &Owner, revoked: &[&Owner]) -> Vec<u8> {
+        let (_, mut list) = read(&list(by, revoked, None)).unwrap();
+        list.tbs_cert_list.crl_extensions = None;
+        let version_2 = list.tbs_cert_list.to_der().unwrap();
+        // Without the version, which is the first field.
+        let content = der::asn1::AnyRef::from_der(&version_2).unwrap().value()[3..].to_vec();
+        let signed = der::asn1::AnyRef::new(der::Tag::Sequence, &content).unwrap();
+        let signature = by.key.sign(&signed.to_der().unwrap()).unwrap();
+        let parts = [
+            signed.to_der().unwrap(),
+            list.signature_algorithm.to_der().unwrap(),
+            der::asn1::BitString::from_bytes(&signature).unwrap().to_der().unwrap(),
+        ];
+        let whole = parts.concat();
+        der::asn1::AnyRef::new(der::Tag::Sequence, &whole).unwrap().to_der().unwrap()
+    }
+
+    /// The reason why a client is not trusted; empty if it is.
+    fn judged(listed: &Owner, lists: &[Vec<u8>], chain: &[&Owner]) -> &'static str {
+        let lists = lists.iter().map(|der| List::new(der, 1).unwrap()).collect();
+        let listed = Listed::new(listed.certificate.der().clone()).unwrap();
+        let lists = Lists { lists, expired: ExpiredLists::Refuse };
+        let trust = Trust::new(Arc::new([listed]), lists);
+        let ders: Vec<_> = chain.iter().map(|owner| owner.certificate.der().clone()).collect();
+        match trust.judge(&ders[0], &ders[1..], Purpose::Client, NOW) {
+            Ok(()) => "",
+            Err(error) => TlsFailure::from(error).reason(),
+        }
+    }
+
+    #[test]
+    fn every_certificate_of_a_path_is_judged_by_a_list_of_its_issuer() {
+        let root = Owner::authority("root", None);
+        let signs = [KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+        let between = intermediate(&root, &signs);
+        let leaf = Owner::new("leaf", Some(&between), numbered(4));
+        let chain = [&leaf, &between];
+        for write in [version_1, |by: &Owner, revoked: &[&Owner]| list(by, revoked, None)] {
+            let (root_has, between_has) = (write(&root, &[]), write(&between, &[]));
+            let revoked = [write(&root, &[&between]), write(&between, &[&leaf])];
+            let told = |lists: &[Vec<u8>]| judged(&root, lists, &chain);
+            assert_eq!(told(&[]), "");
+            assert_eq!(told(&[root_has.clone(), between_has.clone()]), "");
+            assert_eq!(told(std::slice::from_ref(&root_has)), "unknown_revocation");
+            assert_eq!(told(std::slice::from_ref(&between_has)), "unknown_revocation");
+            assert_eq!(told(&[revoked[0].clone(), between_has]), "revoked");
+            assert_eq!(told(&[root_has, revoked[1].clone()]), "revoked");
+        }
+    }
+
+    #[test]
+    fn an_intermediate_that_may_not_sign_lists_is_not_believed() {
+        let root = Owner::authority("root", None);
+        let between = intermediate(&root, &[KeyUsagePurpose::KeyCertSign]);
+        let leaf = Owner::new("leaf", Some(&between), numbered(4));
+        for write in [version_1, |by: &Owner, revoked: &[&Owner]| list(by, revoked, None)] {
+            let lists = [write(&root, &[]), write(&between, &[])];
+            assert_eq!(judged(&root, &lists, &[&leaf, &between]), "unknown_revocation");
+        }
+    }
+
+    #[test]
+    fn a_list_is_only_for_certificates_within_its_scope() {
+        let root = Owner::authority("root", None);
+        let leaf = |points: &[&str]| {
+            let points = points.iter().map(|uri| (*uri).to_owned()).collect::<Vec<_>>();
+            Owner::new("leaf", Some(&root), move |params| {
+                numbered(4)(params);
+                if !points.is_empty() {
+                    let uris = points.clone();
+                    params.crl_distribution_points = vec![CrlDistributionPoint { uris }];
+                }
+            })
+        };
+        let told = |points: &[&str], scope, uri| {
+            let leaf = leaf(points);
+            let lists = [list(&root, &[&leaf], Some((scope, uri)))];
+            judged(&root, &lists, &[&leaf])
+        };
+        assert_eq!(told(&[], CrlScope::UserCertsOnly, "http://a"), "revoked");
+        assert_eq!(told(&["http://a"], CrlScope::UserCertsOnly, "http://a"), "revoked");
+        assert_eq!(told(&["http://b", "http://a"], CrlScope::UserCertsOnly, "http://a"), "revoked");
+        let unknown = "unknown_revocation";
+        assert_eq!(told(&["http://b"], CrlScope::UserCertsOnly, "http://a"), unknown);
+        assert_eq!(told(&[], CrlScope::CaCertsOnly, "http://a"), unknown);
+    }
+
+    #[test]
+    fn a_modified_list_is_unusable_or_not_believed() {
+        let root = Owner::authority("root", None);
+        let leaf = Owner::new("leaf", Some(&root), numbered(4));
+        let good = version_1(&root, &[&leaf]);
+        let listed = Arc::new([Listed::new(root.certificate.der().clone()).unwrap()]);
+        let der = leaf.certificate.der();
+        let trusts = |bytes: &[u8]| {
+            let Ok(list) = List::new(bytes, 1) else { return false };
+            let lists = Lists { lists: vec![list], expired: ExpiredLists::Refuse };
+            let trust = Trust::new(Arc::clone(&listed) as _, lists);
+            trust.judge(der, &[], Purpose::Client, NOW).is_ok()
+        };
+        for at in 0..good.len() {
+            assert!(List::new(&good[..at], 1).is_err(), "the first {at} bytes");
+            for bit in [0x01, 0x80] {
+                let mut changed = good.clone();
+                changed[at] ^= bit;
+                assert!(!trusts(&changed), "byte {at} with bit {bit:#x}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_a_list_lacks_is_found() {
+        let root = Owner::authority("root", None);
+        let missing = |der: &[u8]| List::new(der, 1).unwrap().missing();
+        assert_eq!(missing(&list(&root, &[], None)), [""; 0]);
+        let both = ["authority key identifier", "CRL number"];
+        assert_eq!(missing(&version_1(&root, &[])), both);
+    }
 }

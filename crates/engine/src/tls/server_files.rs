@@ -17,9 +17,10 @@ pub struct ServerFiles {
 }
 
 /// What happens to clients of an authority whose revocation list is past its `nextUpdate`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
 pub enum ExpiredLists {
     /// They are refused.
+    #[default]
     Refuse,
     /// The list counts as it is.
     Accept,

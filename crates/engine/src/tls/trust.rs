@@ -6,7 +6,7 @@
 //! * Dates and purpose of the presented certificate are always checked.
 //! * The key of a client must be for signing. Devices with other `keyUsage` are common.
 //!
-//! webpki checks signatures, and the constraints along a path. Dates are checked when a certificate
+//! webpki checks signatures, and the constraints along a path. [`Lists`] judges revocation. Dates are checked when a certificate
 //! is used, not when its file is read: the clock of a machine may be wrong just after power-on.
 
 use std::hash::{Hash, Hasher};
@@ -15,11 +15,7 @@ use std::sync::Arc;
 
 use rustls::pki_types::{CertificateDer, Der, TrustAnchor, UnixTime};
 use rustls::{CertificateError, DistinguishedName, Error, OtherError};
-use webpki::{
-    CertRevocationList, EndEntityCert, ExpirationPolicy, ExtendedKeyUsageValidator,
-    KeyPurposeIdIter, RevocationOptions, RevocationOptionsBuilder, UnknownStatusPolicy,
-    VerifiedPath,
-};
+use webpki::{EndEntityCert, ExtendedKeyUsageValidator, KeyPurposeIdIter, VerifiedPath};
 use x509_cert::der::asn1::ObjectIdentifier;
 use x509_cert::der::{Reader, SliceReader};
 
@@ -27,6 +23,7 @@ use super::certificate::{Parsed, Purpose};
 use super::failure::{TlsFailure, between};
 use super::files::{FileError, certificates};
 use super::provider::ALGORITHMS;
+use super::revocation::Lists;
 
 /// A trusted certificate.
 #[derive(Debug)]
@@ -100,20 +97,12 @@ impl Hash for Listed {
 #[derive(Debug)]
 pub(super) struct Trust {
     listed: Arc<[Listed]>,
-    /// Revocation lists. If there are any, every authority requires one.
-    revoked: Vec<CertRevocationList<'static>>,
-    /// Whether lists past their `nextUpdate` count.
-    accepts_expired_lists: bool,
+    lists: Lists,
 }
 
 impl Trust {
-    pub(super) fn new(listed: Arc<[Listed]>, revoked: Vec<CertRevocationList<'static>>) -> Trust {
-        Trust { listed, revoked, accepts_expired_lists: false }
-    }
-
-    /// Uses revocation lists also after their `nextUpdate`.
-    pub(super) fn accepting_expired_lists(self) -> Trust {
-        Trust { accepts_expired_lists: true, ..self }
+    pub(super) fn new(listed: Arc<[Listed]>, lists: Lists) -> Trust {
+        Trust { listed, lists }
     }
 
     /// Verifies the certificate of a peer, for its purpose. Does not check the name.
@@ -164,35 +153,20 @@ impl Trust {
     fn leads_to(&self, path: &Path<'_>, authorities: &[&Listed]) -> Result<(), webpki::Error> {
         let anchors = authorities.iter().filter_map(|listed| listed.anchor.as_ref());
         let anchors: Vec<TrustAnchor<'_>> = anchors.map(borrowed).collect();
-        let check = |verified: &VerifiedPath<'_>| is_allowed(verified, authorities);
-        let lists: Vec<&CertRevocationList<'_>> = self.revoked.iter().collect();
+        let check = |verified: &VerifiedPath<'_>| {
+            let authority = is_allowed(verified, authorities)?;
+            self.lists.judge(verified, authority.parsed(), path.now)
+        };
         path.end_entity.verify_for_usage(
             ALGORITHMS.all,
             &anchors,
             path.intermediates,
             path.now,
             path.purpose,
-            self.revocation(&lists),
+            None,
             Some(&check),
         )?;
         Ok(())
-    }
-
-    /// Every authority of a path requires a list.
-    fn revocation<'l>(
-        &self,
-        lists: &'l [&'l CertRevocationList<'l>],
-    ) -> Option<RevocationOptions<'l>> {
-        let options = RevocationOptionsBuilder::new(lists).ok()?;
-        let expiration = match self.accepts_expired_lists {
-            true => ExpirationPolicy::Ignore,
-            false => ExpirationPolicy::Enforce,
-        };
-        let options = options
-            .with_depth(webpki::RevocationCheckDepth::Chain)
-            .with_status_policy(UnknownStatusPolicy::Deny)
-            .with_expiration_policy(expiration);
-        Some(options.build())
     }
 }
 
@@ -223,8 +197,11 @@ fn borrowed<'a>(anchor: &'a TrustAnchor<'static>) -> TrustAnchor<'a> {
 }
 
 /// The rules along a path that webpki does not check: which certificates are authorities, and the
-/// `pathLenConstraint` of a listed one.
-fn is_allowed(path: &VerifiedPath<'_>, authorities: &[&Listed]) -> Result<(), webpki::Error> {
+/// `pathLenConstraint` of a listed one. Returns the listed authority at the end of the path.
+fn is_allowed<'l>(
+    path: &VerifiedPath<'_>,
+    authorities: &[&'l Listed],
+) -> Result<&'l Listed, webpki::Error> {
     let mut len = 0;
     for intermediate in path.intermediate_certificates() {
         let parsed = Parsed::new(&intermediate.der()).map_err(|_| webpki::Error::BadDer)?;
@@ -242,10 +219,8 @@ fn is_allowed(path: &VerifiedPath<'_>, authorities: &[&Listed]) -> Result<(), we
     let fits = |listed: &&Listed| {
         listed.parsed.max_intermediates().is_none_or(|most| len <= usize::from(most))
     };
-    match authorities.iter().filter(is_anchor).any(fits) {
-        true => Ok(()),
-        false => Err(webpki::Error::PathLenConstraintViolated),
-    }
+    let found = authorities.iter().filter(is_anchor).find(|listed| fits(listed));
+    found.copied().ok_or(webpki::Error::PathLenConstraintViolated)
 }
 
 /// Converts an error of webpki. The presented certificate has already passed the checks of its
@@ -260,11 +235,7 @@ fn refused(error: webpki::Error) -> Error {
         }
         Found::UnknownRevocationStatus
         | Found::InvalidCrlSignatureForPublicKey
-        | Found::IssuerNotCrlSigner
-        | Found::UnsupportedCrlSignatureAlgorithmContext(_)
-        | Found::UnsupportedCrlSignatureAlgorithmForPublicKeyContext(_) => {
-            CertificateError::UnknownRevocationStatus.into()
-        }
+        | Found::IssuerNotCrlSigner => CertificateError::UnknownRevocationStatus.into(),
         Found::InvalidSignatureForPublicKey => CertificateError::BadSignature.into(),
         Found::BadDer | Found::BadDerTime | Found::TrailingData(_) => {
             CertificateError::BadEncoding.into()
@@ -380,7 +351,7 @@ mod tests {
 
     fn trust(listed: &[&Owner]) -> Trust {
         let listed = listed.iter().map(|owner| Listed::new(owner.certificate.der().clone()));
-        Trust::new(listed.collect::<Result<_, _>>().unwrap(), Vec::new())
+        Trust::new(listed.collect::<Result<_, _>>().unwrap(), Lists::default())
     }
 
     /// The reason why the first certificate of a chain is not trusted in that year; empty when it
