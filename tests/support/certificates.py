@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from support.machine import tool
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
 ROLE = "1.3.6.1.4.1.50316.802.1"
@@ -30,12 +30,18 @@ default_md = sha256
 default_days = 90
 default_crl_days = 90
 policy = names
-crl_extensions = list
-[names]
+{lists}[names]
 commonName = supplied
 [list]
 authorityKeyIdentifier = keyid
 """
+
+
+LISTS = {
+    "authority key identifier": "crl_extensions = list\n",
+    "CRL number": "crlnumber = {folder}/{name}.number\n",
+}
+"""What adds each extension to revocation lists. Without any, OpenSSL writes lists of version 1."""
 
 
 class Issued(NamedTuple):
@@ -53,19 +59,28 @@ def named(role: str, kind: str = "UTF8String") -> str:
 class Certificates:
     """A CA, and certificates that it issues."""
 
-    def __init__(self, folder: Path, name: str = "authority") -> None:
+    def __init__(
+        self, folder: Path, name: str = "authority", lists_have: Iterable[str] = LISTS
+    ) -> None:
         self._folder = folder
         self._name = name
         self.ca = folder / f"{name}.pem"
-        self._key = folder / f"{name}.key"
+        self.key = folder / f"{name}.key"
         (folder / f"{name}.index").touch()
         self._configuration = folder / f"{name}.cnf"
-        self._configuration.write_text(CONFIGURATION.format(folder=folder, name=name))
+        self.configure_lists(lists_have)
+        (folder / f"{name}.number").write_text("01\n")
         openssl(
             *("req", "-x509", *_new_key("P-256"), "-nodes"),
-            *("-keyout", self._key, "-out", self.ca, "-days", "90", "-subj", f"/CN={name}"),
+            *("-keyout", self.key, "-out", self.ca, "-days", "90", "-subj", f"/CN={name}"),
             *("-addext", "keyUsage=critical,keyCertSign,cRLSign"),
         )
+
+    def configure_lists(self, have: Iterable[str]) -> None:
+        """Sets which extensions of `LISTS` its lists have from now on."""
+        of = {"folder": self._folder, "name": self._name}
+        lists = "".join(LISTS[each].format(**of) for each in have)
+        self._configuration.write_text(CONFIGURATION.format(**of, lists=lists))
 
     def issue(
         self,
@@ -93,17 +108,23 @@ class Certificates:
         )
         return Issued(certificate, key)
 
-    def revoke(self, *issued: Issued, dates: tuple[str, str] | None = None) -> Path:
+    def revoke(
+        self,
+        *issued: Issued,
+        dates: tuple[str, str] | None = None,
+        reason: str | None = None,
+    ) -> Path:
         """Revokes these certificates. Returns the list of all revoked certificates."""
         revoked = self._folder / f"{self._name}.crl"
+        why = () if reason is None else ("-crl_reason", reason)
         for each in issued:
-            self._ca("-revoke", each.certificate)
+            self._ca("-revoke", each.certificate, *why)
         of = () if dates is None else ("-crl_lastupdate", dates[0], "-crl_nextupdate", dates[1])
         self._ca("-gencrl", "-out", revoked, *of)
         return revoked
 
     def _ca(self, *arguments: str | Path) -> None:
-        who = ("-config", self._configuration, "-cert", self.ca, "-keyfile", self._key)
+        who = ("-config", self._configuration, "-cert", self.ca, "-keyfile", self.key)
         openssl("ca", *who, *arguments)
 
 
@@ -114,7 +135,7 @@ def self_signed(
     issued = Issued(folder / f"{name}.pem", folder / f"{name}.key")
     configuration, request, file = (folder / f"{name}.{end}" for end in ("cnf", "csr", "ext"))
     (folder / f"{name}.index").touch()
-    configuration.write_text(CONFIGURATION.format(folder=folder, name=name))
+    configuration.write_text(CONFIGURATION.format(folder=folder, name=name, lists=""))
     file.write_text("\n".join(["basicConstraints=CA:FALSE", *extensions, ""]))
     openssl(
         *("req", *_new_key("P-256"), "-nodes", "-subj", f"/CN={name}"),

@@ -66,7 +66,7 @@ class Authority(Certificates):
         )
         openssl("rsa", "-traditional", "-in", modern, "-out", key)
         openssl(
-            *("x509", "-req", "-in", request, "-CA", self.ca, "-CAkey", self._key),
+            *("x509", "-req", "-in", request, "-CA", self.ca, "-CAkey", self.key),
             *("-CAcreateserial", "-days", "2", "-extfile", extensions, "-out", certificate),
         )
         return certificate, key

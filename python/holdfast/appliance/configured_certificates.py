@@ -61,6 +61,7 @@ def doubts(config: Config) -> list[tuple[KeyPath, str]]:
     found: dict[str, tuple[KeyPath, str]] = {}
     for each in _named(config):
         from holdfast.certificates import expiry
+        from holdfast.certificates.inspection import incomplete_lists
         from holdfast.certificates.own import nameless
 
         lists = each.kind == "revocation lists"
@@ -69,6 +70,8 @@ def doubts(config: Config) -> list[tuple[KeyPath, str]]:
         texts = [one.doubt(now) for one in dates if one.is_valid(now) or not each.by_core]
         if each.kind == "server":
             texts.append(nameless(each.file))
+        if lists and not each.by_core:
+            texts += incomplete_lists(each.file)
         for text in texts:
             if text is not None:
                 told = f"{each.file}: {text}"

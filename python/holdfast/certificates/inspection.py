@@ -11,7 +11,7 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import dsa, ec, ed448, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
-from cryptography.x509.oid import ExtendedKeyUsageOID
+from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID
 
 from holdfast.certificates.authority import ROLE, UTF8_STRING, is_authority
 from holdfast.certificates.expiry import Expiry, now
@@ -23,6 +23,7 @@ from holdfast.certificates.pem import (
     is_locked,
     key,
     public_key,
+    revocation_lists,
 )
 
 if TYPE_CHECKING:
@@ -31,6 +32,11 @@ if TYPE_CHECKING:
     from holdfast.certificates.pem import File
 
 MIN_RSA_BITS = 2048
+
+_REQUIRED_OF_LISTS = {
+    ExtensionOID.AUTHORITY_KEY_IDENTIFIER: "authority key identifier",
+    ExtensionOID.CRL_NUMBER: "CRL number",
+}
 
 _PURPOSES = {
     ExtendedKeyUsageOID.SERVER_AUTH: "server",
@@ -242,11 +248,33 @@ def _of_list(file: File, block: bytes) -> Described:
         "next_update": None if ends is None else ends.isoformat(),
         "revoked": [_revoked(entry) for entry in read],
     }
+    lacks = _lacks(read)
+    if lacks is not None:
+        made.advice.append(f"the list {lacks}")
     if ends is not None:
         doubt = Expiry("the list", read.last_update_utc, ends).doubt(now())
         if doubt is not None:
             (made.flaws if ends <= now() else made.advice).append(doubt)
     return made
+
+
+def incomplete_lists(file: File) -> list[str]:
+    """Returns which revocation lists of a file lack what; none if the file can't be read."""
+    try:
+        found = [(each.issuer.rfc4514_string(), _lacks(each)) for each in revocation_lists(file)]
+    except MALFORMED:
+        return []
+    return [f"the revocation list of {name} {lacks}" for name, lacks in found if lacks]
+
+
+def _lacks(read: x509.CertificateRevocationList) -> str | None:
+    """Returns which extensions a list lacks that RFC 5280, 5.2 requires; `None` if it has both."""
+    present = {each.oid for each in read.extensions}
+    missing = [name for oid, name in _REQUIRED_OF_LISTS.items() if oid not in present]
+    if not missing:
+        return None
+    lacks = " and no ".join(missing)
+    return f"has no {lacks} (RFC 5280, 5.2): Holdfast uses it, other programs may refuse it"
 
 
 def _revoked(entry: x509.RevokedCertificate) -> dict[str, str]:

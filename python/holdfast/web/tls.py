@@ -21,6 +21,7 @@ CHUNK = 65536
 _VERIFICATION = {
     2: "unknown_issuer",
     3: "unknown_revocation",
+    8: "unknown_revocation",
     9: "not_yet_valid",
     10: "expired",
     12: "expired_revocation_list",
@@ -31,6 +32,7 @@ _VERIFICATION = {
     23: "revoked",
     26: "wrong_purpose",
     34: "unsupported_extension",
+    36: "unknown_revocation",
 }
 """Reasons by the error codes of OpenSSL's verification (X509_V_ERR_…)."""
 
