@@ -551,7 +551,7 @@ class Engine:
         """Listener, kind and fields of the next event; `None` after `timeout` seconds.
 
         Fields, as far as they apply: peer, role, subject and serial (TLS), reason, bytes, unit,
-        function.
+        function; `count` if it occurred several times, with any port of the peer.
         """
 
     @property

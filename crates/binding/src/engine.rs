@@ -110,6 +110,9 @@ impl Engine {
         if let Some(subject) = event.subject {
             fields.set_item("subject", subject.as_ref())?;
         }
+        if event.count > 1 {
+            fields.set_item("count", event.count)?;
+        }
         if let Some(reason) = event.kind.reason() {
             fields.set_item("reason", reason)?;
         }

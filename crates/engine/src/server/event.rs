@@ -1,9 +1,14 @@
-//! Events of connections, for a log. Sending never blocks: when the queue is full, events are
+//! Events of connections, for a log. Sending waits for nobody: when the queue is full, events are
 //! dropped and counted.
+//!
+//! A source that causes many events must not displace those of others. If many of its events wait,
+//! further refusals that equal one of them, but for the port of the peer, are only counted there, and
+//! other events have half of the queue.
 
+use std::collections::{HashMap, VecDeque};
+use std::net::{IpAddr, Ipv6Addr};
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use holdfast_protocol::raw_ingest::Refusal;
@@ -15,7 +20,10 @@ use super::refused_request::RefusedRequest;
 /// The most events in the queue.
 const CAPACITY: usize = 1024;
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// How many events of one source wait one by one, whatever it sends.
+const MAX_OF_SOURCE: usize = 32;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Kind {
     Opened,
     /// The TLS handshake is complete: the peer has a certificate.
@@ -65,6 +73,12 @@ impl Kind {
     /// Whether this event belongs to the normal life of a connection.
     const fn is_ordinary(self) -> bool {
         matches!(self, Kind::Opened | Kind::Closed | Kind::Idle | Kind::Ended)
+    }
+
+    /// Whether repetitions by a noisy source may be counted instead of sent.
+    const fn is_refusal(self) -> bool {
+        let is_change = matches!(self, Kind::RightsRevoked | Kind::LineLost | Kind::LineBack);
+        !self.is_ordinary() && !is_change && !matches!(self, Kind::Secured)
     }
 
     pub const fn name(self) -> &'static str {
@@ -122,6 +136,8 @@ pub struct Event {
     pub peer: Option<Peer>,
     /// The subject of the certificate of a peer whose handshake failed, cut to 256 characters.
     pub subject: Option<Box<str>>,
+    /// How often it occurred before it was taken from the queue, with any port of the peer.
+    pub count: u64,
 }
 
 /// Which events are sent.
@@ -138,26 +154,125 @@ pub enum Verbosity {
 #[derive(Debug, Clone)]
 pub(crate) struct Reporter {
     verbosity: Arc<AtomicU8>,
-    sender: SyncSender<Event>,
-    lost: Arc<AtomicU64>,
+    shared: Arc<Shared>,
 }
 
 /// The receiving side.
 #[derive(Debug)]
 pub(crate) struct Events {
-    receiver: Mutex<Receiver<Event>>,
-    /// Without listeners, nobody else can send: whoever waits must still wait.
-    _sender: SyncSender<Event>,
-    lost: Arc<AtomicU64>,
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    queue: Mutex<Queue>,
+    arrived: Condvar,
+    lost: AtomicU64,
+}
+
+/// The events that wait. All maps are about these alone, so they are bounded with them.
+#[derive(Debug, Default)]
+struct Queue {
+    events: VecDeque<Event>,
+    /// The number of events that were taken.
+    taken: usize,
+    /// The place of the last of equal refusals, counted from the first event ever.
+    refusals: HashMap<Repeated, usize>,
+    /// How many events each source has.
+    of_source: HashMap<IpAddr, usize>,
+}
+
+/// What repetitions of a refusal have in common.
+#[derive(Debug, PartialEq, Eq, Hash)]
+struct Repeated {
+    listener: Arc<str>,
+    kind: Kind,
+    source: Option<IpAddr>,
+    subject: Option<Box<str>>,
+}
+
+impl Repeated {
+    fn of(event: &Event) -> Option<Repeated> {
+        let certificate = event.peer.as_ref().and_then(|peer| peer.certificate.as_ref());
+        let subject = event.subject.as_deref().or(certificate.map(|own| own.subject.as_str()));
+        event.kind.is_refusal().then(|| Repeated {
+            listener: Arc::clone(&event.listener),
+            kind: event.kind,
+            source: event.source(),
+            subject: subject.map(Box::from),
+        })
+    }
+}
+
+impl Event {
+    /// Where it comes from: an address, or the network /64 of an IPv6 address, because a host has as
+    /// many addresses of it as it wants.
+    fn source(&self) -> Option<IpAddr> {
+        Some(match self.peer.as_ref()?.ip().to_canonical() {
+            IpAddr::V6(whole) => {
+                IpAddr::V6(Ipv6Addr::from_bits(whole.to_bits() & (u128::MAX << 64)))
+            }
+            four => four,
+        })
+    }
+}
+
+impl Queue {
+    /// Returns whether there was room.
+    fn put(&mut self, event: Event) -> bool {
+        let source = event.source();
+        let of_source =
+            source.map_or(0, |source| self.of_source.get(&source).copied().unwrap_or(0));
+        let repeated = Repeated::of(&event);
+        if of_source >= MAX_OF_SOURCE || self.events.len() >= CAPACITY {
+            if let Some(place) = repeated.as_ref().and_then(|each| self.refusals.get(each)) {
+                self.events[place - self.taken].count += 1;
+                return true;
+            }
+            if self.events.len() >= if source.is_some() { CAPACITY / 2 } else { CAPACITY } {
+                return false;
+            }
+        }
+        if let Some(source) = source {
+            self.of_source.insert(source, of_source + 1);
+        }
+        if let Some(repeated) = repeated {
+            self.refusals.insert(repeated, self.taken + self.events.len());
+        }
+        self.events.push_back(event);
+        true
+    }
+
+    fn take(&mut self) -> Option<Event> {
+        let event = self.events.pop_front()?;
+        if let Some(repeated) = Repeated::of(&event)
+            && self.refusals.get(&repeated) == Some(&self.taken)
+        {
+            self.refusals.remove(&repeated);
+        }
+        self.taken += 1;
+        if let Some(source) = event.source() {
+            match self.of_source.get_mut(&source) {
+                Some(count @ 2..) => *count -= 1,
+                _ => _ = self.of_source.remove(&source),
+            }
+        }
+        debug_assert!(!self.events.is_empty() || self.refusals.is_empty());
+        debug_assert!(!self.events.is_empty() || self.of_source.is_empty());
+        Some(event)
+    }
+}
+
+impl Shared {
+    fn queue(&self) -> MutexGuard<'_, Queue> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 pub(crate) fn channel(verbosity: Verbosity) -> (Reporter, Events) {
-    let (sender, receiver) = sync_channel(CAPACITY);
-    let lost = Arc::new(AtomicU64::new(0));
-    let events =
-        Events { receiver: Mutex::new(receiver), _sender: sender.clone(), lost: Arc::clone(&lost) };
-    let verbosity = Arc::new(AtomicU8::new(verbosity as u8));
-    (Reporter { verbosity, sender, lost }, events)
+    let shared = Arc::new(Shared::default());
+    let events = Events { shared: Arc::clone(&shared) };
+    (Reporter { verbosity: Arc::new(AtomicU8::new(verbosity as u8)), shared }, events)
 }
 
 impl Reporter {
@@ -178,9 +293,11 @@ impl Reporter {
             return;
         }
         let subject = subject.map(Box::from);
-        let event = Event { listener: Arc::clone(listener), kind, peer, subject };
-        if self.sender.try_send(event).is_err() {
-            self.lost.fetch_add(1, Ordering::Relaxed);
+        let event = Event { listener: Arc::clone(listener), kind, peer, subject, count: 1 };
+        if self.shared.queue().put(event) {
+            self.shared.arrived.notify_one();
+        } else {
+            self.shared.lost.fetch_add(1, Ordering::Relaxed);
         }
     }
 }
@@ -188,17 +305,20 @@ impl Reporter {
 impl Events {
     /// The next event; `None` when none arrives within `timeout`.
     pub(crate) fn next(&self, timeout: Duration) -> Option<Event> {
-        self.receiver.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(timeout).ok()
+        let empty = |queue: &mut Queue| queue.events.is_empty();
+        let waited = self.shared.arrived.wait_timeout_while(self.shared.queue(), timeout, empty);
+        waited.unwrap_or_else(PoisonError::into_inner).0.take()
     }
 
     /// The number of dropped events.
     pub(crate) fn lost(&self) -> u64 {
-        self.lost.load(Ordering::Relaxed)
+        self.shared.lost.load(Ordering::Relaxed)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::net::SocketAddr;
     use std::time::Instant;
 
     use super::*;
@@ -210,5 +330,88 @@ mod tests {
         let (began, timeout) = (Instant::now(), Duration::from_millis(20));
         assert_eq!(events.next(timeout), None);
         assert!(began.elapsed() >= timeout);
+    }
+
+    /// The `port`-th connection of a source, refused.
+    fn refuse(reporter: &Reporter, source: &str, port: u16, kind: Kind) {
+        let peer = Peer::from(SocketAddr::new(source.parse().unwrap(), port));
+        reporter.report(&"scada".into(), kind, Some(peer), None);
+    }
+
+    fn taken(events: &Events) -> Vec<(String, u64)> {
+        let all = std::iter::from_fn(|| events.next(Duration::ZERO));
+        all.map(|event| (event.peer.unwrap().ip().to_string(), event.count)).collect()
+    }
+
+    #[test]
+    fn a_flood_of_one_source_does_not_displace_the_events_of_others() {
+        let (reporter, events) = channel(Verbosity::Refusals);
+        // It begins anew when the events were taken.
+        for _ in 0..2 {
+            for port in 0..u16::MAX {
+                refuse(&reporter, "10.0.0.9", port, Kind::RefusedSource);
+            }
+            refuse(&reporter, "10.0.0.7", 1, Kind::RefusedSource);
+            let mut found = taken(&events);
+            assert_eq!(found.pop(), Some(("10.0.0.7".into(), 1)));
+            assert_eq!(found.len(), MAX_OF_SOURCE);
+            let counts: u64 = found.iter().map(|(_, count)| count).sum();
+            assert_eq!((counts, events.lost()), (u64::from(u16::MAX), 0));
+        }
+    }
+
+    #[test]
+    fn a_source_has_half_of_the_queue() {
+        let (reporter, events) = channel(Verbosity::All);
+        for _ in 0..CAPACITY {
+            refuse(&reporter, "10.0.0.9", 1, Kind::Opened);
+        }
+        refuse(&reporter, "10.0.0.7", 1, Kind::RefusedSource);
+        let found = taken(&events);
+        assert_eq!(found.len(), CAPACITY / 2 + 1);
+        assert_eq!(found[CAPACITY / 2], ("10.0.0.7".into(), 1));
+        assert_eq!(events.lost(), (CAPACITY / 2) as u64);
+    }
+
+    #[test]
+    fn a_network_of_ipv6_is_one_source() {
+        let (reporter, events) = channel(Verbosity::Refusals);
+        for host in 0..u16::MAX {
+            let kind = Kind::RefusedSource;
+            refuse(&reporter, &format!("2001:db8::{host:x}"), 1, kind);
+        }
+        refuse(&reporter, "2001:db8:0:1::1", 1, Kind::RefusedSource);
+        assert_eq!((taken(&events).len(), events.lost()), (MAX_OF_SOURCE + 1, 0));
+    }
+
+    #[test]
+    fn other_events_and_subjects_of_a_noisy_source_are_not_counted_together() {
+        let (reporter, events) = channel(Verbosity::Refusals);
+        for port in 0..u16::MAX {
+            refuse(&reporter, "10.0.0.9", port, Kind::RefusedSource);
+        }
+        let peer = || Some(Peer::from(SocketAddr::from(([10, 0, 0, 9], 1))));
+        for listener in ["scada", "raw"] {
+            for reason in ["expired", "revoked"] {
+                for subject in [None, Some("CN=a"), Some("CN=b")] {
+                    for _ in 0..2 {
+                        reporter.report(&listener.into(), Kind::TlsFailed(reason), peer(), subject);
+                    }
+                }
+            }
+        }
+        let all: Vec<Event> = std::iter::from_fn(|| events.next(Duration::ZERO)).collect();
+        let counts: Vec<u64> = all[MAX_OF_SOURCE..].iter().map(|event| event.count).collect();
+        assert_eq!(counts, [2; 12]);
+    }
+
+    #[test]
+    fn events_of_more_sources_than_the_queue_has_room_for_are_lost_and_counted() {
+        let (reporter, events) = channel(Verbosity::Refusals);
+        for number in 0..2 * CAPACITY {
+            let source = format!("10.0.{}.{}", number / 256, number % 256);
+            refuse(&reporter, &source, 1, Kind::RefusedSource);
+        }
+        assert_eq!((taken(&events).len(), events.lost()), (CAPACITY, CAPACITY as u64));
     }
 }

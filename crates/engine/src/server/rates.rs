@@ -38,7 +38,7 @@ pub struct RateLimits {
 }
 
 /// What a source has too many of.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Excess {
     Requests,
     Writes,

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 use holdfast_protocol::pdu::{ExceptionCode, Function};
 
 /// A refused request.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct RefusedRequest {
     pub unit_id: u8,
     pub function_code: u8,
@@ -14,7 +14,7 @@ pub struct RefusedRequest {
 }
 
 /// Why a request was refused.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Why {
     /// The function is not known, or not allowed for the peer.
     Function,
