@@ -124,8 +124,12 @@ def document(
 
 
 def _peer(peer: str) -> dict[str, object]:
-    """The fields of a peer: `10.0.0.9:51200`, `[fd00::9]:51200`, or any other name."""
-    host, _, port = peer.rpartition(":")
+    """The fields of a peer: `10.0.0.9:51200`, `[fd00::9]:51200`, `10.0.0.9`, or any other name."""
+    try:
+        alone = str(ipaddress.ip_address(peer))
+        return {"source": {"address": alone, "ip": alone}, "related": {"ip": [alone]}}
+    except ValueError:
+        host, _, port = peer.rpartition(":")
     try:
         address, number = str(ipaddress.ip_address(host.strip("[]"))), int(port)
     except ValueError:

@@ -477,13 +477,15 @@ class _Running:
                 logs.write(logging.WARNING, "forward_failed", **fields, **told)
 
     def _log_event(self, listener: str, event: str, found: Mapping[str, object]) -> None:
-        fields = {"listener": listener, "peer": "-", **found}
+        fields: dict[str, object] = {"listener": listener, "peer": "-", **found}
+        times = fields.pop("count", 1)
+        assert isinstance(times, int)
         if event in LEVELS:
             logs.write(LEVELS[event], event, **fields)
         else:
             level = logging.INFO if event == "secured" else logging.WARNING
             about = found.get("role" if event in BY_ROLE else "reason")
-            logs.limited(level, event, kind=(listener, about), **fields)
+            logs.count(level, event, fields, kind=(listener, about), times=times)
 
     def _bound_ports(self, undo: ExitStack, *, retried: bool) -> dict[str, Port]:
         """Tries to bind the ports of the HTTP services. The others are tried again later.
