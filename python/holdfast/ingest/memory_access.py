@@ -7,6 +7,7 @@ Accesses are counted, and writes are audited.
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import Counter
 from dataclasses import dataclass, field
@@ -208,7 +209,7 @@ class MemoryAccess:
 
     def refuse(self, refused: Refused, who: str, peer: str) -> None:
         """Counts, logs and audits a refused write. Adapters call it for writes they refuse."""
-        self.note(refused, who, peer)
+        self._note(refused, who, peer, observed=False)
         if self._audit is not None and not refused.is_recorded:
             self._audit.write(
                 listener=self.name,
@@ -220,16 +221,19 @@ class MemoryAccess:
             )
 
     def note(self, refused: Refused, who: str, peer: str) -> None:
-        """Logs and counts a refusal without auditing it, such as the refusal of a read."""
-        logs.refused(
-            "ingest_refused",
-            kind=(self.name, refused.reason),
-            adapter=self.name,
-            peer=peer,
-            source=who,
+        """Logs and counts a refusal that has no line of its own in the audit log: of a read."""
+        self._note(refused, who, peer, observed=True)
+
+    def _note(self, refused: Refused, who: str, peer: str, *, observed: bool) -> None:
+        fields = {
+            "adapter": self.name,
+            "peer": peer,
+            "source": who,
             **refused.where,
-            reason=refused.reason,
-        )
+            "reason": refused.reason,
+        }
+        kind = (self.name, refused.reason)
+        logs.count(logging.WARNING, "ingest_refused", fields, kind=kind, observed=observed)
         with self._lock:
             self._counts.refuse(refused.reason)
 

@@ -140,8 +140,10 @@ audit: {{file: audit.log}}
         client.write_register(5, 4660)
     done("raw-send", stage.here("127.0.0.1:9000"), "coils", "0", "1", "0", "1", "--memory-id", "3")
     post(stage, "ingest", {"memory": "plant", "area": "coils", "address": 1, "values": [1, 0]})
+    with pytest.raises(urllib.error.HTTPError):
+        post(stage, "sessions/end", {"listener": "scada", "id": 1}, "another")
     file = stage.folder / "audit.log"
-    wire.until(lambda: file.read_text().count("\n") >= 6, "the log is written")
+    wire.until(lambda: file.read_text().count("\n") >= 7, "the log is written")
     stage.names["audit_log"] = file.read_text()
 
     def delete(text: str) -> None:

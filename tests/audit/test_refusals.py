@@ -1,0 +1,181 @@
+"""Refusals in the log and in the audit log, of noisy sources and of others."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import closing
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast import logs
+from holdfast.appliance import auditing, running
+from support import web, wire
+from support.audits import lines
+from support.certificates import Certificates
+from support.config_folder import written
+from support.running import endpoint
+from support.tls_peer import context, reasons, verdict
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from support.running import Run
+
+NOISY, QUIET = "127.0.0.2", "127.0.0.3"
+NOISE = 200
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+    monkeypatch.setattr(running, "HEALTH_CHECK_INTERVAL", 0.0)
+
+
+def configured(**more: Any) -> str:
+    rule = {"sources": ["127.0.0.1"], "units": {1: "plant"}, "access": "read-only"}
+    scada = {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": [rule]}
+    whole = {
+        "memories": {"plant": {"holding_registers": 8}},
+        "listeners": {"scada": scada},
+        "audit": {"file": "audit.log"},
+    }
+    return written({**whole, **more})
+
+
+def refused(folder: Path) -> list[dict[str, Any]]:
+    """The refusals in the audit log, without the port of their peer, and their place."""
+    apart = ("start", "stop", "chain")
+    found = [line for line in lines(folder / "audit.log") if line.get("event", "stop") not in apart]
+    for line in found:
+        for key in ("time", "seq", "prev", "serial"):
+            line.pop(key, None)
+        line["peer"] = str(logs.origin("", line).source)
+    return found
+
+
+def test_a_noisy_source_hides_nobody(
+    run: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    appliance = run(configured())
+    address = endpoint(appliance, "scada")
+    for source in [NOISY] * NOISE + [QUIET]:
+        with wire.Connection(address, source=source) as client:
+            assert client.rest() == b""
+    appliance.stop()
+
+    logged = Counter(
+        logs.origin("", record.fields).source  # type: ignore[attr-defined]
+        for record in caplog.records
+        if record.message == "refused_source"
+    )
+    assert logged == {NOISY: 20, QUIET: 1}
+    found = refused(tmp_path)
+    common = {"event": "refused_source", "listener": "scada"}
+    assert found == [
+        {**common, "peer": NOISY, "count": 1},
+        {**common, "peer": QUIET, "count": 1},
+        {**common, "peer": NOISY, "count": NOISE - 1},
+    ]
+
+
+def test_failed_handshakes_are_recorded_by_subject(
+    run: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    own, stranger = Certificates(tmp_path, "own"), Certificates(tmp_path, "stranger")
+    server = own.issue("server", "DNS:localhost")
+    clients = [stranger.issue(name, "DNS:client") for name in ("a", "b")]
+    tls = {"cert_file": server.certificate, "key_file": server.key, "ca_file": own.ca}
+    rule = {"sources": ["127.0.0.1"], "units": {1: "plant"}, "access": "read-only"}
+    secure = {
+        "type": "modbus-tls",
+        "bind": "127.0.0.1:0",
+        "tls": {key: str(file) for key, file in tls.items()},
+        "rules": [rule],
+    }
+    appliance = run(configured(listeners={"secure": secure}))
+    for client in (clients[0], clients[1], clients[0]):
+        assert "ALERT" in verdict(appliance, context(own.ca, client))
+    assert reasons(appliance, caplog, 3) == ["unknown_issuer"] * 3
+    appliance.stop()
+    common = {
+        "event": "tls_failed",
+        "listener": "secure",
+        "peer": "127.0.0.1",
+        "reason": "unknown_issuer",
+    }
+    assert refused(tmp_path) == [
+        {**common, "subject": "CN=a", "count": 1},
+        {**common, "subject": "CN=b", "count": 1},
+        {**common, "subject": "CN=a", "count": 1},
+    ]
+
+
+def test_requests_without_the_right_are_recorded(run: Run, tmp_path: Path) -> None:
+    rest = {
+        "bind": "127.0.0.1:0",
+        "sources": ["127.0.0.1"],
+        "tokens": [
+            {
+                "name": "panel",
+                "sha256": "0" * 64,
+                "memories": ["plant"],
+                "areas": ["holding_registers"],
+                "access": "read-only",
+            }
+        ],
+    }
+    appliance = run(configured(rest=rest))
+    asked = "/api/v1/memory/read?memory=plant&area=holding_registers&address=0&count=1"
+    with closing(web.Client(endpoint(appliance, "rest"))) as client:
+        for _ in range(3):
+            assert client.get(asked).status == 401
+    # A write has a line of its own. Reading what is not granted has none.
+    with wire.Connection(endpoint(appliance, "scada")) as client:
+        assert client.ask(bytes.fromhex("0600000001")) == bytes.fromhex("8601")
+        assert client.ask(bytes.fromhex("03ff000001")) == bytes.fromhex("8302")
+    appliance.stop()
+    common = {"event": "ingest_refused", "adapter": "rest", "peer": "127.0.0.1"}
+    found = refused(tmp_path)
+    of_rest = [line for line in found if line["event"] == "ingest_refused"]
+    assert [line["count"] for line in of_rest] == [1, 2]
+    assert all(line | common == line and line["reason"] == "unauthorized" for line in of_rest)
+    assert [line for line in found if line not in of_rest] == [
+        {
+            "event": "refused_address",
+            "listener": "scada",
+            "peer": "127.0.0.1",
+            "unit": 1,
+            "function": 3,
+            "count": 1,
+        }
+    ]
+
+
+def test_an_attacker_can_not_fill_the_audit_log() -> None:
+    refusals = auditing.Refusals(interval=3600)
+
+    def attacked() -> list[dict[str, object]]:
+        for number in range(2_000):
+            fields = {"listener": "scada", "peer": f"[2001:db8:0:{number:x}::1]:1"}
+            refusals.note("refused_source", fields, logs.origin("refused_source", fields))
+        return refusals.take()
+
+    assert len(attacked()) == auditing.MAX_ORIGINS + 1
+    assert attacked() == []
+    rest = refusals.rest()
+    assert len(rest) == auditing.MAX_ORIGINS + 1
+    assert rest[-1] == {
+        "event": "refused_source",
+        "listener": "scada",
+        "peer": "others",
+        "count": 2 * (2_000 - auditing.MAX_ORIGINS) - 1,
+    }
+
+
+def test_other_events_are_not_recorded() -> None:
+    refusals = auditing.Refusals()
+    for event in ("secured", "slow_reader", "packet_refused", "ingest_refused"):
+        refusals.note(event, {"reason": "malformed"}, logs.NOBODY)
+    refusals.note("refused_unit", {"function": 6}, logs.NOBODY)
+    assert refusals.rest() == []
