@@ -57,6 +57,7 @@ NUMBERS = (
     "opened",
     "retry_in",
     "scan_rate",
+    "step",
     "unit",
 )
 """Fields that are numbers. All others are text: a field must have one type in all documents."""

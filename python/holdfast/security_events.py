@@ -107,6 +107,7 @@ EVENTS: Mapping[str, Meaning] = {
     "log_digests_differ": _UNHEALTHY,
     "thread_stalled": _UNHEALTHY,
     "thread_back": _HEALTHY,
+    "clock_stepped": Meaning(("host",), ("change",), "unknown"),
     # The logs themselves
     "audit_failed": _NOT_STORED,
     "audit_back": _STORED,

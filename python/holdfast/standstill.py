@@ -1,4 +1,7 @@
-"""Detects that a thread or event loop did not run: its process was stopped, or its machine."""
+"""Detects that a thread or event loop did not run: its process was stopped, or its machine.
+
+Also detects that the wall clock was set.
+"""
 
 from __future__ import annotations
 
@@ -47,3 +50,34 @@ class Standstill:
             self.ended, self.lasted = self._looked, self._looked - before
             seconds = round(self.lasted, 1)
             logs.write(logging.WARNING, "stood_still", part=self._part, seconds=seconds)
+
+
+STEP = 2.0
+"""The shortest step of the wall clock, in seconds. Without steps, NTP corrects less than 0.001 s in
+a second."""
+
+_PROMPT = 0.1
+"""Seconds in which both clocks must be read, to be compared."""
+
+
+class WallClock:
+    """Detects steps of the wall clock, by a clock that nobody sets. Not thread-safe."""
+
+    def __init__(self) -> None:
+        self._ahead = self._compare()
+
+    def look(self) -> float | None:
+        """Logs a step since the last look. Returns its seconds, negative if set back, or `None`."""
+        before, ahead = self._ahead, self._compare()
+        self._ahead = before if ahead is None else ahead
+        if before is None or ahead is None or abs(ahead - before) < STEP:
+            return None
+        step = round(ahead - before, 3)
+        logs.write(logging.WARNING, "clock_stepped", step=step)
+        return step
+
+    @staticmethod
+    def _compare() -> float | None:
+        """How far the wall clock is ahead; `None` if the process stopped meanwhile."""
+        began, wall, ended = now(), time.time(), now()
+        return wall - ended if ended - began < _PROMPT else None

@@ -26,6 +26,7 @@ TYPES = {
     "authentication": "start end info",
     "configuration": "access change creation deletion info",
     "file": "access change creation deletion info",
+    "host": "access change end info start",
     "network": "access allowed connection denied end info protocol start",
     "process": "access change end info start",
     "session": "start end info",

@@ -37,6 +37,7 @@ from holdfast.config.route_checks import routed
 from holdfast.faults import fault_word
 from holdfast.ingest import MemoryAccess
 from holdfast.net.addresses import joined
+from holdfast.standstill import WallClock
 from holdfast.web.port import Port
 
 if TYPE_CHECKING:
@@ -256,6 +257,7 @@ class _Running:
         self._forwarded: dict[tuple[str, int], Mapping[str, Any]] = {}
         self._unreachable: set[tuple[str, int]] = set()
         self._expiring = Expiring()
+        self._clock = WallClock()
         self._listening: dict[str, tuple[str, int | None]] = {}
         """Where listeners have logged that they listen."""
         self._looked = self._reviewed = time.monotonic()
@@ -390,6 +392,9 @@ class _Running:
             return
         self._looked = now
         logs.tell_held_back()
+        step = self._clock.look()
+        if step is not None and self._recorder is not None:
+            self._recorder.note("clock_stepped", step=step)
         self.liveness.check()
         self._kept.check()
         self._logs.check()

@@ -65,6 +65,7 @@ from holdfast.scanner.configured import BUCKET
 from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
 from holdfast.scanner.hosts import PRIVATE
 from holdfast.scanner.schema import json_schema
+from holdfast.standstill import WallClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -420,12 +421,13 @@ async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
 
 async def _scan(settings: Settings, check: Callable[[], None] | None, signals: Signals) -> bool:
     """Runs a scanner. Returns whether it ended because of files that have changed."""
-    scanner, known = Scanner(settings), _contents(settings)
+    scanner, known, clock = Scanner(settings), _contents(settings), WallClock()
     running = asyncio.create_task(scanner.run())
     changed = False
     while not running.done():
         await asyncio.wait([running], timeout=JOIN_TIMEOUT)
         logs.tell_held_back()
+        clock.look()
         if running.done():
             break
         try:
