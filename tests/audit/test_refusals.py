@@ -11,7 +11,7 @@ import pytest
 from holdfast import logs
 from holdfast.appliance import auditing, running
 from support import web, wire
-from support.audits import lines
+from support.audits import lines, writes
 from support.certificates import Certificates
 from support.config_folder import written
 from support.running import endpoint
@@ -126,19 +126,21 @@ def test_requests_without_the_right_are_recorded(run: Run, tmp_path: Path) -> No
         ],
     }
     appliance = run(configured(rest=rest))
-    asked = "/api/v1/memory/read?memory=plant&area=holding_registers&address=0&count=1"
+    reading = "/api/v1/memory/read?memory=plant&area=holding_registers&address=0&count=1"
     with closing(web.Client(endpoint(appliance, "rest"))) as client:
         for _ in range(3):
-            assert client.get(asked).status == 401
-    # A write has a line of its own. Reading what is not granted has none.
+            assert client.get(reading).status == 401
+            assert client.ingest([web.command("holding_registers", 0, [7])]).status == 401
+    # This write has a line of its own, and is not a refusal here.
     with wire.Connection(endpoint(appliance, "scada")) as client:
         assert client.ask(bytes.fromhex("0600000001")) == bytes.fromhex("8601")
         assert client.ask(bytes.fromhex("03ff000001")) == bytes.fromhex("8302")
     appliance.stop()
+    assert [line["outcome"] for line in writes(tmp_path / "audit.log")] == ["illegal_function"]
     common = {"event": "ingest_refused", "adapter": "rest", "peer": "127.0.0.1"}
     found = refused(tmp_path)
     of_rest = [line for line in found if line["event"] == "ingest_refused"]
-    assert [line["count"] for line in of_rest] == [1, 2]
+    assert [line["count"] for line in of_rest] == [1, 5]
     assert all(line | common == line and line["reason"] == "unauthorized" for line in of_rest)
     assert [line for line in found if line not in of_rest] == [
         {

@@ -208,9 +208,13 @@ class MemoryAccess:
         return follower
 
     def refuse(self, refused: Refused, who: str, peer: str) -> None:
-        """Counts, logs and audits a refused write. Adapters call it for writes they refuse."""
-        self._note(refused, who, peer, observed=False)
-        if self._audit is not None and not refused.is_recorded:
+        """Counts, logs and audits a refused write. Adapters call it for writes they refuse.
+
+        A write without a valid token has no line of its own: everybody can send any number of them.
+        """
+        by_nobody = refused.reason == "unauthorized"
+        self._note(refused, who, peer, observed=by_nobody)
+        if self._audit is not None and not refused.is_recorded and not by_nobody:
             self._audit.write(
                 listener=self.name,
                 peer=peer,
@@ -221,7 +225,7 @@ class MemoryAccess:
             )
 
     def note(self, refused: Refused, who: str, peer: str) -> None:
-        """Logs and counts a refusal that has no line of its own in the audit log: of a read."""
+        """Logs and counts a refusal without a line of its own in the audit log, as of a read."""
         self._note(refused, who, peer, observed=True)
 
     def _note(self, refused: Refused, who: str, peer: str, *, observed: bool) -> None:
