@@ -57,8 +57,6 @@ memories:
 listeners:
   modbus:
     type: modbus-tcp
-    max_requests_per_source: null
-    max_writes_per_source: null
     bind: 127.0.0.1:0
     rules: [{{sources: [127.0.0.1], units: {{1: plant}}, access: read-only}}]
 rest:

@@ -44,8 +44,6 @@ memories: {plant: {holding_registers: 10}}
 listeners:
   scada:
     type: modbus-tcp
-    max_requests_per_source: null
-    max_writes_per_source: null
     bind: 127.0.0.1:0
     rules: [{sources: [127.0.0.0/8], units: {1: plant}, access: read-write}]
 audit: {file: audit.log}

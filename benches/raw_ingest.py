@@ -26,18 +26,15 @@ memories:
 listeners:
   v1:
     type: raw-ingest
-    max_writes_per_source: null
     bind: 127.0.0.1:0
     rules: [{sources: [127.0.0.1], units: {1: plant}, areas: [holding_registers]}]
   crc:
     type: raw-ingest
-    max_writes_per_source: null
     format: crc
     bind: 127.0.0.1:0
     rules: [{sources: [127.0.0.1], memories: [plant], areas: [holding_registers]}]
   modbus:
     type: modbus-tcp
-    max_requests_per_source: null
     bind: 127.0.0.1:0
     rules: [{sources: [127.0.0.1], units: {1: plant}, access: read-only}]
 """

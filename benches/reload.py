@@ -26,8 +26,6 @@ memories: {{plant: {{holding_registers: 1000}}}}
 listeners:
   scada:
     type: modbus-tcp
-    max_requests_per_source: null
-    max_writes_per_source: null
     bind: 127.0.0.1:0
     max_connections_per_source: null
     rules:

@@ -29,8 +29,6 @@ logs: {{speed: {{servers: ["{url}"], node: a, write_timeout: 10}}}}
 listeners:
   scada:
     type: modbus-tcp
-    max_requests_per_source: null
-    max_writes_per_source: null
     max_connections_per_source: null
     bind: 127.0.0.1:0
     rules: [{{sources: [127.0.0.0/8], units: {{1: plant}}, access: read-write}}]

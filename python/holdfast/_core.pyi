@@ -399,8 +399,7 @@ class Listener:
     addition to `max_connections`. Times are in seconds; `idle_timeout` 0 is unlimited. With
     `listen_only`, function 8 may set a unit to listen only mode, for all peers. `raw_ingest`, only
     with `mbap` and without TLS, is a listener for packets whose connections come to the same port:
-    its own bind and limits are ignored. `max_requests_per_source` and `max_writes_per_source` are
-    per second. Raises `ValueError` for an invalid address, limit or time.
+    its own bind and limits are ignored. Raises `ValueError` for an invalid address, limit or time.
     """
 
     def __new__(
@@ -420,8 +419,6 @@ class Listener:
         tls: ServerTls | None = None,
         max_handshakes: int = 256,
         raw_ingest: Listener | None = None,
-        max_requests_per_source: int | None = None,
-        max_writes_per_source: int | None = None,
     ) -> Listener: ...
     @staticmethod
     def udp(
@@ -431,8 +428,6 @@ class Listener:
         *,
         framing: Literal["mbap", "rtu"] = "mbap",
         listen_only: bool = False,
-        max_requests_per_source: int | None = None,
-        max_writes_per_source: int | None = None,
     ) -> Listener:
         """A listener for Modbus over UDP.
 
@@ -477,7 +472,6 @@ class Listener:
         after_refusal: Literal["close", "continue"] = "close",
         tls: ServerTls | None = None,
         max_handshakes: int = 256,
-        max_writes_per_source: int | None = None,
     ) -> Listener:
         """A listener for Raw Ingest packets.
 

@@ -51,7 +51,6 @@ EVENTS: Mapping[str, Meaning] = {
     "request_timeout": _BROKEN,
     "slow_reader": _BROKEN,
     "broken_frame": _BROKEN,
-    "rate_limited": _UNUSABLE,
     "unrequested_data": _UNUSABLE,
     "accept_error": _UNUSABLE,
     "listener_fault": _UNUSABLE,

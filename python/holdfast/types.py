@@ -141,23 +141,6 @@ class ConnectionCounters(TypedDict):
     open: int
 
 
-class Excess(TypedDict):
-    """What sources had too many of."""
-
-    requests: int
-    writes: int
-
-
-class RateCounters(TypedDict):
-    """How often sources exceeded their requests or writes per second.
-
-    `paused`: connections that were not read for a while. `dropped`: datagrams.
-    """
-
-    paused: Excess
-    dropped: Excess
-
-
 class FrameCounters(TypedDict):
     """Frames that are not requests.
 
@@ -192,7 +175,6 @@ class ModbusCounters(TypedDict):
     exceptions: dict[int, int]
     unanswered: int
     connections: ConnectionCounters
-    rate_limited: RateCounters
     tls_failures: dict[str, int]
     frames: FrameCounters
 
@@ -202,7 +184,6 @@ class RawCounters(TypedDict):
 
     packets: PacketCounters
     connections: ConnectionCounters
-    rate_limited: RateCounters
     tls_failures: dict[str, int]
 
 

@@ -50,10 +50,6 @@ LISTENER: dict[str, Any] = {
     },
     "tls_failures": {"expired": 4, "not_tls": 5},
     "frames": {"foreign": 6, "broken": 0},
-    "rate_limited": {
-        "paused": {"requests": 21, "writes": 22},
-        "dropped": {"requests": 23, "writes": 24},
-    },
 }
 RAW: dict[str, Any] = {
     "packets": {"accepted": 9, "held_bytes": 70, "refused": {"crc": 1, "range": 2}},
@@ -226,10 +222,6 @@ def scraped(client: web.Client) -> dict[tuple[str, ...], float]:
         (("holdfast_connections_refused_total", "scada", "role"), 12),
         (("holdfast_connections_refused_total", "scada", "full"), 13),
         (("holdfast_requests_refused_total", "scada", "listen_only"), 14),
-        (("holdfast_rate_limited_total", "requests", "scada", "paused"), 21),
-        (("holdfast_rate_limited_total", "writes", "scada", "paused"), 22),
-        (("holdfast_rate_limited_total", "requests", "scada", "dropped"), 23),
-        (("holdfast_rate_limited_total", "writes", "scada", "dropped"), 24),
         (("holdfast_connections_closed_total", "scada", "evicted"), 15),
         (("holdfast_connections_closed_total", "scada", "rights_revoked"), 16),
         (("holdfast_connections_closed_total", "scada", "ended"), 17),

@@ -301,26 +301,23 @@ def test_rest_has_the_documented_defaults(loaded: Callable[..., Config]) -> None
     assert rest.tokens == "none"
 
 
+@pytest.mark.parametrize("key", ["max_requests_per_source", "max_writes_per_source"])
 @pytest.mark.parametrize(
-    ("text", "limits"),
-    [
-        ("", (100_000, 50_000)),
-        ("max_requests_per_source: 1000000, max_writes_per_source: 1", (1_000_000, 1)),
-        ("max_requests_per_source: null, max_writes_per_source: null", (None, None)),
-    ],
+    "kind", ["modbus-tcp", "modbus-ascii-over-tcp", "modbus-udp", "raw-ingest"]
 )
-@pytest.mark.parametrize("kind", ["modbus-tcp", "modbus-ascii-over-tcp", "modbus-udp"])
-def test_a_source_has_limits_per_second(
-    loaded: Callable[..., Config], kind: str, text: str, limits: tuple[int | None, int | None]
+def test_no_limit_per_second_is_what_always_holds(
+    loaded: Callable[..., Config], kind: str, key: str
 ) -> None:
-    rule = "{sources: [10.0.0.7], units: {1: plant}, access: read-only}"
-    more = f", {text}" if text else ""
-    scada = f"{{type: {kind}, bind: '[::1]:502', rules: [{rule}]{more}}}"
-    listener = loaded(f"{SERVED}listeners:\n  scada: {scada}\n").listeners["scada"]
-    assert isinstance(listener, ModbusTcpListener | ModbusAsciiOverTcpListener | ModbusUdpListener)
-    assert (listener.max_requests_per_source, listener.max_writes_per_source) == limits
-    given = effective(listener.model_dump())
-    assert (given["max_requests_per_source"], given["max_writes_per_source"]) == limits
+    more = "areas: [coils]" if kind == "raw-ingest" else "access: read-only"
+    rule = f"{{sources: [10.0.0.7], units: {{1: plant}}, {more}}}"
+    scada = f"{{type: {kind}, bind: '[::1]:502', rules: [{rule}], {key}: null}}"
+    config = loaded(f"{SERVED}listeners:\n  scada: {scada}\n")
+    [warning] = config.warnings
+    assert (warning.key, warning.message) == (
+        f"listeners.scada.{key}",
+        "has no effect: an address waits only while others do: delete the key",
+    )
+    assert key not in effective(config.listeners["scada"].model_dump())
 
 
 def test_the_hash_of_a_token_is_kept_in_small_letters(loaded: Callable[..., Config]) -> None:
@@ -570,8 +567,6 @@ def test_the_dump_of_the_example_shows_every_default(loaded: Callable[..., Confi
         "    max_connections: 256\n"
         "    max_connections_per_source: 128\n"
         "    when_full: refuse\n"
-        "    max_requests_per_source: 100000\n"
-        "    max_writes_per_source: 50000\n"
         "    idle_timeout: 300\n"
         "    request_timeout: 10\n"
         "    listen_only: false\n"
@@ -664,23 +659,10 @@ def test_the_schema_takes_null_only_where_it_means_no_limit() -> None:
     ]
     assert sorted(nullable) == [
         "ModbusAsciiOverTcpListener.max_connections_per_source",
-        "ModbusAsciiOverTcpListener.max_requests_per_source",
-        "ModbusAsciiOverTcpListener.max_writes_per_source",
         "ModbusRtuOverTcpListener.max_connections_per_source",
-        "ModbusRtuOverTcpListener.max_requests_per_source",
-        "ModbusRtuOverTcpListener.max_writes_per_source",
-        "ModbusRtuOverUdpListener.max_requests_per_source",
-        "ModbusRtuOverUdpListener.max_writes_per_source",
         "ModbusTcpListener.max_connections_per_source",
-        "ModbusTcpListener.max_requests_per_source",
-        "ModbusTcpListener.max_writes_per_source",
         "ModbusTlsListener.max_connections_per_source",
-        "ModbusTlsListener.max_requests_per_source",
-        "ModbusTlsListener.max_writes_per_source",
-        "ModbusUdpListener.max_requests_per_source",
-        "ModbusUdpListener.max_writes_per_source",
         "RawIngestListener.max_connections_per_source",
-        "RawIngestListener.max_writes_per_source",
         "RestConfig.max_connections_per_source",
     ]
 

@@ -106,8 +106,7 @@ def test_a_listener_of_an_unknown_type_has_its_memories_checked(folder: Folder) 
         (
             "    rules:",
             "    idle_timeout: 5\n    rules:",
-            "8: idle_timeout: unknown key, allowed: type, bind, max_requests_per_source, "
-            "max_writes_per_source, listen_only, rules",
+            "8: idle_timeout: unknown key, allowed: type, bind, listen_only, rules",
         ),
         ("{1: plant}", "{256: plant}", "9: rules[0].units.256: found 256, allowed: a unit id from "
          "0 to 255, or a range, as in 20-40"),
@@ -235,12 +234,13 @@ def test_serial_lines_need_ports_of_their_own(folder: Folder, device: str) -> No
          "7: when_full: found 'wait', allowed: refuse or evict"),
         ("    bind", "    listen_only: true\n    bind", "7: listen_only: unknown key, allowed: "
          "type, format, crc, flags, bind, tls, max_connections, max_connections_per_source, "
-         "when_full, max_handshakes, max_writes_per_source, request_timeout, packets, "
+         "when_full, max_handshakes, request_timeout, packets, "
          "after_refusal, idle_timeout, rules"),
         ("    bind", "    tls: 1\n    bind", "7: tls: found 1, allowed: a mapping with the keys "
          "cert_file, key_file, key_passphrase_file, ca_file, crl_file, expired_crl, review"),
-        ("    bind", "    max_writes_per_source: 0\n    bind",
-         "7: max_writes_per_source: found 0, allowed: an integer from 1 to 1000000 or null"),
+        ("    bind", "    max_writes_per_source: 20\n    bind",
+         "7: max_writes_per_source: removed, there is no limit per second: an address waits only "
+         "while others do: delete the key"),
         ("    bind", "    max_connections: 0\n    bind",
          "7: max_connections: found 0, allowed: an integer from 1 to 65535"),
         ("units: {1: plant}, ", "",

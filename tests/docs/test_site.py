@@ -60,7 +60,7 @@ def test_the_site_is_read_and_searched_without_a_server(site: Path) -> None:
         page.goto((site / "index.html").as_uri())
         page.get_by_role("link", name="Audit log", exact=True).first.click()
         expect(page.get_by_role("heading", name="Audit log")).to_be_visible()
-        page.get_by_role("textbox", name="Search").fill("max_requests_per_source")
+        page.get_by_role("textbox", name="Search").fill("max_connections_per_source")
         page.keyboard.press("Enter")
         result = page.locator("#search-results").get_by_role("link", name="Configuration").first
         expect(result).to_be_visible()

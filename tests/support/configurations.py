@@ -89,8 +89,6 @@ def connections(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, An
         "rules": draw(with_sources(modbus_rules(memories))),
         "max_connections": draw(CONNECTIONS),
         "max_connections_per_source": draw(st.none() | CONNECTIONS),
-        "max_requests_per_source": draw(st.none() | st.integers(1, 1_000_000)),
-        "max_writes_per_source": draw(st.none() | st.integers(1, 1_000_000)),
         "when_full": draw(st.sampled_from(["refuse", "evict"])),
         "idle_timeout": draw(st.just(0) | SECONDS | st.integers(1, 1000)),
         "request_timeout": draw(SECONDS),

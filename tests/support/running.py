@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import signal
 import subprocess
 import sys
 from typing import TYPE_CHECKING, Literal, Protocol, TypedDict
@@ -12,7 +15,7 @@ from holdfast.types import AREAS
 from support import wire
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
     from typing import Unpack
 
     from holdfast.appliance import Appliance
@@ -30,8 +33,6 @@ class ServerOptions(TypedDict, total=False):
     deny: Collection[int]
     max_connections: int
     max_connections_per_source: int
-    max_requests_per_source: int
-    max_writes_per_source: int
     when_full: Literal["refuse", "evict"]
     idle_timeout: float
     request_timeout: float
@@ -97,6 +98,17 @@ class ServerProcess:
             self.stop()
             raise RuntimeError("the server process did not start") from None
         self.address = (host, int(port))
+
+    @contextlib.contextmanager
+    def frozen(self) -> Iterator[None]:
+        """Stops the process meanwhile. What is sent to it arrives, and waits."""
+        os.kill(self.pid, signal.SIGSTOP)
+        # Its threads run on until the system has stopped them all.
+        os.waitid(os.P_PID, self.pid, os.WSTOPPED | os.WNOWAIT)
+        try:
+            yield
+        finally:
+            os.kill(self.pid, signal.SIGCONT)
 
     def stop(self) -> None:
         try:

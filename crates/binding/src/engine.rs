@@ -256,16 +256,6 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
     connections.set_item("tls_failed", counters.tls_failed.total())?;
     connections.set_item("open", listener.open_connections)?;
     all.set_item("connections", connections)?;
-    let limited = PyDict::new(py);
-    for (key, counters) in
-        [("paused", &listener.rates().paused), ("dropped", &listener.rates().dropped)]
-    {
-        let excess = PyDict::new(py);
-        excess.set_item("requests", counters.requests.get())?;
-        excess.set_item("writes", counters.writes.get())?;
-        limited.set_item(key, excess)?;
-    }
-    all.set_item("rate_limited", limited)?;
     all.set_item("tls_failures", counters.tls_failed.by_reason())?;
     Ok(all)
 }

@@ -11,8 +11,8 @@ use holdfast_engine::server::policy::{Elsewhere, Narrowed, Rule as CoreRule};
 use holdfast_engine::server::ranges::Ranges;
 use holdfast_engine::server::{
     AfterRefusal, ConnectionLimits, DatagramFraming, Flags, ListenerKind, ListenerSettings,
-    PacketsPerConnection, RateLimits, RawRule as CoreRawRule, RawSettings, SerialSettings,
-    StreamFraming, StreamSettings, UdpSettings, WhenFull,
+    PacketsPerConnection, RawRule as CoreRawRule, RawSettings, SerialSettings, StreamFraming,
+    StreamSettings, UdpSettings, WhenFull,
 };
 use holdfast_engine::tls::server::{ExpiredLists, ServerFiles, ServerTls as CoreServerTls};
 use holdfast_memory::Memory as CoreMemory;
@@ -173,7 +173,7 @@ pub struct Listener {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Listener {
     #[new]
-    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, frame_timeout=None, listen_only=false, tls=None, max_handshakes=256, raw_ingest=None, max_requests_per_source=None, max_writes_per_source=None))]
+    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, frame_timeout=None, listen_only=false, tls=None, max_handshakes=256, raw_ingest=None))]
     fn new(
         name: String,
         bind: &str,
@@ -189,8 +189,6 @@ impl Listener {
         tls: Option<PyRef<'_, ServerTls>>,
         max_handshakes: i128,
         raw_ingest: Option<PyRef<'_, Listener>>,
-        max_requests_per_source: Option<i128>,
-        max_writes_per_source: Option<i128>,
     ) -> PyResult<Listener> {
         let raw_ingest = match raw_ingest.map(|listener| listener.core.kind.clone()) {
             None => None,
@@ -216,7 +214,6 @@ impl Listener {
             bind: address(bind)?,
             framing: word("framing", framing, &framings)?,
             rules: cores(&rules),
-            rates: rates(max_requests_per_source, max_writes_per_source)?,
             limits: secure_limits(limits, tls.is_some(), max_handshakes)?,
             idle_timeout: (!idle_timeout.is_zero()).then_some(idle_timeout),
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
@@ -231,22 +228,19 @@ impl Listener {
     }
 
     #[staticmethod]
-    #[pyo3(signature = (name, bind, rules, *, framing="mbap", listen_only=false, max_requests_per_source=None, max_writes_per_source=None))]
+    #[pyo3(signature = (name, bind, rules, *, framing="mbap", listen_only=false))]
     fn udp(
         name: String,
         bind: &str,
         rules: Vec<PyRef<'_, Rule>>,
         framing: &str,
         listen_only: bool,
-        max_requests_per_source: Option<i128>,
-        max_writes_per_source: Option<i128>,
     ) -> PyResult<Listener> {
         let framings = [("mbap", DatagramFraming::Mbap), ("rtu", DatagramFraming::Rtu)];
         let udp = UdpSettings {
             bind: address(bind)?,
             framing: word("framing", framing, &framings)?,
             rules: cores(&rules),
-            rates: rates(max_requests_per_source, max_writes_per_source)?,
             listen_only,
         };
         Ok(Listener { core: ListenerSettings { name, kind: ListenerKind::ModbusUdp(udp) } })
@@ -272,7 +266,7 @@ impl Listener {
     }
 
     #[staticmethod]
-    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", flags="strict", max_connections=256, max_connections_per_source=None, when_full="refuse", request_timeout=10.0, packets="one", idle_timeout=300.0, after_refusal="close", tls=None, max_handshakes=256, max_writes_per_source=None))]
+    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", flags="strict", max_connections=256, max_connections_per_source=None, when_full="refuse", request_timeout=10.0, packets="one", idle_timeout=300.0, after_refusal="close", tls=None, max_handshakes=256))]
     fn raw_ingest(
         name: String,
         bind: &str,
@@ -289,7 +283,6 @@ impl Listener {
         after_refusal: &str,
         tls: Option<PyRef<'_, ServerTls>>,
         max_handshakes: i128,
-        max_writes_per_source: Option<i128>,
     ) -> PyResult<Listener> {
         let idle = time_to_wait("idle_timeout", idle_timeout)?;
         let refusals = [("close", AfterRefusal::Close), ("continue", AfterRefusal::Continue)];
@@ -312,7 +305,6 @@ impl Listener {
             flags: word("flags", flags, &[("strict", Flags::Strict), ("ignore", Flags::Ignore)])?,
             rules: rules.iter().map(|rule| rule.core.clone()).collect(),
             limits: secure_limits(limits, tls.is_some(), max_handshakes)?,
-            rates: rates(None, max_writes_per_source)?,
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
             packets,
             tls: tls.map(|tls| Arc::clone(&tls.core)),
@@ -384,16 +376,6 @@ fn secure_limits(
 ) -> PyResult<ConnectionLimits> {
     let most = within("max_handshakes", max_handshakes, 1..=65_535)?;
     Ok(ConnectionLimits { max_handshakes: has_tls.then_some(most), ..limits })
-}
-
-fn rates(requests: Option<i128>, writes: Option<i128>) -> PyResult<RateLimits> {
-    let limit = |what, most: Option<i128>| {
-        most.map_or(Ok(0), |most| within(what, most, 1..=1_000_000).map(|most| most as u32))
-    };
-    Ok(RateLimits {
-        requests: limit("max_requests_per_source", requests)?,
-        writes: limit("max_writes_per_source", writes)?,
-    })
 }
 
 fn time_to_wait(what: &str, time: f64) -> PyResult<Duration> {

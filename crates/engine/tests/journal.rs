@@ -13,8 +13,8 @@ use holdfast_engine::server::functions::{AccessMode, Functions};
 use holdfast_engine::server::policy::Rule;
 use holdfast_engine::server::{
     AfterRefusal, ConnectionLimits, DatagramFraming, Engine, Flags, ListenerKind, ListenerSettings,
-    Listening, PacketsPerConnection, RateLimits, RawRule, RawSettings, Settings, StreamFraming,
-    StreamSettings, UdpSettings, WhenFull,
+    Listening, PacketsPerConnection, RawRule, RawSettings, Settings, StreamFraming, StreamSettings,
+    UdpSettings, WhenFull,
 };
 use holdfast_memory::{
     Access, Area, CarriedOut, Done, Journal, Layout, Memory, Read as Reading, Refusal, Refused,
@@ -87,7 +87,7 @@ impl Setup {
             functions: Functions::All,
             narrowed: Vec::new(),
         };
-        let (bind, rates) = ("127.0.0.1:0".parse().unwrap(), RateLimits::default());
+        let bind = "127.0.0.1:0".parse().unwrap();
         let limits = ConnectionLimits {
             max_connections: 100,
             max_connections_per_source: None,
@@ -98,7 +98,6 @@ impl Setup {
             bind,
             framing: StreamFraming::Mbap,
             rules: vec![rule.clone()],
-            rates,
             limits,
             idle_timeout: None,
             request_timeout: TIMEOUT,
@@ -111,7 +110,6 @@ impl Setup {
             bind,
             framing: DatagramFraming::Mbap,
             rules: vec![rule],
-            rates,
             listen_only: false,
         };
         let raw = |packets| RawSettings {
@@ -126,7 +124,6 @@ impl Setup {
                 areas: Area::ALL.to_vec(),
             }],
             limits,
-            rates,
             request_timeout: TIMEOUT,
             packets,
             tls: None,

@@ -16,8 +16,8 @@ use holdfast_engine::server::event::Verbosity;
 use holdfast_engine::server::functions::{AccessMode, Functions};
 use holdfast_engine::server::policy::{Elsewhere, Rule};
 use holdfast_engine::server::{
-    ConnectionLimits, Engine, ListenerKind, ListenerSettings, Listening, RateLimits, Settings,
-    StreamFraming, StreamSettings, WhenFull,
+    ConnectionLimits, Engine, ListenerKind, ListenerSettings, Listening, Settings, StreamFraming,
+    StreamSettings, WhenFull,
 };
 use holdfast_protocol::frame::{mbap, rtu};
 
@@ -119,7 +119,6 @@ impl Setup {
             bind: "127.0.0.1:0".parse().unwrap(),
             framing: StreamFraming::Mbap,
             rules: vec![rule],
-            rates: RateLimits::default(),
             limits: ConnectionLimits {
                 max_connections: 100,
                 max_connections_per_source: None,

@@ -370,13 +370,6 @@ def _of_listeners(listeners: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric
         "packets_held_bytes", "Memory of Raw Ingest packets that are not complete.", "listener"
     )
     refused = _counter("requests_refused", "Requests refused, by reason.", "listener", "reason")
-    limited = _counter(
-        "rate_limited",
-        "Connections paused and datagrams dropped, by the limit of their source.",
-        "listener",
-        "limit",
-        "outcome",
-    )
     for name, counters in listeners.items():
         for key, counted in counters.items():
             if key == "requests":
@@ -389,10 +382,6 @@ def _of_listeners(listeners: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric
                 _add(more, name, dict(_flat(key, rest)))
             elif key == "tls_failures":
                 _add(connections.tls_failed, name, counted)
-            elif key == "rate_limited":
-                for outcome, excess in counted.items():
-                    for limit, count in excess.items():
-                        limited.add_metric([name, limit, outcome], count)
             elif key == "packets":
                 _add(packets, name, counted["refused"])
                 held.add_metric([name], counted["held_bytes"])
@@ -401,7 +390,7 @@ def _of_listeners(listeners: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric
                 _add(more, name, dict(_flat(key, rest)))
             else:
                 _add(more, name, dict(_flat(key, counted)))
-    yield from (requests, exceptions, refused, limited, packets, held)
+    yield from (requests, exceptions, refused, packets, held)
     yield from (*connections.families(), more)
 
 

@@ -187,8 +187,6 @@ def listener(
                 framing=_FRAMINGS[settings.type],
                 max_connections=settings.max_connections,
                 max_connections_per_source=settings.max_connections_per_source,
-                max_requests_per_source=settings.max_requests_per_source,
-                max_writes_per_source=settings.max_writes_per_source,
                 when_full=settings.when_full,
                 idle_timeout=settings.idle_timeout,
                 request_timeout=settings.request_timeout,
@@ -206,8 +204,6 @@ def listener(
                 rules,
                 framing="mbap" if isinstance(settings, ModbusUdpListener) else "rtu",
                 listen_only=settings.listen_only,
-                max_requests_per_source=settings.max_requests_per_source,
-                max_writes_per_source=settings.max_writes_per_source,
             )
         case ModbusRtuListener() | ModbusAsciiListener():
             line = settings.serial
@@ -233,7 +229,6 @@ def listener(
                 flags=settings.flags or "strict",
                 max_connections=settings.max_connections,
                 max_connections_per_source=settings.max_connections_per_source,
-                max_writes_per_source=settings.max_writes_per_source,
                 when_full=settings.when_full,
                 request_timeout=settings.request_timeout,
                 packets=settings.packets,

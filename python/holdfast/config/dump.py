@@ -20,9 +20,7 @@ from ruamel.yaml.scalarstring import DoubleQuotedScalarString
 
 from holdfast.config.source import scalar
 
-NULL_IS_SAID = frozenset(
-    {"max_connections_per_source", "max_requests_per_source", "max_writes_per_source"}
-)
+NULL_IS_SAID = frozenset({"max_connections_per_source"})
 """Keys whose `None` is written as null; other keys without a value are omitted."""
 
 AS_WRITTEN = frozenset({"options"})

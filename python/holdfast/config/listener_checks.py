@@ -28,6 +28,8 @@ _DEFAULT_CONNECTIONS = ModbusTcpListener.model_fields["max_connections"].default
 _OTHER = {"v1": "crc", "crc": "v1"}
 _NAMING = {"v1": "units", "crc": "memories"}
 """The key with which a raw ingest rule names memories, by packet format."""
+_REMOVED = ("max_requests_per_source", "max_writes_per_source")
+"""Former keys of listeners, whose null was what always holds now."""
 
 
 @dataclass
@@ -77,6 +79,16 @@ class ListenerChecks:
 
     def _limits(self, path: KeyPath, listener: dict[Any, Any]) -> None:
         doubt_source_limit(path, listener, _DEFAULT_CONNECTIONS, self.report)
+        for key in _REMOVED:
+            if key not in listener:
+                continue
+            why = "an address waits only while others do: delete the key"
+            if listener[key] is None:
+                self.report.doubt((*path, key), f"has no effect: {why}")
+                del listener[key]
+            else:
+                message = f"removed, there is no limit per second: {why}"
+                self.report.settle((*path, key), message, of_key=True)
 
     def _rule(self, path: KeyPath, rule: dict[Any, Any]) -> None:
         units = rule.get("units")

@@ -29,7 +29,6 @@ from holdfast.config.scalars import (
     MemoryNames,
     Name,
     NotNull,
-    Rate,
     RawUnitId,
     Role,
     SerialUnitIds,
@@ -187,10 +186,6 @@ class _ConnectionListener(Model):
     max_connections, but at least 16."""
     when_full: Literal["refuse", "evict"] = "refuse"
     """At the limit: refuse closes the new connection, evict the connection idle longest."""
-    max_requests_per_source: Rate | None = 100_000
-    """Maximum number of requests per second from one address; null: unlimited. More are delayed."""
-    max_writes_per_source: Rate | None = 50_000
-    """Maximum number of requests per second from one address that write; null: unlimited."""
     idle_timeout: DurationOrZero = 300.0
     """Seconds without a request after which a connection is closed; 0: unlimited."""
     request_timeout: Duration = 10.0
@@ -309,10 +304,6 @@ class ModbusUdpListener(Model):
     """The protocol."""
     bind: BindAddress
     """Where to listen: an IP address and a port."""
-    max_requests_per_source: Rate | None = 100_000
-    """Maximum number of requests per second from one address; null: unlimited. More are dropped."""
-    max_writes_per_source: Rate | None = 50_000
-    """Maximum number of requests per second from one address that write; null: unlimited."""
     listen_only: bool = False
     """Function 8 may set a unit to listen only mode, for all clients of this listener."""
     rules: Annotated[tuple[RuleConfig, ...], Strict(False), Field(min_length=1)]
@@ -327,10 +318,6 @@ class ModbusRtuOverUdpListener(Model):
     """The protocol."""
     bind: BindAddress
     """Where to listen: an IP address and a port."""
-    max_requests_per_source: Rate | None = 100_000
-    """Maximum number of requests per second from one address; null: unlimited. More are dropped."""
-    max_writes_per_source: Rate | None = 50_000
-    """Maximum number of requests per second from one address that write; null: unlimited."""
     listen_only: bool = False
     """Function 8 may set a unit to listen only mode, for all clients of this listener."""
     rules: Annotated[tuple[RuleConfig, ...], Strict(False), Field(min_length=1)]
@@ -439,8 +426,6 @@ class RawIngestListener(Model):
     """With tls: maximum number of open connections that are not authenticated yet, in addition to
     max_connections; at the limit, the oldest is closed. Default: as many as max_connections, at
     least 256."""
-    max_writes_per_source: Rate | None = 50_000
-    """Maximum number of packets per second from one address; null: unlimited. More are delayed."""
     request_timeout: Duration = 10.0
     """Seconds from the start of a connection to the last byte of its packet; with tls, also for the
     handshake, before that."""

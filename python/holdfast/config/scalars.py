@@ -58,7 +58,6 @@ from holdfast.types import Area
 
 MAX_BYTES = 244
 MAX_CONNECTIONS = 65535
-MAX_RATE = 1_000_000
 MAX_DEVICE = 4095
 MAX_ROLE = 255
 MAX_TIME = 31_622_400
@@ -433,7 +432,6 @@ StopBits = Annotated[Literal[1, 2], BeforeValidator(integral)]
 DataBits = Annotated[Literal[7, 8], BeforeValidator(integral)]
 EightBits = Annotated[Literal[8], BeforeValidator(integral)]
 Connections = Annotated[int, Field(ge=1, le=MAX_CONNECTIONS)]
-Rate = Annotated[int, Field(ge=1, le=MAX_RATE)]
 Source = Annotated[
     Network,
     PlainValidator(parse_source),

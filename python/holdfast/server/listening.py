@@ -42,8 +42,6 @@ class TransportOptions:
 
     max_connections: int = 256
     max_connections_per_source: int | None = None
-    max_requests_per_source: int | None = None
-    max_writes_per_source: int | None = None
     when_full: WhenFull = "refuse"
     idle_timeout: float = 300.0
     request_timeout: float = 10.0
@@ -66,15 +64,13 @@ def listener(bind: str, rules: Sequence[Rule], options: TransportOptions) -> _co
         options.check(scheme)
         return _serial(bind, rules)
     if scheme in _DATAGRAMS:
-        options.check(scheme, "listen_only", "max_requests_per_source", "max_writes_per_source")
+        options.check(scheme, "listen_only")
         return _core.Listener.udp(
             NAME,
             address,
             rules,
             framing=_DATAGRAMS[scheme],
             listen_only=options.listen_only,
-            max_requests_per_source=options.max_requests_per_source,
-            max_writes_per_source=options.max_writes_per_source,
         )
     special = {"rtu+tcp": {"frame_timeout"}, "tls": {"tls", "max_handshakes"}}
     others = {"frame_timeout", "tls", "max_handshakes"} - special.get(scheme, set())
@@ -88,8 +84,6 @@ def listener(bind: str, rules: Sequence[Rule], options: TransportOptions) -> _co
         framing=_CONNECTIONS[scheme],
         max_connections=options.max_connections,
         max_connections_per_source=options.max_connections_per_source,
-        max_requests_per_source=options.max_requests_per_source,
-        max_writes_per_source=options.max_writes_per_source,
         when_full=options.when_full,
         idle_timeout=options.idle_timeout,
         request_timeout=options.request_timeout,

@@ -58,8 +58,6 @@ class Server:
         rules: Sequence[Rule] | None = None,
         max_connections: int = 256,
         max_connections_per_source: int | None = None,
-        max_requests_per_source: int | None = None,
-        max_writes_per_source: int | None = None,
         when_full: WhenFull = "refuse",
         idle_timeout: float = 300.0,
         request_timeout: float = 10.0,
@@ -88,8 +86,6 @@ class Server:
         options = TransportOptions(
             max_connections=max_connections,
             max_connections_per_source=max_connections_per_source,
-            max_requests_per_source=max_requests_per_source,
-            max_writes_per_source=max_writes_per_source,
             when_full=when_full,
             idle_timeout=idle_timeout,
             request_timeout=request_timeout,

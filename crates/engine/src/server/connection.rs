@@ -24,12 +24,11 @@ use super::admission::Ticket;
 use super::audit::Forwarded;
 use super::deferred::{Completed, Deferral, Deferred, MAX_WAITING};
 use super::event::Kind;
+use super::fair_share::{READ, Share};
 use super::framing::{Ascii, Framing, Mbap, Next, Rtu};
-use super::functions::is_write;
 use super::listener::ListenerContext;
 use super::peer::Peer;
 use super::policy::PeerRights;
-use super::rates::{Charge, MAX_PAUSE, Source};
 use super::refused_request::{RefusedRequest, Reported};
 use super::stream::{self, Stream};
 use super::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};
@@ -106,12 +105,7 @@ pub(crate) struct Connection<F: Framing, S> {
     last_read: Instant,
     /// Reads since the last pause.
     turns: u32,
-    /// What the source of the peer has used of its limits. `None` until it has limits.
-    source: Option<Arc<Source>>,
-    /// Nothing is read before: the source has used up its limits.
-    paused: Option<Instant>,
-    /// Whether the connection has written since its last pause, or may have before.
-    wrote: bool,
+    share: Share,
 }
 
 /// The state that replies depend on.
@@ -137,8 +131,8 @@ struct Answered {
     /// Bytes of output.
     len: usize,
     requests: usize,
-    /// What the source pays for: these requests, and frames that were discarded.
-    charge: Charge,
+    /// Frames that were discarded.
+    discarded: usize,
     /// Bytes of complete frames.
     consumed: usize,
     /// A frame was broken. Bytes after it were ignored.
@@ -154,9 +148,10 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         renewal: Renewal,
         ticket: Ticket,
     ) -> Connection<F, S> {
+        let share = Share::of(peer.ip());
         let answering = Answering::new(context, peer, unit_server, rights);
         let last_request = Instant::now();
-        let mut connection = Connection {
+        Connection {
             stream,
             answering,
             timeouts,
@@ -167,15 +162,8 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             begun: None,
             last_read: last_request,
             turns: 0,
-            source: None,
-            paused: None,
-            wrote: true,
-        };
-        if connection.answering.context.rates.are_limited() {
-            // Connections before this one may have used up the limits.
-            connection.charge(Charge::default(), last_request);
+            share,
         }
-        connection
     }
 
     /// Takes over bytes that were already read: the beginning of a request.
@@ -238,7 +226,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
     }
 
-    /// Reads once, answers all complete requests, and writes once. Or writes replies that have come.
+    /// Reads and answers once, unless the source has used its share. Or writes replies that have come.
     fn poll(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
         if self.answering.is_waiting() {
             if let Poll::Ready(step) = self.poll_deferred(context) {
@@ -248,10 +236,17 @@ impl<F: Framing, S: Stream> Connection<F, S> {
                 return Poll::Pending;
             }
         }
-        if self.paused.is_some() {
+        if self.share.poll(context).is_pending() {
             self.turns = 0;
             return Poll::Pending;
         }
+        let read = self.poll_read(context);
+        self.share.pass_on();
+        read
+    }
+
+    /// Reads once, answers all complete requests, and writes once.
+    fn poll_read(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
             let kept = self.answering.restore(input);
             let read = self.stream.poll_read(context, &mut input[kept..], &mut self.unsent);
@@ -263,6 +258,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             let read = read?;
             self.renew()?;
             let answered = self.answering.answer(&input[..kept + read], output);
+            self.share.charge(READ);
             self.note(&answered);
             let output = &output[..answered.len];
             if !output.is_empty() {
@@ -316,9 +312,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             self.last_request = now;
             self.ticket.touch(now.into_std());
         }
-        if self.answering.context.rates.are_limited() {
-            self.charge(answered.charge, now);
-        }
+        self.share.charge((answered.requests + answered.discarded) as u32);
         if self.answering.partial_len == 0 && !self.stream.is_amid_record() {
             self.begun = None;
             return;
@@ -326,46 +320,6 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         self.last_read = now;
         if answered.consumed > 0 || self.begun.is_none() {
             self.begun = Some(now);
-        }
-    }
-
-    /// Charges the source of the peer. If it has used up its limits, nothing more is read for a while.
-    fn charge(&mut self, charge: Charge, now: Instant) {
-        let rates = &self.answering.context.rates;
-        let peer = self.answering.peer.ip();
-        let source = self.source.get_or_insert_with(|| rates.source(peer));
-        rates.charge(source, charge, now.into_std());
-        self.wrote |= charge.writes > 0;
-        if self.pause(now) {
-            self.note_pause(now);
-        }
-    }
-
-    /// Pauses if the source has used up its limits. Returns whether it has.
-    fn pause(&mut self, now: Instant) -> bool {
-        let rates = &self.answering.context.rates;
-        let wait =
-            self.source.as_ref().and_then(|source| rates.wait(source, self.wrote, now.into_std()));
-        self.paused = wait.map(|(wait, _)| now + wait.min(MAX_PAUSE));
-        self.wrote &= wait.is_some();
-        wait.is_some()
-    }
-
-    #[cold]
-    fn note_pause(&self, now: Instant) {
-        let (context, now) = (&self.answering.context, now.into_std());
-        let Some(source) = &self.source else { return };
-        let Some((_, excess)) = context.rates.wait(source, self.wrote, now) else { return };
-        if context.rates.note_pause(source, excess, now) {
-            context.report(Kind::RateLimited(excess), Some(self.answering.peer.clone()));
-        }
-    }
-
-    /// Continues after a pause, during which the peer was not to blame for silence.
-    fn end_pause(&mut self, now: Instant) {
-        if !self.pause(now) {
-            (self.last_request, self.last_read) = (now, now);
-            self.begun = self.begun.map(|_| now);
         }
     }
 
@@ -381,9 +335,6 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     }
 
     fn deadline(&self) -> (Instant, Kind) {
-        if let Some(paused) = self.paused {
-            return (paused, Kind::Idle);
-        }
         match (self.begun, self.timeouts.idle) {
             (Some(begun), _) => {
                 let deadline = begun + self.timeouts.request;
@@ -413,8 +364,10 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         if now < deadline {
             return Ok(());
         }
-        if self.paused.is_some() {
-            self.end_pause(now);
+        if self.share.is_waiting() {
+            // What the peer has sent is not read yet: it is not to blame for silence.
+            (self.last_request, self.last_read) = (now, now);
+            self.begun = self.begun.map(|_| now);
             return Ok(());
         }
         match self.begun {
@@ -443,15 +396,6 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
         self.stream.end(&mut self.unsent);
         let _ = stream::write(self.stream.socket(), &mut self.unsent);
-    }
-}
-
-impl Answered {
-    #[inline]
-    fn add(&mut self, request: &[u8]) {
-        self.requests += 1;
-        self.charge.requests += 1;
-        self.charge.writes += u32::from(is_write(request));
     }
 }
 
@@ -486,7 +430,7 @@ impl<F: Framing> Answering<F> {
     /// Answers the complete requests of `input`, and keeps the incomplete one after them.
     fn answer(&mut self, input: &[u8], output: &mut [u8]) -> Answered {
         let mut answered =
-            Answered { len: 0, requests: 0, charge: Charge::default(), consumed: 0, broken: false };
+            Answered { len: 0, requests: 0, discarded: 0, consumed: 0, broken: false };
         let mut rest = input;
         let is_doubtful = mem::take(&mut self.is_doubtful);
         let mut decoded = F::NOT_DECODED;
@@ -502,7 +446,7 @@ impl<F: Framing> Answering<F> {
                             Deferral::Later(refused) => {
                                 self.note_refused(refused);
                                 rest = &rest[len..];
-                                answered.add(pdu);
+                                answered.requests += 1;
                                 continue;
                             }
                             Deferral::Wait => {
@@ -514,18 +458,18 @@ impl<F: Framing> Answering<F> {
                         }
                     }
                     rest = &rest[len..];
-                    answered.add(pdu);
+                    answered.requests += 1;
                     answered.len += self.reply(tag, unit_id, pdu, &mut output[answered.len..]);
                 }
                 Next::Foreign { len } => {
                     rest = &rest[len..];
                     self.unit_server.counters.frames.foreign.add();
-                    answered.charge.requests += 1;
+                    answered.discarded += 1;
                 }
                 Next::Damaged { len } => {
                     rest = &rest[len..];
                     self.unit_server.counters.frames.damaged.add();
-                    answered.charge.requests += 1;
+                    answered.discarded += 1;
                 }
                 Next::Stray { len } => rest = &rest[len..],
                 Next::Broken => {

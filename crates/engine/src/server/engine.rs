@@ -22,7 +22,6 @@ use super::identity::Identity;
 use super::listener::{ListenerContext, Service, accept, bind_tcp, bind_udp};
 use super::live::Live;
 use super::policy::{PeerRights, Policy};
-use super::rates::{RateCounters, RateLimits};
 use super::raw_ingest::{RawIngest, RawSettings};
 use super::serial::{ModbusSerial, SerialSettings};
 use super::tcp::{ModbusStream, StreamSettings};
@@ -136,10 +135,6 @@ impl ListenerCounters {
     pub fn connections(&self) -> &ConnectionCounters {
         &self.context.connections
     }
-
-    pub fn rates(&self) -> &RateCounters {
-        &self.context.rates.counters
-    }
 }
 
 /// The task of a listener. All tasks are started after all listeners are bound.
@@ -238,16 +233,16 @@ impl Engine {
         kind: ListenerKind,
         identity: Identity,
     ) -> Result<(Listener, Task), StartError> {
-        let context = |limits: Option<ConnectionLimits>, rates: RateLimits| {
+        let context = |limits: Option<ConnectionLimits>| {
             let (reporter, auditor) = (self.reporter.clone(), self.auditor.clone());
-            Arc::new(ListenerContext::new(name, limits, rates, reporter, auditor))
+            Arc::new(ListenerContext::new(name, limits, reporter, auditor))
         };
         let unit_server = |listen_only| Arc::new(UnitServer::new(identity, listen_only));
         let (workers, stopping) = (self.handles.clone(), self.stop.subscribe());
         let (context, bind, address, served, task): (_, _, _, _, Task) = match kind {
             ListenerKind::ModbusStream(stream) => {
                 let (socket, address) = bound(name, stream.bind, bind_tcp)?;
-                let context = context(Some(stream.limits), stream.rates);
+                let context = context(Some(stream.limits));
                 let unit_server = unit_server(stream.listen_only);
                 let service = ModbusStream::new(&stream, Arc::clone(&unit_server), None);
                 let live = Arc::new(Live::new(service));
@@ -257,7 +252,7 @@ impl Engine {
             }
             ListenerKind::RawIngest(raw) => {
                 let (socket, address) = bound(name, raw.bind, bind_tcp)?;
-                let context = context(Some(raw.limits), raw.rates);
+                let context = context(Some(raw.limits));
                 let live = Arc::new(Live::new(RawIngest::new(&raw, Arc::default())));
                 let served = Served::Packets(Arc::clone(&live));
                 let task = accept(Arc::clone(&context), live, socket, workers, stopping);
@@ -265,8 +260,7 @@ impl Engine {
             }
             ListenerKind::ModbusUdp(udp) => {
                 let (socket, address) = bound(name, udp.bind, bind_udp)?;
-                let (context, unit_server) =
-                    (context(None, udp.rates), unit_server(udp.listen_only));
+                let (context, unit_server) = (context(None), unit_server(udp.listen_only));
                 let policy = Arc::new(Live::new(Policy::of(&udp.rules)));
                 let (rules, units) = (Arc::clone(&policy), Arc::clone(&unit_server));
                 let service = ModbusUdp::new(udp.framing, rules, units);
@@ -281,8 +275,7 @@ impl Engine {
                     device: line.device.clone(),
                     error,
                 })?;
-                let unlimited = RateLimits::default();
-                let (context, unit_server) = (context(None, unlimited), unit_server(true));
+                let (context, unit_server) = (context(None), unit_server(true));
                 let rights = Arc::new(Live::new(PeerRights::new(&rule)));
                 let (own, units) = (Arc::clone(&rights), Arc::clone(&unit_server));
                 let service = ModbusSerial::new(line.clone(), own, units);
@@ -446,7 +439,7 @@ impl Listener {
             {
                 let service = ModbusStream::new(new, Arc::clone(units), live.get().packets());
                 let (live, units) = (Arc::clone(live), Arc::clone(units));
-                let (limits, listen_only) = ((new.limits, new.rates), new.listen_only);
+                let (limits, listen_only) = (new.limits, new.listen_only);
                 Some(Box::new(move |listener| {
                     units.update(identity, listen_only);
                     listener.take_over(&live, service, limits);
@@ -456,7 +449,7 @@ impl Listener {
                 if self.bind == Some(new.bind) =>
             {
                 let service = RawIngest::new(new, Arc::clone(&live.get().packets));
-                let (live, limits) = (Arc::clone(live), (new.limits, new.rates));
+                let (live, limits) = (Arc::clone(live), new.limits);
                 Some(Box::new(move |listener| listener.take_over(&live, service, limits)))
             }
             (Served::Datagrams(framing, live, units), ListenerKind::ModbusUdp(new))
@@ -464,10 +457,9 @@ impl Listener {
             {
                 let policy = Arc::new(Policy::of(&new.rules));
                 let (live, units) = (Arc::clone(live), Arc::clone(units));
-                let (rates, listen_only) = (new.rates, new.listen_only);
-                Some(Box::new(move |listener| {
+                let listen_only = new.listen_only;
+                Some(Box::new(move |_| {
                     units.update(identity, listen_only);
-                    listener.context.rates.set_limits(rates);
                     live.replace(policy);
                 }))
             }
@@ -485,14 +477,8 @@ impl Listener {
         }
     }
 
-    fn take_over<S: Service>(
-        &self,
-        live: &Live<S>,
-        service: S,
-        (limits, rates): (ConnectionLimits, RateLimits),
-    ) {
+    fn take_over<S: Service>(&self, live: &Live<S>, service: S, limits: ConnectionLimits) {
         self.context.admission.set_limits(limits);
-        self.context.rates.set_limits(rates);
         let service = Arc::new(service);
         let before = live.replace(Arc::clone(&service));
         self.context.review(&*before, &*service);

@@ -14,7 +14,6 @@ use std::time::Duration;
 use holdfast_protocol::raw_ingest::Refusal;
 
 use super::peer::Peer;
-use super::rates::Excess;
 use super::refused_request::RefusedRequest;
 
 /// The most events in the queue.
@@ -50,8 +49,6 @@ pub enum Kind {
     /// No rule names the role of the peer.
     RefusedRole,
     RefusedFull,
-    /// A source sent more requests or writes per second than it may.
-    RateLimited(Excess),
     /// A peer asked for listen only mode, which the listener does not allow.
     RefusedListenOnly,
     /// A request was refused because of rights, or because a memory is sealed.
@@ -96,7 +93,6 @@ impl Kind {
             Kind::RefusedSource => "refused_source",
             Kind::RefusedRole => "refused_role",
             Kind::RefusedFull => "refused_full",
-            Kind::RateLimited(_) => "rate_limited",
             Kind::RefusedListenOnly => "refused_listen_only",
             Kind::RefusedRequest(refused) => refused.why.name(),
             Kind::TlsFailed(_) => "tls_failed",
@@ -113,7 +109,6 @@ impl Kind {
         match self {
             Kind::PacketRefused(refusal) => Some(refusal.name()),
             Kind::TlsFailed(reason) => Some(reason),
-            Kind::RateLimited(excess) => Some(excess.name()),
             Kind::EvictedHandshake => Some("handshake"),
             _ => None,
         }

@@ -64,7 +64,7 @@ fn is_allowed(code: u8, functions: &Functions, access: AccessMode, of_device: bo
         }
 }
 
-/// Whether a request counts as a write for the limits of a source.
+/// Whether a request writes, also to a file of a device.
 #[inline]
 pub(super) fn is_write(request: &[u8]) -> bool {
     let code = request.first().copied().unwrap_or_default();

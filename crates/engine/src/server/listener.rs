@@ -11,7 +11,7 @@ use tokio::net::TcpStream;
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::task::yield_now;
-use tokio::time::{Instant, sleep, timeout_at};
+use tokio::time::{Instant, timeout_at};
 
 use super::admission::{Admission, ConnectionLimits, Evicted, Full, Ticket, attach};
 use super::audit::{Auditor, Permit};
@@ -19,7 +19,6 @@ use super::counters::ConnectionCounters;
 use super::event::{Kind, Reporter};
 use super::live::Live;
 use super::peer::Peer;
-use super::rates::{Charge, MAX_PAUSE, RateLimits, Rates, Source};
 use super::refused_request::RefusedRequest;
 
 /// The most connections that wait in the system to be accepted.
@@ -45,7 +44,6 @@ const DRAIN_CHUNK: usize = 16 * 1024;
 pub(crate) struct ListenerContext {
     pub(crate) name: Arc<str>,
     pub(crate) admission: Arc<Admission>,
-    pub(crate) rates: Rates,
     pub(crate) connections: ConnectionCounters,
     pub(crate) auditor: Option<Auditor>,
     reporter: Reporter,
@@ -55,14 +53,12 @@ impl ListenerContext {
     pub(crate) fn new(
         name: &str,
         limits: Option<ConnectionLimits>,
-        rates: RateLimits,
         reporter: Reporter,
         auditor: Option<Auditor>,
     ) -> ListenerContext {
         ListenerContext {
             name: name.into(),
             admission: Arc::new(Admission::new(limits.unwrap_or(ConnectionLimits::NONE))),
-            rates: Rates::new(rates),
             connections: ConnectionCounters::default(),
             auditor,
             reporter,
@@ -72,7 +68,7 @@ impl ListenerContext {
     #[cfg(test)]
     pub(crate) fn for_tests() -> ListenerContext {
         let (reporter, _) = super::event::channel(super::event::Verbosity::Nothing);
-        ListenerContext::new("test", None, RateLimits::default(), reporter, None)
+        ListenerContext::new("test", None, reporter, None)
     }
 
     /// Permits a request to a memory. `None` if it can't be recorded, although it must.
@@ -94,48 +90,6 @@ impl ListenerContext {
     #[inline]
     fn permitted(&self, ask: impl FnOnce(&Auditor) -> Option<Permit>) -> Option<Permit> {
         self.auditor.as_ref().map_or_else(|| Some(Permit::default()), ask)
-    }
-
-    /// Whether a source must wait before its next packet.
-    pub(crate) fn is_slowed(&self, peer: SocketAddr) -> bool {
-        self.rates.are_limited()
-            && self
-                .rates
-                .wait(&self.rates.source(peer.ip()), true, Instant::now().into_std())
-                .is_some()
-    }
-
-    /// Charges the source of a packet.
-    pub(crate) fn charge_packet(&self, peer: SocketAddr) -> Option<Arc<Source>> {
-        let source = self.rates.are_limited().then(|| self.rates.source(peer.ip()))?;
-        let packet = Charge { requests: 0, writes: 1 };
-        self.rates.charge(&source, packet, Instant::now().into_std());
-        Some(source)
-    }
-
-    /// Charges the source of a packet, and waits until it may send the next. Returns false when the
-    /// engine stops.
-    pub(crate) async fn pace_packet(
-        &self,
-        peer: SocketAddr,
-        stop: &mut watch::Receiver<bool>,
-    ) -> bool {
-        let Some(source) = self.charge_packet(peer) else { return true };
-        let mut is_noted = false;
-        loop {
-            let now = Instant::now();
-            let Some((wait, excess)) = self.rates.wait(&source, true, now.into_std()) else {
-                return true;
-            };
-            if !is_noted && self.rates.note_pause(&source, excess, now.into_std()) {
-                self.report(Kind::RateLimited(excess), Some(peer.into()));
-            }
-            is_noted = true;
-            tokio::select! {
-                () = sleep(wait.min(MAX_PAUSE)) => {}
-                _ = stop.wait_for(|stop| *stop) => return false,
-            }
-        }
     }
 
     pub(crate) fn report(&self, kind: Kind, peer: Option<Peer>) {

@@ -7,6 +7,7 @@ pub mod counters;
 mod deferred;
 mod engine;
 pub mod event;
+mod fair_share;
 mod framing;
 pub mod functions;
 pub mod identity;
@@ -18,7 +19,6 @@ mod memory_operations;
 mod peer;
 pub mod policy;
 pub mod ranges;
-mod rates;
 mod raw_ingest;
 mod refused_request;
 mod secure;
@@ -35,7 +35,6 @@ pub use engine::{
     Settings, StartError,
 };
 pub use peer::Peer;
-pub use rates::{ByExcess, Excess, RateCounters, RateLimits};
 pub use raw_ingest::{AfterRefusal, Flags, PacketsPerConnection, RawRule, RawSettings};
 pub use refused_request::{RefusedRequest, Why};
 pub use serial::SerialSettings;

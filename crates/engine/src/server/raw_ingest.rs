@@ -10,6 +10,7 @@ use std::future::poll_fn;
 use std::io::{Read, Write as _};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
+use std::task::ready;
 use std::time::Duration;
 
 use holdfast_memory::{Access, Area, Memory, Operation, Refusal as MemoryRefusal, Write};
@@ -27,12 +28,12 @@ use super::admission::{ConnectionLimits, Ticket};
 use super::audit::{Permit, Record, Written};
 use super::counters::PacketCounters;
 use super::event::Kind;
+use super::fair_share::{self, READ, Share};
 use super::incoming::Incoming;
 use super::listener::{Admitted, ListenerContext, Service, drain, set_options};
 use super::live::Live;
 use super::peer::Peer;
 use super::policy::{Grants, PolicyEntry};
-use super::rates::RateLimits;
 use super::secure::secured;
 use super::stream::{self, End, Stream, send_all};
 use crate::tls::server::ServerTls;
@@ -82,8 +83,6 @@ pub struct RawSettings {
     pub crc_if_present: bool,
     pub rules: Vec<RawRule>,
     pub limits: ConnectionLimits,
-    /// Packets count as writes.
-    pub rates: RateLimits,
     /// The longest time from the start of a connection to the last byte of its packet. With TLS also
     /// for the handshake, before that.
     pub request_timeout: Duration,
@@ -173,13 +172,24 @@ pub(crate) struct Sending<S> {
     /// Bytes that the system has not accepted yet.
     unsent: Vec<u8>,
     ticket: Ticket,
+    share: Share,
 }
 
 impl<S: Stream> Sending<S> {
-    /// Reads once, at most about `most` bytes. Returns their number, which can be 0.
+    /// Reads once, at most about `most` bytes, when the source may work. Returns their number, which can
+    /// be 0.
     async fn read(&mut self, most: usize) -> Result<usize, End> {
-        let Sending { stream, bytes, unsent, .. } = self;
-        poll_fn(|context| bytes.poll_read(context, (stream, unsent), most)).await
+        let Sending { stream, bytes, unsent, share, .. } = self;
+        poll_fn(|context| {
+            ready!(share.poll(context));
+            let read = bytes.poll_read(context, (stream, unsent), most);
+            if read.is_ready() {
+                share.charge(READ);
+            }
+            share.pass_on();
+            read
+        })
+        .await
     }
 
     /// Whether part of a packet has arrived.
@@ -284,7 +294,8 @@ impl RawIngest {
     ) -> Sending<S> {
         let mut bytes = Incoming::new(Arc::clone(&self.packets));
         bytes.extend(received);
-        Sending { stream, peer, rights, bytes, unsent: Vec::new(), ticket }
+        let share = Share::of(peer.ip());
+        Sending { stream, peer, rights, bytes, unsent: Vec::new(), ticket, share }
     }
 
     /// Performs the handshake, selects the rights by the role in the certificate, and serves the
@@ -456,14 +467,10 @@ impl RawIngest {
         context: Arc<ListenerContext>,
         mut sending: Sending<S>,
         renewal: Renewal,
-        mut stop: watch::Receiver<bool>,
+        stop: watch::Receiver<bool>,
     ) {
         if let Some(idle) = self.many {
             return self.serve_many(context, sending, renewal, idle, stop).await;
-        }
-        if !context.pace_packet(sending.peer.address, &mut stop).await {
-            context.ended(Kind::Closed, sending.peer.clone());
-            return sending.end();
         }
         let judged = match self.receive(&mut sending, stop.clone()).await {
             Err(end) => {
@@ -479,6 +486,7 @@ impl RawIngest {
             Ok(Packet::Incomplete { .. }) => Err(Refusal::Short),
             Err(refusal) => Err(refusal),
         };
+        sending.share.charge(fair_share::packet(sending.bytes.len()));
         sending.ticket.set_amid_packet(false);
         if let Err(refusal) = written {
             self.refuse(&context, &sending.peer, &sending.bytes, refusal);
@@ -538,9 +546,8 @@ impl RawIngest {
                         end = slow;
                         break;
                     }
-                    if !context.pace_packet(sending.peer.address, &mut stop).await {
-                        break;
-                    }
+                    sending.share.charge(fair_share::packet(len));
+                    sending.share.come().await;
                     begun = Instant::now();
                     packets += 1;
                     if packets.is_multiple_of(TURN) {
@@ -743,16 +750,13 @@ impl Service for RawIngest {
         };
         let bytes = &chunk[..len];
         let peer = Peer::from(connection.peer);
-        let is_slowed = context.is_slowed(connection.peer);
         if let Ok(Packet::Whole { header, memory, payload }) = self.judge(&connection.rights, bytes)
             && len < CHUNK
-            && !is_slowed
             && !memory.has_journal()
             && self.write_at_once(context, &peer, (header, memory, payload)).is_ok()
         {
             let dropped = RawIngest::confirm(&mut connection.stream, &mut Vec::new());
             self.drop_bytes(context, &peer, dropped);
-            context.charge_packet(connection.peer);
             context.ended(Kind::Closed, peer);
             return None;
         }
@@ -835,7 +839,6 @@ mod tests {
             crc_if_present: false,
             rules: Vec::new(),
             limits: ConnectionLimits::NONE,
-            rates: RateLimits::default(),
             request_timeout: Duration::from_secs(10),
             packets: PacketsPerConnection::One,
             tls: None,
@@ -909,6 +912,42 @@ mod tests {
         });
         assert_eq!(raw.packets.accepted.get(), PACKETS as u64);
         assert!(turns >= PACKETS / TURN, "{turns} turns");
+    }
+
+    #[test]
+    fn a_packet_waits_for_one_share_of_another_source() {
+        const CONNECTIONS: u16 = 16;
+        const PACKETS: usize = TURN - 1;
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let packet = b"RI\x01\x03\x00\x01\x00\x00\x00\x01\x00\x07";
+        let context = Arc::new(ListenerContext::for_tests());
+        let raw = Arc::new(listener(Format::V1, Flags::Strict));
+        let (_engine, stop) = watch::channel(false);
+        runtime.block_on(async {
+            let mut clients = Vec::new();
+            let mut serve = |peer: SocketAddr, packets: usize| {
+                let (client, accepted, _) = connected();
+                client.shutdown(std::net::Shutdown::Write).unwrap();
+                clients.push(client);
+                let sending = raw.sending(admitted(accepted, peer, packet.repeat(packets)));
+                let (raw, context, stop) = (Arc::clone(&raw), Arc::clone(&context), stop.clone());
+                tokio::spawn(async move {
+                    let idle = Duration::from_secs(10);
+                    raw.serve_many(context, sending, Box::new(|| None), idle, stop).await;
+                    raw.packets.accepted.get()
+                })
+            };
+            let flood: Vec<_> = (0..CONNECTIONS)
+                .map(|port| serve(([192, 0, 2, 1], port).into(), PACKETS))
+                .collect();
+            let accepted = serve(([192, 0, 2, 2], 1).into(), 1).await.unwrap();
+            // One share before the packet, and one before its sender is found to have left.
+            assert!(accepted <= 1 + 3 * u64::from(fair_share::PACKETS), "{accepted}");
+            for each in flood {
+                each.await.unwrap();
+            }
+        });
+        assert_eq!(raw.packets.accepted.get(), 1 + u64::from(CONNECTIONS) * PACKETS as u64);
     }
 
     /// Whether these bytes begin a packet; `None` if more are needed.

@@ -17,7 +17,6 @@ use super::listener::{Admitted, ListenerContext, Service, set_options};
 use super::live::Live;
 use super::peer::Peer;
 use super::policy::{PeerRights, Policy, Rule};
-use super::rates::RateLimits;
 use super::raw_ingest::{Beginning, DECISIVE, RawIngest, RawSettings};
 use super::secure::secured;
 use super::stream::Stream;
@@ -46,7 +45,6 @@ pub struct StreamSettings {
     pub framing: StreamFraming,
     pub rules: Vec<Rule>,
     pub limits: ConnectionLimits,
-    pub rates: RateLimits,
     /// Closes a connection after this time without a request. `None`: never.
     pub idle_timeout: Option<Duration>,
     /// The longest time from the first byte of a request to its last, and for a peer to read its

@@ -12,23 +12,23 @@ use socket2::SockRef;
 use tokio::io::Interest;
 use tokio::net::UdpSocket;
 use tokio::sync::watch;
-use tokio::task::JoinSet;
+use tokio::task::{JoinSet, yield_now};
 
 use super::audit::{Forwarded, Permit};
 use super::deferred::come;
-use super::event::Kind;
 use super::framing::{Datagram, Mbap, Next, Rtu};
-use super::functions::is_write;
 use super::listener::ListenerContext;
 use super::live::Live;
 use super::policy::{Policy, Rule};
-use super::rates::RateLimits;
 use super::refused_request::RefusedRequest;
 use super::unit_server::UnitServer;
 use crate::link::{Asker, Reply, source};
 
 /// Bytes per read of a socket. The system may deliver several datagrams of one peer at once.
 const INPUT: usize = 64 * 1024;
+
+/// The most reads before other tasks run.
+const TURNS: u32 = 16;
 
 /// The most reads of the remaining input when the listener stops.
 const LAST_READS: usize = 1024;
@@ -57,7 +57,6 @@ pub struct UdpSettings {
     pub bind: SocketAddr,
     pub framing: DatagramFraming,
     pub rules: Vec<Rule>,
-    pub rates: RateLimits,
     /// Whether function 8 may set a unit to listen only mode, for all peers.
     pub listen_only: bool,
 }
@@ -101,7 +100,14 @@ impl ModbusUdp {
         let socket = Datagrams { socket, state };
         let mut input = vec![0; INPUT].into_boxed_slice();
         let mut later = Later { source: source(), replies: JoinSet::new() };
+        let mut turns = 0;
         loop {
+            turns += 1;
+            if turns == TURNS {
+                turns = 0;
+                // Datagrams that never pause leave time for connections, and for `stop`.
+                yield_now().await;
+            }
             let ready = tokio::select! {
                 biased;
                 _ = stop.wait_for(|stop| *stop) => break,
@@ -208,12 +214,6 @@ impl ModbusUdp {
                 return 0;
             }
         };
-        if let Err((excess, is_to_report)) = context.rates.admit(peer.ip(), is_write(request)) {
-            if is_to_report {
-                context.report(Kind::RateLimited(excess), Some(peer.into()));
-            }
-            return 0;
-        }
         let Some(buffer) = output[D::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return 0;
         };
@@ -322,5 +322,56 @@ impl Datagrams {
             // a reply.
             let _ = SockRef::from(&self.socket).send_to(reply, &to.addr.into());
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use holdfast_memory::{Area, Layout, Memory, Span};
+
+    use super::*;
+    use crate::server::functions::{AccessMode, Functions};
+    use crate::server::identity::Identity;
+    use crate::server::listener::bind_udp;
+
+    #[test]
+    fn other_tasks_run_between_many_datagrams_that_have_arrived() {
+        const DATAGRAMS: usize = 100;
+        let span = Span::new(0, 10).unwrap();
+        let layout = Layout::default().with(Area::HoldingRegisters, span);
+        let rule = Rule {
+            sources: vec!["127.0.0.1/32".parse().unwrap()],
+            roles: None,
+            units: vec![(1, Arc::new(Memory::new(layout, None).unwrap()))],
+            elsewhere: Vec::new(),
+            access: AccessMode::ReadOnly,
+            functions: Functions::All,
+            narrowed: Vec::new(),
+        };
+        let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
+        let unit_server = Arc::new(UnitServer::new(Identity::new(&objects, &[]).unwrap(), false));
+        let policy = Arc::new(Live::new(Policy::of(&[rule])));
+        let service = ModbusUdp::new(DatagramFraming::Mbap, policy, Arc::clone(&unit_server));
+        let socket = bind_udp("127.0.0.1:0".parse().unwrap()).unwrap();
+        let client = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+        client.connect(socket.local_addr().unwrap()).unwrap();
+        for _ in 0..DATAGRAMS {
+            client.send(&[0, 0, 0, 0, 0, 6, 1, 3, 0, 0, 0, 1]).unwrap();
+        }
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let (_engine, stop) = watch::channel(false);
+        let read = || unit_server.counters.requests().map(|(_, count)| count).sum::<u64>();
+        let most = runtime.block_on(async {
+            let context = Arc::new(ListenerContext::for_tests());
+            let _serving = tokio::spawn(service.serve(context, socket, stop));
+            let (mut most, mut before) = (0, 0);
+            while before < DATAGRAMS as u64 {
+                yield_now().await;
+                most = most.max(read() - before);
+                before = read();
+            }
+            most
+        });
+        assert!(most <= u64::from(TURNS), "{most} without a pause");
     }
 }
