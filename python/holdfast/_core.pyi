@@ -508,6 +508,13 @@ class Engine:
     def addresses(self) -> list[tuple[str, int] | None]:
         """The address and port of each listener, in their order; `None` for serial lines."""
 
+    @property
+    def sockets(self) -> list[tuple[Literal["tcp", "udp"], str, int]]:
+        """The kind, address and port of each socket that listens.
+
+        Empty after `stop`, and in a forked child.
+        """
+
     def counters(self) -> dict[str, ListenerCounters]:
         """The counters of each listener since the start, by name."""
 

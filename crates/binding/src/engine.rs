@@ -19,7 +19,7 @@ use crate::heartbeat;
 use crate::listener::Listener;
 use crate::peer;
 
-#[pyclass(frozen, module = "holdfast")]
+#[pyclass(frozen, weakref, module = "holdfast")]
 pub struct Engine {
     core: Core,
 }
@@ -86,6 +86,12 @@ impl Engine {
     fn addresses(&self) -> Vec<Option<(String, u16)>> {
         let addresses = self.core.addresses().into_iter();
         addresses.map(|at| at.map(|at| (at.ip().to_string(), at.port()))).collect()
+    }
+
+    #[getter]
+    fn sockets(&self) -> Vec<(&'static str, String, u16)> {
+        let sockets = self.core.sockets().into_iter();
+        sockets.map(|(kind, at)| (kind.name(), at.ip().to_string(), at.port())).collect()
     }
 
     fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {

@@ -1,7 +1,7 @@
 //! Threads that a value owns, which are joined at its end.
 
 use std::process;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError, TryLockError};
 use std::thread::JoinHandle;
 
 /// Threads of this process. In a child process that was forked, they do not exist.
@@ -26,6 +26,16 @@ impl OwnThreads {
     /// parent, with which it shares sockets.
     pub(crate) fn are_of_another_process(&self) -> bool {
         self.process != process::id()
+    }
+
+    /// Whether there are threads that nobody has joined.
+    pub(crate) fn are_running(&self) -> bool {
+        match self.threads.try_lock() {
+            Ok(threads) => !threads.is_empty(),
+            Err(TryLockError::Poisoned(threads)) => !threads.into_inner().is_empty(),
+            // Somebody waits for their end.
+            Err(TryLockError::WouldBlock) => true,
+        }
     }
 
     /// Waits for the end of all threads. A second call waits for the first.

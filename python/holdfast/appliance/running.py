@@ -37,6 +37,7 @@ from holdfast.config.route_checks import routed
 from holdfast.faults import fault_word
 from holdfast.ingest import MemoryAccess
 from holdfast.net.addresses import joined
+from holdfast.server.forking import close_in_children
 from holdfast.standstill import WallClock
 from holdfast.web.port import Port
 
@@ -510,7 +511,7 @@ class _Running:
     def _started_engine(self, links: assembly.Links) -> _core.Engine:
         config = self._config
         identity = assembly.identity(config.identity)
-        return _core.Engine(
+        engine = _core.Engine(
             [assembly.listener(name, config, self._memories, links) for name in config.listeners],
             identity=identity.objects(),
             unit_names=identity.names(),
@@ -518,6 +519,8 @@ class _Running:
             events=_events(config),
             audit=None if config.audit is None else config.audit.fail,
         )
+        close_in_children(engine)
+        return engine
 
     def sessions(self) -> list[dict[str, Any]]:
         return self._engine.sessions()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Self, cast
 
 from holdfast import _core
 from holdfast.net.addresses import LOOPBACK
+from holdfast.server.forking import close_in_children
 from holdfast.server.identity import Identity
 from holdfast.server.listening import NAME, TransportOptions, listener
 
@@ -114,6 +115,7 @@ class Server:
                 unit_names=self._identity.names(),
                 workers=self._workers,
             )
+            close_in_children(self._engine)
         return self
 
     def stop(self) -> None:

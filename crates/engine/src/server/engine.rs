@@ -86,6 +86,22 @@ pub struct Engine {
     records: Option<Records>,
 }
 
+/// The kind of a socket that listens.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SocketKind {
+    Tcp,
+    Udp,
+}
+
+impl SocketKind {
+    pub const fn name(self) -> &'static str {
+        match self {
+            SocketKind::Tcp => "tcp",
+            SocketKind::Udp => "udp",
+        }
+    }
+}
+
 /// What a listener serves, and who may use it.
 #[derive(Debug, Clone)]
 pub struct Listening {
@@ -355,6 +371,19 @@ impl Engine {
     /// The address of each listener, in the order of the settings; `None` for serial lines.
     pub fn addresses(&self) -> Vec<Option<SocketAddr>> {
         self.listeners().iter().map(|listener| listener.address).collect()
+    }
+
+    /// The sockets that listen. None after `stop`, and in a forked child.
+    pub fn sockets(&self) -> Vec<(SocketKind, SocketAddr)> {
+        if self.workers.are_of_another_process() || !self.workers.are_running() {
+            return Vec::new();
+        }
+        let kind = |served: &Served| match served {
+            Served::Datagrams(..) => SocketKind::Udp,
+            Served::Stream(..) | Served::Serial(..) | Served::Packets(_) => SocketKind::Tcp,
+        };
+        let listeners = self.listeners();
+        listeners.iter().filter_map(|each| Some((kind(&each.served), each.address?))).collect()
     }
 
     /// The counters of each listener, in the order of the settings.

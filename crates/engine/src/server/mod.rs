@@ -32,7 +32,7 @@ pub mod unit_server;
 pub use admission::{ConnectionLimits, OpenConnection, WhenFull};
 pub use engine::{
     Engine, ListenerCounters, ListenerKind, ListenerSettings, Listening, ProtocolCounters,
-    Settings, StartError,
+    Settings, SocketKind, StartError,
 };
 pub use peer::Peer;
 pub use raw_ingest::{AfterRefusal, Flags, PacketsPerConnection, RawRule, RawSettings};
