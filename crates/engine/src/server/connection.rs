@@ -627,6 +627,7 @@ mod tests {
     use holdfast_protocol::frame::{ascii, mbap};
 
     use super::*;
+    use crate::server::admission::{Admission, ConnectionLimits};
     use crate::server::framing::MbapBesidePackets;
     use crate::server::functions::{AccessMode, Functions};
     use crate::server::identity::Identity;
@@ -732,6 +733,37 @@ mod tests {
             }
             assert!(replies == whole[..len], "cut at {cut}");
         }
+    }
+
+    #[test]
+    fn a_peer_is_not_to_blame_for_silence_while_its_source_waits() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let _guard = runtime.enter();
+        let bound = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let client = std::net::TcpStream::connect(bound.local_addr().unwrap()).unwrap();
+        client.set_nonblocking(true).unwrap();
+        let (stream, peer) = (
+            tokio::net::TcpStream::from_std(client).unwrap(),
+            SocketAddr::from(([192, 0, 2, 1], 1)),
+        );
+        let limits = ConnectionLimits { max_connections: 1, ..ConnectionLimits::NONE };
+        let (ticket, _) = Arc::new(Admission::new(limits)).admit(peer).unwrap();
+        let Answering { context, unit_server, rights, .. } = answering::<Mbap>();
+        let timeouts = Timeouts { idle: None, request: Duration::ZERO, frame: None };
+        let terms = Terms { rights, timeouts };
+        let stream = (stream, peer.into());
+        let renewal = Box::new(|| None);
+        let mut connection =
+            Connection::<Mbap, _>::new(context, unit_server, stream, terms, renewal, ticket);
+        connection.begin_with(&[0]);
+        let other = Share::of([192, 0, 2, 2].into());
+        connection.share.charge(1_000_000);
+        let mut context = Context::from_waker(std::task::Waker::noop());
+        assert!(connection.poll(&mut context).is_pending());
+        assert_eq!(connection.overdue(), Ok(()));
+        drop(other);
+        assert!(connection.poll(&mut context).is_pending(), "nothing has arrived");
+        assert_eq!(connection.overdue(), Err(Kind::RequestTimeout));
     }
 
     #[test]
