@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import threading
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.appliance import Appliance
+from holdfast.appliance import Appliance, running
 from holdfast.appliance.changes import ReloadRefused
 from holdfast.appliance.shared_logs import LogNotJoined
 from holdfast.config import load
@@ -52,6 +53,7 @@ def config(
     Unless the test is about the timeout of writes, a loaded machine has the time to confirm them.
     """
     audit, log = memory.pop("audit", None), memory.pop("log", {})
+    metrics = {"metrics": {"bind": "127.0.0.1:0"}} if memory.pop("metrics", False) else {}
     plant = {"holding_registers": 100, "coils": 16, "replicate": {"log": "site"}} | memory
     rules = [{"sources": ["127.0.0.0/8"], "units": {1: "plant"}, "access": "read-write"}]
     parts = {
@@ -61,6 +63,7 @@ def config(
         "listeners": {"scada": {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": rules}},
         "rest": {"bind": "127.0.0.1:0", "sources": ["127.0.0.0/8"], "tokens": "none"},
     } | ({} if audit is None else {"audit": {"file": audit}})
+    parts |= metrics
     file = folder / f"{name}.yaml"
     file.write_text(written(parts))
     return load(file)
@@ -329,6 +332,32 @@ rest: {bind: "127.0.0.1:0", sources: [127.0.0.0/8], tokens: none}
 """
     [warning] = Folder(tmp_path).warnings(text)
     assert "logs.site: has no effect: no memory is replicated through it" in warning
+
+
+def test_a_message_with_a_broken_header_is_counted_and_logged(
+    tmp_path: Path,
+    server: NatsServer,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(running, "HEALTH_CHECK_INTERVAL", 0)
+    with Appliance(config(tmp_path, [server.url], metrics=True)) as one:
+        with socket.create_connection((server.host, server.port), wire.DEADLINE) as publisher:
+            publisher.sendall(
+                b'CONNECT {"headers":true}\r\n'
+                b"HPUB holdfast.log.site.steps 12 19\r\nNATS/9.9\r\n\r\npayload\r\n"
+            )
+            wire.until(lambda: one.replicas()["site"]["ignored"] == 1, "it is ignored")
+        assert ask(one, "060003002a") == "060003002a"
+        client = web.Client(endpoint(one, "metrics"))
+        shown = client.get("/metrics").body.decode()
+        client.close()
+        assert 'holdfast_log_messages_ignored_total{log="site"} 1.0' in shown
+        one.log_events(0)
+    [line] = [each for each in caplog.records if each.message == "log_message_ignored"]
+    fields = line.__dict__["fields"]
+    assert (fields["log"], fields["reason"]) == ("site", "it was not sent by a node")
+    assert int(fields["sequence"]) > 0
 
 
 def test_the_past_can_be_rebuilt(

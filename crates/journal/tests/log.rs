@@ -2,12 +2,13 @@
 
 mod nodes;
 
+use std::io::{BufRead, BufReader, Write as _};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use futures_util::StreamExt;
-use holdfast_journal::log::{LogError, Phase, Settings};
+use holdfast_journal::log::{Follower, LogError, Next, Phase, Settings, Until};
 use holdfast_memory::{
     Access, Action, Memory, Operation, Read, Refusal, Step, StepWrite, Write, write_across,
 };
@@ -313,6 +314,116 @@ fn a_message_that_is_sent_twice_is_applied_once() {
     a.write(6, 1).unwrap();
 }
 
+/// Publishes with headers as they are, and waits until the server has them.
+fn publish_raw(server: &Server, subject: &[u8], headers: &[u8], payload: &[u8]) {
+    let mut socket = std::net::TcpStream::connect(("127.0.0.1", server.port)).unwrap();
+    let lengths = format!(" {} {}\r\n", headers.len(), headers.len() + payload.len());
+    let connect = b"CONNECT {\"headers\":true,\"verbose\":false}\r\nHPUB ";
+    let parts = [connect, subject, lengths.as_bytes(), headers, payload, b"\r\nPING\r\n"];
+    socket.write_all(&parts.concat()).unwrap();
+    let mut answers = BufReader::new(socket).lines().map(Result::unwrap);
+    let answer = answers.find(|line| !line.starts_with("INFO"));
+    assert_eq!(answer.as_deref(), Some("PONG"));
+}
+
+const STEPS: &[u8] = b"holdfast.log.site.steps";
+
+/// Headers that the client library can't parse, or takes for an answer of the server.
+const HEADERS: [&[u8]; 9] = [
+    b"NATS/9.9\r\n\r\n",
+    b"\xFF\xFE\r\n\r\n",
+    b"NATS/1.0\r\n\xFF: \xFF\r\n\r\n",
+    b"NATS/1.0\r\nwithout a colon\r\n\r\n",
+    b"NATS/1.0 abc\r\n\r\n",
+    b"NATS/1.0 100\r\n\r\n",
+    b"NATS/1.0 408 Request Timeout\r\nNats-Pending-Messages: x\r\n\r\n",
+    b"NATS/1.0 409 Consumer Deleted\r\n\r\n",
+    b"NATS/1.0 503\r\n\r\n",
+];
+
+#[test]
+fn messages_with_headers_that_nobody_can_read_are_ignored() {
+    let server = Server::new();
+    let (a, b) = (Node::started(&[&server], "a"), Node::started(&[&server], "b"));
+    a.write(0, 1).unwrap();
+    for (count, headers) in HEADERS.iter().enumerate() {
+        publish_raw(&server, STEPS, headers, b"payload");
+        a.write_at_last(1, count as u16);
+        until("both have ignored it", || {
+            [&a, &b].iter().all(|node| node.status().ignored == count as u64 + 1)
+        });
+    }
+    let events = a.log.take_events(Duration::ZERO);
+    let count = |name: &str| events.iter().filter(|event| event.name == name).count();
+    assert_eq!(count("log_message_ignored"), HEADERS.len());
+    assert!(count("log_disconnected") < HEADERS.len(), "after the first one, messages are fetched");
+    // Later a consumer delivers messages again, and does not survive one of these.
+    (0..120).for_each(|_| a.write_at_last(1, HEADERS.len() as u16 - 1));
+    until("a consumer delivers messages", || {
+        publish_raw(&server, STEPS, HEADERS[0], b"payload");
+        a.write_at_last(4, 4);
+        a.log.take_events(Duration::ZERO).iter().any(|event| event.name == "log_disconnected")
+    });
+    until("the other node has the last write", || b.read(1) == Ok(HEADERS.len() as u16 - 1));
+    // Also after a restart, and if there are many, and if the last one is one of them.
+    drop(a);
+    for _ in 0..20 {
+        for headers in HEADERS {
+            publish_raw(&server, STEPS, headers, b"payload");
+        }
+        b.write_at_last(2, 5);
+    }
+    publish_raw(&server, STEPS, HEADERS[0], &vec![b'x'; 1_000_000]);
+    for name in ["a", "c"] {
+        let node = Node::started(&[&server], name);
+        assert_eq!(node.read(2), Ok(5));
+        assert!(node.status().ignored > 21 * HEADERS.len() as u64);
+        node.write(3, 3).unwrap();
+    }
+    until("a node that was there has it", || b.read(3) == Ok(3));
+}
+
+#[test]
+fn keys_that_nobody_can_read_are_replaced() {
+    let server = Server::new();
+    let node = Node::new(&[&server], "a", often);
+    node.start();
+    for (key, value) in [("digest.b", "x"), ("digest.\u{a0}", "x"), ("snapshot", "not JSON")] {
+        let subject = format!("$KV.holdfast-log-site.{key}");
+        publish_raw(&server, subject.as_bytes(), HEADERS[0], value.as_bytes());
+        until("the keys are replaced", || {
+            node.log.take_events(Duration::ZERO).iter().any(|event| {
+                event.name == "log_error" && event.fields[0].1.starts_with("keys of the log")
+            })
+        });
+        node.write_at_last(0, 7);
+    }
+    let other = Node::started(&[&server], "b");
+    assert_eq!(other.read(0), Ok(7));
+}
+
+#[test]
+fn a_replay_goes_on_behind_headers_that_nobody_can_read() {
+    let server = Server::new();
+    let node = Node::started(&[&server], "a");
+    for (value, headers) in HEADERS.iter().enumerate() {
+        node.write_at_last(0, value as u16);
+        publish_raw(&server, STEPS, headers, b"payload");
+    }
+    node.write_at_last(0, 500);
+    let memory = memory_of(100);
+    let members = vec![("plant".to_owned(), Arc::clone(&memory))];
+    let settings = Settings::new("site", "replay", vec![server.url()]);
+    let mut follower = Follower::open(&settings, members, Until::Now, nodes::DEADLINE).unwrap();
+    let mut foreign = 0;
+    while let Next::Record(record) = follower.next(nodes::DEADLINE).unwrap() {
+        foreign += usize::from(record.origin.is_none());
+    }
+    assert!(follower.has_ended());
+    assert_eq!(foreign, HEADERS.len());
+    assert_eq!(Memory::contents(&[memory])[0].areas[2][..2], 500_u16.to_be_bytes());
+}
+
 #[test]
 fn a_node_joins_late_with_a_snapshot_and_the_stream_is_purged() {
     let server = Server::new();
@@ -527,6 +638,7 @@ fn without_contact_reads_are_refused_if_that_is_wanted() {
     node.start();
     node.write(0, 1).unwrap();
     assert_eq!(node.read(0), Ok(1));
+    until("the other node has it", || other.read(0) == Ok(1));
     server.signal("STOP");
     until("reads are refused", || node.read(0) == Err(Refusal::Behind));
     assert_eq!(other.read(0), Ok(1), "the other node serves");

@@ -328,6 +328,7 @@ def _of_logs(logs: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
     sequence = _gauge("log_sequence", "The sequence that was applied last.", "log")
     differs = _gauge("log_differs", "1 if other nodes have other contents.", "log")
     steps = _counter("log_steps", "Writes of this node, by outcome.", "log", "outcome")
+    ignored = _counter("log_messages_ignored", "Messages that no node has sent.", "log")
     for name, told in logs.items():
         up.add_metric([name], told["phase"] == "running" and told["connected"])
         lag.add_metric([name], told["lag"])
@@ -335,6 +336,7 @@ def _of_logs(logs: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
             contact.add_metric([name], told["contact_age"])
         sequence.add_metric([name], told["sequence"])
         differs.add_metric([name], told["digest"] is not None and told["digest"][2] is False)
+        ignored.add_metric([name], told["ignored"])
         for outcome, key in (
             ("done", "steps"),
             ("unavailable", "unavailable"),
@@ -342,7 +344,7 @@ def _of_logs(logs: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
             ("refused", "refused"),
         ):
             steps.add_metric([name, outcome], told[key])
-    yield from (up, lag, contact, sequence, differs, steps)
+    yield from (up, lag, contact, sequence, differs, steps, ignored)
 
 
 def _of_audit(audit: Mapping[str, Any]) -> Iterator[Metric]:

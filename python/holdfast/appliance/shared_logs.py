@@ -132,7 +132,8 @@ class SharedLogs:
         """Logs what has happened since the last call."""
         for name, log in self._logs.items():
             for event, fields in log.events(0):
-                logs.write(EVENTS[event], event, log=name, **fields)
+                # Whoever may publish to a log can cause these.
+                logs.limited(EVENTS[event], event, kind=name, log=name, **fields)
 
     def stop(self) -> None:
         """Waits for the writes that were sent, leaves the logs, and stops servers of our own."""

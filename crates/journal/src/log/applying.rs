@@ -2,13 +2,12 @@
 
 use std::time::Instant;
 
-use async_nats::jetstream;
-use async_nats::jetstream::consumer::pull;
 use holdfast_memory::Outcome;
 
 use super::error::{End, LogError};
 use super::message::OVERHEAD;
 use super::node::{LogSession, Node};
+use super::received::Received;
 use super::state::{Applied, Place};
 use super::status::{Event, NodeView, Phase};
 
@@ -16,17 +15,10 @@ impl Node {
     pub(super) fn received(
         &mut self,
         session: &mut LogSession,
-        message: Option<Result<jetstream::Message, pull::MessagesError>>,
+        received: Received,
     ) -> Result<(), End> {
-        let message = match message {
-            Some(Ok(message)) => message,
-            Some(Err(error)) => return Err(End::lost("reading the stream", error)),
-            None => return Err(End::Lost("the consumer has ended".to_owned())),
-        };
-        let info = message.info().map_err(|error| End::lost("a message of the stream", error))?;
-        let stored = info.published.unix_timestamp_nanos() as i64;
-        let place = Place { sequence: info.stream_sequence, stored };
-        self.shared.counters.last_sequence.set(place.sequence + info.pending);
+        let Received { place, payload, last, is_readable: _ } = received;
+        self.shared.counters.last_sequence.set(last);
         let applied = self.state.place;
         if place.sequence == applied.sequence && place != applied {
             let sequence = place.sequence;
@@ -43,7 +35,7 @@ impl Node {
             let next = applied.sequence + 1;
             return Err(End::Lost(format!("sequence {} came in place of {next}", place.sequence)));
         }
-        self.apply(session, place, &message.payload)
+        self.apply(session, place, &payload)
     }
 
     fn apply(&mut self, session: &mut LogSession, place: Place, payload: &[u8]) -> Result<(), End> {

@@ -4,7 +4,6 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_nats::jetstream;
-use async_nats::jetstream::consumer::pull;
 use futures_util::StreamExt;
 use holdfast_memory::{Memory, Step};
 
@@ -12,12 +11,11 @@ use super::connection::connect;
 use super::error::{End, LogError};
 use super::layout::fingerprint;
 use super::message::{self, Origin};
+use super::messages::{Fetched, fetched};
+use super::received::Received;
 use super::settings::Settings;
 use super::state::{Place, State, digest_of};
 use super::store::{Pointer, Snapshot, Store};
-
-/// How often the server shows that it has no messages.
-const HEARTBEAT: Duration = Duration::from_secs(5);
 
 /// Where to end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -65,7 +63,7 @@ pub enum Next {
 
 struct Reading {
     state: State,
-    messages: pull::Stream,
+    messages: Fetched,
 }
 
 impl Follower {
@@ -166,14 +164,9 @@ impl Reading {
     async fn next(&mut self, until: Until) -> Result<Option<Record>, End> {
         let next = self.state.place.sequence + 1;
         loop {
-            let message = match self.messages.next().await {
-                Some(Ok(message)) => message,
-                Some(Err(error)) => return Err(End::lost("reading the stream", error)),
-                None => return Err(End::Lost("the consumer has ended".to_owned())),
-            };
-            let info = message.info().map_err(|error| End::lost("a message", error))?;
-            let stored = info.published.unix_timestamp_nanos() as i64;
-            let place = Place { sequence: info.stream_sequence, stored };
+            let received = self.messages.next().await;
+            let ended = || Err(End::Lost("the messages have ended".to_owned()));
+            let Received { place, payload, .. } = received.unwrap_or_else(ended)?;
             if place.sequence < next {
                 continue;
             }
@@ -181,15 +174,15 @@ impl Reading {
                 let text = format!("sequence {} came in place of {next}", place.sequence);
                 return Err(LogError::Snapshot(text).into());
             }
-            if matches!(until, Until::Time(end) if stored > end) {
+            if matches!(until, Until::Time(end) if place.stored > end) {
                 return Ok(None);
             }
-            let decoded = message::decode(&message.payload, &self.state.members).ok();
-            let applied = self.state.apply(place, &message.payload)?;
+            let decoded = message::decode(&payload, &self.state.members).ok();
+            let applied = self.state.apply(place, &payload)?;
             let fresh = matches!(applied, super::state::Applied::Fresh { .. });
             let (origin, steps) =
                 decoded.map(|message| (Some(message.origin), message.steps)).unwrap_or_default();
-            let sequence = place.sequence;
+            let Place { sequence, stored } = place;
             return Ok(Some(Record { sequence, stored, origin, steps, fresh }));
         }
     }
@@ -225,7 +218,7 @@ async fn read_from(
     };
     let mut state = State::new(members);
     store.load(snapshot, &mut state).await?;
-    let messages = store.messages(state.place.sequence + 1, HEARTBEAT).await?;
+    let messages = fetched(store, state.place.sequence + 1);
     Ok(Reading { state, messages })
 }
 

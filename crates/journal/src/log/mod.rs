@@ -12,7 +12,7 @@
 //! ```
 //!
 //! `session.rs` runs the thread, and calls the other files: `joining.rs` before it reads the stream,
-//! `applying.rs` for each message, `comparing.rs` for digests, `snapshots.rs` for snapshots. `returning.rs` is for a node whose
+//! `messages.rs` to read it, `applying.rs` for each message, `comparing.rs` for digests, `snapshots.rs` for snapshots. `returning.rs` is for a node whose
 //! contents were wrong.
 
 mod applying;
@@ -25,7 +25,9 @@ mod follower;
 mod joining;
 mod layout;
 mod message;
+mod messages;
 mod node;
+mod received;
 mod returning;
 mod sending;
 mod sent;

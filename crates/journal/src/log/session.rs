@@ -8,12 +8,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use async_nats::jetstream::{self, Context};
-use futures_util::{FutureExt, StreamExt};
+use futures_util::StreamExt;
 use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 
 use super::connection::connect;
 use super::error::{End, LogError};
+use super::messages::Messages;
 use super::node::{LogSession, Node, Report};
 use super::sent::LOOK;
 use super::status::{Event, Phase};
@@ -103,8 +104,13 @@ impl Node {
         let fingerprint = self.fingerprint.clone();
         let store = self.tend(Store::open(&context, &settings, &fingerprint, true)).await??;
         let from = self.join(&store).await?;
-        let heartbeat = (settings.silence() / 4).max(Duration::from_millis(200));
-        let mut messages = self.tend(store.messages(from, heartbeat)).await??;
+        if let Some((_, pointer)) = self.pointer.clone()
+            && self.tend(store.mend_keys(&pointer)).await??
+        {
+            let reason = "keys of the log that can't be read were replaced";
+            self.shared.event(Event::new("log_error", &[("reason", reason)]));
+        }
+        let mut messages = Messages::new(&store, from);
         let inbox = client.new_inbox();
         let subscribed = client.subscribe(format!("{inbox}.*"));
         let lost = |error: &dyn std::fmt::Display| End::lost("subscribe", error);
@@ -149,14 +155,20 @@ impl Node {
         let mut look = tokio::time::interval(LOOK);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
+            if messages.are_calm() {
+                let from = self.state.place.sequence + 1;
+                let heartbeat = (settings.silence() / 4).max(Duration::from_millis(200));
+                let store = session.store.clone();
+                messages.consume(self.tend(store.consume(from, heartbeat)).await??);
+            }
             tokio::select! {
-                message = messages.next() => {
-                    self.received(&mut session, message)?;
+                received = messages.next() => {
+                    self.received(&mut session, received?)?;
                     // What has arrived together is answered before steps are sent: those who were
                     // answered write again, and their steps travel together.
                     for _ in 0..TOGETHER_RECEIVED {
-                        let Some(message) = messages.next().now_or_never() else { break };
-                        self.received(&mut session, message)?;
+                        let Some(received) = messages.next_now() else { break };
+                        self.received(&mut session, received?)?;
                     }
                     self.send_waiting(&mut session).await?;
                 }
@@ -168,7 +180,13 @@ impl Node {
                     None => return Err(End::Lost("the watch of the keys has ended".to_owned())),
                 },
                 Some(report) = reported.recv() => self.reported(&mut session, report).await?,
-                end = connected.end() => return Err(end),
+                end = connected.end() => {
+                    // The message that has ended the connection comes next in the next session.
+                    while let Some(Ok(received)) = messages.next_now() {
+                        self.received(&mut session, received)?;
+                    }
+                    return Err(end);
+                }
                 _ = look.tick() => self.look(&mut session).await?,
             }
         }

@@ -14,11 +14,13 @@ use async_nats::jetstream::{Context, ErrorCode, kv};
 use bytes::Bytes;
 use futures_util::StreamExt;
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 use tokio::io::AsyncReadExt;
 
 use super::error::{End, LogError};
 use super::layout::difference;
-use super::message::VERSION;
+use super::message::{MAX_NODES, VERSION};
+use super::received::{Received, fetch};
 use super::settings::Settings;
 use super::state::{Place, State, digest_of};
 
@@ -46,6 +48,7 @@ const META_ID: &str = "holdfast-id";
 
 #[derive(Clone)]
 pub(super) struct Store {
+    context: Context,
     pub(super) stream: Stream,
     pub(super) keys: kv::Store,
     leases: kv::Store,
@@ -128,7 +131,7 @@ impl Store {
                     .map_err(|error| End::lost("the snapshots of the log", error))?
             }
         };
-        Ok(Store { stream, keys: pointers, leases, objects })
+        Ok(Store { context: context.clone(), stream, keys: pointers, leases, objects })
     }
 
     /// Tells the stream from another one with the same name.
@@ -136,16 +139,14 @@ impl Store {
         self.stream.cached_info().config.metadata.get(META_ID).map(String::as_str)
     }
 
-    pub(super) async fn messages(
+    /// A consumer, from this sequence on.
+    pub(super) async fn consume(
         &self,
         from: u64,
         heartbeat: Duration,
     ) -> Result<pull::Stream, End> {
         let config = pull::Config {
-            deliver_policy: match from {
-                0 => DeliverPolicy::All,
-                start_sequence => DeliverPolicy::ByStartSequence { start_sequence },
-            },
+            deliver_policy: DeliverPolicy::ByStartSequence { start_sequence: from },
             ack_policy: AckPolicy::None,
             inactive_threshold: FORGOTTEN,
             num_replicas: 1,
@@ -158,16 +159,60 @@ impl Store {
         pulls.messages().await.map_err(|error| lost(&error))
     }
 
+    /// The last sequence of the stream.
+    pub(super) async fn last(&self) -> Result<u64, End> {
+        let info = self.stream.get_info().await;
+        Ok(info.map_err(|error| End::lost("the stream of the log", error))?.state.last_sequence)
+    }
+
+    /// The message at this sequence, if the stream has it.
+    pub(super) async fn message(&self, sequence: u64) -> Result<Option<Received>, End> {
+        let name = &self.stream.cached_info().config.name;
+        fetch(&self.context, name, json!({"seq": sequence})).await
+    }
+
     /// Which snapshots there are, and the revision of that knowledge.
     pub(super) async fn pointer(&self) -> Result<Option<(u64, Pointer)>, End> {
-        let entry = self.keys.entry(POINTER).await;
-        let entry = entry.map_err(|error| End::lost("reading the key of the snapshot", error))?;
-        match entry {
-            Some(entry) if entry.operation == kv::Operation::Put => {
-                Ok(Some((entry.revision, parsed(&entry.value)?)))
+        let which = json!({"last_by_subj": format!("{}{POINTER}", self.keys.prefix)});
+        match fetch(&self.context, &self.keys.stream_name, which).await? {
+            // A deleted key is empty.
+            Some(entry) if !entry.payload.is_empty() => {
+                Ok(Some((entry.place.sequence, parsed(&entry.payload)?)))
             }
             _ => Ok(None),
         }
+    }
+
+    /// Replaces the key of the snapshot, or removes digests, if a watch can't read them. Returns whether
+    /// it has done so. A digest that is missing is stored again at the next comparison.
+    pub(super) async fn mend_keys(&self, pointer: &Pointer) -> Result<bool, End> {
+        let (stream, lost) = (&self.keys.stream_name, |error: &dyn std::fmt::Display| {
+            End::lost("mending the keys", error)
+        });
+        let which = json!({"last_by_subj": format!("{}{POINTER}", self.keys.prefix)});
+        let mut is_mended = false;
+        if let Some(entry) = fetch(&self.context, stream, which).await?
+            && !entry.is_readable
+        {
+            let value = serde_json::to_vec(pointer).map_err(|error| lost(&error))?;
+            let updated = self.keys.update(POINTER, value.into(), entry.place.sequence).await;
+            updated.map_err(|error| lost(&error))?;
+            is_mended = true;
+        }
+        let digests = format!("{}{DIGEST}>", self.keys.prefix);
+        let (mut from, mut seen) = (1, 0);
+        loop {
+            let which = json!({"seq": from, "next_by_subj": digests});
+            let Some(entry) = fetch(&self.context, stream, which).await? else { break };
+            (from, seen) = (entry.place.sequence + 1, seen + 1);
+            if !entry.is_readable || seen > MAX_NODES {
+                let purged = self.keys.stream.purge().filter(digests).await;
+                purged.map_err(|error| lost(&error))?;
+                is_mended = true;
+                break;
+            }
+        }
+        Ok(is_mended)
     }
 
     /// Loads one of the snapshots.

@@ -300,6 +300,7 @@ ROUTES = (
                         "unavailable": 0,
                         "not_confirmed": 0,
                         "refused": 0,
+                        "ignored": 0,
                         "nodes": [
                             {
                                 "name": "scada-a",

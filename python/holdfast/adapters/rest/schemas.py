@@ -220,6 +220,7 @@ DIAGNOSTICS: dict[str, Schema] = {
                         "unavailable": COUNTER | {"description": "Writes that were not sent"},
                         "not_confirmed": COUNTER,
                         "refused": COUNTER,
+                        "ignored": COUNTER | {"description": "Messages that no node has sent"},
                     },
                 },
             },
