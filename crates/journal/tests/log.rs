@@ -658,6 +658,55 @@ fn two_processes_with_the_name_of_a_node_are_noticed() {
 }
 
 #[test]
+fn of_two_processes_with_one_name_that_start_at_once_one_goes_on() {
+    let server = Server::new();
+    let nodes = [(); 2].map(|()| Node::new(&[&server], "a", |_| {}));
+    nodes.iter().for_each(|node| node.log.start().unwrap());
+    until("one stops, and the other one has caught up", || {
+        let [one, other] = nodes.each_ref().map(|node| node.status().phase);
+        matches!(
+            (one, other),
+            (Phase::Failed(_), Phase::Running) | (Phase::Running, Phase::Failed(_))
+        )
+    });
+    for node in &nodes {
+        match node.failure() {
+            Some(error) => assert_eq!(error.kind(), "name_taken"),
+            None => node.write(0, 1).unwrap(),
+        }
+    }
+}
+
+/// The message with which a node begins, as one with this start sends it.
+fn beginning(node: &str, start: u64) -> Vec<u8> {
+    let mut bytes = b"HFL\x01\x00".to_vec();
+    bytes.push(node.len() as u8);
+    bytes.extend_from_slice(node.as_bytes());
+    bytes.extend_from_slice(&start.to_le_bytes());
+    bytes.extend_from_slice(&1_u64.to_le_bytes());
+    bytes
+}
+
+#[test]
+fn a_node_starts_whatever_the_clock_has_shown_before() {
+    let server = Server::new();
+    let node = Node::started(&[&server], "a");
+    node.write(0, 1).unwrap();
+    drop(node);
+    // Starts were times once: here of clocks that were in the year 2100, and then before.
+    for seconds in [4_102_444_800, 4_102_444_770, 1_u64] {
+        let start = seconds * 1_000_000;
+        publish_raw(&server, STEPS, b"NATS/1.0\r\n\r\n", &beginning("a", start));
+        let node = Node::started(&[&server], "a");
+        assert_eq!(node.read(0), Ok(1));
+        node.write(1, 2).unwrap();
+    }
+    publish_raw(&server, STEPS, b"NATS/1.0\r\n\r\n", &beginning("a", u64::MAX));
+    let error = Node::new(&[&server], "a", |_| {}).try_start().unwrap_err();
+    assert!(error.to_string().contains("rename the node"), "{error}");
+}
+
+#[test]
 fn a_server_that_has_lost_messages_is_not_followed() {
     let server = Server::new();
     let node = Node::started(&[&server], "a");

@@ -49,9 +49,9 @@ impl Node {
                 compared = compares;
                 if origin.node == self.origin.node {
                     if origin.start > self.origin.start {
-                        return Err(LogError::NameTaken(origin.node).into());
-                    }
-                    if origin.start == self.origin.start {
+                        self.outrun()?;
+                    } else if origin.start == self.origin.start {
+                        self.is_known = true;
                         for_snapshot = session.asked == Some(origin.counter);
                         self.applied_own(session, origin.counter, outcomes);
                     }
@@ -61,7 +61,7 @@ impl Node {
             Applied::Stale(origin) => {
                 counters.stale.add(1);
                 if origin.node == self.origin.node && origin.start > self.origin.start {
-                    return Err(LogError::NameTaken(origin.node).into());
+                    self.outrun()?;
                 }
             }
             Applied::Ignored(error) => {

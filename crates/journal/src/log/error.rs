@@ -25,6 +25,8 @@ pub enum LogError {
     Replaced(String),
     #[error("another process writes to the log as node {0:?}: names of nodes must be unique")]
     NameTaken(String),
+    #[error("the log has the last possible start of node {0:?}: rename the node")]
+    NameUsedUp(String),
     #[error(
         "the contents at sequence {sequence} have digest {found}, {other}: this node has applied \
          something wrongly"
@@ -44,7 +46,7 @@ impl LogError {
             LogError::Version { .. } => "version",
             LogError::Snapshot(_) => "snapshot",
             LogError::Replaced(_) => "replaced",
-            LogError::NameTaken(_) => "name_taken",
+            LogError::NameTaken(_) | LogError::NameUsedUp(_) => "name_taken",
             LogError::Differs { .. } => "differs",
             LogError::Thread(_) => "thread",
         }

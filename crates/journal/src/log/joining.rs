@@ -1,16 +1,20 @@
 //! Where a node begins to read the stream, and with which contents. Whether the servers have lost
 //! messages.
 
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use super::error::{End, LogError};
-use super::node::{Doubt, Node};
+use super::node::{Doubt, LogSession, NOT_ANNOUNCED, Node};
 use super::state::{State, digest_of};
 use super::status::Event;
-use super::store::Store;
+use super::store::{Store, unique};
 
 /// For so long, a server may know less than this node: it may be cut off from the others.
 const CUT_OFF: Duration = Duration::from_secs(30);
+
+/// The distance between two starts, at most. Starts were microseconds of Unix time once: as long as they
+/// stay behind the clock, such a version still follows this one.
+const STARTS: u64 = 1 << 20;
 
 impl Node {
     /// Loads a snapshot if that is needed. Returns the sequence to read from.
@@ -39,14 +43,50 @@ impl Node {
             }
         }
         self.id = id;
-        if self.origin.start == 0 {
-            let clock = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-            let now = u64::try_from(clock.as_micros()).unwrap_or(u64::MAX);
-            self.origin.start = now.max(self.state.last_start(&self.origin.node) + 1);
-        }
         // What was applied last is read again, to see that it is still the same.
         let applied = self.state.place.sequence;
         Ok(if applied >= first.max(1) { applied } else { applied + 1 })
+    }
+
+    /// Sends what was not confirmed before, and the message at which this node has caught up. A node
+    /// that has sent nothing yet first reads all that the log had when the session began.
+    pub(super) async fn announce(&mut self, session: &mut LogSession) -> Result<(), End> {
+        if session.caught_up_at != Some(NOT_ANNOUNCED) {
+            return Ok(());
+        }
+        if self.origin.start == 0 {
+            if self.state.place.sequence < session.last {
+                return Ok(());
+            }
+            self.origin.start = self.next_start()?;
+        } else if self.state.last_start(&self.origin.node) > self.origin.start {
+            self.outrun()?;
+        }
+        for (counter, payload) in self.sent.again() {
+            self.publish(session, counter, payload).await?;
+        }
+        session.caught_up_at = Some(self.origin.counter + 1);
+        self.send(session, self.doubt.is_some(), Vec::new(), Vec::new(), session.began).await
+    }
+
+    /// A start behind all starts of this node in the log, whatever the clock shows. If another process
+    /// with its name starts at the same time, it draws another one.
+    fn next_start(&self) -> Result<u64, LogError> {
+        let node = &self.origin.node;
+        let step = 1 + (unique() as u64) % STARTS;
+        let next = self.state.last_start(node).checked_add(step);
+        next.ok_or_else(|| LogError::NameUsedUp(node.clone()))
+    }
+
+    /// The log has a start of this node that is later than this one.
+    pub(super) fn outrun(&mut self) -> Result<(), End> {
+        if self.is_known {
+            return Err(LogError::NameTaken(self.origin.node.clone()).into());
+        }
+        if std::mem::take(&mut self.origin.start) == 0 {
+            return Ok(());
+        }
+        Err(End::Lost("the log has a later start of this node".to_owned()))
     }
 
     /// A server knows less than this node. Whether that stays so is seen later.

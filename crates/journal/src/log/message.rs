@@ -20,7 +20,7 @@ pub(super) const VERSION: u8 = 1;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Origin {
     pub node: String,
-    /// Grows with each start of the node.
+    /// Grows with each start of the node, in the order of the log.
     pub start: u64,
     /// Grows with each message of a start.
     pub counter: u64,

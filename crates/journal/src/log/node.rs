@@ -23,7 +23,7 @@ pub(super) struct Node {
     pub(super) fingerprint: String,
     pub(super) shared: Arc<Shared>,
     pub(super) state: State,
-    /// What this node has sent last. The start is 0 until the state is loaded.
+    /// What this node has sent last. The start is 0 until the first message is sent.
     pub(super) origin: Origin,
     pub(super) sent: Sent,
     /// Tells the stream that was applied from another one.
@@ -35,6 +35,8 @@ pub(super) struct Node {
     pub(super) short_since: Option<Instant>,
     pub(super) was_short_since: Option<Instant>,
     pub(super) worked: bool,
+    /// A message of this start was applied: a later start is that of another process.
+    pub(super) is_known: bool,
     /// While the node returns with other contents, because its own were wrong.
     pub(super) doubt: Option<Doubt>,
     /// When it has begun to return the last time.
@@ -51,6 +53,8 @@ pub(super) struct LogSession {
     pub(super) began: Instant,
     pub(super) last_sent: Instant,
     pub(super) last_applied: Instant,
+    /// The last sequence of the stream when the session began.
+    pub(super) last: u64,
     /// When a message of this node with this counter is applied, this node has caught up.
     pub(super) caught_up_at: Option<u64>,
     pub(super) reports: mpsc::UnboundedSender<Report>,
@@ -63,6 +67,9 @@ pub(super) struct LogSession {
     pub(super) no_snapshot_before: Instant,
     pub(super) replays: bool,
 }
+
+/// The counter of a message that was not sent yet.
+pub(super) const NOT_ANNOUNCED: u64 = u64::MAX;
 
 /// A snapshot that is stored when no other node has another digest.
 pub(super) struct Prepared {
@@ -117,6 +124,7 @@ impl Node {
             short_since: None,
             was_short_since: None,
             worked: false,
+            is_known: false,
             doubt: None,
             returned: None,
         }

@@ -15,7 +15,7 @@ use tokio::time::MissedTickBehavior;
 use super::connection::connect;
 use super::error::{End, LogError};
 use super::messages::Messages;
-use super::node::{LogSession, Node, Report};
+use super::node::{LogSession, NOT_ANNOUNCED, Node, Report};
 use super::sent::LOOK;
 use super::status::{Event, Phase};
 use super::store::{DIGEST, POINTER, Store, subject};
@@ -126,11 +126,12 @@ impl Node {
             inbox,
             longest: client.server_info().max_payload.saturating_sub(1024),
             client,
+            last: store.stream.cached_info().state.last_sequence,
             store,
             began: now,
             last_sent: now,
             last_applied: now,
-            caught_up_at: None,
+            caught_up_at: Some(NOT_ANNOUNCED),
             reports,
             takes_snapshot: false,
             asked: None,
@@ -146,11 +147,7 @@ impl Node {
             view.replicas = replicas;
         });
         self.sent.expire(Instant::now(), &self.shared.counters);
-        for (counter, payload) in self.sent.again() {
-            self.publish(&mut session, counter, payload).await?;
-        }
-        session.caught_up_at = Some(self.origin.counter + 1);
-        self.send(&mut session, self.doubt.is_some(), Vec::new(), Vec::new(), now).await?;
+        self.announce(&mut session).await?;
 
         let mut look = tokio::time::interval(LOOK);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -170,6 +167,7 @@ impl Node {
                         let Some(received) = messages.next_now() else { break };
                         self.received(&mut session, received?)?;
                     }
+                    self.announce(&mut session).await?;
                     self.send_waiting(&mut session).await?;
                 }
                 ack = acks.next() => self.acknowledged(ack)?,
@@ -213,7 +211,9 @@ impl Node {
             let seconds = silent.as_secs_f64();
             return Err(End::Lost(format!("the log has confirmed nothing for {seconds:.1} s")));
         }
-        if now.saturating_duration_since(session.last_sent) >= self.settings.tick() {
+        let is_announced = session.caught_up_at != Some(NOT_ANNOUNCED);
+        if is_announced && now.saturating_duration_since(session.last_sent) >= self.settings.tick()
+        {
             let until = now + self.settings.write_timeout;
             self.send(session, false, Vec::new(), Vec::new(), until).await?;
         }
