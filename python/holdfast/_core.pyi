@@ -917,6 +917,14 @@ class LogFollower:
     def sequence(self) -> int:
         """The sequence that was applied last."""
 
+    @property
+    def time_ns(self) -> int:
+        """When the stream stored the message that was applied last, in nanoseconds since 1970."""
+
+    @property
+    def last_sequence(self) -> int:
+        """The last sequence that the stream had at the beginning."""
+
     def digest(self) -> str:
         """Returns the digest of the contents, as nodes compare it."""
 

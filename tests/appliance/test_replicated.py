@@ -379,6 +379,26 @@ def test_the_past_can_be_rebuilt(
     assert server.url
 
 
+def test_a_replay_to_behind_the_end_of_the_log_says_so(
+    node: Callable[..., Appliance], tmp_path: Path
+) -> None:
+    one = node("a")
+    ask(one, "060003002a")
+    file = str(tmp_path / "a.yaml")
+    one.stop()
+    told = json.loads(invoke("replay", file, "--json").stdout)
+    last = told["sequence"]
+    result = invoke("replay", file, "--to", str(last + 1))
+    assert (result.exit_code, result.stdout) == (1, "")
+    expected = f"holdfast: logs.site: --to is {last + 1}, but the log ends at sequence {last}, 2"
+    assert result.stderr.startswith(expected)
+    result = invoke("replay", file, "--json", "--to", "2200-01-01T00:00Z")
+    assert (result.exit_code, json.loads(result.stdout)) == (0, told)
+    expected = f"holdfast: --to is after the last message: the log ends at sequence {last}, 2"
+    assert result.stderr.startswith(expected)
+    assert not invoke("replay", file, "--to", str(last)).stderr
+
+
 def test_a_log_that_is_not_there_can_not_be_replayed(tmp_path: Path) -> None:
     config(tmp_path, [f"nats://127.0.0.1:{free_port()}"])
     result = invoke("replay", str(tmp_path / "a.yaml"))

@@ -235,6 +235,16 @@ impl LogFollower {
         py.detach(|| self.locked(|core| core.sequence()))
     }
 
+    #[getter]
+    fn time_ns(&self, py: Python<'_>) -> i64 {
+        py.detach(|| self.locked(|core| core.stored()))
+    }
+
+    #[getter]
+    fn last_sequence(&self, py: Python<'_>) -> u64 {
+        py.detach(|| self.locked(|core| core.last_sequence()))
+    }
+
     fn digest(&self, py: Python<'_>) -> String {
         py.detach(|| self.locked(|core| core.digest()))
     }

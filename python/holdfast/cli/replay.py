@@ -40,6 +40,7 @@ MAX_TIME = 2**63 - 1
     "--to",
     metavar="SEQUENCE|TIME",
     help="The last step: its sequence in the stream, or a time as in 2026-11-20T14:05:00Z. "
+    "A sequence that the log does not have is an error; a time after its last message is noted. "
     "Default: the last one there is.",
 )
 @click.option("--follow", is_flag=True, help="Print each step, also those to come.")
@@ -96,6 +97,8 @@ def replay(
                 if record is not None and follow:
                     click.echo(_line(record, as_json=as_json))
             if not follow:
+                if replaying.ended:
+                    _check_end(replaying, sequence, time_ns)
                 _tell(replaying, memories, values=values, as_json=as_json)
         except (_core.LogError, ServerUnusable, ValueError) as error:
             _fail(f"logs.{log}: {error}")
@@ -120,6 +123,17 @@ def _within(number: int, most: int) -> int:
     if 0 <= number <= most:
         return number
     raise ValueError
+
+
+def _check_end(replaying: _core.LogFollower, sequence: int | None, time_ns: int | None) -> None:
+    """Raises `ValueError` for a sequence that the log does not have, and notes a time after it."""
+    when = logs.timestamp(replaying.time_ns / 1e9)
+    end = f"the log ends at sequence {replaying.sequence}, {when}"
+    if sequence is not None and sequence > replaying.sequence:
+        raise ValueError(f"--to is {sequence}, but {end}")
+    is_last = replaying.sequence >= replaying.last_sequence
+    if time_ns is not None and is_last and time_ns > replaying.time_ns:
+        click.echo(f"holdfast: --to is after the last message: {end}", err=True)
 
 
 def _tell(

@@ -153,6 +153,16 @@ impl Follower {
         self.reading.state.place.sequence
     }
 
+    /// When the stream stored the message that was applied last, in nanoseconds of Unix time.
+    pub fn stored(&self) -> i64 {
+        self.reading.state.place.stored
+    }
+
+    /// The last sequence that the stream had when this began.
+    pub fn last_sequence(&self) -> u64 {
+        self.last
+    }
+
     /// The digest of the contents, as nodes compare it.
     pub fn digest(&self) -> String {
         digest_of(&self.reading.state.encode())
