@@ -36,7 +36,7 @@ class SharedLogConfig(NatsServersConfig):
     """Seconds until a write that the log has not confirmed is answered with exception 04."""
     when_behind: Literal["serve", "refuse"] = "serve"
     """What happens to reads without contact to the log for max_lag seconds: they are served from
-    the contents of this node, or get exception 06."""
+    the contents of this node, however old these are, or get exception 06."""
     max_lag: Seconds = 5.0
     """Seconds without contact to the log."""
 
