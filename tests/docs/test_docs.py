@@ -41,6 +41,24 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
+NATS_CONFIGURATIONS = [
+    *(ROOT / "docs").glob("*.md"),
+    *(ROOT / "examples").rglob("*.conf"),
+    *(ROOT / "packaging").rglob("*.conf"),
+]
+
+
+def test_every_example_of_a_nats_server_stores_writes_at_once() -> None:
+    sections = [
+        (file.name, section)
+        for file in NATS_CONFIGURATIONS
+        for section in re.findall(r"^jetstream \{.*?^\}", file.read_text(), re.M | re.S)
+    ]
+    assert {"durability.md", "nats.conf"} <= {name for name, _ in sections}
+    without = [name for name, section in sections if "sync_interval: always" not in section]
+    assert without == []
+
+
 def reasons(source: Path) -> set[str]:
     """What the function `reason` of a Rust file returns."""
     body = source.read_text().split("fn reason(")[1].split("\n    }\n")[0]

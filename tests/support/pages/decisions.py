@@ -57,6 +57,7 @@ ECS = elsewhere("docs/test_security_events_page.py::test_the_example_is_what_is_
 FILEBEAT = elsewhere(
     "docs/test_security_events_page.py::test_the_configuration_of_filebeat_is_yaml"
 )
+SYNC = elsewhere("docs/test_docs.py::test_every_example_of_a_nats_server_stores_writes_at_once")
 PROMETHEUS = elsewhere(
     "monitoring/test_rules.py::test_a_real_prometheus_evaluates_the_rules_against_an_appliance"
 )
@@ -77,6 +78,7 @@ DECISIONS: dict[tuple[str, str], Decision] = {
     ("docs/architecture.md", "Memory::submit"): drawing,
     ("docs/audit.md", '{"time":'): checks.audit_lines,
     ("docs/cli.md", "REST at http://127.0.0.1:5080   every"): drawing,
+    ("docs/durability.md", "jetstream {"): SYNC,
     ("docs/client.md", ">>> import holdfast"): CLIENT,
     ("docs/client.md", ">>> with holdfast.SyncClient"): CLIENT,
     ("docs/client.md", "import asyncio"): PROGRAM,
