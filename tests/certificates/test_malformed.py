@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from holdfast.certificates import authority, expiry, inspection, own, pem
+from holdfast.file_reading import MAX_CERTIFICATES
 from support.cases import examples
 
 if TYPE_CHECKING:
@@ -54,6 +55,6 @@ def test_a_file_is_either_usable_or_named_as_unusable(tmp_path: Path, text: byte
 
 def test_large_files_are_not_read(tmp_path: Path) -> None:
     file = tmp_path / "large.pem"
-    file.write_bytes(b" " * (pem.MAX_LEN + 1))
+    file.write_bytes(b" " * (MAX_CERTIFICATES + 1))
     with pytest.raises(pem.UnusableFile, match="more than 4194304 bytes"):
         pem.certificates(file)

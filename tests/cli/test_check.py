@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
 from click.testing import CliRunner
 
 import holdfast
+from holdfast import file_reading
 from holdfast.cli import COMMANDS, main
 from holdfast.cli.configuration import load_or_exit
 from holdfast.config import json_schema, load
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from click.testing import Result
 
 GOOD = """\
 memories: {plant: {coils: 8}}
@@ -171,3 +176,98 @@ def test_check_works_as_a_process(bad: Path) -> None:
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.splitlines()[-1] == "2 problems"
     assert "Traceback" not in result.stderr
+
+
+def test_what_never_ends_is_read_up_to_the_limit() -> None:
+    result = CliRunner().invoke(main, ["check", "/dev/zero"])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.splitlines() == [
+        "/dev/zero: can't be read: more than 1048576 bytes, the limit",
+        "1 problem",
+    ]
+
+
+@pytest.mark.parametrize("named", ["plant.yaml", "profile.yaml", "values.csv"])
+def test_a_large_file_is_refused_before_it_is_parsed(named: str, tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(f"{GOOD}profiles: [profile.yaml]\n".replace("8}", "8, initial: values.csv}"))
+    (tmp_path / "profile.yaml").write_text("tags: {power: {area: coils, address: 1}}")
+    (tmp_path / "values.csv").write_text("coils,1,1\n")
+    assert CliRunner().invoke(main, ["check", str(path)]).exit_code == 0
+    size = (8 << 20) if named == "values.csv" else 1 << 20
+    with (tmp_path / named).open("a") as file:
+        file.write(f"# {' ' * (size - 2 - file.tell())}\n")
+    result = CliRunner().invoke(main, ["check", str(path)])
+    assert result.exit_code == 2
+    problem, number = result.stderr.splitlines()
+    assert named in problem
+    assert problem.endswith(f"can't be read: more than {size} bytes, the limit")
+    assert number == "1 problem"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such pipes")
+class TestPipes:
+    """Pipes have their content once, and may never have it."""
+
+    def test_a_configuration_comes_from_the_shell(self) -> None:
+        file, result = self.check(GOOD)
+        assert (result.exit_code, result.stderr) == (0, "")
+        assert "scada:" in result.stdout, file
+
+    def test_problems_of_certificates_have_their_line(self, tmp_path: Path) -> None:
+        (tmp_path / "ca.pem").write_text("nothing")
+        url = f"tls://127.0.0.1?ca={tmp_path}/ca.pem"
+        file, result = self.check(f"{GOOD}links: {{line: {{url: '{url}'}}}}\n")
+        assert result.exit_code == 2
+        assert result.stderr.startswith(f"{file}:7: links.line.url: {tmp_path}/ca.pem: found ")
+
+    @staticmethod
+    def check(text: str) -> tuple[str, Result]:
+        """Checks what `<(command)` of a shell prints."""
+        reader, writer = os.pipe()
+        os.write(writer, text.encode())
+        os.close(writer)
+        file = f"/dev/fd/{reader}"
+        result = CliRunner().invoke(main, ["check", file])
+        os.close(reader)
+        return file, result
+
+    def test_a_configuration_that_never_comes_is_a_problem(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        patient = file_reading.read
+        monkeypatch.setattr(file_reading, "read", partial(patient, timeout_ms=50))
+        pipe = tmp_path / "pipe"
+        os.mkfifo(pipe)
+        result = CliRunner().invoke(main, ["check", str(pipe)])
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert result.stderr.splitlines() == [
+            f"{pipe}: can't be read: no answer within 0.05 s, the limit",
+            "1 problem",
+        ]
+
+    @pytest.mark.parametrize(
+        ("more", "problem"),
+        [
+            ("profiles: [pipe.yaml]\n", "profiles[0]: found 'pipe.yaml'"),
+            (
+                "links: {line: {url: 'tls://127.0.0.1?ca=pipe.yaml'}}\n",
+                "links.line.url: found ca='pipe.yaml'",
+            ),
+            (
+                "nats: {servers: [nats://h], devices: [127.0.0.1], token_file: pipe.yaml}\n",
+                "nats.token_file: found 'pipe.yaml'",
+            ),
+        ],
+        ids=["profile", "certificate", "token"],
+    )
+    def test_a_file_that_is_read_again_and_again_is_no_pipe(
+        self, more: str, problem: str, tmp_path: Path
+    ) -> None:
+        os.mkfifo(tmp_path / "pipe.yaml")
+        path = tmp_path / "p.yaml"
+        path.write_text(GOOD + more)
+        result = CliRunner().invoke(main, ["check", str(path)])
+        assert result.exit_code == 2
+        reason = "which can't be read: it is a named pipe, allowed: a regular file"
+        assert result.stderr.splitlines()[0] == f"{path}:7: {problem}, {reason}"

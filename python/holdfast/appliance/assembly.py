@@ -26,6 +26,7 @@ from holdfast.config import (
 from holdfast.config.rights import items, together, unit_rights
 from holdfast.config.route_checks import routed
 from holdfast.config.scalars import MAX_TIME
+from holdfast.file_reading import require_stored
 from holdfast.net.tls import NO_FILES
 from holdfast.polling.reader import Reader
 from holdfast.server import Identity
@@ -264,8 +265,13 @@ def _shared_port(
 
 def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
     """Loads the certificates of a listener. Raises `ValueError` for an unusable file."""
-    from holdfast.certificates.pem import unlocked
+    from holdfast.certificates.pem import UnusableFile, unlocked
 
+    files = (settings.cert_file, settings.key_file, settings.ca_file, settings.crl_file)
+    try:
+        require_stored(*files)
+    except OSError as error:
+        raise UnusableFile(error.filename, error.strerror or str(error)) from error
     return _core.ServerTls(
         cert_file=settings.cert_file,
         key_file=settings.key_file,

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
+
+from holdfast import file_reading
+from holdfast.file_reading import MAX_CERTIFICATES
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -20,9 +22,6 @@ if TYPE_CHECKING:
 
 PrivateKey: TypeAlias = ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey | rsa.RSAPrivateKey
 """The kinds of keys that TLS connections of Holdfast use."""
-
-MAX_LEN = 4 << 20
-"""The size limit of a file, in bytes."""
 
 KEYS = "RSA, an EC key on P-256, P-384 or P-521, or Ed25519"
 
@@ -52,13 +51,11 @@ class UnusableFile(ValueError):
 def content(file: File) -> bytes:
     """Returns the content of a file. Raises `UnusableFile`."""
     try:
-        with Path(file).open("rb") as opened:
-            text = opened.read(MAX_LEN + 1)
+        return file_reading.read(file, MAX_CERTIFICATES)
+    except file_reading.TooLarge as error:
+        raise UnusableFile(file, f"more than {MAX_CERTIFICATES} bytes, allowed: PEM") from error
     except OSError as error:
         raise UnusableFile(file, error.strerror or str(error)) from error
-    if len(text) > MAX_LEN:
-        raise UnusableFile(file, f"more than {MAX_LEN} bytes, allowed: PEM")
-    return text
 
 
 def blocks(text: bytes) -> list[tuple[str, bytes]]:

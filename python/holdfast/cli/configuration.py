@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from holdfast.appliance import assembly, configured_certificates
 from holdfast.client.endpoint import check_files, endpoint, receiver_endpoint
-from holdfast.config import HTTP_SERVICES, ConfigError, load, source, tls_of
+from holdfast.config import HTTP_SERVICES, ConfigError, tls_of
+from holdfast.config.load import loaded, unanswered
 from holdfast.config.report import Report
+from holdfast.file_reading import NotAnswered, answered
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from holdfast.client.url import Target
     from holdfast.config import Config
     from holdfast.config.source import KeyPath
@@ -27,7 +30,14 @@ def load_whole(path: Path | str) -> Config:
 
     Doubtful certificates are among its warnings. Raises `ConfigError` with every problem.
     """
-    config = load(path)
+    try:
+        return answered(lambda: _load_whole(path))
+    except NotAnswered as error:
+        raise ConfigError(str(path), [unanswered(error)]) from None
+
+
+def _load_whole(path: Path | str) -> Config:
+    config, document = loaded(path)
     file = str(path)
     problems: dict[KeyPath, str] = {}
     doubts: list[tuple[KeyPath, str]] = []
@@ -36,11 +46,11 @@ def load_whole(path: Path | str) -> Config:
         if tls is not None:
             place: KeyPath = ("listeners", name, "tls")
             try:
-                loaded = assembly.server_tls(tls)
+                checked = assembly.server_tls(tls)
             except ValueError as error:
                 problems[place] = str(error)
             else:
-                doubts += [(place, warning) for warning in loaded.warnings]
+                doubts += [(place, warning) for warning in checked.warnings]
     targets: list[tuple[KeyPath, Target]] = [
         (("devices", name), device.target) for name, device in config.devices.items()
     ]
@@ -79,7 +89,7 @@ def load_whole(path: Path | str) -> Config:
         doubts += configured_certificates.doubts(config)
     if not problems and not doubts:
         return config
-    report = Report(source.parse(source.read_text(Path(path), file), file)[0])
+    report = Report(document)
     for where, message in problems.items():
         report.add(where, message)
     if problems:

@@ -12,8 +12,7 @@ import click
 from holdfast.cli.configuration import WRONG
 from holdfast.cli.suggesting import SuggestingGroup
 from holdfast.config import ConfigError
-from holdfast.config.initial import KINDS, parse
-from holdfast.config.source import read_text
+from holdfast.config.initial import KINDS, parse, read
 from holdfast.config.words import guess, listing
 from holdfast.tools import memory_file
 
@@ -101,7 +100,7 @@ def import_(file: Path, values: Path, name: str | None, merge: bool) -> None:
     found = _contents(file)
     areas = _chosen(found, name, file)
     try:
-        text = read_text(values, str(values), "YAML or CSV")
+        text = read(values, str(values))
         spans = {area: kept.addresses for area, kept in areas.items()}
         runs, problems = parse(text, str(values), dict(spans), None)
     except ConfigError as error:

@@ -48,6 +48,7 @@ from holdfast.config.scanning import (
     parse_server,
     written_pollable,
 )
+from holdfast.file_reading import FileWork
 from holdfast.net import event_loop
 from holdfast.net.allow_list import AllowedNetwork
 from holdfast.scanner import (
@@ -424,6 +425,7 @@ async def _scan(settings: Settings, check: Callable[[], None] | None, signals: S
     scanner, known, clock = Scanner(settings), _contents(settings), WallClock()
     running = asyncio.create_task(scanner.run())
     changed = False
+    reading: FileWork[bool] | None = None
     while not running.done():
         await asyncio.wait([running], timeout=JOIN_TIMEOUT)
         logs.tell_held_back()
@@ -439,10 +441,12 @@ async def _scan(settings: Settings, check: Callable[[], None] | None, signals: S
             raise
         if signals.received:
             scanner.end()
-        elif signals.take_reload():
-            changed = _is_reloaded(settings, known)
+        elif reading is not None and reading.is_over():
+            changed, reading = _taken_over(reading), None
             if changed:
                 scanner.end()
+        elif reading is None and signals.take_reload():
+            reading = FileWork(lambda: _has_changed(settings, known))
     await running
     return changed and not signals.received
 
@@ -456,15 +460,20 @@ def _contents(settings: Settings) -> str:
     return fingerprint([file for file in named if file is not None])
 
 
-def _is_reloaded(settings: Settings, known: str) -> bool:
+def _has_changed(settings: Settings, known: str) -> bool:
+    """Whether the files have changed. Raises `OSError` if they can't be used."""
+    settings.servers.options()
+    device_tls.check(settings.device_tls)
+    return _contents(settings) != known
+
+
+def _taken_over(reading: FileWork[bool]) -> bool:
     """Whether the files have changed and can be used. Logs what it finds."""
     try:
-        settings.servers.options()
-        device_tls.check(settings.device_tls)
+        changed = reading.result()
     except OSError as error:
         logs.write(logging.ERROR, "reload_refused", problem=str(error))
         return False
-    changed = _contents(settings) != known
     logs.write(logging.INFO, "reloaded", changed="files" if changed else "nothing")
     return changed
 

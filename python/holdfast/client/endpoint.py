@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from holdfast._core import BlockingClient, Endpoint
 from holdfast.client.tolerance import STRICT
 from holdfast.client.url import NetworkTarget, SerialTarget
+from holdfast.file_reading import require_stored
 from holdfast.protocol import TLS_PORT
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def _secure(host: str, port: int, of: Tls) -> Endpoint:
         from holdfast.certificates import pem
 
         unlocked = pem.unlocked(of.key, of.key_passphrase_file)
+    require_stored(of.ca, of.cert, of.key)
     return Endpoint.tls(host, port, of.ca, of.cert, of.key, of.name, unlocked)
 
 

@@ -7,6 +7,7 @@ import os
 import stat
 from typing import TYPE_CHECKING
 
+from holdfast import file_reading
 from holdfast.config.words import show
 
 if TYPE_CHECKING:
@@ -19,12 +20,13 @@ if TYPE_CHECKING:
 def unreadable(path: Path) -> str:
     """Why a file can't be read, or "" if it can. Does not open it: it may contain a secret."""
     try:
-        mode = path.stat().st_mode
+        mode = file_reading.call(path, path.stat).st_mode
+        may_read = file_reading.call(path, os.access, path, os.R_OK)
     except OSError as error:
         return error.strerror or str(error)
     if stat.S_ISDIR(mode):
         return os.strerror(errno.EISDIR)
-    return "" if os.access(path, os.R_OK) else os.strerror(errno.EACCES)
+    return file_reading.unstored(path, mode) or ("" if may_read else os.strerror(errno.EACCES))
 
 
 def check_readable(

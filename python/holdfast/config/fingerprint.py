@@ -6,6 +6,7 @@ import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from holdfast import file_reading
 from holdfast.config.base import Model
 
 if TYPE_CHECKING:
@@ -13,6 +14,10 @@ if TYPE_CHECKING:
 
     from holdfast.config.model import Config
     from holdfast.net.tls import Tls
+
+
+MAX_BYTES = 8 << 20
+"""The size limit of a file. Everything that is read from one has a lower limit."""
 
 
 def signature(file: Path, config: Config) -> dict[Path, object]:
@@ -36,7 +41,7 @@ def fingerprint(*settings: object) -> str:
         digest.update(repr(plain).encode())
         for file in _files(each):
             try:
-                content = file.read_bytes()
+                content = file_reading.read(file, MAX_BYTES)
             except OSError:
                 content = b""
             digest.update(hashlib.sha256(content).digest())

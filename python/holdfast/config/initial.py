@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 KINDS = (".csv", ".yaml", ".yml")
+MAX_CSV_BYTES = 8 << 20
+"""The size limit of a CSV file. All values of a memory take less."""
+
 HEADER = ["area", "address", "value"]
 
 Cell: TypeAlias = tuple[str, int]
@@ -44,6 +47,12 @@ class _Given(NamedTuple):
     area: object
     address: object
     value: object
+
+
+def read(path: Path, file: str) -> str:
+    """Reads a file of initial values; messages call it `file`. Raises `ConfigError`."""
+    max_bytes = MAX_CSV_BYTES if path.suffix.lower() == ".csv" else source.MAX_BYTES
+    return source.read_text(path, file, "YAML or CSV", max_bytes)
 
 
 def parse(

@@ -11,6 +11,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+from holdfast import file_reading
 from holdfast.config import source
 from holdfast.config.allowed import allowed, known_keys
 from holdfast.config.device_checks import DeviceChecks
@@ -39,11 +40,28 @@ def load(path: Path | str) -> Config:
 
     Valid settings without effect are in `Config.warnings`.
     """
+    return loaded(path)[0]
+
+
+def loaded(path: Path | str) -> tuple[Config, source.Document]:
+    """Reads a configuration, as `load` does. Returns it with its document."""
     file = str(path)
-    content = source.read_bytes(Path(path), file)
-    document, problems = source.parse(source.decoded(content, file), file)
-    config = checked(document, problems, Path(path).absolute().parent)
-    return config.with_sha256(hashlib.sha256(content).hexdigest())
+
+    def work() -> tuple[Config, source.Document]:
+        content = source.read_bytes(Path(path), file)
+        document, problems = source.parse(source.decoded(content, file), file)
+        config = checked(document, problems, Path(path).absolute().parent)
+        return config.with_sha256(hashlib.sha256(content).hexdigest()), document
+
+    try:
+        return file_reading.answered(work)
+    except file_reading.NotAnswered as error:
+        raise ConfigError(file, [unanswered(error)]) from None
+
+
+def unanswered(error: file_reading.NotAnswered) -> Problem:
+    """The problem of a file that was not read in time."""
+    return Problem(str(error.filename), None, None, "", f"can't be read: {error.strerror}")
 
 
 def checked(document: source.Document, problems: list[Problem], folder: Path) -> Config:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pydantic import TypeAdapter
 
-from holdfast.config import initial, source
+from holdfast import file_reading
+from holdfast.config import initial
 from holdfast.config.lenient import fitting, integer, mapping
 from holdfast.config.memories import Extent, Span
 from holdfast.config.problems import ConfigError
@@ -119,7 +120,7 @@ class MemoryChecks:
             return
         shown = str(Path(self.report.document.file).parent / file)
         try:
-            text = source.read_text(self.folder / file, shown, "YAML or CSV")
+            text = initial.read(self.folder / file, shown)
         except ConfigError as error:
             self.report.add(path, f"found {show(file)}, which {error.problems[0].message}")
             return
@@ -137,9 +138,9 @@ class MemoryChecks:
                 continue
             path: KeyPath = ("memories", name, "keep")
             found = str(self.folder / file)
-            if not Path(found).parent.is_dir():
+            if not file_reading.call(found, Path(found).parent.is_dir):
                 self.report.add((*path, "file"), f"found {show(file)}, whose folder does not exist")
-            elif Path(found).is_dir():
+            elif file_reading.call(found, Path(found).is_dir):
                 self.report.add((*path, "file"), f"found {show(file)}, which is a folder")
             elif found in first and first[found][1] != sync:
                 other = first[found][0]

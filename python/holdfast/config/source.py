@@ -12,10 +12,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
+from holdfast import file_reading
 from holdfast.config.problems import ConfigError, Problem
 from holdfast.config.words import show
 
@@ -27,6 +29,12 @@ if TYPE_CHECKING:
 
 Key: TypeAlias = str | int
 KeyPath: TypeAlias = tuple[Key, ...]
+
+MAX_BYTES = 1 << 20
+"""The size limit of a file. A file of devices takes about 5 s and 150 MB for them."""
+
+MAX_WRITTEN = 300_000
+"""Maximum number of keys and values in one file, as written. Each takes about 25 us and 1 KB."""
 
 MAX_VALUES = 1_000_000
 """Maximum number of values in one file, with aliases expanded."""
@@ -59,6 +67,9 @@ class _Spot:
     is_list: bool = False
     is_scalar: bool = False
     values: int = 1
+
+
+_NO_CHILDREN: Final[dict[Key, tuple[Place, _Spot]]] = {}
 
 
 @dataclass(frozen=True)
@@ -126,9 +137,9 @@ def table(file: str, data: Any, lines: Mapping[KeyPath, int]) -> Document:
     return Document(file, data, spot(data, (), 1))
 
 
-def read_text(path: Path, file: str, form: str = "YAML") -> str:
+def read_text(path: Path, file: str, form: str = "YAML", max_bytes: int = MAX_BYTES) -> str:
     """Reads a file; messages call it `file`. Raises `ConfigError`."""
-    return decoded(read_bytes(path, file), file, form)
+    return decoded(read_bytes(path, file, max_bytes), file, form)
 
 
 def decoded(data: bytes, file: str, form: str = "YAML") -> str:
@@ -144,10 +155,10 @@ def decoded(data: bytes, file: str, form: str = "YAML") -> str:
         raise ConfigError(file, [Problem(file, line, None, "", message)]) from None
 
 
-def read_bytes(path: Path, file: str) -> bytes:
+def read_bytes(path: Path, file: str, max_bytes: int = MAX_BYTES) -> bytes:
     """Reads a file without decoding it. Raises `ConfigError`."""
     try:
-        return path.read_bytes()
+        return file_reading.read(path, max_bytes, named_pipe=True)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         message = f"can't be read: {reason}"
@@ -168,6 +179,9 @@ def parse(text: str, file: str) -> tuple[Document, list[Problem]]:
     except YAMLError as error:
         message = f"not YAML: {error}"
         raise ConfigError(file, [Problem(file, None, None, "", message)]) from None
+    except _TooMany:
+        message = f"more than {MAX_WRITTEN} keys and values, the limit"
+        raise ConfigError(file, [Problem(file, None, None, "", message)]) from None
     except RecursionError:
         message = "not a configuration: nested too deeply"
         raise ConfigError(file, [Problem(file, None, None, "", message)]) from None
@@ -181,8 +195,26 @@ def parse(text: str, file: str) -> tuple[Document, list[Problem]]:
     ]
 
 
+class _TooMany(Exception):
+    """A file has too many keys and values."""
+
+
+class _Composer(Composer):
+    """Stops at a file with too many keys and values."""
+
+    _left = MAX_WRITTEN
+
+    def compose_node(self, parent: Node | None, index: object) -> Node | None:
+        self._left -= 1
+        if self._left < 0:
+            raise _TooMany
+        node: Node | None = super().compose_node(parent, index)
+        return node
+
+
 def _compose(text: str) -> Node | None:
     yaml = YAML(typ="safe", pure=True)
+    yaml.Composer = _Composer
     yaml.composer.warn_double_anchors = False
     node: Node | None = yaml.compose(text)
     return node
@@ -226,7 +258,7 @@ class _Reader:
             return self._mapping(node, path)
         if isinstance(node, SequenceNode) and kind == "seq":
             return self._list(node, path)
-        spot = _Spot(_place(node), is_scalar=not _is_empty(node))
+        spot = _Spot(_place(node), _NO_CHILDREN, is_scalar=not _is_empty(node))
         if isinstance(node, ScalarNode):
             try:
                 return scalar(node.value, kind), spot

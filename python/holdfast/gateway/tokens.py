@@ -6,6 +6,7 @@ import re
 from typing import TYPE_CHECKING, TypeAlias
 
 from holdfast.config.scalars import NAME_FORM, is_name
+from holdfast.file_reading import MAX_SECRETS, read
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,7 +26,7 @@ class WrongTokens(Exception):
 def load(file: Path) -> list[Token]:
     """Reads a token file; `#` starts a comment. Raises `OSError` and `WrongTokens`."""
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
+        lines = read(file, MAX_SECRETS).decode().splitlines()
     except UnicodeDecodeError:
         raise WrongTokens(f"{file}: not UTF-8") from None
     tokens: list[Token] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.config.broker import MAX_TEXT
+from holdfast.file_reading import MAX_SECRETS, read
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -16,8 +17,7 @@ def read_password(file: Path | None) -> bytes | None:
     """Reads the password at each attempt, so that a new password needs no restart."""
     if file is None:
         return None
-    with file.open("rb") as opened:
-        content = opened.read(MAX_PASSWORD + 3)
+    content = read(file, MAX_SECRETS)
     newline = b"\r\n" if content.endswith(b"\r\n") else b"\n"
     password = content.removesuffix(newline)
     if len(password) > MAX_PASSWORD:

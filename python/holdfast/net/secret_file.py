@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from holdfast.file_reading import MAX_SECRETS, read
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -11,6 +13,6 @@ if TYPE_CHECKING:
 def read_secret(file: Path) -> str:
     """Returns the text without the end of its line. Raises `OSError` for an unusable file."""
     try:
-        return file.read_text(encoding="utf-8").removesuffix("\n").removesuffix("\r")
+        return read(file, MAX_SECRETS).decode().removesuffix("\n").removesuffix("\r")
     except UnicodeDecodeError:
         raise OSError(f"{file} is not UTF-8 text") from None

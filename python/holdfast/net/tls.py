@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
+from holdfast.file_reading import require_stored
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from os import PathLike
@@ -83,6 +85,7 @@ def broker_context(tls: Tls) -> ssl.SSLContext:
     The files are read at each call, so renewed certificates need no restart. Raises `OSError` for
     an unusable file.
     """
+    require_stored(tls.ca, tls.cert, tls.key)
     made = ssl.create_default_context(cafile=tls.ca)
     made.minimum_version = ssl.TLSVersion.TLSv1_2
     if tls.cert is not None:

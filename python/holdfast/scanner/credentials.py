@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from holdfast.file_reading import MAX_SECRETS, read
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -52,7 +54,7 @@ class Credentials:
         return self._jwt
 
     def _read(self) -> Ed25519PrivateKey:
-        text = self._file.read_bytes()
+        text = read(self._file, MAX_SECRETS)
         try:
             jwt = _block(text, "NATS USER JWT")
             key = _key(_block(text, "USER NKEY SEED"))
