@@ -38,6 +38,9 @@ listeners:
     rules: [{sources: [127.0.0.0/8], units: {1: plant}, access: read-only}]
 """
 
+READ = bytes.fromhex("0300000001")
+READ_0 = bytes.fromhex("03020000")
+
 
 class Manager:
     """The socket of a service manager."""
@@ -108,6 +111,42 @@ def test_systemd_is_notified_of_each_step(
         True,
         True,
     )
+
+
+def test_the_watchdog_is_fed_while_a_file_does_not_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with tempfile.TemporaryDirectory(prefix="hf") as folder:
+        manager = Manager(f"{folder}/notify")
+        monkeypatch.setenv("XDG_RUNTIME_DIR", folder)
+        monkeypatch.setenv("NOTIFY_SOCKET", manager.address)
+        monkeypatch.setenv("WATCHDOG_USEC", "20000")
+        file = tmp_path / "plant.yaml"
+        file.write_text(CONFIGURATION)
+        command = RunCommand(file)
+        try:
+            address = command.wait_until_it_serves()
+            file.unlink()
+            os.mkfifo(file)
+            began = time.monotonic_ns() // 1000
+            command.process.send_signal(signal.SIGHUP)
+            while not manager.next().startswith("RELOADING=1"):
+                pass
+            assert [manager.next() for _ in range(5)] == ["WATCHDOG=1"] * 5
+            with wire.Connection(address) as client:
+                assert client.ask(READ) == READ_0
+            with file.open("w") as writer:
+                writer.write(CONFIGURATION)
+            assert _next_but_watchdog(manager, began) == "READY=1"
+            command.process.send_signal(signal.SIGHUP)
+            while not manager.next().startswith("RELOADING=1"):
+                pass
+            code, log = command.end(signal.SIGTERM)
+        finally:
+            command.process.kill()
+            command.process.communicate()
+            manager.close()
+    assert (code, log.count(" reloaded "), "Traceback" in log) == (0, 1, False)
 
 
 def _next_but_watchdog(manager: Manager, began: int) -> str:
@@ -187,7 +226,7 @@ def test_a_stalled_thread_starves_the_watchdog(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(command, "Signals", Signals)
     monkeypatch.setattr(command, "ServiceManager", Recorder)
     for skipped in ("allow_open_files", "_connections", "give_way"):
-        monkeypatch.setattr(command, skipped, lambda *_: None)
+        monkeypatch.setattr(command, skipped, lambda *_: 0)
     monkeypatch.setattr("holdfast.logs.configure", lambda *_: None)
     settings: Any = SimpleNamespace(log=SimpleNamespace(level="info", format="text"))
     command.serve(settings, lambda _: "served", named="test")

@@ -46,6 +46,12 @@ class Running:
     def write(self, *, size: int = 100, access: str = "read-write", more: str = "") -> None:
         self.file.write_text(CONFIGURATION.format(size=size, access=access, more=more))
 
+    def replace(self, *, access: str, more: str) -> None:
+        """Renames a complete file into place."""
+        new = self.file.with_suffix(".new")
+        new.write_text(CONFIGURATION.format(size=100, access=access, more=more))
+        new.rename(self.file)
+
     def end(self) -> str:
         code, log = self.command.end(signal.SIGTERM)
         assert code == 0
@@ -102,15 +108,17 @@ def test_sighup_reloads_also_that_of_a_closed_terminal(running: Running) -> None
     assert "info reloaded" in running.end()
 
 
-def test_a_watched_file_reloads_when_it_has_changed(running: Running) -> None:
+def test_a_watched_file_reloads_when_another_one_takes_its_place(
+    running: Running,
+) -> None:
     watch = "reload: on-change"
     with wire.Connection(running.address) as client:
         running.write(more=watch)
         assert done("reload", str(running.file)) == ["Reloaded: nothing has changed"]
-        running.write(access="read-only", more=watch)
+        running.replace(access="read-only", more=watch)
         wire.until(lambda: client.ask(WRITE) == FORBIDDEN, "the file was noticed")
-        running.write(access="wrong", more=watch)
-        running.write(access="read-write", more=watch)
+        running.replace(access="wrong", more=watch)
+        running.replace(access="read-write", more=watch)
         wire.until(lambda: client.ask(WRITE) == WRITE, "it was noticed again")
     log = running.end()
     assert log.count("info reloaded") == 3

@@ -6,6 +6,9 @@ import logging
 import threading
 import time
 from concurrent.futures import Future
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -13,26 +16,44 @@ import click
 from holdfast import logs
 from holdfast.adapters.foreign import UnknownAdapter
 from holdfast.appliance import changes
+from holdfast.cli.watched_files import WatchedFiles
 from holdfast.config import ConfigError
-from holdfast.config.fingerprint import signature
+from holdfast.config.fingerprint import files_of
+from holdfast.config.load import unanswered
+from holdfast.file_reading import TIMEOUT_MS, FileWork, NotAnswered, answered
 from holdfast.web.port import explained
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from pathlib import Path
 
     from holdfast.appliance import Appliance
     from holdfast.appliance.service_manager import ServiceManager
     from holdfast.config import Config
 
-WATCH_INTERVAL = 1.0
-"""Seconds between two looks at the files. A change counts when it is still the same at the next."""
+WATCH_INTERVAL_MS = 1000
+"""Milliseconds between two looks at the files. A change counts when it is the same at the next."""
+
+PROMPT_MS = 100
+"""Milliseconds that the thread of the appliance waits for files: most are read by then."""
+
+
+@dataclass(frozen=True)
+class _Read:
+    """What a thread beside the appliance has read."""
+
+    config: Config | None
+    error: Exception | None
+    files: WatchedFiles | None
+    """The files as they were before they were read, if they are watched."""
+    is_steady: bool = True
+    """Whether no watched file has changed meanwhile."""
 
 
 class Reloading:
     """Reloads one appliance with what `load` returns. `step` is for the thread that runs it.
 
-    `load` reads the configuration `file`, or the files of command-line options.
+    `load` reads the configuration `file`, or the files of command-line options. That, and every
+    look at the files, is done in another thread: a file that does not answer holds up nothing.
     """
 
     def __init__(
@@ -41,15 +62,32 @@ class Reloading:
         manager: ServiceManager,
         load: Callable[[], Config],
         file: Path | None = None,
+        *,
+        watch_interval_ms: int = WATCH_INTERVAL_MS,
+        timeout_ms: int = TIMEOUT_MS,
     ) -> None:
         self._appliance = appliance
         self._manager = manager
         self._load = load
         self._file = file
+        self._watch_interval_ms = watch_interval_ms
+        self._timeout_ms = timeout_ms
         self._waiting: list[Future[Mapping[str, Any]]] = []
         self._lock = threading.Lock()
+        self._requested = False
+        self._reading: FileWork[_Read] | None = None
+        self._is_requested = False
+        """Whether somebody has requested what is read."""
+        self._answering: list[Future[Mapping[str, Any]]] = []
+        self._notifying = ExitStack()
+        self._looking: FileWork[WatchedFiles] | None = None
         self._looked = time.monotonic()
-        self._known = self._seen = self._signature()
+        self._seen: WatchedFiles | None = None
+        self._logged: set[tuple[str, str | None]] = set()
+        self._known: WatchedFiles | None = None
+        with suppress(NotAnswered):
+            config = appliance.config
+            self._known = answered(lambda: self._watched(config, hold=True), timeout_ms)
 
     def ask(self) -> Mapping[str, Any]:
         """Has the appliance reloaded. Waits for the result: what changed, or the problems."""
@@ -58,36 +96,122 @@ class Reloading:
             self._waiting.append(future)
         return future.result()
 
-    def step(self, *, requested: bool) -> None:
-        """Reloads if that was requested, or if a watched file has changed."""
+    def close(self) -> None:
+        """Answers those who wait for a reload: there is none any more."""
+        self._notifying.close()
         with self._lock:
-            waiting, self._waiting = self._waiting, []
-        if not (waiting or requested or self._has_changed()):
-            return
-        with self._manager.reloading():
-            result = self._reload()
+            waiting, self._waiting = [*self._answering, *self._waiting], []
         for future in waiting:
-            future.set_result(result)
+            if not future.done():
+                future.set_result({"problems": [self._placed("the appliance has stopped")]})
 
-    def _has_changed(self) -> bool:
-        if self._appliance.config.reload != "on-change":
-            return False
-        now = time.monotonic()
-        if now - self._looked < WATCH_INTERVAL:
-            return False
-        self._looked = now
-        before, self._seen = self._seen, self._signature()
-        return self._seen == before != self._known
+    def step(self, *, requested: bool) -> None:
+        """Reloads if that was requested, or if a watched file was replaced.
 
-    def _reload(self) -> Mapping[str, Any]:
+        Begins to read the files, or takes over what was read since the last call.
+        """
+        self._requested |= requested
+        if self._reading is None:
+            with self._lock:
+                self._answering, self._waiting = self._waiting, []
+            self._is_requested = bool(self._answering or self._requested)
+            if not self._is_requested and not self._is_replaced():
+                return
+            self._requested = False
+            self._notifying.enter_context(self._manager.reloading())
+            config = self._appliance.config
+            self._reading = FileWork(lambda: self._read(config), self._timeout_ms)
+        if self._reading.is_over(PROMPT_MS):
+            reading, self._reading = self._reading, None
+            with self._notifying:
+                result = self._reload(reading)
+            for future in self._answering:
+                future.set_result(result)
+
+    def _read(self, config: Config) -> _Read:
+        """Reads the configuration again, which is now `config`. In a thread of its own."""
+        before = self._watched(config, hold=True)
+        try:
+            now = self._load()
+        except Exception as error:  # Raised again by the thread of the appliance.
+            return _Read(None, error, before)
+        after = self._watched(now, hold=True)
+        if before is None or after is None:
+            return _Read(now, None, after)
+        is_steady = not before.changed(after)
+        return _Read(now, None, after.read_after(before), is_steady)
+
+    def _watched(self, config: Config, *, hold: bool) -> WatchedFiles | None:
+        """The files of a configuration, if they are watched."""
+        if self._file is None or config.reload != "on-change":
+            return None
+        return WatchedFiles(files_of(self._file, config), hold=hold)
+
+    def _is_replaced(self) -> bool:
+        """Whether other files were renamed into the places of watched ones, and nothing else."""
+        config = self._appliance.config
+        if self._file is None or config.reload != "on-change":
+            return False
+        if self._looking is None:
+            if time.monotonic() - self._looked >= self._watch_interval_ms / 1000:
+                self._looked = time.monotonic()
+                files = files_of(self._file, config)
+                self._looking = FileWork(lambda: WatchedFiles(files, hold=False), self._timeout_ms)
+            return False
+        if not self._looking.is_over():
+            return False
+        looking, self._looking = self._looking, None
+        try:
+            now = looking.result()
+        except NotAnswered as error:
+            self._log_once(error.filename, error.strerror)
+            return False
+        before, self._seen = self._seen, now
+        if self._known is None:
+            self._known = now
+        changed = self._known.changed(now)
+        is_steady = before is not None and before.states == now.states
+        is_written = "written" in changed.values()
+        if is_steady and "replaced" in changed.values() and not is_written:
+            return True
+        for file, change in changed.items():
+            if change == "written":
+                self._log_once(file, "written in place, not renamed")
+            elif change == "replaced" and is_written:
+                self._log_once(file, "replaced, but another file was written in place")
+            elif change == "removed" and is_steady:
+                self._log_once(file, "removed")
+        return False
+
+    def _log_once(self, file: Path | str, reason: str | None) -> None:
+        """Logs a change that is not taken over; once until the next reload."""
+        if (key := (str(file), reason)) not in self._logged:
+            self._logged.add(key)
+            todo = f"holdfast reload {self._file}"
+            logs.write(
+                logging.WARNING, "reload_needed", file=str(file), reason=reason, command=todo
+            )
+
+    def _reload(self, reading: FileWork[_Read]) -> Mapping[str, Any]:
         problems: list[str] = []
         changed: list[str] = []
-        before = self._signature()
         try:
-            config = self._load()
+            read = reading.result()
+            if not read.is_steady and not self._is_requested:
+                return {}  # The next looks tell whether somebody still writes.
+            self._known, self._seen, self._looking = read.files, None, None
+            self._logged.clear()
+            if read.error is not None:
+                raise read.error
+            assert read.config is not None, "without an error, there is a configuration"
+            config = read.config
             changed = self._appliance.reload(config)
         except ConfigError as error:
             problems = [str(problem) for problem in error.problems]
+        except NotAnswered as error:
+            # The look that led here is not to lead here again.
+            self._known = self._seen or self._known
+            problems = [str(unanswered(error))]
         except click.UsageError as error:
             problems = [error.format_message()]
         except changes.ReloadRefused as refused:
@@ -99,10 +223,6 @@ class Reloading:
         except changes.ReloadIncomplete as error:
             logs.problem("reload_incomplete")
             return {"incomplete": self._placed(f"internal error: {error}")}
-        finally:
-            # A file that was written meanwhile still differs from what is known.
-            now = self._signature()
-            self._known = self._seen = {file: before.get(file, now[file]) for file in now}
         for problem in problems:
             logs.write(logging.ERROR, "reload_refused", problem=problem)
         if problems:
@@ -119,6 +239,3 @@ class Reloading:
 
     def _placed(self, problem: str) -> str:
         return problem if self._file is None else f"{self._file}: {problem}"
-
-    def _signature(self) -> Mapping[Path, object]:
-        return {} if self._file is None else signature(self._file, self._appliance.config)

@@ -28,6 +28,7 @@ from holdfast.cli.reloading import Reloading
 from holdfast.cli.showing import ranges_shown
 from holdfast.cli.signals import Interrupted, Signals
 from holdfast.config import GatewayConfig, ModbusTcpListener, RouteConfig, UnitMemoryConfig
+from holdfast.config.fingerprint import files_of
 from holdfast.config.rights import unit_rights
 from holdfast.config.scanning import written_pollable
 from holdfast.net.addresses import joined, reachable
@@ -101,12 +102,18 @@ def serve(
     """
     logs.configure(config.log.level, config.log.format)
     give_way()
-    allow_open_files(_connections(config))
+    allow_open_files(_connections(config) + _watched(config, file))
     signals = control or Signals(
         reload="always" if file else "with a terminal" if load else "never"
     )
     manager = control or ServiceManager()
     appliance = Appliance(config, retries_ports=retries_ports)
+    # A start may take long. What changes meanwhile is noticed after it.
+    reloading: Reloading | None = None
+    if file is not None:
+        reloading = Reloading(appliance, manager, lambda: load_whole(file), file)
+    elif load is not None:
+        reloading = Reloading(appliance, manager, load)
     try:
         with signals.interrupting():
             appliance.start()
@@ -129,12 +136,10 @@ def serve(
         parts.callback(manager.close)
         parts.callback(appliance.stop)
         parts.callback(manager.stopping)
-        reloading = None
-        if file is not None:
-            reloading = Reloading(appliance, manager, lambda: load_whole(file), file)
+        if reloading is not None:
+            parts.callback(reloading.close)
+        if reloading is not None and file is not None:
             parts.callback(_control(appliance, reloading, file))
-        elif load is not None:
-            reloading = Reloading(appliance, manager, load)
         click.echo(greeting(appliance))
         manager.ready()
         while not signals.received:
@@ -172,6 +177,13 @@ def _connections(config: Config) -> int:
     if config.gateway is not None:
         most += assembly.gateway(config.gateway).limits.open_connections
     return most
+
+
+def _watched(config: Config, file: Path | None) -> int:
+    """The number of files that are kept open while they are watched."""
+    if file is None or config.reload != "on-change":
+        return 0
+    return len(files_of(file, config))
 
 
 def _greeting(appliance: Appliance, file: Path) -> str:

@@ -1,4 +1,4 @@
-"""Digests of settings with the contents of the files that they name, to notice changes."""
+"""The files that settings name, and digests of settings with the contents of these files."""
 
 from __future__ import annotations
 
@@ -20,17 +20,9 @@ MAX_BYTES = 8 << 20
 """The size limit of a file. Everything that is read from one has a lower limit."""
 
 
-def signature(file: Path, config: Config) -> dict[Path, object]:
-    """What changes when a configuration, or a file that it names, is written."""
-    return {each: _written(each) for each in (file, *config.profile_files, *_files(config))}
-
-
-def _written(file: Path) -> object:
-    try:
-        status = file.stat()
-    except OSError:
-        return None
-    return status.st_mtime_ns, status.st_size, status.st_ino
+def files_of(file: Path, config: Config) -> list[Path]:
+    """A configuration, and the files that it names."""
+    return list(dict.fromkeys([file, *config.profile_files, *_files(config)]))
 
 
 def fingerprint(*settings: object) -> str:

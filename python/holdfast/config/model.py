@@ -145,7 +145,7 @@ class Config(Model):
     """The log of the program."""
     reload: Literal["on-request", "on-change"] = "on-request"
     """When the configuration is reread. on-request: at a signal or a command; on-change: also when
-    this file, or one that it names, has changed."""
+    another file was renamed into the place of this one, or of one that it names."""
     workers: Annotated[int, Field(ge=1, le=64)] = 1
     """Threads that serve connections."""
 

@@ -1,0 +1,322 @@
+"""When a running appliance rereads its files, and what happens if they don't answer."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast.appliance.service_manager import ServiceManager
+from holdfast.cli import reloading
+from holdfast.cli.configuration import load_whole
+from holdfast.cli.reloading import Reloading
+from holdfast.cli.watched_files import WatchedFiles
+from support import wire
+from support.silent_files import Silent, threads
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from holdfast.config import Config
+    from support import web
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="files of other systems differ")
+
+HEAD = """\
+reload: on-change
+memories: {plant: {holding_registers: 10}}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:0
+    rules: [{sources: [127.0.0.0/8], units: {1: plant}, access: read-only}]
+"""
+MORE = HEAD.partition("listeners:\n")[2].replace("scada", "historian")
+DEVICE = "devices: {meter: {url: tcp://127.0.0.1:1, interval: 1, profile: meter}}\n"
+PROFILE = "tags: {power: {area: holding_registers, address: %d}}\n"
+
+
+class Plant:
+    """A configuration, and what reloads it for an appliance that notes what it takes over."""
+
+    def __init__(self, folder: Path, text: str = HEAD + MORE) -> None:
+        self.folder = folder
+        self.file = folder / "plant.yaml"
+        self.file.write_text(text)
+        self.config = load_whole(self.file)
+        self.taken: list[Config] = []
+        this: Any = self
+        self.reloading = Reloading(
+            this,
+            ServiceManager({}),
+            lambda: load_whole(self.file),
+            self.file,
+            watch_interval_ms=1,
+            timeout_ms=50,
+        )
+
+    def reload(self, config: Config) -> list[str]:
+        self.config = config
+        self.taken.append(config)
+        return []
+
+    def replace(self, text: str, file: str = "plant.yaml") -> None:
+        (self.folder / "new").write_text(text)
+        (self.folder / "new").rename(self.folder / file)
+
+    def request(self) -> Mapping[str, Any]:
+        """Requests a reload, as `holdfast reload` does. Returns the answer."""
+        answers: list[Mapping[str, Any]] = []
+        asking = threading.Thread(target=lambda: answers.append(self.reloading.ask()))
+        asking.start()
+        self.step_until(lambda: answers, "the reload was answered")
+        asking.join(wire.DEADLINE)
+        return answers[0]
+
+    def step(self) -> bool:
+        self.reloading.step(requested=False)
+        return True
+
+    def step_until(self, condition: Callable[[], object], what: str) -> None:
+        wire.until(lambda: self.step() and condition(), what)
+
+
+@pytest.fixture
+def looks(monkeypatch: pytest.MonkeyPatch) -> list[WatchedFiles]:
+    """The looks at the files that have begun."""
+    found: list[WatchedFiles] = []
+
+    class Watched(WatchedFiles):
+        def __init__(self, files: Any, *, hold: bool) -> None:
+            super().__init__(files, hold=hold)
+            found.append(self)
+
+    monkeypatch.setattr(reloading, "WatchedFiles", Watched)
+    return found
+
+
+def look_on(plant: Plant, looks: list[WatchedFiles]) -> None:
+    """Has files looked at so often that a change would have been noticed."""
+    enough = len(looks) + 5
+    plant.step_until(lambda: len(looks) >= enough, "the files were looked at")
+
+
+def test_a_slow_writer_changes_nothing_until_a_reload_is_requested(
+    tmp_path: Path, looks: list[WatchedFiles], log: web.Records
+) -> None:
+    """Half of the file is valid too: without the second listener."""
+    plant = Plant(tmp_path)
+    with plant.file.open("w") as writer:
+        for part in ("", HEAD, MORE.replace("read-only", "read-write")):
+            writer.write(part)
+            writer.flush()
+            look_on(plant, looks)
+    look_on(plant, looks)
+    assert plant.taken == []
+    [needed] = log.of("reload_needed")
+    assert needed == {
+        "event": "reload_needed",
+        "file": str(plant.file),
+        "reason": "written in place, not renamed",
+        "command": f"holdfast reload {plant.file}",
+    }
+    assert "problems" not in plant.request()
+    assert list(plant.config.listeners) == ["scada", "historian"]
+    look_on(plant, looks)
+    assert len(plant.taken) == 1
+
+
+def test_a_file_that_was_renamed_into_place_is_taken_over(
+    tmp_path: Path, looks: list[WatchedFiles], log: web.Records
+) -> None:
+    plant = Plant(tmp_path)
+    for number, text in enumerate((HEAD, HEAD + MORE, HEAD), start=1):
+        plant.replace(text)
+        plant.step_until(lambda: len(plant.taken) == number, "it was taken over")  # noqa: B023
+        look_on(plant, looks)
+    assert len(plant.taken) == 3
+    assert log.of("reload_needed") == []
+
+
+def test_a_changed_configmap_is_taken_over(tmp_path: Path, log: web.Records) -> None:
+    """Kubernetes renames a symbolic link to a folder with all files of the new version."""
+    for version, text in (("1", HEAD + MORE), ("2", HEAD)):
+        (tmp_path / version).mkdir()
+        (tmp_path / version / "plant.yaml").write_text(text)
+    (tmp_path / "..data").symlink_to("1")
+    (tmp_path / "plant.yaml").symlink_to("..data/plant.yaml")
+    plant = Plant(tmp_path)
+    (tmp_path / "..data_tmp").symlink_to("2")
+    (tmp_path / "..data_tmp").rename(tmp_path / "..data")
+    (tmp_path / "1" / "plant.yaml").unlink()
+    plant.step_until(lambda: plant.taken, "it was taken over")
+    assert list(plant.config.listeners) == ["scada"]
+    assert log.of("reload_needed") == []
+
+
+def test_a_file_that_is_written_after_it_was_renamed_waits_for_the_writer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant = Plant(tmp_path)
+    sizes = []
+    with (tmp_path / "new").open("w") as writer:
+        writer.write(HEAD)
+        writer.flush()
+        (tmp_path / "new").rename(plant.file)
+        lines = iter(["# more\n"] * 20)
+
+        class Watched(WatchedFiles):
+            """Between any two looks, the writer writes another line."""
+
+            def __init__(self, files: Any, *, hold: bool) -> None:
+                super().__init__(files, hold=hold)
+                writer.write(next(lines, ""))
+                writer.flush()
+                sizes.append(plant.file.stat().st_size)
+
+        monkeypatch.setattr(reloading, "WatchedFiles", Watched)
+        plant.step_until(lambda: len(sizes) >= 20, "the writer has ended")
+        assert plant.taken == []
+        plant.step_until(lambda: plant.taken, "it was taken over")
+
+
+def test_a_file_that_has_the_number_of_an_old_one_is_noticed(
+    tmp_path: Path, looks: list[WatchedFiles]
+) -> None:
+    """The known file is kept open, so that no other one gets its number."""
+    plant = Plant(tmp_path)
+    look_on(plant, looks)
+    number = plant.file.stat().st_ino
+    for _ in range(20):
+        plant.replace(HEAD)
+        assert plant.file.stat().st_ino != number
+    plant.step_until(lambda: plant.taken, "it was taken over")
+
+
+def test_profiles_are_watched_too(
+    tmp_path: Path, looks: list[WatchedFiles], log: web.Records
+) -> None:
+    profile = tmp_path / "meter.yaml"
+    profile.write_text(PROFILE % 1)
+    plant = Plant(tmp_path, f"{HEAD}profiles: [meter.yaml]\n{DEVICE}")
+    profile.write_text(PROFILE % 2)
+    plant.step_until(lambda: log.of("reload_needed"), "the change was noticed")
+    plant.replace(HEAD)
+    plant.step_until(lambda: len(log.of("reload_needed")) == 2, "the other change was noticed")
+    look_on(plant, looks)
+    assert plant.taken == []
+    reasons = {each["file"]: each["reason"] for each in log.of("reload_needed")}
+    assert reasons == {
+        str(profile): "written in place, not renamed",
+        str(plant.file): "replaced, but another file was written in place",
+    }
+    plant.replace(PROFILE % 3, "meter.yaml")
+    plant.step_until(lambda: plant.taken, "both are complete now")
+
+
+def test_a_removed_file_changes_nothing(
+    tmp_path: Path, looks: list[WatchedFiles], log: web.Records
+) -> None:
+    plant = Plant(tmp_path)
+    plant.file.unlink()
+    look_on(plant, looks)
+    [needed] = log.of("reload_needed")
+    assert (needed["reason"], plant.taken) == ("removed", [])
+    plant.replace(HEAD)
+    plant.step_until(lambda: plant.taken, "the new file was taken over")
+
+
+def test_a_wrong_file_is_refused_once(
+    tmp_path: Path, looks: list[WatchedFiles], log: web.Records
+) -> None:
+    plant = Plant(tmp_path)
+    plant.replace("wrong")
+    plant.step_until(lambda: log.of("reload_refused"), "it was refused")
+    look_on(plant, looks)
+    assert len(log.of("reload_refused")) == 1
+
+
+@pytest.mark.parametrize("function", ["open", "stat"])
+def test_a_file_that_never_answers_is_a_problem_and_leaves_one_thread_behind(
+    function: str, tmp_path: Path, log: web.Records, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    profile = tmp_path / "meter.yaml"
+    profile.write_text(PROFILE % 1)
+    text = f"{HEAD}profiles: [meter.yaml]\n{DEVICE}".replace("on-change", "on-request")
+    plant = Plant(tmp_path, text)
+    with Silent(monkeypatch, function, profile) as silent:
+        for _ in range(4):
+            [problem] = plant.request()["problems"]
+            assert problem == f"{profile}: can't be read: no answer within 0.05 s, the limit"
+        assert (len(threads()), plant.taken) == (1, [])
+        plant.replace(HEAD)
+        assert "problems" not in plant.request(), "without the file, there is no problem"
+        plant.replace(text)
+        silent.answer()
+        wire.until(lambda: not threads(), "the thread has ended")
+        assert "problems" not in plant.request()
+    assert len(log.of("reload_refused")) == 4
+
+
+def test_a_watched_file_that_never_answers_is_logged_once(
+    tmp_path: Path, log: web.Records, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant = Plant(tmp_path)
+    with Silent(monkeypatch, "stat", plant.file) as silent:
+        plant.step_until(lambda: log.of("reload_needed"), "it was noticed")
+        for _ in range(100):
+            plant.step()
+        assert silent.calls == 1
+    [needed] = log.of("reload_needed")
+    assert needed["reason"] == "no answer within 0.05 s, the limit"
+    plant.replace(HEAD)
+    plant.step_until(lambda: plant.taken, "it is watched again")
+
+
+def test_a_reload_that_the_watch_began_is_not_repeated_while_a_file_is_silent(
+    tmp_path: Path, log: web.Records, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant = Plant(tmp_path)
+    with Silent(monkeypatch, "read", plant.file) as silent:
+        plant.replace(HEAD)
+        plant.step_until(lambda: log.of("reload_refused"), "it was refused")
+        for _ in range(100):
+            plant.step()
+        assert (len(log.of("reload_refused")), silent.calls) == (1, 1)
+
+
+def test_while_a_file_is_read_nothing_waits_and_requests_are_answered_after_it(
+    tmp_path: Path,
+) -> None:
+    plant = Plant(tmp_path, HEAD.replace("on-change", "on-request"))
+    plant.file.unlink()
+    os.mkfifo(plant.file)
+    plant.reloading._timeout_ms = 60_000
+    plant.reloading.step(requested=True)
+    steps = 0
+    while steps < 3:
+        plant.step()
+        steps += 1
+    assert plant.taken == []
+    with plant.file.open("w") as writer:
+        writer.write(HEAD)
+    plant.step_until(lambda: plant.taken, "it was read")
+
+
+def test_who_waits_for_a_reload_is_answered_when_the_appliance_stops(tmp_path: Path) -> None:
+    plant = Plant(tmp_path, HEAD.replace("on-change", "on-request"))
+    plant.file.unlink()
+    os.mkfifo(plant.file)
+    answers: list[Mapping[str, Any]] = []
+    asking = threading.Thread(target=lambda: answers.append(plant.reloading.ask()))
+    asking.start()
+    plant.step_until(lambda: plant.reloading._answering, "it was requested")
+    plant.reloading.close()
+    asking.join(wire.DEADLINE)
+    assert answers == [{"problems": [f"{plant.file}: the appliance has stopped"]}]
+    with plant.file.open("w") as writer:
+        writer.write(HEAD)
