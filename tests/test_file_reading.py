@@ -172,3 +172,14 @@ def test_what_other_code_reads_by_its_name_must_answer_and_end(
         endpoint(parse(f"tls://127.0.0.1?ca={pipe}"))
     with Silent(monkeypatch, "open", good), pytest.raises(NotAnswered):
         FileWork(lambda: require_stored(good), 50).result()
+
+
+def test_without_a_thread_there_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", fail)
+    with pytest.raises(OSError, match="no thread to read files with: can't start new thread"):
+        read(tmp_path, 100)

@@ -86,7 +86,11 @@ class FileWork(Generic[T]):
         self._is_abandoned = False
         self._value: T | None = None
         self._error: BaseException | None = None
-        threading.Thread(target=self._run, name="holdfast-files", daemon=True).start()
+        try:
+            threading.Thread(target=self._run, name="holdfast-files", daemon=True).start()
+        except RuntimeError as error:
+            self._error = OSError(errno.EAGAIN, f"no thread to read files with: {error}")
+            self._ended.set()
 
     @staticmethod
     def current() -> FileWork[Any] | None:

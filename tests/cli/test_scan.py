@@ -218,6 +218,10 @@ def test_a_new_password_is_used_after_sighup_and_a_wrong_file_changes_nothing(
         connected(process)
         process.send_signal(signal.SIGHUP)
         assert "changed=nothing" in _await_line(process, "reloaded")
+        password.unlink()
+        os.mkfifo(password)
+        process.send_signal(signal.SIGHUP)
+        assert "it is a named pipe" in _await_line(process, "reload_refused")
         with Caller(own.url.replace("//", "//scan:s3cret@")) as caller:
             data = caller.listen("modbus.data.plc1")
             _subscribe(caller, server)

@@ -85,7 +85,7 @@ class Reloading:
         self._seen: WatchedFiles | None = None
         self._logged: set[tuple[str, str | None]] = set()
         self._known: WatchedFiles | None = None
-        with suppress(NotAnswered):
+        with suppress(OSError):
             config = appliance.config
             self._known = answered(lambda: self._watched(config, hold=True), timeout_ms)
 
@@ -163,8 +163,8 @@ class Reloading:
         looking, self._looking = self._looking, None
         try:
             now = looking.result()
-        except NotAnswered as error:
-            self._log_once(error.filename, error.strerror)
+        except OSError as error:
+            self._log_once(error.filename or self._file, error.strerror)
             return False
         before, self._seen = self._seen, now
         if self._known is None:
