@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.config import Config, ConfigError, Problem, load
+from holdfast.config import Config, ConfigError, Problem, load, source
 from holdfast.config.load import checked
 from holdfast.config.source import parse, table
 from support.config_folder import Folder
@@ -485,6 +485,16 @@ def test_what_is_no_configuration_is_told_so(
 def test_values_without_end_are_refused(folder: Folder) -> None:
     endless = "[" * sys.getrecursionlimit()
     assert folder.problems(endless) == ["p.yaml: not a configuration: nested too deeply"]
+
+
+def test_too_many_values_are_refused_before_they_take_memory(
+    folder: Folder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(source, "MAX_WRITTEN", 30)
+    text = MEMORIES + LISTENERS
+    assert folder.problems(text) == ["p.yaml: more than 30 keys and values, the limit"]
+    monkeypatch.undo()
+    assert isinstance(folder.config(text), Config)
 
 
 def test_aliases_can_not_multiply_without_end(folder: Folder) -> None:

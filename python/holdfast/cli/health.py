@@ -16,6 +16,7 @@ import click
 
 from holdfast.cli.showing import plain, table
 from holdfast.cli.tls_options import tls_of, tls_options
+from holdfast.file_reading import require_stored
 from holdfast.net.addresses import joined, reachable
 from holdfast.web import health as probes
 
@@ -128,6 +129,7 @@ def _checked(url: str) -> str:
 def _context(tls: Tls, *, verified: bool) -> ssl.SSLContext:
     """The TLS of the connection. Raises `click.UsageError` for unusable files."""
     try:
+        require_stored(tls.ca, tls.cert, tls.key)
         context = ssl.create_default_context(cafile=tls.ca)
         if tls.cert is not None:
             context.load_cert_chain(tls.cert, tls.key)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import threading
 import time
 from concurrent.futures import Future
@@ -187,7 +188,7 @@ class Reloading:
         """Logs a change that is not taken over; once until the next reload."""
         if (key := (str(file), reason)) not in self._logged:
             self._logged.add(key)
-            todo = f"holdfast reload {self._file}"
+            todo = f"holdfast reload {shlex.quote(str(self._file))}"
             logs.write(
                 logging.WARNING, "reload_needed", file=str(file), reason=reason, command=todo
             )

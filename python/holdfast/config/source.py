@@ -202,7 +202,9 @@ class _TooMany(Exception):
 class _Composer(Composer):
     """Stops at a file with too many keys and values."""
 
-    _left = MAX_WRITTEN
+    def __init__(self, loader: Any = None) -> None:
+        super().__init__(loader)
+        self._left = MAX_WRITTEN
 
     def compose_node(self, parent: Node | None, index: object) -> Node | None:
         self._left -= 1
