@@ -183,3 +183,20 @@ def test_without_a_thread_there_is_an_error(
     monkeypatch.setattr(threading.Thread, "start", fail)
     with pytest.raises(OSError, match="no thread to read files with: can't start new thread"):
         read(tmp_path, 100)
+
+
+def test_work_that_is_over_has_its_result_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loop of an appliance asks for both, one after the other."""
+    file = tmp_path / "file"
+    file.write_bytes(b"content")
+    with Silent(monkeypatch, "open", file) as silent:
+        work = FileWork(lambda: read(file, 100), 50)
+        wire.until(work.is_over, "it was abandoned")
+        silent.answer()
+        wire.until(lambda: not threads(), "the thread has ended")
+        work.timeout_ms = 60_000
+        assert work.is_over()
+        with pytest.raises(NotAnswered):
+            work.result()

@@ -83,7 +83,7 @@ class FileWork(Generic[T]):
         self._ended = threading.Event()
         self._waits: tuple[str, float] | None = None
         """The file that the thread waits for, and since when."""
-        self._is_abandoned = False
+        self._given_up: NotAnswered | None = None
         self._value: T | None = None
         self._error: BaseException | None = None
         try:
@@ -97,17 +97,27 @@ class FileWork(Generic[T]):
         """Returns the work whose thread this is."""
         return getattr(FileWork._current, "work", None)
 
-    def is_over(self, wait_ms: int = 0) -> bool:
-        """Returns whether `result` has no need to wait. Waits for that at most `wait_ms`."""
-        return self._ended.wait(wait_ms / 1000) or self._overdue() is not None
+    def is_over(self, wait_ms: float = 0) -> bool:
+        """Returns whether `result` does not wait. Waits for that at most `wait_ms`.
+
+        The work is abandoned here once a file has taken too long, whatever happens to it later.
+        """
+        if self._given_up is None and not self._ended.wait(wait_ms / 1000):
+            waits = self._waits
+            if waits is None or time.monotonic() - waits[1] < self.timeout_ms / 1000:
+                return False
+            self._given_up = not_answered(waits[0], self.timeout_ms)
+            with FileWork._lock:
+                left = [each for each in FileWork._abandoned if not each._ended.is_set()]
+                FileWork._abandoned = (*left, self)
+        return True
 
     def result(self) -> T:
         """Waits for the end. Raises what the work has raised, and `NotAnswered`."""
-        while not self._ended.wait(self.timeout_ms / 1000):
-            file = self._overdue()
-            if file is not None:
-                self._abandon()
-                raise not_answered(file, self.timeout_ms)
+        while not self.is_over(self._left_ms()):
+            pass
+        if self._given_up is not None:
+            raise self._given_up
         if isinstance(self._error, _Blocked):
             raise not_answered(str(self._error), self.timeout_ms)
         if self._error is not None:
@@ -117,7 +127,7 @@ class FileWork(Generic[T]):
     def call(self, file: str, function: Callable[[], T]) -> T:
         """Calls what may wait for a file, in the thread of this work."""
         blocked = {waits[0] for each in self._abandoned if (waits := each._waits) is not None}
-        if self._is_abandoned or file in blocked:
+        if self._given_up is not None or file in blocked:
             raise _Blocked(file)
         self._waits = (file, time.monotonic())
         try:
@@ -133,17 +143,11 @@ class FileWork(Generic[T]):
             self._error = error
         self._ended.set()
 
-    def _overdue(self) -> str | None:
+    def _left_ms(self) -> float:
+        """Milliseconds after which the file of this moment has taken too long."""
         waits = self._waits
-        if waits is None or time.monotonic() - waits[1] < self.timeout_ms / 1000:
-            return None
-        return waits[0]
-
-    def _abandon(self) -> None:
-        self._is_abandoned = True
-        with FileWork._lock:
-            left = [each for each in FileWork._abandoned if not each._ended.is_set()]
-            FileWork._abandoned = (*left, self)
+        waited_ms = 0.0 if waits is None else (time.monotonic() - waits[1]) * 1000
+        return max(self.timeout_ms - waited_ms, 1)
 
 
 def answered(work: Callable[[], T], timeout_ms: int = TIMEOUT_MS) -> T:

@@ -43,7 +43,7 @@ PROFILE = "tags: {power: {area: holding_registers, address: %d}}\n"
 class Plant:
     """A configuration, and what reloads it for an appliance that notes what it takes over."""
 
-    def __init__(self, folder: Path, text: str = HEAD + MORE) -> None:
+    def __init__(self, folder: Path, text: str = HEAD + MORE, timeout_ms: int = 50) -> None:
         self.folder = folder
         self.file = folder / "plant.yaml"
         self.file.write_text(text)
@@ -56,7 +56,7 @@ class Plant:
             lambda: load_whole(self.file),
             self.file,
             watch_interval_ms=1,
-            timeout_ms=50,
+            timeout_ms=timeout_ms,
         )
 
     def reload(self, config: Config) -> list[str]:
@@ -289,18 +289,15 @@ def test_a_reload_that_the_watch_began_is_not_repeated_while_a_file_is_silent(
         assert (len(log.of("reload_refused")), silent.calls) == (1, 1)
 
 
-def test_while_a_file_is_read_nothing_waits_and_requests_are_answered_after_it(
+def test_while_a_file_is_read_nothing_waits_for_it(
     tmp_path: Path,
 ) -> None:
-    plant = Plant(tmp_path, HEAD.replace("on-change", "on-request"))
+    plant = Plant(tmp_path, HEAD.replace("on-change", "on-request"), 60_000)
     plant.file.unlink()
     os.mkfifo(plant.file)
-    plant.reloading._timeout_ms = 60_000
     plant.reloading.step(requested=True)
-    steps = 0
-    while steps < 3:
+    for _ in range(3):
         plant.step()
-        steps += 1
     assert plant.taken == []
     with plant.file.open("w") as writer:
         writer.write(HEAD)
@@ -314,7 +311,7 @@ def test_who_waits_for_a_reload_is_answered_when_the_appliance_stops(tmp_path: P
     answers: list[Mapping[str, Any]] = []
     asking = threading.Thread(target=lambda: answers.append(plant.reloading.ask()))
     asking.start()
-    plant.step_until(lambda: plant.reloading._answering, "it was requested")
+    plant.step_until(threads, "the file is read")
     plant.reloading.close()
     asking.join(wire.DEADLINE)
     assert answers == [{"problems": [f"{plant.file}: the appliance has stopped"]}]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.fingerprint import fingerprint
+from holdfast.file_reading import answered
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,7 +31,14 @@ SEVERAL = ("memories", "listeners", "devices", "links", "outputs", "adapters")
 
 
 def fingerprints(config: Config) -> dict[str, str]:
-    """The fingerprint of each part of a configuration, by its key: `rest`, `devices.pump`."""
+    """The fingerprint of each part of a configuration, by its key: `rest`, `devices.pump`.
+
+    Raises `NotAnswered`: the first file that does not answer ends it.
+    """
+    return answered(lambda: _fingerprints(config))
+
+
+def _fingerprints(config: Config) -> dict[str, str]:
     found = {key: fingerprint(getattr(config, key)) for key in SINGLE}
     for key in SEVERAL:
         for name, settings in getattr(config, key).items():

@@ -21,7 +21,7 @@ from holdfast.cli.watched_files import WatchedFiles
 from holdfast.config import ConfigError
 from holdfast.config.fingerprint import files_of
 from holdfast.config.load import unanswered
-from holdfast.file_reading import TIMEOUT_MS, FileWork, NotAnswered, answered
+from holdfast.file_reading import TIMEOUT_MS, FileWork, NotAnswered, Unreadable, answered
 from holdfast.web.port import explained
 
 if TYPE_CHECKING:
@@ -217,10 +217,10 @@ class Reloading:
             problems = [error.format_message()]
         except changes.ReloadRefused as refused:
             problems = [self._placed(reason) for reason in refused.reasons]
+        except (Unreadable, UnknownAdapter, ValueError) as error:
+            problems = [self._placed(str(error))]
         except OSError as error:
             problems = [self._placed(explained(error))]
-        except (UnknownAdapter, ValueError) as error:
-            problems = [self._placed(str(error))]
         except changes.ReloadIncomplete as error:
             logs.problem("reload_incomplete")
             return {"incomplete": self._placed(f"internal error: {error}")}

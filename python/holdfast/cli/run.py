@@ -31,6 +31,7 @@ from holdfast.config import GatewayConfig, ModbusTcpListener, RouteConfig, UnitM
 from holdfast.config.fingerprint import files_of
 from holdfast.config.rights import unit_rights
 from holdfast.config.scanning import written_pollable
+from holdfast.file_reading import Unreadable
 from holdfast.net.addresses import joined, reachable
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.types import BIT_AREAS, REGISTER_AREAS
@@ -126,6 +127,9 @@ def serve(
     except LogNotJoined as error:
         click.echo(f"holdfast: {error}", err=True)
         sys.exit(WRONG if error.is_settings else 1)
+    except Unreadable as error:
+        click.echo(f"holdfast: {error}", err=True)
+        sys.exit(1)
     except OSError as error:
         click.echo(f"holdfast: {explained(error)}", err=True)
         sys.exit(1)
