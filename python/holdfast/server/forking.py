@@ -7,7 +7,6 @@ answers.
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import socket
 import sys
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING
 from weakref import WeakSet
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
 
     from holdfast._core import Engine
 
@@ -28,6 +27,7 @@ _bound: set[Bound] = set()
 """The sockets on which servers of this process listen, as of the last fork."""
 
 _FOLDER = Path("/proc/self/fd" if sys.platform == "linux" else "/dev/fd")
+_UNSPECIFIED = {socket.AF_INET: "0.0.0.0", socket.AF_INET6: "::"}
 _MOST = 65_536
 """File descriptors that are tried where the system does not list them."""
 
@@ -60,7 +60,7 @@ def _descriptors() -> Iterable[int]:
 
 
 def _own(number: int) -> set[Bound]:
-    """What a server's socket would be bound to, if this file descriptor is one of its sockets.
+    """What a server would have bound, if this file descriptor is one of its sockets.
 
     An accepted connection has the address of its listener, or any if that is unspecified.
     """
@@ -69,21 +69,16 @@ def _own(number: int) -> set[Bound]:
     except OSError:
         return set()  # It is closed, or no socket.
     try:
-        if found.family not in (socket.AF_INET, socket.AF_INET6):
+        unspecified = _UNSPECIFIED.get(found.family)
+        if unspecified is None:
             return set()
         host, port = found.getsockname()[:2]
-        return {(int(found.type), each, port) for each in _same(host)}
+        hosts = (unspecified, host.partition("%")[0])
+        return {(int(found.type), each, port) for each in hosts}
     except OSError:
         return set()
     finally:
         found.detach()
-
-
-def _same(host: str) -> Iterator[str]:
-    yield from ("0.0.0.0", "::", host)
-    mapped = ipaddress.ip_address(host.partition("%")[0])
-    if isinstance(mapped, ipaddress.IPv6Address) and mapped.ipv4_mapped is not None:
-        yield str(mapped.ipv4_mapped)
 
 
 if hasattr(os, "register_at_fork"):
