@@ -11,22 +11,22 @@ import hashlib
 import json
 import os
 import time
-from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 from nats.errors import Error, NoRespondersError
 
 from holdfast.net import event_loop
-from holdfast.scanner.receiving import SafeClient, TlsClient
+from holdfast.scanner.broker import connected_once
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Coroutine
+    from collections.abc import Callable, Coroutine
     from pathlib import Path
     from typing import TypeVar
 
     from nats.aio.msg import Msg
 
     from holdfast.scanner import Servers
+    from holdfast.scanner.receiving import SafeClient
 
     T = TypeVar("T")
 
@@ -35,9 +35,6 @@ NOT_FOUND = 10059
 """The code of JetStream for a stream that does not exist."""
 
 CHUNK = 128 * 1024
-CONNECTING = 3.0
-"""Seconds to connect."""
-
 SILENCE = 30.0
 """Seconds within which a server must answer, or send the next part."""
 
@@ -110,7 +107,7 @@ def set_replicas(servers: Servers, log: str, replicas: int) -> dict[str, tuple[i
 
 def _run(servers: Servers, work: Callable[[SafeClient], Coroutine[Any, Any, T]]) -> T:
     async def connected() -> T:
-        async with _client(servers) as client:
+        async with connected_once(servers, "holdfast log") as client:
             return await work(client)
 
     try:
@@ -118,27 +115,6 @@ def _run(servers: Servers, work: Callable[[SafeClient], Coroutine[Any, Any, T]])
     except (Error, OSError, TimeoutError) as error:
         reason = str(error).removeprefix("nats: ") or type(error).__name__
         raise BackupFailed(reason) from error
-
-
-@asynccontextmanager
-async def _client(servers: Servers) -> AsyncIterator[SafeClient]:
-    client = TlsClient() if servers.secure else SafeClient()
-
-    async def ignore(_: Exception) -> None:
-        """What fails is raised."""
-
-    try:
-        await client.connect(
-            **servers.options(),
-            allow_reconnect=False,
-            connect_timeout=int(CONNECTING),
-            max_reconnect_attempts=1,
-            reconnect_time_wait=0,
-            error_cb=ignore,
-        )
-        yield client
-    finally:
-        await client.close()
 
 
 async def _ask(client: SafeClient, subject: str, request: Any = None) -> dict[str, Any]:

@@ -30,8 +30,11 @@ MAX_ANSWER = 64 * 1024 * 1024
 TIMEOUT = 5.0
 """Seconds in which a request must arrive."""
 
-MAX_WAIT = 60.0
-"""Seconds that `ask` waits for the answer."""
+ANSWERING = 3.0
+"""Seconds in which an appliance must answer, unless what it was asked takes longer."""
+
+RELOADING = 60.0
+"""Seconds in which it must have reloaded."""
 
 MODE = 0o700
 
@@ -44,7 +47,7 @@ class Control:
     """Answers requests until `close`. Raises `OSError` if the socket can't be created."""
 
     def __init__(self, file: Path, handlers: Mapping[str, Handler]) -> None:
-        self._handlers = handlers
+        self._handlers: Mapping[str, Handler] = {"ping": dict, **handlers}
         self._closed = False
         self.address = _own_address(file)
         self._listener = _listen(self.address)
@@ -85,8 +88,30 @@ class Control:
             return {"error": f"invalid request: {error}"}
 
 
-def ask(file: Path, do: str, **fields: object) -> dict[str, Any]:
-    """Sends a request to the appliance that runs this configuration. Raises `NotRunning`."""
+def ask(
+    file: Path, do: str, *, within_s: float = ANSWERING, ping_s: float = ANSWERING, **fields: object
+) -> dict[str, Any]:
+    """Sends a request to the appliance that runs this configuration. Raises `NotRunning`.
+
+    If the answer may take longer than `ping_s`, a ping is sent before: one that hangs does not
+    answer it.
+    """
+    if within_s > ping_s:
+        ask(file, "ping", within_s=ping_s, ping_s=ping_s)
+    request = json.dumps({"do": do, **fields}).encode()
+    found: list[dict[str, Any] | NotRunning] = []
+    # An appliance that hangs does not accept, and no timeout covers that on every system.
+    asking = threading.Thread(target=lambda: found.append(_answered(file, request)), daemon=True)
+    asking.start()
+    asking.join(within_s)
+    if not found:
+        raise NotRunning(f"{file}: the appliance has not answered within {within_s:g} s")
+    if isinstance(found[0], NotRunning):
+        raise found[0]
+    return found[0]
+
+
+def _answered(file: Path, request: bytes) -> dict[str, Any] | NotRunning:
     for address in _addresses(file):
         try:
             connection = Client(address)
@@ -94,15 +119,13 @@ def ask(file: Path, do: str, **fields: object) -> dict[str, Any]:
             continue
         with connection:
             try:
-                connection.send_bytes(json.dumps({"do": do, **fields}).encode())
-                if not connection.poll(MAX_WAIT):
-                    raise NotRunning(f"{file}: the appliance has not answered in {MAX_WAIT:g} s")
+                connection.send_bytes(request)
                 answer: dict[str, Any] = json.loads(connection.recv_bytes(MAX_ANSWER))
-            except (OSError, EOFError) as error:
-                raise NotRunning(f"{file}: the appliance ended the connection") from error
+            except (OSError, EOFError):
+                return NotRunning(f"{file}: the appliance ended the connection")
         return answer
     tried = ", ".join(_addresses(file))
-    raise NotRunning(f"{file}: no appliance of this user runs it on this machine (tried {tried})")
+    return NotRunning(f"{file}: no appliance of this user runs it on this machine (tried {tried})")
 
 
 def _listen(address: str) -> Listener:

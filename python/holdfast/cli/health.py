@@ -43,7 +43,7 @@ class _NoAnswer(Exception):
 @click.option(
     "--timeout",
     type=click.FloatRange(0.1, 3600),
-    default=5.0,
+    default=4.0,
     show_default=True,
     metavar="SECONDS",
     help="Time for the whole answer.",

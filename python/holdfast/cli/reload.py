@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from holdfast.appliance.control import NotRunning, ask
+from holdfast.appliance.control import RELOADING, NotRunning, ask
 
 REFUSED = 2
 INCOMPLETE = 3
@@ -20,10 +20,11 @@ def reload(file: Path) -> None:
 
     The whole configuration and all files that it names are checked first. If anything is wrong, the
     appliance goes on as before, and every problem is printed. Exit codes: 0 reloaded, 1 no
-    appliance of this user runs FILE, 2 refused, 3 an internal error: restart the appliance.
+    appliance of this user runs FILE, or it does not answer, 2 refused, 3 an internal error: restart
+    the appliance.
     """
     try:
-        answer = ask(file, "reload")
+        answer = ask(file, "reload", within_s=RELOADING)
     except NotRunning as error:
         click.echo(f"holdfast: {error}", err=True)
         sys.exit(1)

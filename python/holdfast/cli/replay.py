@@ -20,6 +20,7 @@ from holdfast.cli.logs_of import chosen_log
 from holdfast.cli.signals import Signals
 from holdfast.config.words import listing
 from holdfast.nats_server import ServerUnusable
+from holdfast.scanner.broker import ANSWERING
 from holdfast.server import Server
 
 if TYPE_CHECKING:
@@ -90,6 +91,7 @@ def replay(
                 sequence=sequence,
                 time_ns=time_ns,
                 follow=follow,
+                connect_timeout=ANSWERING / len(settings.servers),
                 **credentials(settings),
             )
             while not signals.received and not replaying.ended:
@@ -101,7 +103,9 @@ def replay(
                     _check_end(replaying, sequence, time_ns)
                 _tell(replaying, memories, values=values, as_json=as_json)
         except (_core.LogError, ServerUnusable, ValueError) as error:
-            _fail(f"logs.{log}: {error}")
+            shown = assembly.nats_servers(settings).shown
+            where = f" (servers: {shown})" if isinstance(error, _core.LogError) else ""
+            _fail(f"logs.{log}: {error}{where}")
     if port is not None and not signals.received:
         _serve(memories, port, signals)
 

@@ -10,7 +10,8 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Awaitable, Callable, Collection, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -46,6 +47,9 @@ CHECK_INTERVAL = 1.0
 CLOSING = 1.5
 """Seconds to send the last messages when a client is closed."""
 
+ANSWERING = 3.0
+"""Seconds in which servers must answer the first request of a command."""
+
 
 @dataclass(frozen=True)
 class Servers:
@@ -64,6 +68,12 @@ class Servers:
     def secure(self) -> bool:
         """Whether the connection requires TLS."""
         return self.tls != NO_FILES or any(url.startswith("tls://") for url in self.urls)
+
+    @property
+    def shown(self) -> str:
+        """The URLs for messages, without users and passwords."""
+        parts = (url.partition("://") for url in self.urls)
+        return ", ".join(f"{scheme}{mark}{rest.rpartition('@')[2]}" for scheme, mark, rest in parts)
 
     def options(self) -> dict[str, Any]:
         """Returns options for `Client.connect`. Raises `OSError` for an unusable file."""
@@ -244,6 +254,50 @@ class Broker:
             return
         self._told = (reason, now)
         logs.write(logging.WARNING, "nats_connect_failed", reason=reason, attempts=self._failures)
+
+
+@asynccontextmanager
+async def connected_once(
+    servers: Servers, name: str, within_s: float = ANSWERING
+) -> AsyncIterator[SafeClient]:
+    """A connection for one command, which is not made again after its end.
+
+    Raises `ConnectionError`, which names the servers, if there is none in time, and `OSError` for
+    an unusable file.
+    """
+    client = TlsClient() if servers.secure else SafeClient()
+    options = servers.options()
+    failures: list[Exception] = []
+
+    async def failed(error: Exception) -> None:
+        failures.append(error)
+
+    try:
+        try:
+            async with asyncio.timeout(within_s):
+                await client.connect(
+                    **options,
+                    name=name,
+                    error_cb=failed,
+                    allow_reconnect=False,
+                    # nats-py would try each server 60 times, with pauses of 2 s.
+                    max_reconnect_attempts=1,
+                    reconnect_time_wait=0,
+                    # A server that does not answer leaves time for the others.
+                    connect_timeout=within_s / len(servers.urls),  # type: ignore[arg-type]
+                    ping_interval=PING_INTERVAL,  # type: ignore[arg-type]
+                    max_outstanding_pings=PINGS_OUTSTANDING,
+                )
+        except (Error, OSError) as error:
+            cause = failures[-1] if failures else error
+            reason = str(cause).removeprefix("nats: ")
+            if isinstance(cause, TimeoutError):
+                reason = "no answer in time"
+            message = f"no connection to NATS at {servers.shown}: {reason or type(cause).__name__}"
+            raise ConnectionError(message) from error
+        yield client
+    finally:
+        await _closed(client)
 
 
 async def _given_up(client: Client, ended: asyncio.Event) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import time
+from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +13,9 @@ from nats.errors import Error, NoRespondersError
 from nats.js.errors import NotFoundError
 
 from holdfast.leases import LEASE_TIMES, Holding, LeaseBucket
+from holdfast.scanner.broker import ANSWERING, connected_once
 from holdfast.scanner.fleet.exchange import subject
 from holdfast.scanner.fleet.fleet import NODE, PARTITION, leases_of
-from holdfast.scanner.receiving import SafeClient, TlsClient
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 
     from holdfast.leases import Entry
     from holdfast.scanner.broker import Servers
-
-CONNECTING = 5
-"""Seconds to connect, and to wait for answers."""
 
 LOOKED = 0.05
 """Seconds between two looks at a node that leaves."""
@@ -80,35 +77,32 @@ class Seen:
 class Looker:
     """A connection that reads the bucket of leases."""
 
-    def __init__(self, fleet: str, servers: Servers) -> None:
+    def __init__(self, fleet: str, servers: Servers, within_s: float = ANSWERING) -> None:
+        """`within_s` is the time to connect, and to read all that there is."""
         self._fleet = fleet
         self._servers = servers
-        self._client = TlsClient() if servers.secure else SafeClient()
+        self._within_s = within_s
         self._seen: dict[str, Entry] = {}
-        self._is_read = asyncio.Event()
+        self._ending = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
-        async def ignore(_: Exception) -> None:
-            pass
-
-        try:
-            await self._client.connect(
-                **self._servers.options(),
-                name="holdfast fleet",
-                connect_timeout=CONNECTING,
-                allow_reconnect=False,
-                error_cb=ignore,
-            )
-            self._bucket = LeaseBucket(self._client, leases_of(self._fleet))
-            await self._bucket.follow(self._saw, self._is_read.set)
-        except NotFoundError:
-            await self._client.close()
-            raise FleetUnavailable(f"there is no fleet {self._fleet} yet") from None
-        except (Error, OSError) as error:
-            with contextlib.suppress(Exception):
-                await self._client.close()
-            reason = str(error) or type(error).__name__
-            raise FleetUnavailable(f"can't look at the fleet {self._fleet}: {reason}") from None
+        async with AsyncExitStack() as ending:
+            connecting = connected_once(self._servers, "holdfast fleet", self._within_s)
+            began = time.monotonic()
+            self._client = await ending.enter_async_context(connecting)
+            left = began + self._within_s - time.monotonic()
+            bucket, is_read = LeaseBucket(self._client, leases_of(self._fleet)), asyncio.Event()
+            try:
+                async with asyncio.timeout(max(left, 0.0)):
+                    await bucket.follow(self._saw, is_read.set)
+                    await is_read.wait()
+            except NotFoundError:
+                raise FleetUnavailable(f"there is no fleet {self._fleet} yet") from None
+            except TimeoutError:
+                raise FleetUnavailable(f"{self._where} does not answer") from None
+            except (Error, OSError) as error:
+                raise FleetUnavailable(f"{self._where}: {_reason(error)}") from None
+            self._ending = ending.pop_all()
         return self
 
     async def __aexit__(
@@ -117,8 +111,11 @@ class Looker:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        with contextlib.suppress(Exception):
-            await self._client.close()
+        await self._ending.aclose()
+
+    @property
+    def _where(self) -> str:
+        return f"JetStream of NATS at {self._servers.shown}"
 
     def _saw(self, key: str, entry: Entry) -> None:
         before = self._seen.get(key)
@@ -126,10 +123,10 @@ class Looker:
             self._seen[key] = entry
 
     async def look(self) -> Seen:
-        """Returns what is known now."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(CONNECTING):
-                await self._is_read.wait()
+        """Returns what is known now. Raises `FleetUnavailable`."""
+        if not self._client.is_connected:
+            where = f"NATS at {self._servers.shown}"
+            raise FleetUnavailable(f"the connection to {where} was lost")
         now = time.monotonic()
         live = {
             key: entry.holding
@@ -149,16 +146,19 @@ class Looker:
         """Has a node leave. Raises `FleetUnavailable` if it does not."""
         where = subject(prefix, node, "drain")
         try:
-            answer = await self._client.request(where, b"", timeout=CONNECTING)
+            answer = await self._client.request(where, b"", timeout=self._within_s)
             if not msgspec.json.decode(answer.data, type=dict[str, Any]).get("success"):
                 raise FleetUnavailable(f"node {node} does not leave")
         except NoRespondersError:
             raise FleetUnavailable(f"there is no node {node} at {prefix}.fleet") from None
         except (Error, OSError, msgspec.DecodeError) as error:
-            reason = str(error) or type(error).__name__
-            raise FleetUnavailable(f"node {node} does not answer: {reason}") from None
+            raise FleetUnavailable(f"node {node} does not answer: {_reason(error)}") from None
         end = time.monotonic() + LEAVING
         while node in (await self.look()).nodes:
             await asyncio.sleep(LOOKED)
             if time.monotonic() > end:
                 raise FleetUnavailable(f"node {node} has not left within {LEAVING:g} s")
+
+
+def _reason(error: Exception) -> str:
+    return str(error).removeprefix("nats: ") or type(error).__name__
