@@ -60,9 +60,8 @@ class Process:
         return time.clock_gettime(~self.process.pid << 3 | 2)  # As clock_getcpuclockid(3) does.
 
     def memory(self) -> int:
-        """Returns the resident memory in bytes."""
-        status = Path(f"/proc/{self.process.pid}/status").read_text()
-        return 1024 * int(status.partition("VmRSS:")[2].split()[0])
+        """Returns its own memory in bytes."""
+        return common.memory(self.process.pid)["own"]
 
     def count(self, event: str) -> int:
         """Returns how often an event is in the log, with those that were held back."""
@@ -131,8 +130,8 @@ class Bench:
         return sum(node.count("lease_lost") for node in self.nodes)
 
     def memory(self) -> int:
-        """Returns the memory of the largest node in bytes."""
-        return max(node.memory() for node in self.nodes)
+        """Returns the own memory of all nodes in bytes."""
+        return sum(node.memory() for node in self.nodes)
 
     def check(self) -> None:
         """Raises `RuntimeError` if a node has ended."""
@@ -256,8 +255,9 @@ def show(found: dict[str, Any]) -> None:
     print(f"{storm['doubles'] + judged['doubles']} second connections, ", end="")
     print(f"{storm['overlaps'] + judged['overlaps']} polls at once")
     print(f"  scanners say    {found['missed']:10,d} missed scans; {found['lost']} leases lost")
-    print(f"  memory          {found['memory'] / 1024:10.1f} KB per device and node, ", end="")
-    print(f"{found['idle_memory'] / 2**20:.0f} MB per node without devices")
+    memory, idle = found["memory"], found["idle_memory"] / found["nodes"]
+    print(f"  memory          {memory / 1e3:10.1f} KB per device, all nodes together; ", end="")
+    print(f"{idle / 1e6:.0f} MB per node without devices")
     total = sum(found["cpu"])
     print(f"  processor       {1e6 * total / devices:10.0f} us per device and second, ", end="")
     print(f"{100 * total:.1f} % of a core in all; NATS {100 * found['nats_cpu']:.1f} %")
