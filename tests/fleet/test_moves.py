@@ -198,6 +198,7 @@ def test_devices_are_scanned_by_one_node_at_a_time_whatever_happens(
         assert known(caller) == {f"d{number}": ["hmi"] for number in range(DEVICES)}
         assert published.count
         assert not published.returns
+        assert not published.older
         if IS_LONG:
             for kind, found in gaps.items():
                 assert max(found) <= (LEADERLESS if kind == "leader" else GAP), kind
@@ -239,3 +240,45 @@ def test_devices_do_not_rest_longer_than_promised_when_the_leader_of_the_leases_
         told = "shortest {:.2f} s, median {:.2f}, 95 % {:.2f}, longest {:.2f}".format(*parts)
         print(f"{told}, of {len(rests)} deaths")
     assert max(rests) <= LEADERLESS
+
+
+@pytest.mark.skipif(not IS_LONG, reason="a minute: HOLDFAST_TORTURE=1 runs it")
+@pytest.mark.usefixtures("many_files")
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("leads", [True, False])
+def test_values_that_a_frozen_server_sends_late_have_smaller_numbers(
+    cluster: NatsCluster, tmp_path: Path, capsys: pytest.CaptureFixture[str], leads: bool
+) -> None:
+    """If it leads the leases, all nodes lose them; otherwise, nodes keep them."""
+    with ExitStack() as ending:
+        judges = ending.enter_context(Judges(RESTING))
+        nodes = Nodes(cluster.urls, tmp_path, PARTITIONS)
+        ending.callback(nodes.stop)
+        plant = Plant(cluster, nodes, judges, random.Random())
+        for _ in range(3):
+            nodes.start()
+        nodes.settle()
+        leader = cluster.leader(LEASES)
+        other = next(name for name in cluster.servers if name != leader)
+        frozen, listening = (leader, other) if leads else (other, leader)
+        caller = ending.enter_context(Caller(cluster.servers[listening].url))
+        plant.subscribe(caller, RESTING)
+        plant.until_scanned()
+        published = Published(caller)
+        began = time.monotonic()
+        cluster.servers[frozen].freeze()
+        try:
+            wire.until(lambda: cluster.leader(LEASES) != frozen, "another server leads")
+            threading.Event().wait(FROZEN[-1])
+            plant.until_scanned()
+        finally:
+            cluster.servers[frozen].thaw()
+        seconds, count = time.monotonic() - began, published.count
+        cluster.until_whole(LEASES)
+        nodes.settle()
+        plant.until_scanned()
+        with capsys.disabled():
+            late = len(published.returns) + len(published.older)
+            print(f"{late} values behind newer ones, frozen for {seconds:.1f} s")
+        assert published.count > count
+        assert not published.older

@@ -269,6 +269,40 @@ def test_messages_have_the_revision_of_the_lease(
     assert int(headers[-1]["Holdfast-Lease"]) > first
 
 
+def test_messages_over_a_new_connection_have_a_greater_number(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    """What waits in a server of the former connection, which was frozen, can be told from them."""
+    numbers: dict[str, list[int]] = {"data": [], "status": []}
+
+    async def listen() -> None:
+        async def take(message: Any) -> None:
+            kind = message.subject.split(".")[1]
+            numbers[kind].append(int(message.headers["Holdfast-Lease"]))
+
+        for kind in numbers:
+            await caller.client.subscribe(f"modbus.{kind}.>", cb=take)
+        await caller.client.flush()
+
+    caller.do(listen())
+    one = node("a")
+    caller.request("modbus.subscribe", wanted(judges.devices[0]))
+    wire.until(lambda: all(map(bool, numbers.values())), "values and a status come")
+    [first] = set(numbers["data"])
+    part, client = one.scanner._part, one.scanner._broker.client
+    assert part is not None
+    assert client is not None
+    leases = part.fleet.leases
+    held = next(key for key, since in leases.held.items() if since == first)
+    wire.until(lambda: leases.revision(held) > first, "the lease is renewed")
+    one.do(client.force_reconnect())
+    wire.until(
+        lambda: all(found[-1] > first for found in numbers.values()), "they have a greater number"
+    )
+    assert all(found == sorted(found) for found in numbers.values())
+    assert leases.since(held) == first
+
+
 def test_a_subscription_ends_by_its_ttl_unless_any_node_renews_it(
     node: Callable[..., Running], caller: Caller, judges: Judges
 ) -> None:

@@ -163,9 +163,12 @@ class Published:
     """Notes values of a node after those of one that has taken the device over from it."""
 
     def __init__(self, caller: Caller) -> None:
-        self._leases: dict[str, int] = {}
+        self._latest: dict[str, tuple[int, int]] = {}
+        """The number and the time of the newest value of each tag."""
         self.count = 0
         self.returns: list[tuple[str, int, int]] = []
+        self.older: list[tuple[str, int]] = []
+        """Values behind newer ones with the same number."""
 
         async def listen() -> None:
             await caller.client.subscribe("modbus.data.>", cb=self._take)
@@ -176,10 +179,13 @@ class Published:
     async def _take(self, message: Msg) -> None:
         self.count += 1
         assert message.headers is not None
-        lease, latest = int(message.headers["Holdfast-Lease"]), self._leases.get(message.subject, 0)
-        if lease < latest:
-            self.returns.append((message.subject, lease, latest))
-        self._leases[message.subject] = max(lease, latest)
+        found = int(message.headers["Holdfast-Lease"]), int(json.loads(message.data)["timestamp"])
+        latest = self._latest.setdefault(message.subject, found)
+        if found[0] < latest[0]:
+            self.returns.append((message.subject, found[0], latest[0]))
+        elif found < latest:
+            self.older.append((message.subject, latest[1] - found[1]))
+        self._latest[message.subject] = max(found, latest)
 
 
 class Commands:

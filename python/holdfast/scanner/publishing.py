@@ -52,6 +52,7 @@ class Publisher:
         self, prefix: str, device: str, dialect: Dialect = "tentacle", lease: int | None = None
     ) -> None:
         """In a fleet, messages have the revision of the `lease` of the device."""
+        self._lease = lease
         self._header = b"" if lease is None else wire.lease_header(lease)
         self._prefix = prefix
         self._device = device
@@ -74,9 +75,18 @@ class Publisher:
         self._wanted = groups
         self._newcomers.update(newcomers)
 
-    def renew(self) -> None:
-        """Publishes the next values of all tags, even if they are unchanged or not due."""
+    def renew(self, lease: int | None = None) -> None:
+        """Publishes the next values of all tags, even if they are unchanged or not due.
+
+        In a fleet, messages have the revision `lease` from now on.
+        """
         self._anew = True
+        if lease is None or lease == self._lease:
+            return
+        self._lease, self._header = lease, wire.lease_header(lease)
+        self._shapes.clear()
+        for due in self._groups:
+            due.parts.clear()
 
     def regroup(self, groups: Sequence[Group], newcomers: Collection[str]) -> None:
         """Changes the groups now. The next value of newcomers is published even if unchanged."""

@@ -315,7 +315,7 @@ class Scanner:
         self._due.set()
         if client is not None:
             for device in self._registry.devices.values():
-                self._publishers[device.id].renew()
+                self._publishers[device.id].renew(self._lease(device))
                 self._publish_state(device)
 
     def _publish_again(self) -> None:
@@ -654,8 +654,12 @@ class Scanner:
         publisher.want(lambda: grouped(device), asked.tags if self._is_own(device) else ())
 
     def _publisher(self, device: ScannedDevice) -> Publisher:
-        lease = None if self._part is None else self._part.fleet.epoch(device.partition)
-        return Publisher(self._settings.prefix, device.id, self._settings.dialect, lease)
+        settings, lease = self._settings, self._lease(device)
+        return Publisher(settings.prefix, device.id, settings.dialect, lease)
+
+    def _lease(self, device: ScannedDevice) -> int | None:
+        """Returns the number that messages about a device have in a fleet."""
+        return None if self._part is None else self._part.fleet.epoch(device.partition)
 
     async def _place(self, asked: Subscription) -> tuple[Target, Endpoint | None]:
         """Returns the address of a device: the known one, or the result of a lookup."""
@@ -1062,8 +1066,8 @@ class Scanner:
         for name in device.subjects:
             subject = f"{self._settings.prefix}.status.{name}"
             text = wire.text(subject, device.status)
-            if self._part is not None:
-                text = wire.leased(text, self._part.fleet.epoch(device.partition))
+            if (lease := self._lease(device)) is not None:
+                text = wire.leased(text, lease)
             self.outbox.put([((device.id, subject), text)])
 
     async def _beat(self) -> None:

@@ -80,6 +80,7 @@ class Fleet:
         """When this process was the node the last time, or nobody was."""
         self._begun: dict[int, int] = {}
         """The partitions whose devices are used, with the revision of the lease."""
+        self._epochs: dict[int, int] = {}
         self._shown: dict[str, Any] = {}
         self._shown_at = 0.0
         self._relay = Relay(self)
@@ -141,8 +142,19 @@ class Fleet:
         return self.leases.is_held(f"{NODE}{self.node}")
 
     def epoch(self, partition: int) -> int:
-        """The revision with which this node took the lease of a partition; 0 without it."""
-        return self._begun.get(partition, 0)
+        """The number of messages about the devices of a partition; 0 without its lease.
+
+        It is the revision of the lease when this node took it, or last connected after that.
+        """
+        return self._epochs.get(partition, 0)
+
+    def connected(self) -> None:
+        """Gives messages greater numbers than those sent over the former connection.
+
+        A server that was frozen sends what it had received before when it goes on.
+        """
+        for partition, epoch in self._epochs.items():
+            self._epochs[partition] = max(self.revision(partition), epoch)
 
     def revision(self, partition: int) -> int:
         """The latest revision of the lease of a partition that this node has; 0 without it."""
@@ -285,9 +297,10 @@ class Fleet:
         if since == self._begun.get(partition, 0):
             return
         if self._begun.pop(partition, 0):
+            del self._epochs[partition]
             self._lost(partition)
         if since:
-            self._begun[partition] = since
+            self._begun[partition] = self._epochs[partition] = since
             self._gained(partition)
         self._shown_at = 0.0
 

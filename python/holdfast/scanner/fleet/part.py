@@ -127,6 +127,8 @@ class FleetPart:
         """Sets the client; `None` while there is no connection."""
         self._client = client
         self._is_new.set()
+        if client is not None:
+            self.fleet.connected()
 
     def _withheld(self) -> str | None:
         """Why this node can't publish values; then others should have its devices."""
