@@ -11,7 +11,7 @@ import pytest
 
 import holdfast
 from support import wire
-from support.machine import needs_127_0_0_2, needs_proc
+from support.machine import needs_127_0_0_2, needs_proc, resident
 from support.running import endpoint
 
 if TYPE_CHECKING:
@@ -56,6 +56,16 @@ def test_2000_connections_are_held_and_served_at_once(
     ]
     assert is_refused(process.address)
     assert all(is_open(client) for client in clients)
+
+
+@needs_proc
+@pytest.mark.usefixtures("many_files")
+def test_an_idle_connection_costs_little_memory(server_process: Process, connect: Connect) -> None:
+    process = server_process(max_connections=800)
+    assert all(is_open(connect(process.address)) for _ in range(200))
+    before = resident(process.pid)
+    assert all(is_open(connect(process.address)) for _ in range(600))
+    assert resident(process.pid) - before < 600 * 7 * 1024
 
 
 @pytest.mark.usefixtures("many_files")

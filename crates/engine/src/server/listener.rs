@@ -339,8 +339,10 @@ pub(crate) async fn drain(
             _ = stop.wait_for(|stop| *stop) => break,
         };
         let Ok(Ok(())) = readable else { break };
-        // On the stack, because many peers may be read at the same time.
-        match stream.try_read(&mut [0; DRAIN_CHUNK]) {
+        // On the stack, because many peers may be read at the same time: in the `match`, it would be a
+        // part of every connection.
+        let read = stream.try_read(&mut [0; DRAIN_CHUNK]);
+        match read {
             Ok(0) => break,
             Ok(len) => {
                 drained += len;
