@@ -4,9 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::UNIX_EPOCH;
 
-use holdfast_journal::file::{
-    FileError, FileOnDisk, Member, MemoryFile as Core, Options, read, release,
-};
+use holdfast_journal::file::{FileError, FileOnDisk, Member, MemoryFile as Core, Options, read};
 use holdfast_memory::Area;
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
@@ -77,22 +75,12 @@ impl MemoryFile {
     }
 }
 
-/// Checks a file without changing it, and returns the memories in it, or what was cut from them.
+/// Checks a file without changing it, and returns the memories in it.
 #[pyfunction]
-#[pyo3(signature = (path, *, set_aside=false))]
-pub fn read_memory_file(
-    py: Python<'_>,
-    path: PathBuf,
-    set_aside: bool,
-) -> PyResult<Bound<'_, PyDict>> {
+pub fn read_memory_file(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyDict>> {
     let memories = py.detach(|| read(&path)).map_err(|error| raised(&path, error))?;
     let shown = PyDict::new(py);
     for kept in memories {
-        let name = match kept.set_aside_of() {
-            Some(memory) if set_aside => memory,
-            None if !set_aside => &*kept.name,
-            _ => continue,
-        };
         let areas = PyDict::new(py);
         for (area, bytes) in Area::ALL.into_iter().zip(&kept.areas) {
             let span = kept.layout.span(area);
@@ -101,16 +89,9 @@ pub fn read_memory_file(
                 areas.set_item(area.name(), values)?;
             }
         }
-        shown.set_item(name, areas)?;
+        shown.set_item(kept.name, areas)?;
     }
     Ok(shown)
-}
-
-/// Deletes what was cut from a memory and set aside in the file.
-#[pyfunction]
-pub fn release_memory_file(py: Python<'_>, path: PathBuf, memory: &str) -> PyResult<bool> {
-    let disk = Arc::new(FileOnDisk::new(&path));
-    py.detach(|| release(disk, memory)).map_err(|error| raised(&path, error))
 }
 
 fn raised(path: &Path, error: FileError) -> PyErr {

@@ -117,18 +117,14 @@ fn items(memory: &Memory) -> HashMap<(Area, u16), u16> {
     Area::ALL.into_iter().flat_map(addresses).map(value).collect()
 }
 
-/// The items of a memory, also those that it had before.
-type Past = HashMap<(Area, u16), u16>;
-
 /// What a restart makes of a memory.
-fn reopened(old: &Memory, past: &mut Past, shape: &Shape) -> Arc<Memory> {
-    past.extend(items(old));
-    let new = shape.memory();
+fn reopened(old: &Memory, shape: &Shape) -> Arc<Memory> {
+    let (new, old) = (shape.memory(), items(old));
     let closed = new.gate().filter(|gate| gate.mode == GateMode::Once);
     let mut writes = Vec::new();
     for (area, address) in items(&new).into_keys() {
         let is_gate = closed.is_some_and(|gate| (gate.area, gate.address) == (area, address));
-        if let Some(value) = past.get(&(area, address)).filter(|_| !is_gate) {
+        if let Some(value) = old.get(&(area, address)).filter(|_| !is_gate) {
             writes.push((area, address, packed(area, &[*value])));
         }
     }
@@ -213,7 +209,6 @@ proptest! {
         let mut disk = Arc::new(SimDisk::default());
         let mut model = [shapes[0].memory(), shapes[1].memory()];
         let mut kept = [shapes[0].memory(), shapes[1].memory()];
-        let mut pasts = [Past::new(), Past::new()];
         let mut file = open(&disk, &kept, sync);
         for event in &events {
             if let Event::Reopen { shapes, cleanly } = event {
@@ -223,7 +218,7 @@ proptest! {
                 }
                 disk = Arc::new(disk.power_back());
                 drop(file);
-                model = [0, 1].map(|at| reopened(&model[at], &mut pasts[at], &shapes[at]));
+                model = [reopened(&model[0], &shapes[0]), reopened(&model[1], &shapes[1])];
                 kept = [shapes[0].memory(), shapes[1].memory()];
                 file = open(&disk, &kept, sync);
             } else {
