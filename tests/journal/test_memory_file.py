@@ -208,3 +208,17 @@ def test_a_link_to_a_file_is_followed(path: Path) -> None:
     link.symlink_to(path)
     assert MemoryFile(link, [("a", Memory(coils=8))], 0).loaded == ["a"]
     assert link.is_symlink()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs symbolic links")
+def test_a_link_to_nothing_is_named(path: Path) -> None:
+    target = path.with_name("moved.redb")
+    path.symlink_to(target)
+    message = (
+        rf"memories\.redb: not a file of memories: a symbolic link to {target}, which does not"
+    )
+    with pytest.raises(OSError, match=message):
+        MemoryFile(path, [("a", Memory(coils=8))], 0)
+    with pytest.raises(OSError, match=message):
+        read_memory_file(path)
+    assert [path] == list(path.parent.iterdir())

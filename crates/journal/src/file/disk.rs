@@ -16,7 +16,8 @@ pub trait Disk: fmt::Debug + Send + Sync {
     /// The number of bytes of the file; `None` if there is no file.
     ///
     /// # Errors
-    /// [`FileError::Io`], and [`FileError::Foreign`] for a directory or a device.
+    /// [`FileError::Io`], and [`FileError::Foreign`] for a directory, a device, or a symbolic link to
+    /// nothing.
     fn size(&self) -> Result<Option<u64>, FileError>;
 
     /// Opens the file, which exists.
@@ -126,7 +127,17 @@ impl Disk for FileOnDisk {
     fn size(&self) -> Result<Option<u64>, FileError> {
         let found = match fs::metadata(&self.path) {
             Ok(found) => found,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                // A new file here would be empty, in the place of one that was moved or is not mounted.
+                return match fs::read_link(&self.path) {
+                    Ok(target) => Err(FileError::Foreign(format!(
+                        "a symbolic link to {}, which does not exist. Put that file back; to start \
+                         without its contents, remove the link",
+                        target.display()
+                    ))),
+                    Err(_) => Ok(None),
+                };
+            }
             Err(error) => return Err(error.into()),
         };
         if !found.is_file() {
