@@ -110,6 +110,27 @@ def test_addresses_that_remain_keep_their_values(
     assert any("holding_registers" in each["warning"] for each in told)
 
 
+def test_values_of_an_area_that_is_gone_for_one_start_come_back(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = keeping(coils=8)
+    with Appliance(config(tmp_path, plant=whole)) as first:
+        first.memories["plant"].write("holding_registers", 0, range(100))
+        first.memories["plant"].write("coils", 3, [1])
+    for _ in range(2):
+        caplog.clear()
+        with Appliance(config(tmp_path, plant=keeping(holding_registers=10))) as second:
+            second.memories["plant"].write("holding_registers", 9, [77])
+        fields = [vars(each)["fields"] for each in caplog.records]
+        warnings = [each["warning"] for each in fields if "warning" in each]
+        assert "set aside in the file: coils 0-7, holding_registers 10-99" in warnings[-1]
+        assert "'holdfast memory release' deletes them" in warnings[-1]
+    with Appliance(config(tmp_path, plant=whole)) as third:
+        memory = third.memories["plant"]
+        assert memory.read("holding_registers", 0, 100) == [*range(9), 77, *range(10, 100)]
+        assert memory.read("coils", 0, 8) == [0, 0, 0, 1, 0, 0, 0, 0]
+
+
 def test_memories_in_one_file_are_written_in_one_step(tmp_path: Path) -> None:
     both = {"one": keeping(), "plant": keeping(), "alone": keeping(file="alone.redb")}
     with Appliance(config(tmp_path, **both)) as appliance:

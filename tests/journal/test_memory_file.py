@@ -84,7 +84,9 @@ def test_a_resized_area_is_a_warning(path: Path) -> None:
     file = MemoryFile(path, [("plant", Memory(holding_registers=(200, 300), coils=9))], 0)
     assert file.warnings == [
         "plant: holding_registers had addresses 100-399 and now has addresses 200-499: "
-        "addresses 200-399 are kept",
+        "addresses 200-399 are kept, addresses 100-199 are set aside",
+        "plant: set aside in the file: holding_registers 100-199. Their values come back when the "
+        "memory has these addresses again; 'holdfast memory release' deletes them",
         "gone: is in the file but not configured, and stays there",
     ]
 

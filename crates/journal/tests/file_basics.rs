@@ -5,7 +5,9 @@ mod support;
 use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_journal::file::{Disk, FileError, FileOnDisk, MemoryFile, Options};
+use holdfast_journal::file::{
+    Disk, FileError, FileOnDisk, MemoryFile, Options, read_from, release,
+};
 use holdfast_memory::{
     Access, Area, Gate, GateMode, Layout, Memory, Refusal, Span, Write, write_across,
 };
@@ -292,15 +294,107 @@ fn a_resized_area_keeps_the_addresses_of_both() {
         }
         assert_eq!(*contents(&one).areas[0], [0b10100]);
         let expected = [
-            "one: coils had addresses 3-42 and now has addresses 10-14: addresses 10-14 are kept",
+            "one: coils had addresses 3-42 and now has addresses 10-14: addresses 10-14 are kept, \
+             addresses 3-9 and 15-42 are set aside",
             "one: discrete_inputs had no addresses and now has addresses 0-7: no address is kept",
             "one: holding_registers had addresses 100-149 and now has addresses 120-1119: \
-             addresses 120-149 are kept",
-            "one: input_registers had addresses 0-3 and now has no addresses: no address is kept",
+             addresses 120-149 are kept, addresses 100-119 are set aside",
+            "one: input_registers had addresses 0-3 and now has no addresses: no address is kept, \
+             addresses 0-3 are set aside",
+            "one: set aside in the file: coils 3-9 and 15-42, holding_registers 100-119, \
+             input_registers 0-3. Their values come back when the memory has these addresses \
+             again; 'holdfast memory release' deletes them",
         ];
-        assert_eq!(file.warnings(), if round == 0 { &expected[..] } else { &[] });
+        assert_eq!(file.warnings(), &expected[if round == 0 { 0 } else { 4 }..]);
         file.stop().unwrap();
     }
+}
+
+#[test]
+fn what_was_cut_comes_back_with_its_addresses() {
+    let disk = Arc::new(SimDisk::default());
+    let whole = layout(40, 600);
+    let one = memory(whole, None);
+    let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+    for address in 0..600 {
+        set(&one, address, address + 1).unwrap();
+    }
+    let coils = Write { area: Area::Coils, address: 0, count: 40, bytes: &[0xff; 5] };
+    one.write(Access::Ingest, coils).unwrap();
+    file.stop().unwrap();
+    let expected = contents(&one);
+    // Each start lacks something else, and the last one lacks everything.
+    let span = |start, size| Span::new(start, size).unwrap();
+    let part =
+        |coils, registers| Layout::default().with(Area::Coils, coils).with(REGISTERS, registers);
+    for other in [
+        part(span(3, 9), span(0, 100)),
+        part(span(0, 40), span(500, 100)),
+        part(span(20, 20), span(200, 10)),
+        part(span(0, 0), span(0, 0)),
+    ] {
+        keep(&disk, &[("one", &memory(other, None))], at_once()).unwrap();
+    }
+    let again = memory(whole, None);
+    let file = keep(&disk, &[("one", &again)], at_once()).unwrap();
+    assert_eq!(contents(&again), expected);
+    let back = "had no addresses and now has addresses 0-39: no address is kept, \
+                addresses 0-39 are back";
+    assert!(file.warnings()[0].ends_with(back), "{:?}", file.warnings());
+    assert_eq!(file.warnings().len(), 2, "nothing is set aside any more");
+    file.stop().unwrap();
+    let file = keep(&disk, &[("one", &memory(whole, None))], at_once()).unwrap();
+    assert!(file.warnings().is_empty());
+    file.stop().unwrap();
+    assert_eq!(read_from(&*disk).unwrap().len(), 1);
+}
+
+#[test]
+fn what_comes_back_is_as_new_as_the_cut() {
+    let disk = Arc::new(SimDisk::default());
+    for (registers, value) in [(10, 1), (5, 0), (10, 2), (5, 0), (10, 3)] {
+        let one = memory(layout(0, registers), None);
+        let _file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+        if value > 0 {
+            assert_eq!(get(&one, 9), value - 1);
+            set(&one, 9, value).unwrap();
+        }
+    }
+}
+
+#[test]
+fn a_seal_that_comes_back_is_closed() {
+    let disk = Arc::new(SimDisk::default());
+    let gate = Gate { area: Area::Coils, address: 9, mode: GateMode::Once };
+    let one = memory(layout(10, 10), Some(gate));
+    let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+    let open = Write { area: Area::Coils, address: 8, count: 2, bytes: &[3] };
+    one.write(Access::Ingest, open).unwrap();
+    assert!(!one.sealed());
+    file.stop().unwrap();
+    keep(&disk, &[("one", &memory(layout(0, 10), None))], at_once()).unwrap();
+    let again = memory(layout(10, 10), Some(gate));
+    keep(&disk, &[("one", &again)], at_once()).unwrap();
+    assert!(again.sealed());
+    assert_eq!(contents(&again).areas[0][1], 1, "the gate bit is 0, the one before it came back");
+}
+
+#[test]
+fn what_was_cut_is_deleted_when_it_is_released() {
+    let disk = Arc::new(SimDisk::default());
+    assert!(matches!(release(Arc::clone(&disk) as _, "one"), Err(FileError::Io(_))));
+    let (one, two) = (memory(layout(0, 10), None), memory(layout(0, 10), None));
+    let file = keep(&disk, &[("one", &one), ("two", &two)], at_once()).unwrap();
+    set(&one, 9, 1).unwrap();
+    set(&two, 9, 2).unwrap();
+    file.stop().unwrap();
+    let small = || memory(layout(0, 5), None);
+    keep(&disk, &[("one", &small()), ("two", &small())], at_once()).unwrap();
+    assert!(release(Arc::clone(&disk) as _, "one").unwrap());
+    assert!(!release(Arc::clone(&disk) as _, "one").unwrap());
+    let (one, two) = (memory(layout(0, 10), None), memory(layout(0, 10), None));
+    keep(&disk, &[("one", &one), ("two", &two)], at_once()).unwrap();
+    assert_eq!((get(&one, 9), get(&two, 9)), (0, 2));
 }
 
 #[test]
@@ -339,6 +433,9 @@ fn memories_that_cannot_be_kept_together_are_refused() {
         let error = keep(&disk, &members, at_once()).unwrap_err();
         assert!(matches!(error, FileError::Memories(_)), "{error}");
     }
+    let error = keep(&disk, &[("a:set-aside", &one)], at_once()).unwrap_err();
+    let expected = "memory a:set-aside: :set-aside at the end of a name is not allowed";
+    assert_eq!(error.to_string(), expected);
     let _file = keep(&disk, &[("a", &one)], at_once()).unwrap();
     let other = Arc::new(SimDisk::default());
     let error = keep(&other, &[("a", &one)], at_once()).unwrap_err();

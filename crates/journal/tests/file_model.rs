@@ -117,14 +117,18 @@ fn items(memory: &Memory) -> HashMap<(Area, u16), u16> {
     Area::ALL.into_iter().flat_map(addresses).map(value).collect()
 }
 
+/// The items of a memory, also those that it had before.
+type Past = HashMap<(Area, u16), u16>;
+
 /// What a restart makes of a memory.
-fn reopened(old: &Memory, shape: &Shape) -> Arc<Memory> {
-    let (new, old) = (shape.memory(), items(old));
+fn reopened(old: &Memory, past: &mut Past, shape: &Shape) -> Arc<Memory> {
+    past.extend(items(old));
+    let new = shape.memory();
     let closed = new.gate().filter(|gate| gate.mode == GateMode::Once);
     let mut writes = Vec::new();
     for (area, address) in items(&new).into_keys() {
         let is_gate = closed.is_some_and(|gate| (gate.area, gate.address) == (area, address));
-        if let Some(value) = old.get(&(area, address)).filter(|_| !is_gate) {
+        if let Some(value) = past.get(&(area, address)).filter(|_| !is_gate) {
             writes.push((area, address, packed(area, &[*value])));
         }
     }
@@ -187,7 +191,7 @@ fn event() -> impl Strategy<Value = Event> {
         2 => (client, prop::collection::vec(part, 1..4)).prop_map(
             |(client, parts)| Event::Across { client, parts }
         ),
-        1 => (shape(), shape(), any::<bool>()).prop_map(
+        3 => (shape(), shape(), any::<bool>()).prop_map(
             |(one, two, cleanly)| Event::Reopen { shapes: [one, two], cleanly }
         ),
     ]
@@ -209,6 +213,7 @@ proptest! {
         let mut disk = Arc::new(SimDisk::default());
         let mut model = [shapes[0].memory(), shapes[1].memory()];
         let mut kept = [shapes[0].memory(), shapes[1].memory()];
+        let mut pasts = [Past::new(), Past::new()];
         let mut file = open(&disk, &kept, sync);
         for event in &events {
             if let Event::Reopen { shapes, cleanly } = event {
@@ -218,7 +223,7 @@ proptest! {
                 }
                 disk = Arc::new(disk.power_back());
                 drop(file);
-                model = [reopened(&model[0], &shapes[0]), reopened(&model[1], &shapes[1])];
+                model = [0, 1].map(|at| reopened(&model[at], &mut pasts[at], &shapes[at]));
                 kept = [shapes[0].memory(), shapes[1].memory()];
                 file = open(&disk, &kept, sync);
             } else {

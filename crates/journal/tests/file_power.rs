@@ -11,7 +11,7 @@ use holdfast_memory::{
     write_across,
 };
 use support::sim::SimDisk;
-use support::{REGISTERS, Random, at_once, keep, layout, memory, rounds, until};
+use support::{REGISTERS, Random, at_once, contents, keep, layout, memory, rounds, set, until};
 
 const COUNT: u64 = 400;
 
@@ -211,5 +211,27 @@ fn syncs_that_fail_and_forget_lose_nothing_that_was_acknowledged() {
         let file = open(&disk, &last);
         assert!(file.is_some(), "seed {seed}: {:?}", read_from(&*disk).map(drop));
         assert!(possible.contains(&all(&last)), "seed {seed}: other contents");
+    }
+}
+
+#[test]
+fn a_power_cut_at_a_start_with_smaller_areas_loses_nothing() {
+    for seed in 0..rounds(60, 2000) {
+        let mut random = Random(seed);
+        let disk = Arc::new(SimDisk::default());
+        let whole = || memory(layout(200, COUNT as u32), None);
+        let before = whole();
+        let file = keep(&disk, &[("one", &before)], at_once()).unwrap();
+        for address in 0..COUNT as u16 {
+            set(&before, address, address + 1).unwrap();
+        }
+        file.stop().unwrap();
+        disk.cut_after(random.below(60), random.below(u64::MAX));
+        // Perhaps it fails; perhaps the power fails after it.
+        drop(keep(&disk, &[("one", &memory(layout(0, 7), None))], at_once()));
+        let disk = Arc::new(disk.power_back());
+        let after = whole();
+        keep(&disk, &[("one", &after)], at_once()).unwrap();
+        assert_eq!(contents(&after), contents(&before), "seed {seed}");
     }
 }

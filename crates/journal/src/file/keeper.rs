@@ -13,7 +13,7 @@ use holdfast_memory::{Contents, GateMode, Memory};
 
 use super::disk::Disk;
 use super::error::FileError;
-use super::image::{Changes, Image, Kept, layout_of};
+use super::image::{Changes, Image, Kept, SET_ASIDE, layout_of};
 use super::periodic::{Periodic, writes};
 use super::queue::{Queue, QueueLimits};
 use super::status::Status;
@@ -86,14 +86,15 @@ impl MemoryFile {
         let (mut loaded, mut warnings) = (Vec::new(), Vec::new());
         for Member { name, memory } in &members {
             if let Some(kept) = store.image().named(name) {
-                warnings.extend(kept.resizings(layout_of(memory)));
-                memory.restore(&sealed_again(kept, memory));
+                let set_aside = store.image().set_aside_of(name);
+                warnings.extend(kept.resizings(set_aside, layout_of(memory)));
+                memory.restore(&sealed_again(&kept.with(set_aside), memory));
                 loaded.push(name.clone());
             }
         }
         for kept in store.image().memories() {
-            if members.iter().all(|member| member.name != kept.name) {
-                let name = &kept.name;
+            let name = &kept.name;
+            if kept.set_aside_of().is_none() && members.iter().all(|member| member.name != *name) {
                 warnings
                     .push(format!("{name}: is in the file but not configured, and stays there"));
             }
@@ -222,6 +223,10 @@ fn check(members: &[Member]) -> Result<(), FileError> {
         if twice {
             return Err(FileError::Memories(format!("memory {name} is given twice")));
         }
+        if name.ends_with(SET_ASIDE) {
+            let text = format!("memory {name}: {SET_ASIDE} at the end of a name is not allowed");
+            return Err(FileError::Memories(text));
+        }
         if memory.has_journal() {
             return Err(FileError::Memories(format!("memory {name} is kept elsewhere already")));
         }
@@ -253,16 +258,27 @@ fn first_changes(image: &Image, members: &[Member]) -> Result<(Changes, Vec<u16>
     let mut free = image.free_ids();
     for (Member { name, memory }, contents) in members.iter().zip(Memory::contents(&memories)) {
         let (kept, layout) = (image.named(name), layout_of(memory));
-        let id = kept.map(|kept| kept.id).or_else(|| free.next()).ok_or_else(|| {
-            FileError::Memories(format!("no place for memory {name}: the file has 65536 memories"))
-        })?;
+        let mut id_of = |kept: Option<&Kept>| {
+            kept.map(|kept| kept.id).or_else(|| free.next()).ok_or_else(|| {
+                let text = format!("no place for memory {name}: the file has 65536 memories");
+                FileError::Memories(text)
+            })
+        };
+        let id = id_of(kept)?;
+        ids.push(id);
         if kept.is_some_and(|kept| kept.layout == layout) {
             changes.pages.extend(image.differing(id, &contents));
-        } else {
-            let areas = contents.areas;
-            changes.memories.push(Kept { name: name.clone(), id, layout, areas });
+            continue;
         }
-        ids.push(id);
+        if let Some(kept) = kept {
+            let set_aside = image.set_aside_of(name);
+            match kept.cut(set_aside, layout, 0) {
+                Some(cut) => changes.memories.push(Kept { id: id_of(set_aside)?, ..cut }),
+                None => changes.removed.extend(set_aside.map(|old| (old.name.clone(), old.id))),
+            }
+        }
+        let areas = contents.areas;
+        changes.memories.push(Kept { name: name.clone(), id, layout, areas });
     }
     Ok((changes, ids))
 }

@@ -6,6 +6,8 @@
 //!   steps, and several memories in one.
 //! * With `sync` 0, a step is answered after the transaction that stores it, and the memories change
 //!   between the two. A step that can't be stored changes nothing.
+//! * What the layout of a memory lacks at a start is set aside in the same transaction, as a record of
+//!   its own, until the layout has it again or it is released.
 //! * Nobody knows what an I/O error leaves on the disk. So the next transaction writes a new file and
 //!   puts it in the place of the old one.
 //! * A file that is not entirely as it was stored is refused, and not changed. It is never replaced by
@@ -23,6 +25,7 @@ mod steps;
 mod store;
 
 use std::path::Path;
+use std::sync::Arc;
 
 pub use disk::{Disk, FileOnDisk};
 pub use error::FileError;
@@ -32,7 +35,8 @@ pub use overlay::Overlay;
 pub use status::Status;
 pub use store::VERSION;
 
-/// Checks a file and returns what it contains, without changing it.
+/// Checks a file and returns what it contains, without changing it: memories, and what was cut from
+/// them ([`Kept::set_aside_of`]).
 ///
 /// # Errors
 /// As [`MemoryFile::open`], and [`FileError::Io`] for a file that does not exist.
@@ -49,4 +53,21 @@ pub fn read_from(disk: &dyn Disk) -> Result<Vec<Kept>, FileError> {
         Some(len) => Ok(store::inspect(disk, len)?.into_memories()),
         None => Err(FileError::Io(std::io::ErrorKind::NotFound.into())),
     }
+}
+
+/// Deletes what was cut from a memory and set aside in the file. Returns whether there was anything.
+///
+/// # Errors
+/// As [`read`].
+pub fn release(disk: Arc<dyn Disk>, memory: &str) -> Result<bool, FileError> {
+    if disk.size()?.is_none() {
+        return Err(FileError::Io(std::io::ErrorKind::NotFound.into()));
+    }
+    let mut store = store::Store::open(disk, Arc::default())?;
+    let set_aside = store.image().set_aside_of(memory);
+    let removed: Vec<_> = set_aside.map(|kept| (kept.name.clone(), kept.id)).into_iter().collect();
+    let was = !removed.is_empty();
+    store.store(image::Changes { removed, ..image::Changes::default() })?;
+    store.close()?;
+    Ok(was)
 }

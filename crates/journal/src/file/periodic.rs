@@ -43,7 +43,7 @@ impl Periodic {
         let contents = Memory::contents(&self.memories);
         let pages = self.ids.iter().zip(&contents);
         let pages = pages.flat_map(|(id, contents)| image.differing(*id, contents)).collect();
-        self.store.store(Changes { memories: Vec::new(), pages })?;
+        self.store.store(Changes { pages, ..Changes::default() })?;
         self.stored.store(written, Ordering::Relaxed);
         Ok(())
     }

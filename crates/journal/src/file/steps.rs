@@ -64,7 +64,7 @@ impl Steps {
             outcomes.push(outcome);
         }
         let pages = touched.into_iter().filter_map(|place| self.changed(place)).collect();
-        if self.store.store(Changes { memories: Vec::new(), pages }).is_err() {
+        if self.store.store(Changes { pages, ..Changes::default() }).is_err() {
             self.restore_shadows();
             return self.queue.refuse(steps.into_iter().map(|(_, done)| done), Refusal::NotStored);
         }

@@ -163,7 +163,7 @@ fn create_beside(disk: &dyn Disk, image: &Image, replace: bool) -> Result<Databa
     let transaction = database.begin_write()?;
     transaction.open_table(ABOUT)?.insert(FORMAT, VERSION)?;
     let memories = image.memories().to_vec();
-    write(&transaction, &Changes { memories, pages: Vec::new() })?;
+    write(&transaction, &Changes { memories, ..Changes::default() })?;
     transaction.commit()?;
     disk.install(replace)?;
     Ok(database)
@@ -172,6 +172,10 @@ fn create_beside(disk: &dyn Disk, image: &Image, replace: bool) -> Result<Databa
 fn write(transaction: &WriteTransaction, changes: &Changes) -> Result<(), FileError> {
     let mut records = transaction.open_table(MEMORIES)?;
     let mut pages = transaction.open_table(PAGES)?;
+    for (name, id) in &changes.removed {
+        records.remove(&**name)?;
+        pages.retain_in((*id, 0, 0)..=(*id, u8::MAX, u16::MAX), |_, _| false)?;
+    }
     for kept in &changes.memories {
         let record = image::encode(kept.id, kept.layout);
         records.insert(&*kept.name, &*with_checksum(kept.name.as_bytes(), &record))?;
