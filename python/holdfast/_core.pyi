@@ -69,6 +69,7 @@ __all__ = [
     "pack_raw_ingest",
     "plan_blocks",
     "read_memory_file",
+    "release_memory_file",
     "tell_disabled",
     "write_across",
 ]
@@ -234,13 +235,21 @@ class MemoryFile:
         """How storing goes."""
 
 def read_memory_file(
-    path: str | PathLike[str],
+    path: str | PathLike[str], *, set_aside: bool = False
 ) -> dict[str, dict[Area, tuple[int, int, bytes]]]:
     """Checks a file without changing it, and returns the areas of its memories.
+
+    With `set_aside`, returns what was cut from them instead.
 
     An area is its first address, its size, and its bytes. Registers are big-endian; bits are
     packed, least significant bit first, and the last byte is padded with 0. Raises the `OSError`s
     of `MemoryFile`.
+    """
+
+def release_memory_file(path: str | PathLike[str], memory: str) -> bool:
+    """Deletes what was cut from a memory of the file. Returns whether there was anything.
+
+    Raises the `OSError`s of `MemoryFile`.
     """
 
 @final

@@ -32,6 +32,14 @@ def keep(path: Path, **memories: list[int]) -> None:
     kept.stop()
 
 
+def cut(path: Path | str, **memories: holdfast.Memory) -> list[str]:
+    """Starts once with memories of other sizes, and returns the warnings."""
+    kept = MemoryFile(path, list(memories.items()), 0)
+    kept.start()
+    kept.stop()
+    return kept.warnings
+
+
 def registers(path: str, memory: str = "plant") -> list[int]:
     loaded = holdfast.Memory(coils=10, holding_registers=(50, 20))
     MemoryFile(path, [(memory, loaded)], 1).stop()
@@ -45,7 +53,8 @@ def test_a_file_is_verified(file: str) -> None:
         "plant: holding_registers 50 to 69, 2 not 0",
     ]
     areas = {"coils": {"start": 0, "size": 10}, "holding_registers": {"start": 50, "size": 20}}
-    assert answer("memory", "verify", file) == {"file": file, "memories": {"plant": areas}}
+    shown = {"file": file, "memories": {"plant": areas}, "set_aside": {}}
+    assert answer("memory", "verify", file) == shown
 
 
 def test_a_damaged_file_is_named(file: str, tmp_path: Path) -> None:
@@ -131,3 +140,49 @@ def test_with_several_memories_one_is_named(tmp_path: Path) -> None:
 def test_a_form_is_chosen_by_its_ending(file: str, tmp_path: Path) -> None:
     message = usage_error("memory", "export", file, "--output", str(tmp_path / "v.txt"))
     assert message.endswith("found v.txt, allowed: a file with one of .csv, .yaml, .yml")
+
+
+def test_values_that_were_cut_can_be_exported_and_released(file: str) -> None:
+    cut(file, plant=holdfast.Memory(holding_registers=(50, 11)))
+    assert done("memory", "verify", file) == [
+        "intact",
+        "plant: holding_registers 50 to 60, 1 not 0",
+        "set aside of plant: coils 0 to 9, 1 not 0",
+        "set aside of plant: holding_registers 61 to 69, 1 not 0",
+    ]
+    assert answer("memory", "verify", file)["set_aside"] == {
+        "plant": {"coils": {"start": 0, "size": 10}, "holding_registers": {"start": 61, "size": 9}}
+    }
+    header = "area,address,value"
+    assert done("memory", "export", file) == [header, "holding_registers,60,7"]
+    before = [header, "coils,9,1", "holding_registers,62,8"]
+    assert done("memory", "export", file, "--set-aside") == before
+    assert done("memory", "release", file) == [
+        "released of plant: coils 0 to 9, 1 not 0",
+        "released of plant: holding_registers 61 to 69, 1 not 0",
+    ]
+    assert done("memory", "release", file) == [f"{file}: no values are set aside"]
+    assert done("memory", "export", file, "--set-aside") == [header]
+    assert registers(file) == [7, 0, 0, 0]
+
+
+def test_values_of_one_memory_are_released(tmp_path: Path) -> None:
+    path = tmp_path / "two.redb"
+    keep(path, first=[1, 2, 3], second=[4, 5, 6])
+    cut(path, first=holdfast.Memory(coils=10), second=holdfast.Memory(coils=10))
+    file = str(path)
+    assert usage_error("memory", "release", file).endswith("add --memory: first, second")
+    assert "has no memory 'thrid'" in usage_error("memory", "release", file, "--memory", "thrid")
+    done("memory", "release", file, "--memory", "first")
+    assert registers(file, "first") == [0, 0, 0, 1]
+    assert registers(file, "second") == [4, 5, 6, 1]
+
+
+def test_values_of_a_file_in_use_are_not_released(file: str) -> None:
+    cut(file, plant=holdfast.Memory(coils=10))
+    used = MemoryFile(file, [("plant", holdfast.Memory(coils=10))], 0)
+    result = invoke("memory", "release", file)
+    assert result.exit_code == 2
+    assert "in use by another process" in result.stderr
+    used.stop()
+    assert registers(file) == [7, 0, 8, 1]

@@ -54,7 +54,7 @@ mod _core {
     #[pymodule_export]
     use super::memory::{Memory, OutOfRange};
     #[pymodule_export]
-    use super::memory_file::{MemoryFile, read_memory_file};
+    use super::memory_file::{MemoryFile, read_memory_file, release_memory_file};
     #[pymodule_export]
     use super::poller::{PolledDevice, Poller, Results, plan_blocks, tell_disabled};
     #[pymodule_export]

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::UNIX_EPOCH;
 
-use holdfast_journal::file::{FileError, FileOnDisk, Member, MemoryFile as Core, Options, read};
+use holdfast_journal::file::{
+    FileError, FileOnDisk, Member, MemoryFile as Core, Options, read, release,
+};
 use holdfast_memory::Area;
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
@@ -75,12 +77,22 @@ impl MemoryFile {
     }
 }
 
-/// Checks a file without changing it, and returns the memories in it.
+/// Checks a file without changing it, and returns the memories in it, or what was cut from them.
 #[pyfunction]
-pub fn read_memory_file(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyDict>> {
+#[pyo3(signature = (path, *, set_aside=false))]
+pub fn read_memory_file(
+    py: Python<'_>,
+    path: PathBuf,
+    set_aside: bool,
+) -> PyResult<Bound<'_, PyDict>> {
     let memories = py.detach(|| read(&path)).map_err(|error| raised(&path, error))?;
     let shown = PyDict::new(py);
     for kept in memories {
+        let name = match kept.set_aside_of() {
+            Some(memory) if set_aside => memory,
+            None if !set_aside => &*kept.name,
+            _ => continue,
+        };
         let areas = PyDict::new(py);
         for (area, bytes) in Area::ALL.into_iter().zip(&kept.areas) {
             let span = kept.layout.span(area);
@@ -89,9 +101,16 @@ pub fn read_memory_file(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyD
                 areas.set_item(area.name(), values)?;
             }
         }
-        shown.set_item(kept.name, areas)?;
+        shown.set_item(name, areas)?;
     }
     Ok(shown)
+}
+
+/// Deletes what was cut from a memory and set aside in the file.
+#[pyfunction]
+pub fn release_memory_file(py: Python<'_>, path: PathBuf, memory: &str) -> PyResult<bool> {
+    let disk = Arc::new(FileOnDisk::new(&path));
+    py.detach(|| release(disk, memory)).map_err(|error| raised(&path, error))
 }
 
 fn raised(path: &Path, error: FileError) -> PyErr {

@@ -28,7 +28,7 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 
 @click.group(cls=SuggestingGroup, epilog="Example: holdfast memory verify setpoints.redb")
 def memory() -> None:
-    """Verify, export and import files that keep memories.
+    """Verify, export, import and release the contents of files that keep memories.
 
     A file is in use while the appliance runs: stop it first, or work on a copy.
     """
@@ -45,23 +45,16 @@ def _of_memory(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object for programs.")
 def verify(file: Path, as_json: bool) -> None:
     """Check every page of FILE, and list its memories. Exit code 2: the file is not usable."""
-    found = _contents(file)
+    found, set_aside = _contents(file), _contents(file, set_aside=True)
     if as_json:
-        shown = {
-            name: {
-                area: {"start": kept.start, "size": len(kept.values)}
-                for area, kept in areas.items()
-            }
-            for name, areas in found.items()
-        }
-        click.echo(json.dumps({"file": str(file), "memories": shown}, indent=2))
+        shown = {"memories": _places(found), "set_aside": _places(set_aside)}
+        click.echo(json.dumps({"file": str(file), **shown}, indent=2))
         return
     click.echo("intact")
     for name, areas in found.items():
-        for area, kept in areas.items():
-            set_ = sum(map(bool, kept.values))
-            last = kept.addresses.stop - 1
-            click.echo(f"{name}: {area} {kept.start} to {last}, {set_:,} not 0")
+        _show(name, areas)
+    for name, areas in set_aside.items():
+        _show(f"set aside of {name}", areas)
 
 
 @memory.command(epilog="Example: holdfast memory export setpoints.redb --output setpoints.csv")
@@ -74,10 +67,14 @@ def verify(file: Path, as_json: bool) -> None:
     help="A .csv, .yaml or .yml file. Default: CSV on standard output.",
 )
 @click.option("--zeros", is_flag=True, help="Include values that are 0.")
-def export(file: Path, name: str | None, output: Path | None, zeros: bool) -> None:
+@click.option(
+    "--set-aside", is_flag=True, help="Print the values at addresses that were cut instead."
+)
+def export(file: Path, name: str | None, output: Path | None, zeros: bool, set_aside: bool) -> None:
     """Print the values of a memory in FILE, in the format of `initial`."""
     kind = ".csv" if output is None else _kind(output)
-    areas = _chosen(_contents(file), name, file)
+    found = _contents(file, set_aside=set_aside)
+    areas = {} if set_aside and not found else _chosen(found, name, file)
     lines = memory_file.csv_lines if kind == ".csv" else memory_file.yaml_lines
     text = "".join(f"{line}\n" for line in lines(areas, zeros=zeros))
     if output is None:
@@ -119,11 +116,48 @@ def import_(file: Path, values: Path, name: str | None, merge: bool) -> None:
     click.echo(f"{chosen}: {count:,} values stored in {file}")
 
 
-def _contents(file: Path) -> dict[str, dict[Area, KeptArea]]:
+@memory.command(epilog="Example: holdfast memory release setpoints.redb")
+@click.argument("file", type=FILE)
+@_of_memory
+def release(file: Path, name: str | None) -> None:
+    """Delete the values in FILE that were set aside, for good.
+
+    They are at addresses that the memory had before, and does not have in the configuration of the
+    last start. `holdfast memory export --set-aside` prints them.
+    """
+    found = _contents(file, set_aside=True)
+    if not found:
+        click.echo(f"{file}: no values are set aside")
+        return
+    areas = _chosen(found, name, file)
+    chosen = next(each for each, kept in found.items() if kept is areas)
     try:
-        return memory_file.contents(file)
+        memory_file.release(file, chosen)
     except OSError as error:
         _fail(str(error))
+    _show(f"released of {chosen}", areas)
+
+
+def _contents(file: Path, *, set_aside: bool = False) -> dict[str, dict[Area, KeptArea]]:
+    try:
+        return memory_file.contents(file, set_aside=set_aside)
+    except OSError as error:
+        _fail(str(error))
+
+
+def _places(found: dict[str, dict[Area, KeptArea]]) -> dict[str, dict[Area, dict[str, int]]]:
+    return {
+        name: {
+            area: {"start": kept.start, "size": len(kept.values)} for area, kept in areas.items()
+        }
+        for name, areas in found.items()
+    }
+
+
+def _show(name: str, areas: dict[Area, KeptArea]) -> None:
+    for area, kept in areas.items():
+        set_ = sum(map(bool, kept.values))
+        click.echo(f"{name}: {area} {kept.start} to {kept.addresses.stop - 1}, {set_:,} not 0")
 
 
 def _chosen(

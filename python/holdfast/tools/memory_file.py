@@ -27,14 +27,18 @@ class KeptArea(NamedTuple):
         return range(self.start, self.start + len(self.values))
 
 
-def contents(file: Path) -> dict[str, dict[Area, KeptArea]]:
-    """The areas of each memory in a file, after a check of the whole file. Raises `OSError`."""
+def contents(file: Path, *, set_aside: bool = False) -> dict[str, dict[Area, KeptArea]]:
+    """The areas of each memory in a file, after a check of the whole file. Raises `OSError`.
+
+    With `set_aside`, what was cut from them because their configuration had other areas.
+    """
+    found = _core.read_memory_file(str(file), set_aside=set_aside)
     return {
         name: {
             area: KeptArea(start, _values(area, size, data))
             for area, (start, size, data) in areas.items()
         }
-        for name, areas in _core.read_memory_file(str(file)).items()
+        for name, areas in found.items()
     }
 
 
@@ -58,6 +62,11 @@ def replace(file: Path, memory: str, runs: Iterable[InitialRun], *, merge: bool)
         opened.start()
     finally:
         opened.stop()
+
+
+def release(file: Path, memory: str) -> None:
+    """Deletes what is set aside of a memory of the file. Raises `OSError`."""
+    _core.release_memory_file(str(file), memory)
 
 
 def csv_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]:
