@@ -21,6 +21,9 @@ pub enum FileError {
     Newer { found: u64, allowed: u64 },
     #[error("{0}")]
     Io(#[from] io::Error),
+    /// The file does not fit the log of its memories.
+    #[error("{0}")]
+    OfLog(String),
     /// The memories can't be kept in one file.
     #[error("{0}")]
     Memories(String),

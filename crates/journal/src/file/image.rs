@@ -39,11 +39,16 @@ pub(super) struct Changes {
     pub pages: Vec<Page>,
     /// The names and numbers of what the file does not contain any more.
     pub removed: Vec<(String, u16)>,
+    /// Another note of the log, or none any more.
+    pub note: Option<Option<Vec<u8>>>,
 }
 
 impl Changes {
     pub fn is_empty(&self) -> bool {
-        self.memories.is_empty() && self.pages.is_empty() && self.removed.is_empty()
+        self.memories.is_empty()
+            && self.pages.is_empty()
+            && self.removed.is_empty()
+            && self.note.is_none()
     }
 }
 
@@ -51,6 +56,7 @@ impl Changes {
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Image {
     memories: Vec<Kept>,
+    note: Option<Vec<u8>>,
 }
 
 impl Kept {
@@ -168,8 +174,13 @@ impl Kept {
 }
 
 impl Image {
-    pub fn new(memories: Vec<Kept>) -> Image {
-        Image { memories }
+    pub fn new(memories: Vec<Kept>, note: Option<Vec<u8>>) -> Image {
+        Image { memories, note }
+    }
+
+    /// What the log has noted that the contents come from.
+    pub fn note(&self) -> Option<&Vec<u8>> {
+        self.note.as_ref()
     }
 
     pub fn memories(&self) -> &[Kept] {
@@ -208,6 +219,9 @@ impl Image {
 
     pub fn apply(&mut self, changes: Changes) {
         self.memories.retain(|kept| changes.removed.iter().all(|(name, _)| *name != kept.name));
+        if let Some(note) = changes.note {
+            self.note = note;
+        }
         for new in changes.memories {
             match self.memories.iter_mut().find(|kept| kept.id == new.id) {
                 Some(kept) => *kept = new,

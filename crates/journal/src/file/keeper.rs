@@ -14,7 +14,7 @@ use holdfast_memory::{Contents, GateMode, Memory};
 use super::disk::Disk;
 use super::error::FileError;
 use super::image::{Changes, Image, Kept, SET_ASIDE, layout_of};
-use super::periodic::{Periodic, writes};
+use super::periodic::{Periodic, Source, writes};
 use super::queue::{Queue, QueueLimits};
 use super::status::Status;
 use super::steps::Steps;
@@ -52,6 +52,8 @@ pub struct MemoryFile {
     options: Options,
     loaded: Vec<String>,
     warnings: Vec<String>,
+    /// What the log had noted when the file was opened.
+    note: Option<Vec<u8>>,
     queue: Arc<Queue>,
     status: Arc<Mutex<Status>>,
     /// How many writes to the memories are in the file, with a `sync` above 0.
@@ -80,17 +82,47 @@ impl MemoryFile {
         members: Vec<Member>,
         options: Options,
     ) -> Result<MemoryFile, FileError> {
+        MemoryFile::load(disk, members, options, false)
+    }
+
+    /// As [`MemoryFile::open`], for all memories of a log. Whether they are sealed is in the note.
+    ///
+    /// # Errors
+    /// As [`MemoryFile::open`], and [`FileError::OfLog`] for contents that are not of a log.
+    pub fn open_of_log(
+        disk: Arc<dyn Disk>,
+        mut members: Vec<Member>,
+        options: Options,
+    ) -> Result<MemoryFile, FileError> {
+        if options.sync.is_zero() {
+            return Err(FileError::Memories("sync is 0, but the log confirms writes".to_owned()));
+        }
+        members.sort_by(|one, other| one.name.cmp(&other.name));
+        MemoryFile::load(disk, members, options, true)
+    }
+
+    fn load(
+        disk: Arc<dyn Disk>,
+        members: Vec<Member>,
+        options: Options,
+        is_of_log: bool,
+    ) -> Result<MemoryFile, FileError> {
         check(&members)?;
         let status = Arc::new(Mutex::new(Status::default()));
         let store = Store::open(disk, Arc::clone(&status))?;
+        let note = if is_of_log { note_of(store.image(), &members)? } else { None };
         let (mut loaded, mut warnings) = (Vec::new(), Vec::new());
         for Member { name, memory } in &members {
-            if let Some(kept) = store.image().named(name) {
+            let Some(kept) = store.image().named(name) else { continue };
+            if is_of_log {
+                let areas = kept.areas.clone();
+                memory.restore(&Contents { areas, sealed: memory.sealed() });
+            } else {
                 let set_aside = store.image().set_aside_of(name);
                 warnings.extend(kept.resizings(set_aside, layout_of(memory)));
                 memory.restore(&sealed_again(&kept.with(set_aside), memory));
-                loaded.push(name.clone());
             }
+            loaded.push(name.clone());
         }
         for kept in store.image().memories() {
             let name = &kept.name;
@@ -109,7 +141,18 @@ impl MemoryFile {
         }
         let state = Mutex::new(State::Loaded(Box::new(store)));
         let (process, stored) = (process::id(), Arc::default());
-        Ok(MemoryFile { members, options, loaded, warnings, queue, status, stored, process, state })
+        Ok(MemoryFile {
+            members,
+            options,
+            loaded,
+            warnings,
+            note,
+            queue,
+            status,
+            stored,
+            process,
+            state,
+        })
     }
 
     /// The names of the memories whose contents come from the file.
@@ -122,19 +165,45 @@ impl MemoryFile {
         &self.warnings
     }
 
+    /// What the log had noted with the contents that were loaded.
+    pub fn note(&self) -> Option<&[u8]> {
+        self.note.as_deref()
+    }
+
     /// Stores what the memories contain, and goes on storing. A second call does nothing.
     ///
     /// # Errors
     /// [`FileError`] if the contents can't be stored. They are then still not stored.
     pub fn start(&self) -> Result<(), FileError> {
+        self.start_from(None)
+    }
+
+    /// As [`MemoryFile::start`], with the contents of a log.
+    ///
+    /// # Errors
+    /// As [`MemoryFile::start`]; also if the log has no contents.
+    pub fn start_of_log(&self, log: Arc<dyn Source>) -> Result<(), FileError> {
+        self.start_from(Some(log))
+    }
+
+    fn start_from(&self, log: Option<Arc<dyn Source>>) -> Result<(), FileError> {
         let mut state = self.state();
         let State::Loaded(store) = &mut *state else { return Ok(()) };
         let memories: Vec<_> = self.members.iter().map(|m| Arc::clone(&m.memory)).collect();
         let mut ids = Vec::new();
         self.queue.begin(|| {
             self.stored.store(writes(&memories), Ordering::Relaxed);
-            let changes;
-            (changes, ids) = first_changes(store.image(), &self.members)?;
+            let (contents, note) = match &log {
+                None => (Memory::contents(&memories), None),
+                Some(log) => {
+                    log.contents().map(|(contents, note)| (contents, Some(note))).ok_or_else(
+                        || FileError::OfLog("the log has no contents to store".to_owned()),
+                    )?
+                }
+            };
+            let mut changes;
+            (changes, ids) = first_changes(store.image(), &self.members, contents)?;
+            changes.note = (store.image().note() != note.as_ref()).then_some(note);
             store.store(changes)
         })?;
         let State::Loaded(store) = mem::replace(&mut *state, State::Stopped) else {
@@ -147,7 +216,7 @@ impl MemoryFile {
                 Box::new(|| steps.run())
             } else {
                 let (sync, stored) = (self.options.sync, Arc::clone(&self.stored));
-                let periodic = Periodic { store: *store, memories, ids, queue, sync, stored };
+                let periodic = Periodic { store: *store, memories, ids, queue, sync, stored, log };
                 Box::new(|| periodic.run())
             };
         let (queue, status) = (Arc::clone(&self.queue), Arc::clone(&self.status));
@@ -251,12 +320,35 @@ fn sealed_again(kept: &Kept, memory: &Memory) -> Contents {
     Contents { areas, sealed }
 }
 
+/// The note of the log, if the file has the contents of its memories; `None` if it has none yet.
+fn note_of(image: &Image, members: &[Member]) -> Result<Option<Vec<u8>>, FileError> {
+    let all = || members.iter().map(|member| (member, image.named(&member.name)));
+    if image.note().is_none() && all().all(|(_, kept)| kept.is_none()) {
+        return Ok(None);
+    }
+    let advice = "move the file away to start with the contents of the log";
+    let Some(note) = image.note() else {
+        let text = format!("the file has contents that are not of a log: {advice}");
+        return Err(FileError::OfLog(text));
+    };
+    for (Member { name, memory }, kept) in all() {
+        if kept.is_none_or(|kept| kept.layout != layout_of(memory)) {
+            let text = format!("the file has other areas of memory {name}: {advice}");
+            return Err(FileError::OfLog(text));
+        }
+    }
+    Ok(Some(note.clone()))
+}
+
 /// What the file lacks of the memories, and their numbers in it.
-fn first_changes(image: &Image, members: &[Member]) -> Result<(Changes, Vec<u16>), FileError> {
-    let memories: Vec<_> = members.iter().map(|member| Arc::clone(&member.memory)).collect();
+fn first_changes(
+    image: &Image,
+    members: &[Member],
+    contents: Vec<Contents>,
+) -> Result<(Changes, Vec<u16>), FileError> {
     let (mut changes, mut ids) = (Changes::default(), Vec::new());
     let mut free = image.free_ids();
-    for (Member { name, memory }, contents) in members.iter().zip(Memory::contents(&memories)) {
+    for (Member { name, memory }, contents) in members.iter().zip(contents) {
         let (kept, layout) = (image.named(name), layout_of(memory));
         let mut id_of = |kept: Option<&Kept>| {
             kept.map(|kept| kept.id).or_else(|| free.next()).ok_or_else(|| {

@@ -8,6 +8,8 @@
 //!   between the two. A step that can't be stored changes nothing.
 //! * What the layout of a memory lacks at a start is set aside in the same transaction, as a record of
 //!   its own, until the layout has it again or it is released.
+//! * What a log changes comes from the log: contents at one of its messages, with a note of the log that
+//!   is stored with them. The file is never their journal.
 //! * Nobody knows what an I/O error leaves on the disk. So the next transaction writes a new file and
 //!   puts it in the place of the old one.
 //! * A file that is not entirely as it was stored is refused, and not changed. It is never replaced by
@@ -32,6 +34,7 @@ pub use error::FileError;
 pub use image::Kept;
 pub use keeper::{Member, MemoryFile, Options};
 pub use overlay::Overlay;
+pub use periodic::Source;
 pub use status::Status;
 pub use store::VERSION;
 

@@ -1,15 +1,23 @@
 //! Storing every few seconds what has changed.
 
+use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use holdfast_memory::Memory;
+use holdfast_memory::{Contents, Memory};
 
 use super::error::FileError;
 use super::image::Changes;
 use super::queue::{Next, Queue};
 use super::store::Store;
+
+/// A log that changes the memories of a file.
+pub trait Source: fmt::Debug + Send + Sync {
+    /// The contents of all memories after one message, in the order of their names, and what the log has
+    /// to know to go on from there. `None` while there are no contents that are right.
+    fn contents(&self) -> Option<(Vec<Contents>, Vec<u8>)>;
+}
 
 pub(super) struct Periodic {
     pub store: Store,
@@ -21,6 +29,8 @@ pub(super) struct Periodic {
     pub sync: Duration,
     /// How many writes to the memories are in the file.
     pub stored: Arc<AtomicU64>,
+    /// What changes the memories, if a log does.
+    pub log: Option<Arc<dyn Source>>,
 }
 
 impl Periodic {
@@ -39,11 +49,18 @@ impl Periodic {
         if written == self.stored.load(Ordering::Relaxed) && !self.store.in_doubt() {
             return Ok(());
         }
+        let (contents, note) = match &self.log {
+            None => (Memory::contents(&self.memories), None),
+            Some(log) => match log.contents() {
+                Some((contents, note)) => (contents, Some(Some(note))),
+                // What the file has stays the last that was right.
+                None => return Ok(()),
+            },
+        };
         let image = self.store.image();
-        let contents = Memory::contents(&self.memories);
         let pages = self.ids.iter().zip(&contents);
         let pages = pages.flat_map(|(id, contents)| image.differing(*id, contents)).collect();
-        self.store.store(Changes { pages, ..Changes::default() })?;
+        self.store.store(Changes { pages, note, ..Changes::default() })?;
         self.stored.store(written, Ordering::Relaxed);
         Ok(())
     }

@@ -24,6 +24,10 @@ const MEMORIES: TableDefinition<&str, &[u8]> = TableDefinition::new("memories");
 /// Memory, area and number of a page; its bytes, with their checksum.
 const PAGES: TableDefinition<(u16, u8, u16), &[u8]> = TableDefinition::new("pages");
 
+/// What the log has noted whose contents the file has; with its checksum.
+const LOG: TableDefinition<&str, &[u8]> = TableDefinition::new("log");
+const NOTE: &str = "note";
+
 /// redb keeps pages in memory, and the image is there already.
 const CACHE: usize = 1 << 20;
 
@@ -163,7 +167,8 @@ fn create_beside(disk: &dyn Disk, image: &Image, replace: bool) -> Result<Databa
     let transaction = database.begin_write()?;
     transaction.open_table(ABOUT)?.insert(FORMAT, VERSION)?;
     let memories = image.memories().to_vec();
-    write(&transaction, &Changes { memories, ..Changes::default() })?;
+    let note = image.note().cloned().map(Some);
+    write(&transaction, &Changes { memories, note, ..Changes::default() })?;
     transaction.commit()?;
     disk.install(replace)?;
     Ok(database)
@@ -172,6 +177,13 @@ fn create_beside(disk: &dyn Disk, image: &Image, replace: bool) -> Result<Databa
 fn write(transaction: &WriteTransaction, changes: &Changes) -> Result<(), FileError> {
     let mut records = transaction.open_table(MEMORIES)?;
     let mut pages = transaction.open_table(PAGES)?;
+    if let Some(note) = &changes.note {
+        let mut log = transaction.open_table(LOG)?;
+        match note {
+            Some(note) => drop(log.insert(NOTE, &*with_checksum(NOTE.as_bytes(), note))?),
+            None => drop(log.remove(NOTE)?),
+        }
+    }
     for (name, id) in &changes.removed {
         records.remove(&**name)?;
         pages.retain_in((*id, 0, 0)..=(*id, u8::MAX, u16::MAX), |_, _| false)?;
@@ -241,7 +253,14 @@ fn contents(database: &Database) -> Result<Image, FileError> {
     if entries.next().is_some() {
         return Err(FileError::damaged("it has pages of no memory"));
     }
-    Ok(Image::new(memories))
+    let note = match transaction.open_table(LOG) {
+        Err(TableError::TableDoesNotExist(_)) => None,
+        log => log?.get(NOTE)?.map(|note| checked(NOTE.as_bytes(), note.value()).map(Vec::from)),
+    };
+    match note {
+        Some(None) => Err(FileError::damaged("wrong checksum of the note of the log")),
+        note => Ok(Image::new(memories, note.flatten())),
+    }
 }
 
 fn place((memory, area, number): (u16, u8, u16)) -> [u8; 5] {
