@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use holdfast_memory::Outcome;
 
-use super::error::{End, LogError};
+use super::error::End;
 use super::message::OVERHEAD;
 use super::node::{LogSession, Node};
 use super::received::Received;
@@ -21,12 +21,11 @@ impl Node {
         self.shared.counters.last_sequence.set(last);
         let applied = self.state.place;
         if place.sequence == applied.sequence && place != applied {
-            let sequence = place.sequence;
             let text = format!(
-                "the message at sequence {sequence} is not the one that this node has applied: \
-                 the servers have lost messages"
+                "the message at {place} is not the one that this node has applied, {applied}: the \
+                 servers have lost messages"
             );
-            return Err(LogError::Replaced(text).into());
+            return Err(self.replaced(text).into());
         }
         if place.sequence <= applied.sequence {
             return Ok(());

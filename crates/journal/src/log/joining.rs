@@ -1,16 +1,13 @@
 //! Where a node begins to read the stream, and with which contents. Whether the servers have lost
 //! messages.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use super::error::{End, LogError};
 use super::node::{Doubt, LogSession, NOT_ANNOUNCED, Node};
-use super::state::{State, digest_of};
+use super::state::{Place, State, digest_of};
 use super::status::Event;
 use super::store::{Store, unique};
-
-/// For so long, a server may know less than this node: it may be cut off from the others.
-const CUT_OFF: Duration = Duration::from_secs(30);
 
 /// The distance between two starts, at most. Starts were microseconds of Unix time once: as long as they
 /// stay behind the clock, such a version still follows this one.
@@ -22,17 +19,19 @@ impl Node {
         let id = store.id().map(str::to_owned);
         if self.id.is_some() && self.id != id {
             let text = "the stream of the log was deleted and made anew".to_owned();
-            return Err(LogError::Replaced(text).into());
+            return Err(self.replaced(text).into());
         }
-        let (first, last) = {
+        let (first, end) = {
             let info = &store.stream.cached_info().state;
-            (info.first_sequence, info.last_sequence)
+            let stored = info.last_timestamp.unix_timestamp_nanos() as i64;
+            (info.first_sequence, Place { sequence: info.last_sequence, stored })
         };
-        let applied = self.state.place.sequence;
+        let (last, applied) = (end.sequence, self.state.place.sequence);
         if last < applied {
+            let place = self.state.place;
             return Err(self.short(format!(
-                "the stream ends at sequence {last}, but this node has applied {applied}: the \
-                 servers have lost messages"
+                "the stream ends at {end}, but this node has applied {place}: the servers have lost \
+                 messages"
             )));
         }
         let is_wrong = self.doubt.as_ref().is_some_and(|doubt| !doubt.is_loaded);
@@ -93,7 +92,12 @@ impl Node {
     fn short(&mut self, text: String) -> End {
         let since = self.was_short_since.unwrap_or_else(Instant::now);
         self.short_since = Some(since);
-        if since.elapsed() < CUT_OFF { End::Lost(text) } else { LogError::Replaced(text).into() }
+        let error = self.replaced(text);
+        if since.elapsed() < self.settings.cut_off {
+            End::Lost(error.to_string())
+        } else {
+            error.into()
+        }
     }
 
     /// Loads the newest snapshot that is good, or makes the first one.

@@ -12,8 +12,8 @@
 //! ```
 //!
 //! `session.rs` runs the thread, and calls the other files: `joining.rs` before it reads the stream,
-//! `messages.rs` to read it, `applying.rs` for each message, `comparing.rs` for digests, `snapshots.rs` for snapshots. `returning.rs` is for a node whose
-//! contents were wrong.
+//! `messages.rs` to read it, `applying.rs` for each message, `comparing.rs` for digests, `snapshots.rs` for snapshots.
+//! `returning.rs` is for a node whose contents were wrong, `kept.rs` for one with a file.
 
 mod applying;
 mod clock;
@@ -23,6 +23,7 @@ mod digests;
 mod error;
 mod follower;
 mod joining;
+mod kept;
 mod layout;
 mod message;
 mod messages;
@@ -50,8 +51,10 @@ pub use error::LogError;
 pub use follower::{Follower, Next, Record, Until};
 pub use message::Origin;
 pub use settings::{Login, Servers, Settings, Tls, WhenBehind};
+pub use shared::Kept;
 pub use status::{Digest, Event, Node, Phase, Status};
 
+use kept::Note;
 use node::Node as Running;
 use shared::Shared;
 
@@ -63,7 +66,12 @@ pub struct Log {
     shared: Arc<Shared>,
     process: u32,
     thread: Mutex<Option<JoinHandle<()>>>,
+    /// What the contents come from that the memories have before the start.
+    note: Mutex<Option<Note>>,
 }
+
+/// How long the thread of a log may take to give what a file keeps.
+const KEEPING: Duration = Duration::from_secs(10);
 
 impl Log {
     /// Makes the log the journal of these memories. Until it has caught up, writes are refused.
@@ -84,14 +92,37 @@ impl Log {
             let journal: Arc<dyn Journal> = Arc::clone(&shared) as _;
             memory.keep_in(journal, member as u16);
         }
-        let (process, thread) = (std::process::id(), Mutex::default());
-        Ok(Log { settings, members, shared, process, thread })
+        let (process, thread, note) = (std::process::id(), Mutex::default(), Mutex::default());
+        Ok(Log { settings, members, shared, process, thread, note })
+    }
+
+    /// Begins with the contents that the memories have now, with the note that came with them. A log that
+    /// does not lead to them is an error then.
+    ///
+    /// # Errors
+    /// [`LogError`] for a note that is not of this log.
+    pub fn resume(&self, note: &[u8]) -> Result<(), LogError> {
+        let note = Note::parse(note)?;
+        if note.log != self.settings.name {
+            let (found, name) = (&note.log, &self.settings.name);
+            return Err(LogError::Settings(format!(
+                "the file has contents of the log {found:?}, not of {name:?}: move it away"
+            )));
+        }
+        *self.note.lock().unwrap_or_else(PoisonError::into_inner) = Some(note);
+        Ok(())
+    }
+
+    /// The contents after one message, and a note for [`Log::resume`]. `None` while there are no contents
+    /// that are right.
+    pub fn kept(&self) -> Option<Kept> {
+        self.shared.kept(KEEPING)
     }
 
     /// Starts the thread of the log. A second call does nothing.
     ///
     /// # Errors
-    /// [`LogError::Thread`].
+    /// [`LogError::Thread`], and [`LogError::Snapshot`] for contents that are not those of the note.
     pub fn start(&self) -> Result<(), LogError> {
         let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
         if thread.is_some() {
@@ -100,7 +131,10 @@ impl Log {
         let members = self.members.iter().map(|(_, memory)| Arc::clone(memory)).collect();
         let fingerprint = layout::fingerprint(&self.members);
         let (settings, shared) = (Arc::clone(&self.settings), Arc::clone(&self.shared));
-        let node = Running::new(settings, fingerprint, shared, members);
+        let mut node = Running::new(settings, fingerprint, shared, members);
+        if let Some(note) = self.note.lock().unwrap_or_else(PoisonError::into_inner).take() {
+            node.resume(note)?;
+        }
         let name = format!("log {}", self.settings.name);
         let started = std::thread::Builder::new().name(name).spawn(move || node.run());
         *thread = Some(started.map_err(|error| LogError::Thread(error.to_string()))?);

@@ -137,6 +137,7 @@ impl Node {
             tokio::select! {
                 done = &mut work => return Ok(done),
                 () = tokio::time::sleep(LOOK) => {
+                    self.keep();
                     self.sent.expire(Instant::now(), &self.shared.counters);
                     if self.shared.is_stopping() {
                         return Err(End::Stopped);

@@ -56,6 +56,8 @@ impl Node {
                         &self.shared.counters,
                     );
                     if !self.may_return(&error) {
+                        let is_right = !matches!(error, LogError::Differs { .. });
+                        self.shared.give_kept(is_right.then(|| self.kept()).flatten(), true);
                         return self.shared.fail(error);
                     }
                     self.drop_contents(error);
@@ -69,10 +71,12 @@ impl Node {
             while Instant::now() < until && !self.shared.is_stopping() {
                 std::thread::sleep(LOOK.min(pause));
                 self.sent.expire(Instant::now(), &self.shared.counters);
+                self.keep();
             }
             pause = (pause * 2).min(MAX_PAUSE);
         }
         self.sent.expire(Instant::now() + self.settings.write_timeout, &self.shared.counters);
+        self.shared.give_kept(self.kept(), true);
         self.shared.update(|view| {
             view.phase = Phase::Stopped;
             view.server = None;
@@ -201,6 +205,7 @@ impl Node {
 
     async fn look(&mut self, session: &mut LogSession) -> Result<(), End> {
         let now = Instant::now();
+        self.keep();
         self.sent.expire(now, &self.shared.counters);
         self.shared.expire(now);
         if self.shared.is_stopping() && self.sent.is_empty() {

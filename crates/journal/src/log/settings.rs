@@ -73,6 +73,10 @@ pub struct Settings {
     /// A node whose contents differ returns by itself, unless it has done so within this time; with
     /// `None`, never.
     pub return_after: Option<Duration>,
+    /// The file with what was applied, for messages.
+    pub kept_file: Option<String>,
+    /// For so long, a server may know less than this node: it may be cut off from the others.
+    pub cut_off: Duration,
     /// Writes are answered when they are sent. Tests use it to show what then goes wrong.
     #[doc(hidden)]
     pub answers_early: bool,
@@ -98,6 +102,8 @@ impl Settings {
             digest_every: 10_000,
             queue: 4096,
             return_after: Some(Duration::from_secs(24 * 3600)),
+            kept_file: None,
+            cut_off: Duration::from_secs(30),
             answers_early: false,
         }
     }

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use holdfast_memory::{Done, Journal, Refusal, Refused, Step};
+use holdfast_memory::{Contents, Done, Journal, Refusal, Refused, Step};
 use tokio::sync::Notify;
 
 use super::clock::{Clock, Moment};
@@ -43,6 +43,20 @@ pub(super) struct Shared {
     pub(super) counters: Counters,
     progress: Mutex<Progress>,
     changed: Condvar,
+    keeping: Mutex<Keeping>,
+    given: Condvar,
+}
+
+/// The contents of the memories in the order of their names, and a note about them.
+pub type Kept = (Vec<Contents>, Vec<u8>);
+
+/// What a file asks for.
+#[derive(Default)]
+struct Keeping {
+    is_asked: bool,
+    given: Option<Kept>,
+    /// The log has ended: what was given last stays.
+    has_ended: bool,
 }
 
 #[derive(Default)]
@@ -124,6 +138,8 @@ impl Shared {
             counters: Counters::default(),
             progress: Mutex::default(),
             changed: Condvar::new(),
+            keeping: Mutex::default(),
+            given: Condvar::new(),
         }
     }
 
@@ -243,6 +259,27 @@ impl Shared {
             view.phase = Phase::Running;
             view.last_error = None;
         });
+    }
+
+    /// Asks the thread of the log for what a file keeps, and waits for it, at most for this time.
+    pub(super) fn kept(&self, timeout: Duration) -> Option<Kept> {
+        let mut keeping = lock(&self.keeping);
+        if keeping.has_ended {
+            return keeping.given.clone();
+        }
+        keeping.is_asked = true;
+        let waited = self.given.wait_timeout_while(keeping, timeout, |keeping| keeping.is_asked);
+        let mut keeping = waited.unwrap_or_else(PoisonError::into_inner).0;
+        if keeping.has_ended { keeping.given.clone() } else { keeping.given.take() }
+    }
+
+    pub(super) fn is_kept_asked(&self) -> bool {
+        lock(&self.keeping).is_asked
+    }
+
+    pub(super) fn give_kept(&self, given: Option<Kept>, has_ended: bool) {
+        *lock(&self.keeping) = Keeping { is_asked: false, given, has_ended };
+        self.given.notify_all();
     }
 
     pub(super) fn event(&self, event: Event) {

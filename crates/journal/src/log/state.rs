@@ -2,6 +2,7 @@
 //! nodes after the same sequence.
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::sync::Arc;
 
 use aws_lc_rs::digest::{SHA256, digest};
@@ -20,7 +21,7 @@ pub(super) struct State {
     /// How many steps were applied since the log began.
     pub(super) steps: u64,
     /// The start and the last counter that were applied of each node.
-    origins: BTreeMap<String, (u64, u64)>,
+    pub(super) origins: BTreeMap<String, (u64, u64)>,
 }
 
 /// A message of the stream.
@@ -30,6 +31,26 @@ pub(super) struct Place {
     pub(super) sequence: u64,
     /// When the stream has stored it, in nanoseconds of Unix time.
     pub(super) stored: i64,
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let seconds = self.stored.div_euclid(1_000_000_000);
+        let (days, of_day) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
+        // Years begin on 1 March here: a leap day is the last of its year.
+        let days = days + 719_468;
+        let (era, of_era) = (days.div_euclid(146_097), days.rem_euclid(146_097));
+        let year = (of_era - of_era / 1460 + of_era / 36_524 - of_era / 146_096) / 365;
+        let of_year = of_era - (365 * year + year / 4 - year / 100);
+        let month = (5 * of_year + 2) / 153;
+        let day = of_year - (153 * month + 2) / 5 + 1;
+        let month = if month < 10 { month + 3 } else { month - 9 };
+        let year = year + era * 400 + i64::from(month < 3);
+        let (hour, minute, second) = (of_day / 3600, of_day / 60 % 60, of_day % 60);
+        let sequence = self.sequence;
+        write!(f, "sequence {sequence} ({year:04}-{month:02}-{day:02}T")?;
+        write!(f, "{hour:02}:{minute:02}:{second:02}Z)")
+    }
 }
 
 /// What became of a message.
@@ -212,5 +233,24 @@ impl<'a> Rest<'a> {
             areas: [area(coils)?, area(inputs)?, area(holding)?, area(input)?],
             sealed,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_place_is_shown_with_its_time() {
+        for (seconds, expected) in [
+            (0, "1970-01-01T00:00:00Z"),
+            (951_827_696, "2000-02-29T12:34:56Z"),
+            (1_767_225_599, "2025-12-31T23:59:59Z"),
+            (4_107_542_400, "2100-03-01T00:00:00Z"),
+            (-1, "1969-12-31T23:59:59Z"),
+        ] {
+            let place = Place { sequence: 7, stored: seconds * 1_000_000_000 };
+            assert_eq!(place.to_string(), format!("sequence 7 ({expected})"));
+        }
     }
 }
