@@ -19,6 +19,8 @@ pub const DEADLINE: Duration = Duration::from_secs(60);
 
 pub const REGISTERS: Area = Area::HoldingRegisters;
 
+pub const GATE: Area = Area::Coils;
+
 #[track_caller]
 pub fn until(what: &str, mut is: impl FnMut() -> bool) {
     let end = Instant::now() + DEADLINE;
