@@ -200,7 +200,8 @@ class MemoryFile:
 
     Opens or creates the file, and loads contents into the memories before anybody uses them. With
     `sync` 0, it stores every write before it is answered; otherwise it stores changes every `sync`
-    seconds, with one thread.
+    seconds, with one thread. With `of_log`, the memories are all those of a log, and `sync` is more
+    than 0.
 
     Raises `OSError` for a file that is damaged, locked by another process, not writable, of
     another program, or of a newer version; the file and the memories are unchanged then. Raises
@@ -208,7 +209,12 @@ class MemoryFile:
     """
 
     def __new__(
-        cls, path: str | PathLike[str], memories: Sequence[tuple[str, Memory]], sync: float
+        cls,
+        path: str | PathLike[str],
+        memories: Sequence[tuple[str, Memory]],
+        sync: float,
+        *,
+        of_log: bool = False,
     ) -> MemoryFile: ...
     @property
     def loaded(self) -> list[str]:
@@ -218,10 +224,15 @@ class MemoryFile:
     def warnings(self) -> list[str]:
         """Areas that were resized, and memories in the file that are not given."""
 
-    def start(self) -> None:
+    @property
+    def note(self) -> bytes | None:
+        """What the log has noted of the contents that were loaded: for `Log.resume`."""
+
+    def start(self, log: Log | None = None) -> None:
         """Stores what the memories contain, and goes on storing. A second call does nothing.
 
-        Raises `OSError` if the contents can't be stored.
+        With `of_log`, `log` is the log of the memories, which has started. Raises `OSError` if the
+        contents can't be stored.
         """
 
     def stop(self) -> None:
@@ -847,6 +858,8 @@ class Log:
 
     `tls` are files: trusted authorities, certificate, key. All files are read for each connection.
     With `when_behind="refuse"`, all reads are refused after `max_lag` seconds without contact.
+    Servers that know less than this node have lost messages if that lasts `cut_off` seconds; the
+    error names `kept_file`, where a `MemoryFile` keeps the contents.
 
     Raises `ValueError` for an unusable argument, also for a memory that has a log already.
     """
@@ -866,6 +879,8 @@ class Log:
         snapshot_seconds: float = 600.0,
         digest_steps: int = 10_000,
         queue: int = 4096,
+        cut_off: float = 30.0,
+        kept_file: str | None = None,
         connect_timeout: float = 2.0,
         user: str | None = None,
         password_file: str | PathLike[str] | None = None,
@@ -873,6 +888,13 @@ class Log:
         credentials_file: str | PathLike[str] | None = None,
         tls: TlsFiles | None = None,
     ) -> Log: ...
+    def resume(self, note: bytes) -> None:
+        """Begins with the contents that a `MemoryFile` with this note has loaded.
+
+        A log that does not lead to them is an error of `start` then. Raises `LogError` for an
+        unusable note, and `ValueError` for that of another log.
+        """
+
     def start(self, timeout: float) -> None:
         """Starts the thread of the log, and returns when the memories have caught up.
 

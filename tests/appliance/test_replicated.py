@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import json
+import re
+import shutil
 import socket
 import threading
 from contextlib import ExitStack
@@ -11,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
+from holdfast import _core
 from holdfast.appliance import Appliance, running
 from holdfast.appliance.changes import ReloadRefused
 from holdfast.appliance.shared_logs import LogNotJoined
@@ -216,6 +220,49 @@ def test_contents_survive_all_nodes(
         assert register(second, 1) == 8
 
 
+def test_a_node_that_keeps_its_memory_does_not_go_back_with_its_servers(
+    tmp_path: Path, server: NatsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, copy, file = tmp_path / "server/store", tmp_path / "copy", tmp_path / "plant.redb"
+    settings = config(tmp_path, [server.url], keep={"file": "plant.redb"})
+    with Appliance(settings) as node:
+        node.memories["plant"].write("holding_registers", 1, [111])
+    server.kill()
+    shutil.copytree(store, copy)
+    server.start()
+    with Appliance(settings) as node:
+        assert register(node, 1) == 111
+        for _ in range(5):
+            node.memories["plant"].write("holding_registers", 1, [222])
+    server.kill()
+    shutil.rmtree(store)
+    copy.rename(store)
+    server.start()
+    monkeypatch.setattr(_core, "Log", functools.partial(_core.Log, cut_off=0))
+    with pytest.raises(LogNotJoined, match="the servers have lost messages") as raised:
+        Appliance(settings).start()
+    assert raised.value.is_settings, "another start changes nothing"
+    found = re.search(
+        r"logs\.site: the stream ends at sequence (\d+) \(\S+Z\), but this node has applied "
+        r"sequence (\d+) \(\S+Z\)",
+        str(raised.value),
+    )
+    assert found is not None, raised.value
+    assert int(found[1]) < int(found[2])
+    assert f"are kept in {file}. Stop all nodes and decide" in str(raised.value)
+    # The contents of the node, in a new log.
+    done("memory", "export", str(file), "--output", str(tmp_path / "values.csv"))
+    file.rename(tmp_path / "before.redb")
+    config(tmp_path, [server.url], "b", keep={"file": "plant.redb"}, initial="values.csv")
+    (tmp_path / "b.yaml").write_text((tmp_path / "b.yaml").read_text().replace("site", "again"))
+    with Appliance(load(tmp_path / "b.yaml")) as node:
+        assert register(node, 1) == 222
+    # Those of the log.
+    file.unlink()
+    with Appliance(settings) as node:
+        assert register(node, 1) == 111
+
+
 def test_without_its_log_a_node_reads_and_does_not_write(
     node: Callable[..., Appliance], server: NatsServer
 ) -> None:
@@ -310,8 +357,18 @@ def test_a_change_of_logs_requires_a_restart(
     [
         ("memories: {plant: {coils: 8, replicate: {log: sit}}}", "found 'sit', allowed: site; did"),
         (
-            "memories: {plant: {coils: 8, keep: {file: x}, replicate: {log: site}}}",
-            "memories.plant.keep: found together with replicate, allowed: only one of them",
+            "memories: {plant: {coils: 8, keep: {file: x, sync: 0}, replicate: {log: site}}}",
+            "memories.plant.keep.sync: found 0, allowed with replicate: more than 0",
+        ),
+        (
+            "memories: {plant: {coils: 8, keep: {file: x}, replicate: {log: site}}, "
+            "own: {coils: 8, keep: {file: x}}}",
+            "memories.plant.keep.file: found the file of own, which is not of this log",
+        ),
+        (
+            "memories: {plant: {coils: 8, keep: {file: x}, replicate: {log: site}}, "
+            "other: {coils: 8, replicate: {log: site}}}",
+            "memories.other: missing, required: all memories of a log have keep if plant has",
         ),
     ],
 )

@@ -35,14 +35,14 @@ type TlsFiles = (Option<PathBuf>, Option<PathBuf>, Option<PathBuf>);
 
 #[pyclass(frozen, module = "holdfast")]
 pub struct Log {
-    core: Core,
+    pub core: Arc<Core>,
 }
 
 #[pymethods]
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Log {
     #[new]
-    #[pyo3(signature = (name, node, servers, memories, *, replicas=1, write_timeout=1.0, when_behind="serve", max_lag=5.0, snapshot_steps=100_000, snapshot_seconds=600.0, digest_steps=10_000, queue=4096, connect_timeout=2.0, user=None, password_file=None, token_file=None, credentials_file=None, tls=None))]
+    #[pyo3(signature = (name, node, servers, memories, *, replicas=1, write_timeout=1.0, when_behind="serve", max_lag=5.0, snapshot_steps=100_000, snapshot_seconds=600.0, digest_steps=10_000, queue=4096, cut_off=30.0, kept_file=None, connect_timeout=2.0, user=None, password_file=None, token_file=None, credentials_file=None, tls=None))]
     fn new(
         name: &str,
         node: &str,
@@ -56,6 +56,8 @@ impl Log {
         snapshot_seconds: f64,
         digest_steps: i128,
         queue: i128,
+        cut_off: f64,
+        kept_file: Option<String>,
         connect_timeout: f64,
         user: Option<String>,
         password_file: Option<PathBuf>,
@@ -77,11 +79,17 @@ impl Log {
         settings.snapshot_after = seconds("snapshot_seconds", snapshot_seconds)?;
         settings.digest_every = within("digest_steps", digest_steps, 1..=most)? as u64;
         settings.queue = within("queue", queue, 1..=1_000_000)?;
+        settings.cut_off = seconds("cut_off", cut_off)?;
+        settings.kept_file = kept_file;
         settings.servers.connect_timeout = seconds("connect_timeout", connect_timeout)?;
         settings.servers.login = login(user, password_file, token_file, credentials_file)?;
         settings.servers.tls = tls.map(tls_of).transpose()?;
         let core = Core::new(settings, named(&memories)).map_err(raised)?;
-        Ok(Log { core })
+        Ok(Log { core: Arc::new(core) })
+    }
+
+    fn resume(&self, note: &[u8]) -> PyResult<()> {
+        self.core.resume(note).map_err(raised)
     }
 
     fn start(&self, py: Python<'_>, timeout: f64) -> PyResult<()> {

@@ -5,14 +5,16 @@ use std::sync::Arc;
 use std::time::UNIX_EPOCH;
 
 use holdfast_journal::file::{
-    FileError, FileOnDisk, Member, MemoryFile as Core, Options, read, release,
+    FileError, FileOnDisk, Member, MemoryFile as Core, Options, Source, read, release,
 };
+use holdfast_journal::log::{Kept, Log as CoreLog};
 use holdfast_memory::Area;
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
 use crate::arguments::seconds;
+use crate::log::Log;
 use crate::memory::Memory;
 
 #[pyclass(frozen, module = "holdfast")]
@@ -21,14 +23,26 @@ pub struct MemoryFile {
     core: Core,
 }
 
+/// The log of the memories of a file.
+#[derive(Debug)]
+struct OfLog(Arc<CoreLog>);
+
+impl Source for OfLog {
+    fn contents(&self) -> Option<Kept> {
+        self.0.kept()
+    }
+}
+
 #[pymethods]
 impl MemoryFile {
     #[new]
+    #[pyo3(signature = (path, memories, sync, *, of_log=false))]
     fn new(
         py: Python<'_>,
         path: PathBuf,
         memories: Vec<(String, PyRef<'_, Memory>)>,
         sync: f64,
+        of_log: bool,
     ) -> PyResult<MemoryFile> {
         let options = Options::new(seconds("sync", sync)?);
         let members = memories
@@ -36,7 +50,8 @@ impl MemoryFile {
             .map(|(name, memory)| Member { name: name.clone(), memory: Arc::clone(&memory.core) });
         let members = members.collect();
         let disk = Arc::new(FileOnDisk::new(&path));
-        match py.detach(|| Core::open(disk, members, options)) {
+        let open = if of_log { Core::open_of_log } else { Core::open };
+        match py.detach(|| open(disk, members, options)) {
             Ok(core) => Ok(MemoryFile { path, core }),
             Err(error) => Err(raised(&path, error)),
         }
@@ -52,8 +67,19 @@ impl MemoryFile {
         self.core.warnings().to_vec()
     }
 
-    fn start(&self, py: Python<'_>) -> PyResult<()> {
-        py.detach(|| self.core.start()).map_err(|error| raised(&self.path, error))
+    #[getter]
+    fn note(&self) -> Option<&[u8]> {
+        self.core.note()
+    }
+
+    #[pyo3(signature = (log=None))]
+    fn start(&self, py: Python<'_>, log: Option<PyRef<'_, Log>>) -> PyResult<()> {
+        let log = log.map(|log| Arc::new(OfLog(Arc::clone(&log.core))) as Arc<dyn Source>);
+        py.detach(|| match log {
+            Some(log) => self.core.start_of_log(log),
+            None => self.core.start(),
+        })
+        .map_err(|error| raised(&self.path, error))
     }
 
     fn stop(&self, py: Python<'_>) -> PyResult<()> {

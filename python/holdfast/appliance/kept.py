@@ -25,6 +25,7 @@ class KeptMemories:
     def __init__(self, config: Config, memories: Mapping[str, _core.Memory]) -> None:
         """Loads the contents of the memories. Raises `UnusableFile`."""
         self._files: dict[Path, _core.MemoryFile] = {}
+        self._of_logs: dict[str, Path] = {}
         self._failing: dict[Path, str | None] = {}
         try:
             for path, names in _files(config).items():
@@ -39,18 +40,41 @@ class KeptMemories:
     def _open(
         self, path: Path, names: list[str], config: Config, memories: Mapping[str, _core.Memory]
     ) -> None:
-        keep = config.memories[names[0]].keep
+        keep, replicate = config.memories[names[0]].keep, config.memories[names[0]].replicate
         assert keep is not None, "the memory is kept"
-        file = _core.MemoryFile(str(path), [(name, memories[name]) for name in names], keep.sync)
+        members = [(name, memories[name]) for name in names]
+        file = _core.MemoryFile(str(path), members, keep.sync, of_log=replicate is not None)
         self._files[path] = file
         for warning in file.warnings:
             logs.write(logging.WARNING, "memory_file_differs", file=path, warning=warning)
         for name in names:
             if name not in file.loaded:
                 assembly.fill(memories[name], config.memories[name])
-        file.start()
+        if replicate is None:
+            file.start()
+        else:
+            self._of_logs[replicate.log] = path
         loaded = ",".join(file.loaded) or "-"
         logs.write(logging.INFO, "memory_file", file=path, loaded=loaded, sync=keep.sync)
+
+    def of_log(self, log: str) -> Path | None:
+        """The file of the memories of a log."""
+        return self._of_logs.get(log)
+
+    def note(self, log: str) -> bytes | None:
+        """What that file has noted of the log."""
+        path = self.of_log(log)
+        return None if path is None else self._files[path].note
+
+    def start(self, name: str, log: _core.Log) -> None:
+        """Stores from now on what the memories of a log contain. Raises `UnusableFile`."""
+        path = self.of_log(name)
+        if path is None:
+            return
+        try:
+            self._files[path].start(log)
+        except OSError as error:
+            raise UnusableFile(str(error)) from None
 
     def status(self) -> dict[str, dict[str, Any]]:
         """The state and the counters of each file."""

@@ -269,7 +269,7 @@ class _Running:
         with ExitStack() as undo:
             self._kept = KeptMemories(config, memories)
             undo.callback(self._kept.stop)
-            self._logs = SharedLogs(config, memories)
+            self._logs = SharedLogs(config, memories, self._kept)
             undo.callback(self._logs.stop)
             self._leases = DeviceLeases(config, lease_times)
             assembly.mirror(config, memories)

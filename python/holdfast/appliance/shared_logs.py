@@ -12,6 +12,7 @@ from holdfast.net.tls import NO_FILES
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from holdfast.appliance.kept import KeptMemories
     from holdfast.config import Config
     from holdfast.config.logs import SharedLogConfig
     from holdfast.nats_server import NatsServer
@@ -50,8 +51,11 @@ class LogNotJoined(OSError):
 class SharedLogs:
     """The logs of one configuration. The constructor joins all of them or none."""
 
-    def __init__(self, config: Config, memories: Mapping[str, _core.Memory]) -> None:
-        """Returns when the memories have caught up. Raises `LogNotJoined`."""
+    def __init__(
+        self, config: Config, memories: Mapping[str, _core.Memory], kept: KeptMemories
+    ) -> None:
+        """Returns when the memories have caught up. Raises `LogNotJoined`, `UnusableFile`."""
+        self._kept = kept
         self._logs: dict[str, _core.Log] = {}
         self._max_lags = {name: settings.max_lag for name, settings in config.logs.items()}
         self._servers: dict[str, NatsServer] = {}
@@ -83,6 +87,7 @@ class SharedLogs:
     def _join(
         self, name: str, settings: SharedLogConfig, members: list[tuple[str, _core.Memory]]
     ) -> None:
+        path, note = self._kept.of_log(name), self._kept.note(name)
         try:
             log = _core.Log(
                 name,
@@ -93,13 +98,16 @@ class SharedLogs:
                 write_timeout=settings.write_timeout,
                 when_behind=settings.when_behind,
                 max_lag=settings.max_lag,
+                kept_file=None if path is None else str(path),
                 **credentials(settings),
             )
             self._logs[name] = log
+            if note is not None:
+                log.resume(note)
             logs.write(logging.INFO, "log_joining", log=name, node=settings.node)
             log.start(JOIN_TIMEOUT)
         except _core.LogError as error:
-            is_settings = error.kind in ("layout", "version", "snapshot", "name_taken")
+            is_settings = error.kind in ("layout", "version", "snapshot", "name_taken", "replaced")
             raise LogNotJoined(f"logs.{name}: {error}", is_settings=is_settings) from None
         except ValueError as error:
             raise LogNotJoined(f"logs.{name}: {error}", is_settings=True) from None
@@ -111,6 +119,7 @@ class SharedLogs:
             sequence=log.status()["sequence"],
             memories=",".join(each for each, _ in members),
         )
+        self._kept.start(name, log)
 
     def status(self) -> dict[str, dict[str, Any]]:
         """The state and the counters of each log."""

@@ -30,13 +30,46 @@ def check_logs(data: dict[Any, Any], folder: Path, report: Report) -> None:
         if log not in logs:
             words = f"allowed: {listing(logs) or 'none, there are no logs'}{guess(log, logs)}"
             report.add(("memories", name, "replicate", "log"), f"found {show(log)}, {words}")
-        if "keep" in mapping(memory):
-            message = "found together with replicate, allowed: only one of them"
-            report.add(("memories", name, "keep"), message, of_key=True)
     for name in logs:
         if name not in used:
             report.doubt(("logs", name), "has no effect: no memory is replicated through it")
+    _check_files(mapping(data.get("memories")), folder, report)
     _check_devices(data, report)
+
+
+def _check_files(memories: dict[Any, Any], folder: Path, report: Report) -> None:
+    """Reports files that don't have all memories of one log, and no others."""
+    logs: dict[str, object] = {}
+    files: dict[str, Path] = {}
+    for name, memory in memories.items():
+        logs[name] = mapping(mapping(memory).get("replicate")).get("log")
+        file = mapping(mapping(memory).get("keep")).get("file")
+        if isinstance(file, str) and file:
+            files[name] = folder / file
+    for name, log in logs.items():
+        if log is None:
+            continue
+        path = ("memories", name, "keep")
+        own = files.get(name)
+        for other in memories:
+            if logs[other] == log and own is None and other in files:
+                message = f"missing, required: all memories of a log have keep if {other} has"
+                report.add(("memories", name), message)
+                break
+            if own is None or other not in files or other == name:
+                continue
+            if logs[other] == log and files[other] != own:
+                message = (
+                    f"found {show(str(own))}, allowed: {show(str(files[other]))}, as {other} has"
+                )
+                report.add((*path, "file"), message)
+                break
+            if logs[other] != log and files[other] == own:
+                report.add((*path, "file"), f"found the file of {other}, which is not of this log")
+                break
+        keep = mapping(mapping(memories[name]).get("keep"))
+        if own is not None and keep.get("sync", 1) == 0:
+            report.add((*path, "sync"), "found 0, allowed with replicate: more than 0")
 
 
 def _check_devices(data: dict[Any, Any], report: Report) -> None:

@@ -60,7 +60,7 @@ class KeepConfig(Model):
     """The file, in an existing folder. Memories that are written together share one."""
     sync: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False), whole_number] = 1.0
     """0: every write is on the disk before its reply. Otherwise the seconds of writes that a crash
-    or a power cut may cost; a clean stop loses nothing."""
+    or a power cut may cost; a clean stop loses nothing. With replicate, more than 0."""
 
 
 class ReplicateConfig(Model):
@@ -89,7 +89,8 @@ class MemoryConfig(Model):
     """A .csv file with lines of area,address,value, or a .yaml file, with initial values."""
 
     keep: Annotated[KeepConfig | None, NotNull()] = None
-    """Keeps the contents over restarts; `initial` then applies only to the first start."""
+    """Keeps the contents over restarts; `initial` then applies only to the first start. With
+    replicate, shows whether the servers have lost writes."""
 
     replicate: Annotated[ReplicateConfig | None, NotNull()] = None
     """Shares the contents with other appliances: all writes go through a log."""
