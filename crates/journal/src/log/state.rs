@@ -7,6 +7,8 @@ use std::sync::Arc;
 
 use aws_lc_rs::digest::{SHA256, digest};
 use holdfast_memory::{Area, CarriedOut, Contents, Memory, Outcome};
+use time::OffsetDateTime;
+use time::format_description::well_known::Rfc3339;
 
 use super::error::LogError;
 use super::message::{self, MAX_NODES, Message, MessageError, Origin, VERSION};
@@ -35,21 +37,10 @@ pub(super) struct Place {
 
 impl fmt::Display for Place {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let seconds = self.stored.div_euclid(1_000_000_000);
-        let (days, of_day) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
-        // Years begin on 1 March here: a leap day is the last of its year.
-        let days = days + 719_468;
-        let (era, of_era) = (days.div_euclid(146_097), days.rem_euclid(146_097));
-        let year = (of_era - of_era / 1460 + of_era / 36_524 - of_era / 146_096) / 365;
-        let of_year = of_era - (365 * year + year / 4 - year / 100);
-        let month = (5 * of_year + 2) / 153;
-        let day = of_year - (153 * month + 2) / 5 + 1;
-        let month = if month < 10 { month + 3 } else { month - 9 };
-        let year = year + era * 400 + i64::from(month < 3);
-        let (hour, minute, second) = (of_day / 3600, of_day / 60 % 60, of_day % 60);
-        let sequence = self.sequence;
-        write!(f, "sequence {sequence} ({year:04}-{month:02}-{day:02}T")?;
-        write!(f, "{hour:02}:{minute:02}:{second:02}Z)")
+        // Seconds suffice for people.
+        let stored = OffsetDateTime::from_unix_timestamp(self.stored.div_euclid(1_000_000_000));
+        let stored = stored.ok().and_then(|stored| stored.format(&Rfc3339).ok());
+        write!(f, "sequence {} ({})", self.sequence, stored.as_deref().unwrap_or("no time"))
     }
 }
 
