@@ -10,8 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from holdfast.bounded_files import MAX_CERTIFICATES
 from holdfast.certificates import authority, expiry, inspection, own, pem
-from holdfast.file_reading import MAX_CERTIFICATES
 from support.cases import examples
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 import holdfast
-from holdfast import file_reading
+from holdfast import bounded_files
 from holdfast.cli import COMMANDS, main
 from holdfast.cli.configuration import load_or_exit
 from holdfast.config import json_schema, load
@@ -235,8 +235,8 @@ class TestPipes:
     def test_a_configuration_that_never_comes_is_a_problem(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        patient = file_reading.read
-        monkeypatch.setattr(file_reading, "read", partial(patient, timeout_ms=50))
+        patient = bounded_files.read
+        monkeypatch.setattr(bounded_files, "read", partial(patient, timeout_ms=50))
         pipe = tmp_path / "pipe"
         os.mkfifo(pipe)
         result = CliRunner().invoke(main, ["check", str(pipe)])

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, assert_never
 
 from holdfast import _core
+from holdfast.bounded_files import require_stored
 from holdfast.client.endpoint import endpoint, receiver_endpoint
 from holdfast.config import (
     ModbusAsciiListener,
@@ -26,7 +27,6 @@ from holdfast.config import (
 from holdfast.config.rights import items, together, unit_rights
 from holdfast.config.route_checks import routed
 from holdfast.config.scalars import MAX_TIME
-from holdfast.file_reading import require_stored
 from holdfast.net.tls import NO_FILES
 from holdfast.polling.reader import Reader
 from holdfast.server import Identity

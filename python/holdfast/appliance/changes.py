@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from holdfast.bounded_files import answered
 from holdfast.config.fingerprint import fingerprint
-from holdfast.file_reading import answered
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -37,7 +37,7 @@ from holdfast.config.route_checks import routed
 from holdfast.faults import fault_word
 from holdfast.ingest import MemoryAccess
 from holdfast.net.addresses import joined
-from holdfast.server.forking import close_in_children
+from holdfast.server.fork import close_in_children
 from holdfast.standstill import WallClock
 from holdfast.web.port import Port
 

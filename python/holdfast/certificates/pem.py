@@ -10,8 +10,8 @@ from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 
-from holdfast import file_reading
-from holdfast.file_reading import MAX_CERTIFICATES
+from holdfast import bounded_files
+from holdfast.bounded_files import MAX_CERTIFICATES
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -51,8 +51,8 @@ class UnusableFile(ValueError):
 def content(file: File) -> bytes:
     """Returns the content of a file. Raises `UnusableFile`."""
     try:
-        return file_reading.read(file, MAX_CERTIFICATES)
-    except file_reading.TooLarge as error:
+        return bounded_files.read(file, MAX_CERTIFICATES)
+    except bounded_files.TooLarge as error:
         raise UnusableFile(file, f"more than {MAX_CERTIFICATES} bytes, allowed: PEM") from error
     except OSError as error:
         raise UnusableFile(file, error.strerror or str(error)) from error

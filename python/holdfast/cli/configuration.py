@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.appliance import assembly, configured_certificates
+from holdfast.bounded_files import NotAnswered, answered
 from holdfast.client.endpoint import check_files, endpoint, receiver_endpoint
 from holdfast.config import HTTP_SERVICES, ConfigError, tls_of
 from holdfast.config.load import loaded, unanswered
 from holdfast.config.report import Report
-from holdfast.file_reading import NotAnswered, answered
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,9 +14,9 @@ from urllib.parse import urlsplit
 
 import click
 
+from holdfast.bounded_files import require_stored
 from holdfast.cli.showing import plain, table
 from holdfast.cli.tls_options import tls_of, tls_options
-from holdfast.file_reading import require_stored
 from holdfast.net.addresses import joined, reachable
 from holdfast.web import health as probes
 

@@ -17,11 +17,11 @@ import click
 from holdfast import logs
 from holdfast.adapters.foreign import UnknownAdapter
 from holdfast.appliance import changes
+from holdfast.bounded_files import TIMEOUT_MS, FileWork, NotAnswered, Unreadable, answered
 from holdfast.cli.watched_files import WatchedFiles
 from holdfast.config import ConfigError
 from holdfast.config.fingerprint import files_of
 from holdfast.config.load import unanswered
-from holdfast.file_reading import TIMEOUT_MS, FileWork, NotAnswered, Unreadable, answered
 from holdfast.web.port import explained
 
 if TYPE_CHECKING:

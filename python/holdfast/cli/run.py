@@ -21,6 +21,7 @@ from holdfast.appliance.kept import UnusableFile
 from holdfast.appliance.service_manager import ServiceManager
 from holdfast.appliance.shared_logs import LogNotJoined
 from holdfast.appliance.supervision import give_way
+from holdfast.bounded_files import Unreadable
 from holdfast.cli.configuration import WRONG, load_or_exit, load_whole
 from holdfast.cli.open_files import allow_open_files
 from holdfast.cli.places import MODICON
@@ -31,7 +32,6 @@ from holdfast.config import GatewayConfig, ModbusTcpListener, RouteConfig, UnitM
 from holdfast.config.fingerprint import files_of
 from holdfast.config.rights import unit_rights
 from holdfast.config.scanning import written_pollable
-from holdfast.file_reading import Unreadable
 from holdfast.net.addresses import joined, reachable
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.types import BIT_AREAS, REGISTER_AREAS

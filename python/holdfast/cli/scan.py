@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 import click
 
 from holdfast import __version__, logs
+from holdfast.bounded_files import FileWork
 from holdfast.cli.log_options import FORMATS
 from holdfast.cli.open_files import allow_open_files
 from holdfast.cli.run import JOIN_TIMEOUT
@@ -48,7 +49,6 @@ from holdfast.config.scanning import (
     parse_server,
     written_pollable,
 )
-from holdfast.file_reading import FileWork
 from holdfast.net import event_loop
 from holdfast.net.allow_list import AllowedNetwork
 from holdfast.scanner import (

@@ -10,7 +10,7 @@ import contextlib
 import os
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
-from holdfast.file_reading import call
+from holdfast.bounded_files import call
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -6,9 +6,9 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from holdfast._core import BlockingClient, Endpoint
+from holdfast.bounded_files import require_stored
 from holdfast.client.tolerance import STRICT
 from holdfast.client.url import NetworkTarget, SerialTarget
-from holdfast.file_reading import require_stored
 from holdfast.protocol import TLS_PORT
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import os
 import stat
 from typing import TYPE_CHECKING
 
-from holdfast import file_reading
+from holdfast import bounded_files
 from holdfast.config.words import show
 
 if TYPE_CHECKING:
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 def unreadable(path: Path) -> str:
     """Why a file can't be read, or "" if it can. Does not open it: it may contain a secret."""
     try:
-        mode = file_reading.call(path, path.stat).st_mode
-        may_read = file_reading.call(path, os.access, path, os.R_OK)
+        mode = bounded_files.call(path, path.stat).st_mode
+        may_read = bounded_files.call(path, os.access, path, os.R_OK)
     except OSError as error:
         return error.strerror or str(error)
     if stat.S_ISDIR(mode):
         return os.strerror(errno.EISDIR)
-    return file_reading.unstored(path, mode) or ("" if may_read else os.strerror(errno.EACCES))
+    return bounded_files.unstored(path, mode) or ("" if may_read else os.strerror(errno.EACCES))
 
 
 def check_readable(

@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from holdfast import file_reading
+from holdfast import bounded_files
 from holdfast.config.base import Model
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def fingerprint(*settings: object) -> str:
         digest.update(repr(plain).encode())
         for file in _files(each):
             try:
-                content = file_reading.read(file, MAX_BYTES)
+                content = bounded_files.read(file, MAX_BYTES)
             except OSError:
                 content = b""
             digest.update(hashlib.sha256(content).digest())

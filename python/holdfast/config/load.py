@@ -11,7 +11,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from holdfast import file_reading
+from holdfast import bounded_files
 from holdfast.config import source
 from holdfast.config.allowed import allowed, known_keys
 from holdfast.config.device_checks import DeviceChecks
@@ -54,12 +54,12 @@ def loaded(path: Path | str) -> tuple[Config, source.Document]:
         return config.with_sha256(hashlib.sha256(content).hexdigest()), document
 
     try:
-        return file_reading.answered(work)
-    except file_reading.NotAnswered as error:
+        return bounded_files.answered(work)
+    except bounded_files.NotAnswered as error:
         raise ConfigError(file, [unanswered(error)]) from None
 
 
-def unanswered(error: file_reading.NotAnswered) -> Problem:
+def unanswered(error: bounded_files.NotAnswered) -> Problem:
     """The problem of a file that was not read in time."""
     return Problem(str(error.filename), None, None, "", f"can't be read: {error.strerror}")
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pydantic import TypeAdapter
 
-from holdfast import file_reading
+from holdfast import bounded_files
 from holdfast.config import initial
 from holdfast.config.lenient import fitting, integer, mapping
 from holdfast.config.memories import Extent, Span
@@ -138,9 +138,9 @@ class MemoryChecks:
                 continue
             path: KeyPath = ("memories", name, "keep")
             found = str(self.folder / file)
-            if not file_reading.call(found, Path(found).parent.is_dir):
+            if not bounded_files.call(found, Path(found).parent.is_dir):
                 self.report.add((*path, "file"), f"found {show(file)}, whose folder does not exist")
-            elif file_reading.call(found, Path(found).is_dir):
+            elif bounded_files.call(found, Path(found).is_dir):
                 self.report.add((*path, "file"), f"found {show(file)}, which is a folder")
             elif found in first and first[found][1] != sync:
                 other = first[found][0]

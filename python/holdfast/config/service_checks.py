@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from holdfast import file_reading
+from holdfast import bounded_files
 from holdfast.config.broker import parse_topic_filter
 from holdfast.config.broker_checks import check_broker
 from holdfast.config.connection_checks import doubt_source_limit
@@ -156,10 +156,10 @@ class ServiceChecks:
         if not isinstance(file, str) or not file or "\0" in file:
             return
         path = self.folder / file
-        if file_reading.call(path, path.is_dir):
+        if bounded_files.call(path, path.is_dir):
             message = f"found {show(file)}, which is a folder, allowed: a file"
             self.report.add(("audit", "file"), message)
-        elif not file_reading.call(path, path.parent.is_dir):
+        elif not bounded_files.call(path, path.parent.is_dir):
             message = f"found {show(file)}, allowed: a file in an existing folder"
             self.report.add(("audit", "file"), message)
 

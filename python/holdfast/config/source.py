@@ -17,7 +17,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
-from holdfast import file_reading
+from holdfast import bounded_files
 from holdfast.config.problems import ConfigError, Problem
 from holdfast.config.words import show
 
@@ -158,7 +158,7 @@ def decoded(data: bytes, file: str, form: str = "YAML") -> str:
 def read_bytes(path: Path, file: str, max_bytes: int = MAX_BYTES) -> bytes:
     """Reads a file without decoding it. Raises `ConfigError`."""
     try:
-        return file_reading.read(path, max_bytes, named_pipe=True)
+        return bounded_files.read(path, max_bytes, named_pipe=True)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         message = f"can't be read: {reason}"

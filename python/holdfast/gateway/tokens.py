@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, TypeAlias
 
+from holdfast.bounded_files import MAX_SECRETS, read
 from holdfast.config.scalars import NAME_FORM, is_name
-from holdfast.file_reading import MAX_SECRETS, read
 
 if TYPE_CHECKING:
     from pathlib import Path

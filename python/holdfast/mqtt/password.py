@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from holdfast.bounded_files import MAX_SECRETS, read
 from holdfast.config.broker import MAX_TEXT
-from holdfast.file_reading import MAX_SECRETS, read
 
 if TYPE_CHECKING:
     from pathlib import Path

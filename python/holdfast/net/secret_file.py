@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.file_reading import MAX_SECRETS, read
+from holdfast.bounded_files import MAX_SECRETS, read
 
 if TYPE_CHECKING:
     from pathlib import Path

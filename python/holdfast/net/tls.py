@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-from holdfast.file_reading import require_stored
+from holdfast.bounded_files import require_stored
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

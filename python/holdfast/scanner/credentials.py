@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from holdfast.file_reading import MAX_SECRETS, read
+from holdfast.bounded_files import MAX_SECRETS, read
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Self, cast
 
 from holdfast import _core
 from holdfast.net.addresses import LOOPBACK
-from holdfast.server.forking import close_in_children
+from holdfast.server.fork import close_in_children
 from holdfast.server.identity import Identity
 from holdfast.server.listening import NAME, TransportOptions, listener
 

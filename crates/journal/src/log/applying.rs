@@ -7,7 +7,7 @@ use holdfast_memory::Outcome;
 use super::error::End;
 use super::message::OVERHEAD;
 use super::node::{LogSession, Node};
-use super::received::Received;
+use super::raw_message::Received;
 use super::state::{Applied, Place};
 use super::status::{Event, NodeView, Phase};
 

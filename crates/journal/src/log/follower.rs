@@ -12,7 +12,7 @@ use super::error::{End, LogError};
 use super::layout::fingerprint;
 use super::message::{self, Origin};
 use super::messages::{Fetched, fetched};
-use super::received::Received;
+use super::raw_message::Received;
 use super::settings::Settings;
 use super::state::{Place, State, digest_of};
 use super::store::{Pointer, Snapshot, Store};

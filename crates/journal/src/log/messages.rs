@@ -13,7 +13,7 @@ use futures_util::stream::{self, BoxStream};
 use futures_util::{FutureExt, StreamExt};
 
 use super::error::End;
-use super::received::Received;
+use super::raw_message::Received;
 use super::state::Place;
 use super::store::Store;
 

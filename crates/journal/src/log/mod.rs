@@ -13,7 +13,7 @@
 //!
 //! `session.rs` runs the thread, and calls the other files: `joining.rs` before it reads the stream,
 //! `messages.rs` to read it, `applying.rs` for each message, `comparing.rs` for digests, `snapshots.rs` for snapshots.
-//! `returning.rs` is for a node whose contents were wrong, `kept.rs` for one with a file.
+//! `returning.rs` is for a node whose contents were wrong, `note.rs` for one with a file.
 
 mod applying;
 mod clock;
@@ -23,12 +23,12 @@ mod digests;
 mod error;
 mod follower;
 mod joining;
-mod kept;
 mod layout;
 mod message;
 mod messages;
 mod node;
-mod received;
+mod note;
+mod raw_message;
 mod returning;
 mod sending;
 mod sent;
@@ -54,8 +54,8 @@ pub use settings::{Login, Servers, Settings, Tls, WhenBehind};
 pub use shared::Kept;
 pub use status::{Digest, Event, Node, Phase, Status};
 
-use kept::Note;
 use node::Node as Running;
+use note::Note;
 use shared::Shared;
 
 /// The journal of memories that several nodes share.

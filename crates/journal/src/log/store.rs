@@ -20,7 +20,7 @@ use tokio::io::AsyncReadExt;
 use super::error::{End, LogError};
 use super::layout::difference;
 use super::message::{MAX_NODES, VERSION};
-use super::received::{Received, fetch};
+use super::raw_message::{Received, fetch};
 use super::settings::Settings;
 use super::state::{Place, State, digest_of};
 

@@ -12,10 +12,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast import file_reading
-from holdfast.client.endpoint import endpoint
-from holdfast.client.url import parse
-from holdfast.file_reading import (
+from holdfast import bounded_files
+from holdfast.bounded_files import (
     FileWork,
     NotAnswered,
     TooLarge,
@@ -23,6 +21,8 @@ from holdfast.file_reading import (
     read,
     require_stored,
 )
+from holdfast.client.endpoint import endpoint
+from holdfast.client.url import parse
 from support import wire
 from support.silent_files import Silent, threads
 
@@ -141,7 +141,7 @@ def test_work_with_many_silent_files_ends_at_the_first(
     def work() -> None:
         for file in files:
             with contextlib.suppress(OSError):
-                file_reading.call(file, os.stat, file)
+                bounded_files.call(file, os.stat, file)
 
     with Silent(monkeypatch, "stat", *files) as silent:
         for _ in range(3):
@@ -158,7 +158,7 @@ def test_what_other_code_reads_by_its_name_must_answer_and_end(
     good, large = tmp_path / "good", tmp_path / "large"
     good.write_bytes(b"content")
     with large.open("wb") as file:
-        file.truncate(file_reading.MAX_CERTIFICATES + 1)
+        file.truncate(bounded_files.MAX_CERTIFICATES + 1)
     require_stored(good, None, tmp_path / "missing", tmp_path)
     for unusable, reason in (
         (pipe, "it is a named pipe, allowed: a regular file"),
