@@ -39,14 +39,14 @@ test-python: .venv/core.stamp .venv/dev.stamp
 RUST_LOG := .cache/test-rust.log
 test-rust: $(TOOLCHAIN)
 	@cargo test --locked --quiet $(CRATES) --lib --tests > $(RUST_LOG) 2>&1 && \
-	  cargo test --locked --quiet $(CRATES) --doc >> $(RUST_LOG) 2>&1 && \
-	  cargo test --locked --quiet $(PROTOCOL) --no-default-features >> $(RUST_LOG) 2>&1 || \
+	  cargo test --locked --quiet $(CRATES) --doc >> $(RUST_LOG) 2>&1 || \
 	  { cat $(RUST_LOG); exit 1; }
 	@awk '/^test result/ {passed += $$4} END {print "Rust: " passed " passed"}' $(RUST_LOG)
 
-# The cases of tests/slow.txt.
+# The cases of tests/slow.txt, and the tests of the protocol crate once more, without its default features.
 test-slow: .venv/core.stamp .venv/dev.stamp
 	cargo test --locked --quiet -p holdfast-journal --test torture
+	cargo test --locked --quiet $(PROTOCOL) --no-default-features
 	$(PYTEST) --slow only
 
 # New cases for all property tests, and more of them. A case that fails is printed and kept: as a patch of the
