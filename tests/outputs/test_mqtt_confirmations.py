@@ -27,6 +27,7 @@ class Broker:
     def __init__(self, *confirms: int) -> None:
         self._confirms = confirms
         self.seen: list[list[int]] = []
+        self.availability: list[bytes] = []
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port = self._server.getsockname()[1]
         self.thread = threading.Thread(target=self._run)
@@ -60,6 +61,8 @@ class Broker:
                 if is_value:
                     seen.append(int(float(bytes(message.payload))))
                     confirmed += 1
+                elif message.topic.endswith("/pump"):
+                    self.availability.append(bytes(message.payload))
                 connection.sendall(b"\x40\x02" + message.identifier.to_bytes(2))
 
 
@@ -87,6 +90,23 @@ class Site:
         raise AssertionError("no test of this file writes")
 
 
+class Pump(Site):
+    """A site with one device, which can stop answering right after a look at it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_answering, self.is_ending = True, False
+
+    @property
+    def answers(self) -> int:  # type: ignore[override]
+        found = 1 if self.is_answering else 2
+        self.is_answering = self.is_answering and not self.is_ending
+        return found
+
+    def answering(self) -> dict[str, bool]:
+        return {"pump": self.is_answering}
+
+
 @pytest.fixture
 def stop() -> Iterator[Stop]:
     made = Stop()
@@ -94,13 +114,16 @@ def stop() -> Iterator[Stop]:
     made.set()
 
 
+def made(broker: Broker, site: Site, stop: Stop) -> MqttOutput:
+    url = f"mqtt://127.0.0.1:{broker.port}"
+    output = MqttOutput("home", MqttOutputConfig.model_validate({"type": "mqtt", "url": url}), site)
+    output.until(stop)
+    return output
+
+
 def test_a_step_goes_on_where_it_was(stop: Stop) -> None:
     broker = Broker(4, 3, 100)
-    url = f"mqtt://127.0.0.1:{broker.port}"
-    output = MqttOutput(
-        "home", MqttOutputConfig.model_validate({"type": "mqtt", "url": url}), Site()
-    )
-    output.until(stop)
+    output = made(broker, Site(), stop)
     readings = numbered(20)
     for _ in range(2):
         with pytest.raises(OSError, match="connection"):
@@ -109,3 +132,16 @@ def test_a_step_goes_on_where_it_was(stop: Stop) -> None:
     output.close()
     broker.thread.join()
     assert broker.seen == [list(range(4)), list(range(4, 7)), list(range(7, 20))]
+
+
+def test_a_device_that_stops_answering_between_two_looks_becomes_offline(stop: Stop) -> None:
+    site, broker = Pump(), Broker(1)
+    output = made(broker, site, stop)
+    output.idle()
+    site.is_ending = True
+    output.idle()
+    assert not site.is_answering
+    output.send(numbered(1))
+    output.close()
+    broker.thread.join()
+    assert broker.availability == [b"online", b"offline"]

@@ -199,8 +199,6 @@ class MqttOutput:
         now = self._site.answers
         if now == self._answers:
             return
-        if answering:
-            self._answers = now
         found = self._site.answering()
         changed = [
             device
@@ -208,6 +206,9 @@ class MqttOutput:
             if answers is answering and self._answering.get(device) is not answers
         ]
         self._answering.update(dict.fromkeys(changed, answering))
+        # A device that has just stopped answering is for the next call, before its values.
+        if all(self._answering.get(device) is answers for device, answers in found.items()):
+            self._answers = now
         payload = ONLINE if answering else OFFLINE
         topics = [self._topics.of_availability(device) for device in changed]
         if topics:
