@@ -358,7 +358,7 @@ def test_an_identification_ends_though_a_device_always_has_more(make: Make, dial
 
     device = make("tcp", then=more)
     with pytest.raises(holdfast.InvalidResponse, match="object 255 can't follow object"):
-        dial(device.url).identify()
+        dial(device.url, timeout=3 * wire.DEADLINE).identify()  # For all 256 requests.
     assert len(device.requests) == 256
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import threading
 import time
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -177,6 +176,9 @@ def test_the_connection_of_leases_is_made_again(
 def test_the_thread_of_leases_ends_with_the_node(node: Callable[..., Running]) -> None:
     one = node("a")
     share(one)
+    thread = part_of(one).fleet._thread._thread
+    assert thread is not None
+    assert thread.is_alive()
     one.stop()
-    assert "holdfast-leases" not in [each.name for each in threading.enumerate()]
+    assert not thread.is_alive()
     assert not part_of(one).fleet.leases.held

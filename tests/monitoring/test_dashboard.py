@@ -38,7 +38,7 @@ COLUMNS = 24
 
 def with_values(query: str) -> str:
     """A query as Grafana sends it, with everything selected."""
-    chosen = {"instance": ".*", "device": ".*", "__rate_interval": "30s"}
+    chosen = {"instance": ".*", "device": ".*", "__rate_interval": "60s"}
     return re.sub(r"\$(\w+)", lambda found: chosen[found[1]], query)
 
 

@@ -119,7 +119,6 @@ def test_a_real_prometheus_evaluates_the_rules_against_an_appliance(
     class WithRules(Prometheus):
         target = endpoint(appliance, "metrics")
         rules = MONITORING / "alerts.yml"
-        interval = 3  # A loaded machine takes more than a second for all metrics.
 
     prometheus = WithRules(tmp_path)
 

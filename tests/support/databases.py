@@ -90,8 +90,8 @@ class Prometheus(Database):
     name = "prometheus"
     target: tuple[str, int] = ("127.0.0.1", 9)
     rules: Path | None = None
-    interval = 1
-    """Seconds between scrapes, and the timeout of each."""
+    interval = 10
+    """Seconds between scrapes, and the timeout of each: a loaded machine needs some of them."""
 
     def command(self) -> list[str]:
         file = self._folder / "prometheus.yml"
