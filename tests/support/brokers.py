@@ -148,10 +148,15 @@ class NatsServer(Broker):
         """Removes everything that JetStream stored. The server must not run."""
         shutil.rmtree(self._folder / "store")
 
+    @property
+    def monitoring(self) -> str:
+        """Where a server with the option `-m` answers HTTP."""
+        address: str = re.findall(r"Starting http monitor on (\S+)", self.log)[-1]
+        return f"http://{address}"
+
     def clients(self) -> list[str]:
         """The names of the connected clients, of a server with the option `-m`."""
-        monitor = re.findall(r"Starting http monitor on (\S+)", self.log)[-1]
-        host, _, port = monitor.rpartition(":")
+        host, _, port = self.monitoring.removeprefix("http://").rpartition(":")
         # Without a resolver, which a test may have replaced.
         with socket.socket() as made, contextlib.closing(HTTPConnection(host)) as http:
             made.settimeout(wire.DEADLINE)

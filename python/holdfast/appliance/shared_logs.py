@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from holdfast import _core, logs
-from holdfast.appliance import embedded
+from holdfast.appliance import embedded, log_servers
 from holdfast.net.tls import NO_FILES
 
 if TYPE_CHECKING:
@@ -120,6 +120,7 @@ class SharedLogs:
             memories=",".join(each for each, _ in members),
         )
         self._kept.start(name, log)
+        log_servers.begin(name, settings)
 
     def status(self) -> dict[str, dict[str, Any]]:
         """The state and the counters of each log."""

@@ -34,6 +34,9 @@ def check_servers(path: KeyPath, log: dict[Any, Any], report: Report) -> None:
         if key in log:
             message = "found with embedded, allowed: username and password_file, or token_file"
             report.add((*path, key), message, of_key=True)
+    if "monitoring" in log:
+        message = "found with embedded, allowed: without, its sync_interval is always"
+        report.add((*path, "monitoring"), message, of_key=True)
     if log.get("replicas", 1) != 1:
         message = f"found {show(log['replicas'])} with embedded, allowed: 1, it is one server"
         report.add((*path, "replicas"), message)

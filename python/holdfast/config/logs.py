@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, Strict, model_validator
 
-from holdfast.config.scalars import FilePath, Name, NatsUrl, NotNull, whole_number
+from holdfast.config.scalars import FilePath, HttpUrl, Name, NatsUrl, NotNull, whole_number
 from holdfast.config.services import NatsServersConfig
 
 EMBEDDED_URL = "nats://127.0.0.1:4222"
@@ -26,6 +26,9 @@ class SharedLogConfig(NatsServersConfig):
     servers: Annotated[tuple[NatsUrl, ...], Strict(False), Field(min_length=1)] = ()
     """The NATS servers: nats://host:port or tls://host:port; optional with embedded, whose only
     entry is where the embedded server listens."""
+    monitoring: Annotated[tuple[HttpUrl, ...], Strict(False)] = ()
+    """Where the NATS servers answer HTTP (their key http): at its start, the appliance warns of
+    those that a power cut may cost what they have confirmed."""
     embedded: Annotated[FilePath | None, NotNull()] = None
     """The folder of a NATS server that is started with the appliance; requires nats-server."""
     node: Name
