@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -11,6 +13,7 @@ from click.testing import CliRunner
 from holdfast.cli import main
 from holdfast.cli.configuration import load_whole
 from holdfast.config import ConfigError
+from support import wire
 from support.certificate_cases import CA, NAME, SIGNS, Mint
 from support.certificates import FUTURE, PAST, Certificates, named
 from support.tls_peer import configuration, context, reasons, verdict
@@ -195,3 +198,27 @@ def test_check_prints_warnings_and_succeeds(plant: Plant) -> None:
 def test_a_policy_without_lists_has_no_effect(plant: Plant) -> None:
     [warning] = load_whole(plant.config(expired_crl="accept")).warnings
     assert warning.message == "has no effect without crl_file"
+
+
+def test_a_file_that_does_not_answer_stops_no_other_thread(tmp_path: Path) -> None:
+    """As a file of a network file system whose server is away."""
+    program = """
+import os, sys, threading
+import holdfast
+
+silent = sys.argv[1]
+os.mkfifo(silent)
+files = {"cert_file": silent, "key_file": silent, "ca_file": silent}
+threading.Thread(target=holdfast.ServerTls, kwargs=files, daemon=True).start()
+with open(silent, "wb"):  # It is open for reading now, and has neither bytes nor an end.
+    print("goes on", flush=True)
+    os._exit(0)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "silent")],
+        capture_output=True,
+        text=True,
+        timeout=wire.DEADLINE,
+        check=True,
+    )
+    assert done.stdout == "goes on\n"

@@ -224,6 +224,7 @@ impl Endpoint {
     #[staticmethod]
     #[pyo3(signature = (host, port, ca=None, cert=None, key=None, name=None, unlocked=None))]
     fn tls(
+        py: Python<'_>,
         host: String,
         port: u16,
         ca: Option<PathBuf>,
@@ -238,7 +239,9 @@ impl Endpoint {
             _ => return Err(PyValueError::new_err("cert and key: give both, or neither")),
         };
         let name = name.unwrap_or(&host);
-        let tls = ClientTls::new(ClientSettings { ca: ca.as_deref(), own, key: unlocked, name });
+        let settings = ClientSettings { ca: ca.as_deref(), own, key: unlocked, name };
+        // A file that does not answer stops no other thread.
+        let tls = py.detach(|| ClientTls::new(settings));
         let tls = Some(Arc::new(tls.map_err(unusable)?));
         Ok(Endpoint { core: Place::Tcp { host, port, tls }.into() })
     }

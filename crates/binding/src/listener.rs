@@ -142,6 +142,7 @@ impl ServerTls {
     #[new]
     #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None, expired_crl="refuse", key=None))]
     fn new(
+        py: Python<'_>,
         cert_file: PathBuf,
         key_file: PathBuf,
         ca_file: PathBuf,
@@ -152,7 +153,8 @@ impl ServerTls {
         let allowed = [("refuse", ExpiredLists::Refuse), ("accept", ExpiredLists::Accept)];
         let expired_lists = word("expired_crl", expired_crl, &allowed)?;
         let files = ServerFiles { cert_file, key_file, ca_file, crl_file, expired_lists };
-        let core = CoreServerTls::load(&files, key);
+        // A file that does not answer stops no other thread.
+        let core = py.detach(|| CoreServerTls::load(&files, key));
         let core = core.map_err(|error| PyValueError::new_err(error.to_string()))?;
         Ok(ServerTls { core: Arc::new(core) })
     }

@@ -12,7 +12,7 @@ pub enum LogError {
     /// A setting is wrong, or a file of the settings can't be used.
     #[error("{0}")]
     Settings(String),
-    #[error("no connection to the log within {} s: {last}", .within.as_secs_f64())]
+    #[error("not caught up with the log within {} s: {last}", .within.as_secs_f64())]
     NoConnection { within: Duration, last: String },
     #[error("the layout differs from that of the log: {0}")]
     Layout(String),

@@ -159,7 +159,10 @@ impl Log {
     /// The error that says why the log did not catch up within a time.
     pub fn no_connection(&self, within: Duration) -> LogError {
         let last = self.shared.view().last_error;
-        LogError::NoConnection { within, last: last.unwrap_or_else(|| "catching up".to_owned()) }
+        LogError::NoConnection {
+            within,
+            last: last.unwrap_or_else(|| "it has more messages".to_owned()),
+        }
     }
 
     /// Refuses writes from now on, waits for those that were sent, and ends the thread.
