@@ -164,9 +164,16 @@ def test_what_nats_took_before_it_died_is_published_anew(
     device = scanner.scanner._registry.devices["plc1"]
     seen = device.health.scans + 3
     wire.until(lambda: device.health.scans > seen, "the change was handed to NATS")
-    own_nats.kill()
-    own_nats.start()
-    wire.until(lambda: own_caller.client.is_connected, "the caller is back")
+
+    async def restart() -> None:
+        # In the scanner's event loop: it can't connect before the caller, who would miss something.
+        own_nats.kill()
+        wire.until(lambda: not own_caller.client.is_connected, "the caller has noticed")
+        own_nats.start()
+        wire.until(lambda: own_caller.client.is_connected, "the caller is back")
+        own_caller.publish("behind.its.subscriptions")
+
+    scanner.do(restart())
     found: dict[str, int] = {}
     while len(found) < 3:
         message = data.next()
