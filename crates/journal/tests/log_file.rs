@@ -261,6 +261,18 @@ fn a_file_that_something_else_has_changed_is_refused() {
 }
 
 #[test]
+fn all_who_ask_at_once_for_what_a_file_keeps_get_it() {
+    let (server, folder) = (Server::new(), Folder::new());
+    let node = KeptNode::started(&server, &file_in(&folder));
+    node.node.write(0, 1).unwrap();
+    std::thread::scope(|scope| {
+        for _ in 0..4 {
+            scope.spawn(|| (0..100).for_each(|_| assert!(node.node.log.kept().is_some())));
+        }
+    });
+}
+
+#[test]
 fn a_note_that_does_not_fit_is_refused() {
     let (server, folder) = (Server::new(), Folder::new());
     let path = file_in(&folder);

@@ -43,6 +43,8 @@ pub(super) struct Shared {
     pub(super) counters: Counters,
     progress: Mutex<Progress>,
     changed: Condvar,
+    /// Held by who asks for what a file keeps: an answer is for one only.
+    asking: Mutex<()>,
     keeping: Mutex<Keeping>,
     given: Condvar,
 }
@@ -138,6 +140,7 @@ impl Shared {
             counters: Counters::default(),
             progress: Mutex::default(),
             changed: Condvar::new(),
+            asking: Mutex::default(),
             keeping: Mutex::default(),
             given: Condvar::new(),
         }
@@ -263,6 +266,7 @@ impl Shared {
 
     /// Asks the thread of the log for what a file keeps, and waits for it, at most for this time.
     pub(super) fn kept(&self, timeout: Duration) -> Option<Kept> {
+        let _alone = lock(&self.asking);
         let mut keeping = lock(&self.keeping);
         if keeping.has_ended {
             return keeping.given.clone();
