@@ -269,6 +269,51 @@ def test_a_request_to_memory_waits_for_the_write_before_it(
     )
 
 
+@pytest.mark.parametrize("link", [{"in_flight": 1}, {"in_flight": 8}, {"cache": 3600}], ids=str)
+@pytest.mark.parametrize("pattern", ["WR", "RW", "WWR", "RWR", "WRWR", "RRWRR", "WRRW", "RWRWR"])
+def test_what_a_client_sends_together_has_the_outcome_of_its_order(
+    device: Stream, run: Run, connect: Connect, pattern: str, link: dict[str, Any]
+) -> None:
+    """Also while equal reads of others wait, or have been answered."""
+    appliance = run(configuration(device.url, link=link))
+    first, other, front = (connect(scada(appliance)) for _ in range(3))
+    assert first.ask(READ) == FIVE
+    held = Held()
+    device.script = [held]
+    first.send(wire.frame(bytes.fromhex("0300060001")))
+    device.await_requests(2)
+    other.send(wire.frame(READ))
+    value, requests, expected = 5, [], []
+    for number, kind in enumerate(pattern):
+        value = 100 + number if kind == "W" else value
+        write = bytes.fromhex("060005") + value.to_bytes(2)
+        requests.append(write if kind == "W" else READ)
+        expected.append(write if kind == "W" else b"\x03\x02" + value.to_bytes(2))
+    front.send(wire.frames(requests))
+    wire.until(lambda: counters(appliance)["requests"] >= 3 + len(pattern), "all have come")
+    held.release()
+
+    assert [reply.pdu for reply in front.receive_many(len(pattern))] == expected
+
+
+def test_a_request_waits_until_the_write_before_it_is_answered(
+    device: Stream, run: Run, connect: Connect
+) -> None:
+    """A device that answers several requests at once may carry them out in another order."""
+    unanswered: list[Asked] = []
+    device.script = [unanswered.append]
+    appliance = run(configuration(device.url, link={"in_flight": 8}))
+    front, other = connect(scada(appliance)), connect(scada(appliance))
+    front.send(wire.frame(WRITE) + wire.frame(READ))
+    device.await_requests(1)
+    assert other.ask(bytes.fromhex("0300060001")) == bytes.fromhex("03020006")
+    assert [asked.pdu for asked in device.requests] == [WRITE, bytes.fromhex("0300060001")]
+    unanswered[0].answer()
+
+    replies = [reply.pdu for reply in front.receive_many(2)]
+    assert replies == [WRITE, bytes.fromhex("03021234")]
+
+
 @pytest.mark.parametrize("in_flight", [1, 8])
 def test_many_clients_never_get_the_reply_of_another(
     device: Stream, run: Run, in_flight: int

@@ -18,6 +18,7 @@ mod fault;
 mod fence;
 mod flood;
 mod handshake;
+mod order;
 mod pace;
 mod permit;
 mod queue;

@@ -11,6 +11,7 @@ use tokio::sync::mpsc;
 use super::backoff::Retry;
 use super::caller::{Caller, Waiting};
 use super::coming::{Coming, ReplyTo, coming};
+use super::order::InOrder;
 use super::pace::InFlight;
 use super::queue::Priority;
 use crate::client::{ClientError, Endpoint, StrayCounters};
@@ -85,6 +86,8 @@ pub(crate) struct Call {
 /// when this is dropped.
 pub(super) struct Reply {
     to: Receiver,
+    /// What its connection asks for after it waits for its end.
+    in_order: Option<InOrder>,
     _place: Place,
 }
 
@@ -177,7 +180,7 @@ impl SharedLink {
         let priority = self.priority(request, None);
         let (ticket, waiting) = caller.begin(request, timeout, is_broadcast);
         let (request, source) = (request.clone(), caller.source);
-        let reply = Reply { to: Receiver::EventLoop(waiting), _place: place };
+        let reply = Reply { to: Receiver::EventLoop(waiting), in_order: None, _place: place };
         // If the link has ended, the call ends as lost.
         let _ = self.calls.send(Call { unit_id, request, source, priority, reply });
         Some(ticket)
@@ -219,7 +222,11 @@ impl Route {
             request,
             source: asker.source,
             priority,
-            reply: Reply { to: Receiver::Listener(to, self.timeout), _place: place },
+            reply: Reply {
+                to: Receiver::Listener(to, self.timeout),
+                in_order: None,
+                _place: place,
+            },
         };
         match link.calls.send(call) {
             Ok(()) => Ok(coming),
@@ -236,6 +243,11 @@ impl Reply {
             (Receiver::EventLoop(to), Ok(pdu)) => to.end(Ok(pdu.to_vec())),
             (Receiver::EventLoop(to), Err((error, _))) => to.end(Err(Arc::clone(error))),
         }
+    }
+
+    /// Its connection keeps its requests in order until this ends.
+    pub(super) fn hold(&mut self, in_order: InOrder) {
+        self.in_order = Some(in_order);
     }
 
     /// Whether nobody waits for the reply any more.

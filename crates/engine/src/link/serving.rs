@@ -11,6 +11,7 @@ use tokio::task::spawn_local;
 
 use super::access::Link;
 use super::fault::{Exchanged, Fault, exception, fault};
+use super::order::Order;
 use super::permit::Permit;
 use super::route::{Call, LinkCounters, LinkSettings, Reply, SharedLink};
 use super::shared_reads::{SharedReads, shareable};
@@ -29,7 +30,8 @@ pub(crate) async fn serve(
     }
     let reads = SharedReads::new(settings.coalesce, settings.cache);
     let silence = Silence::new(link.retry);
-    let serving = Rc::new(Serving { link, reads, silence, error: RefCell::default() });
+    let order = Arc::<Order>::default();
+    let serving = Rc::new(Serving { link, order, reads, silence, error: RefCell::default() });
     while let Some(call) = calls.recv().await {
         let Some(shared) = shared.upgrade() else { return };
         spawn_local(Rc::clone(&serving).carry_out(call, shared));
@@ -38,6 +40,7 @@ pub(crate) async fn serve(
 
 struct Serving {
     link: Rc<Link>,
+    order: Arc<Order>,
     reads: SharedReads,
     silence: Silence,
     /// Why the address could not be reached the last time.
@@ -46,8 +49,12 @@ struct Serving {
 
 impl Serving {
     async fn carry_out(self: Rc<Self>, call: Call, shared: Arc<SharedLink>) {
-        let Call { unit_id, request, source, priority, reply } = call;
+        let Call { unit_id, request, source, priority, mut reply } = call;
         let counters = &shared.counters;
+        // Callers of an event loop wait for their own replies, and share one source.
+        if reply.is_of_listener() {
+            reply.hold(self.order.wait(source, request.is_read()).await);
+        }
         let read = shareable(unit_id, &request);
         let changes = self.link.changes.get();
         if let Some(pdu) = read.as_ref().and_then(|read| self.reads.cached(read, changes)) {
