@@ -172,7 +172,7 @@ def test_the_live_view_shows_values_units_and_states(
 
 def test_values_of_a_hung_device_are_dimmed_with_their_age(tags: str) -> None:
     with FakeDevice(lambda pdu: registers(pdu, 1)) as device:
-        arguments = ("watch", device.url, "--tags", tags, "--every", "0.05", "--timeout", "0.05")
+        arguments = ("watch", device.url, "--tags", tags, "--every", "0.05", "--timeout", "0.5")
         with Terminal(*arguments) as terminal:
             terminal.until("running (1)", "q quits")
             device.answer = lambda _: None
