@@ -99,9 +99,13 @@ def problem(event: str, **fields: object) -> None:
         LOGGER.error(event, extra={"fields": fields | more}, exc_info=True)
 
 
-def tell_held_back() -> None:
-    """Logs how many events were held back, for kinds of which none came since. Call it often."""
-    for kind, by, count in _REFUSALS.over(time.monotonic()):
+def tell_held_back(*, all_of_them: bool = False) -> None:
+    """Logs how many events were held back, for kinds of which none came since. Call it often.
+
+    At the end, have it log `all_of_them`, also where more could follow.
+    """
+    held_back = _REFUSALS.rest() if all_of_them else _REFUSALS.over(time.monotonic())
+    for kind, by, count in held_back:
         event, of = kind if isinstance(kind, tuple) else (kind, "")
         parts = of if isinstance(of, tuple) else (of,)
         shown = " ".join(str(part) for part in parts if part is not None)

@@ -50,11 +50,11 @@ NATS_CONFIGURATIONS = [
 
 def test_every_example_of_a_nats_server_stores_writes_at_once() -> None:
     sections = [
-        (file.name, section)
+        (file.relative_to(ROOT).as_posix(), section)
         for file in NATS_CONFIGURATIONS
         for section in re.findall(r"^jetstream \{.*?^\}", file.read_text(), re.M | re.S)
     ]
-    assert {"durability.md", "nats.conf"} <= {name for name, _ in sections}
+    assert {"docs/durability.md", "examples/replicated/nats.conf"} <= {name for name, _ in sections}
     without = [name for name, section in sections if "sync_interval: always" not in section]
     assert without == []
 

@@ -369,7 +369,7 @@ class _Running:
     def _log_last_events(self) -> None:
         while (event := self._engine.next_event(0)) is not None:
             self._log_event(*event)
-        logs.tell_held_back()
+        logs.tell_held_back(all_of_them=True)
 
     def log_events(self, timeout: float) -> None:
         event = self._engine.next_event(timeout)

@@ -417,6 +417,7 @@ async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
     logs.write(logging.INFO, "started", version=__version__)
     while await _scan(settings, check, signals):
         pass
+    logs.tell_held_back(all_of_them=True)
     logs.write(logging.INFO, "stopped")
 
 
