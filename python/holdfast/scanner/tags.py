@@ -11,6 +11,7 @@ from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages import FunctionCode, TagRequest
 from holdfast.tags.decoding import Undecoded
 from holdfast.tags.markers import as_decoded
+from holdfast.tags.register_scale import Scaled
 from holdfast.tags.writing import unwritable
 from holdfast.types import AREAS, BIT_AREAS
 from holdfast.values import ConversionError, WrongArea, codec_for
@@ -74,6 +75,21 @@ class Tag:
         return self.address + self.count
 
     @property
+    def source(self) -> tags.Tag | None:
+        """The register that contains the scale, if one does."""
+        return None if self.meaning is None else self.meaning.source
+
+    @property
+    def span(self) -> range:
+        """The addresses that one request must read: those of the value and of its scale."""
+        return range(self.address, self.end) if self.meaning is None else self.meaning.span
+
+    def scaled(self, raw: Any, content: Any) -> Scaled:
+        """The value, from the contents of its registers and of that of its scale."""
+        assert self.meaning is not None, "only tags of profiles have a scale"
+        return self.meaning.scaled(raw, content)
+
+    @property
     def asked_type(self) -> str:
         """The type as requests name it."""
         bools = parsed(self.type).base == "bool"
@@ -103,6 +119,8 @@ class Tag:
 
 def clean(value: Any, tag: Tag) -> Any:
     """Returns a decoded value; `None` for NaN and for markers of the tag."""
+    if type(value) is Scaled:
+        return value.value
     if type(value) is list:
         return [clean(item, tag) for item in value]
     if type(value) is float and value != value:

@@ -11,12 +11,14 @@ from functools import lru_cache
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeAlias, TypeVar
 
+from holdfast.tags.register_scale import PlacedRegisters, Scaled
 from holdfast.values import ConversionError, Field, Layout, decode
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from holdfast.tags.register_scale import Source
     from holdfast.types import Area
 
 Decoder: TypeAlias = Callable[[bytes], Sequence[Any]]
@@ -27,40 +29,23 @@ LAYOUTS = 1024
 _BITS = [tuple(bool(byte >> bit & 1) for bit in range(8)) for byte in range(256)]
 
 
-class PlacedTag(Protocol):
+class PlacedTag(PlacedRegisters, Protocol):
     """What is needed of a tag to decode it."""
-
-    @property
-    def area(self) -> Area:
-        """The area."""
-
-    @property
-    def address(self) -> int:
-        """The first address."""
-
-    @property
-    def type(self) -> str:
-        """The type."""
-
-    @property
-    def order(self) -> str:
-        """The byte order."""
-
-    @property
-    def encoding(self) -> str | None:
-        """The encoding of text; `None` for ASCII."""
-
-    @property
-    def count(self) -> int:
-        """The number of bits or registers."""
-
-    @property
-    def end(self) -> int:
-        """The address after the last one."""
 
     @property
     def of_bits(self) -> bool:
         """Whether the tag is in an area of bits."""
+
+    @property
+    def span(self) -> range:
+        """The addresses that one request must read: those of the value and of its scale."""
+
+    @property
+    def source(self) -> Source | None:
+        """The register that contains the scale, if one does."""
+
+    def scaled(self, raw: Any, content: Any) -> Scaled:
+        """The value, from the contents of its registers and of that of its scale."""
 
 
 T = TypeVar("T", bound=PlacedTag)
@@ -71,15 +56,15 @@ class Places(Generic[T]):
 
     def __init__(self, tags: Iterable[T]) -> None:
         self._tags: dict[Area, list[T]] = {}
-        for tag in sorted(tags, key=lambda tag: tag.address):
+        for tag in sorted(tags, key=lambda tag: tag.span.start):
             self._tags.setdefault(tag.area, []).append(tag)
-        self._starts = {area: [tag.address for tag in tags] for area, tags in self._tags.items()}
+        self._starts = {area: [tag.span.start for tag in tags] for area, tags in self._tags.items()}
 
     def inside(self, area: Area, address: int, count: int) -> list[T]:
-        """Returns the tags that are entirely inside a block, sorted by address."""
+        """Returns the tags that are entirely inside a block, with their scales."""
         starts, end = self._starts.get(area, []), address + count
         first, last = bisect_left(starts, address), bisect_left(starts, end)
-        return [tag for tag in self._tags.get(area, [])[first:last] if tag.end <= end]
+        return [tag for tag in self._tags.get(area, [])[first:last] if tag.span.stop <= end]
 
 
 class Undecoded:
@@ -93,6 +78,48 @@ def decoder(tags: Sequence[PlacedTag], address: int, count: int) -> Decoder:
     """Returns a decoder for tags of one area, which must all be inside the block."""
     if tags[0].of_bits:
         return _bits(tags, address)
+    if any(tag.source is not None for tag in tags):
+        return _with_scales(tags, address, count)
+    return _registers(tags, address, count)
+
+
+def _with_scales(tags: Sequence[PlacedTag], address: int, count: int) -> Decoder:
+    """A decoder for tags of which some have their scale in the same block."""
+    sources: dict[tuple[int, str, str], Source] = {}
+    for tag in tags:
+        if tag.source is not None:
+            sources.setdefault(_place(tag.source), tag.source)
+    numbers = {place: at for at, place in enumerate(sources, len(tags))}
+    scales = [None if tag.source is None else numbers[_place(tag.source)] for tag in tags]
+    decode = _registers([*tags, *sources.values()], address, count)
+
+    def decoded(data: bytes) -> Sequence[Any]:
+        found = decode(data)
+        return [
+            raw if at is None else _scaled(tag, raw, found[at])
+            for tag, raw, at in zip(tags, found, scales, strict=False)
+        ]
+
+    return decoded
+
+
+def _place(source: Source) -> tuple[int, str, str]:
+    return source.address, source.type, source.order
+
+
+def _scaled(tag: PlacedTag, raw: Any, content: Any) -> Scaled | Undecoded:
+    if type(raw) is Undecoded:
+        return raw
+    if type(content) is Undecoded:
+        return Undecoded(f"the scale: {content.error}")
+    try:
+        return tag.scaled(raw, content)
+    except ValueError as error:
+        return Undecoded(str(error))
+
+
+def _registers(tags: Sequence[PlacedRegisters], address: int, count: int) -> Decoder:
+    """A decoder for registers that are all inside the block."""
     layout = _layout(
         count, *((tag.type, tag.address - address, tag.order, tag.encoding) for tag in tags)
     )
@@ -115,16 +142,20 @@ def _layout(count: int, *fields: tuple[str, int, str, str | None]) -> Layout:
 
 def value_of(tag: PlacedTag, data: bytes, address: int) -> Any:
     """Decodes one tag of a block that begins at `address`."""
-    if not tag.of_bits:
-        return _alone(tag, data, address)
-    return _bits([tag], address)(data)[0]
+    if tag.of_bits:
+        return _bits([tag], address)(data)[0]
+    raw = _alone(tag, data, address)
+    source = tag.source
+    return raw if source is None else _scaled(tag, raw, _alone(source, data, address))
 
 
 def assembled(tag: PlacedTag, pieces: Sequence[tuple[int, bytes]]) -> bytes | None:
     """The bytes of a tag that several requests have read; `None` if something is missing.
 
-    `pieces` are addresses and bytes.
+    `pieces` are addresses and bytes. A scale in a register is only valid in the request that has
+    read it, so there are no pieces of such tags.
     """
+    assert tag.source is None, "a value and its scale are from one request"
     units: dict[int, bytes | bool] = {}
     for address, data in pieces:
         of_piece: Sequence[bytes | bool] = (
@@ -140,7 +171,7 @@ def assembled(tag: PlacedTag, pieces: Sequence[tuple[int, bytes]]) -> bytes | No
     return packed.to_bytes((len(wanted) + 7) // 8, "little")
 
 
-def _alone(tag: PlacedTag, data: bytes, address: int) -> Any:
+def _alone(tag: PlacedRegisters, data: bytes, address: int) -> Any:
     """Decodes one tag, independently of the others."""
     start = 2 * (tag.address - address)
     try:

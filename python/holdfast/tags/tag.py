@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from typing import Any
 
 from holdfast.integers import as_integer
-from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_LIMITS, WRITE_LIMITS
 from holdfast.tags.linear import Linear
 from holdfast.tags.markers import FLOATS, Marker, as_decoded
+from holdfast.tags.register_scale import RegisterScale, Scaled
 from holdfast.tags.writing import unwritable
 from holdfast.types import AREAS, BIT_AREAS, Area
 from holdfast.values import ConversionError, DoesNotFit, codec_for
+from holdfast.values.digits import shortest
 from holdfast.values.types import Type, parsed
 
 INTEGERS = ("int", "uint", "bcd")
@@ -49,7 +52,8 @@ class Tag:
     order: str = "ABCD"
     encoding: str | None = None
     """The encoding of text; `None` for ASCII."""
-    scale: float = 1
+    scale: float | RegisterScale = 1
+    """A number, or the register that contains it."""
     offset: float = 0
     unit: str = ""
     """The unit of the value, such as `V` or `°C`."""
@@ -101,16 +105,19 @@ class Tag:
     of_type: Type = field(init=False, repr=False, compare=False)
     """The type, split into its parts."""
     _linear: Linear = field(init=False, repr=False, compare=False)
+    """Of a scale in a register, only the offset."""
 
     def _check_number(self) -> None:
+        scale = 1 if isinstance(self.scale, RegisterScale) else self.scale
         try:
-            self._put("_linear", Linear(self.scale, self.offset))
+            self._put("_linear", Linear(scale, self.offset))
         except ValueError as error:
             raise TagError(str(error).split()[0], str(error)) from None
         if not self.is_number:
             for key in ("scale", "offset", "min", "max", "deadband"):
                 if (given := getattr(self, key)) != getattr(Tag, key):
                     raise TagError(key, f"{key} is {given}, allowed: only with numbers")
+        self._check_source()
         if not (math.isfinite(self.deadband) and self.deadband >= 0):
             found = f"deadband is {self.deadband}"
             raise TagError("deadband", f"{found}, allowed: a finite number from 0")
@@ -122,6 +129,29 @@ class Tag:
             names = list(self.states.values())
             twice = next(name for name in names if names.count(name) > 1)
             raise TagError("states", f"two states have the name {twice!r}")
+
+    def _check_source(self) -> None:
+        """A scale must be readable in the request that reads the value."""
+        source = self.source
+        if source is None or not isinstance(self.scale, RegisterScale):
+            return
+        found = f"the scale is from {self.scale.where}"
+        if source.area != self.area:
+            raise TagError("scale", f"{found}, allowed: a register in {self.area}, as the value")
+        if not source.is_number or source.of_type.count is not None:
+            raise TagError("scale", f"{found}, type {source.type}, allowed: a single number")
+        if source.is_float and self.scale.form == "exponent":
+            raise TagError("scale", f"{found}, type {source.type}, allowed: an integer exponent")
+        if isinstance(source.scale, RegisterScale):
+            raise TagError("scale", f"{found}, whose own scale is in a register")
+        most = READ_LIMITS[self.area]
+        if len(self.span) > most:
+            place = f"{self.span.start} to {self.span.stop - 1}"
+            raise TagError(
+                "scale",
+                f"{found}: {place} are {len(self.span)} registers, one request reads at most "
+                f"{most}, and a value is only read together with its scale",
+            )
 
     def _check_writable(self) -> None:
         if self.writable and (flaw := self.unwritable) is not None:
@@ -136,6 +166,21 @@ class Tag:
     def end(self) -> int:
         """The address after the last one."""
         return self.address + self.count
+
+    @property
+    def source(self) -> Tag | None:
+        """The register that contains the scale, if one does."""
+        source = self.scale.source if isinstance(self.scale, RegisterScale) else None
+        assert source is None or isinstance(source, Tag)
+        return source
+
+    @property
+    def span(self) -> range:
+        """The addresses that one request must read: those of the value and of its scale."""
+        of = self.source
+        if of is None:
+            return range(self.address, self.end)
+        return range(min(self.address, of.address), max(self.end, of.end))
 
     @property
     def of_bits(self) -> bool:
@@ -160,14 +205,66 @@ class Tag:
         return unwritable(self.area, self.of_type, self.type)
 
     def value(self, raw: Any) -> Any:
-        """The value of what the registers hold; `None` if none is available."""
+        """The value of what the registers hold; `None` if none is available.
+
+        Raises `ValueError` if the scale is in a register: see `with_scale`.
+        """
+        if type(raw) is Scaled:
+            return raw.value
+        if isinstance(self.scale, RegisterScale):
+            raise ValueError(self._unscaled)
+        return self._value(raw, self._linear)
+
+    def scaled(self, raw: Any, content: Any) -> Scaled:
+        """The value, from the contents of its registers and of that of its scale.
+
+        Raises `ValueError` if there is a number, but no scale.
+        """
+        assert isinstance(self.scale, RegisterScale), "only such tags have a register for it"
+        if self._is_null(raw):
+            return Scaled(self._value(raw, self._linear))
+        return Scaled(self._value(self._as_written(raw), self.scale.linear(content, self.offset)))
+
+    def with_scale(self, content: Any) -> Tag:
+        """The tag with the scale that its register contains. Raises `ValueError` without one."""
+        assert isinstance(self.scale, RegisterScale), "only such tags have a register for it"
+        return replace(self, scale=self.scale.factor(content))
+
+    def resolved(self, tags: Mapping[str, Tag]) -> Tag:
+        """The tag with the register of its scale, which is among `tags`. Raises `TagError`."""
+        if not isinstance(self.scale, RegisterScale) or self.scale.name is None:
+            return self
+        source = tags.get(self.scale.name, self.scale.source)
+        if source is None:
+            raise TagError("scale", f"the tag {self.scale.name!r} does not exist in this list")
+        return replace(self, scale=replace(self.scale, source=source))
+
+    @property
+    def _unscaled(self) -> str:
+        assert isinstance(self.scale, RegisterScale)
+        return f"the scale is in {self.scale.where}, which has to be read first"
+
+    def _is_null(self, raw: Any) -> bool:
         if type(raw) is list:
-            return [self.value(item) for item in raw]
+            return all(map(self._is_null, raw))
+        return bool(raw != raw or raw in self.null)
+
+    def _as_written(self, raw: Any) -> Any:
+        """Floats as the shortest decimals that they stand for: 0.1 of a `float32` is 0.1."""
+        if type(raw) is list:
+            return [self._as_written(item) for item in raw]
+        if not isinstance(raw, float) or not math.isfinite(raw) or raw in self.null:
+            return raw
+        return Fraction(shortest(raw, self.of_type.base))
+
+    def _value(self, raw: Any, linear: Linear) -> Any:
+        if type(raw) is list:
+            return [self._value(item, linear) for item in raw]
         if raw != raw or (self.null and raw in self.null):
             return None
-        if self._linear.is_identity or not self.is_number:
-            return raw
-        return self._linear.value(raw)
+        if linear.is_identity or not self.is_number:
+            return float(raw) if isinstance(raw, Fraction) else raw
+        return linear.value(raw)
 
     def state(self, value: Any) -> str | None:
         """The name of a value, if it has one."""
@@ -191,6 +288,8 @@ class Tag:
             raise DoesNotFit(f"{value!r} is not a number")
         if not math.isfinite(value):
             raise DoesNotFit(f"{value} is not a finite number")
+        if isinstance(self.scale, RegisterScale):
+            raise DoesNotFit(self._unscaled)
         least, most = self.min, self.max
         if (least is not None and value < least) or (most is not None and value > most):
             allowed = f"{'' if least is None else least} to {'' if most is None else most}"

@@ -11,7 +11,10 @@ if TYPE_CHECKING:
 
 
 class TagList:
-    """The tags of a device, in their order. Raises `TagError` for two tags of one name."""
+    """The tags of a device, in their order.
+
+    Raises `TagError` for two tags of one name, and for a scale that no tag of the list has.
+    """
 
     def __init__(self, tags: Iterable[Tag] = ()) -> None:
         self._tags: dict[str, Tag] = {}
@@ -19,6 +22,8 @@ class TagList:
             if tag.name in self._tags:
                 raise TagError("name", f"two tags have the name {tag.name!r}")
             self._tags[tag.name] = tag
+        for name, tag in self._tags.items():
+            self._tags[name] = tag.resolved(self._tags)
 
     def __iter__(self) -> Iterator[Tag]:
         return iter(self._tags.values())

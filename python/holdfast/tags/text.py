@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast.tags.linear import Linear
+from holdfast.tags.register_scale import RegisterScale, linear_of
 from holdfast.tags.writing import BOOLEANS, from_text
 from holdfast.values import DoesNotFit
 from holdfast.values.digits import shortest
@@ -114,7 +114,9 @@ def _trimmed(tag: Tag, value: float) -> float:
         return value
     if tag.scale == 1 and tag.offset == 0:
         return float(shortest(value, base))
-    linear = _linear(tag.scale, tag.offset)
+    if isinstance(tag.scale, RegisterScale):
+        return value  # `Tag.scaled` has calculated it from these decimals.
+    linear = linear_of(tag.scale, tag.offset)
     try:
         number = float(linear.number(value))
     except OverflowError:
@@ -123,13 +125,10 @@ def _trimmed(tag: Tag, value: float) -> float:
 
 
 @lru_cache(1024)
-def _linear(scale: float, offset: float) -> Linear:
-    return Linear(scale, offset)
-
-
-@lru_cache(1024)
-def _places(scale: float, offset: float) -> int | None:
-    """The decimal places of all scaled integers; `None` for too many."""
+def _places(scale: float | RegisterScale, offset: float) -> int | None:
+    """The decimal places of all scaled integers; `None` for too many, and if they may change."""
+    if isinstance(scale, RegisterScale):
+        return None
     found = 0
     for number in (scale, offset):
         text = repr(float(number))

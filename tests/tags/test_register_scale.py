@@ -1,0 +1,156 @@
+"""A scale in a register: values are made with the scale of their own reply, or are bad."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import pytest
+
+from holdfast import values
+from holdfast.tags import Tag, TagError, TagList
+from holdfast.tags.decoding import Places, Undecoded, decoder, value_of
+from holdfast.tags.register_scale import Form, RegisterScale
+from holdfast.tags.text import plain, text_of
+from holdfast.values import DoesNotFit
+
+HR: Final = "holding_registers"
+
+
+def by_name(form: Form = "exponent", **more: Any) -> TagList:
+    source: dict[str, Any] = {"type": "int16", **more.pop("source", {})}
+    made: dict[str, Any] = {"type": "int16", "scale": RegisterScale(form, "sf"), **more}
+    return TagList([Tag("power", HR, 10, **made), Tag("sf", HR, 12, **source)])
+
+
+def value(tags: TagList, registers: list[int]) -> Any:
+    """The value of `power`, whose block begins at 10; the error if it is bad."""
+    power = tags["power"]
+    data = b"".join(each.to_bytes(2) for each in registers)
+    [found] = decoder([power], 10, len(registers))(data)
+    alone = value_of(power, data, 10)
+    if isinstance(found, Undecoded):
+        assert isinstance(alone, Undecoded)
+        assert alone.error == found.error
+        return found.error
+    assert power.value(alone) == power.value(found)
+    return power.value(found)
+
+
+@pytest.mark.parametrize(
+    ("number", "exponent", "expected"),
+    [
+        (432, 1, 4320),
+        (4320, 0, 4320),
+        (43200, -1, 4320.0),
+        (215, -1, 21.5),
+        (3, -10, 3e-10),
+        (3, 10, 30_000_000_000),
+        (0, -3, 0.0),
+    ],
+)
+def test_an_exponent_moves_the_point_exactly(number: int, exponent: int, expected: float) -> None:
+    found = value(by_name(type="uint16"), [number, 0, exponent & 0xFFFF])
+    assert (found, type(found)) == (expected, type(expected))
+
+
+@pytest.mark.parametrize("exponent", [0x8000, 11, -11 & 0xFFFF, 0x7FFF])
+def test_without_a_valid_exponent_a_number_is_bad(exponent: int) -> None:
+    signed = exponent - 0x10000 if exponent & 0x8000 else exponent
+    assert value(by_name(), [432, 0, exponent]) == (
+        f"the scale in {HR} 12 is 10^{signed}, allowed: exponents from -10 to 10"
+    )
+
+
+def test_a_point_without_a_value_needs_no_scale() -> None:
+    tags = by_name(null=frozenset([-32768]))
+    assert value(tags, [0x8000, 0, 0x8000]) is None
+    assert "10^-32768" in value(tags, [1, 0, 0x8000])
+
+
+@pytest.mark.parametrize(
+    ("source", "registers", "expected"),
+    [
+        ({"type": "uint16"}, [43, 0, 100], 4300),
+        ({"type": "uint16", "scale": 0.01}, [43, 0, 50], 21.5),
+        ({"type": "float32"}, [215, 0, *values.encode(0.1, "float32")], 21.5),
+        ({"type": "uint16"}, [43, 0, 0], "is 0, allowed: a finite number other than 0"),
+        ({"type": "float32"}, [215, 0, 0x7FC0, 0], "has no value"),
+        ({"type": "float32"}, [215, 0, 0x7F80, 0], "is inf, allowed: a finite number other"),
+        ({"type": "uint16", "null": frozenset([7])}, [1, 0, 7], "has no value"),
+        ({"type": "bcd16"}, [1, 0, 0xFFFF], "the scale: "),
+    ],
+)
+def test_a_factor_is_the_value_of_its_tag(
+    source: dict[str, Any], registers: list[int], expected: Any
+) -> None:
+    found = value(by_name("factor", source=source), registers)
+    assert expected in found if isinstance(expected, str) else found == expected
+
+
+def test_floats_and_arrays_have_scales_too() -> None:
+    floating = by_name(type="float32")
+    registers = [*values.encode(0.1, "float32"), -1 & 0xFFFF]
+    assert value(floating, registers) == 0.01
+    assert plain(floating["power"], 0.01) == 0.01
+    assert value(by_name(type="int16[2]", offset=5), [1, 2, 1]) == [15, 25]
+    assert text_of(floating["power"], 21.5) == "21.5"
+    assert text_of(by_name()["power"], 432.0) == "432"
+
+
+def test_a_value_without_the_content_of_its_scale_is_refused() -> None:
+    power = by_name(min=0)["power"]
+    with pytest.raises(ValueError, match=f"the scale is in {HR} 12, which has to be read first"):
+        power.value(432)
+    with pytest.raises(DoesNotFit, match="has to be read first"):
+        power.raw(4320)
+    fixed = power.with_scale(1)
+    assert (fixed.raw(4320), fixed.value(432), fixed.min) == (432, 4320, 0)
+    with pytest.raises(DoesNotFit, match="steps of 10"):
+        fixed.raw(4321)
+    with pytest.raises(ValueError, match="is 10\\^-32768"):
+        power.with_scale(-32768)
+
+
+def test_a_block_has_a_tag_only_with_its_scale() -> None:
+    tags = by_name()
+    places = Places(tags)
+    assert [each.name for each in places.inside(HR, 10, 3)] == ["power", "sf"]
+    assert places.inside(HR, 10, 2) == []
+    assert [each.name for each in places.inside(HR, 11, 2)] == ["sf"]
+    before = TagList(
+        [Tag("late", HR, 12, scale=RegisterScale("exponent", source=Tag("", HR, 2, "int16")))]
+    )
+    assert before["late"].span == range(2, 13)
+    assert Places(before).inside(HR, 3, 20) == []
+
+
+@pytest.mark.parametrize(
+    ("source", "more", "message"),
+    [
+        ({}, {"scale": RegisterScale("exponent", "x")}, "the tag 'x' does not exist in this list"),
+        ({"area": "input_registers"}, {}, "allowed: a register in holding_registers, as the value"),
+        ({"type": "string:2"}, {}, "type string:2, allowed: a single number"),
+        ({"type": "int16[2]"}, {}, "type int16[2], allowed: a single number"),
+        ({"type": "float32"}, {}, "type float32, allowed: an integer exponent"),
+        ({}, {"scale": RegisterScale("exponent", "power")}, "whose own scale is in a register"),
+        ({"address": 135}, {}, "10 to 135 are 126 registers, one request reads at most 125"),
+        ({}, {"type": "string:4"}, "scale is exponent from sf, allowed: only with numbers"),
+    ],
+)
+def test_scales_that_one_request_cannot_read_are_refused(
+    source: dict[str, Any], more: dict[str, Any], message: str
+) -> None:
+    place: dict[str, Any] = {"area": HR, "address": 12, "type": "int16", **source}
+    made: dict[str, Any] = {"type": "int16", "scale": RegisterScale("exponent", "sf"), **more}
+    with pytest.raises(TagError) as caught:
+        TagList([Tag("power", HR, 10, **made), Tag("sf", **place)])
+    assert caught.value.key == "scale"
+    assert message in str(caught.value)
+
+
+def test_a_list_takes_the_register_of_its_own_tag() -> None:
+    first = by_name()
+    moved = TagList([first["power"], Tag("sf", HR, 20, "int16")])
+    assert moved["power"].span == range(10, 21)
+    assert TagList([first["power"]])["power"].span == range(10, 13)
+    assert moved != first
