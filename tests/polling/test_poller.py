@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -11,6 +12,7 @@ import holdfast
 from holdfast import Tag, TagList
 from holdfast.faults import NO_CONNECTION
 from holdfast.polling import Poller, Reading, WriteFailed
+from holdfast.tags.register_scale import RegisterScale
 from support import wire
 from support.brokers import free_port
 
@@ -233,3 +235,39 @@ def test_a_batch_that_a_cancelled_task_waited_for_is_not_lost(device: holdfast.S
         assert [batch async for batch in made] == []
 
     asyncio.run(steps())
+
+
+def test_a_scale_in_a_register_is_that_of_the_same_poll(
+    poller: Poller, device: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    scale = RegisterScale("exponent", "sf")
+    power = Tag("power", "input_registers", 0, "int16", scale=scale)
+    steps = itertools.cycle([[432, 1], [4320, 0], [1, 0x8000]])
+
+    def step() -> None:
+        number, exponent = next(steps)
+        memory.write_many([("input_registers", 0, [number]), ("input_registers", 100, [exponent])])
+
+    step()
+    tags = TagList([power, Tag("sf", "input_registers", 100, "int16")])
+    poller.add(url(device), tags, interval=0.01)
+    seen: set[tuple[Any, bool]] = set()
+
+    def known() -> bool:
+        step()
+        for reading in taken(poller):
+            if reading.name == "power":
+                seen.add((reading.value, reading.error is None))
+        return len(seen) >= 2 and (None, False) in seen
+
+    wire.until(known, "numbers and bad values")
+    assert seen == {(4320, True), (None, False)}
+
+
+def test_a_write_needs_a_scale_that_was_read(poller: Poller, device: holdfast.Server) -> None:
+    source = Tag("", "holding_registers", 6, "int16")
+    scale = RegisterScale("exponent", source=source)
+    tags = TagList([Tag("limit", "holding_registers", 5, scale=scale, writable=True)])
+    name = poller.add(url(device), tags)
+    with pytest.raises(ValueError, match="the scale is in holding_registers 6"):
+        poller.write(name, "limit", 20)

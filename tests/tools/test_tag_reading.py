@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,8 @@ import pytest
 
 import holdfast
 from holdfast.errors import ConnectFailed, ModbusException, RequestTimeout
-from holdfast.tags import Tag
+from holdfast.tags import Tag, TagList
+from holdfast.tags.register_scale import RegisterScale
 from holdfast.tools.tag_reading import REFUSED_FOR, TagReader
 from holdfast.values import ConversionError
 from support import cli, wire
@@ -177,3 +179,36 @@ def unused() -> str:
     """A URL where nothing listens."""
     with FakeDevice(without()) as device:
         return device.url
+
+
+def test_a_value_and_its_scale_are_from_one_request() -> None:
+    scale = RegisterScale("exponent", source=tag("", 60, "int16"))
+    with FakeDevice(lambda pdu: registers(pdu, 1)) as device:
+        reader = TagReader([tag("first", 3), tag("power", 10, scale=scale)])
+        assert read(device, reader) == [1, 10]
+        assert asked(device) == [(3, 1), (10, 51)]
+
+
+def test_a_scale_that_moves_never_makes_a_wrong_value() -> None:
+    turns = itertools.cycle([(432, 1), (4320, 0), (43200, 0xFFFF)])
+
+    def moving(pdu: bytes) -> bytes:
+        """A device that changes both registers between all requests."""
+        first, count = struct.unpack(">HH", pdu[1:])
+        power, exponent = next(turns)
+        whole = {12: power, 13: exponent}
+        content = [whole.get(each, 0) for each in range(first, first + count)]
+        return bytes([3, 2 * count]) + struct.pack(f">{count}H", *content)
+
+    scale = RegisterScale("exponent", "sf")
+    tags = TagList([tag("power", 12, scale=scale), tag("sf", 13, "int16")])
+    with FakeDevice(moving) as device:
+        reader = TagReader(tags)
+        assert [read(device, reader)[0] for _ in range(6)] == [4320] * 6
+
+
+def test_a_scale_that_is_refused_costs_its_value() -> None:
+    scale = RegisterScale("exponent", source=tag("", 12, "int16"))
+    with FakeDevice(without(12)) as device:
+        found = read(device, TagReader([tag("power", 10, scale=scale), tag("other", 11)]))
+        assert [str(found[0])[:12], found[1]] == ["exception 02", 7]

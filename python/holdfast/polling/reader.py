@@ -33,7 +33,8 @@ class Reader:
     @property
     def fields(self) -> list[tuple[Area, int, int]]:
         """What has to be read: areas, addresses and counts, each once."""
-        return list(dict.fromkeys((tag.area, tag.address, tag.count) for tag in self.tags))
+        places = ((tag.area, tag.span.start, len(tag.span)) for tag in self.tags)
+        return list(dict.fromkeys(places))
 
     def poll(self, blocks: Sequence[PolledBlock]) -> DevicePoll:
         """The readings of one poll, one for each tag, in the order of the tags.
@@ -61,9 +62,8 @@ class Reader:
             if tag.name in found:
                 continue
             pieces = [block for block in blocks if block[0] == tag.area and _overlap(tag, block)]
-            data = assembled(
-                tag, [(piece[1], piece[3]) for piece in pieces if piece[3] is not None]
-            )
+            parts = [(piece[1], piece[3]) for piece in pieces if piece[3] is not None]
+            data = assembled(tag, parts) if tag.source is None else None
             faulty = [block for block in [*pieces, *blocks[-1:]] if block[4]]
             if data is not None:
                 yield tag.name, self._reading(tag, value_of(tag, data, tag.address), pieces[-1][5])
@@ -90,4 +90,4 @@ class Reader:
 
 
 def _overlap(tag: Tag, block: PolledBlock) -> bool:
-    return block[1] < tag.end and tag.address < block[1] + block[2]
+    return block[1] < tag.span.stop and tag.span.start < block[1] + block[2]

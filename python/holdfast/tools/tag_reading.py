@@ -193,7 +193,7 @@ class TagReader:
         self._planned, self._is_whole = now, True
         fields: dict[tuple[Area, int, int], _Field] = {}
         for index, tag in enumerate(self.tags):
-            place = tag.area, tag.address, tag.count
+            place = tag.area, tag.span.start, len(tag.span)
             fields.setdefault(place, _Field(*place)).tags.append(index)
         short: list[_Field] = []
         long: list[_Field] = []

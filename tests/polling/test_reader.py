@@ -1,0 +1,48 @@
+"""`Reader`: the values of tags, from the blocks of polls."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+from holdfast.polling.reader import Reader
+from holdfast.tags import Tag, TagList
+from holdfast.tags.register_scale import RegisterScale
+
+if TYPE_CHECKING:
+    from holdfast.types import PolledBlock
+
+HR: Final = "holding_registers"
+TAGS = TagList(
+    [
+        Tag("power", HR, 0, "int16", scale=RegisterScale("exponent", "sf")),
+        Tag("sf", HR, 3, "int16"),
+    ]
+)
+
+
+def block(address: int, *registers: int) -> PolledBlock:
+    data = b"".join(each.to_bytes(2) for each in registers)
+    return HR, address, len(registers), data, 0, 1.0
+
+
+def read(*blocks: PolledBlock) -> dict[str, tuple[Any, int, str | None]]:
+    readings = Reader("meter", TAGS).poll(blocks).readings
+    return {each.name: (each.value, each.fault, each.undecoded) for each in readings}
+
+
+def test_one_field_has_a_value_and_its_scale() -> None:
+    assert Reader("meter", TAGS).fields == [(HR, 0, 4), (HR, 3, 1)]
+    assert read(block(0, 432, 0, 0, 1)) == {"power": (4320, 0, None), "sf": (1, 0, None)}
+
+
+def test_a_value_without_a_valid_scale_is_undecoded() -> None:
+    value, fault, why = read(block(0, 432, 0, 0, 0x8000))["power"]
+    assert (value, fault) == (None, 0)
+    assert why == f"the scale in {HR} 3 is 10^-32768, allowed: exponents from -10 to 10"
+
+
+def test_a_scale_of_another_request_is_never_taken() -> None:
+    assert read(block(0, 432), block(3, 1)) == {"sf": (1, 0, None)}
+    assert read(block(0, 432, 0), block(2, 0, 1)) == {"sf": (1, 0, None)}
+    failed: PolledBlock = (HR, 0, 4, None, 2, 1.0)
+    assert read(failed, block(3, 1)) == {"power": (None, 2, None), "sf": (1, 0, None)}
