@@ -10,10 +10,17 @@ import pytest
 from holdfast.config.tag_files import load_tags
 from holdfast.config.tag_output import tags_as_csv, tags_as_yaml
 from holdfast.tags import Tag, TagList
+from holdfast.tags.register_scale import Form, RegisterScale
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+
+def place(form: Form, address: int, kind: str, order: str = "ABCD") -> RegisterScale:
+    return RegisterScale(form, source=Tag("", "holding_registers", address, kind, order))
+
+
+RATIO = place("factor", 64, "float32", "CDAB")
 TAGS = [
     Tag("on", "coils", 3),
     Tag("voltage", "input_registers", 0, "float32", "CDAB", unit="V", description="a: b, c"),
@@ -21,6 +28,9 @@ TAGS = [
     Tag("name", "holding_registers", 10, "string:16"),
     Tag("mixed", "holding_registers", 40, "uint32", "ABCD", description='"quoted"'),
     Tag("raw", "holding_registers", 50, "uint16[3]", description="confidence 0.30: always 0"),
+    Tag("sf", "holding_registers", 60, "int16"),
+    Tag("power", "holding_registers", 61, scale=RegisterScale("exponent", "sf")),
+    Tag("share", "holding_registers", 62, order="CDAB", scale=RATIO),
     Tag("setpoint", "holding_registers", 30, "int16", offset=-5, unit="°C", writable=True),
 ]
 STATE = Tag("state", "holding_registers", 31, states={0: "off", 1: "running"})
@@ -28,7 +38,15 @@ STATE = Tag("state", "holding_registers", 31, states={0: "off", 1: "running"})
 
 def meaning(tags: TagList) -> list[Tag]:
     """Tags without the order of single registers, in which the usual orders are the same."""
-    return [replace(tag, order=tag.order if tag.count > 1 else "ABCD") for tag in tags]
+    return [usual(tag) for tag in tags]
+
+
+def usual(tag: Tag) -> Tag:
+    made = replace(tag, order=tag.order if tag.count > 1 else "ABCD")
+    if tag.source is None:
+        return made
+    assert isinstance(tag.scale, RegisterScale)
+    return replace(made, scale=replace(tag.scale, source=usual(tag.source)))
 
 
 @pytest.mark.parametrize("suffix", ["yaml", "csv"])
@@ -36,7 +54,7 @@ def test_tags_are_read_as_they_were_written(tmp_path: Path, suffix: str) -> None
     write = {"yaml": tags_as_yaml, "csv": tags_as_csv}[suffix]
     file = tmp_path / f"device.{suffix}"
     file.write_text(write(TAGS), encoding="utf-8")
-    assert meaning(load_tags(file)) == TAGS
+    assert meaning(load_tags(file)) == meaning(TagList(TAGS))
 
 
 def test_yaml_has_a_tag_a_line_and_states() -> None:

@@ -13,6 +13,7 @@ from holdfast.config.problems import ConfigError, Problem
 from holdfast.config.report import Report
 from holdfast.config.scalars import is_name
 from holdfast.config.tag_checks import TagChecks
+from holdfast.config.tag_scale import FORMS, PLACE_KEYS
 from holdfast.config.words import guess, listing, show
 from holdfast.tags import TagList
 
@@ -161,9 +162,24 @@ def _cell(key: str, cell: str) -> Any:
         return _SHORT.get(cell.lower(), cell.lower())
     if key in _TEXT:
         return cell
+    if key == "scale":
+        return _scale(cell)
     if key == "writable":
         words = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
         return words.get(cell.lower(), cell)
     if key == "null":
         return [source.scalar(part.strip()) for part in cell.split("|")]
     return source.scalar(cell)
+
+
+def _scale(cell: str) -> Any:
+    """A scale: a number, or `exponent W_SF`, `factor hr 12 uint16` for one in a register."""
+    form, *words = cell.split()
+    if form.lower() not in FORMS or not words:
+        return source.scalar(cell)
+    if len(words) == 1:
+        return {"from": words[0], "as": form.lower()}
+    if len(words) > len(PLACE_KEYS):
+        return cell
+    place = {key: _cell(key, word) for key, word in zip(PLACE_KEYS, words, strict=False)}
+    return {"from": place, "as": form.lower()}

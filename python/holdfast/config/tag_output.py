@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.dump import on_one_line
 from holdfast.config.tag_files import COLUMNS
 from holdfast.tags import Tag
+from holdfast.tags.register_scale import RegisterScale
 from holdfast.tags.tag import default_type
 
 if TYPE_CHECKING:
@@ -40,10 +41,29 @@ def tags_as_csv(tags: Iterable[Tag]) -> str:
         if states:
             row["description"] = "; ".join(filter(None, (tag.description, f"states: {states}")))
         row["null"] = "|".join(str(each) for each in row.get("null", ()))
+        if isinstance(tag.scale, RegisterScale):
+            row["scale"] = _scale_cell(tag.scale)
         if row.get("writable"):
             row["writable"] = "true"
         rows.writerow(row)
     return out.getvalue()
+
+
+def scale_as_data(scale: RegisterScale) -> dict[str, Any]:
+    """The register of a scale as in a tag list."""
+    if scale.name is not None:
+        return {"from": scale.name, "as": scale.form}
+    source = scale.source
+    assert source is not None, "a scale has a name or a register"
+    place = {"area": source.area, "address": source.address, "type": source.type}
+    return {"from": place, "as": scale.form}
+
+
+def _scale_cell(scale: RegisterScale) -> str:
+    """The register of a scale as a cell of CSV, such as `exponent W_SF`."""
+    source = scale_as_data(scale)["from"]
+    words = [source] if isinstance(source, str) else map(str, source.values())
+    return " ".join([scale.form, *words])
 
 
 def _settings(tag: Tag, order: str) -> dict[str, Any]:
@@ -56,7 +76,7 @@ def _settings(tag: Tag, order: str) -> dict[str, Any]:
     for key in ("encoding", "scale", "offset", "unit", "writable", "min", "max", "deadband"):
         value = getattr(tag, key)
         if value != getattr(Tag, key):
-            data[key] = value
+            data[key] = scale_as_data(value) if isinstance(value, RegisterScale) else value
     if tag.states:
         data["states"] = dict(tag.states)
     if tag.null:
@@ -70,6 +90,6 @@ def _has_other_order(tag: Tag, order: str) -> bool:
     """Whether the order of a tag means something else than the default order."""
     if tag.of_type.base == "bool":
         return False
-    if tag.count > 1:
+    if tag.count > 1 or (tag.source is not None and tag.source.count > 1):
         return tag.order != order
     return (tag.order in SWAPPED_BYTES) != (order in SWAPPED_BYTES)

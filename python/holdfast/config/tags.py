@@ -5,18 +5,25 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Annotated, Any
 
-from pydantic import Field, Strict
+from pydantic import Field, PlainSerializer, PlainValidator, Strict
 from pydantic.config import JsonDict
+from pydantic.json_schema import WithJsonSchema
 
 from holdfast.config.base import Model
 from holdfast.config.memories import Register
 from holdfast.config.scalars import NAME_KEYS, Name, NotNull, whole_number
+from holdfast.config.tag_scale import SCALE_SCHEMA, ScaleConfig, parse_scale, written_scale
 from holdfast.tags import Tag, TagList
 from holdfast.types import Area
 
 Number = Annotated[float, Field(allow_inf_nan=False), whole_number]
 Marker = bool | int | float | str
-
+Scale = Annotated[
+    float | ScaleConfig,
+    PlainValidator(parse_scale),
+    PlainSerializer(written_scale),
+    WithJsonSchema(SCALE_SCHEMA),
+]
 
 _INTEGER_KEYS: JsonDict = {"propertyNames": {"pattern": "^-?[0-9]+$"}}
 
@@ -34,8 +41,9 @@ class TagConfig(Model):
     """The byte order: ABCD, DCBA, BADC or CDAB. Default: that of the profile, or ABCD."""
     encoding: Annotated[str | None, NotNull()] = None
     """The encoding of text. Default: ASCII."""
-    scale: Number = 1.0
-    """The value is scale × number + offset, where the number is what the registers hold."""
+    scale: Scale = 1.0
+    """The value is scale × number + offset, where the number is what the registers hold. A mapping
+    with from and as names the register that contains the scale."""
     offset: Number = 0.0
     """What is added."""
     unit: str = ""
@@ -58,7 +66,10 @@ class TagConfig(Model):
     def tag(self, name: str, order: str) -> Tag:
         """The tag, with a default order. Raises `TagError`."""
         settings: dict[str, Any] = {key: getattr(self, key) for key in _KEYS}
-        return Tag(name, null=frozenset(self.null), order=(self.order or order).upper(), **settings)
+        order = (self.order or order).upper()
+        if isinstance(self.scale, ScaleConfig):
+            settings["scale"] = self.scale.of(order)
+        return Tag(name, null=frozenset(self.null), order=order, **settings)
 
 
 _KEYS = tuple(key for key in TagConfig.model_fields if key not in ("null", "order"))
