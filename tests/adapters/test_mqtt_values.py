@@ -158,6 +158,11 @@ ENTRY = "{topic: a, memory: plant, tag: {area: coils, address: 0}}"
             "{topic: a, memory: plant, tag: {area: input_registers, address: 0, type: what}}",
             "mqtt.map[0].tag.type: ",
         ),
+        (
+            "{topic: a, memory: plant, tag: {area: input_registers, address: 0, "
+            "scale: {from: sf, as: exponent}}}",
+            "mqtt.map[0].tag.scale: the scale is the exponent from sf, allowed: a number",
+        ),
     ],
 )
 def test_errors_in_a_map_are_named(tmp_path: Path, entries: str, problem: str) -> None:

@@ -68,6 +68,137 @@ def test_a_device_has_the_tags_of_its_profile_and_its_own(tmp_path: Path) -> Non
     assert load(written(tmp_path, config.dump(), "again.yaml")) == config
 
 
+SCALED = """
+  meter:
+    tags:
+      power: {area: input_registers, address: 0, type: int16, scale: {from: sf, as: exponent}}
+      energy: {area: input_registers, address: 2, scale: {from: {area: input_registers, address: 9},
+               as: factor}}
+      sf: {area: input_registers, address: 12, type: int16}
+"""
+
+
+def test_a_scale_can_be_in_a_register(tmp_path: Path) -> None:
+    file = written(
+        tmp_path,
+        f"profiles:{SCALED}"
+        "devices:\n"
+        "  a: {url: tcp://10.0.0.5, profile: meter, interval: 1}\n"
+        "  b: {url: tcp://10.0.0.6, profile: meter, interval: 1, tags: {\n"
+        "    sf: {area: input_registers, address: 40}}}\n",
+    )
+    config = load(file)
+    spans = {name: [tag.span for tag in config.tags(name)] for name in "ab"}
+    assert spans == {
+        "a": [range(13), range(2, 10), range(12, 13)],
+        "b": [range(41), range(2, 10), range(40, 41)],
+    }
+    assert config.tags("a")["energy"].with_scale(10).value(5) == 50
+    assert load(written(tmp_path, config.dump(), "again.yaml")) == config
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("x", "found 'x', allowed: a number, or a mapping with the keys from, as"),
+        ("{from: sf}", "the key as is missing, allowed: from, as"),
+        ("{from: sf, as: power}", "as: found 'power', allowed: factor or exponent"),
+        ("{form: sf, as: factor}", "found the key 'form', allowed: from, as; did you mean 'from'?"),
+        ("{from: 3, as: factor}", "from: found 3, allowed: the name of a tag, or a mapping with"),
+        ("{from: {area: x, address: 1}, as: factor}", "from: area: found 'x', allowed: coils"),
+        ("{from: {area: coils}, as: factor}", "from: the key address is missing"),
+        (
+            "{from: {area: input_registers, address: 70000}, as: factor}",
+            "from: address: found 70000, allowed: an integer from 0 to 65535",
+        ),
+        (
+            "{from: {area: input_registers, address: 1, type: int13}, as: factor}",
+            "from: type 'int13' is unknown, allowed: ",
+        ),
+        (
+            "{from: {area: holding_registers, address: 1}, as: factor}",
+            "the scale is from holding_registers 1, allowed: a register in input_registers, as the",
+        ),
+        (
+            "{from: {area: input_registers, address: 1000}, as: exponent}",
+            "the scale is from input_registers 1000: 0 to 1000 are 1001 registers, one request",
+        ),
+        ("{from: sg, as: factor}", "the tag 'sg' does not exist in this list"),
+    ],
+)
+def test_a_scale_that_cannot_be_is_named_with_its_line(
+    tmp_path: Path, text: str, expected: str
+) -> None:
+    lines = f"  a: {{area: input_registers, address: 0, scale: {text}}}\n"
+    file = written(
+        tmp_path, f"tags:\n{lines}  sf: {{area: input_registers, address: 1}}\n", "list.yaml"
+    )
+    [problem] = problems(file)
+    assert problem.startswith(f"list.yaml:2: tags.a.scale: {expected}")
+
+
+@pytest.mark.parametrize(
+    ("settings", "where", "flaw"),
+    [
+        ("max_registers: 12", "profile: power: ", "0 to 12 are 13 registers, max_registers is 12"),
+        (
+            "forbidden: [{area: input_registers, start: 10, count: 1}]",
+            "profile: power: ",
+            "0 to 12 overlaps the forbidden range 10 to 10",
+        ),
+        (
+            "max_gap: 5, readable: [{area: input_registers, start: 0, count: 10}]",
+            "profile: power: ",
+            "1 to 11 are not readable",
+        ),
+        (
+            "max_registers: 20, tags: {power: {area: input_registers, address: 40, "
+            "scale: {from: sf, as: exponent}}}",
+            "tags.power.scale: ",
+            "12 to 40 are 29 registers, max_registers is 20",
+        ),
+    ],
+)
+def test_a_device_must_be_able_to_read_a_value_with_its_scale(
+    tmp_path: Path, settings: str, where: str, flaw: str
+) -> None:
+    device = f"{{url: tcp://10.0.0.5, profile: meter, interval: 1, {settings}}}"
+    file = written(tmp_path, f"profiles:{SCALED}devices:\n  a: {device}\n")
+    [problem] = problems(file)
+    assert problem == (
+        f"p.yaml:9: devices.a.{where}the scale is from input_registers 12, {flaw}, and a value is "
+        "only read together with its scale"
+    )
+
+
+def test_a_device_cannot_move_a_scale_out_of_reach(tmp_path: Path) -> None:
+    own = "tags: {sf: {area: holding_registers, address: 1}}"
+    device = f"{{url: tcp://10.0.0.5, profile: meter, interval: 1, {own}}}"
+    file = written(tmp_path, f"profiles:{SCALED}devices:\n  a: {device}\n")
+    [problem] = problems(file)
+    assert problem.startswith("p.yaml:9: devices.a.tags.sf: power has its scale here: ")
+
+
+def test_csv_has_scales_in_registers(tmp_path: Path) -> None:
+    file = written(
+        tmp_path,
+        "name,area,address,type,order,scale\n"
+        "power,ir,0,int16,,exponent sf\n"
+        "energy,ir,2,,,factor ir 9\n"
+        "share,ir,3,,,factor ir 10 float32\n"
+        "sf,ir,12,int16,,\n",
+        "meter.csv",
+    )
+    spans = {tag.name: tag.span for tag in load_tags(file)}
+    assert (spans["power"], spans["energy"], spans["share"]) == (
+        range(13),
+        range(2, 10),
+        range(3, 12),
+    )
+    wrong = written(tmp_path, "a,ir,0,,,exponent x y z w\n", "wrong.csv")
+    assert problems(wrong)[0].startswith("wrong.csv:1: tags.a.scale: found 'exponent x y z w'")
+
+
 def test_profiles_can_be_files(tmp_path: Path) -> None:
     written(tmp_path, PROFILE.replace("\n  pump:", "").replace("\n    ", "\n"), "pump.yaml")
     written(

@@ -13,6 +13,7 @@ from holdfast.config.topics import parse_topic_name
 from holdfast.config.unique import Owners
 from holdfast.config.words import guess, listing, show
 from holdfast.tags import Tag, TagError
+from holdfast.tags.register_scale import RegisterScale
 
 if TYPE_CHECKING:
     from holdfast.config.grant_checks import GrantChecks
@@ -85,6 +86,9 @@ def _check_place(
     if tag.of_type.base == "bit":
         message = f"found the type {tag.type}, allowed: types of whole registers, and bool"
         report.add((*at, "type") if "tag" in entry else at, message)
+    if isinstance(tag.scale, RegisterScale):
+        message = f"the scale is the {tag.scale}, allowed: a number, for what a topic writes"
+        report.add((*at, "scale") if "tag" in entry else at, message)
     name = entry.get("memory")
     if not isinstance(name, str):
         return  # Reported by the model.
