@@ -10,6 +10,8 @@ from holdfast.config.outputs import MqttOutputConfig
 from holdfast.outputs import sending
 from holdfast.outputs.mqtt.home_assistant import Discovery
 from holdfast.outputs.mqtt.payloads import Payloads
+from holdfast.tags import Tag
+from holdfast.tags.register_scale import RegisterScale
 from support import wire
 from support.home_assistant import UNITS, Entity, entity
 from support.mqtt_plant import TAGS, Plant
@@ -18,8 +20,6 @@ from support.readings import reading, tag
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-
-    from holdfast.tags import Tag
 
 
 @pytest.fixture(autouse=True)
@@ -47,8 +47,11 @@ def found(of: Tag, device: str = "pump", **more: Any) -> Entity:
 
 STATES = {0: "off", 1: "it's on"}
 
+MOVING = RegisterScale("exponent", source=Tag("", "holding_registers", 1, "int16"))
+
 COMPONENTS = [
     (tag(unit="W"), "sensor"),
+    (tag(area="holding_registers", type="int16", scale=MOVING, writable=True), "sensor"),
     (tag(type="string:4"), "sensor"),
     (tag(type="uint16", states=STATES), "sensor"),
     (tag(area="coils", type="bool"), "binary_sensor"),

@@ -19,6 +19,7 @@ from holdfast.outputs.sparkplug.node import EdgeNode
 from holdfast.outputs.sparkplug.primary_host import PrimaryHost
 from holdfast.polling import Reading
 from holdfast.tags import Tag
+from holdfast.tags.register_scale import RegisterScale
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -93,6 +94,12 @@ def test_an_integer_that_is_too_large_for_a_double_is_infinite() -> None:
     tag = Tag("x", "holding_registers", 0, "uint16[2]", scale=1e308)
     datatype, _ = datatype_of(tag)
     assert datatype.packed(tag.value([65535, 0])) == struct.pack("<2d", math.inf, 0)
+
+
+def test_a_scale_in_a_register_makes_any_number_a_double() -> None:
+    scale = RegisterScale("exponent", source=Tag("", "holding_registers", 1, "int16"))
+    datatype, _ = datatype_of(Tag("x", "holding_registers", 0, "uint16", scale=scale))
+    assert (datatype.name, datatype.packed(4320)) == ("Double", 4320.0)
 
 
 TAGS = [

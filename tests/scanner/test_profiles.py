@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.tags import Tag, TagList
+from holdfast.tags.register_scale import RegisterScale
 from support import wire
 from support.nats_bus import leaving, subscription, tag
 
@@ -22,11 +23,24 @@ PROFILE = TagList(
         Tag("open", "coils", 3),
     ]
 )
+METER = TagList(
+    [
+        Tag("power", "holding_registers", 0, "int16", scale=RegisterScale("exponent", "sf")),
+        Tag(
+            "limit",
+            "holding_registers",
+            1,
+            scale=RegisterScale("exponent", "sf"),
+            writable=True,
+        ),
+        Tag("sf", "holding_registers", 50, "int16"),
+    ]
+)
 
 
 @pytest.fixture(autouse=True)
 def scanner(run_scanner: Run) -> None:
-    run_scanner(profiles={"heater": PROFILE}, writes="tags")
+    run_scanner(profiles={"heater": PROFILE, "meter": METER}, writes="tags")
 
 
 def first(data: Any, count: int) -> dict[str, Any]:
@@ -81,9 +95,9 @@ def test_commands_are_scaled_and_have_the_limits_of_the_profile(
 @pytest.mark.parametrize(
     ("request_", "error"),
     [
-        ({"profile": "pump"}, "profile is 'pump', allowed: heater"),
+        ({"profile": "pump"}, "profile is 'pump', allowed: heater, meter"),
         ({"tags": [tag("x", 0, profile="heater")]}, "tags[0]: the profile heater has no tag 'x'"),
-        ({"tags": [tag("x", 0, profile="y")]}, "tags[0].profile is 'y', allowed: heater"),
+        ({"tags": [tag("x", 0, profile="y")]}, "tags[0].profile is 'y', allowed: heater, meter"),
     ],
 )
 def test_an_unknown_profile_refuses_the_request(
@@ -107,3 +121,28 @@ def test_a_subscription_to_a_profile_survives_a_restart(
     assert first(data, 4) == {"water": 21.5, "setpoint": 17.5, "mode": 1, "open": False}
     answer = caller.request("line2.command.plc1.setpoint", "4")
     assert "4 is outside 5 to 30" in answer["error"]
+
+
+def test_a_scale_in_a_register_is_that_of_the_same_scan(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write_many([("holding_registers", 0, [432, 7]), ("holding_registers", 50, [1])])
+    data = caller.listen("modbus.data.plc1")
+    request = subscription(server, profile="meter")
+    assert caller.request("modbus.subscribe", request) == {"success": True, "count": 3}
+    assert first(data, 3) == {"power": 4320, "limit": 70, "sf": 1}
+    memory.write_many([("holding_registers", 0, [4320, 70]), ("holding_registers", 50, [0])])
+    wire.until(lambda: first(data, 3) == {"power": 4320, "limit": 70, "sf": 0}, "the new scale")
+    [device] = caller.request("modbus.browse", b"")["devices"]
+    [block] = device["blocks"]
+    assert (block["address"], block["count"], block["holes"]) == (0, 51, 48)
+    refused = caller.request("modbus.command.plc1.limit", b"80")
+    assert "the scale is in holding_registers 50" in refused["error"]
+    memory.write("holding_registers", 50, [0x8000])
+    wire.until(lambda: first(data, 3)["power"] is None, "no valid scale")
+    [device] = caller.request("modbus.browse", b"")["devices"]
+    errors = {each["id"]: each.get("error") for each in device["tags"]}
+    assert "10^-32768" in errors["power"]
+    latest = {each["variableId"]: each for each in caller.request("modbus.variables", b"")}
+    assert (latest["power"]["value"], latest["power"]["quality"]) == (None, "bad")
+    caller.request("modbus.unsubscribe", leaving())

@@ -52,7 +52,21 @@ TAG: Schema = {
         "type": TEXT,
         "order": TEXT,
         "unit": TEXT,
-        "scale": {"type": "number"},
+        "scale": {
+            "anyOf": [
+                {"type": "number"},
+                {
+                    "type": "object",
+                    "description": "The register that contains the scale: a tag, or its place",
+                    "required": ["from", "as"],
+                    "properties": {
+                        "from": {"anyOf": [TEXT, {"type": "object"}]},
+                        "as": {"enum": ["factor", "exponent"]},
+                    },
+                    "additionalProperties": False,
+                },
+            ]
+        },
         "offset": {"type": "number"},
         "writable": {"type": "boolean"},
         "min": NUMBER,

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 from holdfast import values
 from holdfast.config import ConfigError
 from holdfast.config.tag_files import parse_tags
+from holdfast.config.tag_output import scale_as_data
 from holdfast.config.words import guess, listing
 from holdfast.gateway.fields import Field, malformed
+from holdfast.tags.register_scale import RegisterScale
 from holdfast.tags.text import plain, text_of, value_from
 from holdfast.types import BIT_AREAS
 from holdfast.web.requests import shown
@@ -99,7 +101,7 @@ def described(tag: Tag) -> dict[str, Any]:
         "type": tag.type,
         "order": tag.order,
         "unit": tag.unit,
-        "scale": tag.scale,
+        "scale": scale_as_data(tag.scale) if isinstance(tag.scale, RegisterScale) else tag.scale,
         "offset": tag.offset,
         "writable": tag.writable,
         "min": tag.min,

@@ -180,7 +180,13 @@ class _Report:
             inside = self._places.inside(area, address, count)
             if not any(tag.id in ids for tag in inside):
                 continue
-            wanted = {at for tag in inside for at in range(tag.address, tag.end)}
+            wanted = {
+                at
+                for tag in inside
+                for part in (tag, tag.source)
+                if part is not None
+                for at in range(part.address, part.end)
+            }
             yield BlockReport(
                 area=area,
                 address=address,

@@ -59,7 +59,7 @@ class Plan:
     def blocks(self, tags: Sequence[Tag]) -> list[tuple[Area, int, int, list[int], int]]:
         """Returns the blocks that read the tags, see `plan_blocks`. Raises `ValueError`."""
         return plan_blocks(
-            [(tag.area, tag.address, tag.count) for tag in tags],
+            [(tag.area, tag.span.start, len(tag.span)) for tag in tags],
             max_gap=self.max_gap,
             max_registers=self.max_registers,
             max_bits=self.max_bits,
@@ -71,12 +71,13 @@ class Plan:
         """Raises `Refused` for a tag that the plan does not allow to read."""
         for tag in tags:
             most = self.max_bits if tag.of_bits else self.max_registers
-            if tag.count > most:
+            if len(tag.span) > most:
                 kind = "bits" if tag.of_bits else "registers"
-                found = f"has {tag.count} {kind}, one request reads at most {most}"
+                scaled = "" if tag.source is None else " with its scale"
+                found = f"has {len(tag.span)} {kind}{scaled}, one request reads at most {most}"
                 raise Refused(f"tag {tag.id!r}: {tag.type} {found}")
             for area, start, end in self.forbidden:
-                if tag.area == area and start < tag.end and tag.address < end:
+                if tag.area == area and start < tag.span.stop and tag.span.start < end:
                     found = f"plan.forbidden contains {start} to {end - 1} of {area}"
                     raise Refused(f"tag {tag.id!r} from address {tag.address}: {found}")
 

@@ -49,8 +49,9 @@ class LatestBlocks:
         A value that can't be decoded is `None`.
         """
         found: tuple[float, int, bytes] | None = None
+        span = tag.span
         for (area, address, count), (data, time) in self._blocks.items():
-            inside = area == tag.area and address <= tag.address and tag.end <= address + count
+            inside = area == tag.area and address <= span.start and span.stop <= address + count
             if inside and (found is None or time > found[0]):
                 found = (time, address, data)
         if found is None:

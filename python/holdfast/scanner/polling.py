@@ -174,7 +174,7 @@ class Polling:
         interval = device.rate / 1000
         fence = self._fence(device)
         reads = dict.fromkeys(
-            (tag.area, tag.address, tag.count, None) for tag in device.tags.values()
+            (tag.area, tag.span.start, len(tag.span), None) for tag in device.tags.values()
         )
         return _core.PolledDevice(
             name,

@@ -221,7 +221,7 @@ class Publisher:
         _, address, count = block
         group = due.group
         texts = [self._template(tag) for tag in tags]
-        infallible = all(tag.type in _INFALLIBLE for tag in tags)
+        infallible = all(tag.type in _INFALLIBLE and tag.source is None for tag in tags)
         remembered = group.change or any(tag.id in self._last for tag in tags)
         return _Part(
             decoder(tags, address, count),

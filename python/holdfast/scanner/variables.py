@@ -127,7 +127,8 @@ def _variable(
 
 def _failed(device: ScannedDevice, tag: Tag) -> bool:
     """Returns whether the last scan that read a tag failed."""
+    span = tag.span
     return any(
-        fault and area == tag.area and address <= tag.address and tag.end <= address + count
+        fault and area == tag.area and address <= span.start and span.stop <= address + count
         for area, address, count, _, fault, _ in device.health.blocks
     )

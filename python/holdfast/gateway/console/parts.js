@@ -66,10 +66,17 @@ const SHORT = { coils: 1, discrete_inputs: 2, holding_registers: 3, input_regist
 /** Returns the read function of the area of a tag. */
 export const functionOf = (tag) => SHORT[tag.area];
 
+/** Describes a scale: a number, or the register that contains it. */
+function scaled(scale) {
+  if (typeof scale === "number") return `${scale}`;
+  const source = typeof scale.from === "string" ? scale.from : `${scale.from.area.replace("_", " ")} ${scale.from.address}`;
+  return scale.as === "exponent" ? `10^(${source})` : source;
+}
+
 /** Describes where a tag is, and what it holds. */
 export function placed(tag) {
   const order = tag.order === "ABCD" ? "" : ` ${tag.order}`;
-  const scale = tag.scale === 1 ? "" : ` × ${tag.scale}`;
+  const scale = tag.scale === 1 ? "" : ` × ${scaled(tag.scale)}`;
   const offset = tag.offset === 0 ? "" : ` ${tag.offset < 0 ? "−" : "+"} ${Math.abs(tag.offset)}`;
   return `${tag.area.replace("_", " ")} ${tag.address} = ${modicon(functionOf(tag), tag.address)}, ${tag.type}${order}${scale}${offset}`;
 }

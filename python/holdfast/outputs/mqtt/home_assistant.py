@@ -8,6 +8,7 @@ import msgspec
 
 from holdfast._core import __version__
 from holdfast.outputs.mqtt.quantities import classes
+from holdfast.tags.register_scale import RegisterScale
 from holdfast.tags.text import text_of
 
 if TYPE_CHECKING:
@@ -84,7 +85,8 @@ class Discovery:
 
     def _entity(self, device: str, tag: Tag) -> tuple[str, dict[str, Any]]:
         """The component of a tag, and what only that component has."""
-        writes = self._settings.writes and tag.writable
+        # Commands are refused for tags whose scale is in a register.
+        writes = self._settings.writes and tag.writable and tag.source is None
         command = {"command_topic": self._names.of_commands(device, tag.name)} if writes else {}
         if tag.of_type.base in ("bool", "bit"):
             on, off = text_of(tag, True), text_of(tag, False)
@@ -131,6 +133,7 @@ class Discovery:
 
 def _bounds(tag: Tag) -> dict[str, float]:
     """The bounds of a number, and its step."""
+    assert not isinstance(tag.scale, RegisterScale), "such a tag is a sensor"
     if tag.is_float:
         step, low, high = MIN_STEP, -MAX_NUMBER, MAX_NUMBER
     else:
