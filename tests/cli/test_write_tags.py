@@ -135,3 +135,55 @@ def test_a_value_that_is_read_back_different_is_a_failure(tags: tuple[str, str])
         assert failure(*other) == ["holdfast: limit: read back no value"]
         found = answer(*arguments, code=1)
         assert (found["ok"], found["verified"]) == (False, False)
+
+
+SCALED = """
+tags:
+  limit: {area: holding_registers, address: 0, scale: {from: sf, as: exponent}, writable: true,
+          unit: W}
+  sf: {area: holding_registers, address: 5, type: int16, writable: true}
+"""
+
+
+@pytest.fixture
+def scaled(tmp_path: Path) -> tuple[str, str]:
+    file = tmp_path / "inverter.yaml"
+    file.write_text(SCALED)
+    return "--tags", str(file)
+
+
+def test_a_scale_in_a_register_is_read_before_the_write(
+    server: holdfast.Server, memory: holdfast.Memory, scaled: tuple[str, str]
+) -> None:
+    words = ("write", cli.url(server), "limit=4320", *scaled)
+    for exponent, number in ((0, 4320), (1, 432), (0xFFFF, 43200)):
+        memory.write("holding_registers", 5, [exponent])
+        assert done(*words, "--verify")[-1] == "Read back alike."
+        assert memory.read("holding_registers", 0, 1) == [number]
+    memory.write("holding_registers", 5, [2])
+    assert "4320 is between two values of the registers, allowed: steps of 100" in usage_error(
+        *words
+    )
+    memory.write("holding_registers", 5, [0x8000])
+    assert "limit: the scale in holding_registers 5 is 10^-32768" in usage_error(*words)
+    assert "which has to be read first" in usage_error(*words, "--dry-run")
+    changed = usage_error(*words, "sf=1")
+    assert "limit: sf changes its scale, allowed: one write after the other" in changed
+    assert memory.read("holding_registers", 0, 1) == [43200]
+
+
+def test_a_scale_that_moves_during_a_write_is_noticed(scaled: tuple[str, str]) -> None:
+    scales = iter([0, 1])
+
+    def moving(pdu: bytes) -> bytes:
+        if pdu[0] == 6:
+            return pdu
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        whole = {0: 4320, 5: next(scales)}
+        content = [whole.get(each, 0).to_bytes(2) for each in range(first, first + count)]
+        return bytes([3, 2 * count]) + b"".join(content)
+
+    with FakeDevice(moving) as device:
+        found = invoke("write", device.url, "limit=4320", *scaled, "--verify")
+    assert found.exit_code == 1
+    assert "holdfast: limit: read back 43200" in found.stderr

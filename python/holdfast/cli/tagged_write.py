@@ -26,12 +26,18 @@ def write_tags(
     of: TaggedDevice, words: Sequence[str], *, verify: bool, dry_run: bool, as_json: bool
 ) -> None:
     """Checks all values, then writes them in their order, until the first error."""
-    writes = _prepared(of, words)
+    texts = _texts(words)
     if dry_run:
+        writes = _prepared(of, texts, None)
         pdus = [write.request.pdu.hex() for write in writes]
         click.echo(json.dumps({"requests": pdus}) if as_json else "\n".join(pdus))
         return
     with device.connect(of.url, of.unit, of.timeout) as client:
+        try:
+            writes = _prepared(of, texts, client)
+        except ModbusError as error:
+            told = {"url": of.url, "unit": of.unit, "written": [], "maybe_written": False}
+            device.fail(error, of.url, told if as_json else None)
         for at, write in enumerate(writes):
             try:
                 write.send(client)
@@ -54,7 +60,8 @@ def write_tags(
         sys.exit(device.FAILED)
 
 
-def _prepared(of: TaggedDevice, words: Sequence[str]) -> list[TagWrite]:
+def _texts(words: Sequence[str]) -> list[tuple[str, str]]:
+    """Names and values."""
     texts = [(name, text) for name, sign, text in (word.partition("=") for word in words) if sign]
     if len(texts) < len(words):
         wrong = next(word for word in words if "=" not in word)
@@ -63,8 +70,14 @@ def _prepared(of: TaggedDevice, words: Sequence[str]) -> list[TagWrite]:
         raise click.UsageError(f"{wrong!r} is not NAME=VALUE, as in setpoint=21.5.")
     if not texts:
         raise click.UsageError("Missing argument 'NAME=VALUE...'.")
+    return texts
+
+
+def _prepared(
+    of: TaggedDevice, texts: Sequence[tuple[str, str]], client: SyncClient | None
+) -> list[TagWrite]:
     try:
-        return prepared(of.tags, texts)
+        return prepared(of.tags, texts, client)
     except KeyError as error:
         [name] = error.args
         writable = [tag.name for tag in of.tags if tag.writable]
