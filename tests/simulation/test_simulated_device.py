@@ -12,6 +12,7 @@ from holdfast.errors import ModbusException
 from holdfast.simulation import generators, playback
 from holdfast.simulation.device import Refused, SimulatedDevice
 from holdfast.tags import Tag, TagList
+from holdfast.tags.register_scale import RegisterScale
 from holdfast.tools.tag_reading import TagReader
 from support import cli
 
@@ -248,3 +249,78 @@ def test_a_file_that_can_not_be_played_back_is_refused(
     tags = TagList([Tag("t", "holding_registers", 0)])
     with pytest.raises(playback.Unplayable, match=message):
         playback.load(file, tags)
+
+
+def scaled_tags(**source: Any) -> TagList:
+    scale = RegisterScale("exponent", "sf")
+    return TagList(
+        [
+            Tag("power", "holding_registers", 0, "int16", scale=scale, unit="W"),
+            Tag("limit", "holding_registers", 1, scale=scale, writable=True),
+            Tag("sf", "holding_registers", 4, "int16", **source),
+            Tag(
+                "current",
+                "input_registers",
+                0,
+                scale=RegisterScale("factor", source=Tag("", "input_registers", 7)),
+                unit="A",
+            ),
+        ]
+    )
+
+
+def values_of(client: holdfast.SyncClient, tags: TagList) -> dict[str, Any]:
+    readings = TagReader(tags).read(client)
+    assert [each.error for each in readings] == [None] * len(tags)
+    return {each.tag.name: each.value for each in readings}
+
+
+def test_values_are_simulated_with_the_scale_of_their_register(serve_simulated: Any) -> None:
+    tags = scaled_tags()
+    device = SimulatedDevice(
+        tags, chosen={"power": generators.parsed(tags["power"], "constant:432")}
+    )
+    client = serve_simulated(device)
+    found = values_of(client, tags)
+    assert (found["power"], found["sf"], device.memory.read("holding_registers", 0, 1)) == (
+        432,
+        -1,
+        [4320],
+    )
+    assert 1 <= found["current"] <= 15
+
+
+def test_a_simulated_scale_can_move(serve_simulated: Any) -> None:
+    tags = scaled_tags()
+    chosen = {
+        "power": generators.parsed(tags["power"], "constant:4300"),
+        "sf": generators.parsed(tags["sf"], "ramp:-1:2:3"),
+    }
+    device = SimulatedDevice(tags, chosen=chosen)
+    client = serve_simulated(device)
+    moved = set()
+    for _ in range(6):
+        device.step()
+        found = values_of(client, tags)
+        moved.add((found["sf"], found["power"]))
+    assert moved == {(0, 4300), (1, 4300), (-1, 3276.7)}
+
+
+def test_a_written_scale_is_that_of_the_next_values(serve_simulated: Any) -> None:
+    tags = scaled_tags(writable=True)
+    device = SimulatedDevice(
+        tags, chosen={"power": generators.parsed(tags["power"], "constant:300")}
+    )
+    client = serve_simulated(device)
+    client.write_register(4, 1)
+    device.step()
+    assert device.memory.read("holding_registers", 0, 1) == [30]
+    client.write_register(4, 0x8000)
+    device.step()
+    assert device.memory.read("holding_registers", 0, 1) == [30]
+
+
+def test_a_scale_that_is_none_is_refused() -> None:
+    tags = scaled_tags()
+    with pytest.raises(Refused, match="power: the scale in holding_registers 4 is 10\\^99"):
+        SimulatedDevice(tags, chosen={"sf": generators.parsed(tags["sf"], "constant:99")})

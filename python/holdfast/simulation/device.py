@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from random import Random
 from typing import TYPE_CHECKING, Any
 
@@ -10,13 +11,15 @@ from holdfast import values
 from holdfast._core import Memory, Rule
 from holdfast.simulation import generators
 from holdfast.simulation.raw import nearest
+from holdfast.tags.register_scale import RegisterScale
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from holdfast.simulation.generators import Generator, Series
     from holdfast.tags import Tag, TagList
+    from holdfast.tags.register_scale import Form
     from holdfast.types import Area
 
 
@@ -29,7 +32,8 @@ class SimulatedDevice:
 
     A writable tag keeps what is written to it, as do tags in the same registers: they only have a
     first value. `chosen` are generators by name, `played` are whole series of values, which take
-    precedence; other tags have a usual generator. The same
+    precedence; other tags have a usual generator. Registers of scales exist even if no tag names
+    them, and values are written with the scale that they contain. The same
     seed gives the same values. Raises `Refused`.
     """
 
@@ -43,9 +47,11 @@ class SimulatedDevice:
         played: Mapping[str, Sequence[Any]] | None = None,
     ) -> None:
         chosen, played = chosen or {}, played or {}
+        everything = [*tags, *_unnamed(tags)]
+        chosen = {**_of_scales(everything), **chosen}
         writable = [tag for tag in tags if tag.writable]
         kept = {place for tag in writable for place in _places(tag)}
-        extents = _extents(tags)
+        extents = _extents(everything)
         self.memory = Memory(
             coils=extents.get("coils"),
             discrete_inputs=extents.get("discrete_inputs"),
@@ -53,19 +59,22 @@ class SimulatedDevice:
             input_registers=extents.get("input_registers"),
         )
         self._registers: dict[Area, dict[int, int]] = {area: {} for area in AREAS}
-        self._written = _spans(writable)
-        self._readable = _spans(tags)
+        self._written = _spans((tag.area, range(tag.address, tag.end)) for tag in writable)
+        self._readable = _spans((tag.area, tag.span) for tag in everything)
         self._series: list[tuple[Tag, list[Series]]] = []
-        for tag in tags:
-            if not kept.isdisjoint(_places(tag)):
-                self._keep(tag, chosen.get(tag.name), played.get(tag.name))
-            else:
-                generator = chosen.get(tag.name) or generators.usual(tag)
-                self._series.append(
-                    (tag, _all_series(tag, generator, played.get(tag.name), step, seed))
-                )
-        self._write()
-        self.step()
+        scaled = [tag for tag in everything if tag.source is not None]
+        for some in ([tag for tag in everything if tag.source is None], scaled):
+            for tag in some:
+                if not kept.isdisjoint(_places(tag)):
+                    self._keep(tag, chosen.get(tag.name), played.get(tag.name))
+                else:
+                    generator = chosen.get(tag.name) or self._usual(tag)
+                    self._series.append(
+                        (tag, _all_series(tag, generator, played.get(tag.name), step, seed))
+                    )
+            self._write()
+            if some:
+                self.step()
 
     def rule(self, unit: int, sources: Sequence[str]) -> Rule:
         """The rights of clients: to read what tags have, and to write what is writable."""
@@ -79,10 +88,26 @@ class SimulatedDevice:
     def step(self) -> None:
         """Gives all tags that are not writable their next values, in one step."""
         self._registers = {area: {} for area in AREAS}
-        for tag, series in self._series:
+        for tag, series in self._series:  # Those that contain scales come before those with them.
             numbers = [next(each) for each in series]
             self._put(tag, numbers if tag.of_type.count is not None else numbers[0])
         self._write()
+
+    def _usual(self, tag: Tag) -> Generator:
+        try:
+            return generators.usual(self._with_scale(tag))
+        except ValueError as error:
+            raise Refused(f"{tag.name}: {error}") from None
+
+    def _with_scale(self, tag: Tag) -> Tag:
+        """The tag with the scale that its register contains. Raises `ValueError` without one."""
+        source = tag.source
+        if source is None:
+            return tag
+        changed = self._registers[source.area]
+        now = self.memory.read(source.area, source.address, source.count)
+        registers = [changed.get(at, old) for at, old in enumerate(now, source.address)]
+        return tag.with_scale(values.decode(registers, source.type, source.order))
 
     def _keep(self, tag: Tag, generator: Generator | None, played: Sequence[Any] | None) -> None:
         """Gives a tag its first value."""
@@ -95,7 +120,11 @@ class SimulatedDevice:
         self._put(tag, value if whole else [value] * (tag.of_type.count or 1))
 
     def _put(self, tag: Tag, value: Any) -> None:
-        """Puts a value into registers that `_write` writes."""
+        """Puts a value into registers that `_write` writes; without a scale, they do not change."""
+        try:
+            tag = self._with_scale(tag)
+        except ValueError:
+            return
         registers = self._registers[tag.area]
         raw: Any = (
             [nearest(tag, each) for each in value]
@@ -146,11 +175,33 @@ def _played(values: Sequence[Any], at: int | None) -> Iterator[Any]:
             yield value if at is None or value is None else value[at]
 
 
+def _unnamed(tags: TagList) -> Iterator[Tag]:
+    """The registers of scales that no tag has."""
+    named = {place for tag in tags for place in _places(tag)}
+    for source in dict.fromkeys(tag.source for tag in tags if tag.source is not None):
+        if named.isdisjoint(_places(source)):
+            yield replace(source, name=f"{source.area} {source.address}")
+
+
+def _of_scales(tags: Sequence[Tag]) -> dict[str, Generator]:
+    """The generators of registers that contain the scales of other tags, by name."""
+    forms: dict[tuple[Area, int], Form] = {}
+    for tag in tags:
+        if tag.source is not None and isinstance(tag.scale, RegisterScale):
+            forms[tag.source.area, tag.source.address] = tag.scale.form
+    places = {tag: (tag.area, tag.address) for tag in tags if tag.is_number}
+    return {
+        tag.name: generators.scale(tag, forms[place])
+        for tag, place in places.items()
+        if place in forms and tag.source is None
+    }
+
+
 def _places(tag: Tag) -> set[tuple[Area, int]]:
     return {(tag.area, address) for address in range(tag.address, tag.end)}
 
 
-def _extents(tags: TagList) -> dict[Area, tuple[int, int]]:
+def _extents(tags: Sequence[Tag]) -> dict[Area, tuple[int, int]]:
     """Start and size of each area."""
     found = {}
     for area in AREAS:
@@ -161,13 +212,13 @@ def _extents(tags: TagList) -> dict[Area, tuple[int, int]]:
     return found
 
 
-def _spans(tags: Sequence[Tag] | TagList) -> list[tuple[Area, int, int]]:
-    """The addresses of tags, as areas, first addresses and counts."""
+def _spans(places: Iterable[tuple[Area, range]]) -> list[tuple[Area, int, int]]:
+    """Addresses as areas, first addresses and counts."""
     spans: list[tuple[Area, int, int]] = []
-    for tag in sorted(tags, key=lambda tag: (tag.area, tag.address)):
-        if spans and spans[-1][0] == tag.area and tag.address <= sum(spans[-1][1:]):
+    for of, span in sorted(places, key=lambda place: (place[0], place[1].start)):
+        if spans and spans[-1][0] == of and span.start <= sum(spans[-1][1:]):
             area, start, count = spans[-1]
-            spans[-1] = area, start, max(count, tag.end - start)
+            spans[-1] = area, start, max(count, span.stop - start)
         else:
-            spans.append((tag.area, tag.address, tag.count))
+            spans.append((of, span.start, len(span)))
     return spans

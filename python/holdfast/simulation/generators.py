@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from random import Random
 
     from holdfast.tags import Tag
+    from holdfast.tags.register_scale import Form
 
 Series: TypeAlias = "Iterator[Any]"
 
@@ -61,7 +62,8 @@ def parsed(tag: Tag, text: str) -> Generator:
         raise ValueError(f"{kind!r} is not a generator, allowed: {ALLOWED}")
     if kind == "constant":
         value = value_from(tag, rest)
-        tag.raw(value)
+        if tag.source is None:
+            tag.raw(value)
         return constant(value)
     if kind == "cycle":
         return Generator(kind, _numbers(kind, rest), _items(tag))
@@ -181,6 +183,17 @@ def usual(tag: Tag) -> Generator:
     if found.kind == "counter" or low <= found.numbers[0] < found.numbers[1] <= high:
         return found
     return Generator("sine", (low + (high - low) * 0.1, low + (high - low) * 0.9, 60))
+
+
+def scale(tag: Tag, form: Form) -> Generator:
+    """The value of a register that contains the scale of other tags: a tenth, if it can."""
+    if form == "exponent":
+        return constant(-1 if extremes(tag)[0] < 0 else 0)
+    try:
+        tag.raw(0.1)
+    except ValueError:
+        return constant(tag.value(1))
+    return constant(0.1)
 
 
 def still(tag: Tag) -> Generator:

@@ -6,6 +6,7 @@ import itertools
 from typing import TYPE_CHECKING, Any
 
 from holdfast.tags.linear import Linear
+from holdfast.tags.register_scale import RegisterScale
 from holdfast.values.numeric import MAX
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def nearest(tag: Tag, value: Any) -> Any:
     if isinstance(value, str):
         return tag.raw(value)
     least, most = _limits(tag)
-    number = Linear(tag.scale, tag.offset).number(value)
+    number = _linear(tag).number(value)
     if tag.is_float:
         return min(most, max(least, float(number)))
     raw = int(min(most, max(least, round(number))))
@@ -37,9 +38,14 @@ def nearest(tag: Tag, value: Any) -> Any:
 
 def extremes(tag: Tag) -> tuple[float, float]:
     """The least and the largest value that the registers of a number can hold."""
-    linear = Linear(tag.scale, tag.offset)
+    linear = _linear(tag)
     first, second = (linear.value(number) for number in _limits(tag))
     return min(first, second), max(first, second)
+
+
+def _linear(tag: Tag) -> Linear:
+    assert not isinstance(tag.scale, RegisterScale), "the device gives such a tag its scale"
+    return Linear(tag.scale, tag.offset)
 
 
 def _limits(tag: Tag) -> tuple[float, float]:
