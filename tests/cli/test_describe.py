@@ -62,9 +62,11 @@ def test_every_unit_id_has_a_file(plant: str, tmp_path: Path) -> None:
     assert [model["id"] for model in second["sunspec"]["models"]] == [1, 103]
     assert second["areas"]["holding_registers"]["exist"] == 130
     current = next(tag for tag in second["tags"] if tag["name"] == "inverter_three_phase_A")
-    assert (current["values"], current["scale"], current["confidence"]) == ([215], 0.1, 1.0)
+    place = {"area": "holding_registers", "address": 40076, "type": "int16"}
+    assert (current["values"], current["confidence"]) == ([215], 1.0)
+    assert current["scale"] == {"from": place, "as": "exponent"}
     tags = load_tags(tmp_path / "device-unit4.csv")
-    assert tags["inverter_three_phase_A"].scale == 0.1
+    assert tags["inverter_three_phase_A"].with_scale(-1).scale == 0.1
 
 
 def test_nothing_is_written_to_the_device() -> None:

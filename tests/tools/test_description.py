@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import random
 from typing import TYPE_CHECKING, Any
 
@@ -11,13 +12,19 @@ from hypothesis import strategies as st
 
 import holdfast
 from holdfast import values
-from holdfast.tools import description
+from holdfast.config.tag_files import load_tags
+from holdfast.config.tag_output import tags_as_yaml
+from holdfast.tags.register_scale import RegisterScale
+from holdfast.tools import description, sunspec
 from holdfast.tools.description import Description
 from holdfast.tools.discovery import LimitReached, Survey
+from holdfast.tools.tag_reading import TagReader
 from support import cli, plant_data, sunspec_device
 from support.cases import examples
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from holdfast.tools.description import Described
     from support.running import Serve
 
@@ -73,15 +80,65 @@ def test_sunspec_is_decoded_and_not_guessed(serve: Serve) -> None:
     found = described(serve({1: memory}), areas=["holding_registers"])
     tags = {each.tag.name: each.tag for each in found.tags}
     current = tags["inverter_three_phase_A"]
-    assert (current.address, current.scale, current.unit) == (40072, 0.1, "A")
+    assert (current.address, current.unit) == (40072, "A")
     assert current.null == {0xFFFF}
-    assert current.value(215) == 21.5
+    assert isinstance(current.scale, RegisterScale)
+    assert current.span == range(40072, 40077)
+    assert current.with_scale(-1).value(215) == 21.5
     assert not current.writable
     assert tags["inverter_three_phase_St"].state(4) == "MPPT"
     assert "inverter_three_phase_PPVphAB" not in tags
     behind = 40000 + len(registers)
     assert tags[f"hr_{behind}"].type == "uint16"
     assert not any(name.startswith("hr_400") for name in tags)
+
+
+def test_a_sunspec_value_follows_its_scale_factor(serve: Serve, tmp_path: Path) -> None:
+    registers = sunspec_device.registers(sunspec_device.inverter())
+    power, factor = 40004 + 12, 40004 + 13
+    memory = holdfast.Memory(holding_registers=(40000, len(registers)))
+    memory.write("holding_registers", 40000, registers)
+    memory.write("holding_registers", power, [4320, 0])
+    server = serve({1: memory})
+    found = described(server, areas=["holding_registers"])
+    file = tmp_path / "inverter.yaml"
+    file.write_text(tags_as_yaml(each.tag for each in found.tags), encoding="utf-8")
+    reader = TagReader([load_tags(file)["inverter_three_phase_W"]])
+    with holdfast.SyncClient(cli.url(server)) as client:
+        for number, exponent, expected in ((4320, 0, 4320), (432, 1, 4320), (15, 0xFFFF, 1.5)):
+            memory.write("holding_registers", power, [number, exponent])
+            [reading] = reader.read(client)
+            assert (reading.value, reading.error) == (expected, None)
+        memory.write("holding_registers", factor, [0x8000])
+        [reading] = reader.read(client)
+        assert reading.value is None
+        assert "10^-32768, allowed: exponents from -10 to 10" in str(reading.error)
+
+
+def test_a_scale_factor_that_is_too_far_leaves_the_raw_number() -> None:
+    far = sunspec.Point(
+        name="far",
+        address=200,
+        type="int16",
+        scale=0.1,
+        scaled_by="X_SF",
+        scaled_at=40,
+        unit="W",
+        label="",
+        can_be_written=False,
+        states={},
+        missing=None,
+        value=7,
+    )
+    near = dataclasses.replace(far, name="near", address=164)
+    model = sunspec.Model(160, "mppt", "", 2, 300, (near, far))
+    spec = sunspec.SunSpec(0, (model,), is_complete=True)
+    found = Description(1, Survey(["holding_registers"]), sunspec=spec)
+    description.conclude(found)
+    first, second = (each.tag for each in found.tags)
+    assert (first.name, first.unit, first.span) == ("mppt_near", "W", range(40, 165))
+    assert (second.name, second.unit, second.scale) == ("mppt_far_raw", "", 1)
+    assert "no scale from X_SF, which is at 40" in second.description
 
 
 def overlaps(tags: list[Described]) -> bool:

@@ -54,6 +54,7 @@ def test_values_have_their_units_scales_and_states() -> None:
     assert (found["Mn"].value, found["Mn"].type, found["Opt"].value) == ("Acme", "string:32", None)
     current = found["A"]
     assert (current.address, current.value, current.scale, current.unit) == (40072, 215, 0.1, "A")
+    assert (current.scaled_by, current.scaled_at) == ("A_SF", 40076)
     assert (found["W"].type, found["W"].value, found["W"].scale) == ("int16", -4950, 1)
     assert (found["Hz"].value, found["Hz"].scale) == (4998, 0.01)
     assert (found["WH"].type, found["WH"].value, found["WH"].scale) == ("uint32", 1234567, 10)
@@ -66,6 +67,7 @@ def test_repeated_groups_have_numbers() -> None:
     found = points(sunspec_device.mppt())
     assert [found[f"module_{each}_IDStr"].value for each in (1, 2)] == ["East", "West"]
     assert (found["module_2_DCA"].value, found["module_2_DCA"].scale) == (52, 0.1)
+    assert found["module_2_DCA"].scaled_at == found["module_1_DCA"].scaled_at == 40004
     assert found["module_2_DCA"].address - found["module_1_DCA"].address == 20
 
 
@@ -97,6 +99,36 @@ def test_models_that_do_not_end_are_incomplete() -> None:
     assert found.extent == range(40000, 40000 + len(registers))
 
 
+@pytest.mark.parametrize("model", [[0, 0], [1, 0], [64999, 0]])
+def test_a_model_without_registers_ends_the_search(model: list[int]) -> None:
+    asked = []
+    registers = [*sunspec_device.text("SunS", 4), *sunspec_device.inverter(), *model * 20_000]
+
+    def read(address: int, count: int) -> list[int]:
+        asked.append((address, count))
+        return reader(registers, 0)(address, count)
+
+    found = sunspec.find(read)
+    assert found is not None
+    assert [each.id for each in found.models] == [103]
+    assert not found.is_complete
+    assert asked[1:] == [(0, 2), (2, 2), (4, 50), (54, 2)]
+
+
+def test_unknown_models_are_passed_over_without_being_read() -> None:
+    asked = []
+    registers = sunspec_device.registers([64999, 2000, *[1] * 2000], sunspec_device.inverter())
+
+    def read(address: int, count: int) -> list[int]:
+        asked.append(count)
+        return reader(registers)(address, count)
+
+    found = sunspec.find(read)
+    assert found is not None
+    assert [each.length for each in found.models] == [2000, 50]
+    assert asked == [2, 2, 2, 50, 2]
+
+
 def test_a_device_without_models_is_none_and_a_silent_one_an_error() -> None:
     assert sunspec.find(reader([0] * 10)) is None
 
@@ -109,7 +141,7 @@ def test_a_device_without_models_is_none_and_a_silent_one_an_error() -> None:
 
 @given(
     st.sampled_from([int(each) for each in sunspec.definitions()]),
-    st.lists(st.integers(0, 0xFFFF), max_size=120),
+    st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=120),
 )
 def test_any_content_of_a_model_is_decoded_within_its_length(
     number: int, content: list[int]

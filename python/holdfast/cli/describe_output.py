@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 from holdfast.cli import coverage, showing
 from holdfast.cli.unit_ids import listed
+from holdfast.config.tag_output import scale_as_data
+from holdfast.tags.register_scale import RegisterScale
 from holdfast.tools.segments import FILL_REASONS
 
 if TYPE_CHECKING:
@@ -147,7 +149,7 @@ def _shown(each: Described, raw: object) -> str:
         return showing.shown(raw, tag.of_type.base)
     if isinstance(raw, list):
         return _bits(raw)
-    value = tag.value(raw)
+    value = (each.shown or tag).value(raw)
     name = tag.state(value)
     text = showing.shown(value, tag.of_type.base)
     return f"{text} ({name})" if name else text
@@ -215,7 +217,7 @@ def _tag(each: Described) -> dict[str, object]:
         "address": tag.address,
         "type": tag.type,
         "order": tag.order,
-        "scale": tag.scale,
+        "scale": scale_as_data(tag.scale) if isinstance(tag.scale, RegisterScale) else tag.scale,
         "unit": tag.unit,
         "confidence": round(each.confidence, 4),
         "values": [showing.jsonable(value) for value in each.values],

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
 
 from holdfast.errors import ModbusException
 from holdfast.protocol import READ_LIMITS
 from holdfast.tags import Tag
+from holdfast.tags.register_scale import RegisterScale
 from holdfast.tools import discovery, finding, segments, sunspec
 from holdfast.tools.finding import Identity
 from holdfast.types import BIT_AREAS
+from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -68,6 +70,8 @@ class Described:
     values: tuple[Any, ...]
     """The numbers, bits or texts of each read, without scale."""
     reasons: tuple[str, ...]
+    shown: Tag | None = None
+    """The tag with the scale that its register contained; `None` if no register does."""
 
 
 @dataclass
@@ -317,12 +321,15 @@ def _of_sunspec(found: SunSpec) -> Iterator[Described]:
 
 
 def _of_point(model: Model, point: Point, names: set[str]) -> Described:
-    name = _unique(f"{model.name}_{point.name}", names)
+    scale, flaw = _scale_of(point)
+    name = _unique(f"{model.name}_{point.name}{'_raw' if flaw else ''}", names)
     said = f"SunSpec model {model.id}"
     if point.label:
         said += f", {point.label}"
     if point.scaled_by is not None:
-        said += f"; scale from {point.scaled_by}"
+        said += f"; {'no ' if flaw else ''}scale from {point.scaled_by}"
+    if flaw:
+        said += f", {flaw}"
     if point.can_be_written:
         said += "; can be written"
     tag = Tag(
@@ -330,13 +337,30 @@ def _of_point(model: Model, point: Point, names: set[str]) -> Described:
         "holding_registers",
         point.address,
         point.type,
-        scale=point.scale,
-        unit=point.unit,
+        scale=1 if flaw else point.scale,
+        unit="" if flaw else point.unit,
         states=point.states,
         null=frozenset(() if point.missing is None else (point.missing,)),
         description=said,
     )
-    return Described(tag, 1.0, (point.value,), (said,))
+    if scale is None:
+        return Described(tag, 1.0, (point.value,), (said,))
+    return Described(replace(tag, scale=scale), 1.0, (point.value,), (said,), shown=tag)
+
+
+def _scale_of(point: Point) -> tuple[RegisterScale | None, str]:
+    """The register that contains the scale of a point, or why no tag can have it."""
+    if point.scaled_at is None:
+        return None, ""
+    size = parsed(point.type).registers
+    first, last = (
+        min(point.address, point.scaled_at),
+        max(point.address + size, point.scaled_at + 1),
+    )
+    if last - first > READ_LIMITS["holding_registers"]:
+        return None, f"which is at {point.scaled_at}, too far to be read with it"
+    source = Tag("", "holding_registers", point.scaled_at, "int16")
+    return RegisterScale("exponent", source=source), ""
 
 
 def _unique(name: str, names: set[str]) -> str:

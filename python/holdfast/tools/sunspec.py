@@ -32,6 +32,8 @@ END = 0xFFFF
 """The id after the last model."""
 
 MAX_MODELS = 100
+"""With the limit of an address, this limits the requests, whatever the device answers."""
+
 MAX_SCALE = 10
 
 TYPES = {
@@ -75,6 +77,8 @@ class Point:
     """The value is this, times the number in the registers."""
     scaled_by: str | None
     """The name of the point that contains the scale factor, if one does."""
+    scaled_at: int | None
+    """The address of that point."""
     unit: str
     label: str
     can_be_written: bool
@@ -141,9 +145,11 @@ def _models(read: Read, base: int) -> SunSpec:
             number, length = read(at, 2)
             if number == END:
                 return SunSpec(base, tuple(models), is_complete=True)
-            if at + 2 + length > ADDRESSES:
-                break
-            models.append(_model(number, at, length, _block(read, at + 2, length)))
+            if not length or at + 2 + length > ADDRESSES:
+                break  # No model is empty: these are not headers of models.
+            known = str(number) in definitions()
+            registers = _block(read, at + 2, length) if known else []
+            models.append(_model(number, at, length, registers))
         except ModbusError as error:
             if not _is_refused(error):
                 raise
@@ -201,8 +207,8 @@ class _Group:
         self._prefix = prefix
         self._outer = outer
         self._places: list[tuple[int, list[Any]]] = []
-        self._numbers: dict[str, int] = {}
-        """The raw values of one register: counts and scale factors are among them."""
+        self._numbers: dict[str, tuple[int, int]] = {}
+        """Offsets and raw values of single registers: counts and scale factors are among them."""
         self._inner: list[_Group] = []
         self.stop = offset
         for row in definition["points"]:
@@ -212,7 +218,7 @@ class _Group:
                 return
             self._places.append((self.stop, row))
             if size == 1:
-                self._numbers[row[0]] = registers[self.stop]
+                self._numbers[row[0]] = self.stop, registers[self.stop]
             self.stop += size
         for inner in definition.get("groups", ()):
             self._repeat(inner)
@@ -221,8 +227,8 @@ class _Group:
         """Adds the repetitions of a group: a number, as many as a point says, or as many as fit."""
         count = definition.get("count", 1)
         if isinstance(count, str):
-            count = self._number(count)
-            count = 0 if count in (None, 0xFFFF) else count
+            _, found = self._number(count) or (0, 0)
+            count = 0 if found == 0xFFFF else found
             fits = False
         else:
             fits = count == 0
@@ -243,8 +249,8 @@ class _Group:
             self.stop = group.stop
             index += 1
 
-    def _number(self, name: str) -> int | None:
-        """The raw value of a point of this group or one around it."""
+    def _number(self, name: str) -> tuple[int, int] | None:
+        """Offset and raw value of a point of this group or one around it."""
         if name in self._numbers:
             return self._numbers[name]
         return None if self._outer is None else self._outer._number(name)
@@ -263,12 +269,14 @@ class _Group:
         type, missing = (kind, None) if kind.startswith("string") else TYPES[kind]
         registers = self._registers[offset : offset + _size(kind)]
         scale = self._scale(factor)
+        scaled = self._number(factor) if isinstance(factor, str) and factor else None
         return Point(
             name=f"{self._prefix}{name}",
             address=self._address + offset,
             type=type,
             scale=1 if scale is None else scale,
             scaled_by=factor if isinstance(factor, str) and factor else None,
+            scaled_at=None if scaled is None else self._address + scaled[0],
             unit=UNITS.get(unit, unit),
             label=label,
             can_be_written=access == "w",
@@ -281,7 +289,8 @@ class _Group:
         """The scale of a scale factor: a number, or the name of a point; `None` if it has none."""
         if factor == "":
             return 1
-        raw = self._number(factor) if isinstance(factor, str) else factor & 0xFFFF
+        found = self._number(factor) if isinstance(factor, str) else (0, factor & 0xFFFF)
+        raw = None if found is None else found[1]
         power = None if raw is None else raw - 0x10000 if raw & 0x8000 else raw
         if power is None or abs(power) > MAX_SCALE:
             return None
