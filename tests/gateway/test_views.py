@@ -157,6 +157,29 @@ digits,hr,6,bcd16
         assert "digit" in found["errors"]["2"]
 
 
+def test_a_scale_in_a_register_is_shown_and_not_written(
+    gateway: Running, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    tags = """\
+name,area,address,type,order,scale,offset,unit,writable
+power,hr,0,int16,,exponent sf,,W,yes
+sf,hr,4,int16
+"""
+    memory.write("holding_registers", 0, [432, 0, 0, 0, 1])
+    part = {"tags": tags, "format": "csv"}
+    [event] = list(view(gateway, server.address[1], part, once=True))
+    [found] = event.data["parts"]
+    assert (found["values"], found["texts"]) == ([4320, 1], ["4320", "1"])
+    assert found["tags"][0]["scale"] == {"from": "sf", "as": "exponent"}
+    memory.write("holding_registers", 4, [0x8000])
+    [event] = list(view(gateway, server.address[1], part, once=True))
+    [found] = event.data["parts"]
+    assert found["values"][0] is None
+    assert "10^-32768" in found["errors"]["0"]
+    answer = local(gateway, "/tags/value", {**part, "name": "power", "value": "4320"})
+    assert "the scale is in holding_registers 4" in str(answer.json)
+
+
 def test_a_view_ends_after_one_event_if_asked(gateway: Running, server: holdfast.Server) -> None:
     stream = view(gateway, server.address[1], ranged(0), {"tags": METER}, once=True, describe=False)
     [event] = list(stream)
