@@ -55,16 +55,19 @@ class Places(Generic[T]):
     """An index of tags by address, to find the tags of a block quickly."""
 
     def __init__(self, tags: Iterable[T]) -> None:
-        self._tags: dict[Area, list[T]] = {}
-        for tag in sorted(tags, key=lambda tag: tag.span.start):
-            self._tags.setdefault(tag.area, []).append(tag)
-        self._starts = {area: [tag.span.start for tag in tags] for area, tags in self._tags.items()}
+        self._tags: dict[Area, list[tuple[int, T]]] = {}
+        """Tags with the ends of their spans."""
+        self._starts: dict[Area, list[int]] = {}
+        spans = [(tag.span, tag) for tag in tags]
+        for span, tag in sorted(spans, key=lambda each: each[0].start):
+            self._tags.setdefault(tag.area, []).append((span.stop, tag))
+            self._starts.setdefault(tag.area, []).append(span.start)
 
     def inside(self, area: Area, address: int, count: int) -> list[T]:
         """Returns the tags that are entirely inside a block, with their scales."""
         starts, end = self._starts.get(area, []), address + count
         first, last = bisect_left(starts, address), bisect_left(starts, end)
-        return [tag for tag in self._tags.get(area, [])[first:last] if tag.span.stop <= end]
+        return [tag for stop, tag in self._tags.get(area, [])[first:last] if stop <= end]
 
 
 class Undecoded:
