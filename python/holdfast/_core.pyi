@@ -702,7 +702,7 @@ class Endpoint:
         *,
         accept_unit: int | Literal["any"] | None = None,
         pad: bool = False,
-        echo: bool = False,
+        echo: bool | Literal["auto"] = "auto",
         pause: float = 0.0,
         pause_after_connect: float = 0.0,
         retries: int = 0,
@@ -777,7 +777,13 @@ class Connection:
     result, a `ModbusError`, or an `Attempt` when the request may be sent again.
     """
 
-    def __new__(cls, endpoint: Endpoint, now: float) -> Connection: ...
+    def __new__(
+        cls, endpoint: Endpoint, now: float, last: Connection | None = None
+    ) -> Connection:
+        """A connection that follows the `last` one to this endpoint, which has ended: late replies to
+        requests of that one are recognized.
+        """
+
     @property
     def is_ready(self) -> bool:
         """Whether requests can be sent: the TLS handshake, if any, is complete."""

@@ -11,7 +11,7 @@ use holdfast_engine::client::{
 use holdfast_engine::tls::FileError;
 use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
 use holdfast_engine::{LineDirection, LineMode, LineParity, SerialLine};
-use holdfast_protocol::client::{AcceptUnit, Tolerance};
+use holdfast_protocol::client::{AcceptUnit, Echo, Tolerance};
 use holdfast_protocol::frame::rtu;
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
@@ -262,12 +262,12 @@ impl Endpoint {
         Ok(Endpoint { core: Place::Serial(line).into() })
     }
 
-    #[pyo3(signature = (*, accept_unit=None, pad=false, echo=false, pause=0.0, pause_after_connect=0.0, retries=0, retry_busy=false, close_after=0, reconnect=0.0))]
+    #[pyo3(signature = (*, accept_unit=None, pad=false, echo=None, pause=0.0, pause_after_connect=0.0, retries=0, retry_busy=false, close_after=0, reconnect=0.0))]
     fn tolerating(
         &self,
         accept_unit: Option<&Bound<'_, PyAny>>,
         pad: bool,
-        echo: bool,
+        echo: Option<&Bound<'_, PyAny>>,
         pause: f64,
         pause_after_connect: f64,
         retries: i128,
@@ -279,6 +279,12 @@ impl Endpoint {
             None => AcceptUnit::Requested,
             Some(any) if any.extract().is_ok_and(|word: &str| word == "any") => AcceptUnit::Any,
             Some(unit) => AcceptUnit::Also(byte("accept_unit", integer(unit)?)?),
+        };
+        let echo = match echo {
+            None => Echo::Auto,
+            Some(auto) if auto.extract().is_ok_and(|word: &str| word == "auto") => Echo::Auto,
+            Some(flag) if flag.extract::<bool>()? => Echo::Always,
+            Some(_) => Echo::Never,
         };
         let tolerance = Tolerance {
             accept_unit,

@@ -1,6 +1,7 @@
 //! `Connection`: the client side of a TCP connection, with or without TLS. The caller owns the
 //! socket.
 
+use std::hash::{BuildHasher, RandomState};
 use std::io;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -65,7 +66,12 @@ type Completed<'py> = Vec<(u64, Bound<'py, PyAny>)>;
 #[pymethods]
 impl Connection {
     #[new]
-    fn new(endpoint: PyRef<'_, Endpoint>, now: f64) -> PyResult<Connection> {
+    #[pyo3(signature = (endpoint, now, last=None))]
+    fn new(
+        endpoint: PyRef<'_, Endpoint>,
+        now: f64,
+        last: Option<PyRef<'_, Connection>>,
+    ) -> PyResult<Connection> {
         let Place::Tcp { tls, .. } = &endpoint.core.place else {
             return Err(PyValueError::new_err("endpoint is not one of TCP or TLS"));
         };
@@ -76,7 +82,13 @@ impl Connection {
                 raised(ClientError::Tls { to: to.clone(), failure, maybe_sent: false })
             })?),
         };
-        let core = Core::tolerant(Transport::Tcp, endpoint.core.tolerance, clock(now)?);
+        let now = clock(now)?;
+        let core = Core::tolerant(Transport::Tcp, endpoint.core.tolerance, now);
+        // The keys of a hasher are random.
+        let mut core = core.unpredictable(RandomState::new().hash_one(0));
+        if let Some(last) = last {
+            core.follow(last.state().core.take_past(now));
+        }
         Ok(Connection { state: Mutex::new(State { core, tls, ending: None }), to })
     }
 

@@ -130,6 +130,7 @@ pub fn tell_strays(all: &Bound<'_, PyDict>, strays: Option<&StrayCounters>) -> P
     all.set_item("unexpected_replies", count(|strays| strays.replies.get()))?;
     all.set_item("stray_bytes", count(|strays| strays.bytes.get()))?;
     all.set_item("late_replies", count(|strays| strays.late.get()))?;
+    all.set_item("raised_timeouts", count(|strays| strays.raised_timeouts.get()))?;
     all.set_item("floods", count(|strays| strays.floods.get()))
 }
 

@@ -107,12 +107,15 @@ impl SerialLine {
         match self.mode {
             LineMode::Rtu { silence: Some(silence) } => silence,
             _ if self.baud > fast => shortest,
-            _ => {
-                let parity = u32::from(self.parity != LineParity::None);
-                let bits = 1 + u32::from(self.data_bits) + parity + u32::from(self.stop_bits);
-                Duration::from_secs_f64(3.5 * f64::from(bits) / f64::from(self.baud))
-            }
+            _ => self.character().mul_f64(3.5),
         }
+    }
+
+    /// The time of one character.
+    pub(crate) fn character(&self) -> Duration {
+        let parity = u32::from(self.parity != LineParity::None);
+        let bits = 1 + u32::from(self.data_bits) + parity + u32::from(self.stop_bits);
+        Duration::from_secs_f64(f64::from(bits) / f64::from(self.baud))
     }
 }
 

@@ -90,6 +90,8 @@ class _LoopConnection:
         self._max_in_flight = self._free = max_in_flight
         self._queue: deque[asyncio.Future[None]] = deque()
         self._open: _Protocol | None = None
+        self._last: Connection | None = None
+        """The newest connection, open or ended: its late replies may come on the next one."""
         self._connecting: asyncio.Task[_Protocol] | None = None
         self._is_looking_up = False
         """Whether the attempt to connect waits, or has waited, for the addresses of the host."""
@@ -190,7 +192,7 @@ class _LoopConnection:
         self._is_looking_up = False
         if self._connect_at > self.loop.time():
             await asyncio.sleep(min(self._connect_at - self.loop.time(), timeout))
-        core = Connection(self._endpoint, self.loop.time())
+        self._last = core = Connection(self._endpoint, self.loop.time(), self._last)
         protocol = _Protocol(self, core, has_pauses=target.tolerance.has_pauses)
         deadline = self.loop.time() + timeout
         try:

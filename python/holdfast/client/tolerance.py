@@ -20,8 +20,8 @@ class Tolerance:
     """Whether surplus bytes at the end of a reply are ignored. Over TCP and UDP, an exception reply
     ends after its exception code whatever length its header has.
     """
-    echo: bool = False
-    """Whether the adapter repeats what is sent."""
+    echo: bool | Literal["auto"] = "auto"
+    """Whether the adapter repeats what is sent; `auto` detects it at reads."""
     pause: float = 0.0
     """Seconds between the end of a request and the next; one request is in flight then."""
     pause_after_connect: float = 0.0

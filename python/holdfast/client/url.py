@@ -198,6 +198,10 @@ def _unit(text: str) -> int | str:
     return text if text == "any" else _up_to(MAX_UNIT)(text)
 
 
+def _echo(text: str) -> bool | str:
+    return text if text == "auto" else _up_to(1)(text) == 1
+
+
 def _flag(schemes: tuple[str, ...]) -> _Option:
     return _Option("0, 1", _one_of("0", "1", read=lambda text: text == "1").read, schemes)
 
@@ -217,7 +221,7 @@ OPTIONS: Mapping[str, _Option] = {
     "rs485": _one_of("rts", "rts-low"),
     "accept_unit": _Option(f"any, 0 to {MAX_UNIT}", _unit, ALL),
     "pad": _flag(ALL),
-    "echo": _flag(tuple(each for each in ALL if each not in MBAP)),
+    "echo": _Option("0, 1, auto", _echo, tuple(each for each in ALL if each not in MBAP)),
     "pause": _Option(f"seconds, up to {MAX_PAUSE}", _pause, ALL),
     "pause_after_connect": _Option(f"seconds, up to {MAX_PAUSE}", _pause, ALL),
     "retries": _Option(f"0 to {MAX_RETRIES}", _up_to(MAX_RETRIES), ALL),

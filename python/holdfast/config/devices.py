@@ -204,8 +204,8 @@ class ToleranceConfig(Model):
     """A unit id that replies may carry besides that of the request, or any."""
     pad: bool = False
     """Whether surplus bytes at the end of a reply are ignored."""
-    echo: bool = False
-    """Whether the adapter repeats what is sent; for RTU and ASCII frames."""
+    echo: bool | Literal["auto"] = "auto"
+    """Whether the adapter repeats what is sent, or auto; for RTU and ASCII frames."""
     pause: Pause = 0.0
     """Seconds between the end of a request and the next; one request is in flight then."""
     pause_after_connect: Pause = 0.0

@@ -11,14 +11,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use holdfast_protocol::client::{Attempt, Closed, Connection, Done, Transport};
+use holdfast_protocol::client::{Attempt, Closed, Connection, Done, Past, Transport};
 use holdfast_protocol::pdu::{EncodedRequest, Response};
 
 use super::byte_stream::{ByteStream, StreamError};
 use super::connect::connect;
 use super::interrupt::{Interrupt, SLICE};
 use super::turns::Turns;
-use super::{ClientError, Endpoint, Lost, StrayCounters};
+use super::{ClientError, Endpoint, Lost, Place, StrayCounters};
 
 /// Bytes per read of a socket. No Modbus datagram is longer.
 const CHUNK: usize = 512;
@@ -33,12 +33,16 @@ pub struct BlockingClient {
     state: Mutex<State>,
     late: AtomicU64,
     strays: Arc<StrayCounters>,
+    /// The zero of the clock of all its connections.
+    epoch: Instant,
 }
 
 /// The state of the connection.
 #[derive(Default)]
 struct State {
     open: Option<Open>,
+    /// What the last connection left to the next one.
+    past: Past,
     /// When the last connection ended.
     ended: Option<Instant>,
 }
@@ -91,6 +95,7 @@ impl BlockingClient {
             state: Mutex::default(),
             late: AtomicU64::new(0),
             strays: Arc::default(),
+            epoch: Instant::now(),
         }
     }
 
@@ -241,7 +246,10 @@ impl BlockingClient {
                 interrupt.sleep_until(from.min(deadline));
             }
             match self.open(deadline, timeout, interrupt) {
-                Some(Ok(open)) => state.open = Some(open),
+                Some(Ok(mut open)) => {
+                    open.connection.follow(std::mem::take(&mut state.past));
+                    state.open = Some(open);
+                }
                 failed => {
                     state.end();
                     return failed.map(|failed| failed.map(|_| unreachable!("it was not opened")));
@@ -263,15 +271,15 @@ impl BlockingClient {
         if interrupt.is_hit() {
             return None;
         }
-        let endpoint = self.endpoint.clone();
+        let (endpoint, epoch) = (self.endpoint.clone(), self.epoch);
         let (sender, opened) = mpsc::sync_channel(1);
         let work = move || {
             // Whoever was interrupted does not receive it.
-            let _ = sender.send(Open::new(&endpoint, deadline, timeout));
+            let _ = sender.send(Open::new(&endpoint, epoch, deadline, timeout));
         };
         let connecting = thread::Builder::new().name("holdfast-connect".into());
         if !interrupt.is_possible() || connecting.spawn(work).is_err() {
-            return Some(Open::new(&self.endpoint, deadline, timeout));
+            return Some(Open::new(&self.endpoint, self.epoch, deadline, timeout));
         }
         loop {
             match opened.recv_timeout(SLICE) {
@@ -323,12 +331,20 @@ impl BlockingClient {
 
 impl State {
     fn end(&mut self) {
-        *self = State { open: None, ended: Some(Instant::now()) };
+        if let Some(mut open) = self.open.take() {
+            self.past = open.connection.take_past(open.epoch.elapsed());
+        }
+        self.ended = Some(Instant::now());
     }
 }
 
 impl Open {
-    fn new(endpoint: &Endpoint, deadline: Instant, timeout: Duration) -> Result<Open, ClientError> {
+    fn new(
+        endpoint: &Endpoint,
+        epoch: Instant,
+        deadline: Instant,
+        timeout: Duration,
+    ) -> Result<Open, ClientError> {
         let transport = endpoint.place.transport();
         let to = || endpoint.to_string();
         let stream = connect(&endpoint.place, deadline).map_err(|error| match error {
@@ -341,10 +357,14 @@ impl Open {
             StreamError::Tls(failure) => ClientError::Tls { to: to(), failure, maybe_sent: false },
         })?;
         let now = Instant::now();
-        let connection = Connection::tolerant(transport, endpoint.tolerance, Duration::ZERO);
+        let connection = Connection::tolerant(transport, endpoint.tolerance, now - epoch);
         // The keys of a hasher are random.
         let connection = connection.unpredictable(RandomState::new().hash_one(0));
-        Ok(Open { stream, connection, transport, epoch: now, used: now, late: 0 })
+        let connection = match &endpoint.place {
+            Place::Serial(line) => connection.on_line(line.character()),
+            _ => connection,
+        };
+        Ok(Open { stream, connection, transport, epoch, used: now, late: 0 })
     }
 
     /// Whether the connection can carry another request: the peer has not closed it, and has not
@@ -462,7 +482,6 @@ mod tests {
     use holdfast_protocol::pdu::Request;
 
     use super::*;
-    use crate::client::Place;
 
     #[test]
     fn what_may_no_longer_begin_after_the_connect_is_not_sent() {

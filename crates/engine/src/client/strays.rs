@@ -12,6 +12,8 @@ pub struct StrayCounters {
     pub bytes: Counter,
     /// Replies that came after the timeout of their request.
     pub late: Counter,
+    /// Requests that had more than their timeout, because late replies repeat.
+    pub raised_timeouts: Counter,
     /// Times that a connection was closed, and not opened for a while, because these were too many.
     pub floods: Counter,
 }
@@ -23,6 +25,10 @@ impl StrayCounters {
         if strays.bytes > 0 {
             self.replies.add_many(strays.replies);
             self.bytes.add_many(strays.bytes);
+        }
+        let raised = connection.take_raised();
+        if raised > 0 {
+            self.raised_timeouts.add_many(raised);
         }
         let before = std::mem::replace(late, connection.late());
         self.late.add_many(*late - before);

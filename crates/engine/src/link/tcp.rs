@@ -2,13 +2,14 @@
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
+use std::hash::{BuildHasher, RandomState};
 use std::io::{self, ErrorKind};
 use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 
 use holdfast_protocol::client::{
-    Attempt, Closed, Connection, Done, Failure, Ticket, Tolerance, Transport,
+    Attempt, Closed, Connection, Done, Failure, Past, Ticket, Tolerance, Transport,
 };
 use holdfast_protocol::pdu::EncodedRequest;
 use tokio::net::TcpStream;
@@ -57,6 +58,10 @@ pub(super) struct TcpLink {
     failed: RefCell<Option<(Instant, Arc<ClientError>)>>,
     /// When the last connection ended.
     ended: Rc<Cell<Option<Instant>>>,
+    /// What it left to the next one.
+    past: Rc<RefCell<Past>>,
+    /// The zero of the clock of all connections.
+    epoch: Instant,
     open: Rc<RefCell<Option<Open>>>,
 }
 
@@ -66,12 +71,12 @@ type Outcome = Option<(Result<Vec<u8>, Failure>, Option<Attempt>)>;
 /// An open connection.
 struct Open {
     connection: Connection,
-    /// The zero of the clock of the connection.
     epoch: Instant,
     waiting: HashMap<Ticket, oneshot::Sender<Outcome>>,
     /// Requests that wait for a pause, and until when they may be sent.
     held: Vec<(Ticket, Instant)>,
     ended: Rc<Cell<Option<Instant>>>,
+    past: Rc<RefCell<Past>>,
     strays: Arc<StrayCounters>,
     /// Late replies that were counted.
     late: u64,
@@ -105,6 +110,8 @@ impl TcpLink {
             failures: Cell::default(),
             failed: RefCell::default(),
             ended: Rc::default(),
+            past: Rc::default(),
+            epoch: Instant::now(),
             open: Rc::default(),
         }
     }
@@ -248,12 +255,18 @@ impl TcpLink {
     fn take(&self, stream: TcpStream, tls: Option<Channel>) {
         let _ = stream.set_nodelay(true);
         let (reader, writer) = stream.into_split();
+        let (transport, now) = (Transport::Tcp, self.epoch.elapsed());
+        let connection = Connection::tolerant(transport, self.tolerance, now);
+        // The keys of a hasher are random.
+        let mut connection = connection.unpredictable(RandomState::new().hash_one(0));
+        connection.follow(self.past.take());
         let open = Open {
-            connection: Connection::tolerant(Transport::Tcp, self.tolerance, Duration::ZERO),
-            epoch: Instant::now(),
+            connection,
+            epoch: self.epoch,
             waiting: HashMap::new(),
             held: Vec::new(),
             ended: Rc::clone(&self.ended),
+            past: Rc::clone(&self.past),
             strays: Arc::clone(&self.strays),
             late: 0,
             writer,
@@ -445,6 +458,7 @@ impl Open {
 impl Drop for Open {
     fn drop(&mut self) {
         self.ended.set(Some(Instant::now()));
+        self.past.replace(self.connection.take_past(self.epoch.elapsed()));
         if self.is_fenced() {
             self.unsent.clear();
         }

@@ -1,7 +1,9 @@
 //! The connection: the part that is the same for every transport.
 
+use alloc::vec::Vec;
 use core::time::Duration;
 
+use super::earlier::Earlier;
 use super::flights::{Call, Done, Flights, Strays, Ticket};
 use super::mbap_datagrams::Datagrams;
 use super::mbap_stream::Stream;
@@ -43,6 +45,19 @@ pub struct Connection {
     sent: u32,
 }
 
+/// What a connection leaves to the next one to the same address: see [`Connection::take_past`].
+#[derive(Debug, Default)]
+pub struct Past(Left);
+
+#[derive(Debug, Default)]
+enum Left {
+    #[default]
+    Nothing,
+    /// The next transaction id, and those that may still be answered.
+    Ids(u16, Vec<u16>),
+    Earlier(Earlier),
+}
+
 #[derive(Debug)]
 enum Wire {
     Stream(Stream),
@@ -75,14 +90,53 @@ impl Connection {
         Connection { wire, flights, ready_at, sent: 0 }
     }
 
-    /// Lets the transaction ids of datagrams follow from a random number, so that nobody who sees none of
-    /// them can forge a reply. In a stream they count up: forging a part of it takes more than an id.
+    /// Lets transaction ids begin with a random number: a device or a gateway may still answer the
+    /// requests of an earlier connection. Those of datagrams follow from it, so that nobody who sees none
+    /// of them can forge a reply. In a stream they count up: forging a part of it takes more than an id.
     #[must_use]
     pub fn unpredictable(mut self, seed: u64) -> Connection {
-        if let Wire::Datagrams(datagrams) = &mut self.wire {
-            datagrams.randomize(seed);
+        match &mut self.wire {
+            Wire::Stream(stream) => stream.randomize(seed),
+            Wire::Datagrams(datagrams) => datagrams.randomize(seed),
+            Wire::OneAtATime(_) => {}
         }
         self
+    }
+
+    /// Tells how long a character takes on a serial line: a reply that comes before the line can have
+    /// carried its request and itself is not believed, unless the first replies show that the line is
+    /// faster, as a pseudo-terminal is.
+    #[must_use]
+    pub fn on_line(mut self, character: Duration) -> Connection {
+        if let Wire::OneAtATime(line) = &mut self.wire {
+            line.character = character;
+        }
+        self
+    }
+
+    /// Takes what the next connection to this address has to know: replies that may still come, and how
+    /// late they are. This connection is not used again.
+    pub fn take_past(&mut self, now: Time) -> Past {
+        self.flights.close(Closed::BySelf, &mut |_| {});
+        match &mut self.wire {
+            Wire::Stream(stream) => {
+                let (next_id, given_up) = stream.take_ids(&self.flights);
+                Past(Left::Ids(next_id, given_up))
+            }
+            Wire::Datagrams(_) => Past::default(),
+            Wire::OneAtATime(line) => Past(Left::Earlier(line.take_earlier(&self.flights, now))),
+        }
+    }
+
+    /// Goes on where another connection to the same address ended, whose clock was the same.
+    pub fn follow(&mut self, past: Past) {
+        match (&mut self.wire, past.0) {
+            (Wire::Stream(stream), Left::Ids(next_id, given_up)) => {
+                stream.go_on(next_id, &given_up)
+            }
+            (Wire::OneAtATime(line), Left::Earlier(earlier)) => line.earlier = earlier,
+            _ => {}
+        }
     }
 
     /// Sends a request, or queues it until the line is silent. `timeout` runs from now, and again
@@ -255,6 +309,12 @@ impl Connection {
     /// Takes the counts of what was received without a request, since the last call.
     pub fn take_strays(&mut self) -> Strays {
         core::mem::take(&mut self.flights.strays)
+    }
+
+    /// Takes the number of requests since the last call that had more than their timeout, because late
+    /// replies repeat.
+    pub fn take_raised(&mut self) -> u64 {
+        core::mem::take(&mut self.flights.raised)
     }
 
     /// The number of late replies, which were dropped.

@@ -26,7 +26,7 @@ pub struct Strays {
 pub struct Done<'d> {
     /// The ticket that [`super::Connection::send`] returned.
     pub ticket: Ticket,
-    /// The timeout that [`super::Connection::send`] was given.
+    /// The timeout that [`super::Connection::send`] was given, or the raised one.
     pub timeout: Duration,
     /// The response, or why the request failed.
     pub outcome: Result<Response<'d>, Failure>,
@@ -70,6 +70,12 @@ pub(super) struct Flights {
     /// The number of late replies, which were dropped.
     pub(super) late: u64,
     pub(super) strays: Strays,
+    /// The number of requests that had more than their timeout, because late replies repeat.
+    pub(super) raised: u64,
+    /// Transaction ids of requests that ended with the connection.
+    pub(super) unanswered: Vec<u16>,
+    /// The unit and the request of the last of them, when it was sent, and its timeout.
+    pub(super) cut_off: Option<(u8, EncodedRequest, Time, Duration)>,
     next_ticket: u64,
     pub(super) tolerance: Tolerance,
     /// `out` waits until then: the pause after the request before.
@@ -187,6 +193,25 @@ impl Flights {
         invalid
     }
 
+    /// Notes that the first request is sent now. Its timeout begins at the latest, and may be raised.
+    pub(super) fn transmitted(&mut self, timeout: Duration, now: Time) {
+        let Some(flight) = self.waiting.front_mut() else { return };
+        flight.sent = now;
+        if timeout > flight.timeout {
+            self.raised += 1;
+            flight.deadline = now + timeout;
+            flight.timeout = timeout;
+        }
+        flight.deadline = flight.deadline.min(now + flight.timeout);
+    }
+
+    /// Starts the timeout of the first request again.
+    pub(super) fn restart(&mut self, now: Time) {
+        if let Some(flight) = self.waiting.front_mut() {
+            flight.deadline = now + flight.timeout;
+        }
+    }
+
     /// Starts the timeouts of requests again that were sent after this one.
     pub(super) fn restart_after(&mut self, ticket: Ticket, now: Time) {
         for later in self.waiting.iter_mut().filter(|flight| flight.ticket > ticket) {
@@ -250,7 +275,15 @@ impl Flights {
         self.closed = Some(why);
         self.out.clear();
         let failure = why.failure();
+        let were_sent = self.held.is_none();
+        self.cut_off = self
+            .waiting
+            .back()
+            .map(|flight| (flight.unit_id, flight.request.clone(), flight.sent, flight.timeout));
         while let Some(flight) = self.waiting.pop_front() {
+            if were_sent {
+                self.unanswered.push(flight.transaction_id);
+            }
             self.end(flight, Err(failure), sink);
         }
     }

@@ -17,8 +17,9 @@ const IDS: usize = 65_536;
 #[derive(Debug, Default)]
 pub(super) struct Stream {
     next_id: u16,
-    /// Transaction ids of requests that were given up: their replies may still come.
-    given_up: BTreeMap<u16, Ticket>,
+    /// Transaction ids of requests that were given up: their replies may still come. Those of an earlier
+    /// connection have no ticket.
+    given_up: BTreeMap<u16, Option<Ticket>>,
     /// The beginning of a frame.
     partial: Vec<u8>,
     /// The number of timeouts since the last received byte, and the time of the last one.
@@ -28,7 +29,28 @@ pub(super) struct Stream {
     surplus: usize,
 }
 
+/// Given up requests whose transaction ids the next connection knows.
+const REMEMBERED: u16 = 4096;
+
 impl Stream {
+    pub(super) fn randomize(&mut self, seed: u64) {
+        self.next_id = (seed ^ (seed >> 16) ^ (seed >> 32) ^ (seed >> 48)) as u16;
+    }
+
+    /// What the next connection needs: its first transaction id, and those that may still be answered.
+    pub(super) fn take_ids(&mut self, flights: &Flights) -> (u16, Vec<u16>) {
+        let given_up = core::mem::take(&mut self.given_up).into_keys();
+        let mut ids: Vec<u16> = given_up.chain(flights.unanswered.iter().copied()).collect();
+        ids.retain(|id| self.next_id.wrapping_sub(*id) <= REMEMBERED);
+        (self.next_id, ids)
+    }
+
+    /// Goes on where another connection ended.
+    pub(super) fn go_on(&mut self, next_id: u16, given_up: &[u16]) {
+        self.next_id = next_id;
+        self.given_up = given_up.iter().map(|id| (*id, None)).collect();
+    }
+
     pub(super) fn send(
         &mut self,
         flights: &mut Flights,
@@ -56,7 +78,7 @@ impl Stream {
         let behind: usize = flights.after(ticket).map(frame_len).sum();
         let Some(flight) = flights.take(ticket) else { return };
         if flights.held.is_none() {
-            self.given_up.insert(flight.transaction_id, flight.ticket);
+            self.given_up.insert(flight.transaction_id, Some(flight.ticket));
             return;
         }
         let end = flights.out.len().saturating_sub(behind);
@@ -146,7 +168,9 @@ impl Stream {
             if let Some(ticket) = self.given_up.remove(&id) {
                 flights.late += 1;
                 flights.reply_begun = false;
-                flights.restart_after(ticket, now);
+                if let Some(ticket) = ticket {
+                    flights.restart_after(ticket, now);
+                }
                 return None;
             }
             return Some(InvalidResponse::TransactionId(id));
@@ -167,7 +191,7 @@ impl Stream {
         let mut timed_out = false;
         while let Some(flight) = flights.expired(now) {
             timed_out = true;
-            self.given_up.insert(flight.transaction_id, flight.ticket);
+            self.given_up.insert(flight.transaction_id, Some(flight.ticket));
             if self.timeouts == 0 || flight.sent >= self.timed_out {
                 self.timeouts += 1;
                 self.timed_out = now;

@@ -10,8 +10,11 @@
 //! * A reply counts only when transaction id (where there is one), unit id, function and length are
 //!   those of the request. On a stream, anything else ends the connection: the two sides no longer
 //!   mean the same thing.
-//! * A request that timed out is given up. Its late reply is dropped and counted where transaction
-//!   ids tell it apart; where they do not, the connection ends, and a serial line is silenced first.
+//! * A request that timed out is given up. Its late reply is dropped and counted. Where no transaction id
+//!   tells it apart, a stream ends, and nothing is sent whose reply could be taken for it until it has
+//!   come or late replies are known to have ended. The next connection gets this as [`Past`].
+//! * Transaction ids go on from one connection to the next, and none is used again while a reply to it may
+//!   come.
 //! * What no request asked for is counted apart from late replies ([`Strays`]). Datagrams that match no
 //!   request are dropped, because their sender may be forged; a flood of them ends the connection.
 //! * A connection ends when a reply broke off, and after [`MAX_CONSECUTIVE_TIMEOUTS`] without a byte:
@@ -22,15 +25,16 @@
 //! An ended connection cannot be used again: the driver creates a new one.
 
 mod connection;
+mod earlier;
 mod flights;
 mod mbap_datagrams;
 mod mbap_stream;
 mod rtu_and_ascii;
 mod tolerance;
 
-pub use connection::Connection;
+pub use connection::{Connection, Past};
 pub use flights::{Done, Strays, Ticket};
-pub use tolerance::{AcceptUnit, Attempt, BUSY_PAUSE, Tolerance};
+pub use tolerance::{AcceptUnit, Attempt, BUSY_PAUSE, Echo, Tolerance};
 
 use core::time::Duration;
 
@@ -55,6 +59,13 @@ pub const MAX_STRAY_DATAGRAMS: u32 = 1000;
 /// The time that the units of a serial line have to carry out a broadcast (Modbus over Serial Line
 /// V1.02, 2.4.1).
 pub const TURNAROUND: Duration = Duration::from_millis(100);
+
+/// The time after a reply in which the same one may come again, on lines and streams without transaction
+/// ids. It passes before the next request until enough replies have come once.
+pub const GUARD: Duration = Duration::from_millis(25);
+
+/// How long after its timeout a late reply may come at most, where there are no transaction ids.
+pub const MAX_LATENESS: Duration = Duration::from_secs(10);
 
 /// The transport of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -1,13 +1,16 @@
 //! RTU and ASCII frames, on a serial line or in a stream: one request at a time, without
 //! transaction ids. On a serial line, silence separates replies: unrequested bytes are discarded,
 //! and a request waits until the line is silent. A stream has no silence: there, unrequested bytes
-//! or a timeout end the connection.
+//! or a timeout end the connection. A request also waits until no reply to an earlier one can come that
+//! could be taken for its own ([`Earlier`]), on the next connection too.
 
 use alloc::vec::Vec;
 use core::time::Duration;
 
+use super::earlier::{Earlier, Ended};
 use super::flights::{Call, Done, Flight, Flights, Ticket};
-use super::{Closed, Failure, InvalidResponse, TURNAROUND, Time};
+use super::tolerance::{Attempt, Echo};
+use super::{Closed, Failure, GUARD, InvalidResponse, TURNAROUND, Time};
 use crate::frame::{FrameError, ascii, rtu};
 use crate::pdu::{self, EncodedRequest, Response};
 
@@ -17,16 +20,36 @@ pub(super) enum Framing {
     Ascii,
 }
 
+/// Reads in a row whose echo came before their reply, after which an echo is expected of writes too.
+const ECHOES: u8 = 3;
+
+/// Bytes behind a reply that are no sign of another one: lines have some when a driver is switched off.
+const NOISE: usize = 2;
+
 #[derive(Debug)]
 pub(super) struct OneAtATime {
     framing: Framing,
     /// The silence between frames on a serial line; `None` for a stream.
     silence: Option<Duration>,
-    /// Whether the adapter echoes sent bytes.
-    echo: bool,
+    echo: Echo,
+    /// Reads in a row whose echo came before their reply.
+    echoes: u8,
+    pub(super) earlier: Earlier,
+    /// The time of a character on a serial line; 0 elsewhere.
+    pub(super) character: Duration,
+    /// The timeout that the request was given: its own may be longer.
+    timeout: Duration,
+    /// The request is not sent before: what it waits for is a pause.
+    start: Time,
+    /// The request repeats an earlier one of the same call.
+    repeats: bool,
+    /// A frame came right behind the reply.
+    behind: Behind,
+    /// The reply that is believed if no other follows.
+    doubted: Option<(u8, Vec<u8>)>,
+    /// It may be an echo, before the same bytes as the reply.
+    is_maybe_echo: bool,
     state: State,
-    /// When the line was last used.
-    used: Time,
     /// The frame of the request.
     frame: Vec<u8>,
     received: Vec<u8>,
@@ -45,20 +68,42 @@ enum State {
     Sent {
         echoed: bool,
     },
+    /// A reply has come. Until then, no other may.
+    Doubting {
+        until: Time,
+    },
     /// A broadcast was sent.
     Turnaround {
         until: Time,
     },
 }
 
+/// What came right behind a reply.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Behind {
+    NoFrame,
+    /// The same frame.
+    Same,
+    /// Another frame.
+    Another,
+}
+
 impl OneAtATime {
-    pub(super) fn new(framing: Framing, silence: Option<Duration>, echo: bool) -> OneAtATime {
+    pub(super) fn new(framing: Framing, silence: Option<Duration>, echo: Echo) -> OneAtATime {
         OneAtATime {
             framing,
             silence,
             echo,
+            echoes: 0,
+            earlier: Earlier::default(),
+            character: Duration::ZERO,
+            timeout: Duration::ZERO,
+            start: Time::ZERO,
+            repeats: false,
+            behind: Behind::NoFrame,
+            doubted: None,
+            is_maybe_echo: false,
             state: State::Idle,
-            used: Time::ZERO,
             frame: Vec::new(),
             received: Vec::new(),
             stray: None,
@@ -80,7 +125,7 @@ impl OneAtATime {
         start: Time,
         now: Time,
     ) -> Ticket {
-        let Call { unit_id, request, .. } = call;
+        let Call { unit_id, request, timeout, attempt } = call;
         self.frame.clear();
         match self.framing {
             Framing::Rtu => encode(&mut self.frame, [0; rtu::MAX_LEN], |frame| {
@@ -92,17 +137,40 @@ impl OneAtATime {
         }
         self.received.clear();
         self.stray = None;
-        let ticket = flights.push(call, 0, start);
-        let until = self.silence.map_or(start, |silence| start.max(self.used + silence));
+        (self.timeout, self.start) = (timeout, start);
+        // The reply to the same request, sent before by the same call, is as good.
+        self.repeats = attempt != Attempt::default();
+        let may_begin = start.max(self.clear_at(flights, (unit_id, request), now));
+        let ticket = flights.push(call, 0, may_begin);
+        let until =
+            self.silence.map_or(may_begin, |silence| may_begin.max(self.earlier.used + silence));
         self.state = State::Quieting { until };
         self.transmit(flights, now);
         ticket
     }
 
+    /// From when on no reply can come that could be taken for the one to this request.
+    fn clear_at(
+        &mut self,
+        flights: &Flights,
+        (unit_id, request): (u8, &EncodedRequest),
+        now: Time,
+    ) -> Time {
+        let is_broadcast = unit_id == 0 && self.silence.is_some();
+        if self.repeats || is_broadcast {
+            return Time::ZERO;
+        }
+        let accepted = flights.tolerance.accept_unit;
+        let clear = self.earlier.until(unit_id, request.pdu().first(), accepted, now);
+        let used = self.earlier.used;
+        let guarded = if used.is_zero() { used } else { used + self.earlier.guard() };
+        clear.unwrap_or_default().max(guarded)
+    }
+
     /// When to call `advance`.
     pub(super) fn deadline(&self, flights: &Flights) -> Option<Time> {
         match self.state {
-            State::Turnaround { until } => Some(until),
+            State::Turnaround { until } | State::Doubting { until } => Some(until),
             State::Quieting { until } => flights.deadline().map(|deadline| deadline.min(until)),
             State::Idle | State::Sent { .. } => flights.deadline(),
         }
@@ -114,6 +182,10 @@ impl OneAtATime {
             && until <= now
         {
             flights.out.extend_from_slice(&self.frame);
+            let unit_id = flights.first().map_or(0, |flight| flight.unit_id);
+            flights.transmitted(self.earlier.timeout(unit_id, self.timeout), now);
+            self.earlier.expire(now);
+            self.received.clear();
             let broadcast = flights.first().is_some_and(|flight| flight.unit_id == 0);
             self.state = if broadcast && self.silence.is_some() {
                 State::Turnaround { until: now + TURNAROUND }
@@ -130,13 +202,18 @@ impl OneAtATime {
         now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
+        if let State::Doubting { .. } = self.state {
+            return self.after_doubted(flights, bytes, now, sink);
+        }
         let State::Sent { mut echoed } = self.state else {
-            flights.strays.bytes += self.count_unrequested(flights, bytes);
-            return self.unrequested(flights, now, sink);
+            return self.unrequested(flights, bytes, now, sink);
         };
         let room = self.max_received().saturating_sub(self.received.len());
         let (bytes, surplus) = bytes.split_at(bytes.len().min(room));
         self.received.extend_from_slice(bytes);
+        if !self.repeats && self.take_late(flights, now) > 0 {
+            flights.restart(now);
+        }
         let found = match self.framing {
             Framing::Rtu => self.rtu(flights, &mut echoed),
             Framing::Ascii => self.ascii(flights, &mut echoed),
@@ -146,7 +223,7 @@ impl OneAtATime {
             Ok(Some(Reply { unit_id, pdu, stray })) => {
                 let behind = if flights.tolerance.pad { 0 } else { surplus.len() };
                 flights.strays.bytes += (stray + behind) as u64;
-                self.replied(flights, unit_id, &pdu, now, sink);
+                self.found(flights, (unit_id, pdu), now, sink);
             }
             Ok(None) if surplus.is_empty() && room > bytes.len() => {}
             Ok(None) => {
@@ -157,24 +234,201 @@ impl OneAtATime {
         }
     }
 
-    /// Bytes without a request in flight, unless the device may send surplus bytes.
-    fn count_unrequested(&self, flights: &Flights, bytes: &[u8]) -> u64 {
-        let may_be_surplus = flights.tolerance.pad && self.state == State::Idle;
-        if may_be_surplus { 0 } else { bytes.len() as u64 }
+    /// Handles bytes while no request waits for its reply: a late reply, or data from another sender.
+    fn unrequested(
+        &mut self,
+        flights: &mut Flights,
+        bytes: &[u8],
+        now: Time,
+        sink: &mut impl FnMut(Done<'_>),
+    ) {
+        let is_idle = self.state == State::Idle;
+        let may_be_surplus = flights.tolerance.pad && is_idle;
+        if self.received.len() + bytes.len() > self.max_received() {
+            self.received.clear();
+        }
+        self.received.extend_from_slice(&bytes[..bytes.len().min(self.max_received())]);
+        let late = self.take_late(flights, now);
+        if !may_be_surplus {
+            flights.strays.bytes += bytes.len().saturating_sub(late) as u64;
+        }
+        if late == 0 && self.is_reply() {
+            self.received.clear();
+            self.earlier.stray(now.saturating_sub(self.earlier.used));
+        }
+        self.earlier.used = now;
+        let Some(silence) = self.silence else {
+            if is_idle && late == 0 && !may_be_surplus {
+                flights.close(Closed::Invalid(InvalidResponse::Unrequested), sink);
+            }
+            return self.wait_again(flights, Duration::ZERO, now);
+        };
+        self.wait_again(flights, silence, now);
     }
 
-    /// Handles bytes without a request in flight: a late reply, or data from another sender.
-    fn unrequested(&mut self, flights: &mut Flights, now: Time, sink: &mut impl FnMut(Done<'_>)) {
-        match self.silence {
-            None if flights.tolerance.pad && self.state == State::Idle => {}
-            None => flights.close(Closed::Invalid(InvalidResponse::Unrequested), sink),
-            Some(silence) => {
-                self.used = now;
-                if let State::Quieting { .. } = self.state {
-                    self.state = State::Quieting { until: now + silence };
+    /// Lets a request that waits for silence wait from now on.
+    fn wait_again(&mut self, flights: &Flights, silence: Duration, now: Time) {
+        let State::Quieting { .. } = self.state else { return };
+        let Some(flight) = flights.first() else { return };
+        let (unit_id, request) = (flight.unit_id, flight.request.clone());
+        let clear = self.clear_at(flights, (unit_id, &request), now);
+        self.state = State::Quieting { until: self.start.max(clear).max(now + silence) };
+    }
+
+    /// Takes late replies out of the received bytes. Returns the number of their bytes.
+    fn take_late(&mut self, flights: &mut Flights, now: Time) -> usize {
+        let mut taken = 0;
+        while let Some((place, at, len)) = self.late_reply() {
+            self.earlier.late(place, now);
+            self.received.drain(at..at + len);
+            flights.late += 1;
+            taken += len;
+        }
+        taken
+    }
+
+    /// The place of an earlier request whose reply was received, and where it is.
+    fn late_reply(&self) -> Option<(usize, usize, usize)> {
+        let mut earlier = self.earlier.unanswered().enumerate();
+        earlier.find_map(|(place, earlier)| {
+            let (unit_id, request) = (earlier.unit_id, &earlier.request);
+            (0..self.received.len()).find_map(|at| {
+                let len = self.reply_to(unit_id, request, &self.received[at..])?;
+                Some((place, at, len))
+            })
+        })
+    }
+
+    /// The length of the reply that `bytes` begin with, if it answers this request.
+    fn reply_to(&self, unit_id: u8, request: &EncodedRequest, bytes: &[u8]) -> Option<usize> {
+        let function = *request.pdu().first()?;
+        let is_its = |(unit, pdu): (u8, &[u8])| {
+            unit == unit_id && pdu.first().is_some_and(|code| code & 0x7F == function)
+        };
+        match self.framing {
+            Framing::Rtu => {
+                if bytes.len() < 2 || bytes[0] != unit_id || bytes[1] & 0x7F != function {
+                    return None;
                 }
+                let len = response_len(bytes, request).ok()??;
+                rtu::decode(bytes.get(..len)?).is_ok_and(is_its).then_some(len)
+            }
+            Framing::Ascii => {
+                let line = ascii_line(bytes)?;
+                let mut body = [0; pdu::MAX_LEN + 2];
+                ascii::decode(line, &mut body).is_ok_and(is_its).then_some(line.len())
             }
         }
+    }
+
+    /// Whether the received bytes are one frame.
+    fn is_reply(&self) -> bool {
+        is_frame(self.framing, &self.received)
+    }
+
+    /// Handles a reply that can answer the request: believes it, or waits whether another follows.
+    fn found(
+        &mut self,
+        flights: &mut Flights,
+        (unit_id, pdu): (u8, Vec<u8>),
+        now: Time,
+        sink: &mut impl FnMut(Done<'_>),
+    ) {
+        if self.is_too_fast(flights, pdu.len(), now) {
+            flights.strays.replies += 1;
+            flights.strays.bytes += self.received.len() as u64;
+            self.received.clear();
+            return self.earlier.stray(Duration::ZERO);
+        }
+        let behind = core::mem::replace(&mut self.behind, Behind::NoFrame);
+        let is_like_echo = self.is_like_echo(flights, &pdu);
+        if is_like_echo && behind == Behind::Same {
+            self.echoes = self.echoes.saturating_add(1);
+            return self.replied(flights, unit_id, &pdu, now, sink);
+        }
+        if behind != Behind::NoFrame && !flights.tolerance.pad {
+            self.earlier.stray(Duration::ZERO);
+        }
+        if behind == Behind::Another && !flights.tolerance.pad {
+            return self.contradicted(flights, now, sink);
+        }
+        let accepted = flights.tolerance.accept_unit;
+        let is_doubtful = flights.first().is_some_and(|flight| {
+            let request = (flight.unit_id, flight.request.pdu());
+            let is_its = accepted.accepts(flight.unit_id, unit_id);
+            is_its && !self.repeats && self.earlier.is_doubtful(request, &pdu, now)
+        });
+        if is_doubtful || is_like_echo {
+            if let (State::Sent { .. }, Some(flight)) = (self.state, flights.first()) {
+                self.learn_echo(is_no_reply(flight));
+            }
+            let usual = if is_like_echo { self.earlier.longest(unit_id) * 4 } else { GUARD };
+            (self.doubted, self.is_maybe_echo) = (Some((unit_id, pdu)), is_like_echo);
+            self.received.clear();
+            self.state = State::Doubting { until: now + usual.max(GUARD) };
+            return;
+        }
+        self.replied(flights, unit_id, &pdu, now, sink);
+    }
+
+    /// Whether the line can't have carried the request and its reply by now.
+    fn is_too_fast(&mut self, flights: &Flights, pdu_len: usize, now: Time) -> bool {
+        let Some(flight) = flights.first() else { return false };
+        let reply_len = match self.framing {
+            Framing::Rtu => pdu_len + 3,
+            Framing::Ascii => 2 * pdu_len + 7,
+        };
+        let least = self.character * (self.frame.len() + reply_len) as u32;
+        now.saturating_sub(flight.sent) < least && !self.earlier.is_fast_line()
+    }
+
+    /// Whether this reply may be an echo: it equals the request, and the last reads had one, but too few to
+    /// rely on it.
+    fn is_like_echo(&self, flights: &Flights, pdu: &[u8]) -> bool {
+        let State::Sent { echoed: false } = self.state else { return false };
+        let equals = flights.first().is_some_and(|flight| flight.request.pdu() == pdu);
+        equals && self.echo == Echo::Auto && (1..ECHOES).contains(&self.echoes)
+    }
+
+    /// Handles bytes after a reply that is doubted.
+    fn after_doubted(
+        &mut self,
+        flights: &mut Flights,
+        bytes: &[u8],
+        now: Time,
+        sink: &mut impl FnMut(Done<'_>),
+    ) {
+        let room = self.max_received() - self.received.len();
+        self.received.extend_from_slice(&bytes[..bytes.len().min(room)]);
+        if self.is_maybe_echo && self.frame == self.received {
+            self.echoes = self.echoes.saturating_add(1);
+            return self.believe_doubted(flights, now, sink);
+        }
+        if self.is_maybe_echo && self.frame.starts_with(&self.received) {
+            return;
+        }
+        flights.strays.bytes += bytes.len() as u64;
+        if self.received.len() > NOISE {
+            self.contradicted(flights, now, sink);
+        }
+    }
+
+    fn believe_doubted(
+        &mut self,
+        flights: &mut Flights,
+        now: Time,
+        sink: &mut impl FnMut(Done<'_>),
+    ) {
+        let (unit_id, pdu) = self.doubted.take().expect("a reply is doubted");
+        self.replied(flights, unit_id, &pdu, now, sink);
+    }
+
+    /// Two replies came to one request: nothing shows which one is its own.
+    fn contradicted(&mut self, flights: &mut Flights, now: Time, sink: &mut impl FnMut(Done<'_>)) {
+        self.earlier.stray(Duration::ZERO);
+        self.doubted = None;
+        self.state = State::Sent { echoed: true };
+        self.invalid(flights, InvalidResponse::Unrequested, now, sink);
     }
 
     fn replied(
@@ -190,10 +444,23 @@ impl OneAtATime {
             let invalid = InvalidResponse::UnitId { expected, found };
             return self.invalid(flights, invalid, now, sink);
         }
+        let doubted = matches!(self.state, State::Doubting { .. });
+        if let Some(flight) = flights.first() {
+            let request = (flight.unit_id, flight.request.pdu());
+            self.earlier.believed(request, pdu, doubted, now);
+            let took = now.saturating_sub(flight.sent);
+            self.earlier.answered(flight.unit_id, took, self.timeout);
+            self.learn_echo(is_no_reply(flight));
+        }
+        let unanswered = flights.first().map(|flight| (flight.unit_id, flight.request.clone()));
+        let sent = flights.first().map_or(now, |flight| flight.sent);
         self.rest(now);
-        if let Some(invalid) = flights.answer(0, pdu, now, sink)
-            && self.silence.is_none()
-        {
+        let Some(invalid) = flights.answer(0, pdu, now, sink) else { return };
+        if let Some((unit_id, request)) = unanswered {
+            let times = (sent, self.timeout);
+            self.earlier.ended((unit_id, &request), times, Ended::Otherwise, now);
+        }
+        if self.silence.is_none() {
             flights.close(Closed::Invalid(invalid), sink);
         }
     }
@@ -205,6 +472,7 @@ impl OneAtATime {
         now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
+        self.note_ended(flights, Ended::Otherwise, now);
         self.rest(now);
         flights.finish(Err(Failure::Invalid(invalid)), sink);
         if self.silence.is_none() {
@@ -212,9 +480,52 @@ impl OneAtATime {
         }
     }
 
+    /// Takes what the next connection has to know of earlier requests.
+    pub(super) fn take_earlier(&mut self, flights: &Flights, now: Time) -> Earlier {
+        if let (State::Sent { .. }, Some(cut_off)) = (self.state, &flights.cut_off) {
+            let (unit_id, request, sent, timeout) = cut_off;
+            self.earlier.ended((*unit_id, request), (*sent, *timeout), Ended::Otherwise, now);
+        }
+        core::mem::take(&mut self.earlier)
+    }
+
+    /// Notes that the request ends without its reply, if it was sent.
+    fn note_ended(&mut self, flights: &Flights, how: Ended, now: Time) {
+        if let (State::Sent { echoed }, Some(flight)) = (self.state, flights.first()) {
+            let times = (flight.sent, self.timeout);
+            self.earlier.ended((flight.unit_id, &flight.request), times, how, now);
+            if how == Ended::TimedOut && !echoed && !is_no_reply(flight) {
+                self.echoes = 0;
+            }
+        }
+    }
+
+    /// An echo before the reply to a read shows that the adapter echoes, and no echo that it does not.
+    fn learn_echo(&mut self, is_unmistakable: bool) {
+        if let (State::Sent { echoed }, true) = (self.state, is_unmistakable) {
+            self.echoes = if echoed { self.echoes.saturating_add(1) } else { 0 };
+        }
+    }
+
+    /// Whether no reply comes before the echo of this request.
+    fn awaits_echo(&self, flight: &Flight) -> bool {
+        match self.echo {
+            Echo::Always => true,
+            Echo::Never => false,
+            Echo::Auto => self.echoes >= ECHOES && !is_no_reply(flight),
+        }
+    }
+
+    /// Whether the request itself, sent back, is its echo.
+    fn may_be_echo(&self, flight: &Flight) -> bool {
+        let is_detected = self.echo == Echo::Auto && is_no_reply(flight);
+        is_detected || self.awaits_echo(flight)
+    }
+
     fn rest(&mut self, now: Time) {
         self.state = State::Idle;
-        self.used = now;
+        self.received.clear();
+        self.earlier.used = now;
     }
 
     pub(super) fn advance(
@@ -229,6 +540,15 @@ impl OneAtATime {
                 flights.finish(Ok(Response::Written), sink);
             }
             return;
+        }
+        if let State::Doubting { until } = self.state {
+            if until <= now {
+                self.believe_doubted(flights, now, sink);
+            }
+            return;
+        }
+        if flights.first().is_some_and(|flight| flight.deadline <= now) {
+            self.note_ended(flights, Ended::TimedOut, now);
         }
         if let Some(flight) = flights.expired(now) {
             let sent = !matches!(self.state, State::Quieting { .. });
@@ -247,13 +567,13 @@ impl OneAtATime {
     /// skipped: the reply begins at the first byte that fits the request and the CRC.
     fn rtu(&mut self, flights: &Flights, echoed: &mut bool) -> Result<Option<Reply>, FrameError> {
         let Some(flight) = flights.first() else { return Ok(None) };
-        let may_be_echo = !*echoed && (self.echo || is_no_reply(flight));
+        let may_be_echo = !*echoed && self.may_be_echo(flight);
         let echo = self.received.windows(self.frame.len()).position(|bytes| bytes == self.frame);
         if may_be_echo && let Some(start) = echo {
             self.received.drain(..start + self.frame.len());
-            (*echoed, self.echo) = (true, true);
+            *echoed = true;
         }
-        if self.echo && !*echoed {
+        if self.awaits_echo(flight) && !*echoed {
             return Ok(None);
         }
         let request = flight.request.pdu();
@@ -270,6 +590,7 @@ impl OneAtATime {
                 Ok(Some(len)) if len <= bytes.len() => match rtu::decode(&bytes[..len]) {
                     Ok(reply) => {
                         let behind = bytes.len() - len;
+                        self.behind = behind_reply(Framing::Rtu, &bytes[..len], &bytes[len..]);
                         let stray = if flights.tolerance.pad { start } else { start + behind };
                         return Ok(Some(Reply::new(reply, stray)));
                     }
@@ -297,11 +618,14 @@ impl OneAtATime {
             let start = line.iter().rposition(|byte| *byte == b':').unwrap_or(0);
             let behind = if flights.tolerance.pad { 0 } else { self.received.len() };
             let line = &line[start..];
-            let may_be_echo = !*echoed && (self.echo || is_no_reply(flight));
-            if may_be_echo && line == self.frame {
-                (*echoed, self.echo) = (true, true);
+            if !*echoed && self.may_be_echo(flight) && line == self.frame {
+                *echoed = true;
                 continue;
             }
+            if self.awaits_echo(flight) && !*echoed {
+                return Ok(None);
+            }
+            self.behind = behind_reply(Framing::Ascii, line, &self.received);
             let mut body = [0; pdu::MAX_LEN + 2];
             return ascii::decode(line, &mut body)
                 .map(|parts| Some(Reply::new(parts, start + behind)));
@@ -324,6 +648,32 @@ fn response_len(bytes: &[u8], request: &EncodedRequest) -> Result<Option<usize>,
 fn is_no_reply(flight: &Flight) -> bool {
     let request = &flight.request;
     request.is_read() && request.response(request.pdu()).is_err()
+}
+
+/// The first line in these characters, from its colon to its end.
+fn ascii_line(bytes: &[u8]) -> Option<&[u8]> {
+    let end = bytes.windows(2).position(|pair| pair == b"\r\n")?;
+    bytes.starts_with(b":").then(|| &bytes[..end + 2])
+}
+
+/// What came right behind a reply.
+fn behind_reply(framing: Framing, reply: &[u8], behind: &[u8]) -> Behind {
+    match is_frame(framing, behind) {
+        false => Behind::NoFrame,
+        true if reply == behind => Behind::Same,
+        true => Behind::Another,
+    }
+}
+
+/// Whether these bytes are one frame.
+fn is_frame(framing: Framing, bytes: &[u8]) -> bool {
+    match framing {
+        Framing::Rtu => rtu::decode(bytes).is_ok(),
+        Framing::Ascii => {
+            let mut body = [0; pdu::MAX_LEN + 2];
+            ascii_line(bytes).is_some_and(|line| ascii::decode(line, &mut body).is_ok())
+        }
+    }
 }
 
 /// A reply that was taken out of its frame.

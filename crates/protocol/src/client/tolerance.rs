@@ -16,8 +16,8 @@ pub struct Tolerance {
     /// Ignores surplus bytes at the end of a reply. Over TCP and UDP, an exception reply ends after its
     /// exception code whatever length its header has.
     pub pad: bool,
-    /// The adapter repeats what is sent. An adapter that repeats reads is noticed without it.
-    pub echo: bool,
+    /// Whether the adapter repeats what is sent.
+    pub echo: Echo,
     /// Time between the end of a request and the next. Only one request is in flight then.
     pub pause: Duration,
     /// Time between connecting and the first request.
@@ -38,6 +38,19 @@ impl Tolerance {
     pub const fn is_one_at_a_time(&self) -> bool {
         !self.pause.is_zero() || self.close_after > 0
     }
+}
+
+/// Whether the adapter repeats what is sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Echo {
+    /// It is detected at reads. After several reads in a row with an echo, one is expected of every
+    /// request; the first read without an echo ends that.
+    #[default]
+    Auto,
+    /// Nothing counts as a reply before the echo.
+    Always,
+    /// What looks like an echo is not removed.
+    Never,
 }
 
 /// Unit ids that a reply may carry.

@@ -1,0 +1,299 @@
+//! What earlier requests may still bring on lines and streams without transaction ids, and how long a
+//! request waits for it.
+//!
+//! A request that ended without its reply stays here until that reply has come, or until late replies are
+//! known to have ended. Meanwhile, nothing is sent whose reply could be taken for it.
+
+use alloc::collections::{BTreeMap, BTreeSet, VecDeque};
+use core::time::Duration;
+
+use super::tolerance::AcceptUnit;
+use super::{GUARD, MAX_LATENESS, Time};
+use crate::pdu::EncodedRequest;
+
+/// Requests without a reply that are remembered. With the bounds on their time, there are never as many.
+const MAX_UNANSWERED: usize = 64;
+
+/// A late reply may take this many times the timeout, as long as nothing else is known.
+const LATENESS: u32 = 3;
+
+/// Late replies after which the timeout of a unit is raised.
+const LATE_IN_A_ROW: u8 = 2;
+
+/// A raised timeout is at most this many times the timeout.
+const MAX_RAISED: u32 = 4;
+
+/// Replies within the timeout after which it is no longer raised.
+const IN_TIME: u8 = 32;
+
+/// Replies that a new line or stream has to give, none of them twice, before it needs no guard time.
+const PROBATION: u32 = 8;
+
+/// The same after a reply that nobody asked for.
+const PROBATION_AFTER_STRAY: u32 = 1000;
+
+/// The longest guard time.
+const MAX_GUARD: Duration = GUARD.saturating_mul(10);
+
+/// Replies that were doubted because they equal one to another request, and turned out right: no more are
+/// doubted until one comes that nobody asked for.
+const ENOUGH_DOUBTS: u32 = 8;
+
+/// Replies that are compared with the next one.
+const RECENT: usize = 16;
+
+/// A reply that came longer ago is not repeated now.
+const RECENTLY: Duration = GUARD.saturating_mul(2);
+
+/// How long after an invalid reply its own may come to a request, as long as nothing is known of the unit.
+const AFTER_INVALID: Duration = Duration::from_millis(250);
+
+/// What earlier requests may still bring.
+#[derive(Debug, Default)]
+pub(super) struct Earlier {
+    /// The oldest first.
+    unanswered: VecDeque<Unanswered>,
+    /// Units and functions of which a reply never came: a device may send it with the next one.
+    never_came: BTreeSet<(u8, u8)>,
+    units: BTreeMap<u8, Unit>,
+    guard: Guard,
+    /// When something was received the last time, or a request ended.
+    pub(super) used: Time,
+    /// The line is faster than its settings say: replies showed it that were the first ones.
+    is_fast: bool,
+    /// The newest first.
+    recent: VecDeque<Recent>,
+}
+
+/// A reply, as checksums.
+#[derive(Debug, Clone, Copy)]
+struct Recent {
+    request: u32,
+    reply: u32,
+    at: Time,
+}
+
+/// A request that ended without its reply.
+#[derive(Debug)]
+pub(super) struct Unanswered {
+    pub(super) unit_id: u8,
+    pub(super) request: EncodedRequest,
+    sent: Time,
+    /// The reply may come until then.
+    until: Time,
+}
+
+/// Why a request ended without its reply.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Ended {
+    TimedOut,
+    /// By bytes that are not its reply, or with its connection.
+    Otherwise,
+}
+
+/// How long a unit takes.
+#[derive(Debug, Default)]
+struct Unit {
+    /// The longest time of a reply that was not late.
+    longest: Duration,
+    /// The longest time of a late reply.
+    latest: Duration,
+    /// Late replies since the last of [`IN_TIME`] that were not.
+    late: u8,
+    in_time: u8,
+}
+
+/// Whether replies may come twice.
+#[derive(Debug, Default)]
+struct Guard {
+    /// A reply has come.
+    has_begun: bool,
+    /// Replies since the last one that nobody asked for.
+    clean: u32,
+    /// What was learned from those that nobody asked for; `None` before the first.
+    learned: Option<Duration>,
+    doubts: u32,
+}
+
+impl Earlier {
+    /// The timeout of a request to this unit: more than `timeout` if late replies repeat.
+    pub(super) fn timeout(&self, unit_id: u8, timeout: Duration) -> Duration {
+        match self.units.get(&unit_id) {
+            Some(unit) if unit.late >= LATE_IN_A_ROW => {
+                timeout.max((unit.latest * 3 / 2).min(timeout * MAX_RAISED))
+            }
+            _ => timeout,
+        }
+    }
+
+    /// Until when a reply may come that could be taken for the one to this request.
+    pub(super) fn until(
+        &mut self,
+        unit_id: u8,
+        function: Option<&u8>,
+        accepted: AcceptUnit,
+        now: Time,
+    ) -> Option<Time> {
+        self.expire(now);
+        let alike = self.unanswered.iter().filter(|earlier| {
+            let same_unit = accepted != AcceptUnit::Requested || earlier.unit_id == unit_id;
+            same_unit && earlier.request.pdu().first() == function
+        });
+        alike.map(|earlier| earlier.until).max()
+    }
+
+    /// Forgets requests whose replies can't come any more, as far as is known.
+    pub(super) fn expire(&mut self, now: Time) {
+        let never_came = &mut self.never_came;
+        self.unanswered.retain(|earlier| {
+            let may_come = earlier.until > now;
+            if !may_come && let Some(function) = earlier.request.pdu().first() {
+                never_came.insert((earlier.unit_id, *function));
+            }
+            may_come
+        });
+    }
+
+    /// The time after a reply in which the same one may come again.
+    pub(super) fn guard(&self) -> Duration {
+        let Guard { has_begun, clean, learned, .. } = self.guard;
+        let (guard, enough) = match learned {
+            // Nothing can be repeated.
+            None if !has_begun => (Duration::ZERO, PROBATION),
+            None => (GUARD, PROBATION),
+            Some(learned) => (learned, PROBATION_AFTER_STRAY),
+        };
+        if clean < enough { guard } else { Duration::ZERO }
+    }
+
+    /// Whether the line may be faster than its settings say. Asked for a reply that came too fast: one of
+    /// the first, while the guard time excludes another reason, shows it.
+    pub(super) fn is_fast_line(&mut self) -> bool {
+        let Guard { clean, learned, .. } = self.guard;
+        self.is_fast |= learned.is_none() && clean < PROBATION;
+        self.is_fast
+    }
+
+    /// Notes a reply that nobody asked for, this time after the last one.
+    pub(super) fn stray(&mut self, after: Duration) {
+        let learned = self.guard.learned.unwrap_or(GUARD);
+        // Much later, it says nothing of the time between a reply and its repetition.
+        let after = if after > MAX_GUARD { Duration::ZERO } else { after * 2 };
+        self.guard = Guard {
+            has_begun: true,
+            clean: 0,
+            learned: Some(after.clamp(learned, MAX_GUARD)),
+            doubts: 0,
+        };
+    }
+
+    /// Notes a request that was sent at this time and ended without its reply.
+    pub(super) fn ended(
+        &mut self,
+        (unit_id, request): (u8, &EncodedRequest),
+        (sent, timeout): (Time, Duration),
+        how: Ended,
+        now: Time,
+    ) {
+        let unit = self.units.get(&unit_id);
+        let until = match how {
+            Ended::TimedOut => {
+                let latest = unit.map_or(Duration::ZERO, |unit| unit.latest * 2);
+                let most = timeout + MAX_LATENESS;
+                sent + (timeout * LATENESS).max(latest).min(most)
+            }
+            Ended::Otherwise => {
+                let longest = unit.map(|unit| (unit.longest * 4).max(GUARD));
+                (sent + timeout).min(now + longest.unwrap_or(AFTER_INVALID))
+            }
+        };
+        if until <= now {
+            return;
+        }
+        if self.unanswered.len() == MAX_UNANSWERED {
+            self.unanswered.pop_front();
+        }
+        let request = request.clone();
+        self.unanswered.push_back(Unanswered { unit_id, request, sent, until });
+    }
+
+    /// The longest time of a reply of this unit that was not late.
+    pub(super) fn longest(&self, unit_id: u8) -> Duration {
+        self.units.get(&unit_id).map_or(Duration::ZERO, |unit| unit.longest)
+    }
+
+    /// Requests whose replies may still come.
+    pub(super) fn unanswered(&self) -> impl Iterator<Item = &Unanswered> {
+        self.unanswered.iter()
+    }
+
+    /// Notes the late reply to the request at this place.
+    pub(super) fn late(&mut self, place: usize, now: Time) {
+        let Some(earlier) = self.unanswered.remove(place) else { return };
+        self.guard.has_begun = true;
+        let unit = self.units.entry(earlier.unit_id).or_default();
+        let took = now.saturating_sub(earlier.sent).min(earlier.until - earlier.sent);
+        unit.latest = unit.latest.max(took);
+        unit.late = unit.late.saturating_add(1);
+        unit.in_time = 0;
+    }
+
+    /// Whether this reply is believed only if no other follows: one to an earlier request never came, or it
+    /// equals a recent one to another request.
+    pub(super) fn is_doubtful(&self, request: (u8, &[u8]), reply: &[u8], now: Time) -> bool {
+        let (unit_id, pdu) = request;
+        if pdu.first().is_some_and(|function| self.never_came.contains(&(unit_id, *function))) {
+            return true;
+        }
+        if self.guard.doubts >= ENOUGH_DOUBTS {
+            return false;
+        }
+        let (request, reply) = (checksum(request), crc32fast::hash(reply));
+        let last = self.recent.iter().find(|recent| recent.request == request);
+        let is_usual = last.is_some_and(|last| last.reply == reply);
+        let since = now.saturating_sub(RECENTLY);
+        !is_usual && self.recent.iter().any(|other| other.reply == reply && other.at >= since)
+    }
+
+    /// Notes a reply that is believed, and whether it was doubted.
+    pub(super) fn believed(
+        &mut self,
+        request: (u8, &[u8]),
+        reply: &[u8],
+        doubted: bool,
+        now: Time,
+    ) {
+        self.guard.doubts += u32::from(doubted);
+        if let (unit_id, [function, ..]) = request {
+            self.never_came.remove(&(unit_id, *function));
+        }
+        let (request, reply) = (checksum(request), crc32fast::hash(reply));
+        self.recent.retain(|recent| recent.request != request);
+        self.recent.truncate(RECENT - 1);
+        self.recent.push_front(Recent { request, reply, at: now });
+    }
+
+    /// Notes a reply that was asked for, and took this time.
+    pub(super) fn answered(&mut self, unit_id: u8, took: Duration, timeout: Duration) {
+        self.guard.has_begun = true;
+        self.guard.clean = self.guard.clean.saturating_add(1);
+        let unit = self.units.entry(unit_id).or_default();
+        unit.longest = unit.longest.max(took.min(timeout));
+        if took > timeout {
+            unit.in_time = 0;
+            unit.latest = unit.latest.max(took);
+            return;
+        }
+        unit.in_time += 1;
+        if unit.in_time == IN_TIME {
+            *unit = Unit { longest: took, ..Unit::default() };
+        }
+    }
+}
+
+fn checksum((unit_id, pdu): (u8, &[u8])) -> u32 {
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(&[unit_id]);
+    hasher.update(pdu);
+    hasher.finalize()
+}
