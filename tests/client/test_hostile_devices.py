@@ -256,12 +256,11 @@ def test_the_request_itself_is_an_echo_and_no_reply(kind: str, make: Make, dial:
             client.read_holding_registers(7, 2)
         if not device.requests:
             return False
-        # The adapter is taken for one that repeats everything until a new connection shows
-        # otherwise.
-        client.close()
+        # One echo does not make the adapter one that repeats everything.
         client.timeout = wire.DEADLINE
-        assert client.read_holding_registers(8, 2) == [8, 9]
-        assert len(device.requests) == 2
+        for address in range(8, 12):
+            assert client.read_holding_registers(address, 2) == [address, address + 1]
+        assert len(device.requests) == 5
         return True
 
     wire.until_long_enough(is_echoed, "the request comes")
@@ -792,6 +791,33 @@ def test_a_late_reply_is_thrown_away_where_replies_have_no_ids(
 
     assert client.read_holding_registers(8, 1) == [8]
     assert len(device.requests) == 3
+
+
+@pytest.mark.parametrize("kind", LINES)
+def test_a_late_reply_is_not_taken_for_that_of_a_call_that_waits(
+    kind: str, make: Make, dial: Dial
+) -> None:
+    def is_told_apart(timeout: float) -> bool:
+        device = make(kind, good, silent)
+        client = connected(dial, device.url, timeout)
+        with pytest.raises(holdfast.RequestTimeout):
+            client.read_holding_registers(7, 1)
+        if len(device.requests) < 2:
+            return False
+        with ThreadPoolExecutor(1) as other:
+            client.timeout = wire.DEADLINE
+            began = time.monotonic()
+            call = other.submit(client.read_holding_registers, 8, 1)
+            wire.until(lambda: time.monotonic() > began + timeout / 4, "the call waits")
+            in_time = time.monotonic() < began + timeout
+            device.requests[1].answer()
+            value = call.result()
+        if not in_time or client.late == 0:
+            return False
+        assert value == [8]
+        return True
+
+    wire.until_long_enough(is_told_apart, "the late reply comes while the next call waits", SHORT)
 
 
 # Two replies

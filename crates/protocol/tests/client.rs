@@ -6,8 +6,8 @@
 use std::time::Duration;
 
 use holdfast_protocol::client::{
-    AcceptUnit, Attempt, BUSY_PAUSE, Closed, Connection, Done, Failure, InvalidResponse,
-    MAX_STRAY_DATAGRAMS, Strays, TURNAROUND, Ticket, Tolerance, Transport,
+    AcceptUnit, Attempt, BUSY_PAUSE, Closed, Connection, Done, Echo, Failure, GUARD,
+    InvalidResponse, MAX_STRAY_DATAGRAMS, Strays, TURNAROUND, Ticket, Tolerance, Transport,
 };
 use holdfast_protocol::frame::{FrameError, ascii, mbap, rtu};
 use holdfast_protocol::pdu::{self, EncodedRequest, Range, Request, Response, ResponseError};
@@ -25,7 +25,7 @@ const ASCII: Transport = Transport::SerialAscii { silence: SILENCE };
 const STRICT: Tolerance = Tolerance {
     accept_unit: AcceptUnit::Requested,
     pad: false,
-    echo: false,
+    echo: Echo::Auto,
     pause: Duration::ZERO,
     pause_after_connect: Duration::ZERO,
     retries: 0,
@@ -491,6 +491,8 @@ fn a_serial_line_is_silent_before_a_request_and_what_came_before_is_thrown_away(
     client.after(SILENCE / 2);
     assert_eq!(client.outgoing(), []);
     client.after(SILENCE / 2);
+    assert_eq!(client.outgoing(), [], "this was a reply, and may come again");
+    client.after(GUARD - SILENCE);
     assert_eq!(client.outgoing(), rtu_frame(7, &[3, 0, 3, 0, 1]));
     client.receive(&rtu_frame(7, &[3, 2, 0, 42]));
     assert_eq!(client.got(), [(ticket, Ok(vec![0, 42]))]);
@@ -536,14 +538,20 @@ fn an_invalid_reply_does_not_end_a_serial_line() {
     ] {
         let mut client = Client::new(transport);
         let first = client.send(read());
+        client.outgoing();
         client.receive(&bad);
         let invalid = InvalidResponse::UnitId { expected: 7, found: 8 };
         assert_eq!(client.got(), [(first, Err(Failure::Invalid(invalid)))]);
         let second = client.send(read());
         client.after(SILENCE);
+        assert_eq!(client.outgoing(), [], "the reply to the first may still come");
+        client.after(SECOND / 4);
         client.receive(&good);
+        assert_eq!(client.got(), [], "another one may follow");
+        client.after(GUARD);
         assert_eq!(client.got(), [(second, Ok(vec![0, 1]))]);
         let third = client.send(read());
+        client.after(GUARD);
         client.after(SECOND);
         assert_eq!(client.got(), [(third, Err(Failure::Timeout))]);
         assert_eq!(client.connection.closed(), None);
@@ -552,7 +560,7 @@ fn an_invalid_reply_does_not_end_a_serial_line() {
 
 #[test]
 fn an_echo_is_removed_if_it_is_expected_or_cannot_be_a_reply() {
-    for (echo, request) in [(false, read()), (true, read()), (true, WRITE)] {
+    for (echo, request) in [(Echo::Auto, read()), (Echo::Always, read()), (Echo::Always, WRITE)] {
         for ascii in [false, true] {
             let frame = |pdu: &[u8]| if ascii { ascii_frame(7, pdu) } else { rtu_frame(7, pdu) };
             let tolerance = Tolerance { echo, ..STRICT };
@@ -564,9 +572,72 @@ fn an_echo_is_removed_if_it_is_expected_or_cannot_be_a_reply() {
             for byte in [sent, frame(reply)].concat() {
                 client.receive(&[byte]);
             }
-            assert_eq!(client.got(), [(ticket, Ok(registers))], "{echo} {request:?} {ascii}");
+            assert_eq!(client.got(), [(ticket, Ok(registers))], "{echo:?} {request:?} {ascii}");
         }
     }
+}
+
+#[test]
+fn one_echo_makes_a_line_not_deaf() {
+    for transport in [RTU, ASCII] {
+        let frame =
+            |pdu: &[u8]| if transport == RTU { rtu_frame(7, pdu) } else { ascii_frame(7, pdu) };
+        let mut client = Client::new(transport);
+        client.send(read());
+        let echo = client.outgoing();
+        client.receive(&echo);
+        client.after(SECOND);
+        assert_eq!(client.got().len(), 1);
+        client.after(4 * SECOND);
+        for request in [read(), WRITE, read(), WRITE] {
+            client.send(request);
+            client.after(SECOND / 10);
+            client.outgoing();
+            let reply: &[u8] = if request == WRITE { &[6, 0, 3, 0, 7] } else { &[3, 2, 0, 5] };
+            client.receive(&frame(reply));
+            client.after(SECOND / 10);
+            assert!(matches!(client.got()[..], [(_, Ok(_))]), "{request:?}");
+        }
+    }
+}
+
+#[test]
+fn an_echo_is_expected_of_writes_after_three_reads_until_a_read_without_one() {
+    let mut client = Client::new(RTU);
+    let answered = |client: &mut Client, request: Request<'_>, times: usize| {
+        client.send(request);
+        client.after(SECOND / 10);
+        let echo = client.outgoing();
+        let reply: &[u8] = if request == WRITE { &[6, 0, 3, 0, 7] } else { &[3, 2, 0, 5] };
+        client.receive(&[echo.repeat(times), rtu_frame(7, reply)].concat());
+        client.after(SECOND / 10);
+        client.got()
+    };
+    for _ in 0..3 {
+        assert!(matches!(answered(&mut client, read(), 1)[..], [(_, Ok(_))]));
+    }
+    assert_eq!(answered(&mut client, WRITE, 0), [], "this may be the echo");
+    client.after(SECOND);
+    assert!(matches!(client.got()[..], [(_, Err(Failure::Timeout))]));
+    client.after(4 * SECOND);
+    for _ in 0..3 {
+        assert!(matches!(answered(&mut client, read(), 1)[..], [(_, Ok(_))]));
+    }
+    assert!(matches!(answered(&mut client, WRITE, 1)[..], [(_, Ok(_))]));
+    assert!(matches!(answered(&mut client, read(), 0)[..], [(_, Ok(_))]), "it is unlearned");
+    assert!(matches!(answered(&mut client, WRITE, 0)[..], [(_, Ok(_))]));
+}
+
+#[test]
+fn without_an_echo_the_request_sent_back_is_no_reply() {
+    let tolerance = Tolerance { echo: Echo::Never, ..STRICT };
+    let mut client = Client::tolerant(RTU, tolerance);
+    client.send(read());
+    let echo = client.outgoing();
+    client.receive(&echo);
+    client.receive(&rtu_frame(7, &[3, 2, 0, 42]));
+    client.after(SECOND);
+    assert!(matches!(client.got()[..], [(_, Err(Failure::Invalid(_)))]));
 }
 
 #[test]
@@ -881,7 +952,9 @@ fn stray_bytes_alone_are_an_invalid_reply() {
 
 #[test]
 fn an_echo_in_a_stream_is_taken_away() {
-    for (tolerance, stray) in [(STRICT, &[][..]), (Tolerance { echo: true, ..STRICT }, &[0])] {
+    for (tolerance, stray) in
+        [(STRICT, &[][..]), (Tolerance { echo: Echo::Always, ..STRICT }, &[0])]
+    {
         let mut client = Client::tolerant(Transport::RtuOverTcp, tolerance);
         let ticket = client.send(read());
         let echo = client.outgoing();
@@ -912,7 +985,7 @@ fn tolerances() -> impl Strategy<Value = Tolerance> {
         |(accept_unit, [pad, echo, retry_busy], pause, connect, retries, close_after)| Tolerance {
             accept_unit,
             pad,
-            echo,
+            echo: if echo { Echo::Always } else { Echo::Auto },
             pause: SECOND / 4 * pause,
             pause_after_connect: SECOND / 4 * connect,
             retries,

@@ -1,0 +1,355 @@
+//! Devices whose replies come late, twice or in another order, on every transport, with a simulated
+//! clock: no reply is ever taken for that of another request.
+
+#![cfg(feature = "alloc")]
+
+use std::time::Duration;
+
+use holdfast_protocol::client::{Closed, Connection, Done, Failure, Tolerance, Transport};
+use holdfast_protocol::frame::{ascii, mbap, rtu};
+use holdfast_protocol::pdu::{EncodedRequest, Range, Request, Response};
+
+const MS: Duration = Duration::from_millis(1);
+const TIMEOUT: Duration = Duration::from_millis(250);
+const SILENCE: Duration = Duration::from_millis(2);
+
+const SERIAL: [Transport; 2] =
+    [Transport::SerialRtu { silence: SILENCE }, Transport::SerialAscii { silence: SILENCE }];
+const TRANSPORTS: [Transport; 7] = [
+    SERIAL[0],
+    SERIAL[1],
+    Transport::RtuOverTcp,
+    Transport::AsciiOverTcp,
+    Transport::RtuOverUdp,
+    Transport::Tcp,
+    Transport::Udp,
+];
+
+/// A fixed sequence of numbers that look random.
+struct Numbers(u64);
+
+impl Numbers {
+    /// A number between these, in steps of a hundredth of their difference.
+    fn between(&mut self, least: Duration, most: Duration) -> Duration {
+        self.0 =
+            self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        least + (most - least) * ((self.0 >> 33) % 101) as u32 / 100
+    }
+}
+
+/// A reply that comes just before the next one.
+const KEPT: Duration = Duration::MAX;
+
+/// What a device does with its `number`th reply: when the copies of it come, after the request.
+type Vice = fn(number: u32, &mut Numbers) -> Vec<Duration>;
+
+/// A device behind a gateway that sends to whichever connection there is.
+struct World {
+    transport: Transport,
+    vice: Vice,
+    connection: Connection,
+    now: Duration,
+    /// What is on its way to the client.
+    coming: Vec<(Duration, Vec<u8>)>,
+    kept: Vec<Vec<u8>>,
+    numbers: Numbers,
+    requests: u32,
+    late: u64,
+    /// Whether the driver reads between two requests.
+    listens: bool,
+}
+
+#[derive(Debug, Default, PartialEq, Eq, Clone, Copy)]
+struct Counts {
+    right: u32,
+    wrong: u32,
+    failed: u32,
+}
+
+impl World {
+    fn new(transport: Transport, vice: Vice) -> World {
+        let connection = Connection::new(transport).unpredictable(7);
+        let (now, coming) = (MS, Vec::new());
+        World {
+            transport,
+            vice,
+            connection,
+            now,
+            coming,
+            kept: Vec::new(),
+            numbers: Numbers(1),
+            requests: 0,
+            late: 0,
+            listens: true,
+        }
+    }
+
+    /// A new connection instead of the one that has ended.
+    fn reconnect(&mut self) {
+        self.late += self.connection.late();
+        let past = self.connection.take_past(self.now);
+        let connection = Connection::tolerant(self.transport, Tolerance::default(), self.now);
+        self.connection = connection.unpredictable(u64::from(self.requests));
+        self.connection.follow(past);
+    }
+
+    /// The next bytes that come until then.
+    fn next(&mut self, until: Duration) -> Option<(Duration, Vec<u8>)> {
+        let first = (0..self.coming.len()).min_by_key(|at| self.coming[*at].0)?;
+        (self.coming[first].0 <= until).then(|| self.coming.swap_remove(first))
+    }
+
+    /// Lets time pass without a request.
+    fn pass(&mut self, time: Duration) {
+        let until = self.now + time;
+        while let Some((at, bytes)) = self.next(until) {
+            let now = if self.listens { at.max(self.now) } else { until };
+            self.now = now;
+            self.connection.receive(&bytes, now, |_| panic!("there is no request"));
+            if self.connection.closed().is_some() {
+                self.reconnect();
+            }
+        }
+        self.now = until;
+    }
+
+    fn read(&mut self, unit_id: u8, address: u16) -> Result<u16, Failure> {
+        let request = Request::ReadHoldingRegisters(Range::new(address, 1).unwrap());
+        let request = EncodedRequest::new(&request);
+        self.connection.send(unit_id, &request, TIMEOUT, self.now).unwrap();
+        let mut found = None;
+        loop {
+            self.serve(unit_id, address);
+            let Some(deadline) = self.connection.deadline() else { break };
+            let received = self.next(deadline);
+            let sink = |done: Done<'_>| {
+                found = Some(done.outcome.map(|response| match response {
+                    Response::Registers(registers) => registers.iter().next().unwrap(),
+                    _ => panic!("registers were read"),
+                }));
+            };
+            match received {
+                Some((at, bytes)) => {
+                    self.now = self.now.max(at);
+                    self.connection.receive(&bytes, self.now, sink);
+                }
+                None => {
+                    self.now = self.now.max(deadline);
+                    self.connection.advance(self.now, sink);
+                }
+            }
+            if found.is_some() {
+                break;
+            }
+        }
+        if self.connection.closed().is_some() {
+            self.reconnect();
+        }
+        found.expect("every request has a result")
+    }
+
+    /// Answers what the client has sent.
+    fn serve(&mut self, unit_id: u8, address: u16) {
+        let sent = self.connection.outgoing().to_vec();
+        if sent.is_empty() {
+            return;
+        }
+        self.connection.sent(sent.len());
+        self.coming.extend(self.kept.drain(..).map(|kept| (self.now + 2 * MS, kept)));
+        let [high, low] = address.to_be_bytes();
+        let pdu = [3, 2, high, low];
+        let reply = match self.transport {
+            Transport::Tcp | Transport::Udp => {
+                let id = u16::from_be_bytes([sent[0], sent[1]]);
+                [&mbap::header(id, unit_id, pdu.len())[..], &pdu].concat()
+            }
+            Transport::AsciiOverTcp | Transport::SerialAscii { .. } => {
+                let mut frame = [0; ascii::MAX_LEN];
+                let len = ascii::encode(unit_id, &pdu, &mut frame).unwrap();
+                frame[..len].to_vec()
+            }
+            _ => {
+                let mut frame = [0; rtu::MAX_LEN];
+                let len = rtu::encode(unit_id, &pdu, &mut frame).unwrap();
+                frame[..len].to_vec()
+            }
+        };
+        for after in (self.vice)(self.requests, &mut self.numbers) {
+            match after {
+                KEPT => self.kept.push(reply.clone()),
+                after => self.coming.push((self.now + after, reply.clone())),
+            }
+        }
+        self.requests += 1;
+    }
+
+    /// Reads different addresses, one after the other, with this pause.
+    fn run(&mut self, reads: u16, pause: Duration) -> Counts {
+        let mut counts = Counts::default();
+        for number in 0..reads {
+            self.pass(pause);
+            let address = 100 + number % 7 * 100;
+            match self.read(1, address) {
+                Ok(value) if value == address => counts.right += 1,
+                Ok(_) => counts.wrong += 1,
+                Err(_) => counts.failed += 1,
+            }
+        }
+        self.late += self.connection.late();
+        counts
+    }
+}
+
+const VICES: [(&str, Vice); 12] = [
+    ("always 0.32 s", |_, _| vec![320 * MS]),
+    ("once 0.32 s", |number, _| vec![if number == 5 { 320 * MS } else { 5 * MS }]),
+    ("1.1 to 2.2 times the timeout", |_, numbers| vec![numbers.between(275 * MS, 550 * MS)]),
+    ("0.5 to 1.5 times the timeout", |_, numbers| vec![numbers.between(125 * MS, 375 * MS)]),
+    ("a fifth is late", |number, numbers| {
+        vec![if number % 5 == 3 { numbers.between(260 * MS, 550 * MS) } else { 5 * MS }]
+    }),
+    ("all twice", |_, numbers| vec![3 * MS, 3 * MS + numbers.between(MS / 2, 10 * MS)]),
+    ("all twice, late", |_, numbers| vec![320 * MS, 320 * MS + numbers.between(MS / 2, 10 * MS)]),
+    ("twice at once", |_, _| vec![3 * MS, 3 * MS]),
+    ("three times", |_, _| vec![3 * MS, 6 * MS, 12 * MS]),
+    ("a fifth twice", |number, numbers| match number % 5 {
+        3 => vec![3 * MS, 3 * MS + numbers.between(MS / 2, 10 * MS)],
+        _ => vec![3 * MS],
+    }),
+    ("a fifth before the next", |number, _| vec![if number % 5 == 3 { KEPT } else { 3 * MS }]),
+    ("a fifth behind the next", |number, _| match number % 5 {
+        3 => vec![KEPT],
+        _ => vec![MS],
+    }),
+];
+
+#[test]
+fn no_reply_is_taken_for_another() {
+    let mut table = String::new();
+    let mut wrong = 0;
+    for (name, vice) in VICES {
+        for transport in TRANSPORTS {
+            for (pause, listens) in [(Duration::ZERO, true), (7 * MS, true), (7 * MS, false)] {
+                let mut world = World::new(transport, vice);
+                world.listens = listens;
+                let counts = world.run(500, pause);
+                wrong += counts.wrong;
+                table += &format!("{name}, {transport:?}, {pause:?}: {counts:?}\n");
+            }
+        }
+    }
+    assert_eq!(wrong, 0, "{table}");
+    println!("{table}");
+}
+
+/// The reads of a device that always takes this long.
+fn constantly(transport: Transport, vice: Vice) -> (Counts, u64, u64) {
+    let mut world = World::new(transport, vice);
+    let counts = world.run(40, Duration::ZERO);
+    let raised = world.connection.take_raised();
+    (counts, world.late, raised)
+}
+
+#[test]
+fn a_device_that_is_always_late_gets_more_time_until_it_is_not() {
+    for transport in SERIAL {
+        let (counts, late, raised) = constantly(transport, |_, _| vec![320 * MS]);
+        assert_eq!(counts, Counts { right: 38, wrong: 0, failed: 2 });
+        assert_eq!((late, raised), (2, 38));
+        // From then on it is fast: a while later, nothing is raised any more.
+        let (counts, _, raised) =
+            constantly(transport, |number, _| vec![if number < 3 { 320 * MS } else { 3 * MS }]);
+        assert_eq!(counts, Counts { right: 38, wrong: 0, failed: 2 });
+        assert_eq!(raised, 33);
+    }
+}
+
+#[test]
+fn a_good_line_is_as_fast_as_before_after_its_first_replies() {
+    for transport in [SERIAL[0], SERIAL[1], Transport::RtuOverTcp] {
+        let mut world = World::new(transport, |_, _| vec![3 * MS]);
+        world.run(20, Duration::ZERO);
+        let began = world.now;
+        let counts = world.run(100, Duration::ZERO);
+        assert_eq!(counts, Counts { right: 100, wrong: 0, failed: 0 });
+        let silence = if SERIAL.contains(&transport) { SILENCE } else { Duration::ZERO };
+        assert_eq!(world.now - began, 100 * (3 * MS + silence));
+    }
+}
+
+#[test]
+fn a_unit_that_is_silent_holds_up_no_other_unit() {
+    let mut world =
+        World::new(SERIAL[0], |number, _| if number == 0 { vec![] } else { vec![3 * MS] });
+    assert_eq!(world.read(9, 100), Err(Failure::Timeout));
+    let began = world.now;
+    assert_eq!(world.read(1, 200), Ok(200));
+    assert!(world.now - began <= 50 * MS);
+    // Its own reply may still come.
+    assert_eq!(world.read(9, 300), Ok(300));
+    assert!(world.now - began >= 2 * TIMEOUT);
+}
+
+#[test]
+fn a_late_reply_to_another_unit_does_not_end_a_request() {
+    let mut world =
+        World::new(SERIAL[0], |number, _| if number == 0 { vec![260 * MS] } else { vec![30 * MS] });
+    assert_eq!(world.read(9, 100), Err(Failure::Timeout));
+    assert_eq!(world.read(1, 200), Ok(200));
+    assert_eq!(world.connection.late(), 1);
+    assert_eq!(world.connection.take_strays().bytes, 0);
+}
+
+/// The transaction ids of requests on a connection after another one that ended without a reply.
+#[test]
+fn a_late_reply_on_the_next_connection_is_known_by_its_transaction_id() {
+    let request = EncodedRequest::new(&Request::ReadHoldingRegisters(Range::new(1, 1).unwrap()));
+    for seed in 0..100 {
+        let mut first = Connection::new(Transport::Tcp).unpredictable(seed);
+        first.send(1, &request, TIMEOUT, MS).unwrap();
+        let id = u16::from_be_bytes([first.outgoing()[0], first.outgoing()[1]]);
+        first.close(Closed::ByPeer, |_| {});
+        let mut next = Connection::new(Transport::Tcp).unpredictable(seed);
+        next.follow(first.take_past(MS));
+        next.send(1, &request, TIMEOUT, MS).unwrap();
+        let late = [&mbap::header(id, 1, 4)[..], &[3, 2, 0, 9]].concat();
+        next.receive(&late, MS, |_| panic!("the reply is not its own"));
+        assert_eq!((next.late(), next.closed()), (1, None));
+    }
+}
+
+#[test]
+fn transaction_ids_begin_at_random() {
+    let request = EncodedRequest::new(&Request::ReadHoldingRegisters(Range::new(1, 1).unwrap()));
+    let first = |seed: u64| {
+        let mut connection = Connection::new(Transport::Tcp).unpredictable(seed << 20);
+        connection.send(1, &request, TIMEOUT, MS).unwrap();
+        u16::from_be_bytes([connection.outgoing()[0], connection.outgoing()[1]])
+    };
+    let mut ids: Vec<u16> = (0..100).map(first).collect();
+    ids.dedup();
+    assert!(ids.len() > 90, "{ids:?}");
+}
+
+#[test]
+fn a_reply_that_is_faster_than_the_line_is_not_believed() {
+    let twice: Vice = |number, _| match number {
+        // The second one comes when the next request has been sent.
+        20 => vec![30 * MS, 33 * MS],
+        _ => vec![30 * MS],
+    };
+    let mut world = World::new(SERIAL[0], twice);
+    world.connection = Connection::new(SERIAL[0]).on_line(MS);
+    for number in 0..40 {
+        assert_eq!(world.read(1, 100 + number), Ok(100 + number));
+    }
+    assert_eq!(world.connection.take_strays().replies, 1);
+}
+
+#[test]
+fn a_line_that_is_faster_than_its_settings_is_believed() {
+    let mut world = World::new(SERIAL[0], |_, _| vec![MS]);
+    world.connection = Connection::new(SERIAL[0]).on_line(MS);
+    let counts = world.run(40, Duration::ZERO);
+    assert_eq!(counts, Counts { right: 40, wrong: 0, failed: 0 });
+}
