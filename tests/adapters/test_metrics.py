@@ -72,6 +72,7 @@ LINK: dict[str, int] = {
     "unexpected_replies": 31,
     "stray_bytes": 32,
     "late_replies": 33,
+    "raised_timeouts": 35,
     "floods": 34,
 }
 
@@ -86,6 +87,7 @@ METER: dict[str, Any] = {
     "unexpected_replies": 41,
     "stray_bytes": 42,
     "late_replies": 43,
+    "raised_timeouts": 45,
     "floods": 44,
     "polls": 30,
     "missed": 1,

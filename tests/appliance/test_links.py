@@ -37,6 +37,7 @@ NONE = dict.fromkeys(
         "unexpected_replies",
         "stray_bytes",
         "late_replies",
+        "raised_timeouts",
         "floods",
     ),
     0,

@@ -130,8 +130,8 @@ def test_a_good_device_has_no_strays(run: Run) -> None:
         appliance = polled(run, fake.url)
         until_polled(appliance, "meter", 10)
         told = counters(appliance, "meter")
-    keys = ("unexpected_replies", "stray_bytes", "late_replies", "floods")
-    assert [told[key] for key in keys] == [0] * 4
+    keys = ("unexpected_replies", "stray_bytes", "late_replies", "raised_timeouts", "floods")
+    assert [told[key] for key in keys] == [0] * 5
 
 
 def test_a_device_that_floods_is_left_alone_for_a_while(run: Run) -> None:

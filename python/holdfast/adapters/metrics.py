@@ -472,6 +472,7 @@ def _strays(of: str) -> dict[str, CounterMetricFamily]:
         "unexpected_replies": "Replies that no request asked for.",
         "stray_bytes": "Bytes received that are no part of a reply to a request.",
         "late_replies": "Replies that came after the timeout of their request.",
+        "raised_timeouts": "Requests with more than their timeout, because late replies repeat.",
         "floods": "Pauses because of too many stray bytes.",
     }
     return {key: _counter(f"{of}_{key}", text, of) for key, text in texts.items()}

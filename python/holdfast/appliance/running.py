@@ -254,7 +254,7 @@ class _Running:
         self._health = dict.fromkeys(config.devices, "unknown")
         self._plan_errors: dict[str, str | None] = {}
         self._unstored: dict[str, int] = {}
-        self._strays: dict[tuple[str, str], tuple[int, float]] = {}
+        self._strays: dict[tuple[str, str, str], tuple[int, float]] = {}
         self._forwarded: dict[tuple[str, int], Mapping[str, Any]] = {}
         self._unreachable: set[tuple[str, int]] = set()
         self._expiring = Expiring()
@@ -452,14 +452,21 @@ class _Running:
         logs.write(logging.INFO if usual else logging.WARNING, "device_health", **fields)
 
     def _log_strays(self, kind: str, name: str, told: Mapping[str, int]) -> None:
-        """Logs that a device has begun to send what nobody asked for."""
-        key, now, count = (kind, name), time.monotonic(), told["stray_bytes"]
+        """Logs that a device has begun to send what nobody asked for, or all its replies late."""
+        if self._has_begun((kind, name, "stray_bytes"), told):
+            counted = {"replies": told["unexpected_replies"], "bytes": told["stray_bytes"]}
+            logs.write(logging.WARNING, "unrequested_data", **{kind: name}, **counted)
+        if self._has_begun((kind, name, "raised_timeouts"), told):
+            late = told["late_replies"]
+            logs.write(logging.WARNING, "timeout_raised", **{kind: name}, late_replies=late)
+
+    def _has_begun(self, key: tuple[str, str, str], told: Mapping[str, int]) -> bool:
+        """Whether a counter has begun to count, or goes on after a while."""
+        now, count = time.monotonic(), told[key[-1]]
         before, since = self._strays.get(key, (0, -QUIET))
         if count != before:
             self._strays[key] = (count, now)
-        if count > before and now - since >= QUIET:
-            counted = {"replies": told["unexpected_replies"], "bytes": count}
-            logs.write(logging.WARNING, "unrequested_data", **{kind: name}, **counted)
+        return count > before and now - since >= QUIET
 
     def _log_forwards(self, name: str, counted: Sequence[Mapping[str, Any]]) -> None:
         """Logs what happened at the receivers of a device since the last check."""

@@ -262,6 +262,7 @@ ROUTES = (
                         "unexpected_replies": 0,
                         "stray_bytes": 0,
                         "late_replies": 1,
+                        "raised_timeouts": 0,
                         "floods": 0,
                     }
                 },

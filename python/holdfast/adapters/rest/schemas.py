@@ -149,6 +149,8 @@ DIAGNOSTICS: dict[str, Schema] = {
                         "unexpected_replies": COUNTER | {"description": "Without a request"},
                         "stray_bytes": COUNTER | {"description": "Not part of an expected reply"},
                         "late_replies": COUNTER,
+                        "raised_timeouts": COUNTER
+                        | {"description": "Requests with more than their timeout"},
                         "floods": COUNTER | {"description": "Pauses because of stray bytes"},
                     }
                 ),
