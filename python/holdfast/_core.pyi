@@ -777,11 +777,9 @@ class Connection:
     result, a `ModbusError`, or an `Attempt` when the request may be sent again.
     """
 
-    def __new__(
-        cls, endpoint: Endpoint, now: float, last: Connection | None = None
-    ) -> Connection:
-        """A connection that follows the `last` one to this endpoint, which has ended: late replies to
-        requests of that one are recognized.
+    def __new__(cls, endpoint: Endpoint, now: float, last: Connection | None = None) -> Connection:
+        """A connection that follows the `last` one to this endpoint, which has ended: late replies
+        to requests of that one are recognized.
         """
 
     @property
