@@ -298,6 +298,9 @@ impl Connection {
 
     /// Ends the connection. Every request in flight fails.
     pub fn close(&mut self, why: Closed, mut sink: impl FnMut(Done<'_>)) {
+        if let (Wire::OneAtATime(line), Closed::ByPeer) = (&mut self.wire, why) {
+            line.stream_ended(&mut self.flights, &mut sink);
+        }
         self.flights.close(why, &mut sink);
     }
 

@@ -423,6 +423,13 @@ impl OneAtATime {
         self.replied(flights, unit_id, &pdu, now, sink);
     }
 
+    /// Believes a reply that is doubted: the stream has ended, so no other follows.
+    pub(super) fn stream_ended(&mut self, flights: &mut Flights, sink: &mut impl FnMut(Done<'_>)) {
+        if let State::Doubting { until } = self.state {
+            self.believe_doubted(flights, until, sink);
+        }
+    }
+
     /// Two replies came to one request: nothing shows which one is its own.
     fn contradicted(&mut self, flights: &mut Flights, now: Time, sink: &mut impl FnMut(Done<'_>)) {
         self.earlier.stray(Duration::ZERO);
@@ -647,7 +654,7 @@ fn response_len(bytes: &[u8], request: &EncodedRequest) -> Result<Option<usize>,
 /// Whether the request itself, sent back, can't be taken for its reply.
 fn is_no_reply(flight: &Flight) -> bool {
     let request = &flight.request;
-    request.is_read() && request.response(request.pdu()).is_err()
+    request.response(request.pdu()).is_err()
 }
 
 /// The first line in these characters, from its colon to its end.
