@@ -1,5 +1,6 @@
 //! The connection: the part that is the same for every transport.
 
+use alloc::boxed::Box;
 use alloc::vec::Vec;
 use core::time::Duration;
 
@@ -62,7 +63,7 @@ enum Left {
 enum Wire {
     Stream(Stream),
     Datagrams(Datagrams),
-    OneAtATime(OneAtATime),
+    OneAtATime(Box<OneAtATime>),
 }
 
 impl Connection {
@@ -73,8 +74,9 @@ impl Connection {
 
     /// A connection that was made `now`, to a device that needs this tolerance.
     pub fn tolerant(transport: Transport, tolerance: Tolerance, now: Time) -> Connection {
-        let one =
-            |framing, silence| Wire::OneAtATime(OneAtATime::new(framing, silence, tolerance.echo));
+        let one = |framing, silence| {
+            Wire::OneAtATime(Box::new(OneAtATime::new(framing, silence, tolerance.echo)))
+        };
         let wire = match transport {
             Transport::Tcp => Wire::Stream(Stream::default()),
             Transport::Udp => Wire::Datagrams(Datagrams::default()),
