@@ -287,7 +287,7 @@ class ModbusRtuOverTcpListener(_ConnectionListener):
     type: Literal["modbus-rtu-over-tcp"]
     """The protocol."""
     frame_timeout: Duration = 0.05
-    """Seconds without a byte after which an incomplete request may be followed by the next one."""
+    """Seconds without a byte after which an incomplete request is discarded."""
 
 
 class ModbusAsciiOverTcpListener(_ConnectionListener):

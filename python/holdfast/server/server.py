@@ -36,7 +36,7 @@ class Server:
     Times are in seconds. `idle_timeout` is the time without a request; 0 is unlimited.
     `request_timeout` is the time from the first byte of a request to its last, and the time for a
     peer to read its replies. `frame_timeout`, for `rtu+tcp`, is the time without a byte after which
-    the next request may follow an incomplete one. With `listen_only`, a peer that may write can set
+    an incomplete request is discarded. With `listen_only`, a peer that may write can set
     a unit to listen only mode for all peers (function 8, sub-function 4). `workers` is the number
     of native threads.
 

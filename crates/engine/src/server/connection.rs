@@ -76,8 +76,8 @@ pub(crate) struct Timeouts {
     /// The longest time from the first byte of a request to its last, and for a peer to read its
     /// replies.
     pub(crate) request: Duration,
-    /// The longest time between two reads of a request. After that, what follows may be the next
-    /// request; `None` where frames can't be told apart that way.
+    /// The longest time between two reads of a request. After that, the request is discarded, and the
+    /// next byte starts a frame; `None` where silence means nothing.
     pub(crate) frame: Option<Duration>,
 }
 
@@ -117,8 +117,8 @@ struct Answering<F: Framing> {
     /// The beginning of an incomplete request.
     partial: F::Partial,
     partial_len: usize,
-    /// Nothing followed that beginning for [`Timeouts::frame`]: it may be all of it.
-    is_doubtful: bool,
+    /// What is known of the bytes before it.
+    before: F::Before,
     /// The last character of an ASCII frame, which the peer can change.
     delimiter: u8,
     reported: Reported,
@@ -313,12 +313,15 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             self.ticket.touch(now.into_std());
         }
         self.share.charge((answered.requests + answered.discarded) as u32);
-        if self.answering.partial_len == 0 && !self.stream.is_amid_record() {
+        let is_at_start = F::is_at_start(&self.answering.before);
+        if self.answering.partial_len == 0 && is_at_start && !self.stream.is_amid_record() {
             self.begun = None;
             return;
         }
         self.last_read = now;
-        if answered.consumed > 0 || self.begun.is_none() {
+        // Bytes that are discarded until a silence do not put off the end of the connection.
+        let is_new = answered.requests > 0 || answered.consumed > 0 && is_at_start;
+        if self.begun.is_none() || is_new {
             self.begun = Some(now);
         }
     }
@@ -334,34 +337,41 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         Ok(())
     }
 
-    fn deadline(&self) -> (Instant, Kind) {
-        match (self.begun, self.timeouts.idle) {
-            (Some(begun), _) => {
-                let deadline = begun + self.timeouts.request;
-                let silent = self.timeouts.frame.map(|frame| self.last_read + frame);
-                (silent.map_or(deadline, |silent| silent.min(deadline)), Kind::RequestTimeout)
-            }
-            (None, Some(idle)) if !self.answering.is_waiting() => {
-                (self.last_request + idle, Kind::Idle)
-            }
-            (None, _) => (self.last_request + FAR, Kind::Idle),
+    /// When and why the connection ends.
+    fn end(&self) -> (Instant, Kind) {
+        let is_amid_request = self.answering.partial_len > 0 || self.stream.is_amid_record();
+        // Bytes that are discarded do not put off the end for want of requests.
+        let idle = self.timeouts.idle.filter(|_| !is_amid_request && !self.answering.is_waiting());
+        let idle = (self.last_request + idle.unwrap_or(FAR), Kind::Idle);
+        match self.begun.map(|begun| begun + self.timeouts.request) {
+            Some(request) if is_amid_request || request < idle.0 => (request, Kind::RequestTimeout),
+            _ => idle,
         }
+    }
+
+    /// When a silence ends a request.
+    fn silence(&self) -> Option<Instant> {
+        self.begun.and(self.timeouts.frame).map(|frame| self.last_read + frame)
+    }
+
+    fn deadline(&self) -> Instant {
+        let (end, _) = self.end();
+        self.silence().map_or(end, |silence| silence.min(end))
     }
 
     /// Moves the alarm to an earlier time. A later deadline is set when the alarm fires: requests
     /// are much more frequent than alarms.
     fn set(&self, alarm: Pin<&mut Sleep>) {
-        let (deadline, _) = self.deadline();
+        let deadline = self.deadline();
         if deadline < alarm.deadline() || alarm.is_elapsed() {
             alarm.reset(deadline);
         }
     }
 
-    /// Doubts the beginning of a request that nothing followed, or ends the connection.
+    /// Discards the beginning of a request that nothing followed, or ends the connection.
     fn overdue(&mut self) -> Result<(), Kind> {
-        let (deadline, kind) = self.deadline();
-        let now = Instant::now();
-        if now < deadline {
+        let (now, (end, kind)) = (Instant::now(), self.end());
+        if now < self.deadline() {
             return Ok(());
         }
         if self.share.is_waiting() {
@@ -370,14 +380,12 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             self.begun = self.begun.map(|_| now);
             return Ok(());
         }
-        match self.begun {
-            Some(begun) if now < begun + self.timeouts.request => {
-                self.answering.is_doubtful = true;
-                self.begun = None;
-                Ok(())
-            }
-            _ => Err(kind),
+        if self.silence().is_some_and(|silence| silence < end) {
+            self.answering.fall_silent();
+            self.begun = None;
+            return Ok(());
         }
+        Err(kind)
     }
 
     /// Answers what the system has already received, then ends. The engine drops connections whose
@@ -413,7 +421,7 @@ impl<F: Framing> Answering<F> {
             rights,
             partial: F::NO_PARTIAL,
             partial_len: 0,
-            is_doubtful: false,
+            before: F::Before::default(),
             delimiter: ASCII_DELIMITER,
             reported: Reported::default(),
             deferred: None,
@@ -432,10 +440,10 @@ impl<F: Framing> Answering<F> {
         let mut answered =
             Answered { len: 0, requests: 0, discarded: 0, consumed: 0, broken: false };
         let mut rest = input;
-        let is_doubtful = mem::take(&mut self.is_doubtful);
         let mut decoded = F::NOT_DECODED;
         loop {
-            match F::next(rest, || self.delimiter, &mut decoded) {
+            let before = self.before.clone();
+            match F::next(&mut self.before, rest, || self.delimiter, &mut decoded) {
                 Next::Request { tag, unit_id, pdu, len } => {
                     let place = self.unit_server.elsewhere(&self.rights, unit_id, pdu);
                     if place.is_some() || self.deferred.is_some() {
@@ -451,6 +459,7 @@ impl<F: Framing> Answering<F> {
                             }
                             Deferral::Wait => {
                                 deferred.leave(rest);
+                                self.before = before;
                                 rest = &[];
                                 break;
                             }
@@ -477,11 +486,7 @@ impl<F: Framing> Answering<F> {
                     answered.broken = true;
                     break;
                 }
-                Next::Incomplete => {
-                    let Some(len) = is_doubtful.then(|| F::resync(rest)).flatten() else { break };
-                    rest = &rest[len..];
-                    self.unit_server.counters.frames.damaged.add();
-                }
+                Next::Incomplete => break,
             }
         }
         answered.consumed = input.len() - rest.len();
@@ -495,6 +500,14 @@ impl<F: Framing> Answering<F> {
         let kept = rest.len().min(partial.len());
         partial[..kept].copy_from_slice(&rest[..kept]);
         self.partial_len = kept;
+    }
+
+    /// Discards the beginning of a request: the next byte starts a frame.
+    fn fall_silent(&mut self) {
+        if mem::take(&mut self.partial_len) > 0 {
+            self.unit_server.counters.frames.damaged.add();
+        }
+        self.before = F::Before::default();
     }
 
     /// Whether replies come later.
@@ -623,24 +636,33 @@ impl<F: Framing> Answering<F> {
 mod tests {
     use std::net::SocketAddr;
 
-    use holdfast_memory::{Area, Layout, Memory, Span};
-    use holdfast_protocol::frame::{ascii, mbap};
+    use holdfast_memory::{Area, Contents, Layout, Memory, Span};
+    use holdfast_protocol::frame::{ascii, mbap, rtu};
 
     use super::*;
     use crate::server::admission::{Admission, ConnectionLimits};
+    use crate::server::cuts::assert_same_outcome;
     use crate::server::framing::MbapBesidePackets;
     use crate::server::functions::{AccessMode, Functions};
     use crate::server::identity::Identity;
     use crate::server::policy::Rule;
 
-    fn answering<F: Framing>() -> Answering<F> {
+    fn memory() -> Arc<Memory> {
         let span = Span::new(0, 2000).unwrap();
         let layout =
             Area::ALL.into_iter().fold(Layout::default(), |layout, area| layout.with(area, span));
+        Arc::new(Memory::new(layout, None).unwrap())
+    }
+
+    fn answering<F: Framing>() -> Answering<F> {
+        answering_with(memory())
+    }
+
+    fn answering_with<F: Framing>(memory: Arc<Memory>) -> Answering<F> {
         let rule = Rule {
             sources: Vec::new(),
             roles: None,
-            units: vec![(1, Arc::new(Memory::new(layout, None).unwrap()))],
+            units: vec![(1, memory)],
             elsewhere: Vec::new(),
             access: AccessMode::ReadWrite,
             functions: Functions::All,
@@ -665,29 +687,40 @@ mod tests {
         frame[..len].to_vec()
     }
 
-    /// One request of each function, and some that are refused.
+    fn rtu_frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {
+        let mut frame = [0; rtu::MAX_LEN];
+        let len = rtu::encode(unit_id, pdu, &mut frame).unwrap();
+        frame[..len].to_vec()
+    }
+
+    /// Requests of each function, and some that are refused.
+    const PDUS: [&[u8]; 16] = [
+        &[1, 0, 3, 7, 0xD0 - 3],
+        &[2, 0, 0, 0, 9],
+        &[3, 0, 0, 0, 125],
+        &[4, 0, 1, 0, 2],
+        &[5, 0, 9, 0xFF, 0],
+        &[6, 0, 9, 1, 2],
+        &[8, 0, 0, 1, 2],
+        &[8, 0, 0x0B, 0, 0],
+        &[11],
+        &[15, 0, 3, 0, 9, 2, 0xFF, 1],
+        &[17],
+        &[22, 0, 4, 0, 0xF2, 0, 0x25],
+        &[23, 0, 0, 0, 2, 0, 1, 0, 1, 2, 0xBE, 0xEF],
+        &[43, 14, 3, 0],
+        &[3, 0xFF, 0xFF, 0, 2],
+        &[99],
+    ];
+
+    const LONG_WRITE: [u8; 252] = {
+        let mut pdu = [0; 252];
+        (pdu[0], pdu[4], pdu[5]) = (16, 123, 246);
+        pdu
+    };
+
     fn requests(frame: fn(u8, &[u8]) -> Vec<u8>) -> Vec<u8> {
-        let write = [&[16, 0, 0, 0, 123, 246][..], &[0; 246]].concat();
-        let pdus: [&[u8]; 17] = [
-            &[1, 0, 3, 7, 0xD0 - 3],
-            &[2, 0, 0, 0, 9],
-            &[3, 0, 0, 0, 125],
-            &[4, 0, 1, 0, 2],
-            &[5, 0, 9, 0xFF, 0],
-            &[6, 0, 9, 1, 2],
-            &[8, 0, 0, 1, 2],
-            &[8, 0, 0x0B, 0, 0],
-            &[11],
-            &[15, 0, 3, 0, 9, 2, 0xFF, 1],
-            &write,
-            &[17],
-            &[22, 0, 4, 0, 0xF2, 0, 0x25],
-            &[23, 0, 0, 0, 2, 0, 1, 0, 1, 2, 0xBE, 0xEF],
-            &[43, 14, 3, 0],
-            &[3, 0xFF, 0xFF, 0, 2],
-            &[99],
-        ];
-        pdus.iter().flat_map(|pdu| frame(1, pdu)).collect()
+        PDUS.iter().copied().chain([&LONG_WRITE[..]]).flat_map(|pdu| frame(1, pdu)).collect()
     }
 
     #[test]
@@ -707,31 +740,104 @@ mod tests {
         assert_eq!(allocations.count_total, 0);
     }
 
+    /// What comes of the pieces of a stream, and of the silence after it: replies, the end of the
+    /// connection, counters and memory.
+    fn outcome<F: Framing>(
+        pieces: &[&[u8]],
+        output: &mut [u8],
+    ) -> (Vec<u8>, bool, String, Vec<Contents>) {
+        let memory = memory();
+        let (mut answering, mut input) = (answering_with::<F>(Arc::clone(&memory)), vec![0; INPUT]);
+        let (mut replies, mut broken) = (Vec::new(), false);
+        for piece in pieces {
+            let kept = answering.restore(&mut input);
+            input[kept..kept + piece.len()].copy_from_slice(piece);
+            let answered = answering.answer(&input[..kept + piece.len()], output);
+            replies.extend_from_slice(&output[..answered.len]);
+            broken = answered.broken;
+            if broken {
+                break;
+            }
+        }
+        if !broken {
+            answering.fall_silent();
+        }
+        let counters = &answering.unit_server.counters;
+        let counted = format!("{:?} {:?}", counters.frames, counters.bus());
+        (replies, broken, counted, Memory::contents(&[memory]))
+    }
+
+    fn have_the_same_outcome<F: Framing>(cases: &[Vec<u8>]) {
+        let output = RefCell::new(vec![0; OUTPUT]);
+        assert_same_outcome(cases, |pieces| outcome::<F>(pieces, &mut output.borrow_mut()));
+    }
+
+    /// The requests of [`requests`], one a case.
+    fn each_request(frame: fn(u8, &[u8]) -> Vec<u8>) -> Vec<Vec<u8>> {
+        PDUS.iter()
+            .map(|pdu| frame(1, pdu))
+            .chain([frame(1, &LONG_WRITE), frame(9, &[17])])
+            .collect()
+    }
+
     #[test]
-    fn requests_split_anywhere_get_the_same_replies() {
-        get_the_same_replies::<Mbap>(&requests(frame));
-        get_the_same_replies::<Ascii>(&requests(ascii_frame));
+    fn modbus_tcp_has_the_same_outcome_however_it_is_cut() {
+        let foreign = [0, 1, 0, 9, 0, 2, 1, 17].to_vec();
+        let broken = [0, 1, 0, 0, 0, 255, 1, 17].to_vec();
+        let begun = frame(1, &LONG_WRITE)[..40].to_vec();
+        let packet = b"RI\x01\x03\x00\x01\x00\x00\x00\x01\x00\x07".to_vec();
+        let cases = [each_request(frame), vec![foreign, broken, begun, packet]].concat();
+        have_the_same_outcome::<Mbap>(&cases);
+        have_the_same_outcome::<MbapBesidePackets>(&cases);
+    }
+
+    #[test]
+    fn rtu_in_a_stream_has_the_same_outcome_however_it_is_cut() {
+        let mut damaged = rtu_frame(1, PDUS[2]);
+        damaged[7] ^= 1;
+        // The last byte of the data is the first byte of the CRC of those before it.
+        let [low, _] = rtu::crc(&[1, 99, 1]).to_le_bytes();
+        let misleading = rtu_frame(1, &[99, 1, low]);
+        let begun = [1, 16, 0, 0, 0, 0x7B, 0xF6].to_vec();
+        let cases = [
+            each_request(rtu_frame),
+            vec![damaged.clone(), rtu_frame(1, &[17]), damaged.clone(), damaged],
+            vec![misleading.clone(), rtu_frame(0, &[17]), misleading, rtu_frame(1, &[17])],
+            vec![begun, rtu_frame(1, PDUS[2]), vec![0], vec![0x64; 300], vec![1, 20, 255]],
+        ];
+        have_the_same_outcome::<Rtu>(&cases.concat());
+    }
+
+    #[test]
+    fn ascii_in_a_stream_has_the_same_outcome_however_it_is_cut() {
         // Characters between frames, a frame cut short, a wrong checksum, and a line without end.
         let disturbed = [b"\r\nx\0".to_vec(), ascii_frame(1, &[17]), b":0111:0111EF\r\n".to_vec()];
         let endless = [b":".to_vec(), vec![b'0'; 2 * ascii::MAX_LEN], ascii_frame(1, &[17])];
-        get_the_same_replies::<Ascii>(&[disturbed.concat(), endless.concat()].concat());
+        let delimiter = ascii_frame(1, &[8, 0, 3, b'!', 0]);
+        let cases =
+            [each_request(ascii_frame), vec![disturbed.concat(), endless.concat(), delimiter]];
+        have_the_same_outcome::<Ascii>(&cases.concat());
     }
 
-    fn get_the_same_replies<F: Framing>(input: &[u8]) {
-        let mut whole = vec![0; OUTPUT];
-        let len = answering::<F>().answer(input, &mut whole).len;
-        assert!(len > 0);
-        for cut in 0..input.len() {
-            let (mut answering, mut buffer, mut output) =
-                (answering::<F>(), vec![0; INPUT], vec![0; OUTPUT]);
-            let mut replies = Vec::new();
-            for part in [&input[..cut], &input[cut..]] {
-                let kept = answering.restore(&mut buffer);
-                buffer[kept..kept + part.len()].copy_from_slice(part);
-                let answered = answering.answer(&buffer[..kept + part.len()], &mut output);
-                replies.extend_from_slice(&output[..answered.len]);
-            }
-            assert!(replies == whole[..len], "cut at {cut}");
+    #[test]
+    fn rtu_after_a_silence_is_never_part_of_what_came_before() {
+        let mut output = vec![0; OUTPUT];
+        let read = rtu_frame(1, &[3, 0, 0, 0, 1]);
+        let answer = rtu_frame(1, &[3, 2, 0, 0]);
+        let begun = [1, 16, 0, 0, 0, 0x7B, 0xF6].to_vec();
+        let swallowed = [&begun[..], &read].concat();
+        let mut damaged = read.clone();
+        damaged[7] ^= 1;
+        let lost = [&damaged[..], &[0; 12]].concat();
+        for before in [begun, swallowed, damaged, lost, rtu_frame(1, &[99]), vec![0x64; 300]] {
+            let mut answering = answering::<Rtu>();
+            let first = answering.answer(&before, &mut output);
+            let replies = rtu_frame(1, &[99]) == before;
+            assert_eq!(first.len > 0, replies, "{before:02x?}");
+            answering.fall_silent();
+            assert_eq!(answering.partial_len, 0);
+            let len = answering.answer(&read, &mut output).len;
+            assert_eq!(output[..len], answer, "{before:02x?}");
         }
     }
 

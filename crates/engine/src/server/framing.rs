@@ -41,6 +41,9 @@ pub(crate) trait Framing: Send + Sync + 'static {
     type Partial: AsRef<[u8]> + AsMut<[u8]> + Send;
     const NO_PARTIAL: Self::Partial;
 
+    /// What is known of the bytes before those that are looked at.
+    type Before: Default + Clone + Send;
+
     /// Room for a decoded frame, where the PDU is not in the frame as it is.
     type Decoded;
     const NOT_DECODED: Self::Decoded;
@@ -48,14 +51,15 @@ pub(crate) trait Framing: Send + Sync + 'static {
     /// Looks at the start of `bytes`. An incomplete frame is never longer than
     /// [`Framing::MAX_LEN`]. `delimiter` returns the last character of an ASCII frame.
     fn next<'a>(
+        before: &mut Self::Before,
         bytes: &'a [u8],
         delimiter: impl FnOnce() -> u8,
         decoded: &'a mut Self::Decoded,
     ) -> Next<'a>;
 
-    /// Where the next request starts if an incomplete one before it never ends.
-    fn resync(_bytes: &[u8]) -> Option<usize> {
-        None
+    /// Whether the next byte starts a frame, even if no silence precedes it.
+    fn is_at_start(_before: &Self::Before) -> bool {
+        true
     }
 
     /// Completes a frame with a PDU of `pdu_len` bytes in place: `frame` has room for
@@ -81,11 +85,14 @@ impl Framing for Mbap {
     type Partial = [u8; Self::MAX_LEN];
     const NO_PARTIAL: Self::Partial = [0; Self::MAX_LEN];
 
+    type Before = ();
+
     type Decoded = ();
     const NOT_DECODED: () = ();
 
     #[inline]
     fn next<'a>(
+        _before: &mut (),
         bytes: &'a [u8],
         _delimiter: impl FnOnce() -> u8,
         _decoded: &'a mut (),
@@ -126,11 +133,14 @@ impl Framing for MbapBesidePackets {
     type Partial = <Mbap as Framing>::Partial;
     const NO_PARTIAL: Self::Partial = Mbap::NO_PARTIAL;
 
+    type Before = ();
+
     type Decoded = ();
     const NOT_DECODED: () = ();
 
     #[inline]
     fn next<'a>(
+        _before: &mut (),
         bytes: &'a [u8],
         _delimiter: impl FnOnce() -> u8,
         _decoded: &'a mut (),
@@ -167,28 +177,27 @@ impl Framing for Rtu {
     type Partial = [u8; Self::MAX_LEN];
     const NO_PARTIAL: Self::Partial = [0; Self::MAX_LEN];
 
+    type Before = rtu::Requests;
+
     type Decoded = ();
     const NOT_DECODED: () = ();
 
     fn next<'a>(
+        before: &mut rtu::Requests,
         bytes: &'a [u8],
         _delimiter: impl FnOnce() -> u8,
         _decoded: &'a mut (),
     ) -> Next<'a> {
-        match rtu::next_request(bytes) {
+        match before.next(bytes) {
             rtu::Next::Incomplete => Next::Incomplete,
             rtu::Next::Frame { unit_id, pdu, len } => Next::Request { tag: 0, unit_id, pdu, len },
-            rtu::Next::Damaged { .. } | rtu::Next::Broken => match rtu::resync(bytes) {
-                Some(len) => Next::Damaged { len },
-                // The next frame shows where frames start.
-                None if bytes.len() < rtu::MAX_LEN => Next::Incomplete,
-                None => Next::Damaged { len: bytes.len() },
-            },
+            rtu::Next::Damaged { len } => Next::Damaged { len },
+            rtu::Next::Stray { len } => Next::Stray { len },
         }
     }
 
-    fn resync(bytes: &[u8]) -> Option<usize> {
-        rtu::resync(bytes)
+    fn is_at_start(before: &rtu::Requests) -> bool {
+        before.is_at_start()
     }
 
     fn complete(frame: &mut [u8], _tag: u16, unit_id: u8, pdu_len: usize) -> usize {
@@ -223,10 +232,13 @@ impl Framing for Ascii {
     type Partial = [u8; Self::MAX_LEN];
     const NO_PARTIAL: Self::Partial = [0; Self::MAX_LEN];
 
+    type Before = ();
+
     type Decoded = [u8; ascii::MAX_BODY_LEN];
     const NOT_DECODED: Self::Decoded = [0; ascii::MAX_BODY_LEN];
 
     fn next<'a>(
+        _before: &mut (),
         bytes: &'a [u8],
         delimiter: impl FnOnce() -> u8,
         decoded: &'a mut Self::Decoded,

@@ -4,6 +4,8 @@ mod admission;
 pub mod audit;
 mod connection;
 pub mod counters;
+#[cfg(test)]
+mod cuts;
 mod deferred;
 mod engine;
 pub mod event;

@@ -4,7 +4,7 @@
 //! | --- | --- | --- |
 //! | TCP, UDP | [`mbap::encode`] | [`mbap::next`] |
 //! | serial line, RTU mode | [`rtu::encode`] | [`rtu::decode`] |
-//! | RTU over TCP | [`rtu::encode`] | [`rtu::next_request`], [`rtu::response_len`] |
+//! | RTU over TCP | [`rtu::encode`] | [`rtu::Requests`], [`rtu::response_len`] |
 //! | serial line, ASCII mode | [`ascii::encode`] | [`ascii::decode`] |
 
 pub mod ascii;

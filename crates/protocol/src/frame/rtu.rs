@@ -1,8 +1,8 @@
 //! RTU frames (Modbus over Serial Line V1.02, 2.5.1): unit id, PDU, CRC-16 low byte first.
 //!
 //! On a serial line, a silence ends a frame: the caller measures it and calls [`decode`] with the
-//! bytes before it. RTU over TCP has no silence between frames: a server calls [`next_request`], a
-//! client [`response_len`].
+//! bytes before it. RTU over TCP has no silence between frames: a server uses [`Requests`], a client
+//! [`response_len`].
 //!
 //! ```
 //! use holdfast_protocol::frame::rtu;
@@ -12,8 +12,6 @@
 //! assert_eq!(frame[..len], [17, 3, 0, 107, 0, 3, 0x76, 0x87]);
 //! assert_eq!(rtu::decode(&frame[..len]), Ok((17, &[3, 0, 107, 0, 3][..])));
 //! ```
-
-use core::mem;
 
 use super::{FrameError, split};
 use crate::pdu;
@@ -95,71 +93,186 @@ pub enum Next<'a> {
         /// Bytes of the frame.
         len: usize,
     },
-    /// A frame with a wrong CRC: discard it.
+    /// A frame with a wrong CRC, or longer than any frame: discard it.
     Damaged {
-        /// Bytes of the frame.
+        /// Bytes of the frame that have arrived.
         len: usize,
     },
-    /// Longer than any frame. The start of the next frame is unknown: close the connection.
-    Broken,
+    /// Bytes that do not belong to a frame: discard them.
+    Stray {
+        /// Their number.
+        len: usize,
+    },
 }
 
-/// Looks at the start of `bytes`, which may end anywhere. A stream has no silence between frames:
-/// the length of a request follows from its function code. A frame of an unknown function ends
-/// where the CRC first matches.
+/// Finds requests in a stream that may be cut anywhere: what it finds depends on the bytes only, not on
+/// how many of them arrive together.
+///
+/// The length of a request follows from its function code. A frame of an unknown function ends where the
+/// CRC first matches. After a damaged frame, one of a known function is believed if it follows directly.
+/// Otherwise no more frames are found: bytes that look like a request may be data of a damaged write.
+///
+/// After a silence, the next byte starts a frame: discard the bytes that were left over, and begin again
+/// with [`Requests::default`].
 ///
 /// ```
-/// use holdfast_protocol::frame::rtu::{self, Next};
+/// use holdfast_protocol::frame::rtu::{Next, Requests};
 ///
 /// let received = [17, 3, 0, 107, 0, 3, 0x76, 0x87, 17, 3];
+/// let mut requests = Requests::default();
 /// let pdu = &received[1..6];
-/// assert_eq!(rtu::next_request(&received), Next::Frame { unit_id: 17, pdu, len: 8 });
-/// assert_eq!(rtu::next_request(&received[8..]), Next::Incomplete);
+/// assert_eq!(requests.next(&received), Next::Frame { unit_id: 17, pdu, len: 8 });
+/// assert_eq!(requests.next(&received[8..]), Next::Incomplete);
 /// ```
-pub fn next_request(bytes: &[u8]) -> Next<'_> {
-    let Some(&[_, function_code, ref data @ ..]) = bytes.get(..bytes.len().min(MAX_LEN)) else {
-        return Next::Incomplete;
-    };
-    let len = match request_data_len(function_code, data) {
-        DataLen::Known(len) => 2 + len + 2,
-        DataLen::Incomplete => return Next::Incomplete,
-        DataLen::Unknown => return first_fit(bytes),
-    };
-    match bytes.get(..len) {
-        _ if len > MAX_LEN => Next::Broken,
-        None => Next::Incomplete,
-        Some(frame) => match decode(frame) {
-            Ok((unit_id, pdu)) => Next::Frame { unit_id, pdu, len },
-            Err(_) => Next::Damaged { len },
-        },
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Requests {
+    place: Place,
+}
+
+/// What the next byte of a stream is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+enum Place {
+    /// The first byte of a frame.
+    #[default]
+    Start,
+    /// The byte behind a frame of an unknown function: its last one, if that is 0, or the first of the
+    /// next.
+    AfterUnknown,
+    /// The byte behind a damaged frame, whose length may be damaged too.
+    AfterDamaged,
+    /// Unknown.
+    Lost,
+}
+
+impl Requests {
+    /// Looks at the start of `bytes`, which may end anywhere. Bytes that are not part of
+    /// the result are expected again at the start of the next call.
+    pub fn next<'a>(&mut self, bytes: &'a [u8]) -> Next<'a> {
+        if bytes.is_empty() {
+            return Next::Incomplete;
+        }
+        match self.place {
+            Place::Start => self.found(request(bytes), bytes.len()),
+            Place::AfterUnknown if bytes[0] == 0 => self.after_unknown(bytes),
+            Place::AfterUnknown => {
+                self.place = Place::Start;
+                self.next(bytes)
+            }
+            Place::AfterDamaged => match known(bytes) {
+                Some(found @ (Found::Frame { .. } | Found::Incomplete)) => {
+                    self.found(found, bytes.len())
+                }
+                Some(Found::Damaged { .. } | Found::Endless) | None => {
+                    self.place = Place::Lost;
+                    Next::Stray { len: bytes.len() }
+                }
+            },
+            Place::Lost => Next::Stray { len: bytes.len() },
+        }
+    }
+
+    /// Whether the next byte is known to start a frame. Otherwise it would do so only after a silence.
+    pub fn is_at_start(&self) -> bool {
+        self.place == Place::Start
+    }
+
+    fn found<'a>(&mut self, found: Found<'a>, received: usize) -> Next<'a> {
+        let (place, next) = match found {
+            Found::Incomplete => return Next::Incomplete,
+            Found::Frame { unit_id, pdu, len } => {
+                let place = match request_data_len(pdu[0], &pdu[1..]) {
+                    DataLen::Known(_) => Place::Start,
+                    DataLen::Incomplete | DataLen::Unknown => Place::AfterUnknown,
+                };
+                (place, Next::Frame { unit_id, pdu, len })
+            }
+            Found::Damaged { len } => (Place::AfterDamaged, Next::Damaged { len }),
+            Found::Endless => (Place::Lost, Next::Damaged { len: received }),
+        };
+        self.place = place;
+        next
+    }
+
+    /// When the last byte of the data of an unknown function equals the first byte of the CRC of the
+    /// bytes before it, the CRC matches one byte too early. The remaining byte is 0. But unit 0 may also
+    /// be the next one: of both frames, the one that is complete first shows it.
+    fn after_unknown<'a>(&mut self, bytes: &'a [u8]) -> Next<'a> {
+        let (here, behind) = (known(bytes), known(&bytes[1..]));
+        match (here, behind) {
+            (Some(Found::Frame { len, .. }), Some(Found::Frame { len: other, .. }))
+                if 1 + other < len =>
+            {
+                self.stray_zero()
+            }
+            (Some(found @ Found::Frame { .. }), _) => self.found(found, bytes.len()),
+            (_, Some(Found::Frame { .. })) => self.stray_zero(),
+            (Some(Found::Incomplete), _) | (_, Some(Found::Incomplete)) => Next::Incomplete,
+            _ => self.found(Found::Endless, bytes.len()),
+        }
+    }
+
+    fn stray_zero(&mut self) -> Next<'static> {
+        self.place = Place::Start;
+        Next::Stray { len: 1 }
     }
 }
 
-/// After a damaged frame: where the next frames start, if `bytes` end with complete frames of known
-/// functions. They must fill the bytes to the end: data of a damaged frame that look like a frame
-/// are not a request.
-///
-/// ```
-/// use holdfast_protocol::frame::rtu;
-///
-/// let received = [0, 17, 3, 0, 107, 0, 3, 0x76, 0x87];
-/// assert_eq!(rtu::resync(&received), Some(1));
-/// assert_eq!(rtu::resync(&received[..8]), None);
-/// ```
-pub fn resync(bytes: &[u8]) -> Option<usize> {
-    // Where earlier attempts came by: all of them failed.
-    let mut tried = [false; 2 * MAX_LEN];
-    (1..bytes.len().min(MAX_LEN + 1)).find(|start| {
-        let mut at = *start;
-        while at < bytes.len() {
-            if tried.get_mut(at).is_some_and(|tried| mem::replace(tried, true)) {
-                return false;
-            }
-            let Some(len) = known_and_whole(&bytes[at..]) else { return false };
-            at += len;
-        }
-        true
+/// What bytes start with, if they start with a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Found<'a> {
+    Incomplete,
+    Frame {
+        unit_id: u8,
+        pdu: &'a [u8],
+        len: usize,
+    },
+    Damaged {
+        len: usize,
+    },
+    /// Longer than any frame, or no frame at all.
+    Endless,
+}
+
+fn request(bytes: &[u8]) -> Found<'_> {
+    known(bytes).unwrap_or_else(|| first_fit(bytes))
+}
+
+/// `None` for a function of unknown length.
+fn known(bytes: &[u8]) -> Option<Found<'_>> {
+    let [_, function_code, data @ ..] = bytes else { return Some(Found::Incomplete) };
+    let len = match request_data_len(*function_code, data) {
+        DataLen::Known(len) => 2 + len + 2,
+        DataLen::Incomplete => return Some(Found::Incomplete),
+        DataLen::Unknown => return None,
+    };
+    Some(match bytes.get(..len) {
+        _ if len > MAX_LEN => Found::Endless,
+        None => Found::Incomplete,
+        Some(frame) => whole(frame),
     })
+}
+
+/// A frame of an unknown function: it ends where the CRC first matches.
+fn first_fit(bytes: &[u8]) -> Found<'_> {
+    let longest = bytes.len().min(MAX_LEN);
+    let mut crc = CRC_START;
+    let ends_here = |len: &usize| {
+        crc = extended(crc, bytes[len - 1]);
+        *len >= 4 && crc == 0
+    };
+    match (1..=longest).find(ends_here) {
+        Some(len) => whole(&bytes[..len]),
+        None if longest == MAX_LEN => Found::Endless,
+        None => Found::Incomplete,
+    }
+}
+
+fn whole(frame: &[u8]) -> Found<'_> {
+    let len = frame.len();
+    match decode(frame) {
+        Ok((unit_id, pdu)) => Found::Frame { unit_id, pdu, len },
+        Err(_) => Found::Damaged { len },
+    }
 }
 
 enum DataLen {
@@ -190,35 +303,6 @@ fn request_data_len(function_code: u8, data: &[u8]) -> DataLen {
         },
         _ => DataLen::Unknown,
     }
-}
-
-fn first_fit(bytes: &[u8]) -> Next<'_> {
-    let longest = bytes.len().min(MAX_LEN);
-    let mut crc = CRC_START;
-    let ends_here = |len: &usize| {
-        crc = extended(crc, bytes[len - 1]);
-        *len >= 4 && crc == 0
-    };
-    let Some(first) = (1..=longest).find(ends_here) else {
-        return if longest == MAX_LEN { Next::Broken } else { Next::Incomplete };
-    };
-    // When the last byte of the data equals the first byte of the CRC of the bytes before it, the
-    // CRC matches one byte too early. The remaining byte is 0, and no frame for unit 0 starts with
-    // it.
-    let longer = first < longest && bytes[first] == 0 && known_and_whole(&bytes[first..]).is_none();
-    let len = first + usize::from(longer);
-    match decode(&bytes[..len]) {
-        Ok((unit_id, pdu)) => Next::Frame { unit_id, pdu, len },
-        Err(_) => Next::Damaged { len },
-    }
-}
-
-/// The length of the complete frame of a known function that bytes start with.
-fn known_and_whole(bytes: &[u8]) -> Option<usize> {
-    let [_, function_code, data @ ..] = bytes else { return None };
-    let DataLen::Known(len) = request_data_len(*function_code, data) else { return None };
-    let len = 2 + len + 2;
-    decode(bytes.get(..len)?).is_ok().then_some(len)
 }
 
 /// The length of the frame at the start of `bytes`, according to its function code. The frame
@@ -274,7 +358,6 @@ mod tests {
     extern crate std;
 
     use std::cell::Cell;
-    use std::vec;
     use std::vec::Vec;
 
     use proptest::prelude::*;
@@ -297,29 +380,13 @@ mod tests {
     }
 
     /// The search for the end of a frame with a CRC of its own for each length.
-    fn plain_first_fit(bytes: &[u8]) -> Next<'_> {
+    fn plain_first_fit(bytes: &[u8]) -> Found<'_> {
         let longest = bytes.len().min(MAX_LEN);
-        let Some(first) = (4..=longest).find(|len| decode(&bytes[..*len]).is_ok()) else {
-            return if longest == MAX_LEN { Next::Broken } else { Next::Incomplete };
-        };
-        let longer =
-            first < longest && bytes[first] == 0 && known_and_whole(&bytes[first..]).is_none();
-        let len = first + usize::from(longer);
-        match decode(&bytes[..len]) {
-            Ok((unit_id, pdu)) => Next::Frame { unit_id, pdu, len },
-            Err(_) => Next::Damaged { len },
+        match (4..=longest).find(|len| decode(&bytes[..*len]).is_ok()) {
+            Some(len) => whole(&bytes[..len]),
+            None if longest == MAX_LEN => Found::Endless,
+            None => Found::Incomplete,
         }
-    }
-
-    /// The search for frames after a damaged one that tries every start without a memory.
-    fn plain_resync(bytes: &[u8]) -> Option<usize> {
-        (1..bytes.len().min(MAX_LEN + 1)).find(|start| {
-            let mut rest = &bytes[*start..];
-            while let Some(len) = known_and_whole(rest) {
-                rest = &rest[len..];
-            }
-            rest.is_empty()
-        })
     }
 
     fn frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {
@@ -328,26 +395,16 @@ mod tests {
         frame[..len].to_vec()
     }
 
-    /// Garbage and frames in any order, of known and unknown functions, and frames cut short.
-    fn stream() -> impl Strategy<Value = Vec<u8>> {
-        let code = prop_oneof![prop::sample::select(vec![3, 7, 16, 17, 23, 24, 43]), any::<u8>()];
-        let data = prop::collection::vec(any::<u8>(), 0..12);
-        let framed = (any::<u8>(), code, data)
-            .prop_map(|(unit, code, data)| frame(unit, &[&[code], &data[..]].concat()));
-        let known = any::<u8>().prop_map(|unit| frame(unit, &[3, 0, 0, 0, 1]));
-        let cut = framed.clone().prop_map(|frame| frame[..frame.len() - 1].to_vec());
-        let garbage = prop::collection::vec(any::<u8>(), 0..300);
-        let same = (any::<u8>(), 0..300_usize).prop_map(|(byte, count)| vec![byte; count]);
-        let parts = prop_oneof![4 => known, 4 => framed, 1 => cut, 1 => garbage, 1 => same];
-        prop::collection::vec(parts, 0..12).prop_map(|parts| parts.concat())
-    }
-
     proptest! {
         #[test]
-        fn the_searches_find_what_plain_searches_find(bytes in stream()) {
-            prop_assert_eq!(resync(&bytes), plain_resync(&bytes));
-            for start in 0..bytes.len().min(5) {
-                prop_assert_eq!(first_fit(&bytes[start..]), plain_first_fit(&bytes[start..]));
+        fn the_search_for_an_end_finds_what_a_plain_search_finds(
+            unit_id: u8,
+            code: u8,
+            data in prop::collection::vec(any::<u8>(), 0..300),
+        ) {
+            let framed = frame(unit_id, &[&[code], &data[..data.len().min(252)]].concat());
+            for bytes in [&framed, &framed[..framed.len() - 1], &data] {
+                prop_assert_eq!(first_fit(bytes), plain_first_fit(bytes));
             }
         }
     }
@@ -355,20 +412,10 @@ mod tests {
     #[test]
     fn the_search_for_an_end_looks_at_each_byte_once() {
         let garbage = [0x64; 4096];
-        assert_eq!(plain_first_fit(&garbage), Next::Broken);
-        assert_eq!(next_request(&garbage), Next::Broken);
-        assert_eq!(steps(|| next_request(&garbage)), MAX_LEN);
+        assert_eq!(plain_first_fit(&garbage), Found::Endless);
+        assert_eq!(request(&garbage), Found::Endless);
+        assert_eq!(steps(|| request(&garbage)), MAX_LEN);
         // Each length with a CRC of its own: 2 to 254 bytes.
         assert_eq!(steps(|| plain_first_fit(&garbage)), (2..=254).sum());
-    }
-
-    #[test]
-    fn frames_that_do_not_reach_the_end_are_looked_at_once() {
-        let frames = frame(1, &[17]).repeat(1000);
-        let bytes = [&[0x64][..], &frames, &[1]].concat();
-        assert_eq!(resync(&bytes), plain_resync(&bytes));
-        // One pass over the frames, of whose bytes a CRC covers two.
-        assert!(steps(|| resync(&bytes)) <= frames.len());
-        assert!(steps(|| plain_resync(&bytes)) > 30 * frames.len());
     }
 }
