@@ -77,13 +77,15 @@ def count(
     kind: object,
     times: int = 1,
     observed: bool = True,
+    throttle: Throttle | None = None,
 ) -> None:
     """Does what `limited` does for an event that occurred so many `times`.
 
-    Observers get it if `observed`.
+    Observers get it if `observed`. `throttle` is the limit, in place of that of all events.
     """
     by = origin(event, fields)
-    admitted, held_back = _REFUSALS.admit((event, kind), time.monotonic(), by, times)
+    limit = _REFUSALS if throttle is None else throttle
+    admitted, held_back = limit.admit((event, kind), time.monotonic(), by, times)
     if admitted:
         more = {"held_back": held_back} if held_back else {}
         write(level, event, **fields, **more)

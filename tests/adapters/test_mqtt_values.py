@@ -47,6 +47,11 @@ REGISTER = {"area": "holding_registers", "address": 4}
 WRITTEN: list[tuple[dict[str, Any], str, list[int]]] = [
     (REGISTER | {"type": "uint16"}, "21", [21]),
     (REGISTER | {"type": "int16", "scale": 0.1}, "-21.5", [65536 - 215]),
+    (REGISTER | {"type": "int16", "scale": 0.1}, "21.53", [215]),
+    (REGISTER | {"type": "int16", "scale": 0.1}, "-21.57", [65536 - 216]),
+    (REGISTER | {"type": "uint16"}, "1.5", [2]),
+    (REGISTER | {"type": "uint16", "round": "nearest"}, "2.5", [2]),
+    (REGISTER | {"type": "uint16[2]", "scale": 0.5}, "[0.74, 1]", [1, 2]),
     (REGISTER | {"type": "float32"}, "21.5", list(struct.unpack(">HH", struct.pack(">f", 21.5)))),
     (REGISTER | {"type": "uint32", "order": "CDAB"}, "65538", [2, 1]),
     (REGISTER | {"type": "uint16", "states": {0: "off", 3: "fault"}}, "fault", [3]),
@@ -73,7 +78,7 @@ def test_a_coil_takes_words(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(
-    "payload", [b"", b"warm", b"21,5", b"\xff", b"1e999", b"70000", b"1.5", b"9" * 5000, b"nan"]
+    "payload", [b"", b"warm", b"21,5", b"\xff", b"1e999", b"70000", b"65535.5", b"9" * 5000, b"nan"]
 )
 def test_a_bad_payload_is_refused_counted_and_logged(
     rig: Rig, payload: bytes, caplog: pytest.LogCaptureFixture
@@ -89,6 +94,62 @@ def test_a_bad_payload_is_refused_counted_and_logged(
     probe.publish(TOPIC, "5")
     running.wait_until_received(2)
     assert rig.registers(4, 1) == [5]
+
+
+REFUSED: list[tuple[dict[str, Any], str, str, float | None]] = [
+    (
+        {"scale": 0.1, "round": "exact"},
+        "21.53",
+        "21.53 is between two values of the registers, allowed: steps of 0.1",
+        0.1,
+    ),
+    ({"scale": 0.1}, "6553.6", "65536 is outside 0 to 65535 of uint16", 0.1),
+    ({"scale": 0.5, "max": 20.3}, "20.3", "20.3 is 20.5 in steps of 0.5, outside to 20.3", 0.5),
+    ({"scale": 0.1}, "warm", "'warm' is not a number", 0.1),
+    (
+        {"states": {0: "off", 1: "on"}},
+        "0.7",
+        "0.7 is between two values of the registers, allowed: steps of 1",
+        None,
+    ),
+]
+
+
+@pytest.mark.parametrize(("tag", "text", "cause", "step"), REFUSED)
+def test_a_refusal_names_the_tag_the_value_the_step_and_the_cause(
+    rig: Rig,
+    tag: dict[str, Any],
+    text: str,
+    cause: str,
+    step: float | None,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    running, probe = started(rig, REGISTER | tag)
+    probe.publish(TOPIC, text)
+    running.wait_until_received(1)
+    [fields] = refusals(caplog)
+    named = {key: fields.get(key) for key in ("tag", "value", "step", "cause", "address")}
+    expected = {"tag": "tag", "value": text, "step": step, "cause": cause, "address": 4}
+    assert named == expected
+    assert rig.registers(4, 1) == [0]
+
+
+def test_of_the_bad_values_of_a_topic_one_is_logged(
+    rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    running, probe = started(rig, REGISTER | {"round": "exact"})
+    for number in range(9):
+        probe.publish(TOPIC, f"{number}.5")
+    running.wait_until_received(9)
+    counts: Any = rig.memory_access.counts()
+    assert counts["refused"] == {"invalid_value": 9}
+    assert [fields["value"] for fields in refusals(caplog)] == ["0.5"]
+
+
+def refusals(caplog: pytest.LogCaptureFixture) -> list[dict[str, Any]]:
+    """The fields of the refusals in the log."""
+    records = [record for record in caplog.records if record.message == "ingest_refused"]
+    return [vars(record)["fields"] for record in records]
 
 
 def test_values_and_commands_have_topics_of_their_own(rig: Rig) -> None:

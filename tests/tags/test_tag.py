@@ -76,6 +76,41 @@ def test_a_value_that_does_not_fit_is_refused(
         tag(**settings).raw(value)
 
 
+@pytest.mark.parametrize(
+    ("value", "settings", "number"),
+    [
+        (21.53, {"scale": 0.1}, 215),
+        (-21.57, {"scale": 0.1}, -216),
+        (21.53, {"scale": -0.1, "offset": 20}, -15),
+        (2.5, {}, 2),
+        (3.5, {}, 4),
+        ([0.2, 0.8], {"type": "int16[2]"}, [0, 1]),
+        (21.5, {"type": "float32"}, 21.5),
+    ],
+)
+def test_a_value_between_two_steps_becomes_the_nearest_if_the_tag_or_the_writer_says_so(
+    value: Any, settings: dict[str, Any], number: Any
+) -> None:
+    assert tag(**settings).raw(value, default_round="nearest") == number
+    if not tag(**settings).is_stepped:
+        return
+    assert tag(**settings, round="nearest").raw(value) == number
+    with pytest.raises(DoesNotFit, match="between two values"):
+        tag(**settings, round="exact").raw(value, default_round="nearest")
+
+
+def test_limits_hold_for_the_rounded_value() -> None:
+    it = tag(scale=0.5, min=0.3, max=20.3, round="nearest")
+    assert (it.raw(0.5), it.raw(20.1)) == (1, 40)
+    with pytest.raises(DoesNotFit, match=r"20.3 is 20.5 in steps of 0.5, outside 0.3 to 20.3"):
+        it.raw(20.3)
+
+
+def test_a_state_is_never_rounded() -> None:
+    with pytest.raises(DoesNotFit, match="between two values"):
+        tag(states={0: "off", 1: "on"}).raw(0.7, default_round="nearest")
+
+
 def test_states_have_names_both_ways() -> None:
     it = tag(states={0: "off", 1: "running"})
     assert [it.state(it.value(raw)) for raw in (0, 1, 2)] == ["off", "running", None]
@@ -107,6 +142,9 @@ def test_markers_and_nan_are_no_values() -> None:
         ({"deadband": -1}, "deadband", "allowed: a finite number from 0"),
         ({"min": 2, "max": 1}, "max", "max is 1, allowed: at least min, 2"),
         ({"type": "float32", "states": {0: "off"}}, "states", "states of float32"),
+        ({"type": "float32", "round": "nearest"}, "round", "only with integers without states"),
+        ({"states": {0: "off"}, "round": "nearest"}, "round", "round is nearest, allowed: only"),
+        ({"type": "string:4", "round": "exact"}, "round", "only with integers without states"),
         ({"states": {0: "off", 1: "off"}}, "states", "two states have the name 'off'"),
         ({"area": "input_registers", "writable": True}, "writable", "input_registers can't be"),
         ({"type": "bit:3[2]", "writable": True}, "writable", "only one bit can"),

@@ -35,7 +35,7 @@ COLUMNS = (
     "description",
 )
 """The columns of CSV, in this order if the file does not name them."""
-MORE_COLUMNS = ("min", "max", "deadband", "encoding", "null")
+MORE_COLUMNS = ("min", "max", "deadband", "round", "encoding", "null")
 """Columns that a file can have if it names its columns."""
 
 _SHORT = {
@@ -50,7 +50,7 @@ _SHORT = {
 }
 """Names of areas that lists of manufacturers have."""
 
-_TEXT = ("name", "type", "order", "unit", "description", "encoding")
+_TEXT = ("name", "type", "order", "unit", "description", "encoding", "round")
 
 
 def load_tags(path: Path | str) -> TagList:

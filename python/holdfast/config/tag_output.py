@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 
+_PLAIN = ("encoding", "scale", "offset", "unit", "writable", "min", "max", "deadband", "round")
+"""Keys that are written if they are not the default."""
+
 SWAPPED_BYTES = ("BADC", "DCBA")
 """The orders that differ in a single register from the others."""
 
@@ -73,7 +76,7 @@ def _settings(tag: Tag, order: str) -> dict[str, Any]:
         data["type"] = tag.type
     if _has_other_order(tag, order):
         data["order"] = tag.order
-    for key in ("encoding", "scale", "offset", "unit", "writable", "min", "max", "deadband"):
+    for key in _PLAIN:
         value = getattr(tag, key)
         if value != getattr(Tag, key):
             data[key] = scale_as_data(value) if isinstance(value, RegisterScale) else value

@@ -14,6 +14,7 @@ from holdfast.config.memories import Register
 from holdfast.config.scalars import NAME_KEYS, Name, NotNull, whole_number
 from holdfast.config.tag_scale import SCALE_SCHEMA, ScaleConfig, parse_scale, written_scale
 from holdfast.tags import Tag, TagList
+from holdfast.tags.tag import Rounding
 from holdfast.types import Area
 
 Number = Annotated[float, Field(allow_inf_nan=False), whole_number]
@@ -60,6 +61,8 @@ class TagConfig(Model):
     """What the registers hold when no value is available, such as 65535 or nan."""
     deadband: Number = 0.0
     """How much a value must change to count as changed."""
+    round: Annotated[Rounding | None, NotNull()] = None
+    """What happens to a value between two steps. Default: exact for writes, nearest in mqtt.map."""
     description: str = ""
     """A description, for people."""
 

@@ -207,13 +207,17 @@ class MemoryAccess:
             self._counts.reads += 1
         return follower
 
-    def refuse(self, refused: Refused, who: str, peer: str) -> None:
+    def refuse(
+        self, refused: Refused, who: str, peer: str, *, throttle: logs.Throttle | None = None
+    ) -> None:
         """Counts, logs and audits a refused write. Adapters call it for writes they refuse.
+
+        `throttle` limits the lines in the log, in place of the limit for all refusals.
 
         A write without a valid token has no line of its own: everybody can send any number of them.
         """
         by_nobody = refused.reason == "unauthorized"
-        self._note(refused, who, peer, observed=by_nobody)
+        self._note(refused, who, peer, observed=by_nobody, throttle=throttle)
         if self._audit is not None and not refused.is_recorded and not by_nobody:
             self._audit.write(
                 listener=self.name,
@@ -228,7 +232,15 @@ class MemoryAccess:
         """Logs and counts a refusal without a line of its own in the audit log, as of a read."""
         self._note(refused, who, peer, observed=True)
 
-    def _note(self, refused: Refused, who: str, peer: str, *, observed: bool) -> None:
+    def _note(
+        self,
+        refused: Refused,
+        who: str,
+        peer: str,
+        *,
+        observed: bool,
+        throttle: logs.Throttle | None = None,
+    ) -> None:
         fields = {
             "adapter": self.name,
             "peer": peer,
@@ -237,7 +249,14 @@ class MemoryAccess:
             "reason": refused.reason,
         }
         kind = (self.name, refused.reason)
-        logs.count(logging.WARNING, "ingest_refused", fields, kind=kind, observed=observed)
+        logs.count(
+            logging.WARNING,
+            "ingest_refused",
+            fields,
+            kind=kind,
+            observed=observed,
+            throttle=throttle,
+        )
         with self._lock:
             self._counts.refuse(refused.reason)
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 from holdfast.integers import as_integer
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_LIMITS, WRITE_LIMITS
@@ -18,6 +18,9 @@ from holdfast.types import AREAS, BIT_AREAS, Area
 from holdfast.values import ConversionError, DoesNotFit, codec_for
 from holdfast.values.digits import shortest
 from holdfast.values.types import Type, parsed
+
+Rounding: TypeAlias = Literal["nearest", "exact"]
+"""What happens to a value between two values of the registers: rounded, or refused."""
 
 INTEGERS = ("int", "uint", "bcd")
 """What the names of integer types begin with."""
@@ -68,6 +71,8 @@ class Tag:
     """What the registers hold when no value is available; NaN never is one."""
     deadband: float = 0
     """How much a value must change to count as changed."""
+    round: Rounding | None = None
+    """What happens to a value between two steps; `None`: whoever writes decides."""
     description: str = ""
 
     def __post_init__(self) -> None:
@@ -129,6 +134,9 @@ class Tag:
             names = list(self.states.values())
             twice = next(name for name in names if names.count(name) > 1)
             raise TagError("states", f"two states have the name {twice!r}")
+        if self.round is not None and not self.is_stepped:
+            message = "allowed: only with integers without states"
+            raise TagError("round", f"round is {self.round}, {message}")
 
     def _check_source(self) -> None:
         """A scale must be readable in the request that reads the value."""
@@ -196,6 +204,11 @@ class Tag:
     def is_number(self) -> bool:
         """Whether the values are numbers, and not bits or text."""
         return self.is_float or self.of_type.base.startswith(INTEGERS)
+
+    @property
+    def is_stepped(self) -> bool:
+        """Whether the values are numbers in steps of `scale`, and not names."""
+        return self.is_number and not self.is_float and not self.states
 
     @property
     def unwritable(self) -> str | None:
@@ -270,16 +283,17 @@ class Tag:
         """The name of a value, if it has one."""
         return self.states.get(value) if isinstance(value, int) else None
 
-    def raw(self, value: Any) -> Any:
+    def raw(self, value: Any, *, default_round: Rounding = "exact") -> Any:
         """What the registers have to hold for a value, or for the name of one.
 
-        Raises `DoesNotFit` for a value that they can't hold exactly, and for one below `min` or
-        above `max`. Floating-point registers take the nearest number.
+        Raises `DoesNotFit` for a value that they can't hold, and for one below `min` or above
+        `max`. `default_round` is for a tag without `round`. A number that stands for a state is
+        never rounded. Floating-point registers take the nearest number.
         """
         if hasattr(value, "tolist"):
             value = value.tolist()
         if isinstance(value, list | tuple):
-            return [self.raw(item) for item in value]
+            return [self.raw(item, default_round=default_round) for item in value]
         if isinstance(value, str) and self.states:
             value = self._named(value)
         if not self.is_number:
@@ -290,17 +304,25 @@ class Tag:
             raise DoesNotFit(f"{value} is not a finite number")
         if isinstance(self.scale, RegisterScale):
             raise DoesNotFit(self._unscaled)
-        least, most = self.min, self.max
-        if (least is not None and value < least) or (most is not None and value > most):
-            allowed = f"{'' if least is None else least} to {'' if most is None else most}"
-            raise DoesNotFit(f"{value} is outside {allowed.strip()}")
+        self._check_limits(value, f"{value} is")
         if self.is_float:
             return value if self._linear.is_identity else float(self._linear.number(value))
         exact = self._linear.number(value)
-        if exact.denominator != 1:
-            steps = f"allowed: steps of {abs(self.scale)}"
-            raise DoesNotFit(f"{value} is between two values of the registers, {steps}")
-        return exact.numerator
+        if exact.denominator == 1:
+            return exact.numerator
+        steps = f"steps of {abs(self.scale)}"
+        if not self.is_stepped or (self.round or default_round) == "exact":
+            raise DoesNotFit(f"{value} is between two values of the registers, allowed: {steps}")
+        nearest = round(exact)
+        rounded = self._linear.value(nearest)
+        self._check_limits(rounded, f"{value} is {rounded} in {steps},")
+        return nearest
+
+    def _check_limits(self, value: float, found: str) -> None:
+        least, most = self.min, self.max
+        if (least is not None and value < least) or (most is not None and value > most):
+            allowed = f"{'' if least is None else least} to {'' if most is None else most}"
+            raise DoesNotFit(f"{found} outside {allowed.strip()}")
 
     def _named(self, name: str) -> int:
         for value, known in self.states.items():

@@ -20,6 +20,9 @@ MAX_BYTES = 8 * 2**20
 MAX_TOPIC = 200
 """Characters of a topic that are logged."""
 
+BAD_VALUE_SILENCE = 600.0
+"""Seconds before another bad value of the same topic is logged."""
+
 _NOBODY = Grant("no subscription", (), (), writes=False)
 
 
@@ -32,6 +35,7 @@ class Inbox:
         self._memory_access = memory_access
         self._filters, self._values = filters, values
         self._broker = broker
+        self._bad_values = logs.Throttle(burst=0, window=BAD_VALUE_SILENCE)
         self.received = 0
 
     def take(self, message: Publish) -> dict[str, object]:
@@ -52,7 +56,7 @@ class Inbox:
             self._memory_access.refuse(refused, grant.name, peer)
         except BadValue as error:
             refused = Refused("invalid_value", str(error), **error.where)
-            self._memory_access.refuse(refused, grant.name, peer)
+            self._memory_access.refuse(refused, grant.name, peer, throttle=self._bad_values)
         except Refused as error:
             refused = error
         except Exception:  # An error in one message must not stop the adapter.

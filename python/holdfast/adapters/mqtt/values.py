@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from holdfast.ingest import Grant
+from holdfast.ingest.memory_access import MAX_SHOWN
 from holdfast.tags.text import value_from
 from holdfast.values import ConversionError, codec_for
 
@@ -18,7 +19,11 @@ MAX_BYTES = 4096
 
 
 class BadValue(Exception):
-    """A payload that is no value of its tag. `where` is the place in memory."""
+    """A payload that is no value of its tag.
+
+    `where` is the place in memory, the tag, the payload as text with a limited length, and the
+    cause.
+    """
 
     def __init__(self, detail: str, where: dict[str, Any]) -> None:
         super().__init__(detail)
@@ -40,12 +45,20 @@ class Value:
             if len(payload) > MAX_BYTES:
                 raise ValueError(f"{len(payload)} bytes, allowed: {MAX_BYTES}")
             text = bytes(payload).decode()
-            values = self._codec.encode(self._tag.raw(value_from(self._tag, text)))
+            value = value_from(self._tag, text)
+            values = self._codec.encode(self._tag.raw(value, default_round="nearest"))
         except UnicodeDecodeError:
-            raise BadValue("the payload is not UTF-8", self._where) from None
+            raise self._bad(payload, "the payload is not UTF-8") from None
         except (ConversionError, ValueError, TypeError, OverflowError) as error:
-            raise BadValue(str(error), self._where) from None
+            raise self._bad(payload, str(error)) from None
         return {**self._where, "values": list(values)}
+
+    def _bad(self, payload: memoryview, cause: str) -> BadValue:
+        shown = bytes(payload[: 4 * MAX_SHOWN]).decode(errors="replace")
+        shown = shown if len(shown) <= MAX_SHOWN else f"{shown[:MAX_SHOWN]}…"
+        step = {"step": abs(self._tag.scale)} if self._tag.is_stepped else {}
+        where = {**self._where, "tag": self._tag.name, "value": shown, **step, "cause": cause}
+        return BadValue(f"{self._tag.name}: {cause}", where)
 
 
 class Values:
