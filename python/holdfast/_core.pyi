@@ -150,13 +150,20 @@ class Memory:
         """Reads `count` bits (0 or 1) or registers (0 to 65535) from `address`, as one snapshot.
 
         Raises `OutOfRange` outside the area, `ValueError` for an unknown area or a count below 1,
-        `OSError` while the log of the memory does not let it be read.
+        `OSError` while the log of the memory does not let it be read, or the values of a mirrored
+        device are too old.
         """
 
-    def mirror(self, ranges: Sequence[tuple[Area, int, int]]) -> None:
+    def mirror(
+        self,
+        reserved: Sequence[tuple[Area, int, int]],
+        aging: Sequence[tuple[Area, int, int, MirrorAge]] = (),
+    ) -> None:
         """Reserves ranges (area, address, count) for the poller; others can't write them any more.
 
-        They replace those of an earlier call. Raises `ValueError` for a range outside its area.
+        `aging` are ranges whose age is known, reserved or not; while one is too old, only the
+        poller uses it. Both replace those of an earlier call. Raises `ValueError` for a range
+        outside its area.
         """
 
     def read_many(self, ranges: Sequence[tuple[Area, int, int]]) -> list[list[int]]:
@@ -193,6 +200,29 @@ class Memory:
         callback that writes to the same memory is called for that write as well, unless
         `clients_only` is set. Close the result to end the calls; they also end with the program.
         """
+
+class Stale(OSError):
+    """The range mirrors a device, and its values are older than allowed."""
+
+@final
+class MirrorAge:
+    """How old the values of a range are: a write of the poller to the whole range renews them.
+
+    They are stale `after` seconds, and before the first write. With `refuses`, a memory refuses to
+    read and write them then. Thread-safe; the time goes on while the machine is suspended.
+    """
+
+    def __new__(cls, after: float, *, refuses: bool) -> MirrorAge: ...
+    def set(self, after: float, *, refuses: bool) -> None:
+        """Changes the settings. The age of the values stays."""
+
+    @property
+    def seconds(self) -> float | None:
+        """The age of the last values; `None` if there are none yet."""
+
+    @property
+    def stale_for(self) -> float | None:
+        """For how many seconds the values have been stale; `None` if they are not."""
 
 @final
 class MemoryFile:

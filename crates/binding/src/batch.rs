@@ -142,6 +142,7 @@ const fn reason(refusal: Refusal) -> &'static str {
         Refusal::GateBit => "gate_bit",
         Refusal::WrongLength => "wrong_length",
         Refusal::Mirrored => "mirrored",
+        Refusal::Stale => "stale",
         Refusal::NotRegisters => "not_registers",
         // What is wrong with the log is in its status.
         Refusal::Unavailable | Refusal::Behind | Refusal::Differs => "log_unavailable",

@@ -2,13 +2,13 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use holdfast_memory::Follower as CoreFollower;
+use holdfast_memory::{Follower as CoreFollower, Refusal};
 use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
 
 use crate::listed::listed;
-use crate::memory::{Memory, Range, integer};
+use crate::memory::{Memory, Range, Stale, integer};
 
 #[pyclass(frozen, module = "holdfast")]
 pub struct Follower {
@@ -38,8 +38,10 @@ impl Follower {
     fn changes<'py>(&self, py: Python<'py>) -> PyResult<(u64, Vec<Change<'py>>)> {
         let looked =
             py.detach(|| self.core.lock().unwrap_or_else(PoisonError::into_inner).changes());
-        let (writes, changes) =
-            looked.map_err(|refusal| PyOSError::new_err(refusal.to_string()))?;
+        let (writes, changes) = looked.map_err(|refusal| match refusal {
+            Refusal::Stale => Stale::new_err(refusal.to_string()),
+            _ => PyOSError::new_err(refusal.to_string()),
+        })?;
         let told = changes.into_iter().map(|change| {
             let values = listed(py, change.area, change.count, &change.bytes)?;
             Ok((change.range, change.address, values))

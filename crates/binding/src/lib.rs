@@ -20,6 +20,7 @@ mod listener;
 mod log;
 mod memory;
 mod memory_file;
+mod mirror_age;
 mod peer;
 mod poller;
 mod raw_ingest;
@@ -52,9 +53,11 @@ mod _core {
     #[pymodule_export]
     use super::log::{Log, LogError, LogFollower};
     #[pymodule_export]
-    use super::memory::{Memory, OutOfRange};
+    use super::memory::{Memory, OutOfRange, Stale};
     #[pymodule_export]
     use super::memory_file::{MemoryFile, read_memory_file, release_memory_file};
+    #[pymodule_export]
+    use super::mirror_age::MirrorAge;
     #[pymodule_export]
     use super::poller::{PolledDevice, Poller, Results, plan_blocks, tell_disabled};
     #[pymodule_export]

@@ -3,13 +3,15 @@
 use std::sync::Arc;
 
 use holdfast_memory::{
-    Access, Area, Gate, GateMode, Layout, Memory as Core, Mirrored, Read, Refusal, Span, Write,
+    Access, Area, Freshness, Gate, GateMode, Layout, Memory as Core, Mirrored, Read, Refusal, Span,
+    Write,
 };
 use pyo3::exceptions::{PyIndexError, PyOSError, PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyByteArray, PyBytes, PyDict, PyInt, PyList, PyString};
 
 use crate::listed::listed;
+use crate::mirror_age::MirrorAge;
 use crate::write_queue::WriteQueue;
 
 pyo3::create_exception!(
@@ -17,6 +19,13 @@ pyo3::create_exception!(
     OutOfRange,
     PyIndexError,
     "The range is not inside the area. Nothing was read or written."
+);
+
+pyo3::create_exception!(
+    holdfast._core,
+    Stale,
+    PyOSError,
+    "The range mirrors a device, and its values are older than allowed."
 );
 
 /// A size from address 0, or a start and a size.
@@ -93,12 +102,23 @@ impl Memory {
 
     /// Reserves ranges (area, address, count) for the poller; others can't write them any more.
     ///
-    /// They replace those of an earlier call. Raises `ValueError` for a range outside its area.
-    fn mirror(&self, ranges: Vec<(String, u16, usize)>) -> PyResult<()> {
-        let ranges = ranges
+    /// `aging` are ranges whose age is known, reserved or not; while one is too old, only the
+    /// poller uses it. Both replace those of an earlier call. Raises `ValueError` for a range
+    /// outside its area.
+    #[pyo3(signature = (reserved, aging=Vec::new()))]
+    fn mirror(
+        &self,
+        reserved: Vec<(String, u16, usize)>,
+        aging: Vec<(String, u16, usize, PyRef<'_, MirrorAge>)>,
+    ) -> PyResult<()> {
+        let reserved = reserved
             .into_iter()
-            .map(|(area, address, count)| Ok(Mirrored { area: named(&area)?, address, count }));
-        let ranges = ranges.collect::<PyResult<_>>()?;
+            .map(|(area, address, count)| Ok(Mirrored::reserved(named(&area)?, address, count)));
+        let aging = aging.into_iter().map(|(area, address, count, age)| {
+            let freshness = Some(Arc::clone(&age.core) as Arc<dyn Freshness>);
+            Ok(Mirrored { area: named(&area)?, address, count, is_reserved: false, freshness })
+        });
+        let ranges = reserved.chain(aging).collect::<PyResult<_>>()?;
         self.core.mirror(ranges).map_err(|error| PyValueError::new_err(error.to_string()))
     }
 
@@ -123,7 +143,8 @@ impl Memory {
     /// Reads `count` bits (0 or 1) or registers (0 to 65535) from `address`, as one snapshot.
     ///
     /// Raises `OutOfRange` outside the area, `ValueError` for an unknown area or a count below 1,
-    /// `OSError` while the log of the memory does not let it be read.
+    /// `OSError` while the log of the memory does not let it be read, or the values of a mirrored
+    /// device are too old.
     fn read<'py>(
         &self,
         py: Python<'py>,
@@ -289,6 +310,7 @@ impl Range {
             Refusal::OutOfRange => {
                 out_of_range(memory, self.area, i128::from(self.address), self.count as i128)
             }
+            stale @ Refusal::Stale => Stale::new_err(stale.to_string()),
             kept @ (Refusal::Unavailable
             | Refusal::NotStored
             | Refusal::NotConfirmed

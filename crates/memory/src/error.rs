@@ -28,6 +28,8 @@ pub enum Refusal {
     WrongLength,
     #[error("the range mirrors a device")]
     Mirrored,
+    #[error("the range mirrors a device, and its values are older than allowed")]
+    Stale,
     #[error("only registers can be masked")]
     NotRegisters,
     #[error("what keeps the memory can't be reached, and nothing was written")]

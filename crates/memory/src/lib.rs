@@ -15,6 +15,9 @@
 //! * If a memory has a journal, the journal alone changes it: every write becomes a step, which the
 //!   journal carries out when it has kept it.
 //!
+//! * Ranges that mirror a device can have a [`Freshness`], which knows a clock: while a range is stale,
+//!   only the mirror uses it.
+//!
 //! It does no I/O, has no clock, and knows no protocol: an address is a number, a bit is a bit, a
 //! register is two bytes.
 
@@ -27,6 +30,7 @@ mod carry_out;
 mod error;
 mod follower;
 mod memory;
+mod mirrored;
 mod observer;
 mod operation;
 mod step;
@@ -34,7 +38,8 @@ mod step;
 pub use area::{Area, Layout, Span};
 pub use error::{LayoutError, Refusal, Refused};
 pub use follower::{Change, Follower};
-pub use memory::{Contents, Gate, GateMode, Memory, Mirrored, check_across, write_across};
+pub use memory::{Contents, Gate, GateMode, Memory, check_across, write_across};
+pub use mirrored::{Freshness, Mirrored};
 pub use observer::{WriteQueue, Written};
 pub use operation::{Access, Read, Write};
 pub use step::{Action, CarriedOut, Done, Journal, Operation, Outcome, Step, StepWrite};

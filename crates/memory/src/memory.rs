@@ -8,24 +8,10 @@ use crate::area::{Area, Layout, Span};
 use crate::batch::{self, Run};
 use crate::bits;
 use crate::error::{LayoutError, Refusal, Refused};
+use crate::mirrored::{Freshness, Mirrored, MirroredRanges};
 use crate::observer::{Observers, WriteQueue};
 use crate::operation::{Access, Read, Write};
 use crate::step::{Action, Done, Journal, Operation, Step, StepWrite, wait};
-
-/// Items that [`Access::Mirror`] alone writes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Mirrored {
-    pub area: Area,
-    pub address: u16,
-    pub count: usize,
-}
-
-impl Mirrored {
-    fn overlaps(&self, area: Area, address: u16, count: usize) -> bool {
-        let (start, first) = (usize::from(address), usize::from(self.address));
-        self.area == area && start < first + self.count && first < start + count
-    }
-}
 
 /// When the gate bit opens the seal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,10 +22,10 @@ pub enum GateMode {
     Level,
 }
 
-/// Which ranges may be written.
+/// Which ranges may be used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Ranges {
-    /// Those that are not reserved for [`Access::Mirror`], unless that is the access.
+    /// Those that are not reserved for [`Access::Mirror`] and not stale, unless that is the access.
     Unreserved,
     /// All: where a step was checked before.
     All,
@@ -68,7 +54,7 @@ pub struct Memory {
     rank: u64,
     layout: Layout,
     gate: Option<Gate>,
-    mirrored: RwLock<Vec<Mirrored>>,
+    mirrored: RwLock<MirroredRanges>,
     /// What carries out the writes in place of the memory, and the number of the memory in it.
     journal: OnceLock<(Arc<dyn Journal>, u16)>,
     content: RwLock<Content>,
@@ -85,7 +71,7 @@ pub struct Contents {
 #[derive(Debug)]
 struct Content {
     areas: [Box<[u8]>; 4],
-    /// [`SEALED`], [`GUARDED`], both or 0.
+    /// Any of [`SEALED`], [`GUARDED`] and [`AGING`].
     door: u8,
     /// How many times the seal opened, and how many times it closed again.
     seal_changes: (u64, u64),
@@ -99,6 +85,9 @@ const SEALED: u8 = 1;
 
 /// The journal is asked before each access.
 const GUARDED: u8 = 2;
+
+/// Mirrored ranges can be stale.
+const AGING: u8 = 4;
 
 static NEXT_RANK: AtomicU64 = AtomicU64::new(0);
 
@@ -143,32 +132,74 @@ impl Memory {
         self.gate
     }
 
-    /// Reserves ranges for [`Access::Mirror`], in place of those of an earlier call.
+    /// Sets the ranges that [`Access::Mirror`] writes, in place of those of an earlier call.
     ///
     /// # Errors
     /// [`LayoutError`] for a range outside its area. Nothing has changed then.
     pub fn mirror(&self, ranges: Vec<Mirrored>) -> Result<(), LayoutError> {
-        for &Mirrored { area, address, count } in &ranges {
+        for &Mirrored { area, address, count, .. } in &ranges {
             if count == 0 || !self.span(area).holds(address, count) {
                 return Err(LayoutError::MirrorOutside { address });
             }
         }
+        let ranges = MirroredRanges::new(ranges);
+        let ages = ranges.can_be_stale();
+        // Accesses take the two locks in the other order, so they are not held together here.
         *self.mirrored.write().unwrap_or_else(PoisonError::into_inner) = ranges;
+        let mut content = self.exclusive();
+        content.door = content.door & !AGING | if ages { AGING } else { 0 };
         Ok(())
     }
 
-    fn is_reserved(
+    fn mirrored(&self) -> RwLockReadGuard<'_, MirroredRanges> {
+        self.mirrored.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Checks whether a range may be written, as far as mirrored ranges are concerned.
+    fn unreserved(
         &self,
         access: Access,
         area: Area,
         address: u16,
         count: usize,
         ranges: Ranges,
-    ) -> bool {
-        let mirrored = || self.mirrored.read().unwrap_or_else(PoisonError::into_inner);
-        ranges == Ranges::Unreserved
-            && access != Access::Mirror
-            && mirrored().iter().any(|range| range.overlaps(area, address, count))
+    ) -> Result<(), Refusal> {
+        if ranges == Ranges::All || access == Access::Mirror {
+            return Ok(());
+        }
+        let mirrored = self.mirrored();
+        if mirrored.touched(area, address, count).any(|range| range.is_reserved) {
+            Err(Refusal::Mirrored)
+        } else if mirrored.touched(area, address, count).any(Mirrored::is_stale) {
+            Err(Refusal::Stale)
+        } else {
+            Ok(())
+        }
+    }
+
+    /// Checks whether a range may be read, as far as mirrored ranges are concerned.
+    fn fresh(
+        &self,
+        content: &Content,
+        access: Access,
+        (area, address, count): (Area, u16, usize),
+    ) -> Result<(), Refusal> {
+        let ages = content.door & AGING != 0 && access != Access::Mirror;
+        if ages && self.mirrored().touched(area, address, count).any(Mirrored::is_stale) {
+            return Err(Refusal::Stale);
+        }
+        Ok(())
+    }
+
+    /// Notes which mirrored ranges were written as a whole.
+    #[inline(never)]
+    fn renew<'w>(&self, writes: impl IntoIterator<Item = &'w Write<'w>>) {
+        let mirrored = self.mirrored();
+        for write in writes {
+            let touched = mirrored.touched(write.area, write.address, write.count);
+            let written = touched.filter(|range| range.is_in(write));
+            written.filter_map(|range| range.freshness.as_deref()).for_each(Freshness::renew);
+        }
     }
 
     /// Lets a journal carry out all writes from now on. Whoever writes waits for it; to not wait, use
@@ -219,7 +250,8 @@ impl Memory {
         operation: Operation<'_>,
         done: Done,
     ) -> Result<(), Refusal> {
-        self.admit(&self.shared(), access)?;
+        let content = self.shared();
+        self.admit(&content, access)?;
         let Some((journal, member)) = self.journal.get() else { panic!("there is no journal") };
         let member = *member;
         let action = match operation {
@@ -234,6 +266,7 @@ impl Memory {
             Operation::WriteThenRead { write, area, address, count } => {
                 self.writable(access, &[write], Ranges::Unreserved).map_err(Refused::alone)?;
                 self.holds(area, address, count)?;
+                self.fresh(&content, access, (area, address, count))?;
                 Action::WriteThenRead {
                     write: StepWrite::new(member, &write),
                     area,
@@ -242,6 +275,7 @@ impl Memory {
                 }
             }
         };
+        drop(content);
         journal.submit(Step { access, action }, done);
         Ok(())
     }
@@ -292,13 +326,29 @@ impl Memory {
     /// Reads one range.
     ///
     /// # Errors
-    /// [`Refusal::Sealed`] (for a client), then `WrongLength`, `OutOfRange`. Then `out` is unchanged.
+    /// [`Refusal::Sealed`] (for a client), then `WrongLength`, `OutOfRange`, `Stale`. Then `out` is
+    /// unchanged.
     pub fn read(&self, access: Access, read: Read<'_>) -> Result<(), Refusal> {
         let offset = self.readable(&read);
         let content = self.shared();
-        self.admit(&content, access)?;
+        if content.door != 0 {
+            self.judge_read(&content, access, (read.area, read.address, read.count), offset)?;
+        }
         content.copy_out(offset?, read);
         Ok(())
+    }
+
+    #[inline(never)]
+    fn judge_read(
+        &self,
+        content: &Content,
+        access: Access,
+        range: (Area, u16, usize),
+        offset: Result<usize, Refusal>,
+    ) -> Result<(), Refusal> {
+        self.judge(content, access)?;
+        offset?;
+        self.fresh(content, access, range)
     }
 
     /// Reads several ranges atomically: no write happens between them.
@@ -309,7 +359,9 @@ impl Memory {
         let content = self.shared();
         self.admit(&content, access).map_err(|refusal| Refused { index: 0, refusal })?;
         for (index, read) in reads.iter().enumerate() {
-            self.readable(read).map_err(|refusal| Refused { index, refusal })?;
+            let fresh = || self.fresh(&content, access, (read.area, read.address, read.count));
+            let readable = self.readable(read).and_then(|_| fresh());
+            readable.map_err(|refusal| Refused { index, refusal })?;
         }
         for read in reads {
             let Read { area, address, count, ref mut out } = *read;
@@ -323,7 +375,7 @@ impl Memory {
     /// seal is ignored. The ranges must have been checked by `holds`.
     ///
     /// # Errors
-    /// Those of [`Journal::admit`].
+    /// Those of [`Journal::admit`], then `Stale`.
     pub(crate) fn read_since(
         &self,
         seen: Option<u64>,
@@ -331,6 +383,9 @@ impl Memory {
     ) -> Result<u64, Refusal> {
         let content = self.shared();
         self.admit(&content, Access::Ingest)?;
+        for read in &*reads {
+            self.fresh(&content, Access::Ingest, (read.area, read.address, read.count))?;
+        }
         if seen != Some(content.writes) {
             for read in reads {
                 let Read { area, address, count, ref mut out } = *read;
@@ -361,8 +416,8 @@ impl Memory {
     /// Writes one range atomically.
     ///
     /// # Errors
-    /// [`Refusal::Sealed`] (for a client), then `WrongLength`, `OutOfRange`, `GateBit`, `Mirrored`.
-    /// Nothing has changed then.
+    /// [`Refusal::Sealed`] (for a client), then `WrongLength`, `OutOfRange`, `GateBit`, `Mirrored`,
+    /// `Stale`. Nothing has changed then.
     pub fn write(&self, access: Access, write: Write<'_>) -> Result<(), Refusal> {
         self.write_many(access, &[write]).map_err(|refused| refused.refusal)
     }
@@ -393,7 +448,7 @@ impl Memory {
     /// Replaces a register by `(now AND and_mask) OR (or_mask AND NOT and_mask)`, atomically.
     ///
     /// # Errors
-    /// [`Refusal::Sealed`] (for a client), then `NotRegisters`, `OutOfRange`, `Mirrored`.
+    /// [`Refusal::Sealed`] (for a client), then `NotRegisters`, `OutOfRange`, `Mirrored`, `Stale`.
     pub fn mask_write(
         &self,
         access: Access,
@@ -485,6 +540,9 @@ impl Memory {
         content.admit(access)?;
         valid.map_err(|refused| refused.refusal)?;
         let offset = offset?;
+        if ranges == Ranges::Unreserved {
+            self.fresh(&content, access, (read.area, read.address, read.count))?;
+        }
         self.apply(access, &mut content, &writes);
         content.copy_out(offset, read);
         Ok(())
@@ -508,8 +566,10 @@ impl Memory {
     ) -> Result<usize, Refusal> {
         match self.span(area).offset(address, 1) {
             _ if area.is_bits() => Err(Refusal::NotRegisters),
-            Some(_) if self.is_reserved(access, area, address, 1, ranges) => Err(Refusal::Mirrored),
-            offset => offset.ok_or(Refusal::OutOfRange),
+            offset => {
+                let offset = offset.ok_or(Refusal::OutOfRange)?;
+                self.unreserved(access, area, address, 1, ranges).map(|()| offset)
+            }
         }
     }
 
@@ -536,10 +596,12 @@ impl Memory {
                 Refusal::OutOfRange
             } else if access == Access::Client && self.gate.is_some_and(|gate| gate.is_in(write)) {
                 Refusal::GateBit
-            } else if self.is_reserved(access, write.area, write.address, write.count, ranges) {
-                Refusal::Mirrored
             } else {
-                continue;
+                let Write { area, address, count, .. } = *write;
+                match self.unreserved(access, area, address, count, ranges) {
+                    Ok(()) => continue,
+                    Err(refusal) => refusal,
+                }
             };
             return Err(Refused { index, refusal });
         }
@@ -556,7 +618,10 @@ impl Memory {
         for write in writes.clone() {
             self.copy_in(content, write);
         }
-        content.written(access, writes);
+        content.written(access, writes.clone());
+        if access == Access::Mirror && content.door & AGING != 0 {
+            self.renew(writes);
+        }
         self.settle(access, content);
     }
 
@@ -790,8 +855,7 @@ mod tests {
         let span = Span::new(0, 20).unwrap();
         let layout = Layout::default().with(REGISTERS, span).with(Area::Coils, span);
         let memory = Memory::new(layout, None).unwrap();
-        let range = Mirrored { area: REGISTERS, address: 5, count: 3 };
-        memory.mirror(vec![range]).unwrap();
+        memory.mirror(vec![Mirrored::reserved(REGISTERS, 5, 3)]).unwrap();
         memory
     }
 
@@ -827,13 +891,130 @@ mod tests {
     fn ranges_outside_the_area_are_refused_and_change_nothing() {
         let memory = mirroring();
         for (address, count) in [(18, 3), (0, 0)] {
-            let range = Mirrored { area: REGISTERS, address, count };
+            let range = Mirrored::reserved(REGISTERS, address, count);
             assert_eq!(memory.mirror(vec![range]), Err(LayoutError::MirrorOutside { address }));
         }
         let write = writing(REGISTERS, 5, &[1, 1]);
         assert_eq!(memory.write(Access::Ingest, write), Err(Refusal::Mirrored));
         memory.mirror(Vec::new()).unwrap();
         memory.write(Access::Ingest, write).unwrap();
+    }
+
+    /// Is stale when a test says so, and fresh after a write.
+    #[derive(Debug, Default)]
+    struct Aged(std::sync::atomic::AtomicBool);
+
+    impl Freshness for Aged {
+        fn renew(&self) {
+            self.0.store(false, Ordering::Relaxed);
+        }
+
+        fn is_stale(&self) -> bool {
+            self.0.load(Ordering::Relaxed)
+        }
+    }
+
+    /// A memory whose holding registers 5 to 7 are stale.
+    fn aging(is_reserved: bool) -> (Memory, Arc<Aged>) {
+        let memory = mirroring();
+        let aged = Arc::new(Aged(true.into()));
+        let freshness = Some(Arc::clone(&aged) as Arc<dyn Freshness>);
+        let range = Mirrored { is_reserved, freshness, ..Mirrored::reserved(REGISTERS, 5, 3) };
+        memory.mirror(vec![range]).unwrap();
+        (memory, aged)
+    }
+
+    /// What each kind of access to registers is answered with.
+    fn accesses(
+        memory: &Arc<Memory>,
+        access: Access,
+        address: u16,
+        count: usize,
+    ) -> [Result<(), Refusal>; 6] {
+        let bytes = [1; 40];
+        let write = writing(REGISTERS, address, &bytes[..2 * count]);
+        let mut out = [[0; 40]; 3];
+        let [one, many, then] = out.each_mut().map(|out| Read {
+            area: REGISTERS,
+            address,
+            count,
+            out: &mut out[..2 * count],
+        });
+        let beside = writing(REGISTERS, 19, &[1, 1]);
+        [
+            memory.read(access, one),
+            memory.read_many(access, &mut [many]).map_err(Refused::alone),
+            memory.write_then_read(access, beside, then),
+            memory.write(access, write),
+            memory.mask_write(access, REGISTERS, address, 1, 1),
+            write_across(access, &[(&**memory, write)]).map(drop).map_err(Refused::alone),
+        ]
+    }
+
+    #[test]
+    fn while_a_range_is_stale_only_the_mirror_uses_it() {
+        for access in [Access::Client, Access::Ingest] {
+            let memory = Arc::new(aging(false).0);
+            for (address, count) in [(5, 1), (7, 9), (5, 3)] {
+                assert_eq!(accesses(&memory, access, address, count), [Err(Refusal::Stale); 6]);
+            }
+            assert_eq!(accesses(&memory, access, 0, 5), [Ok(()); 6]);
+            assert_eq!(accesses(&memory, access, 8, 4), [Ok(()); 6]);
+            let outside = Read { area: REGISTERS, address: 7, count: 20, out: &mut [0; 40] };
+            assert_eq!(memory.read(access, outside), Err(Refusal::OutOfRange));
+            memory.write(Access::Mirror, writing(REGISTERS, 6, &[1; 4])).unwrap();
+            assert_eq!(
+                accesses(&memory, access, 6, 2)[0],
+                Err(Refusal::Stale),
+                "a part is written"
+            );
+            memory.write(Access::Mirror, writing(REGISTERS, 4, &[1; 8])).unwrap();
+            assert_eq!(accesses(&memory, access, 5, 3), [Ok(()); 6]);
+        }
+    }
+
+    #[test]
+    fn a_reserved_range_is_never_written_and_not_read_while_it_is_stale() {
+        let (memory, aged) = aging(true);
+        let memory = Arc::new(memory);
+        let (stale, mirrored) = (Err(Refusal::Stale), Err(Refusal::Mirrored));
+        let refused = [stale, stale, stale, mirrored, mirrored, mirrored];
+        assert_eq!(accesses(&memory, Access::Client, 5, 3), refused);
+        aged.renew();
+        let refused = [Ok(()), Ok(()), Ok(()), mirrored, mirrored, mirrored];
+        assert_eq!(accesses(&memory, Access::Client, 5, 3), refused);
+    }
+
+    #[test]
+    fn a_follower_of_a_stale_range_sees_all_of_it_when_it_is_fresh_again() {
+        let (memory, aged) = aging(true);
+        let memory = Arc::new(memory);
+        let mut follower = Follower::new(Arc::clone(&memory), [(REGISTERS, 7, 2)]).unwrap();
+        assert_eq!(follower.changes(), Err(Refusal::Stale));
+        aged.renew();
+        let all = follower.changes().unwrap();
+        assert!(follower.changes().unwrap().1.is_empty());
+        aged.0.store(true, Ordering::Relaxed);
+        assert_eq!(follower.changes(), Err(Refusal::Stale), "nothing was written since");
+        aged.renew();
+        assert_eq!(follower.changes(), Ok(all));
+    }
+
+    #[test]
+    fn a_stale_range_is_refused_before_the_journal_has_a_step_and_not_when_it_is_carried_out() {
+        let (memory, _) = aging(false);
+        let memory = Arc::new(memory);
+        let members = Arc::downgrade(&memory);
+        let guard = Guard { guards: false, refusal: std::sync::Mutex::default(), members };
+        memory.keep_in(Arc::new(guard) as Arc<dyn Journal>, 0);
+        assert_eq!(accesses(&memory, Access::Client, 5, 3), [Err(Refusal::Stale); 6]);
+        let write = StepWrite::new(0, &writing(REGISTERS, 6, &[3, 4]));
+        let action = Action::WriteThenRead { write, area: REGISTERS, address: 6, count: 1 };
+        let step = Step { access: Access::Client, action };
+        // Another node may know newer values.
+        assert_eq!(step.carry_out(&[Arc::clone(&memory)]).unwrap().read, [3, 4]);
+        memory.write(Access::Mirror, writing(REGISTERS, 5, &[1; 6])).unwrap();
+        assert_eq!(accesses(&memory, Access::Client, 5, 3), [Ok(()); 6]);
     }
 
     /// Carries out each step at once, and refuses accesses while it has a refusal.

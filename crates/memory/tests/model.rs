@@ -435,7 +435,7 @@ fn memories_of_different_journals_are_not_written_in_one_step() {
 fn reserved_ranges_are_settled_when_a_step_is_given_to_the_journal() {
     let memory = Arc::new(Memory::new(layout(), None).unwrap());
     keep(std::slice::from_ref(&memory));
-    memory.mirror(vec![Mirrored { area: Area::Coils, address: 10, count: 5 }]).unwrap();
+    memory.mirror(vec![Mirrored::reserved(Area::Coils, 10, 5)]).unwrap();
     let write = Write { area: Area::Coils, address: 12, count: 1, bytes: &[1] };
     let never = || -> Done { Box::new(|_| panic!("nothing is submitted")) };
     for access in [Access::Client, Access::Ingest] {
@@ -446,7 +446,7 @@ fn reserved_ranges_are_settled_when_a_step_is_given_to_the_journal() {
     memory.write(Access::Mirror, write).unwrap();
     assert_eq!(read(&memory, Access::Client, Area::Coils, 12, 1), Ok(vec![1]));
     // On another node, the range may be reserved.
-    memory.mirror(vec![Mirrored { area: Area::Coils, address: 3, count: 40 }]).unwrap();
+    memory.mirror(vec![Mirrored::reserved(Area::Coils, 3, 40)]).unwrap();
     let step = Kept {
         access: Access::Client,
         action: holdfast_memory::Action::Write(vec![holdfast_memory::StepWrite {

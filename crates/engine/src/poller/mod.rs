@@ -11,6 +11,7 @@ mod cost;
 mod device;
 mod health;
 mod learned;
+mod mirror_age;
 pub mod plan;
 mod raw_ingest;
 mod results;
@@ -24,6 +25,7 @@ mod turn;
 mod write_through;
 
 pub use device::{DeviceSettings, ReadSettings};
+pub use mirror_age::MirrorAge;
 pub use raw_ingest::{ForwardCounters, ForwardFailure, ForwardSettings};
 pub use results::{Batch, BlockResult, Poll, Results, Written};
 pub use sink::Destination;

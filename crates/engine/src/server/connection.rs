@@ -586,7 +586,7 @@ impl<F: Framing> Answering<F> {
         let len = self.unit_server.answer(&self.rights, unit_id, request, permitted, buffer);
         let answered = &buffer[..len.unwrap_or_default()];
         if !is_silence {
-            self.note_refused(RefusedRequest::by(unit_id, request, answered));
+            self.note_refused(RefusedRequest::by(&self.rights, unit_id, request, answered));
         }
         self.delimiter = changed_delimiter(request, answered).unwrap_or(self.delimiter);
         if let Some(auditor) = &self.context.auditor {

@@ -21,6 +21,7 @@ pub(super) fn exception_of(refusal: Refusal) -> ExceptionCode {
             ExceptionCode::IllegalDataAddress
         }
         Refusal::WrongLength | Refusal::NotRegisters => ExceptionCode::IllegalDataValue,
+        Refusal::Stale => ExceptionCode::GatewayTargetFailedToRespond,
         Refusal::Unavailable | Refusal::Behind => ExceptionCode::ServerDeviceBusy,
         Refusal::NotStored | Refusal::NotConfirmed | Refusal::Differs => {
             ExceptionCode::ServerDeviceFailure

@@ -806,6 +806,7 @@ fn refusal(refused: MemoryRefusal) -> Refusal {
     match refused {
         MemoryRefusal::Unavailable
         | MemoryRefusal::NotStored
+        | MemoryRefusal::Stale
         | MemoryRefusal::Behind
         | MemoryRefusal::Differs => Refusal::NotStored,
         MemoryRefusal::NotConfirmed => Refusal::NotConfirmed,

@@ -5,6 +5,8 @@ use std::sync::atomic::{AtomicU8, Ordering};
 
 use holdfast_protocol::pdu::{ExceptionCode, Function};
 
+use super::policy::PeerRights;
+
 /// A refused request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct RefusedRequest {
@@ -41,15 +43,26 @@ impl Why {
 impl RefusedRequest {
     /// The refusal that a memory's reply to a request is; `None` for any other reply.
     #[inline]
-    pub(crate) fn by(unit_id: u8, request: &[u8], reply: &[u8]) -> Option<RefusedRequest> {
+    pub(crate) fn by(
+        rights: &PeerRights,
+        unit_id: u8,
+        request: &[u8],
+        reply: &[u8],
+    ) -> Option<RefusedRequest> {
         let &[code, exception, ..] = reply else { return None };
         if code & 0x80 == 0 {
             return None;
         }
         let code = ExceptionCode::from_code(exception)?;
-        let refused = RefusedRequest::with(unit_id, request, code);
-        let sealed = code == ExceptionCode::ServerDeviceBusy && writes(request);
-        refused.or_else(|| sealed.then(|| RefusedRequest::new(unit_id, request, Why::Sealed)))
+        let why = match code {
+            ExceptionCode::ServerDeviceBusy if writes(request) => Why::Sealed,
+            // With a memory, it is the device whose values the memory has that does not answer.
+            ExceptionCode::GatewayTargetFailedToRespond if rights.memory(unit_id).is_none() => {
+                Why::Unit
+            }
+            _ => return RefusedRequest::with(unit_id, request, code),
+        };
+        Some(RefusedRequest::new(unit_id, request, why))
     }
 
     /// The refusal of a request that was not sent to its device; `None` if it was, or can't be.
@@ -65,7 +78,6 @@ impl RefusedRequest {
         let why = match code {
             ExceptionCode::IllegalFunction => Why::Function,
             ExceptionCode::IllegalDataAddress => Why::Address,
-            ExceptionCode::GatewayTargetFailedToRespond => Why::Unit,
             _ => return None,
         };
         Some(RefusedRequest::new(unit_id, request, why))
@@ -95,13 +107,37 @@ impl Reported {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
+    use holdfast_memory::{Layout, Memory};
+
+    use super::super::functions::{AccessMode, Functions};
+    use super::super::policy::Rule;
     use super::*;
 
     const READ: [u8; 5] = [3, 0, 0, 0, 1];
     const WRITE: [u8; 5] = [6, 0, 0, 0, 1];
 
     fn why(request: &[u8], reply: &[u8]) -> Option<Why> {
-        RefusedRequest::by(1, request, reply).map(|refused| refused.why)
+        RefusedRequest::by(&PeerRights::none(), 1, request, reply).map(|refused| refused.why)
+    }
+
+    #[test]
+    fn a_unit_whose_memory_is_stale_is_not_refused_for_rights() {
+        let memory = Memory::new(Layout::default(), None).unwrap();
+        let rights = PeerRights::new(&Rule {
+            sources: Vec::new(),
+            roles: None,
+            units: vec![(1, Arc::new(memory))],
+            elsewhere: Vec::new(),
+            access: AccessMode::ReadWrite,
+            functions: Functions::All,
+            narrowed: Vec::new(),
+        });
+        for (unit_id, expected) in [(1, None), (2, Some(Why::Unit))] {
+            let refused = RefusedRequest::by(&rights, unit_id, &READ, &[0x83, 0x0B]);
+            assert_eq!(refused.map(|refused| refused.why), expected);
+        }
     }
 
     #[test]

@@ -278,7 +278,7 @@ impl ModbusSerial {
         let permitted = permit.is_some();
         let len = self.unit_server.answer(&rights, unit_id, request, permitted, reply);
         let answered = &reply[..len.unwrap_or_default()];
-        self.note_refused(context, RefusedRequest::by(unit_id, request, answered));
+        self.note_refused(context, RefusedRequest::by(&rights, unit_id, request, answered));
         if let Some(delimiter) = changed_delimiter(request, answered) {
             self.delimiter.store(delimiter, Ordering::Relaxed);
         }

@@ -266,7 +266,9 @@ impl ModbusUdp {
         let permitted = permit.is_some();
         let len = self.unit_server.answer(&rights, unit_id, request, permitted, buffer);
         let answered = &buffer[..len.unwrap_or_default()];
-        if !is_silence && let Some(refused) = RefusedRequest::by(unit_id, request, answered) {
+        if !is_silence
+            && let Some(refused) = RefusedRequest::by(&rights, unit_id, request, answered)
+        {
             context.refuse_request(refused, Some(peer.into()));
         }
         if let Some(auditor) = &context.auditor {

@@ -3,7 +3,7 @@
 //!
 //! The checks run in this order: the function is known and allowed (exception 01), the unit is
 //! mapped (0B), form, quantity and value are right (03), a write can be recorded (04), the memory is
-//! not sealed (06), the range is inside its area (02). A denied function is refused before the unit is looked up, so that a
+//! not sealed (06), the range is inside its area (02), what it mirrors is not stale (0B). A denied function is refused before the unit is looked up, so that a
 //! peer without rights cannot discover units. A unit in listen only mode never answers.
 
 use std::sync::Arc;

@@ -18,7 +18,7 @@ pub(super) struct Moment(u64);
 impl Clock {
     pub(super) fn now(&self) -> Moment {
         let now = match self {
-            Clock::Machine => machine(),
+            Clock::Machine => time_since_boot(),
             #[cfg(test)]
             Clock::Test(now) => *now.lock().unwrap(),
         };
@@ -41,9 +41,10 @@ impl Moment {
     }
 }
 
-/// [`std::time::Instant`] stands still during a suspend on Linux and macOS.
+/// The time since the machine was started. [`std::time::Instant`] stands still during a suspend on Linux
+/// and macOS.
 #[cfg(any(target_os = "linux", target_os = "android", target_vendor = "apple"))]
-fn machine() -> Duration {
+pub fn time_since_boot() -> Duration {
     use rustix::time::{ClockId, clock_gettime};
     #[cfg(target_vendor = "apple")]
     let now = clock_gettime(ClockId::Monotonic);
@@ -53,9 +54,9 @@ fn machine() -> Duration {
     Duration::new(seconds, u32::try_from(now.tv_nsec).unwrap_or_default())
 }
 
-/// On Windows, [`std::time::Instant`] goes on during a suspend.
+/// The time since the process began. On Windows, [`std::time::Instant`] goes on during a suspend.
 #[cfg(not(any(target_os = "linux", target_os = "android", target_vendor = "apple")))]
-fn machine() -> Duration {
+pub fn time_since_boot() -> Duration {
     use std::sync::LazyLock;
     use std::time::Instant;
     static BEGAN: LazyLock<Instant> = LazyLock::new(Instant::now);
@@ -82,7 +83,7 @@ mod tests {
             let text = std::fs::read_to_string("/proc/uptime").unwrap();
             Duration::from_secs_f64(text.split(' ').next().unwrap().parse().unwrap())
         };
-        let (before, now, after) = (uptime(), machine(), uptime());
+        let (before, now, after) = (uptime(), time_since_boot(), uptime());
         let hundredth = Duration::from_millis(10);
         assert!(before <= now && now <= after + hundredth, "{before:?} {now:?} {after:?}");
     }

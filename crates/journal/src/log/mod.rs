@@ -47,6 +47,7 @@ use std::time::Duration;
 
 use holdfast_memory::{Journal, Memory};
 
+pub use clock::time_since_boot;
 pub use error::LogError;
 pub use follower::{Follower, Next, Record, Until};
 pub use message::Origin;

@@ -1,0 +1,40 @@
+//! `MirrorAge`: how old the values are that a device is read into.
+
+use std::sync::Arc;
+
+use holdfast_engine::poller::MirrorAge as Core;
+use holdfast_journal::log::time_since_boot;
+use pyo3::prelude::*;
+
+use crate::arguments::seconds;
+
+#[pyclass(frozen, module = "holdfast._core")]
+pub struct MirrorAge {
+    pub core: Arc<Core>,
+}
+
+#[pymethods]
+impl MirrorAge {
+    #[new]
+    #[pyo3(signature = (after, *, refuses))]
+    fn new(after: f64, refuses: bool) -> PyResult<MirrorAge> {
+        let core = Core::new(time_since_boot, seconds("after", after)?, refuses);
+        Ok(MirrorAge { core: Arc::new(core) })
+    }
+
+    #[pyo3(signature = (after, *, refuses))]
+    fn set(&self, after: f64, refuses: bool) -> PyResult<()> {
+        self.core.set(seconds("after", after)?, refuses);
+        Ok(())
+    }
+
+    #[getter]
+    fn seconds(&self) -> Option<f64> {
+        self.core.age().map(|age| age.as_secs_f64())
+    }
+
+    #[getter]
+    fn stale_for(&self) -> Option<f64> {
+        self.core.stale_for().map(|time| time.as_secs_f64())
+    }
+}

@@ -1,0 +1,119 @@
+//! How old the values are that a device is read into. Whoever reads them compares the time, so values
+//! become old even if the poller hangs.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
+
+use holdfast_memory::Freshness;
+
+/// The time since some moment. It goes on while the machine is suspended: values from before are old.
+pub type Clock = fn() -> Duration;
+
+/// The age of the values of a range. They are stale from the start, until a device was read.
+#[derive(Debug)]
+pub struct MirrorAge {
+    clock: Clock,
+    began: Duration,
+    /// The time of the last values, in nanoseconds; 0 if there are none yet.
+    renewed: AtomicU64,
+    /// In nanoseconds.
+    after: AtomicU64,
+    refuses: AtomicBool,
+}
+
+impl MirrorAge {
+    /// Values are stale `after` this time. Stale values are refused, or only shown as stale.
+    pub fn new(clock: Clock, after: Duration, refuses: bool) -> MirrorAge {
+        MirrorAge {
+            clock,
+            began: clock(),
+            renewed: AtomicU64::new(0),
+            after: AtomicU64::new(nanos(after)),
+            refuses: AtomicBool::new(refuses),
+        }
+    }
+
+    /// Changes the settings. The age of the values stays.
+    pub fn set(&self, after: Duration, refuses: bool) {
+        self.after.store(nanos(after), Ordering::Relaxed);
+        self.refuses.store(refuses, Ordering::Relaxed);
+    }
+
+    /// The age of the last values, if there are any.
+    pub fn age(&self) -> Option<Duration> {
+        let renewed = Some(self.renewed.load(Ordering::Relaxed)).filter(|renewed| *renewed > 0)?;
+        Some((self.clock)().saturating_sub(Duration::from_nanos(renewed)))
+    }
+
+    /// For how long the values have been stale; `None` if they are not.
+    pub fn stale_for(&self) -> Option<Duration> {
+        let after = Duration::from_nanos(self.after.load(Ordering::Relaxed));
+        match self.age() {
+            None => Some((self.clock)().saturating_sub(self.began)),
+            Some(age) => age.checked_sub(after),
+        }
+    }
+}
+
+impl Freshness for MirrorAge {
+    fn renew(&self) {
+        self.renewed.store(nanos((self.clock)()).max(1), Ordering::Relaxed);
+    }
+
+    fn is_stale(&self) -> bool {
+        self.refuses.load(Ordering::Relaxed) && self.stale_for().is_some()
+    }
+}
+
+fn nanos(time: Duration) -> u64 {
+    u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+
+    use super::*;
+
+    thread_local! {
+        static NOW: Cell<u64> = const { Cell::new(100) };
+    }
+
+    fn pass(seconds: u64) {
+        NOW.set(NOW.get() + seconds);
+    }
+
+    fn of(refuses: bool) -> MirrorAge {
+        MirrorAge::new(|| Duration::from_secs(NOW.get()), Duration::from_secs(10), refuses)
+    }
+
+    #[test]
+    fn values_are_stale_before_the_first_read_and_after_a_time_without_one() {
+        let age = of(true);
+        pass(3);
+        assert_eq!((age.age(), age.stale_for()), (None, Some(Duration::from_secs(3))));
+        assert!(age.is_stale());
+        age.renew();
+        assert_eq!((age.age(), age.stale_for()), (Some(Duration::ZERO), None));
+        pass(9);
+        assert!(!age.is_stale());
+        pass(1);
+        assert_eq!(age.stale_for(), Some(Duration::ZERO));
+        assert!(age.is_stale());
+        age.set(Duration::from_secs(11), true);
+        assert!(!age.is_stale());
+        pass(60);
+        assert!(age.is_stale());
+        age.renew();
+        assert!(!age.is_stale());
+    }
+
+    #[test]
+    fn values_that_are_kept_are_shown_as_stale_and_not_refused() {
+        let age = of(false);
+        assert!(!age.is_stale());
+        assert!(age.stale_for().is_some());
+        age.set(Duration::from_secs(10), true);
+        assert!(age.is_stale());
+    }
+}
