@@ -727,6 +727,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "SharedLogConfig": ["node"],
         "ServerTlsConfig": ["cert_file", "key_file", "ca_file"],
         "Span": ["size"],
+        "StaleConfig": ["after"],
         "StatusConfig": ["area", "slot", "memory"],
         "SparkplugConfig": ["url", "type", "group", "edge_node"],
         "SubscriptionConfig": ["topic", "memories", "areas"],

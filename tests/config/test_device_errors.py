@@ -407,6 +407,40 @@ def test_readable_ranges_without_holes_are_a_warning(
     assert folder.warnings(text) == ([message] if warned else [])
 
 
+@pytest.mark.parametrize(
+    ("stale", "told"),
+    [
+        ("{after: 10}", []),
+        (
+            "{after: 1, answer: exception}",
+            ["stale.after: found 1, which is not more than interval"],
+        ),
+    ],
+)
+def test_values_that_are_stale_between_two_polls_are_a_warning(
+    folder: Folder, stale: str, told: list[str]
+) -> None:
+    warnings = folder.warnings(HEAD + METER + f"    stale: {stale}\n")
+    assert len(warnings) == len(told)
+    assert all(part in each for part, each in zip(told, warnings, strict=True)), warnings
+
+
+def test_stale_has_no_effect_without_a_place_in_memory(folder: Folder) -> None:
+    into = "        into: {memory: plant, area: input_registers, address: 100}\n"
+    forward = "    forward: [{url: 'raw://a:1', unit: 1}]\n"
+    text = changed(into, "") + forward + "    stale: {after: 10}\n"
+    assert folder.warnings(text) == [
+        "p.yaml:14: devices.meter.stale: has no effect: no read has an into"
+    ]
+
+
+@pytest.mark.parametrize("stale", ["{answer: keep}", "{after: 0}", "{after: 5, answer: zero}", "5"])
+def test_stale_has_a_time_and_one_of_two_answers(folder: Folder, stale: str) -> None:
+    [problem] = folder.problems(HEAD + METER + f"    stale: {stale}\n")
+    assert "devices.meter.stale" in problem
+    assert "allowed: " in problem
+
+
 def test_a_block_of_a_receiver_has_one_device(folder: Folder) -> None:
     block = (
         "forward: [{url: 'raw://A:1', unit: 1, status: {unit: 2, area: input_registers, slot: 3}}]"

@@ -437,7 +437,17 @@ def _of_devices(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
             "device_requests_per_poll", "Requests per poll in the current plan.", "device"
         ),
     }
+    labels = ("device", "memory", "area", "address")
+    stale = _gauge("mirror_stale", "1 while the values of a device are stale.", *labels)
+    since = _gauge(
+        "mirror_stale_since_timestamp_seconds", "Unix time since which they are stale.", *labels
+    )
     for name, told in devices.items():
+        for mirror in told.get("mirrors", ()):
+            of = [name, mirror["memory"], mirror["area"], str(mirror["address"])]
+            stale.add_metric(of, mirror["stale_since"] is not None)
+            if mirror["stale_since"] is not None:
+                since.add_metric(of, mirror["stale_since"])
         _add(health, name, {known: known == told["health"] for known in HEALTH})
         _add(requests, name, {key: told[key] for key in OUTCOMES if key in told})
         for key, counter in counters.items():
@@ -449,7 +459,7 @@ def _of_devices(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
         for number, packets in enumerate(told.get("forward", ())):
             for outcome in ("sent", "refused", "failed", "replaced"):
                 forward.add_metric([name, str(number), outcome], packets[outcome])
-    yield from (health, requests, *counters.values(), *gauges.values(), forward)
+    yield from (health, requests, *counters.values(), *gauges.values(), forward, stale, since)
 
 
 def _of_links(links: Mapping[str, Mapping[str, int]]) -> Iterator[Metric]:

@@ -323,23 +323,6 @@ def device(
     )
 
 
-def mirror(config: Config, memories: Mapping[str, Memory]) -> None:
-    """Reserves the ranges that devices are read into, unless local writes are allowed there.
-
-    Ranges of an earlier call are free again.
-    """
-    mirrored: dict[str, list[tuple[Area, int, int]]] = {}
-    for device in config.devices.values():
-        if not device.enabled or device.writes == "local":
-            continue
-        for read in device.reads:
-            if (into := read.into) is not None:
-                ranges = mirrored.setdefault(into.memory, [])
-                ranges.append((into.area, into.address, read.count))
-    for name, made in memories.items():
-        made.mirror(mirrored.get(name, []))
-
-
 def _forward(device: str, settings: ForwardConfig) -> Forward:
     """The packets for a receiver, as the native poller has them."""
     status = settings.status

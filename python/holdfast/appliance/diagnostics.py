@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from holdfast.appliance.device_leases import DeviceLeases
     from holdfast.appliance.kept import KeptMemories
     from holdfast.appliance.liveness import Liveness
+    from holdfast.appliance.mirrors import Mirrors
     from holdfast.appliance.shared_logs import SharedLogs
     from holdfast.appliance.supervision import Supervisor
     from holdfast.appliance.tag_values import TagValues
@@ -51,6 +52,9 @@ class Diagnostics:
         self.values: TagValues | None = None
         self.links: Mapping[str, Link] = {}
         """What listeners pass requests on to."""
+        self.mirrors: Mirrors | None = None
+        """What devices are read into."""
+
         self.disabled: Sequence[str] = ()
         """Devices that are not polled."""
 
@@ -102,7 +106,11 @@ class Diagnostics:
     def devices(self) -> dict[str, dict[str, Any]]:
         """Returns the health and the counters of each device."""
         polled = {} if self.poller is None else configured(self.poller)
-        return {**polled, **{name: {"health": "disabled"} for name in self.disabled}}
+        found = {**polled, **{name: {"health": "disabled"} for name in self.disabled}}
+        aging = {} if self.mirrors is None else self.mirrors.status()
+        for name in found.keys() & aging.keys():
+            found[name]["mirrors"] = aging[name]
+        return found
 
     def tag_values(self) -> list[Reading]:
         """Returns the last reading of each tag of the configured devices."""

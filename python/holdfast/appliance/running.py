@@ -20,6 +20,7 @@ from holdfast.appliance.expiring import Expiring
 from holdfast.appliance.health import Health
 from holdfast.appliance.kept import KeptMemories
 from holdfast.appliance.liveness import Liveness
+from holdfast.appliance.mirrors import Mirrors
 from holdfast.appliance.output_site import OutputSite
 from holdfast.appliance.shared_logs import SharedLogs
 from holdfast.appliance.supervision import STOP_TIMEOUT, Starter, Supervisor
@@ -272,7 +273,7 @@ class _Running:
             self._logs = SharedLogs(config, memories, self._kept)
             undo.callback(self._logs.stop)
             self._leases = DeviceLeases(config, lease_times)
-            assembly.mirror(config, memories)
+            self._mirrors = Mirrors(config, memories)
             disabled = self._tell_disabled()
             self._audit = auditing.opened(config)
             if self._audit is not None:
@@ -315,6 +316,7 @@ class _Running:
             self.diagnostics.poller = self._poller
             self.diagnostics.links = links.links
             self.diagnostics.disabled = disabled
+            self.diagnostics.mirrors = self._mirrors
             self.diagnostics.expiries = configured_certificates.expiries(config)
             self.diagnostics.values = self._values
             for name, part in self._adapters(config, self._ports).items():
@@ -400,6 +402,7 @@ class _Running:
         self._kept.check()
         self._logs.check()
         self._expiring.check(self.diagnostics.expiries)
+        self._mirrors.log_changes()
         interval = _review_interval(self._config)
         if interval is not None and now - self._reviewed >= interval:
             self._reviewed = now
@@ -605,7 +608,7 @@ class _Running:
         """The part of a reload that follows the change of the listeners, and refuses nothing."""
         config = self._config
         self._seals |= {name: memory.seal_changes for name, memory in added.items()}
-        assembly.mirror(config, self._memories)
+        self._mirrors.adopt(config, self._memories)
         self._passages.update(links.passages)
         for name in [name for name in self._passages if name not in links.passages]:
             del self._passages[name]

@@ -29,7 +29,7 @@ _NAMING = {"v1": "unit", "crc": "memory_id"}
 """The key for the target of a packet, by format."""
 
 
-_OF_POLLING = ("interval", "cost", "readable", "forbidden", "forward", "status")
+_OF_POLLING = ("interval", "cost", "readable", "forbidden", "forward", "status", "stale")
 """Keys that only concern polling, and that are not set by default."""
 
 
@@ -68,6 +68,7 @@ class DeviceChecks:
     def _device(self, path: KeyPath, device: dict[Any, Any]) -> None:
         self._polling(path, device)
         self._passing(path, device)
+        self._aging(path, device)
         if "max_gap" in device and "cost" in device:
             message = "found together with max_gap, allowed: only one of them"
             self.report.add((*path, "cost"), message, of_key=True)
@@ -112,6 +113,19 @@ class DeviceChecks:
         ):
             message = "pass has no effect: no coils are read into coils, and no holding registers"
             self.report.doubt((*path, "writes"), f"{message} into holding registers")
+
+    def _aging(self, path: KeyPath, device: dict[Any, Any]) -> None:
+        """Warns about values that are always or never stale."""
+        if not isinstance(device.get("stale"), dict):
+            return
+        reads = [mapping(read) for read in entries(device.get("reads"))]
+        if reads and not any("into" in read for read in reads):
+            self.report.doubt((*path, "stale"), "has no effect: no read has an into")
+        after, interval = device["stale"].get("after"), device.get("interval")
+        if _is_number(after) and _is_number(interval) and after <= interval:
+            found = f"found {after}, which is not more than interval, {interval}"
+            message = f"{found}: values are stale between two polls"
+            self.report.doubt((*path, "stale", "after"), message)
 
     def _forward(self, path: KeyPath, forward: dict[Any, Any]) -> None:
         form = forward.get("format", "v1")
@@ -249,6 +263,10 @@ class DeviceChecks:
 
     def _named(self, path: KeyPath) -> str:
         return f"{self.report.document.spell(path)} in line {self.report.line(path)}"
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _meet(one: range, other: range) -> bool:

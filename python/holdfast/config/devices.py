@@ -66,6 +66,15 @@ class ReadConfig(Model):
     """The destination in this appliance."""
 
 
+class StaleConfig(Model):
+    """When values that were read are too old, and what happens to requests for them then."""
+
+    after: Duration
+    """Seconds without a successful read after which values are stale."""
+    answer: Literal["exception", "keep"] = "keep"
+    """exception: requests that touch stale values are refused; keep: the last values stay."""
+
+
 class RangeConfig(Model):
     """A range of addresses: start and end, or start and count."""
 
@@ -266,6 +275,8 @@ class DeviceConfig(Model):
     """The unit id, 0 to 255; on a serial line 1 to 247."""
     writes: Literal["refuse", "pass", "local"] = "refuse"
     """Writes into what it is read into: refused, sent to it, or kept until the next poll."""
+    stale: Annotated[StaleConfig | None, NotNull()] = None
+    """When what it is read into is too old. Default: never."""
     emulate: bool = False
     """With writes: pass, whether function 22 is sent as a read and function 6."""
     enabled: bool = True

@@ -6,6 +6,23 @@ This package does not know HTTP or MQTT.
 from __future__ import annotations
 
 from holdfast._core import Follower
-from holdfast.ingest.memory_access import KEEPING, Counts, Grant, MemoryAccess, Refused, Written
+from holdfast.ingest.memory_access import (
+    KEEPING,
+    Counts,
+    Grant,
+    MemoryAccess,
+    Refused,
+    Written,
+    unreadable,
+)
 
-__all__ = ["KEEPING", "Counts", "Follower", "Grant", "MemoryAccess", "Refused", "Written"]
+__all__ = [
+    "KEEPING",
+    "Counts",
+    "Follower",
+    "Grant",
+    "MemoryAccess",
+    "Refused",
+    "Written",
+    "unreadable",
+]

@@ -180,7 +180,7 @@ class MemoryAccess:
                 raise self._out_of_range(memory, area, address, count) from None
             except OSError as error:
                 where = _where(None, memory, area, address)
-                raise Refused("log_unavailable", str(error), **where) from None
+                raise Refused(unreadable(error), str(error), **where) from None
         except Refused as refused:
             self.note(refused, grant.name, peer)
             raise
@@ -410,6 +410,9 @@ class MemoryAccess:
                 found = f"{_of(index)}{len(values)} from address {_shown(address)} of {area}"
                 detail = f"{found} overlap a range that mirrors a device"
                 return Refused("mirrored", detail, **where)
+            case "stale":
+                detail = f"{_of(index)}a range mirrors a device, and its values are too old"
+                return Refused("stale", detail, **where)
             case "not_one_step":
                 detail = f"{_of(index)}{memory} and the memories before it are not kept together"
                 return Refused("not_one_step", f"{detail}, so no step writes all of them", **where)
@@ -443,6 +446,11 @@ class MemoryAccess:
         found = f"{_of(index)}{count} from address {_shown(address)} of {area}"
         where = _where(index, memory, area, address)
         return Refused("out_of_range", f"{found}, {allowed}", **where)
+
+
+def unreadable(error: OSError) -> str:
+    """The reason why a memory can't be read."""
+    return "stale" if isinstance(error, _core.Stale) else "log_unavailable"
 
 
 def _decoded(body: bytes | bytearray | memoryview) -> object:

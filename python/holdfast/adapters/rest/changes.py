@@ -2,7 +2,8 @@
 
 A stream looks at the memory at most once per `min_interval`, and only when its peer has taken the
 events before. So a slow peer receives the newest values, and nothing is queued for it. While the
-memory can't be read because its log is behind, a stream says so and waits.
+memory can't be read because its log is behind, or a range because what it mirrors is stale, a
+stream says so and waits.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
+from holdfast.ingest import unreadable
 from holdfast.web.events import Stream
 from holdfast.web.requests import BadRequest
 
@@ -91,7 +93,7 @@ async def _follow(
     """Sends events until one of the tasks `ends` is done."""
     loop = asyncio.get_running_loop()
     due = loop.time()
-    refusal = ""
+    refusal = reason = ""
     while not any(task.done() for task in ends):
         if loop.time() >= due:
             due = loop.time() + min_interval
@@ -99,10 +101,10 @@ async def _follow(
             try:
                 (sequence, changes), refusal = follower.changes(), ""
             except OSError as error:
-                changes, refusal = [], str(error)
+                changes, refusal, reason = [], str(error), unreadable(error)
             if refusal and refusal != before:
                 memory, _ = ranges[0]
-                told = {"memory": memory, "reason": "log_unavailable", "detail": refusal}
+                told = {"memory": memory, "reason": reason, "detail": refusal}
                 await stream.event(UNAVAILABLE, told)
             for index, address, values in changes:
                 memory, area = ranges[index]

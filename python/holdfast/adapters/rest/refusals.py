@@ -62,9 +62,10 @@ REFUSALS = Refusals(
     ),
     Refusal(
         503,
-        ("unrecorded", "not_stored", "log_unavailable", "busy"),
+        ("unrecorded", "not_stored", "log_unavailable", "stale", "busy"),
         "The audit log, the file or the log of the memory can't be written, and nothing has "
-        "changed; or too many change streams are open",
+        "changed; the range mirrors a device whose values are too old; or too many change streams "
+        "are open",
         "the audit log can't be written, and no write is carried out without a record",
     ),
     Refusal(
@@ -96,5 +97,6 @@ VALUES = (
     "not_one_step",
     "not_stored",
     "log_unavailable",
+    "stale",
     "not_confirmed",
 )

@@ -144,7 +144,7 @@ READ = Route(
     "read",
     "Read a range atomically",
     json_answer("The values; bits are 0 or 1", ref("Values"), {"values": [100, 200, 300]}),
-    (*QUERY, *MEMORY, "log_unavailable"),
+    (*QUERY, *MEMORY, "log_unavailable", "stale"),
     parameters=(
         Parameter("memory", "The name of the memory", TEXT, "plant_a"),
         Parameter("area", "The area", ref("Area"), "holding_registers"),
@@ -166,7 +166,8 @@ CHANGES = Route(
     "client that reads slowly receives the newest values. `area`, `address` and `count` can be "
     f"repeated together, for up to {MAX_RANGES} ranges. After a reconnect, with or without "
     "`Last-Event-ID`, the stream begins with the current values. `unavailable` means that a "
-    "replicated memory can't be read at present; once it can, all ranges follow as a whole.",
+    "replicated memory can't be read at present, or that a range mirrors a device that does not "
+    "answer; once all ranges can be read, they follow as a whole.",
     parameters=(
         Parameter("memory", "The name of the memory", TEXT, "plant_a"),
         Parameter("area", "The area", ref("Area"), ["holding_registers"], repeats=True),

@@ -55,7 +55,7 @@ ANSWERS: dict[str, Schema] = {
     "Unavailable": object_of(
         {
             "memory": TEXT,
-            "reason": {"const": "log_unavailable"},
+            "reason": {"enum": ["log_unavailable", "stale"]},
             "detail": TEXT | {"description": "A message for people"},
         }
     ),
