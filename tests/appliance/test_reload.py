@@ -17,8 +17,9 @@ import pytest
 
 import holdfast
 from holdfast import raw_ingest
-from holdfast.appliance import Appliance, assembly, running
+from holdfast.appliance import Appliance, running
 from holdfast.appliance.changes import ReloadIncomplete, ReloadRefused
+from holdfast.appliance.mirrors import Mirrors
 from holdfast.config import load
 from support import wire
 from support.certificates import Certificates, Issued, named
@@ -657,7 +658,7 @@ def test_an_internal_error_is_not_told_as_a_refusal(
     def broken(*_: object) -> None:
         raise KeyError("pump")
 
-    monkeypatch.setattr(assembly, "mirror", broken)
+    monkeypatch.setattr(Mirrors, "adopt", broken)
     less = listener(rule("127.0.0.0/8", access="read-only"))
     with pytest.raises(ReloadIncomplete, match="KeyError: 'pump'"):
         rig.reload(plant(listeners={"scada": less}))

@@ -56,7 +56,9 @@ class Value:
     def _bad(self, payload: memoryview, cause: str) -> BadValue:
         shown = bytes(payload[: 4 * MAX_SHOWN]).decode(errors="replace")
         shown = shown if len(shown) <= MAX_SHOWN else f"{shown[:MAX_SHOWN]}…"
-        step = {"step": abs(self._tag.scale)} if self._tag.is_stepped else {}
+        scale = self._tag.scale
+        assert isinstance(scale, int | float), "a map has no tag whose scale is in a register"
+        step = {"step": abs(scale)} if self._tag.is_stepped else {}
         where = {**self._where, "tag": self._tag.name, "value": shown, **step, "cause": cause}
         return BadValue(f"{self._tag.name}: {cause}", where)
 
