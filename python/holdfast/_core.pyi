@@ -52,6 +52,7 @@ __all__ = [
     "LogFollower",
     "Memory",
     "MemoryFile",
+    "MirrorAge",
     "OutOfRange",
     "Passage",
     "PolledDevice",
@@ -62,6 +63,7 @@ __all__ = [
     "Route",
     "Rule",
     "ServerTls",
+    "Stale",
     "TlsChannel",
     "WriteQueue",
     "__version__",
@@ -157,7 +159,7 @@ class Memory:
     def mirror(
         self,
         reserved: Sequence[tuple[Area, int, int]],
-        aging: Sequence[tuple[Area, int, int, MirrorAge]] = (),
+        aging: Sequence[tuple[Area, int, int, MirrorAge]] = ...,
     ) -> None:
         """Reserves ranges (area, address, count) for the poller; others can't write them any more.
 
@@ -732,7 +734,7 @@ class Endpoint:
         *,
         accept_unit: int | Literal["any"] | None = None,
         pad: bool = False,
-        echo: bool | Literal["auto"] = "auto",
+        echo: bool | Literal["auto"] | None = None,
         pause: float = 0.0,
         pause_after_connect: float = 0.0,
         retries: int = 0,
