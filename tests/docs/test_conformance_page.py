@@ -89,6 +89,7 @@ def test_lock_files_name_no_registry(file: str) -> None:
 
 def test_the_host_of_sparkplug_is_the_locked_one() -> None:
     assert f"(tahu-host {java_versions()['tahu-host']}, " in PAGE
+    assert f"(sparkplug-payload {node_versions()['sparkplug-payload']}, " in PAGE
 
 
 def test_the_tests_of_sparkplug_exist() -> None:

@@ -161,6 +161,43 @@ def test_types_of_metrics(tag: Tag, expected: str) -> None:
     assert f"{datatype.name}{' by item' if by_item else ''}" == expected
 
 
+@pytest.mark.parametrize(
+    ("type", "field"),
+    [
+        ("uint16", "int_value"),
+        ("int32", "int_value"),
+        ("uint32", "long_value"),
+        ("bcd32", "long_value"),
+        ("uint64", "long_value"),
+    ],
+)
+def test_unsigned_integers_of_32_bits_are_long(type: str, field: str) -> None:
+    tag = Tag("speed", "input_registers", 0, type)
+    made = EdgeNode(Names("group", "edge"))
+    made.begin()
+    made.adopt({"pump": [tag]})
+    *_, birth = made.births({"pump": True}, lambda: latest(reading(7, 1.0, tag)))
+    [data] = made.data([reading(8, 2.0, tag)], latest)
+    for message, value in ((birth, 7), (data, 8)):
+        [metric] = payload(message).metrics
+        assert metric.HasField(field)
+        assert getattr(metric, field) == value
+
+
+@pytest.mark.parametrize("always_typed", [False, True])
+def test_data_has_types_if_they_are_always_wanted(always_typed: bool) -> None:
+    made = EdgeNode(Names("group", "edge"), always_typed=always_typed)
+    made.begin()
+    made.adopt({"pump": [SPEED]})
+    *_, birth = made.births({"pump": True}, lambda: latest(reading(0, 10.0)))
+    found = [payload(birth).metrics[0]]
+    for some in (reading(3, 8.0), reading(5, 11.0), reading(None, 12.0, fault=2)):
+        [message] = made.data([some], latest)
+        found += payload(message).metrics
+    assert [metric.HasField("datatype") for metric in found] == [True, *[always_typed] * 3]
+    assert {metric.datatype for metric in found} <= {0, 6}
+
+
 def test_sequence_numbers_begin_again_after_255() -> None:
     made = node(reading(0, 1.0))
     found = [

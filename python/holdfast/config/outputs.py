@@ -166,6 +166,8 @@ class SparkplugConfig(OutputConfig, BrokerConfig):
     """The version of MQTT."""
     client_id: Annotated[MqttText | None, NotNull()] = None
     """The client identifier. Default: holdfast, the name of the output, and that of the host."""
+    datatypes: Literal["births", "always"] = "births"
+    """Which messages have the types of metrics. always: DDATA too, for readers without a state."""
     writes: bool = False
     """Whether commands for writable tags are written to their devices."""
 

@@ -47,7 +47,7 @@ _FIELDS = {
     3: "int_value",
     4: "long_value",
     6: "int_value",
-    7: "int_value",
+    7: "long_value",
     8: "long_value",
     9: "float_value",
     10: "double_value",

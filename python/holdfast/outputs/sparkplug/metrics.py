@@ -31,8 +31,9 @@ class Entry(NamedTuple):
 class DeviceMetrics:
     """The metrics of one device, and what a host knows of them. For one thread."""
 
-    def __init__(self, device: str, tags: Sequence[Tag]) -> None:
+    def __init__(self, device: str, tags: Sequence[Tag], *, always_typed: bool) -> None:
         self.device = device
+        self._always_typed = always_typed
         self._tags = tags
         self._entries: dict[str, list[Entry]] = {}
         self.by_name: dict[str, Entry] = {}
@@ -77,6 +78,8 @@ class DeviceMetrics:
         is_historical = reading.time < self._born[name]
         for entry in self._entries[name]:
             metric = payload.metrics.add(alias=entry.alias, timestamp=int(reading.time * 1000))
+            if self._always_typed:
+                metric.datatype = entry.datatype.number
             if is_historical:
                 metric.is_historical = True
             has_value = _fill(metric, entry, reading.value)

@@ -36,10 +36,14 @@ SEQUENCE = 256
 
 
 class EdgeNode:
-    """What a host knows of this node and its devices. For one thread."""
+    """What a host knows of this node and its devices. For one thread.
 
-    def __init__(self, names: Names) -> None:
+    Metrics have their types in births, and if `always_typed`, also in data.
+    """
+
+    def __init__(self, names: Names, *, always_typed: bool = False) -> None:
         self._names = names
+        self._always_typed = always_typed
         self._seq = 0
         self._session = -1
         self._aliases = itertools.count(random.SystemRandom().randrange(1, FIRST_ALIASES))
@@ -59,7 +63,10 @@ class EdgeNode:
 
     def adopt(self, tags: Mapping[str, Sequence[Tag]]) -> None:
         """Takes over the tags, before births."""
-        self._devices = {device: DeviceMetrics(device, some) for device, some in tags.items()}
+        self._devices = {
+            device: DeviceMetrics(device, some, always_typed=self._always_typed)
+            for device, some in tags.items()
+        }
 
     def find(self, device: str, name: str, alias: int | None) -> Entry | None:
         """The metric with an alias, or with a name. Thread-safe."""

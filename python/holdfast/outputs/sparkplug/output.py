@@ -37,7 +37,7 @@ class SparkplugOutput:
         self._client_id = settings.client_id or f"holdfast-{name}-{socket.gethostname()}"
         self._broker = joined(settings.host, settings.port)
         self._names = Names(settings.group, settings.edge_node)
-        self._node = EdgeNode(self._names)
+        self._node = EdgeNode(self._names, always_typed=settings.datatypes == "always")
         self._commands = Commands(name, self._broker, site, self._node.find, writes=settings.writes)
         self._primary = None if settings.primary_host is None else PrimaryHost()
         self._stop: Stop | None = None
