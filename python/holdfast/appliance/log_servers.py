@@ -67,7 +67,7 @@ def _check(name: str, settings: SharedLogConfig) -> None:
 def sync_interval(url: str, settings: SharedLogConfig) -> float | None:
     """Seconds that what a server has confirmed may not be on its disk; `None` with `always`.
 
-    Raises `OSError`, `HTTPException`, and `ValueError` for an answer that is none of nats-server.
+    Raises `OSError`, `HTTPException`, and `ValueError` for an answer of another program.
     """
     host, port, secure, path = parse_http(url)
     connection = http.client.HTTPConnection(host, port, timeout=ANSWER_S)
