@@ -515,6 +515,20 @@ fn a_serial_line_that_is_never_silent_lets_the_request_time_out_unsent() {
 }
 
 #[test]
+fn a_request_whose_thread_wakes_up_late_is_sent_and_has_its_whole_timeout() {
+    for transport in [RTU, ASCII] {
+        let mut client = Client::new(transport);
+        client.receive(&[0]);
+        let ticket = client.send(read());
+        client.after(SECOND * 2);
+        assert!(!client.outgoing().is_empty());
+        assert_eq!(client.connection.deadline(), Some(client.now + SECOND));
+        client.after(SECOND);
+        assert_eq!(client.got(), [(ticket, Err(Failure::Timeout))]);
+    }
+}
+
+#[test]
 fn nobody_replies_to_a_broadcast_of_a_serial_line() {
     for transport in [RTU, ASCII] {
         let mut client = Client::new(transport);

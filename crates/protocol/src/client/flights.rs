@@ -193,16 +193,15 @@ impl Flights {
         invalid
     }
 
-    /// Notes that the first request is sent now. Its timeout begins at the latest, and may be raised.
+    /// Notes that the first request is sent now. Its timeout begins, and may be raised.
     pub(super) fn transmitted(&mut self, timeout: Duration, now: Time) {
         let Some(flight) = self.waiting.front_mut() else { return };
-        flight.sent = now;
         if timeout > flight.timeout {
             self.raised += 1;
-            flight.deadline = now + timeout;
             flight.timeout = timeout;
         }
-        flight.deadline = flight.deadline.min(now + flight.timeout);
+        flight.sent = now;
+        flight.deadline = now + flight.timeout;
     }
 
     /// Starts the timeout of the first request again.

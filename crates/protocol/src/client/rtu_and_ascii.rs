@@ -554,6 +554,8 @@ impl OneAtATime {
             }
             return;
         }
+        // First of all: where a thread wakes up late, its request is sent late, and not given up unsent.
+        self.transmit(flights, now);
         if flights.first().is_some_and(|flight| flight.deadline <= now) {
             self.note_ended(flights, Ended::TimedOut, now);
         }
@@ -565,9 +567,7 @@ impl OneAtATime {
             if sent && self.silence.is_none() {
                 flights.close(Closed::TimedOut, sink);
             }
-            return;
         }
-        self.transmit(flights, now);
     }
 
     /// The reply in what was received; `None` while more bytes are needed. Stray bytes before it are
