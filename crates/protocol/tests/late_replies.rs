@@ -114,12 +114,17 @@ impl World {
     }
 
     fn read(&mut self, unit_id: u8, address: u16) -> Result<u16, Failure> {
-        let request = Request::ReadHoldingRegisters(Range::new(address, 1).unwrap());
+        self.read_some(unit_id, address, 1)
+    }
+
+    /// Reads this many registers. Returns the first one.
+    fn read_some(&mut self, unit_id: u8, address: u16, quantity: u16) -> Result<u16, Failure> {
+        let request = Request::ReadHoldingRegisters(Range::new(address, quantity).unwrap());
         let request = EncodedRequest::new(&request);
         self.connection.send(unit_id, &request, TIMEOUT, self.now).unwrap();
         let mut found = None;
         loop {
-            self.serve(unit_id, address);
+            self.serve(unit_id, (address, quantity));
             let Some(deadline) = self.connection.deadline() else { break };
             let received = self.next(deadline);
             let sink = |done: Done<'_>| {
@@ -149,15 +154,15 @@ impl World {
     }
 
     /// Answers what the client has sent.
-    fn serve(&mut self, unit_id: u8, address: u16) {
+    fn serve(&mut self, unit_id: u8, (address, quantity): (u16, u16)) {
         let sent = self.connection.outgoing().to_vec();
         if sent.is_empty() {
             return;
         }
         self.connection.sent(sent.len());
         self.coming.extend(self.kept.drain(..).map(|kept| (self.now + 2 * MS, kept)));
-        let [high, low] = address.to_be_bytes();
-        let pdu = [3, 2, high, low];
+        let registers = (address..address + quantity).flat_map(u16::to_be_bytes);
+        let pdu: Vec<u8> = [3, 2 * quantity as u8].into_iter().chain(registers).collect();
         let reply = match self.transport {
             Transport::Tcp | Transport::Udp => {
                 let id = u16::from_be_bytes([sent[0], sent[1]]);
@@ -183,13 +188,13 @@ impl World {
         self.requests += 1;
     }
 
-    /// Reads different addresses, one after the other, with this pause.
-    fn run(&mut self, reads: u16, pause: Duration) -> Counts {
+    /// Reads different addresses, one after the other, with this pause, and 1 to `most` registers at each.
+    fn run(&mut self, reads: u16, pause: Duration, most: u16) -> Counts {
         let mut counts = Counts::default();
         for number in 0..reads {
             self.pass(pause);
             let address = 100 + number % 7 * 100;
-            match self.read(1, address) {
+            match self.read_some(1, address, 1 + number % most) {
                 Ok(value) if value == address => counts.right += 1,
                 Ok(_) => counts.wrong += 1,
                 Err(_) => counts.failed += 1,
@@ -230,11 +235,13 @@ fn no_reply_is_taken_for_another() {
     for (name, vice) in VICES {
         for transport in TRANSPORTS {
             for (pause, listens) in [(Duration::ZERO, true), (7 * MS, true), (7 * MS, false)] {
-                let mut world = World::new(transport, vice);
-                world.listens = listens;
-                let counts = world.run(500, pause);
-                wrong += counts.wrong;
-                table += &format!("{name}, {transport:?}, {pause:?}: {counts:?}\n");
+                for most in [1, 3] {
+                    let mut world = World::new(transport, vice);
+                    world.listens = listens;
+                    let counts = world.run(250, pause, most);
+                    wrong += counts.wrong;
+                    table += &format!("{name}, {transport:?}, {pause:?}, {most}: {counts:?}\n");
+                }
             }
         }
     }
@@ -245,7 +252,7 @@ fn no_reply_is_taken_for_another() {
 /// The reads of a device that always takes this long.
 fn constantly(transport: Transport, vice: Vice) -> (Counts, u64, u64) {
     let mut world = World::new(transport, vice);
-    let counts = world.run(40, Duration::ZERO);
+    let counts = world.run(40, Duration::ZERO, 1);
     let raised = world.connection.take_raised();
     (counts, world.late, raised)
 }
@@ -268,9 +275,9 @@ fn a_device_that_is_always_late_gets_more_time_until_it_is_not() {
 fn a_good_line_is_as_fast_as_before_after_its_first_replies() {
     for transport in [SERIAL[0], SERIAL[1], Transport::RtuOverTcp] {
         let mut world = World::new(transport, |_, _| vec![3 * MS]);
-        world.run(20, Duration::ZERO);
+        world.run(20, Duration::ZERO, 1);
         let began = world.now;
-        let counts = world.run(100, Duration::ZERO);
+        let counts = world.run(100, Duration::ZERO, 1);
         assert_eq!(counts, Counts { right: 100, wrong: 0, failed: 0 });
         let silence = if SERIAL.contains(&transport) { SILENCE } else { Duration::ZERO };
         assert_eq!(world.now - began, 100 * (3 * MS + silence));
@@ -287,6 +294,34 @@ fn a_unit_that_is_silent_holds_up_no_other_unit() {
     assert!(world.now - began <= 50 * MS);
     // Its own reply may still come.
     assert_eq!(world.read(9, 300), Ok(300));
+    assert!(world.now - began >= 2 * TIMEOUT);
+}
+
+#[test]
+fn a_read_of_another_length_does_not_wait_for_a_late_reply() {
+    for transport in SERIAL {
+        let late: Vice = |number, _| vec![if number == 0 { 320 * MS } else { 30 * MS }];
+        let mut world = World::new(transport, late);
+        assert_eq!(world.read_some(1, 100, 2), Err(Failure::Timeout));
+        let began = world.now;
+        assert_eq!(world.read_some(1, 200, 3), Ok(200));
+        assert!(world.now - began <= 60 * MS);
+        // Its own length waits for the late reply.
+        assert_eq!(world.read_some(1, 300, 2), Ok(300));
+        assert!(world.now - began > 70 * MS);
+        assert_eq!(world.connection.late(), 1);
+    }
+}
+
+#[test]
+fn the_length_of_a_reply_does_not_count_where_devices_pad_them() {
+    let tolerance = Tolerance { pad: true, ..Tolerance::default() };
+    let mut world =
+        World::new(SERIAL[0], |number, _| if number == 0 { vec![] } else { vec![3 * MS] });
+    world.connection = Connection::tolerant(SERIAL[0], tolerance, MS);
+    assert_eq!(world.read_some(1, 100, 2), Err(Failure::Timeout));
+    let began = world.now;
+    assert_eq!(world.read_some(1, 200, 3), Ok(200));
     assert!(world.now - began >= 2 * TIMEOUT);
 }
 
@@ -350,6 +385,6 @@ fn a_reply_that_is_faster_than_the_line_is_not_believed() {
 fn a_line_that_is_faster_than_its_settings_is_believed() {
     let mut world = World::new(SERIAL[0], |_, _| vec![MS]);
     world.connection = Connection::new(SERIAL[0]).on_line(MS);
-    let counts = world.run(40, Duration::ZERO);
+    let counts = world.run(40, Duration::ZERO, 1);
     assert_eq!(counts, Counts { right: 40, wrong: 0, failed: 0 });
 }

@@ -7,9 +7,9 @@
 use alloc::collections::{BTreeMap, BTreeSet, VecDeque};
 use core::time::Duration;
 
-use super::tolerance::AcceptUnit;
+use super::tolerance::{AcceptUnit, Tolerance};
 use super::{GUARD, MAX_LATENESS, Time};
-use crate::pdu::EncodedRequest;
+use crate::pdu::{EncodedRequest, Request};
 
 /// Requests without a reply that are remembered. With the bounds on their time, there are never as many.
 const MAX_UNANSWERED: usize = 64;
@@ -130,14 +130,15 @@ impl Earlier {
     pub(super) fn until(
         &mut self,
         unit_id: u8,
-        function: Option<&u8>,
-        accepted: AcceptUnit,
+        request: &EncodedRequest,
+        tolerance: &Tolerance,
         now: Time,
     ) -> Option<Time> {
         self.expire(now);
+        let accepted = tolerance.accept_unit;
         let alike = self.unanswered.iter().filter(|earlier| {
             let same_unit = accepted != AcceptUnit::Requested || earlier.unit_id == unit_id;
-            same_unit && earlier.request.pdu().first() == function
+            same_unit && may_confuse(&earlier.request, request, tolerance.pad)
         });
         alike.map(|earlier| earlier.until).max()
     }
@@ -288,6 +289,24 @@ impl Earlier {
         if unit.in_time == IN_TIME {
             *unit = Unit { longest: took, ..Unit::default() };
         }
+    }
+}
+
+/// Whether a reply to the earlier request could be taken for one to the other: not if both read a different
+/// number of bytes, which their replies contain. Bytes may be added to a reply that is padded.
+fn may_confuse(earlier: &EncodedRequest, other: &EncodedRequest, pads: bool) -> bool {
+    let same_function = earlier.pdu().first() == other.pdu().first();
+    same_function && (pads || read_bytes(earlier) == read_bytes(other))
+}
+
+/// The number of bytes that a read asks for; `None` for any other request.
+fn read_bytes(request: &EncodedRequest) -> Option<usize> {
+    match request.request()? {
+        Request::ReadCoils(range) | Request::ReadDiscreteInputs(range) => Some(range.byte_len()),
+        Request::ReadHoldingRegisters(range) | Request::ReadInputRegisters(range) => {
+            Some(range.byte_len())
+        }
+        _ => None,
     }
 }
 

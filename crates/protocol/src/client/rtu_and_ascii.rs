@@ -12,7 +12,7 @@ use super::flights::{Call, Done, Flight, Flights, Ticket};
 use super::tolerance::{Attempt, Echo};
 use super::{Closed, Failure, GUARD, InvalidResponse, TURNAROUND, Time};
 use crate::frame::{FrameError, ascii, rtu};
-use crate::pdu::{self, EncodedRequest, Response};
+use crate::pdu::{self, EncodedRequest, Response, ResponseError};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Framing {
@@ -160,8 +160,7 @@ impl OneAtATime {
         if self.repeats || is_broadcast {
             return Time::ZERO;
         }
-        let accepted = flights.tolerance.accept_unit;
-        let clear = self.earlier.until(unit_id, request.pdu().first(), accepted, now);
+        let clear = self.earlier.until(unit_id, request, &flights.tolerance, now);
         let used = self.earlier.used;
         let guarded = if used.is_zero() { used } else { used + self.earlier.guard() };
         clear.unwrap_or_default().max(guarded)
@@ -278,7 +277,7 @@ impl OneAtATime {
     /// Takes late replies out of the received bytes. Returns the number of their bytes.
     fn take_late(&mut self, flights: &mut Flights, now: Time) -> usize {
         let mut taken = 0;
-        while let Some((place, at, len)) = self.late_reply() {
+        while let Some((place, at, len)) = self.late_reply(flights.tolerance.pad) {
             self.earlier.late(place, now);
             self.received.drain(at..at + len);
             flights.late += 1;
@@ -288,22 +287,32 @@ impl OneAtATime {
     }
 
     /// The place of an earlier request whose reply was received, and where it is.
-    fn late_reply(&self) -> Option<(usize, usize, usize)> {
+    fn late_reply(&self, pads: bool) -> Option<(usize, usize, usize)> {
         let mut earlier = self.earlier.unanswered().enumerate();
         earlier.find_map(|(place, earlier)| {
             let (unit_id, request) = (earlier.unit_id, &earlier.request);
             (0..self.received.len()).find_map(|at| {
-                let len = self.reply_to(unit_id, request, &self.received[at..])?;
+                let len = self.reply_to(unit_id, request, pads, &self.received[at..])?;
                 Some((place, at, len))
             })
         })
     }
 
-    /// The length of the reply that `bytes` begin with, if it answers this request.
-    fn reply_to(&self, unit_id: u8, request: &EncodedRequest, bytes: &[u8]) -> Option<usize> {
+    /// The length of the reply that `bytes` begin with, if it answers this request. One with an exception
+    /// answers any request of its function.
+    fn reply_to(
+        &self,
+        unit_id: u8,
+        request: &EncodedRequest,
+        pads: bool,
+        bytes: &[u8],
+    ) -> Option<usize> {
         let function = *request.pdu().first()?;
         let is_its = |(unit, pdu): (u8, &[u8])| {
-            unit == unit_id && pdu.first().is_some_and(|code| code & 0x7F == function)
+            let is_of_function = pdu.first().is_some_and(|code| code & 0x7F == function);
+            // A request that reads another number of bytes may wait for its own reply.
+            let fits = pads || !matches!(request.response(pdu), Err(ResponseError::Length));
+            unit == unit_id && is_of_function && fits
         };
         match self.framing {
             Framing::Rtu => {
