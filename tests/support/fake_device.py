@@ -428,6 +428,10 @@ class Udp(ScriptedDevice):
         self._socket.close()
 
 
+FAST = {"parity": "none", "baud": 4_000_000}
+"""A pseudo-terminal carries bytes at once: clients doubt replies that are faster than their line."""
+
+
 class Serial(ScriptedDevice):
     """On a serial line."""
 
@@ -442,7 +446,7 @@ class Serial(ScriptedDevice):
         super().__init__(*script, then=then)
         self.terminal = lines.Terminal(device)
         self._peer = Wire(OnLine(mode), self.terminal)
-        query = "&".join(f"{key}={value}" for key, value in {"parity": "none", **options}.items())
+        query = "&".join(f"{key}={value}" for key, value in {**FAST, **options}.items())
         self.url = f"{mode.name}://{device}?{query}"
 
     def sources(self) -> list[Any]:

@@ -388,3 +388,15 @@ fn a_line_that_is_faster_than_its_settings_is_believed() {
     let counts = world.run(40, Duration::ZERO, 1);
     assert_eq!(counts, Counts { right: 40, wrong: 0, failed: 0 });
 }
+
+#[test]
+fn a_line_that_repeats_its_first_reply_and_is_faster_than_its_settings_is_believed_after_two_timeouts()
+ {
+    // The first reply is slow enough, so that it does not show that the line is fast.
+    let vice: Vice = |number, _| if number == 0 { vec![30 * MS, 31 * MS] } else { vec![MS] };
+    let mut world = World::new(SERIAL[0], vice);
+    world.connection = Connection::new(SERIAL[0]).on_line(MS);
+    let found: Vec<_> = (1..=5).map(|number| world.read(1, 100 * number)).collect();
+    let lost = Err(Failure::Timeout);
+    assert_eq!(found, [Ok(100), lost.clone(), lost, Ok(400), Ok(500)]);
+}

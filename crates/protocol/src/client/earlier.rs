@@ -39,6 +39,9 @@ const MAX_GUARD: Duration = GUARD.saturating_mul(10);
 /// doubted until one comes that nobody asked for.
 const ENOUGH_DOUBTS: u32 = 8;
 
+/// Requests in a row that have no other reply than one that comes too fast, after which none is too fast.
+const ONLY_TOO_FAST: u8 = 2;
+
 /// Replies that are compared with the next one.
 const RECENT: usize = 16;
 
@@ -59,8 +62,12 @@ pub(super) struct Earlier {
     guard: Guard,
     /// When something was received the last time, or a request ended.
     pub(super) used: Time,
-    /// The line is faster than its settings say: replies showed it that were the first ones.
+    /// The line is faster than its settings say: replies showed it that were the first ones, or the only ones.
     is_fast: bool,
+    /// A reply to the request came too fast.
+    too_fast: bool,
+    /// Requests in a row that had no other reply than one that came too fast.
+    only_too_fast: u8,
     /// The newest first.
     recent: VecDeque<Recent>,
 }
@@ -175,6 +182,21 @@ impl Earlier {
         self.is_fast
     }
 
+    /// Notes that the reply to a request came too fast to be its own.
+    pub(super) fn came_too_fast(&mut self) {
+        self.too_fast = true;
+        self.stray(Duration::ZERO);
+    }
+
+    /// Notes that a request timed out. A copy of an earlier reply that came too fast would have been followed
+    /// by its own: if none is, time and again, the line is faster than its settings say, as one over USB or a
+    /// network is.
+    fn timed_out(&mut self) {
+        self.only_too_fast = if self.too_fast { self.only_too_fast + 1 } else { 0 };
+        self.is_fast |= self.only_too_fast >= ONLY_TOO_FAST;
+        self.too_fast = false;
+    }
+
     /// Notes a reply that nobody asked for, this time after the last one.
     pub(super) fn stray(&mut self, after: Duration) {
         let learned = self.guard.learned.unwrap_or(GUARD);
@@ -196,6 +218,9 @@ impl Earlier {
         how: Ended,
         now: Time,
     ) {
+        if how == Ended::TimedOut {
+            self.timed_out();
+        }
         let unit = self.units.get(&unit_id);
         let until = match how {
             Ended::TimedOut => {
@@ -278,6 +303,7 @@ impl Earlier {
     pub(super) fn answered(&mut self, unit_id: u8, took: Duration, timeout: Duration) {
         self.guard.has_begun = true;
         self.guard.clean = self.guard.clean.saturating_add(1);
+        (self.too_fast, self.only_too_fast) = (false, 0);
         let unit = self.units.entry(unit_id).or_default();
         unit.longest = unit.longest.max(took.min(timeout));
         if took > timeout {

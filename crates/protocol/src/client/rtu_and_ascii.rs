@@ -347,7 +347,7 @@ impl OneAtATime {
             flights.strays.replies += 1;
             flights.strays.bytes += self.received.len() as u64;
             self.received.clear();
-            return self.earlier.stray(Duration::ZERO);
+            return self.earlier.came_too_fast();
         }
         let behind = core::mem::replace(&mut self.behind, Behind::NoFrame);
         let is_like_echo = self.is_like_echo(flights, &pdu);
