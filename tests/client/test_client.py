@@ -258,9 +258,13 @@ def test_a_client_that_was_never_used_can_be_closed(device: Device, dial: Dial) 
 
 
 @pytest.mark.parametrize("device", ["rtu", "ascii"], indirect=True)
-def test_a_write_to_all_units_of_a_line_waits_for_no_reply(client: Face) -> None:
+def test_a_write_to_all_units_of_a_line_waits_for_no_reply(device: Device, client: Face) -> None:
+    memories = (device.memory, device.other)
     client.write("holding_registers", 5, 21.5, "float32", unit=0)
+    # A line that is read late has no silence between two frames.
+    wire.until(lambda: all(m.read("holding_registers", 5, 1) != [0] for m in memories), "written")
     client.write_coil(3, True, unit=0)
+    wire.until(lambda: all(m.read("coils", 3, 1) == [True] for m in memories), "written")
 
     for unit in (1, 2):
         assert client.read_holding_registers(5, 2, unit=unit) == [0x41AC, 0]
