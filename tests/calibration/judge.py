@@ -175,7 +175,7 @@ def _of_one(case: Case, offset: int, type: str, order: str, end: int) -> bool | 
         return True
     readings = _readings(case, offset, registers, type, order)
     return any(
-        _same(readings, _readings(case, offset, registers, other, truth.order))
+        _same(readings, _readings(case, offset, truth.registers, other, truth.order))
         for other in (truth.type, *_of_bytes(truth))
     ) or (truth.is_bits and _same_bits(case, truth, type, order))
 

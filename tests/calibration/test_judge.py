@@ -58,6 +58,11 @@ def test_a_claim_that_begins_inside_a_value_is_wrong() -> None:
     assert judgement(block(("uint32", "ABCD", 70_000), ("uint16", "ABCD", 7)), 1, "uint32") is False
 
 
+def test_a_number_that_takes_a_register_too_much_is_wrong_though_it_is_the_same() -> None:
+    case = block(("uint16", "ABCD", 7), (EMPTY, "ABCD", 0))
+    assert judgement(case, 0, "uint32", "CDAB") is False
+
+
 def test_the_other_sign_is_true_if_all_reads_are_the_same_number_and_else_wrong() -> None:
     case = block(("int16", "ABCD", 230), ("int16", "ABCD", -230))
     assert judgement(case, 0, "uint16") is True
@@ -118,6 +123,8 @@ def test_a_text_is_true_if_it_is_whole_and_swallows_only_registers_without_a_val
     assert judgement(case, 0, "string:4") is False
     assert judgement(case, 0, "string:8", "BADC") is False
     assert judgement(case, 0, "string:14") is False
+    followed_by_zero = block(("string:4", "ABCD", "V1.2"), ("uint16", "ABCD", 0))
+    assert judgement(followed_by_zero, 0, "string:6") is False
 
 
 def test_two_texts_that_are_claimed_as_one_are_wrong() -> None:
