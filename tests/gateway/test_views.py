@@ -335,3 +335,44 @@ def test_a_value_that_does_not_fit_is_refused(
     answer = local(gateway, "/tags/value", {"tags": METER, "name": name, "value": text})
     assert answer.status == 400
     assert says in answer.json["error"], answer.json["error"]
+
+
+@pytest.mark.parametrize(
+    ("datatype", "order", "given", "registers", "texts"),
+    [
+        ("uint16", "ABCD", [222], [222], ["222"]),
+        ("int16", "ABCD", [-1], [0xFFFF], ["-1"]),
+        ("float32", "CDAB", [222, 1e-7], [0, 0x435E, 0xBF95, 0x33D6], ["222", "1e-07"]),
+        ("uint64", "ABCD", [2**64 - 1], [0xFFFF] * 4, ["18446744073709551615"]),
+        ("bytes:3", "ABCD", ["0a0b0c"], [0x0A0B, 0x0C00], ["0a 0b 0c"]),
+    ],
+)
+def test_the_registers_of_typed_values_are_told_before_a_write(
+    gateway: Running,
+    datatype: str,
+    order: str,
+    given: list[Any],
+    registers: list[int],
+    texts: list[str],
+) -> None:
+    asked = {"datatype": datatype, "byteOrder": order, "values": given}
+    found = local(gateway, "/values", asked).json
+    assert (found["values"], found["typedText"]) == (registers, texts)
+
+
+@pytest.mark.parametrize(
+    ("datatype", "given", "says"),
+    [
+        ("uint16", [70000], "values[0]:"),
+        ("float32", [1, 1e39], "values[1]:"),
+        ("float64", [1] * 31, "124 registers, allowed: 123 in a request"),
+        ("bit:3", [True], "use /api/modbus/write/mask"),
+        ("uint17", [1], "uint17"),
+    ],
+)
+def test_typed_values_that_can_not_be_written_are_refused_before_a_write(
+    gateway: Running, datatype: str, given: list[Any], says: str
+) -> None:
+    answer = local(gateway, "/values", {"datatype": datatype, "values": given})
+    assert answer.status == 400
+    assert says in answer.json["error"], answer.json["error"]

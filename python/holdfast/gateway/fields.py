@@ -85,6 +85,8 @@ REGISTER = integer(0, MAX_WORD)
 ADDRESS_SCHEMA = integer(0, LAST_ADDRESS)
 UNIT_SCHEMA = integer(0, MAX_UNIT)
 BIT: Schema = {"enum": [False, True, 0, 1]}
+TYPED_SCHEMA: Schema = {"type": ["integer", "number", "string", "boolean"]}
+"""A value of the type that `datatype` names."""
 TEXT: Schema = {"type": "string", "minLength": 1, "maxLength": 32}
 ORDER: Schema = {"type": "string", "pattern": "^([A-D]{4}|[A-H]{8})$"}
 

@@ -1,17 +1,28 @@
-"""The endpoints for tag lists. They ask no device."""
+"""The endpoints for tag lists, and for values before they are written. They ask no device."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from holdfast.gateway import tagging
+from holdfast.gateway import tagging, typed
+from holdfast.gateway.endpoint import REGISTERS
+from holdfast.gateway.fields import (
+    BYTE_ORDER,
+    DATATYPE,
+    REQUIRED,
+    TYPED_SCHEMA,
+    Field,
+    array,
+)
+from holdfast.gateway.reading import TYPED
+from holdfast.protocol import WRITE_REGISTERS
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from holdfast.gateway.endpoint import Answer, Given
-    from holdfast.gateway.fields import Field, Schema
+    from holdfast.gateway.fields import Schema
     from holdfast.tags import TagList
 
 PROFILES = "/api/gateway/profiles"
@@ -29,9 +40,12 @@ class Local:
     answer: Callable[[Given, Mapping[str, TagList]], Awaitable[Answer]]
     properties: dict[str, Schema]
     """The schemas of the answer's fields, without `success`."""
+    example: str
+    """The name of an example of a request, and of its answer."""
     request: dict[str, Any]
-    """An example of a request, and of its answer."""
     reply: dict[str, Any]
+    optional: tuple[str, ...] = ()
+    """The properties that an answer may not have."""
 
 
 def profiles(known: Mapping[str, TagList]) -> Answer:
@@ -107,6 +121,7 @@ ENDPOINTS = (
         tagging.LIST,
         tagging.parse,
         {"tags": {"type": "array", "items": TAG}},
+        "A list of one tag",
         {"tags": _EXAMPLE, "format": "csv"},
         {"tags": [_SETPOINT]},
     ),
@@ -128,6 +143,7 @@ ENDPOINTS = (
             "value": {"description": "The value as it is then read"},
             "text": TEXT,
         },
+        "A list of one tag",
         {"tags": _EXAMPLE, "format": "csv", "name": "setpoint", "value": "21.5"},
         {
             "tag": _SETPOINT,
@@ -136,5 +152,27 @@ ENDPOINTS = (
             "value": 21.5,
             "text": "21.5",
         },
+    ),
+    Local(
+        "/api/gateway/values",
+        "values",
+        "Check typed values before they are written",
+        "Returns the registers that hold the values, and the values as they are then read. Nothing "
+        "is sent. A value that does not fit the type is refused.",
+        (
+            Field(
+                "values",
+                array(TYPED_SCHEMA, WRITE_REGISTERS),
+                f"Values of the type, bytes in hex, for up to {WRITE_REGISTERS} registers",
+            ),
+            replace(DATATYPE, default=REQUIRED),
+            BYTE_ORDER,
+        ),
+        typed.encode,
+        {"values": REGISTERS, **TYPED},
+        "A float, low word first",
+        {"values": [21.5], "datatype": "float32", "byteOrder": "CDAB"},
+        {"values": [0, 0x41AC], "typed": [21.5], "typedText": ["21.5"]},
+        optional=("typedErrors",),
     ),
 )

@@ -54,7 +54,7 @@ def document(version: str, endpoints: Iterable[Operation], settings: Settings) -
     secured = bool(settings.tokens)
     limits = settings.limits
     paths: dict[str, Any] = {each.path: {"post": _endpoint(each, limits)} for each in endpoints}
-    paths |= _streams(limits) | {STATUS: {"get": _status()}, **_of_lists()}
+    paths |= _streams(limits) | {STATUS: {"get": _status()}, **_local()}
     for path in paths.values():
         for operation in path.values():
             operation["security"] = [{"token": []}] if secured else []
@@ -169,19 +169,21 @@ def _view(limits: GatewayLimits) -> dict[str, Any]:
     }
 
 
-def _of_lists() -> dict[str, Any]:
-    """The operations on tag lists."""
+def _local() -> dict[str, Any]:
+    """The operations that ask no device."""
     found: dict[str, Any] = {
         each.path: {
             "post": {
                 "operationId": each.name,
                 "summary": each.summary,
                 "description": each.description,
-                "requestBody": _body(each.fields, {"A list of one tag": each.request}),
+                "requestBody": _body(each.fields, {each.example: each.request}),
                 "responses": {
                     "200": json_answer(
-                        "The list is valid",
-                        object_of({"success": {"const": True}, **each.properties}),
+                        "The request is valid",
+                        object_of(
+                            {"success": {"const": True}, **each.properties}, optional=each.optional
+                        ),
                         {"success": True, **each.reply},
                     ),
                     **_refusals(*BODY, *ASKING, "busy"),

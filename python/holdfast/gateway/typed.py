@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast import values
 from holdfast.gateway.fields import malformed
+from holdfast.protocol import WRITE_REGISTERS
 from holdfast.values import ConversionError, WrongArea
 from holdfast.values.digits import shortest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from holdfast.gateway.endpoint import Answer, Given
     from holdfast.types import Area
 
 
@@ -54,6 +56,8 @@ class Typed:
                 registers += values.encode(self._plain(value), self.element, self.order)
             except ConversionError as error:
                 raise malformed(f"values[{index}]: {error}") from None
+        if len(registers) > WRITE_REGISTERS:
+            raise malformed(f"{len(registers)} registers, allowed: {WRITE_REGISTERS} in a request")
         return registers
 
     def _plain(self, value: Any) -> Any:
@@ -95,6 +99,17 @@ def typed(datatype: str | None, order: str, area: Area) -> Typed | None:
     except ConversionError as error:
         raise malformed(str(error)) from None
     return Typed(type.element, order, type.width // 2, type.count)
+
+
+async def encode(given: Given, _: object) -> Answer:
+    """Answers with the registers that hold values, and the values as they are then read.
+
+    Raises `BadRequest`.
+    """
+    kind = typed(given["datatype"], given["byteOrder"], "holding_registers")
+    assert kind is not None
+    registers = kind.encode(given["values"])
+    return {"success": True, "values": registers, **kind.decode(registers)}
 
 
 def quantity_of(given: int | None, kind: Typed | None) -> int:

@@ -19,6 +19,7 @@ from holdfast.gateway.fields import (
     BYTE_ORDER,
     DATATYPE,
     REGISTER,
+    TYPED_SCHEMA,
     Field,
     array,
     integer,
@@ -42,9 +43,6 @@ if TYPE_CHECKING:
 
 ON = 0xFF00
 TIMEOUT = 5_000
-
-PLAIN_OR_TYPED = {"type": ["integer", "number", "string", "boolean"]}
-"""Values of the type that `datatype` names."""
 
 
 async def _write_coil(given: Given, device: RequestedDevice) -> Answer:
@@ -81,8 +79,6 @@ async def _write_register(given: Given, device: RequestedDevice) -> Answer:
 
 async def _write_registers(given: Given, device: RequestedDevice) -> Answer:
     address, values = given["address"], _registers(given)
-    if len(values) > WRITE_REGISTERS:
-        raise malformed(f"{len(values)} registers, allowed: {WRITE_REGISTERS} in a request")
     _check_end(address, len(values))
     await device.ask(lambda client: client.write_registers(address, values, unit=device.unit))
     return _written(device, address, len(values))
@@ -181,7 +177,7 @@ ENDPOINTS = (
             *TARGET,
             ADDRESS,
             _values(
-                PLAIN_OR_TYPED,
+                TYPED_SCHEMA,
                 WRITE_REGISTERS,
                 f"Up to {WRITE_REGISTERS} register values 0 to {MAX_WORD}; with `datatype`, values "
                 "of that type, bytes in hex",
