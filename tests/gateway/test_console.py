@@ -54,7 +54,7 @@ def test_a_device_is_connected_to_and_read(
     view.says("The device responded")
     view.says("Acme")
     view.says(HARMFUL)
-    view.choose(quantity="8")
+    view.choose(type="float32", quantity="8")
     view.button("Read").click()
     view.says("Holding registers 0 to 7: read in")
     cells = [
@@ -76,6 +76,16 @@ def test_every_type_of_a_register_is_shown(opened: Opened) -> None:
     expect(dialog.get_by_role("row", name="uint16 16812 16812")).to_be_visible()
     view.button("Close").click()
     expect(dialog).to_be_hidden()
+
+
+def review(view: View, button: str | None, text: str) -> Locator:
+    """Types a value into the write dialog, which the button opens, and reviews it."""
+    if button is not None:
+        view.button(button).click()
+    view.page.locator("#write-value").fill(text)
+    view.button("Review").click()
+    expect(view.button("Write it")).to_be_visible()
+    return view.page.get_by_role("dialog")
 
 
 @both
@@ -104,7 +114,7 @@ def test_a_register_is_written_after_old_and_new_were_seen(
 def test_typed_values_are_written(opened: Opened, plant: holdfast.Memory) -> None:
     view = opened()
     view.connect()
-    view.choose(order="CDAB")
+    view.choose(type="float32", order="CDAB")
     view.button("Read").click()
     view.button("Write 8").click()
     view.page.get_by_role("textbox", name="New value").fill("21.5, -1")
@@ -127,6 +137,154 @@ def test_a_coil_is_written(opened: Opened, plant: holdfast.Memory) -> None:
     view.button("Write it").click()
     expect(view.button("Coil 1: 1, on")).to_be_visible()
     assert plant.read("coils", 0, 3) == [1, 1, 1]
+
+
+def test_a_newcomer_writes_one_register(opened: Opened, plant: holdfast.Memory) -> None:
+    view = opened()
+    view.connect()
+    expect(view.page.get_by_role("combobox", name="Type")).to_have_value("uint16")
+    view.button("Read").click()
+    view.says("Holding registers 0 to 9: read in")
+    dialog = review(view, "Write 4", "222")
+    expect(dialog.get_by_text("Writes 1 register: 4.")).to_be_visible()
+    expect(dialog.get_by_role("row", name="4 1234 0x04D2 222 0x00DE")).to_be_visible()
+    view.button("Write it").click()
+    view.says("Written and read back")
+    assert plant.read("holding_registers", 4, 2) == [222, 0]
+
+
+def test_a_chosen_type_stays_chosen(opened: Opened) -> None:
+    view = opened()
+    view.connect()
+    view.choose(type="float32")
+    view.page.reload()
+    expect(view.page.locator("#type")).to_have_value("float32")
+    view.connect()
+    view.button("Read").click()
+    view.says("Holding registers 0 to 9: read in")
+    view.button("Write 0").click()
+    expect(view.page.get_by_role("combobox", name="Written as")).to_have_value("typed")
+    expect(view.page.locator("#write-as option").last).to_have_text("float32")
+
+
+def test_a_review_lists_each_register_of_typed_values(opened: Opened) -> None:
+    view = opened()
+    view.connect()
+    view.choose(type="float32")
+    view.button("Read").click()
+    dialog = review(view, "Write 0", "222; 0.1")
+    expect(dialog.get_by_text("Writes 4 registers: 0-3.")).to_be_visible()
+    values = dialog.get_by_role("table", name="float32, byte order ABCD")
+    expect(values.get_by_role("row")).to_have_count(3)
+    expect(values.get_by_role("row", name="0 21.5 222")).to_be_visible()
+    expect(values.get_by_role("row", name="2 1.013 0.1")).to_be_visible()
+    words = dialog.get_by_role("table", name="Registers").get_by_role("row")
+    assert [" ".join(text.split()) for text in words.all_inner_texts()] == [
+        "Register Now New",
+        "0 16812 0x41AC 17246 0x435E",
+        "1 0 0x0000 0 0x0000",
+        "2 16257 0x3F81 15820 0x3DCC",
+        "3 43516 0xA9FC 52429 0xCCCD",
+    ]
+    # The value as the device then has it, which differs from what was typed.
+    view.button("Back").click()
+    review(view, None, "16777217")
+    expect(values.get_by_role("row", name="0 21.5 16777216")).to_be_visible()
+
+
+def test_a_review_lists_each_coil(opened: Opened, plant: holdfast.Memory) -> None:
+    view = opened()
+    view.connect()
+    view.choose(area="1", quantity="20")
+    view.button("Read").click()
+    dialog = review(view, "Coil 1: 0, off", "1; 0; 0")
+    expect(dialog.get_by_text("Writes 3 coils: 1-3.")).to_be_visible()
+    rows = dialog.get_by_role("table", name="Coils").get_by_role("row")
+    texts = [text.split() for text in rows.all_inner_texts()[1:]]
+    assert texts == [["1", "off", "on"], ["2", "on", "off"], ["3", "off", "off"]]
+    view.button("Write it").click()
+    view.says("Written and read back")
+    assert plant.read("coils", 0, 4) == [1, 1, 0, 0]
+
+
+def test_a_review_of_a_bit_lists_its_register(opened: Opened, plant: holdfast.Memory) -> None:
+    view = opened()
+    view.connect()
+    view.choose(type="bit", size="3")
+    view.button("Read").click()
+    dialog = review(view, "Write 4", "on")
+    expect(dialog.get_by_text("Writes 1 register: 4. Only bit 3 is written.")).to_be_visible()
+    expect(dialog.get_by_role("row", name="4 false true")).to_be_visible()
+    expect(dialog.get_by_role("row", name="4 1234 0x04D2 1242 0x04DA")).to_be_visible()
+    view.button("Write it").click()
+    view.says("Written and read back")
+    assert plant.read("holding_registers", 4, 1) == [1242]
+
+
+def test_a_review_of_many_registers_lists_them_all(opened: Opened, plant: holdfast.Memory) -> None:
+    view = opened(PHONE)
+    view.connect()
+    view.button("Read").click()
+    values = list(range(500, 623))
+    view.button("Write 0").click()
+    box = view.page.get_by_role("textbox", name="New value")
+    box.fill(";".join(map(str, [*values, 1])))
+    view.button("Review").click()
+    view.says("too many values: 124 registers, at most 123 in one write")
+    dialog = review(view, None, ";".join(map(str, values)))
+    expect(dialog.get_by_text("Writes 123 registers: 0-122.")).to_be_visible()
+    expect(dialog.get_by_role("row")).to_have_count(124)
+    expect(view.button("Write it")).to_be_in_viewport(ratio=1)
+    view.button("Write it").click()
+    view.says("Written and read back")
+    assert plant.read("holding_registers", 0, 123) == values
+
+
+def test_a_review_can_be_read_at_320_pixels_and_by_screen_readers(opened: Opened) -> None:
+    view = opened({"viewport": {"width": 320, "height": 640}, "has_touch": True})
+    view.connect()
+    view.choose(type="float32")
+    view.button("Read").click()
+    dialog = review(view, "Write 0", "222")
+    expect(view.button("Write it")).to_be_focused()
+    expect(view.button("Write it")).to_be_in_viewport(ratio=1)
+    expect(view.button("Write it")).to_have_accessible_description(
+        re.compile("Writes 2 registers: 0-1. The current values were read at")
+    )
+    assert dialog.evaluate("(each) => each.scrollWidth <= each.clientWidth")
+    tables = dialog.get_by_role("region", name="What is written")
+    assert tables.evaluate("(each) => each.scrollWidth <= each.clientWidth")
+    assert view.page.evaluate(UNNAMED) == []
+    view.page.keyboard.press("Shift+Tab")
+    expect(view.button("Back")).to_be_focused()
+    view.page.keyboard.press("Shift+Tab")
+    expect(tables).to_be_focused()
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "allowed"),
+    [
+        ("uint16", "65536", "0 to 65535"),
+        ("uint16", "-5", "0 to 65535"),
+        ("int16", "40000", "−32768 to 32767"),
+        ("uint32", "-1", "0 to 4294967295"),
+        ("bcd16", "10000", "0 to 9999"),
+        ("float32", "4e38", "−3.40282e+38 to 3.40282e+38"),
+    ],
+)
+def test_a_value_outside_the_chosen_type_is_refused_with_its_range(
+    opened: Opened, plant: holdfast.Memory, kind: str, text: str, allowed: str
+) -> None:
+    view = opened()
+    view.connect()
+    view.choose(type=kind)
+    view.button("Read").click()
+    view.button("Write 4").click()
+    view.page.get_by_role("textbox", name="New value").fill(text)
+    view.button("Review").click()
+    expect(view.page.get_by_role("alert").filter(has_text=f": {allowed}")).to_be_visible()
+    expect(view.button("Write it")).to_be_hidden()
+    assert plant.read("holding_registers", 4, 2) == [1234, 0]
 
 
 def test_a_value_that_is_none_is_not_written(opened: Opened, plant: holdfast.Memory) -> None:
@@ -153,7 +311,7 @@ def test_what_changes_is_marked_and_plotted(
 ) -> None:
     view = opened(size, scheme)
     view.connect()
-    view.choose(quantity="4", interval="50")
+    view.choose(type="float32", quantity="4", interval="50")
     view.button("Watch").click()
     view.says("Watching holding registers 0 to 3")
     plot = view.page.get_by_role("article").filter(has=view.page.get_by_role("heading", name="0"))
@@ -460,6 +618,8 @@ class Registers:
     def __init__(self, fault: Callable[[bytes], bytes | None] | None = None) -> None:
         self.values = [1234] * 10
         self.fault = fault
+        self.hides = False
+        """Whether the registers can only be written."""
         self.heard: list[bytes] = []
 
     def __call__(self, pdu: bytes) -> bytes | None:
@@ -467,6 +627,8 @@ class Registers:
         first = int.from_bytes(pdu[1:3])
         if pdu[0] == 3:
             count = int.from_bytes(pdu[3:5])
+            if self.hides:
+                return exception(pdu, 4)
             if first + count > len(self.values):
                 return exception(pdu, 2)
             found = self.values[first : first + count]
@@ -590,6 +752,83 @@ def test_errors_before_a_write_are_told_in_plain_words(opened: Opened) -> None:
         assert device.writes == []
 
 
+def test_registers_that_can_not_be_read_are_written(opened: Opened) -> None:
+    device = Registers()
+    with FakeDevice(device) as hiding:
+        view = opened()
+        read_registers(view, hiding.port)
+        device.hides = True
+        dialog = review(view, "Write 1", "4711")
+        expect(dialog.get_by_text("The current value can't be read.")).to_be_visible()
+        expect(dialog.get_by_text("The device failed to carry out the request.")).to_be_visible()
+        expect(dialog.get_by_role("row", name="1 not read 4711 0x1267")).to_be_visible()
+        view.button("Write it").click()
+        view.says("Written. Reading back failed.")
+        assert device.values[1] == 4711
+
+
+REFRESHED_AFTER = """(ms) => {
+  const wait = window.setTimeout;
+  window.setTimeout = (work, time, ...more) => wait(work, time === 3000 ? ms : time, ...more);
+}"""
+"""Changes the time after which a review reads again."""
+NEVER = 10**9
+LATER = "() => { const now = Date.now; Date.now = () => now() + 60_000; }"
+
+
+def test_a_review_is_refreshed_before_a_write_if_a_register_has_changed(opened: Opened) -> None:
+    device = Registers()
+    with FakeDevice(device) as changing:
+        view = opened()
+        view.page.evaluate(REFRESHED_AFTER, NEVER)
+        read_registers(view, changing.port)
+        dialog = review(view, "Write 1", "4711")
+        expect(dialog.get_by_role("row", name="1 1234 0x04D2 4711 0x1267")).to_be_visible()
+        device.values[1] = 7
+        view.button("Write it").click()
+        view.says("The current values have changed.")
+        expect(dialog.get_by_role("row", name="1 7 0x0007 4711 0x1267")).to_be_visible()
+        assert device.writes == []
+        device.values[1] = 8  # A value that changes all the time can be written.
+        view.button("Write it").click()
+        view.says("Written and read back")
+        assert device.values[1] == 4711
+
+
+def test_an_open_review_is_refreshed(opened: Opened) -> None:
+    device = Registers()
+    with FakeDevice(device) as changing:
+        view = opened()
+        view.page.evaluate(REFRESHED_AFTER, 20)
+        read_registers(view, changing.port)
+        dialog = review(view, "Write 1", "4711")
+        device.values[1] = 7
+        expect(dialog.get_by_role("row", name="1 7 0x0007 4711 0x1267")).to_be_visible()
+        view.says("The current values have changed.")
+        device.hides = True
+        view.page.evaluate(LATER)
+        expect(dialog.get_by_role("row", name="1 not read 4711 0x1267")).to_be_visible()
+        assert device.writes == []
+
+
+def test_an_old_review_is_refreshed_before_a_write(opened: Opened) -> None:
+    device = Registers()
+    with FakeDevice(device) as hiding:
+        view = opened()
+        view.page.evaluate(REFRESHED_AFTER, NEVER)
+        read_registers(view, hiding.port)
+        dialog = review(view, "Write 1", "4711")
+        device.hides = True
+        view.page.evaluate(LATER)
+        view.button("Write it").click()
+        view.says("The current values have changed.")
+        expect(dialog.get_by_role("row", name="1 not read 4711 0x1267")).to_be_visible()
+        assert device.writes == []
+        view.button("Write it").click()
+        view.says("Written. Reading back failed.")
+        assert device.values[1] == 4711
+
+
 def test_a_change_of_the_device_makes_what_is_shown_old(opened: Opened) -> None:
     first, second = Registers(), Registers()
     second.values = [7] * 10
@@ -688,6 +927,7 @@ def test_a_click_on_a_range_reads_no_more_than_that(
     with FakeDevice(only(there)) as device:
         view = opened()
         view.connect(port=device.port)
+        view.choose(type="float32")
         survey(view, 900, 1400)
         last = f"–{there[-1]}" if len(there) > 1 else ""
         view.button(f"Read holding registers 1000{last}").click()
@@ -886,7 +1126,7 @@ def test_a_range_is_checked_before_it_is_watched_or_read(opened: Opened) -> None
 def test_whole_values_are_read_and_that_is_told(opened: Opened) -> None:
     view = opened()
     view.connect()
-    view.choose(quantity="125")
+    view.choose(type="float32", quantity="125")
     view.button("Read").click()
     view.says("Each float32 has 2 registers: 124 instead of 125.")
     view.choose(quantity="1")
@@ -918,7 +1158,7 @@ def test_a_watch_goes_on_when_the_gateway_is_back(opened: Opened) -> None:
     view = opened()
     view.connect()
     view.says("The device responded")
-    view.choose(quantity="2", interval="50")
+    view.choose(type="float32", quantity="2", interval="50")
     part = {"kind": "range", "functionCode": 3, "address": 0, "quantity": 2, "format": "registers"}
     part |= {"values": [0, 0], "texts": ["0"], "errors": {}}
     body = json.dumps({"time": 0, "rtt": 0, "stream": True, "parts": [part]})
@@ -958,7 +1198,7 @@ def test_a_plot_of_tiny_values_has_labels(opened: Opened, plant: holdfast.Memory
     view = opened()
     view.page.evaluate(LABELS)
     view.connect()
-    view.choose(quantity="2", interval="50")
+    view.choose(type="float32", quantity="2", interval="50")
     view.button("Watch").click()
     view.says("Watching")
     plant.write("holding_registers", 0, floats(2e-30))

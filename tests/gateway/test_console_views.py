@@ -32,6 +32,12 @@ tags:
   lamp: {area: coils, address: 2, writable: true}
   absent: {area: input_registers, address: 5}
 """
+PLACES = """\
+tags:
+  flow: {area: holding_registers, address: 10, type: float32, order: CDAB, writable: true}
+  alarm: {area: holding_registers, address: 12, type: "bit:4", writable: true}
+  lamps: {area: coils, address: 1, type: "bool[2]", writable: true}
+"""
 TANK = TagList([Tag("level", "input_registers", 1002, "int16", unit="mm")])
 WATCHES = 7
 """More tabs than the connections that a browser opens to one host."""
@@ -166,6 +172,28 @@ def test_a_tag_is_written_in_its_unit(opened: Opened, plant: holdfast.Memory) ->
     view.says("Written and read back")
     assert plant.read("holding_registers", 4, 1) == [215]
     expect(tag(view, "room")).to_have_text("21.5")
+
+
+def test_a_review_of_a_tag_lists_its_registers(opened: Opened, plant: holdfast.Memory) -> None:
+    plant.write("holding_registers", 10, [0, 0x41AC, 0x0800])
+    view = connected(opened)
+    add_tags(view, PLACES)
+    view.button("Read").click()
+    for name, text, says, rows in (
+        ("flow", "222", "Writes 2 registers: 10-11.", ("flow 21.5 222", "11 16812 0x41AC 17246")),
+        ("alarm", "on", "Only bit 4 is written.", ("alarm false true", "12 2048 0x0800 2064")),
+        ("lamps", "[true,false]", "Writes 2 coils: 1-2.", ("1 off on", "2 on off")),
+    ):
+        view.button(f"Write {name}").click()
+        view.page.locator("#write-value").fill(text)
+        view.button("Review").click()
+        dialog = view.page.get_by_role("dialog")
+        expect(dialog.get_by_text(says)).to_be_visible()
+        for row in rows:
+            expect(dialog.get_by_role("row", name=row)).to_be_visible()
+        view.button("Back").click()
+        view.button("Cancel").click()
+    assert plant.read("holding_registers", 10, 3) == [0, 0x41AC, 0x0800]
 
 
 def test_states_and_bits_of_tags_are_written(opened: Opened, plant: holdfast.Memory) -> None:
@@ -452,7 +480,7 @@ def test_what_is_shown_is_downloaded(opened: Opened, plant: holdfast.Memory) -> 
     plant.write("holding_registers", 0, floats(21.5))
     plant.write("holding_registers", 8, [0x3D31, 0])  # "=1"
     view = connected(opened)
-    view.choose(quantity="4")
+    view.choose(type="float32", quantity="4")
     view.button("Add range to view").click()
     view.choose(address="8", quantity="1", type="string", size="2")
     view.button("Add range to view").click()

@@ -71,14 +71,14 @@ def read(opened: Opened, scheme: Scheme) -> View:
     """Registers, read once."""
     view = opened(DESK, scheme)
     view.connect()
-    view.choose(quantity="10")
+    view.choose(type="float32", quantity="10")
     view.button("Read").click()
     view.says("Holding registers 0 to 9: read in")
     return view
 
 
 def write(opened: Opened, scheme: Scheme) -> View:
-    """Old and new value before a write, on a phone."""
+    """The review of a register before a write, on a phone."""
     view = opened(PHONE, scheme)
     view.connect()
     view.choose(type="uint16", address="4", quantity="4")
@@ -94,7 +94,7 @@ def watch(opened: Opened, scheme: Scheme) -> View:
     """Changing registers, with plots."""
     view = opened(DESK, scheme)
     view.connect()
-    view.choose(quantity="6", interval="250")
+    view.choose(type="float32", quantity="6", interval="250")
     view.button("Watch").click()
     view.says("Watching holding registers")
     for step in range(40):

@@ -32,6 +32,11 @@ export async function once(button, work) {
   }
 }
 
+export const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+
+/** Returns a time in milliseconds as hours, minutes and seconds. */
+export const clock = (time) => new Date(time).toTimeString().slice(0, 8);
+
 /** Shows or hides a field with its label. Hidden fields are not validated. */
 export function show(field, is) {
   field.closest("label").hidden = !is;

@@ -35,15 +35,19 @@ const DIGITS = { 1: "0", 2: "1", 3: "4", 4: "3" };
 export const modicon = (area, address) =>
   DIGITS[area] + String(address + 1).padStart(address > 9998 ? 5 : 4, "0");
 
-/** Parses a register: decimal, 0x, 0b, or negative. Throws an error for other text. */
+/** What can be typed for a register. */
+export const REGISTER_FORMS = "0 to 65535, 0x0000 to 0xFFFF, or bits such as 0b1010";
+
+/** Parses a register: decimal, 0x or 0b. Throws an error for other text. */
 export function register(text) {
   const plain = text.trim().replaceAll("_", "");
-  const form = /^(-?\d{1,5}|0[xX][0-9a-fA-F]{1,4}|0[bB][01]{1,16})$/;
+  const form = /^(\d{1,5}|0[xX][0-9a-fA-F]{1,4}|0[bB][01]{1,16})$/;
   const value = form.test(plain) ? Number(plain) : NaN;
-  if (!(value >= -32768 && value <= 65535)) {
-    throw new Error(`“${text.trim()}” is not a register value: −32768 to 65535, 0x0000 to 0xFFFF or 0b…`);
+  if (!(value <= 65535)) {
+    const negative = /^[-−]/.test(plain) ? ". For negative values, choose the type int16" : "";
+    throw new Error(`“${text.trim()}” is not a register value: ${REGISTER_FORMS}${negative}`);
   }
-  return value < 0 ? value + 65536 : value;
+  return value;
 }
 
 /** Parses a bit. Throws an error for other text. */
@@ -64,23 +68,19 @@ export function separated(text) {
   return text.split(/[;,]/);
 }
 
-/** Parses a value of a type. Returns its display text and its JSON. Throws an error for other text. */
+/** Parses a value of a type. Returns its JSON. Throws an error for other text. */
 export function literal(text, type) {
   if (type.kind === "string") return characters(text, type);
   if (type.kind === "bytes") return octets(text, type);
-  if (type.kind === "bool" || type.kind === "bit") {
-    const is = String(bit(text));
-    return { shown: is, json: is };
-  }
-  const number = numeral(text, type.name);
-  return { shown: number, json: number };
+  if (type.kind === "bool" || type.kind === "bit") return String(bit(text));
+  return type.kind === "uint16" ? String(register(text)) : numeral(text, type.name);
 }
 
 function characters(text, type) {
   if (!/^[\x00-\x7f]*$/.test(text) || text.length > type.size) {
     throw new Error(`“${text}” is not a valid ${type.name}: up to ${type.size} ASCII characters`);
   }
-  return { shown: text, json: JSON.stringify(text) };
+  return JSON.stringify(text);
 }
 
 function octets(text, type) {
@@ -88,7 +88,7 @@ function octets(text, type) {
   if (!/^([0-9a-f]{2})*$/.test(plain) || plain.length !== 2 * type.size) {
     throw new Error(`“${text.trim()}” is not a valid ${type.name}: ${type.size} pairs of hexadecimal digits`);
   }
-  return { shown: plain.replace(/(..)(?=.)/g, "$1 "), json: JSON.stringify(plain) };
+  return JSON.stringify(plain);
 }
 
 /** The minimum and the maximum of integer types. */
@@ -105,6 +105,13 @@ const FLOATS = {
   float64: [Number.MAX_VALUE, (number) => number],
 };
 
+/** Returns the range of a numeric type as text, or "" for other types. */
+export function extent(kind) {
+  const most = FLOATS[kind]?.[0].toPrecision(6);
+  const ends = EXTENTS[kind] ?? (most ? [`-${most}`, most] : []);
+  return ends.join(" to ").replace("-", "−");
+}
+
 /** Rounds a number to a significand of some bits, as `Math.fround` does. */
 function rounded(number, bits, least) {
   if (number === 0) return number;
@@ -117,7 +124,7 @@ function rounded(number, bits, least) {
 function floating(text, plain, type) {
   const [most, fit] = FLOATS[type];
   const found = fit(Number(plain));
-  if (!(Math.abs(found) <= most)) throw new Error(`“${text.trim()}” does not fit ${type}: −${most.toPrecision(6)} to ${most.toPrecision(6)}`);
+  if (!(Math.abs(found) <= most)) throw new Error(`“${text.trim()}” does not fit ${type}: ${extent(type)}`);
   if (found === 0 && /[1-9]/.test(plain.split(/e/i)[0])) throw new Error(`“${text.trim()}” is too small for ${type}, which would be 0`);
   return plain;
 }
@@ -125,13 +132,13 @@ function floating(text, plain, type) {
 /** Parses a number of a type. Returns JSON text with the same digits. Throws an error for other text. */
 export function numeral(text, type) {
   const plain = text.trim().replace(/^\+/, "");
-  const extent = EXTENTS[type];
-  if (!extent && /^-?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?$/.test(plain)) return floating(text, plain, type);
-  if (extent && /^-?(0|[1-9]\d{0,19})$/.test(plain)) {
+  const ends = EXTENTS[type];
+  if (!ends && /^-?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?$/.test(plain)) return floating(text, plain, type);
+  if (ends && /^-?(0|[1-9]\d{0,19})$/.test(plain)) {
     const whole = BigInt(plain);
-    if (whole >= extent[0] && whole <= extent[1]) return plain;
+    if (whole >= ends[0] && whole <= ends[1]) return plain;
   }
-  throw new Error(`“${text.trim()}” is not a valid ${type}${extent ? `: ${extent[0]} to ${extent[1]}` : ""}`);
+  throw new Error(`“${text.trim()}” is not a valid ${type}: ${extent(type)}`);
 }
 
 const READERS = {
@@ -166,6 +173,9 @@ const ORDERS = {
   BADC: (bytes) => pairs(bytes).flatMap(([a, b]) => [b, a]),
   DCBA: (bytes) => [...bytes].reverse(),
 };
+
+/** Returns whether a byte order swaps the bytes of each register. */
+export const swapsBytes = (order) => ["BADC", "DCBA"].includes(order);
 
 const SPELLED = ["CDABGHEF", "EFGHABCD", "FEHGBADC", "DCBAHGFE"];
 

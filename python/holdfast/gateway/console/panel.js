@@ -1,7 +1,7 @@
 // What the tables of ranges and of tag lists have in common: values, errors, age, and marks.
 
 import { meaning } from "./api.js";
-import { h } from "./dom.js";
+import { clock, h } from "./dom.js";
 
 const MARKED = 1500;
 
@@ -77,7 +77,7 @@ export class Panel {
   fresh(time, isOnce) {
     this.time = time;
     this.isStale = false;
-    const at = isOnce ? `, read at ${new Date(time).toTimeString().slice(0, 8)}` : "";
+    const at = isOnce ? `, read at ${clock(time)}` : "";
     this.aged(`Values of ${this.where}${at}.`, null);
   }
 

@@ -2,7 +2,7 @@
 
 import uPlot from "./vendor/uplot/uPlot.esm.js";
 import { save, stamp } from "./csv.js";
-import { $, colour, h, onTheme } from "./dom.js";
+import { $, clock, colour, h, onTheme } from "./dom.js";
 import { History } from "./history.js";
 
 const SPANS = { 120: "2 minutes", 600: "10 minutes", 3600: "1 hour" };
@@ -208,7 +208,7 @@ class Plot {
     const extent = least > greatest ? "" : `${shortened(least)} … ${shortened(greatest)}`;
     const gaps = this.history.gaps().filter(([, end]) => end === null || end >= start);
     const open = this.root.classList.contains("old");
-    this.extent.textContent = open ? `no value since ${clock(this.history.until || now())}` : extent;
+    this.extent.textContent = open ? `no value since ${timeOf(this.history.until || now())}` : extent;
     const told = gaps.length === 0 ? "" : `, ${gaps.length} ${gaps.length === 1 ? "gap" : "gaps"}`;
     this.body.setAttribute("aria-label", `Plot of ${this.label}${told}`);
   }
@@ -225,7 +225,7 @@ class Plot {
       cursor: { show: false },
       scales: { x: { time: true }, y: { range: (_, low, high) => padded(low, high) } },
       series: [{}, { stroke: colour("--plot"), width: 1.75, points: { show: false }, paths: uPlot.paths.stepped({ align: 1 }) }],
-      axes: [{ ...axis, size: 24, space: 80, values: (_, ticks) => ticks.map(clock) }, { ...axis, size: 58, space: 26, values: (_, ticks) => ticks.map((each) => short(each / this.scale)) }],
+      axes: [{ ...axis, size: 24, space: 80, values: (_, ticks) => ticks.map(timeOf) }, { ...axis, size: 58, space: 26, values: (_, ticks) => ticks.map((each) => short(each / this.scale)) }],
       hooks: { drawClear: [(plot) => this.shade(plot)] },
     }, [[], []], this.body);
     this.draw();
@@ -289,7 +289,7 @@ function scaled(values) {
   return most > 0 && most < 1e-6 ? 10 ** Math.min(300, -Math.floor(Math.log10(most))) : 1;
 }
 
-const clock = (seconds) => new Date(1000 * seconds).toTimeString().slice(0, 8);
+const timeOf = (seconds) => clock(1000 * seconds);
 
 /** Adds space above and below, also for a flat line. */
 function padded(low, high) {

@@ -2,7 +2,7 @@
 
 import { failure, notice, stream } from "./api.js";
 import { save, stamp } from "./csv.js";
-import { $, h, say, show } from "./dom.js";
+import { $, h, pause, say, show } from "./dom.js";
 import { Lists } from "./lists.js";
 import * as link from "./link.js";
 import { flaw, modicon, typeOf } from "./numbers.js";
@@ -494,8 +494,6 @@ export class Values {
     $("watch").textContent = is ? "Stop" : "Watch";
   }
 }
-
-const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
 /** Rounds a quantity down to whole values, at least one. */
 const whole = (quantity, width) => Math.max(width, Math.floor(quantity / width) * width);

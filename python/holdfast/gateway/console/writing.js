@@ -1,24 +1,37 @@
-// The write dialog: asks for a value, shows it beside the current one, then writes it.
+// The write dialog: asks for a value, reviews what it changes, then writes it.
 
-import { notice, post, Problem, stream } from "./api.js";
-import { $, h, once } from "./dom.js";
-import { binary, bit, hex, literal, modicon, register, separated } from "./numbers.js";
+import { notice, post, Problem } from "./api.js";
+import { isPlain, ofTag, ofType, ofWords } from "./changes.js";
+import { $, h, once, pause } from "./dom.js";
+import { extent, modicon, REGISTER_FORMS } from "./numbers.js";
 import { placed, same } from "./parts.js";
-import { areaOf } from "./standard.js";
+import * as reviews from "./review.js";
 
 const BITS_HELP = "0, 1, on or off. Separate values for consecutive coils with semicolons.";
+const SEVERAL = "Separate values for consecutive registers with semicolons.";
 const HELP = {
-  register: () => "Decimal, 0x… or 0b…. Separate values for consecutive registers with semicolons.",
+  register: () => `${REGISTER_FORMS}. ${SEVERAL}`,
   string: ({ size }) => `Up to ${size} ASCII characters. Shorter text is padded with zeros.`,
-  bytes: ({ size }) => `${size} bytes in hex, such as 0a ff. Separate values for consecutive registers with semicolons.`,
+  bytes: ({ size }) => `${size} bytes in hex, such as 0a ff. ${SEVERAL}`,
+  bool: () => `0, 1, on or off. ${SEVERAL}`,
   bit: () => "0, 1, on or off. This uses function 22. If the device does not support it, write the whole register.",
 };
-const TYPED_HELP = () => "With a decimal point, as in 21.5. Separate values for consecutive registers with semicolons.";
-const MAX_REVIEWED = 16;
+HELP.uint16 = HELP.register;
+const NUMBER_HELP = ({ kind }) =>
+  (kind.startsWith("float") ? `With a decimal point, as in 21.5. ${SEVERAL}` : `A whole number, ${extent(kind)}. ${SEVERAL}`);
+const MAX_LISTED = 16;
 
+/** How long the review waits before it reads the device again, in milliseconds. */
+const REFRESH_MS = 3000;
+/** How long the review may show what was read last when later reads fail, in milliseconds. */
+const MAX_AGE_MS = 5000;
+const READING = "Reading the current value…";
+const CHANGED = "The current values have changed. Check the review again before you write.";
+
+/** Reasons of errors after which the same request is refused again. */
+const FINAL = ["no_such_name", "refused_target", "writes_off", "malformed", "unauthorized", "foreign_page", "too_large", "not_json"];
 /** Reasons of errors that occur before anything is sent to the device. */
-const UNSENT = new Set(["no_connection", "no_such_name", "refused_target", "writes_off", "malformed", "busy", "unauthorized",
-  "foreign_page", "too_large", "not_json"]);
+const UNSENT = new Set([...FINAL, "no_connection", "busy"]);
 /** Exceptions after which a write may still be carried out: Acknowledge, and a gateway's timeout. */
 const OPEN = /\(code 0x[5b]\)/;
 /** The gateway's message for a timeout of a request that it has not sent. */
@@ -52,17 +65,13 @@ export class Writer {
    */
   ask(target) {
     const { part, tag, area, address, ofBits } = target;
-    const asked = { ...target, device: part.device, change: null, sending: null, outcome: null };
+    const asked = { ...target, change: null, before: null, looks: 0, sending: null, outcome: null };
     this.asked = asked;
     const { host, port, unitId } = part.device;
     const what = ofBits ? "coil" : "holding register";
     $("write-title").textContent = tag ? `Write ${tag.name}` : `Write ${what} ${address}`;
     $("write-where").textContent = `${tag ? placed(tag) : modicon(area, address)} of unit ${unitId} at ${host}:${port}`;
-    const forms = tag ? [["tag", "tag"]] : ofBits ? [["bit", "bit"]] : [["register", "plain register"], ["typed", part.type.name]];
-    $("write-as").replaceChildren(...forms.map(([value, text]) => h("option", { value }, text)));
-    $("write-as-label").hidden = ofBits || tag !== null;
-    const plain = !tag && ["int16", "uint16"].includes(part.type.kind);
-    if (!tag && !plain && (address - part.address) % part.width === 0) $("write-as").value = forms.at(-1)[0];
+    this.offer(target);
     const states = Object.values(tag?.states ?? {});
     $("write-states").replaceChildren(...states.map((value) => h("option", { value })));
     if (states.length > 0) $("write-value").setAttribute("list", "write-states");
@@ -81,11 +90,24 @@ export class Writer {
     });
   }
 
+  /** Offers the plain register, and the type of the range where one of its values starts. */
+  offer({ part, tag, address, ofBits }) {
+    $("write-as-label").hidden = ofBits || tag !== null;
+    if (ofBits || tag) {
+      $("write-as").replaceChildren();
+      return;
+    }
+    const forms = [["register", "plain register"], ["typed", part.type.name]];
+    const offered = isPlain(part) ? [["typed", "uint16 (register)"]] : forms;
+    $("write-as").replaceChildren(...offered.map(([value, text]) => h("option", { value }, text)));
+    if ((address - part.address) % part.width === 0) $("write-as").value = "typed";
+  }
+
   help() {
     const { part, tag, ofBits } = this.asked;
     const typed = $("write-as").value === "typed";
     const kind = typed ? part.type.kind : "register";
-    $("write-help").textContent = tag ? tagHelp(tag) : ofBits ? BITS_HELP : (HELP[kind] ?? TYPED_HELP)(part.type);
+    $("write-help").textContent = tag ? tagHelp(tag) : ofBits ? BITS_HELP : (HELP[kind] ?? NUMBER_HELP)(part.type);
     $("write-value").required = !(typed && kind === "string") && !/^string/.test(tag?.type ?? "");
   }
 
@@ -94,6 +116,7 @@ export class Writer {
     this.asked.change = null;
     $("write-ask").hidden = false;
     $("write-review").hidden = true;
+    reviews.clear();
     $("write-go").textContent = "Review";
     $("write-cancel").textContent = "Cancel";
   }
@@ -103,56 +126,104 @@ export class Writer {
     return this.asked === asked && this.dialog.open;
   }
 
-  /** Says what the dialog waits for. Until then, its button does nothing. */
-  wait(text) {
+  /** Says what the dialog waits for, or what has changed. */
+  tell(text) {
     $("write-wait").textContent = text;
+  }
+
+  /** Shows an error, also on a small screen. */
+  fail(...content) {
+    $("write-error").replaceChildren(...content);
+    $("write-error").scrollIntoView({ block: "nearest" });
   }
 
   step(asked) {
     return once($("write-go"), async () => {
       $("write-error").replaceChildren();
-      this.wait(asked.change ? "Writing…" : "Reading the current value…");
+      let told = "";
       try {
-        if (!asked.change) {
-          await this.review(asked);
-          return;
-        }
-        asked.sending = this.write(asked);
-        await asked.sending;
+        if (asked.change) told = await this.confirm(asked);
+        else await this.review(asked);
       } catch (error) {
-        if (this.isAbout(asked)) $("write-error").replaceChildren(error instanceof Problem ? notice(error) : error.message);
+        if (this.isAbout(asked)) this.fail(error instanceof Problem ? notice(error) : error.message);
       } finally {
         asked.sending = null;
-        if (this.asked === asked) this.wait("");
+        if (this.asked === asked) this.tell(told);
       }
     });
   }
 
-  /** Reads the current values, and shows them beside the new ones. */
+  /** Checks what was typed, reads the current values, and shows them beside the new ones. */
   async review(asked) {
-    const change = asked.tag
-      ? await ofTag(asked, $("write-value").value)
-      : wanted(asked.part, $("write-as").value, $("write-value").value);
-    change.before = await this.read(asked, change);
+    this.tell(READING);
+    const text = $("write-value").value;
+    const isTyped = $("write-as").value === "typed" && !isPlain(asked.part);
+    const change = await (asked.tag ? ofTag : isTyped ? ofType : ofWords)(asked, text);
+    const before = await read(change);
     if (!this.isAbout(asked)) return;
     asked.change = change;
-    const { form, step, shown, before } = change;
-    $("write-review").replaceChildren(form === "register" && shown.length === 1
-      ? table("by-row", [h("span", { class: "unseen" }, "When"), "Decimal", "Hex", "Binary"], forms(before[0], shown[0]))
-      : table("by-column", [asked.tag ? "Tag" : "Address", "Now", "New"], shown.map((value, at) => [asked.tag ? asked.tag.name : String(asked.address + at * step), inWords(before[at]), inWords(value)])));
+    asked.before = before;
+    reviews.show(change, before);
     $("write-review").hidden = false;
     $("write-ask").hidden = true;
     $("write-go").textContent = "Write it";
     $("write-cancel").textContent = "Back";
     $("write-go").focus();
+    this.follow(asked, change);
+  }
+
+  /** Returns whether this change is under review, and nothing is sent yet. */
+  isReviewed(asked, change) {
+    return this.isAbout(asked) && asked.change === change && asked.sending === null;
+  }
+
+  /** Keeps the review current, as long as the device can be read. */
+  async follow(asked, change) {
+    while (this.isAbout(asked) && asked.change === change && !asked.before.error) {
+      await pause(REFRESH_MS);
+      // Nobody sees a hidden page. Before a write, it reads again.
+      if (!document.hidden && this.isReviewed(asked, change) && (await this.refresh(asked, change))) this.tell(CHANGED);
+    }
+  }
+
+  /** Reads again, and shows the result. Returns whether it differs from what was shown. */
+  async refresh(asked, change) {
+    const now = await change.read().catch((error) => ({ error }));
+    const shown = asked.before;
+    // A read that a write has overtaken may have seen the new values. One read may fail.
+    if (!this.isReviewed(asked, change) || (now.error && isRecent(shown.time))) return false;
+    asked.before = now;
+    const differs = !equal(now, shown);
+    if (differs) reviews.show(change, now);
+    else reviews.date(change, now);
+    return differs;
+  }
+
+  /** Writes what the review shows. If it has changed, shows that instead. Returns what to tell. */
+  async confirm(asked) {
+    const { change, before } = asked;
+    // Who has looked again may write, even if a value changes all the time.
+    if (!before.error && !isRecent(asked.looks)) {
+      this.tell(READING);
+      await this.refresh(asked, change);
+      if (!this.isReviewed(asked, change)) return "";
+      if (!equal(before, asked.before)) {
+        asked.looks = Date.now();
+        return CHANGED;
+      }
+    }
+    this.tell("Writing…");
+    asked.sending = this.write(asked, change);
+    await asked.sending;
+    return "";
   }
 
   /** Writes the confirmed values. Never throws: `asked.outcome` has the outcome. */
-  async write(asked) {
+  async write(asked, change) {
     const doubt = asked.outcome === "unknown" ? "unknown" : "refused";
     asked.outcome = "unknown";
     try {
-      await post(...request(asked));
+      await post(...change.request());
       asked.outcome = "written";
       if (this.isAbout(asked)) this.dialog.close();
     } catch (error) {
@@ -161,21 +232,30 @@ export class Writer {
         : UNSENT.has(error.reason) || KEPT.test(error.message);
       if (refused) asked.outcome = doubt;
       const told = refused ? "Not written." : "Unknown whether it was written.";
-      const back = await this.read(asked, asked.change).catch(() => null);
+      const back = await change.read().catch(() => null);
       if (!this.isAbout(asked)) return;
-      $("write-error").replaceChildren(notice(error, told), h("p", {}, compared(asked.change, back)));
       this.back();
+      this.fail(notice(error, told), h("p", {}, compared(change, asked.before, back)));
     }
   }
+}
 
-  /** Reads the addresses of a change. */
-  async read({ device, part, tag, area, address }, { count, typed }) {
-    if (tag) return readTag(part, tag);
-    const { most } = areaOf(area);
-    if (count > most) throw new Error(`too many values: ${count}, at most ${most}`);
-    const found = await post("/api/modbus/read", { ...device, functionCode: area, address, quantity: count, ...typed });
-    return found.typedText ?? found.values;
+/** Reads what a change is about. An error of the device is a part of the result: some registers can only be written. */
+async function read(change) {
+  try {
+    return await change.read();
+  } catch (error) {
+    if (!(error instanceof Problem) || FINAL.includes(error.reason)) throw error;
+    return { error };
   }
+}
+
+const equal = (one, other) => same([one.words, one.texts], [other.words, other.texts]);
+
+/** Returns whether a time is at most `MAX_AGE_MS` ago. A clock that was set back makes it unknown. */
+function isRecent(time) {
+  const age = Date.now() - time;
+  return age >= 0 && age <= MAX_AGE_MS;
 }
 
 function tagHelp({ unit, min, max, states, type }) {
@@ -188,96 +268,11 @@ function tagHelp({ unit, min, max, states, type }) {
   ].filter(Boolean).join(" ");
 }
 
-/** Reads the value of one tag as text. */
-async function readTag(part, tag) {
-  const body = JSON.stringify({ ...part.device, parts: [{ ...part.source, only: [tag.name] }], once: true, describe: false });
-  let own = null;
-  await stream("/api/modbus/watch/view", { method: "POST", body, extraTime: part.device.timeout }, (_, data) => ([own] = data.parts));
-  const error = own?.error ?? own?.errors?.[0];
-  if (own === null || error) throw new Problem(own?.reason ?? "exception", error ?? "the gateway sent no value");
-  return own.texts;
-}
-
-/** Lets the gateway check the value of a tag, which is scaled there. */
-async function ofTag({ part, tag }, text) {
-  try {
-    const { tag: now, form, values, text: shown } = await post("/api/gateway/tags/value", { ...part.source, name: tag.name, value: text });
-    if (!same(now, tag)) throw new Error(`The gateway has another definition of ${tag.name} now. Close this dialog and read the values again.`);
-    return { form, shown: [shown], json: values, step: 1, count: tag.count, typed: {} };
-  } catch (error) {
-    throw error.reason === "malformed" ? new Error(error.message) : error;
-  }
-}
-
-/** Parses the typed values. Returns their display text and JSON. Throws an error if they are invalid. */
-function wanted(range, form, text) {
-  const { type, order } = range;
-  if (form !== "typed") {
-    // Bits have no decimals, so a comma between them separates.
-    const shown = form === "bit" ? text.split(/[;,]/).map(bit) : separated(text).map(register);
-    return { form, shown, json: shown, step: 1, count: shown.length, typed: {} };
-  }
-  const parts = type.kind === "string" ? [text] : type.kind === "bytes" ? text.split(/[;,]/) : separated(text);
-  if (type.kind === "bit" && parts.length > 1) throw new Error("Write one bit at a time");
-  const values = parts.map((part) => literal(part, type));
-  return {
-    form,
-    shown: values.map((each) => each.shown),
-    json: values.map((each) => each.json),
-    step: type.width,
-    count: values.length * type.width,
-    typed: { datatype: type.name, byteOrder: order },
-  };
-}
-
-/** Returns the path and the body of the request for a change. */
-function request({ device, part: range, address, change }) {
-  const about = { ...device, address };
-  const { form, json, typed } = change;
-  if (form === "mask") return ["/api/modbus/write/mask", { ...about, andMask: json[0], orMask: json[1] }];
-  if (form === "typed" && range.type.kind === "bit") {
-    const swapped = ["BADC", "DCBA"].includes(range.order) ? 8 : 0;
-    const mask = 1 << (range.type.size ^ swapped);
-    return ["/api/modbus/write/mask", { ...about, andMask: 65535 ^ mask, orMask: json[0] === "true" ? mask : 0 }];
-  }
-  if (form === "typed") {
-    const more = JSON.stringify({ ...about, ...typed });
-    return ["/api/modbus/write/registers", `${more.slice(0, -1)},"values":[${json.join()}]}`];
-  }
-  const [one, many] = form === "bit" || form === "coils" ? ["coil", "coils"] : ["register", "registers"];
-  return json.length === 1
-    ? [`/api/modbus/write/${one}`, { ...about, value: json[0] }]
-    : [`/api/modbus/write/${many}`, { ...about, values: json }];
-}
-
 /** Describes the values that were read back after a failed write. */
-function compared({ shown, before }, back) {
+function compared(change, before, back) {
   if (back === null) return "Reading back failed: read the values before you continue.";
-  const equals = (others) => back.every((value, at) => value === others[at]);
-  if (equals(before)) return "Read back: unchanged.";
-  if (equals(shown)) return "Read back: the new values are there.";
-  return `Read back: neither the old nor the new values, but ${back.slice(0, MAX_REVIEWED).map(inWords).join(", ")}.`;
-}
-
-function inWords(value) {
-  if (typeof value === "boolean") return value ? "on" : "off";
-  return typeof value === "number" ? `${value}  0x${hex(value)}` : value;
-}
-
-/** Formats one register in every form. Changed bits are marked. */
-function forms(before, after) {
-  const [was, will] = [binary(before), binary(after)];
-  const marked = [...will].map((bit, at) => (bit === was[at] ? bit : h("mark", {}, bit)));
-  return [["Now", String(before), hex(before), was], ["New", String(after), hex(after), marked]];
-}
-
-function table(kind, head, rows) {
-  const lines = rows.slice(0, MAX_REVIEWED).map(([name, ...cells]) =>
-    h("tr", {}, h("th", { scope: "row" }, name), cells.map((cell) => h("td", {}, cell))));
-  const more = rows.length - lines.length;
-  return h("div", { class: "scroll" },
-    h("table", { class: `review ${kind}` },
-      h("thead", {}, h("tr", {}, head.map((text) => h("th", { scope: "col" }, text)))),
-      h("tbody", {}, lines)),
-    more > 0 ? h("p", { class: "dim" }, `and ${more} more`) : null);
+  if (!before.error && same(back.words, before.words)) return "Read back: unchanged.";
+  if (change.isIn(back.words)) return "Read back: the new values are there.";
+  const found = back.texts.length > 0 ? back.texts : back.words.map(reviews.inWords);
+  return `Read back: ${before.error ? "not" : "neither the old nor"} the new values, but ${found.slice(0, MAX_LISTED).join(", ")}.`;
 }
