@@ -513,7 +513,7 @@ class Listener:
         rules: Sequence[RawRule],
         *,
         format: Literal["v1", "crc"] = "v1",
-        crc: Literal["required", "none", "if-present"] = "required",
+        crc: Literal["required", "none"] = "required",
         flags: Literal["strict", "ignore"] = "strict",
         max_connections: int = 256,
         max_connections_per_source: int | None = None,
@@ -527,11 +527,11 @@ class Listener:
     ) -> Listener:
         """A listener for Raw Ingest packets.
 
-        With `crc` if-present, only with `packets` one, bytes that have arrived behind a packet are
-        its CRC. With `flags` ignore, flags and the reserved byte may have any value. With `packets`
-        many, a connection carries any number of them, until the sender closes, one is refused, or
-        none comes for `idle_timeout` seconds. With `after_refusal` continue, only an invalid header
-        or CRC ends the connection. `tls` and `max_handshakes` are those of the constructor.
+        With `crc` none, packets end with their payload. With `flags` ignore, flags and the reserved
+        byte may have any value. With `packets` many, a connection carries any number of them, until
+        the sender closes, one is refused, or none comes for `idle_timeout` seconds. With
+        `after_refusal` continue, only an invalid header or CRC ends the connection. `tls` and
+        `max_handshakes` are those of the constructor.
         """
 
 @final

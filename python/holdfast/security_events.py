@@ -69,6 +69,7 @@ EVENTS: Mapping[str, Meaning] = {
     "refused_sealed": _REQUEST_DENIED,
     "refused_listen_only": _REQUEST_DENIED,
     "packet_refused": _REQUEST_DENIED,
+    "surplus_bytes": _REQUEST_DENIED,
     "bytes_dropped": _REQUEST_DENIED,
     "broken_request": _REQUEST_DENIED,
     "message_malformed": _REQUEST_DENIED,

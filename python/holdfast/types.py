@@ -157,12 +157,15 @@ class FrameCounters(TypedDict):
 class PacketCounters(TypedDict):
     """Raw Ingest packets: written packets, their values, and refused packets by reason.
 
-    `dropped_bytes`: bytes behind accepted packets that were dropped. `held_bytes`: the memory of
-    packets that are not complete.
+    `surplus_bytes`: bytes behind written packets, where a connection carries one: their sender does
+    not speak Raw Ingest, so the values may be wrong. `dropped_bytes`: bytes of packets that ended
+    early, behind written ones, where a connection carries many. `held_bytes`: the memory of packets
+    that are not complete.
     """
 
     accepted: int
     values: int
+    surplus_bytes: int
     dropped_bytes: int
     held_bytes: int
     refused: dict[str, int]

@@ -208,7 +208,7 @@ def after(case: dict[str, Any]) -> dict[str, list[int]]:
 ACCEPTED = CASES["accepted"]
 
 # Without a CRC there is nothing wrong with the first; the others, with four bytes less, are others.
-NOT_WITHOUT_CRC = {"wrong CRC", "payload one byte short", "one byte too many", "the other format"}
+NOT_WITHOUT_CRC = {"wrong CRC", "payload one byte short", "the other format"}
 
 REASONS = {
     "magic": "magic",
@@ -222,14 +222,12 @@ REASONS = {
     "start past the end": "range",
     "address plus count wraps at 65536": "range",
     "payload one byte short": "short",
-    "one byte too many": "extra",
     "header cut": "short",
     "nothing at all": None,
     "the other format": "area or flags",
     "wrong CRC": "crc",
     "flags not zero": "flags",
     "reserved not zero": "flags",
-    "payload length field, as old senders had it": "extra",
 }
 
 
@@ -252,6 +250,7 @@ def test_accepted_vectors_reach_memory(plant: Plant, kind: str) -> None:
     assert plant.counted() == {
         "accepted": 2 * len(ACCEPTED),
         "values": 2 * values,
+        "surplus_bytes": 0,
         "dropped_bytes": 0,
         "held_bytes": 0,
         "refused": {},
@@ -316,8 +315,6 @@ def test_a_packet_may_be_cut_in_two_anywhere(plant: Plant, kind: str) -> None:
 def test_a_refused_packet_may_be_cut_in_two_anywhere(plant: Plant, kind: str) -> None:
     before = plant.fill()
     for case, packet in refused_vectors(kind):
-        if REASONS[case["name"]] == "extra":
-            continue  # Cut where the packet ends, what is too much has not arrived yet.
         for cut in range(1, len(packet)):
             reply = plant.answer(packet[:cut], packet[cut:], finish=True)
             assert (reply, plant.content()) == (REFUSED, before), (case["name"], cut)
@@ -363,23 +360,6 @@ def test_every_wrong_bit_is_found_by_the_crc(area: Area, start: Start) -> None:
     assert plant.answer(packet) == DONE
 
 
-def test_bytes_behind_a_packet_refuse_it(plant: Plant, kind: str) -> None:
-    before = plant.fill()
-    packet = good(kind, "coils", 0, [0] * 8)
-    for extra in (b"\x00", packet, bytes(5000), bytes(1 << 20)):
-        assert plant.answer(packet + extra) == REFUSED, len(extra)
-    assert plant.content() == before
-    assert plant.refusals() == {"extra": 4}
-
-
-def test_bytes_behind_a_packet_that_came_in_pieces_refuse_it(plant: Plant, kind: str) -> None:
-    before = plant.fill()
-    packet = good(kind, "input_registers", 0, [0] * 8)
-    assert plant.answer(packet[:7], packet[7:] + b"\x00") == REFUSED
-    assert plant.content() == before
-    assert plant.refusals() == {"extra": 1}
-
-
 def test_a_packet_that_ends_early_is_refused(plant: Plant, kind: str) -> None:
     before = plant.fill()
     packet = good(kind, "coils", 0, [0] * 20)
@@ -415,6 +395,94 @@ def test_a_packet_is_written_though_nobody_waits_for_the_reply(plant: Plant, kin
         ending(client)
         wire.until(lambda n=accepted: plant.counted()["accepted"] == n + 1, "it is written")  # type: ignore[misc]
         assert plant.content()["coils"][0] == 1
+
+
+# Bytes behind a packet
+
+
+def surplus(plant: Plant) -> int:
+    """Bytes behind packets so far, once no connection is left."""
+    wire.until(lambda: plant.counted("connections")["open"] == 0, "all connections have ended")
+    counted: int = plant.counted()["surplus_bytes"]
+    return counted
+
+
+def logged(plant: Plant, caplog: pytest.LogCaptureFixture, event: str) -> list[dict[str, Any]]:
+    """The fields of the events of a kind, once there is one."""
+
+    def found() -> list[dict[str, Any]]:
+        with caplog.at_level(logging.WARNING, "holdfast"):
+            plant.appliance.log_events(0.0)
+        return [vars(each)["fields"] for each in caplog.records if each.getMessage() == event]
+
+    wire.until(found, event)
+    return found()
+
+
+def test_a_packet_is_written_whatever_follows_it_and_however_it_is_cut(
+    plant: Plant, kind: str
+) -> None:
+    expected = 0
+    for case in CASES["followed"]:
+        text = case["v1" if kind == "v1" else "crc"]
+        if text is None:
+            continue
+        sent = bytes.fromhex(text)
+        # A sender that appends a CRC where none is expected has four more.
+        more = case["surplus"] + 4 * (kind == "none")
+        for cut in range(len(sent)):
+            plant.clear()
+            pieces = [sent[:cut], sent[cut:]] if cut else [sent]
+            assert plant.answer(*pieces, finish=True) == DONE, (case["name"], cut)
+            assert plant.content() == after(case), (case["name"], cut)
+            expected += more
+            assert surplus(plant) == expected, (case["name"], cut)
+    assert plant.refusals() == {}
+
+
+def test_any_number_of_bytes_behind_a_packet_is_read_and_counted(plant: Plant, kind: str) -> None:
+    packet = good(kind, "coils", 0, [1] * 8)
+    for count in (1, len(packet), 5000, 1 << 20):
+        before = surplus(plant)
+        with plant.connect() as client:
+            client.send(packet + bytes(count))
+            client.finish()
+            assert client.rest() == DONE
+        assert surplus(plant) - before == count
+    assert plant.counted()["accepted"] == 4
+    assert plant.content()["coils"][:9] == [1] * 8 + [0]
+
+
+def test_bytes_behind_a_packet_that_arrive_after_the_reply_are_counted_and_reset_nothing(
+    plant: Plant, kind: str
+) -> None:
+    with plant.connect() as client:
+        client.send(good(kind, "coils", 0, [1]))
+        assert client.rest() == DONE
+        client.send(bytes(3))
+        client.send(bytes(2))
+    assert surplus(plant) == 5
+
+
+def test_bytes_behind_a_packet_are_logged_once_for_each_connection(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    plant = Plant(start(listener("v1")))
+    with plant.connect() as client:
+        peer = "{}:{}".format(*client.socket.getsockname())
+        client.send(good("v1", "coils", 0, [1]) + bytes(2))
+        assert client.rest() == DONE
+        client.send(bytes(5))
+    assert surplus(plant) == 7
+    assert logged(plant, caplog, "surplus_bytes") == [{"listener": "raw", "peer": peer, "bytes": 7}]
+    assert [each.levelname for each in caplog.records] == ["WARNING"]
+
+
+def test_bytes_behind_a_refused_packet_are_not_counted(plant: Plant, kind: str) -> None:
+    packet = bytearray(good(kind, "coils", 0, [1]))
+    packet[-1 if kind == "crc" else 0] ^= 1
+    assert plant.answer(bytes(packet) + bytes(9), finish=True) == REFUSED
+    assert surplus(plant) == 0
 
 
 # Time
@@ -467,6 +535,7 @@ def test_a_peer_that_sends_nothing_gets_nothing(start: Start, kind: str) -> None
     assert plant.counted() == {
         "accepted": 0,
         "values": 0,
+        "surplus_bytes": 0,
         "dropped_bytes": 0,
         "held_bytes": 0,
         "refused": {},
@@ -490,19 +559,19 @@ def test_stopping_ends_what_has_begun(start: Start) -> None:
 # Replies
 
 
-@pytest.mark.parametrize("why", ["magic", "unit", "range", "extra"])
-def test_the_reply_arrives_though_much_more_was_sent(why: str, start: Start) -> None:
+@pytest.mark.parametrize("why", ["magic", "unit", "range", None])
+def test_the_reply_arrives_though_much_more_was_sent(why: str | None, start: Start) -> None:
     """A socket that is closed with unread bytes resets the connection, reply and all."""
     plant = Plant(start(listener("v1")))
     packet = bytearray(good("v1", "coils", 0, [1]))
-    if why != "extra":
+    if why is not None:
         packet[{"magic": 0, "unit": 4, "range": 6}[why]] = 0xFF
     for _ in range(5):
         with plant.connect() as client:
             client.send(bytes(packet) + bytes(10_000_000))
-            assert client.socket.recv(2) == REFUSED
+            assert client.socket.recv(2) == (DONE if why is None else REFUSED)
             assert client.socket.recv(1) == b""
-    assert plant.refusals() == {why: 5}
+    assert plant.refusals() == ({} if why is None else {why: 5})
 
 
 def test_a_reply_is_one_byte_and_the_connection_ends(plant: Plant, kind: str) -> None:
@@ -536,6 +605,7 @@ def test_a_source_that_no_rule_names_gets_no_byte(start: Start) -> None:
     assert plant.counted() == {
         "accepted": 0,
         "values": 0,
+        "surplus_bytes": 0,
         "dropped_bytes": 0,
         "held_bytes": 0,
         "refused": {},
@@ -726,6 +796,7 @@ def test_a_packet_over_a_whole_area_is_never_seen_in_part(
     assert plant.counted() == {
         "accepted": packets_sent,
         "values": packets_sent * 65535,
+        "surplus_bytes": 0,
         "dropped_bytes": 0,
         "held_bytes": 0,
         "refused": {},
@@ -750,6 +821,7 @@ def test_200_connections_at_once_all_get_their_byte(start: Start, workers: int) 
     assert plant.counted() == {
         "accepted": 200,
         "values": 200,
+        "surplus_bytes": 0,
         "dropped_bytes": 0,
         "held_bytes": 0,
         "refused": {},
@@ -770,8 +842,9 @@ def test_connections_too_many_get_no_byte(start: Start) -> None:
         assert plant.content()["coils"][0] == 0
         first.send(packet)
         assert first.rest() == DONE
-        wire.until(lambda: plant.counted("connections")["open"] == 1, "a place is free")
+        # It has its reply: it keeps no other one out, although its sender has not closed it.
         assert plant.answer(packet) == DONE
+        assert plant.counted("connections")["evicted"] == 0
         second.send(packet)
         assert second.rest() == DONE
     assert plant.counted("connections")["refused_full"] == 1
@@ -827,36 +900,40 @@ def test_what_the_library_sends_arrives(whole: Whole, start: Start, kind: str) -
 # Any bytes at all
 
 
-def judged(kind: str, packet: bytes) -> tuple[Area, int, list[int]] | None:
-    """What a packet writes, as docs/raw-ingest.md says, into a memory of `SIZES`; or nothing."""
-    if kind == "crc":
-        body, trailer = packet[:-4], packet[-4:]
-        if len(packet) < 16 or struct.pack(">I", zlib.crc32(body)) != trailer:
-            return None
-    else:
-        body = packet
+class Written(NamedTuple):
+    """What a packet writes, and how many bytes follow it."""
+
+    area: Area
+    address: int
+    values: list[int]
+    surplus: int
+
+
+def judged(kind: str, sent: bytes) -> Written | None:
+    """What these bytes write, as docs/raw-ingest.md says, into a memory of `SIZES`; or nothing."""
     if kind == "v1":
-        head, rest = body[:3], body[3:]
+        length, fields = 10, sent[3:10]
     else:
-        if len(body) < 12 or body[3] != 0 or body[5] != 0:
-            return None
-        head, rest = body[:3], body[4:5] + body[6:]
-    if head != b"RI\x01" or len(rest) < 7:
+        length, fields = 12, sent[4:5] + sent[6:12]
+    flags = b"" if kind == "v1" else sent[3:4] + sent[5:6]
+    if len(sent) < length or sent[:3] != b"RI\x01" or any(flags):
         return None
-    code, target, address, count = struct.unpack_from(">BHHH", rest)
-    payload = rest[7:]
+    code, target, address, count = struct.unpack(">BHHH", fields)
     if not 1 <= code <= 4 or target != 1 or count == 0:
         return None
     area = AREAS[code - 1]
     if address + count > SIZES[area]:
         return None
-    if code <= 2:
-        if len(payload) != (count + 7) // 8:
-            return None
-        return area, address, [payload[place // 8] >> place % 8 & 1 for place in range(count)]
-    if len(payload) != 2 * count:
+    end = length + ((count + 7) // 8 if code <= 2 else 2 * count)
+    whole = end + 4 * (kind == "crc")
+    if len(sent) < whole or (kind == "crc" and sealed_with_crc(sent[:end]) != sent[:whole]):
         return None
-    return area, address, list(struct.unpack(f">{count}H", payload))
+    payload = sent[length:end]
+    if code <= 2:
+        values = [payload[place // 8] >> place % 8 & 1 for place in range(count)]
+    else:
+        values = list(struct.unpack(f">{count}H", payload))
+    return Written(area, address, values, len(sent) - whole)
 
 
 @st.composite
@@ -909,13 +986,12 @@ def test_packets_are_taken_as_a_model_says(data: st.DataObject, plant: Plant, ki
     counted = plant.counted()
     written = judged(kind, packet)
     pieces = [packet] if cut is None else [packet[:cut], packet[cut:]]
-    if cut is not None and judged(kind, packet[:cut]) is not None:
-        pieces = [packet]  # What is too much has to arrive with the packet.
 
     reply = plant.answer(*pieces, finish=True)
+    surplus(plant)
 
     if written is not None:
-        area, address, values = written
+        area, address, values, _ = written
         expected[area][address : address + len(values)] = values
         assert reply == DONE
     else:
@@ -923,7 +999,9 @@ def test_packets_are_taken_as_a_model_says(data: st.DataObject, plant: Plant, ki
     assert plant.content() == expected
     now = plant.counted()
     assert now["accepted"] - counted["accepted"] == (written is not None)
-    assert now["values"] - counted["values"] == (len(written[2]) if written else 0)
+    assert now["values"] - counted["values"] == (len(written.values) if written else 0)
+    behind = now["surplus_bytes"] - counted["surplus_bytes"]
+    assert behind == (written.surplus if written else 0)
     refused = sum(now["refused"].values()) - sum(counted["refused"].values())
     assert refused == (written is None and packet != b"")
 

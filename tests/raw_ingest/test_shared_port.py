@@ -227,66 +227,43 @@ def test_modbus_needs_no_more_bytes_where_flags_are_ignored(run: Run, dial: Any)
     assert counters(appliance)["packets"]["refused"] == {}
 
 
-@pytest.fixture(params=["modbus-tcp", "raw-ingest"])
-def lenient(run: Run, request: pytest.FixtureRequest) -> Appliance:
-    return run(configuration({"format": "crc", "crc": "if-present"}, kind=request.param))
-
-
 def crc_of(body: bytes) -> bytes:
     return zlib.crc32(body).to_bytes(4, "big")
 
 
-def test_a_crc_that_has_arrived_is_checked(lenient: Appliance, dial: Any) -> None:
-    body = with_memory_id(0, 7, 8)
-    wrong = bytes([crc_of(body)[0] ^ 1]) + crc_of(body)[1:]
-    for sent, reply in [
-        (body + wrong, REFUSED),
-        (body + crc_of(body) + b"\0", REFUSED),
-        (body + body, REFUSED),
-        (body + crc_of(body), DONE),
-    ]:
-        assert registers(lenient) == [0, 0, 0, 0]
-        sender = dial(lenient)
-        sender.sendall(sent)
-        assert (sender.recv(2), sender.recv(1)) == (reply, b"")
-    assert registers(lenient) == [7, 8, 0, 0]
-    assert counters(lenient)["packets"]["refused"] == {"crc": 1, "extra": 2}
-
-
-def test_a_crc_that_has_begun_is_awaited(lenient: Appliance, dial: Any) -> None:
-    body = with_memory_id(0, 7)
-    sender = dial(lenient)
-    sender.sendall(body + crc_of(body)[:1])
-    wire.until_taken(sender)
-    for byte in crc_of(body)[1:]:
-        sender.sendall(bytes([byte]))
-    assert sender.recv(1) == DONE
-    cut = dial(lenient)
-    cut.sendall(body + crc_of(body)[:3])
-    cut.shutdown(socket.SHUT_WR)
-    assert cut.recv(1) == REFUSED
-    assert counters(lenient)["packets"]["refused"] == {"short": 1}
-
-
-def test_a_packet_without_a_crc_is_written_at_once(lenient: Appliance, dial: Any) -> None:
-    sender = dial(lenient)
-    sender.sendall(with_memory_id(0, 7, 8))
-    assert (sender.recv(2), sender.recv(1)) == (DONE, b"")
-    assert registers(lenient) == [7, 8, 0, 0]
-
-
-def test_a_crc_that_comes_too_late_is_counted_and_resets_nothing(
-    lenient: Appliance, dial: Any
+@pytest.mark.parametrize("kind", ["modbus-tcp", "raw-ingest"])
+def test_a_crc_that_is_not_expected_is_surplus_however_it_arrives(
+    run: Run, dial: Any, kind: str
 ) -> None:
+    appliance = run(configuration({"format": "crc", "crc": "none"}, kind=kind))
     body = with_memory_id(0, 7, 8)
-    sender = dial(lenient)
-    sender.sendall(body)
-    wire.until(lambda: registers(lenient)[0] == 7, "it is written")
-    sender.sendall(crc_of(body))
-    assert (sender.recv(2), sender.recv(1)) == (DONE, b"")
-    sender.close()
-    wire.until(lambda: counters(lenient)["packets"]["dropped_bytes"] == 4, "it is counted")
-    assert counters(lenient)["packets"]["accepted"] == 1
+    sent = body + crc_of(body)
+    for number, cut in enumerate(range(1, len(sent) + 1), 1):
+        appliance.memories["plant"].write("holding_registers", 0, [0, 0])
+        with dial(appliance) as sender:
+            sender.sendall(sent[:cut])
+            wire.until_taken(sender)
+            sender.sendall(sent[cut:])
+            assert (sender.recv(2), sender.recv(1)) == (DONE, b"")
+        assert registers(appliance) == [7, 8, 0, 0]
+        wire.until(lambda: counters(appliance)["connections"]["open"] == 0, "it has ended")
+        assert counters(appliance)["packets"]["surplus_bytes"] == 4 * number
+    assert counters(appliance)["packets"]["accepted"] == len(sent)
+    assert counters(appliance)["packets"]["refused"] == {}
+
+
+@pytest.mark.parametrize("kind", ["modbus-tcp", "raw-ingest"])
+def test_among_many_packets_a_crc_that_is_not_expected_is_the_next_one(
+    run: Run, dial: Any, kind: str
+) -> None:
+    part = {"format": "crc", "crc": "none", "packets": "many", "after_refusal": "continue"}
+    appliance = run(configuration(part, kind=kind))
+    body = with_memory_id(0, 7, 8)
+    sender = dial(appliance)
+    sender.sendall(body + crc_of(body))
+    assert (sender.recv(1), sender.recv(1), sender.recv(1)) == (DONE, REFUSED, b"")
+    counted = counters(appliance)["packets"]
+    assert (counted["refused"], counted["surplus_bytes"]) == ({"magic": 1}, 0)
 
 
 @pytest.mark.parametrize("kind", ["modbus-tcp", "raw-ingest"])

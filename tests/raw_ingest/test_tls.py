@@ -250,27 +250,23 @@ def test_several_packets_are_answered_in_order_however_they_are_cut(run: Run, pa
     assert counted(plant)["held_bytes"] == 0
 
 
-def test_a_crc_may_be_missing_over_tls_too(run: Run, party: Party) -> None:
-    rule = {"sources": ["127.0.0.1"], "units": {}, "memories": ["plant"], "areas": AREAS}
-    del rule["units"]
-    listener = {
-        "type": "raw-ingest",
-        "bind": "127.0.0.1:0",
-        "format": "crc",
-        "crc": "if-present",
-        "tls": {key: str(path) for key, path in party.files.items()},
-        "rules": [rule],
-    }
-    memories = {"plant": {"id": 1, "coils": 8, "holding_registers": 8}}
-    plant = run(written({"memories": memories, "listeners": {"secure": listener}}))
-    packets = [
-        raw_ingest.encode("coils", 0, [1], memory_id=1, crc=crc) for crc in ("none", "required")
-    ]
-    wrong = packets[1][:-1] + bytes([packets[1][-1] ^ 1])
-    trust = party.trust(party.line)
-    replies = [secure_reply(address(plant), trust, each) for each in (*packets, wrong)]
-    assert replies == [DONE, DONE, REFUSED]
-    assert counted(plant)["refused"] == {"crc": 1}
+@versions
+def test_bytes_behind_a_packet_are_counted_in_whatever_record_they_are(
+    plant: Appliance, party: Party, version: str
+) -> None:
+    for records in ([PACKET + b"123"], [PACKET, b"123"], [PACKET[:5], PACKET[5:] + b"1", b"23"]):
+        before = counted(plant)["surplus_bytes"]
+        with TlsPeer(address(plant), party.trust(party.line, version)) as client:
+            client.shake()
+            for record in records:
+                client.send(record)
+            assert client.rest() == DONE
+            # After the reply, which is the last one.
+            client.send(b"45")
+            client.wire.finish()
+            wire.until(lambda: counted(plant, "connections")["open"] == 0, "it has ended")
+        assert counted(plant)["surplus_bytes"] - before == 5
+    assert counted(plant)["accepted"] == 3
 
 
 @pytest.mark.parametrize("when_full", ["evict", "refuse"])

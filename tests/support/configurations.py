@@ -145,7 +145,7 @@ def raw_ingest(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, Any
     own: dict[str, st.SearchStrategy[str]] = {"when_full": st.sampled_from(["refuse", "evict"])}
     if form == "crc":
         own |= {
-            "crc": st.sampled_from(["required", "none", "if-present"]),
+            "crc": st.sampled_from(["required", "none"]),
             "flags": st.sampled_from(["strict", "ignore"]),
         }
     return {

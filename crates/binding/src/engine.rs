@@ -212,6 +212,7 @@ fn counted_packets<'py>(
     let packets = PyDict::new(py);
     packets.set_item("accepted", counters.accepted.get())?;
     packets.set_item("values", counters.values.get())?;
+    packets.set_item("surplus_bytes", counters.surplus_bytes.get())?;
     packets.set_item("dropped_bytes", counters.dropped_bytes.get())?;
     packets.set_item("held_bytes", counters.held_bytes.get())?;
     packets.set_item("refused", refused)?;

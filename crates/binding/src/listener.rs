@@ -292,18 +292,12 @@ impl Listener {
         let many = PacketsPerConnection::Many { idle, after_refusal };
         let packets =
             word("packets", packets, &[("one", PacketsPerConnection::One), ("many", many)])?;
-        let crcs =
-            [("required", (true, false)), ("none", (false, false)), ("if-present", (false, true))];
-        let (required, crc_if_present) = word("crc", crc, &crcs)?;
-        if crc_if_present && packets != PacketsPerConnection::One {
-            return Err(PyValueError::new_err("crc if-present: allowed only with packets one"));
-        }
+        let required = word("crc", crc, &[("required", true), ("none", false)])?;
         let formats = [("v1", Format::V1), ("crc", Format::Crc { required })];
         let limits = limits(max_connections, max_connections_per_source, when_full)?;
         let kind = ListenerKind::RawIngest(RawSettings {
             bind: address(bind)?,
             format: word("format", format, &formats)?,
-            crc_if_present,
             flags: word("flags", flags, &[("strict", Flags::Strict), ("ignore", Flags::Ignore)])?,
             rules: rules.iter().map(|rule| rule.core.clone()).collect(),
             limits: secure_limits(limits, tls.is_some(), max_handshakes)?,

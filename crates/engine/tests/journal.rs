@@ -116,7 +116,6 @@ impl Setup {
             bind,
             format: Format::V1,
             flags: Flags::Strict,
-            crc_if_present: false,
             rules: vec![RawRule {
                 sources: vec!["127.0.0.1/32".parse().unwrap()],
                 roles: None,

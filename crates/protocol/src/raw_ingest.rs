@@ -26,7 +26,6 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
-use core::cmp::Ordering;
 use core::num::NonZeroU16;
 
 use thiserror::Error;
@@ -60,7 +59,8 @@ pub enum Format {
     V1,
     /// A header of 12 bytes that names a memory id.
     Crc {
-        /// Whether a CRC-32 follows the payload.
+        /// Whether packets end with a CRC-32. Otherwise, what follows the payload is not part of the
+        /// packet.
         required: bool,
     },
 }
@@ -107,14 +107,12 @@ codes! {
         Short = 10, "short";
         /// The packet was not complete in time.
         Late = 11, "late";
-        /// Bytes follow the packet.
-        Extra = 12, "extra";
         /// The receiver must record the write, and can't.
-        Unrecorded = 13, "unrecorded";
+        Unrecorded = 12, "unrecorded";
         /// The receiver must keep the write, and can't.
-        NotStored = 14, "not_stored";
+        NotStored = 13, "not_stored";
         /// The write was passed on, and not confirmed: it may still be carried out.
-        NotConfirmed = 15, "not_confirmed";
+        NotConfirmed = 14, "not_confirmed";
     }
 }
 
@@ -177,7 +175,7 @@ impl Format {
         }
     }
 
-    /// Bytes after the payload.
+    /// Bytes of the packet after the payload.
     pub const fn trailer_len(self) -> usize {
         match self {
             Format::Crc { required: true } => CRC_LEN,
@@ -209,6 +207,7 @@ impl Format {
     }
 
     fn checked_header(self, bytes: &[u8], strict: bool) -> Result<Option<Header>, Refusal> {
+        // In the order of the bytes, so that the refusal does not depend on how many have arrived.
         let is = |at: usize, expected: u8| bytes.get(at).is_none_or(|byte| *byte == expected);
         if !is(0, MAGIC[0]) || !is(1, MAGIC[1]) {
             return Err(Refusal::Magic);
@@ -216,17 +215,20 @@ impl Format {
         if !is(2, VERSION) {
             return Err(Refusal::Version);
         }
-        let rest = match self {
-            Format::V1 => bytes.get(3..),
-            Format::Crc { .. } if strict && !(is(3, 0) && is(5, 0)) => {
-                return Err(Refusal::Flags);
-            }
-            Format::Crc { .. } => bytes.get(4..),
+        let (checks_flags, area_at) = match self {
+            Format::V1 => (false, 3),
+            Format::Crc { .. } => (strict, 4),
         };
-        let Some(&[area, ref rest @ ..]) = rest else {
+        if checks_flags && !is(3, 0) {
+            return Err(Refusal::Flags);
+        }
+        let Some(&[area, ref rest @ ..]) = bytes.get(area_at..) else {
             return Ok(None);
         };
         let area = Area::from_code(area).ok_or(Refusal::Area)?;
+        if checks_flags && !is(5, 0) {
+            return Err(Refusal::Flags);
+        }
         let fields = if self == Format::V1 { Some(rest) } else { rest.get(1..) };
         let Some(&[t0, t1, a0, a1, c0, c1, ..]) = fields else {
             return Ok(None);
@@ -236,17 +238,12 @@ impl Format {
         Ok(Some(Header { area, target, address, count }))
     }
 
-    /// The payload of a complete packet.
+    /// The payload of the packet that `bytes` begin with. What follows the packet is ignored.
     ///
     /// # Errors
-    /// [`Refusal::Short`] or [`Refusal::Extra`] when `packet` does not have the length that its
-    /// header requires, [`Refusal::Crc`] for a wrong CRC.
-    pub fn payload<'p>(self, header: &Header, packet: &'p [u8]) -> Result<&'p [u8], Refusal> {
-        match packet.len().cmp(&self.packet_len(header)) {
-            Ordering::Less => return Err(Refusal::Short),
-            Ordering::Greater => return Err(Refusal::Extra),
-            Ordering::Equal => {}
-        }
+    /// [`Refusal::Short`] when `bytes` end before the packet, [`Refusal::Crc`] for a wrong CRC.
+    pub fn payload<'p>(self, header: &Header, bytes: &'p [u8]) -> Result<&'p [u8], Refusal> {
+        let packet = bytes.get(..self.packet_len(header)).ok_or(Refusal::Short)?;
         let (body, trailer) = packet.split_at(packet.len() - self.trailer_len());
         if !trailer.is_empty() && trailer != crc32fast::hash(body).to_be_bytes() {
             return Err(Refusal::Crc);

@@ -40,6 +40,37 @@ proptest! {
     }
 
     #[test]
+    fn what_follows_a_packet_does_not_change_it(
+        (header, payload) in a_packet(),
+        format in a_format(),
+        behind in prop::collection::vec(any::<u8>(), 0..20),
+    ) {
+        let bytes = [encoded(format, &header, &payload), behind].concat();
+        prop_assert_eq!(format.header(&bytes), Ok(Some(header)));
+        prop_assert_eq!(format.payload(&header, &bytes), Ok(&payload[..]));
+    }
+
+    #[test]
+    fn a_header_is_judged_the_same_however_many_of_its_bytes_have_arrived(
+        (header, payload) in a_packet(),
+        format in a_format(),
+        damage in prop::collection::vec((0..12_usize, any::<u8>()), 0..4),
+    ) {
+        let mut packet = encoded(format, &header, &payload);
+        for (at, byte) in damage {
+            packet[at] = byte;
+        }
+        for judged in [Format::header, Format::header_with_any_flags] {
+            let mut outcome = Ok(None);
+            for len in 0..=packet.len() {
+                let now = judged(format, &packet[..len]);
+                prop_assert!(outcome == Ok(None) || now == outcome, "{outcome:?}, then {now:?}");
+                outcome = now;
+            }
+        }
+    }
+
+    #[test]
     fn a_flipped_bit_does_not_pass_the_crc(
         (header, payload) in a_packet(),
         flip: prop::sample::Index,

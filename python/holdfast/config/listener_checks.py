@@ -118,10 +118,10 @@ class ListenerChecks:
             if key in listener and listener.get("format", "v1") == "v1":
                 message = "found with format v1, allowed: only with format crc"
                 self.report.add((*path, key), message, of_key=True)
-        if listener.get("crc") == "if-present" and listener.get("packets", "one") == "many":
-            message = "found if-present with packets: many, allowed: required or none; bytes behind"
-            told = f"{message} a packet could be its CRC or the next packet"
-            self.report.add((*path, "crc"), told)
+        if listener.get("crc") == "if-present":
+            allowed = "allowed: required, if all senders send a CRC, otherwise none"
+            message = f"found 'if-present', which was removed, {allowed}"
+            self.report.settle((*path, "crc"), message)
         if listener.get("after_refusal") == "continue" and listener.get("packets", "one") == "one":
             message = "found continue with packets: one, allowed: close, or packets: many"
             self.report.add((*path, "after_refusal"), message)

@@ -218,11 +218,9 @@ class RawIngestConfig(Model):
 
     format: Literal["v1", "crc"] = "v1"
     """v1: a 10-byte header with a unit id; crc: a 12-byte header with a memory id, and a CRC."""
-    crc: Annotated[Literal["required", "none", "if-present"] | None, NotNull()] = Field(
-        default_factory=_crc
-    )
-    """Format crc: whether packets end with a CRC. if-present, only with packets: one: bytes that
-    have arrived behind a packet are its CRC. Default: required."""
+    crc: Annotated[Literal["required", "none"] | None, NotNull()] = Field(default_factory=_crc)
+    """Format crc: whether packets end with a CRC. none: what follows the payload is not part of the
+    packet. Default: required."""
     flags: Annotated[Literal["strict", "ignore"] | None, NotNull()] = Field(default_factory=_flags)
     """Format crc: strict, flags and the reserved byte must be 0; ignore: may be anything. Default:
     strict."""
@@ -401,11 +399,9 @@ class RawIngestListener(Model):
     """The protocol."""
     format: Literal["v1", "crc"] = "v1"
     """v1: a 10-byte header with a unit id; crc: a 12-byte header with a memory id, and a CRC."""
-    crc: Annotated[Literal["required", "none", "if-present"] | None, NotNull()] = Field(
-        default_factory=_crc
-    )
-    """Format crc: whether packets end with a CRC. if-present, only with packets: one: bytes that
-    have arrived behind a packet are its CRC. Default: required."""
+    crc: Annotated[Literal["required", "none"] | None, NotNull()] = Field(default_factory=_crc)
+    """Format crc: whether packets end with a CRC. none: what follows the payload is not part of the
+    packet. Default: required."""
     flags: Annotated[Literal["strict", "ignore"] | None, NotNull()] = Field(default_factory=_flags)
     """Format crc: strict, flags and the reserved byte must be 0; ignore: may be anything. Default:
     strict."""

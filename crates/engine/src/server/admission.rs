@@ -89,6 +89,8 @@ struct Activity {
     /// In microseconds since the epoch of the admission. Before any request, when it was admitted.
     last_request: AtomicU64,
     is_amid_packet: AtomicBool,
+    /// Whether the connection has had its last reply, and waits for its peer to close.
+    is_answered: AtomicBool,
     /// Whether the connection must look up its rights again.
     is_outdated: AtomicBool,
 }
@@ -113,6 +115,8 @@ pub(crate) struct Full;
 pub(crate) enum Evicted {
     Connection(Peer),
     Handshake(Peer),
+    /// It had its last reply: nothing was lost.
+    Answered(Peer),
 }
 
 /// The place of one connection. Dropping it frees the place.
@@ -157,6 +161,7 @@ impl Admission {
         let activity = Arc::new(Activity {
             last_request: AtomicU64::new(admitted),
             is_amid_packet: AtomicBool::new(false),
+            is_answered: AtomicBool::new(false),
             is_outdated: AtomicBool::new(false),
         });
         let (peer, opened) = (peer.into(), SystemTime::now());
@@ -221,14 +226,33 @@ impl Admission {
 impl Table {
     /// Makes sure that there is a place for a session.
     fn clear_session(&mut self, source: IpAddr) -> Result<Option<Evicted>, Full> {
-        let source = source.to_canonical();
-        if self.is_most(self.places(source).sessions) {
-            self.evict(Some(source)).map(Some)
-        } else if self.sessions.len() >= self.limits.max_connections {
-            self.evict(None).map(Some)
-        } else {
-            Ok(None)
+        let Some(of) = self.crowd(source.to_canonical()) else {
+            return Ok(None);
+        };
+        if let Some(id) = self.answered(of) {
+            return Ok(self.end(id).map(|held| Evicted::Answered(held.peer)));
         }
+        self.evict(of).map(Some)
+    }
+
+    /// Whose sessions leave no place for one of `source`: those of the source itself, or `None` for
+    /// those of all. The outer `None`: there is a place.
+    fn crowd(&self, source: IpAddr) -> Option<Option<IpAddr>> {
+        if self.is_most(self.places(source).sessions) {
+            Some(Some(source))
+        } else {
+            (self.sessions.len() >= self.limits.max_connections).then_some(None)
+        }
+    }
+
+    /// The first session, of one source or of all, that has had its last reply.
+    fn answered(&self, source: Option<IpAddr>) -> Option<u64> {
+        let is_answered = |held: &Held| {
+            held.task.is_some()
+                && held.is_of(source)
+                && held.activity.is_answered.load(Ordering::Relaxed)
+        };
+        self.sessions.iter().filter(|(_, held)| is_answered(held)).map(|(id, _)| *id).min()
     }
 
     /// Makes sure that there is a place for a handshake. The oldest handshake gives way: one that
@@ -236,9 +260,10 @@ impl Table {
     fn clear_handshake(&mut self, source: IpAddr, most: usize) -> Result<Option<Evicted>, Full> {
         let source = source.to_canonical();
         let places = self.places(source);
-        let is_full =
-            self.is_most(places.sessions) || self.sessions.len() >= self.limits.max_connections;
-        if is_full && self.limits.when_full == WhenFull::Refuse {
+        if let Some(crowd) = self.crowd(source)
+            && self.limits.when_full == WhenFull::Refuse
+            && self.answered(crowd).is_none()
+        {
             return Err(Full);
         }
         let of = self.is_most(places.handshakes).then_some(source);
@@ -385,6 +410,15 @@ impl Ticket {
     pub(crate) fn set_amid_packet(&self, is_amid_packet: bool) {
         self.activity.is_amid_packet.store(is_amid_packet, Ordering::Relaxed);
     }
+
+    /// Records that the connection has had its last reply: it gives its place to any other one.
+    pub(crate) fn set_answered(&self) {
+        self.activity.is_answered.store(true, Ordering::Relaxed);
+    }
+
+    pub(crate) fn is_answered(&self) -> bool {
+        self.activity.is_answered.load(Ordering::Relaxed)
+    }
 }
 
 /// Sets the task of a connection, so that it can be evicted.
@@ -520,6 +554,44 @@ mod tests {
         sixth.set_amid_packet(true);
         fifth.set_amid_packet(false);
         assert_eq!(admit(7).1, Some(session(1, 5)), "its packet is complete");
+    }
+
+    #[test]
+    fn a_connection_that_was_answered_gives_its_place_to_any_other() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        for when_full in [WhenFull::Refuse, WhenFull::Evict] {
+            let admission = admission(3, Some(2), when_full);
+            let admit = |last, port| {
+                let (ticket, evicted) = admission.admit(peer(last, port))?;
+                attach(&admission, ticket.id(), task(&runtime));
+                Ok::<_, Full>((ticket, evicted))
+            };
+            let answered = |last, port| Some(Evicted::Answered(peer(last, port).into()));
+            let tickets = [(1, 1), (2, 1), (1, 2)].map(|(last, port)| admit(last, port).unwrap().0);
+            tickets[1].set_answered();
+            let (_fourth, evicted) = admit(3, 1).unwrap();
+            assert_eq!(evicted, answered(2, 1));
+            tickets[2].set_answered();
+            let (_fifth, evicted) = admit(1, 3).unwrap();
+            assert_eq!(evicted, answered(1, 2), "the limit of the source");
+            let next = admit(1, 4).map(|(_, evicted)| evicted);
+            let expected =
+                if when_full == WhenFull::Evict { Ok(Some(session(1, 1))) } else { Err(Full) };
+            assert_eq!(next, expected, "no other one was answered");
+        }
+    }
+
+    #[test]
+    fn a_session_that_was_answered_keeps_no_handshake_out() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = with_handshakes(2, 1, None, WhenFull::Refuse);
+        let (first, _) = begin(&admission, &runtime, peer(1, 1));
+        assert_eq!(first.establish(), Ok(None));
+        assert_eq!(admission.admit(peer(1, 2)).unwrap_err(), Full);
+        first.set_answered();
+        let (second, evicted) = begin(&admission, &runtime, peer(1, 2));
+        assert_eq!(evicted, None, "only its session needs the place");
+        assert_eq!(second.establish(), Ok(Some(Evicted::Answered(peer(1, 1).into()))));
     }
 
     #[test]

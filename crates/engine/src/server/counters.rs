@@ -40,7 +40,11 @@ pub struct PacketCounters {
     pub accepted: Counter,
     /// Bits and registers written.
     pub values: Counter,
-    /// Bytes behind accepted packets that were dropped.
+    /// Bytes behind packets that were written, where a connection carries one: the sender does not speak
+    /// this protocol.
+    pub surplus_bytes: Counter,
+    /// Bytes of packets that did not arrive completely, behind others that were written, where a
+    /// connection carries many.
     pub dropped_bytes: Counter,
     /// Memory of packets that are not complete, in bytes.
     pub held_bytes: Gauge,

@@ -58,7 +58,9 @@ pub enum Kind {
     AcceptError,
     /// A Raw Ingest packet was not written.
     PacketRefused(Refusal),
-    /// This many bytes behind an accepted Raw Ingest packet were dropped.
+    /// This many bytes followed the only Raw Ingest packet of a connection, which was written.
+    SurplusBytes(u64),
+    /// This many bytes of a Raw Ingest packet behind others were dropped: its end is missing.
     BytesDropped(u64),
     /// A serial device was lost. The listener tries to open it again.
     LineLost,
@@ -98,6 +100,7 @@ impl Kind {
             Kind::TlsFailed(_) => "tls_failed",
             Kind::AcceptError => "accept_error",
             Kind::PacketRefused(_) => "packet_refused",
+            Kind::SurplusBytes(_) => "surplus_bytes",
             Kind::BytesDropped(_) => "bytes_dropped",
             Kind::LineLost => "line_lost",
             Kind::LineBack => "line_back",
@@ -117,7 +120,7 @@ impl Kind {
     /// The number of bytes that the event is about.
     pub const fn bytes(self) -> Option<u64> {
         match self {
-            Kind::BytesDropped(count) => Some(count),
+            Kind::SurplusBytes(count) | Kind::BytesDropped(count) => Some(count),
             _ => None,
         }
     }

@@ -1,6 +1,7 @@
 //! What all listeners share: a name, a socket, and the admission, counting and reporting of
 //! connections.
 
+use std::future::poll_fn;
 use std::io;
 use std::net::{IpAddr, Shutdown, SocketAddr};
 use std::sync::Arc;
@@ -20,6 +21,7 @@ use super::event::{Kind, Reporter};
 use super::live::Live;
 use super::peer::Peer;
 use super::refused_request::RefusedRequest;
+use super::stream::Stream;
 
 /// The most connections that wait in the system to be accepted.
 const BACKLOG: i32 = 1024;
@@ -35,9 +37,11 @@ const KEEPALIVE: (Duration, u32, Duration) = (Duration::from_secs(60), 4, Durati
 /// The pause after a failed accept, usually for lack of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
-/// The longest time that a refused peer is read, and the bytes per read.
+/// The longest time that a peer is read after its last reply, the bytes per read, and the most reads
+/// after that time.
 const DRAIN: Duration = Duration::from_secs(5);
 const DRAIN_CHUNK: usize = 16 * 1024;
+const LAST_READS: usize = 4;
 
 /// The part of a listener that does not depend on its protocol.
 #[derive(Debug)]
@@ -134,6 +138,7 @@ impl ListenerContext {
                 self.connections.evicted_handshakes.add();
                 self.report(Kind::EvictedHandshake, Some(peer));
             }
+            Some(Evicted::Answered(peer)) => self.ended(Kind::Closed, peer),
         }
     }
 
@@ -168,7 +173,7 @@ pub(crate) struct Admitted<G> {
     pub(crate) stream: TcpStream,
     pub(crate) peer: SocketAddr,
     pub(crate) rights: Arc<G>,
-    /// Bytes that have already been read.
+    /// Bytes that have already been read, and not answered.
     pub(crate) received: Vec<u8>,
     pub(crate) ticket: Ticket,
 }
@@ -183,13 +188,13 @@ pub(crate) trait Service: Send + Sync + Sized + 'static {
     /// if it stays.
     fn ends(&self, before: &Self, peer: &Peer) -> Option<Kind>;
 
-    /// Serves the connection immediately if that is possible without waiting. Otherwise returns it.
+    /// Answers what has arrived if that is possible without waiting.
     fn serve_at_once(
         &self,
         _front: &ListenerContext,
         connection: Admitted<Self::PeerRights>,
-    ) -> Option<Admitted<Self::PeerRights>> {
-        Some(connection)
+    ) -> Admitted<Self::PeerRights> {
+        connection
     }
 
     /// Serves a connection to its end. `live` is this service, or what has taken its place.
@@ -257,9 +262,7 @@ fn admit<S: Service>(
     };
     let id = ticket.id();
     let connection = Admitted { stream, peer, rights, received: Vec::new(), ticket };
-    let Some(connection) = service.serve_at_once(context, connection) else {
-        return;
-    };
+    let connection = service.serve_at_once(context, connection);
     let (context, live, stop) = (Arc::clone(context), Arc::clone(live), stop.clone());
     let admission = Arc::clone(&context.admission);
     let task = if let [worker] = workers {
@@ -320,40 +323,33 @@ pub(crate) fn set_options(stream: &TcpStream) {
     let _ = SockRef::from(stream).set_tcp_keepalive(&keepalive);
 }
 
-/// Shuts down the sending side, then reads until the peer closes, or about `most` bytes. Returns their
-/// number. Closing a socket with unread bytes resets the connection, and the peer may lose the last
-/// reply.
-pub(crate) async fn drain(
-    stream: &TcpStream,
-    most: usize,
+/// Shuts down the sending side, then reads until the peer closes, and passes the number of bytes on.
+/// Closing a socket with unread bytes resets the connection, and the peer may lose the last reply.
+pub(crate) async fn drain<S: Stream>(
+    stream: &mut S,
     mut stop: watch::Receiver<bool>,
-) -> usize {
-    let mut drained = 0;
-    if SockRef::from(stream).shutdown(Shutdown::Write).is_err() {
-        return drained;
-    }
+    mut drained: impl FnMut(usize),
+) {
+    let _ = SockRef::from(stream.socket()).shutdown(Shutdown::Write);
+    let mut unsent = Vec::new();
     let deadline = Instant::now() + DRAIN;
-    while drained < most && Instant::now() < deadline {
-        let readable = tokio::select! {
-            readable = timeout_at(deadline, stream.readable()) => readable,
+    while Instant::now() < deadline {
+        // On the stack, because many peers may be read at the same time: outside the closure, it would
+        // be a part of every connection.
+        let read = poll_fn(|context| stream.poll_read(context, &mut [0; DRAIN_CHUNK], &mut unsent));
+        let read = tokio::select! {
+            read = timeout_at(deadline, read) => read,
             _ = stop.wait_for(|stop| *stop) => break,
         };
-        let Ok(Ok(())) = readable else { break };
-        // On the stack, because many peers may be read at the same time: in the `match`, it would be a
-        // part of every connection.
-        let read = stream.try_read(&mut [0; DRAIN_CHUNK]);
-        match read {
-            Ok(0) => break,
-            Ok(len) => {
-                drained += len;
-                // A peer that never pauses leaves time for other connections.
-                yield_now().await;
-            }
-            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-            Err(_) => break,
-        }
+        let Ok(Ok(len)) = read else { return };
+        drained(len);
+        // A peer that never pauses leaves time for other connections.
+        yield_now().await;
     }
-    drained
+    for _ in 0..LAST_READS {
+        let Some(len) = stream.read_now(&mut [0; DRAIN_CHUNK], &mut unsent) else { return };
+        drained(len);
+    }
 }
 
 /// Whether an error of `accept` concerns one peer, not the listener.

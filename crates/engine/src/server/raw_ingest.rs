@@ -1,9 +1,13 @@
 //! A Raw Ingest listener: each connection carries one packet, one write, and one byte of reply. If the
 //! settings allow it, it carries several packets one after another, each with its reply.
 //!
-//! The header is checked before the payload is read, and the whole packet before memory is written.
-//! After a refusal, the listener reads until the peer closes: closing a socket with unread bytes
-//! resets the connection, and the reply could be lost.
+//! The header is checked before the payload is read, and the whole packet before memory is written. A
+//! packet is answered at its last byte, or at the first that is wrong: what follows never changes its
+//! outcome, so the outcome does not depend on how the bytes were cut.
+//!
+//! After the last reply, the listener reads until the peer closes: closing a socket with unread bytes
+//! resets the connection, and the reply could be lost. What it reads behind an accepted packet is
+//! counted, because its sender does not speak this protocol: its packet may mean something else.
 
 use std::collections::HashMap;
 use std::future::poll_fn;
@@ -45,20 +49,11 @@ pub(crate) const DECISIVE: usize = 4;
 /// of its protocol id, 0.
 const BEFORE_FLAGS: usize = 3;
 
-/// Bytes per read of a new connection, and of what follows its packet.
+/// Bytes per read of a new connection.
 const CHUNK: usize = 16 * 1024;
-
-/// The most reads of what follows an accepted packet.
-const LAST_READS: usize = 4;
 
 /// The most packets of one connection that are answered before other tasks run.
 const TURN: usize = 64;
-
-/// The most bytes that are read after a packet without its CRC.
-const LATE_BYTES: usize = 64 * 1024;
-
-/// Bytes that are read to see what has arrived behind a packet: more than a CRC.
-const BEHIND: usize = 5;
 
 /// What peers from some networks can write.
 #[derive(Debug, Clone)]
@@ -78,9 +73,6 @@ pub struct RawSettings {
     pub bind: SocketAddr,
     pub format: Format,
     pub flags: Flags,
-    /// With a format without a CRC, and one packet for each connection: if bytes have arrived behind a
-    /// packet when it is complete, they are its CRC.
-    pub crc_if_present: bool,
     pub rules: Vec<RawRule>,
     pub limits: ConnectionLimits,
     /// The longest time from the start of a connection to the last byte of its packet. With TLS also
@@ -143,7 +135,6 @@ pub(crate) struct RawIngest {
     tls: Option<Arc<ServerTls>>,
     format: Format,
     flags: Flags,
-    crc_if_present: bool,
     request_timeout: Duration,
     many: Option<Duration>,
     after_refusal: AfterRefusal,
@@ -175,6 +166,30 @@ pub(crate) struct Sending<S> {
     share: Share,
 }
 
+/// Bytes behind an accepted packet. They are counted as they arrive, and reported when their connection
+/// ends, also if another one needs its place.
+struct Surplus<'a> {
+    packets: &'a PacketCounters,
+    context: &'a ListenerContext,
+    peer: &'a Peer,
+    bytes: u64,
+}
+
+impl Surplus<'_> {
+    fn add(&mut self, count: usize) {
+        self.packets.surplus_bytes.add_many(count as u64);
+        self.bytes += count as u64;
+    }
+}
+
+impl Drop for Surplus<'_> {
+    fn drop(&mut self) {
+        if self.bytes > 0 {
+            self.context.report(Kind::SurplusBytes(self.bytes), Some(self.peer.clone()));
+        }
+    }
+}
+
 impl<S: Stream> Sending<S> {
     /// Reads once, at most about `most` bytes, when the source may work. Returns their number, which can
     /// be 0.
@@ -197,14 +212,6 @@ impl<S: Stream> Sending<S> {
         !self.bytes.is_empty() || self.stream.is_amid_record()
     }
 
-    /// Appends bytes that have arrived behind a packet, without waiting. Returns whether there are any.
-    fn read_behind(&mut self) -> bool {
-        let mut behind = [0; BEHIND];
-        let len = self.stream.read_now(&mut behind, &mut self.unsent).unwrap_or(0);
-        self.bytes.extend(&behind[..len]);
-        len > 0
-    }
-
     /// Announces the end, if nothing was cut off before.
     fn end(&mut self) {
         if self.unsent.is_empty() {
@@ -219,7 +226,6 @@ pub(crate) type Renewal = Box<dyn Fn() -> Option<Arc<RawGrant>> + Send + Sync>;
 
 impl RawIngest {
     pub(crate) fn new(settings: &RawSettings, packets: Arc<PacketCounters>) -> RawIngest {
-        debug_assert!(!settings.crc_if_present || settings.packets == PacketsPerConnection::One);
         let rules = settings.rules.iter().map(|rule| {
             let targets = rule.targets.iter().cloned().collect();
             let rights = RawGrant { targets, areas: rule.areas.clone() };
@@ -236,7 +242,6 @@ impl RawIngest {
             tls: settings.tls.clone(),
             format: settings.format,
             flags: settings.flags,
-            crc_if_present: settings.crc_if_present,
             request_timeout: settings.request_timeout,
             many,
             after_refusal,
@@ -269,13 +274,13 @@ impl RawIngest {
     pub(crate) async fn refuse_peer(
         &self,
         context: &ListenerContext,
-        (stream, peer): (TcpStream, SocketAddr),
+        (mut stream, peer): (TcpStream, SocketAddr),
         packet: &[u8],
         stop: watch::Receiver<bool>,
     ) {
         self.refuse(context, &peer.into(), packet, Refusal::NotGranted);
         let _ = (&*SockRef::from(&stream)).write(&[REFUSED]);
-        drain(&stream, usize::MAX, stop).await;
+        drain(&mut stream, stop, |_| ()).await;
         context.ended(Kind::Closed, peer);
     }
 
@@ -335,7 +340,7 @@ impl RawIngest {
         }
     }
 
-    /// Checks the bytes received so far.
+    /// Checks the bytes received so far, up to the end of the first packet.
     fn judge<'p>(&self, rights: &'p RawGrant, bytes: &'p [u8]) -> Result<Packet<'p>, Refusal> {
         let Some(header) = self.header(bytes)? else {
             let missing = self.format.header_len().saturating_sub(bytes.len()).max(1);
@@ -359,15 +364,10 @@ impl RawIngest {
         if address < start || address + u32::from(header.count.get()) > end {
             return Err(Refusal::Range);
         }
-        let format = if self.crc_if_present && bytes.len() > self.format.packet_len(&header) {
-            Format::Crc { required: true }
-        } else {
-            self.format
-        };
-        match format.packet_len(&header).checked_sub(bytes.len()) {
+        match self.format.packet_len(&header).checked_sub(bytes.len()) {
             Some(missing) if missing > 0 => Ok(Packet::Incomplete { missing }),
             _ => {
-                let payload = format.payload(&header, bytes)?;
+                let payload = self.format.payload(&header, bytes)?;
                 Ok(Packet::Whole { header, memory, payload })
             }
         }
@@ -435,18 +435,11 @@ impl RawIngest {
             sending.ticket.set_amid_packet(sending.is_amid_packet());
             let missing = match self.judge(&sending.rights, &sending.bytes) {
                 Ok(Packet::Incomplete { missing }) => missing,
-                Ok(Packet::Whole { .. }) => 0,
+                Ok(Packet::Whole { .. }) => return Ok(Ok(())),
                 Err(refusal) => return Ok(Err(refusal)),
             };
-            if missing == 0 {
-                if sending.read_behind() {
-                    continue;
-                }
-                return Ok(Ok(()));
-            }
-            // One byte more than the packet has, to detect extra bytes.
             let read = tokio::select! {
-                read = timeout_at(deadline, sending.read(missing + 1)) => read,
+                read = timeout_at(deadline, sending.read(missing)) => read,
                 _ = stop.wait_for(|stop| *stop) => return Err(Kind::Closed),
             };
             match read {
@@ -479,14 +472,16 @@ impl RawIngest {
             }
             Ok(judged) => judged,
         };
+        let mut behind = 0;
         let written = match judged.and_then(|()| self.judge(&sending.rights, &sending.bytes)) {
             Ok(Packet::Whole { header, memory, payload }) => {
+                behind = sending.bytes.len() - self.format.packet_len(&header);
                 self.write(&context, &sending.peer, (header, memory, payload)).await
             }
             Ok(Packet::Incomplete { .. }) => Err(Refusal::Short),
             Err(refusal) => Err(refusal),
         };
-        sending.share.charge(fair_share::packet(sending.bytes.len()));
+        sending.share.charge(fair_share::packet(sending.bytes.len() - behind));
         sending.ticket.set_amid_packet(false);
         if let Err(refusal) = written {
             self.refuse(&context, &sending.peer, &sending.bytes, refusal);
@@ -495,22 +490,29 @@ impl RawIngest {
                 context.ended(Kind::Closed, sending.peer.clone());
                 return sending.end();
             }
-            send_last(&mut sending.stream, &mut sending.unsent, REFUSED);
-            drain(sending.stream.socket(), usize::MAX, stop).await;
+            answer(&mut sending.stream, &mut sending.unsent, &sending.ticket, REFUSED);
+            drain(&mut sending.stream, stop, |_| ()).await;
         } else {
             sending.bytes.clear();
-            let mut dropped = RawIngest::confirm(&mut sending.stream, &mut sending.unsent);
-            if self.crc_if_present && self.tls.is_none() {
-                // A CRC that comes too late must not reset the connection, reply and all.
-                dropped += drain(sending.stream.socket(), LATE_BYTES, stop).await;
-            } else if self.tls.is_some() {
-                // Nor must the message that ends TLS.
-                drain(sending.stream.socket(), LATE_BYTES, stop).await;
-            }
-            self.drop_bytes(&context, &sending.peer, dropped);
+            answer(&mut sending.stream, &mut sending.unsent, &sending.ticket, DONE);
+            self.drain_surplus(&context, (&mut sending.stream, &sending.peer), behind, stop).await;
         }
         context.ended(Kind::Closed, sending.peer);
         drop(sending.ticket);
+    }
+
+    /// Reads and counts what follows the only packet of a connection, which was written. `received`
+    /// bytes of it were already read.
+    async fn drain_surplus<S: Stream>(
+        &self,
+        context: &ListenerContext,
+        (stream, peer): (&mut S, &Peer),
+        received: usize,
+        stop: watch::Receiver<bool>,
+    ) {
+        let mut surplus = Surplus { packets: &self.packets, context, peer, bytes: 0 };
+        surplus.add(received);
+        drain(stream, stop, |len| surplus.add(len)).await;
     }
 
     /// Serves packets one after another.
@@ -604,9 +606,10 @@ impl RawIngest {
             if refusal == Refusal::NotConfirmed {
                 break;
             }
+            sending.ticket.set_answered();
             let _ = self.reply(&mut sending, REFUSED).await;
             sending.end();
-            drain(sending.stream.socket(), usize::MAX, stop).await;
+            drain(&mut sending.stream, stop, |_| ()).await;
             break;
         }
         if accepted {
@@ -682,19 +685,7 @@ impl RawIngest {
         }
     }
 
-    /// Confirms the only packet of a connection. Bytes that have arrived behind it by then are read,
-    /// because closing a socket with unread bytes could lose the reply. Returns their number.
-    fn confirm<S: Stream>(stream: &mut S, unsent: &mut Vec<u8>) -> usize {
-        send_last(stream, unsent, DONE);
-        let (mut chunk, mut dropped) = ([0; CHUNK], 0);
-        for _ in 0..LAST_READS {
-            let Some(len) = stream.read_now(&mut chunk, unsent) else { break };
-            dropped += len;
-        }
-        dropped
-    }
-
-    /// Counts and reports bytes behind an accepted packet that are not part of another one.
+    /// Counts and reports bytes behind accepted packets that began another one, which did not arrive.
     fn drop_bytes(&self, context: &ListenerContext, peer: &Peer, count: usize) {
         if count > 0 {
             self.packets.dropped_bytes.add_many(count as u64);
@@ -735,34 +726,34 @@ impl Service for RawIngest {
         self.policy.rights(peer)
     }
 
-    /// Most packets have arrived when their connection is accepted, and do not require a task.
+    /// Most packets have arrived when their connection is accepted: they are answered before a task
+    /// begins.
     fn serve_at_once(
         &self,
         context: &ListenerContext,
         mut connection: Admitted<RawGrant>,
-    ) -> Option<Admitted<RawGrant>> {
-        if self.many.is_some() || self.crc_if_present || self.tls.is_some() {
-            return Some(connection);
+    ) -> Admitted<RawGrant> {
+        if self.many.is_some() || self.tls.is_some() {
+            return connection;
         }
         let mut chunk = [0; CHUNK];
         let Ok(len) = (&*SockRef::from(&connection.stream)).read(&mut chunk) else {
-            return Some(connection);
+            return connection;
         };
-        let bytes = &chunk[..len];
-        let peer = Peer::from(connection.peer);
+        let mut bytes = &chunk[..len];
         if let Ok(Packet::Whole { header, memory, payload }) = self.judge(&connection.rights, bytes)
-            && len < CHUNK
             && !memory.has_journal()
-            && self.write_at_once(context, &peer, (header, memory, payload)).is_ok()
+            && self
+                .write_at_once(context, &connection.peer.into(), (header, memory, payload))
+                .is_ok()
         {
-            let dropped = RawIngest::confirm(&mut connection.stream, &mut Vec::new());
-            self.drop_bytes(context, &peer, dropped);
-            context.ended(Kind::Closed, peer);
-            return None;
+            bytes = &bytes[self.format.packet_len(&header)..];
+            answer(&mut connection.stream, &mut Vec::new(), &connection.ticket, DONE);
+        } else {
+            connection.ticket.set_amid_packet(len > 0);
         }
         connection.received = bytes.to_vec();
-        connection.ticket.set_amid_packet(len > 0);
-        Some(connection)
+        connection
     }
 
     fn ends(&self, before: &RawIngest, peer: &Peer) -> Option<Kind> {
@@ -791,6 +782,13 @@ impl Service for RawIngest {
             // In a box of its own, so that plain connections do not reserve memory for it.
             return Box::pin(self.secure(tls, live, context, connection, stop)).await;
         }
+        if connection.ticket.is_answered() {
+            let Admitted { mut stream, peer, received, ticket, .. } = connection;
+            let from = (&mut stream, &peer.into());
+            self.drain_surplus(&context, from, received.len(), stop).await;
+            context.ended(Kind::Closed, peer);
+            return drop(ticket);
+        }
         let peer = connection.peer.ip();
         let renewal = Box::new(move || live.get().rights(peer));
         self.serve_packets(context, self.sending(connection), renewal, stop).await;
@@ -814,8 +812,11 @@ fn refusal(refused: MemoryRefusal) -> Refusal {
     }
 }
 
-/// Sends the last reply of a connection and announces the end, without waiting.
-fn send_last<S: Stream>(stream: &mut S, unsent: &mut Vec<u8>, reply: u8) {
+/// Sends the last reply of a connection and announces the end, without waiting. From now on, the
+/// connection is only open so that the reply is not lost.
+fn answer<S: Stream>(stream: &mut S, unsent: &mut Vec<u8>, ticket: &Ticket, reply: u8) {
+    // First, because a sender that has its reply may expect a place for its next packet.
+    ticket.set_answered();
     if stream.send(&[reply], unsent).is_ok() {
         stream.end(unsent);
         let _ = stream::write(stream.socket(), unsent);
@@ -824,20 +825,28 @@ fn send_last<S: Stream>(stream: &mut S, unsent: &mut Vec<u8>, reply: u8) {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::VecDeque;
     use std::io::Write as _;
     use std::net::TcpListener;
+    use std::num::NonZeroU16;
+    use std::sync::Mutex;
+    use std::task::{Context, Poll};
 
     use holdfast_memory::{Layout, Span};
+    use holdfast_protocol::raw_ingest::Area as PacketArea;
+    use tokio::runtime::Runtime;
 
     use super::super::admission::Admission;
+    use super::super::cuts::assert_same_outcome;
+    use super::super::event::{self, Verbosity};
     use super::*;
+    use crate::counter::Counter;
 
     fn listener(format: Format, flags: Flags) -> RawIngest {
         let settings = RawSettings {
             bind: SocketAddr::from(([127, 0, 0, 1], 0)),
             format,
             flags,
-            crc_if_present: false,
             rules: Vec::new(),
             limits: ConnectionLimits::NONE,
             request_timeout: Duration::from_secs(10),
@@ -856,12 +865,15 @@ mod tests {
         accepted.set_nonblocking(true).unwrap();
         let limits = ConnectionLimits { max_connections: 1, ..ConnectionLimits::NONE };
         let (ticket, _) = Arc::new(Admission::new(limits)).admit(peer).unwrap();
-        let layout = Layout::default().with(Area::HoldingRegisters, Span::new(0, 1).unwrap());
-        let memory = Arc::new(Memory::new(layout, None).unwrap());
-        let rights =
-            RawGrant { targets: HashMap::from([(1, memory)]), areas: vec![Area::HoldingRegisters] };
         let stream = TcpStream::from_std(accepted).unwrap();
-        Admitted { stream, peer, rights: Arc::new(rights), received, ticket }
+        Admitted { stream, peer, rights: Arc::new(rights()), received, ticket }
+    }
+
+    /// The rights to write 8 registers of unit 1.
+    fn rights() -> RawGrant {
+        let layout = Layout::default().with(Area::HoldingRegisters, Span::new(0, 8).unwrap());
+        let memory = Arc::new(Memory::new(layout, None).unwrap());
+        RawGrant { targets: HashMap::from([(1, memory)]), areas: vec![Area::HoldingRegisters] }
     }
 
     /// Both ends of a connection.
@@ -986,24 +998,226 @@ mod tests {
         }
     }
 
+    /// A stream whose bytes arrive in these pieces. Then the peer closes its side.
+    struct Pieces<'a> {
+        pieces: VecDeque<&'a [u8]>,
+        replies: Arc<Mutex<Vec<u8>>>,
+        socket: &'a TcpStream,
+    }
+
+    impl Stream for Pieces<'_> {
+        fn poll_read(
+            &mut self,
+            _context: &mut Context<'_>,
+            input: &mut [u8],
+            _unsent: &mut Vec<u8>,
+        ) -> Poll<Result<usize, End>> {
+            let Some(piece) = self.pieces.front_mut() else {
+                return Poll::Ready(Err(End::ByPeer));
+            };
+            let (read, rest) = piece.split_at(piece.len().min(input.len()));
+            input[..read.len()].copy_from_slice(read);
+            *piece = rest;
+            if rest.is_empty() {
+                self.pieces.pop_front();
+            }
+            Poll::Ready(Ok(read.len()))
+        }
+
+        fn read_now(&mut self, _input: &mut [u8], _unsent: &mut Vec<u8>) -> Option<usize> {
+            None
+        }
+
+        fn send(&mut self, output: &[u8], _unsent: &mut Vec<u8>) -> Result<(), Kind> {
+            self.replies.lock().unwrap().extend_from_slice(output);
+            Ok(())
+        }
+
+        fn is_amid_record(&self) -> bool {
+            false
+        }
+
+        fn end(&mut self, _unsent: &mut Vec<u8>) {}
+
+        fn socket(&self) -> &TcpStream {
+            self.socket
+        }
+    }
+
+    /// A format, what becomes of flags, how many packets a connection carries, and what follows a refusal.
+    type Terms = ((Format, Flags), (Option<Duration>, AfterRefusal));
+
+    fn terms() -> impl Iterator<Item = Terms> {
+        let (crc, none) = (Format::Crc { required: true }, Format::Crc { required: false });
+        let formats = [
+            (Format::V1, Flags::Strict),
+            (crc, Flags::Strict),
+            (none, Flags::Strict),
+            (none, Flags::Ignore),
+        ];
+        let many = Some(Duration::from_secs(10));
+        let packets = [
+            (None, AfterRefusal::Close),
+            (many, AfterRefusal::Close),
+            (many, AfterRefusal::Continue),
+        ];
+        formats.into_iter().flat_map(move |format| packets.map(|packets| (format, packets)))
+    }
+
+    fn listener_with(((format, flags), (many, after_refusal)): Terms) -> RawIngest {
+        RawIngest { many, after_refusal, ..listener(format, flags) }
+    }
+
+    /// Packets that are written, refused for each reason, or cut short.
+    fn cases(format: Format) -> Vec<Vec<u8>> {
+        let packet = |area, target, address, values: &[u8]| {
+            let count = NonZeroU16::new(values.len() as u16 / 2).unwrap();
+            let (header, mut packet) = (Header { area, target, address, count }, vec![0; 64]);
+            let len = format.encode_to_slice(&header, values, &mut packet).unwrap();
+            packet.truncate(len);
+            packet
+        };
+        let area = PacketArea::HoldingRegisters;
+        let good = packet(area, 1, 3, &[0, 7, 0, 8]);
+        let changed = |at: usize, byte| {
+            let mut packet = good.clone();
+            packet[at] = byte;
+            packet
+        };
+        let header_len = format.header_len();
+        // As an old sender has it: the length of the payload comes first.
+        let mut shifted = good.clone();
+        shifted.splice(header_len..header_len, [0, 4]);
+        vec![
+            good.clone(),
+            packet(area, 1, 0, &[1, 2]),
+            shifted,
+            packet(area, 9, 0, &[1, 2]),
+            packet(area, 1, 7, &[1, 2, 3, 4]),
+            packet(PacketArea::InputRegisters, 1, 0, &[1, 2]),
+            changed(0, 0x72),
+            changed(1, 0),
+            changed(2, 2),
+            changed(3, 9),
+            changed(4, 9),
+            // Area and reserved byte are both wrong.
+            [&good[..4], &[9, 1], &good[6..]].concat(),
+            changed(header_len - 1, 0),
+            changed(good.len() - 1, 0xEE),
+            good[..good.len() - 1].to_vec(),
+            good[..header_len - 2].to_vec(),
+            b"RI\x01\x03\x00\x01\x00\x00\x00\x01\x00\x07".to_vec(),
+            vec![0; 40],
+        ]
+    }
+
+    /// What has come of a connection.
+    fn outcome_of(raw: &RawIngest, replies: &[u8], memory: &Arc<Memory>) -> String {
+        let PacketCounters { accepted, values, surplus_bytes, dropped_bytes, .. } = &*raw.packets;
+        let counted = [accepted, values, surplus_bytes, dropped_bytes].map(Counter::get);
+        let refused: Vec<_> = raw.packets.refused().collect();
+        let contents = Memory::contents(std::slice::from_ref(memory));
+        format!("{replies:?} {counted:?} {refused:?} {contents:?}")
+    }
+
+    /// What comes of the pieces of a connection. The first may have been read before it is served.
+    fn outcome(
+        terms: Terms,
+        (runtime, socket): (&Runtime, &TcpStream),
+        pieces: &[&[u8]],
+        is_read: bool,
+    ) -> String {
+        let raw = listener_with(terms);
+        let (read, pieces) = pieces.split_at(usize::from(is_read));
+        let (replies, pieces) = (Arc::default(), pieces.iter().copied().collect());
+        let stream = Pieces { pieces, replies: Arc::clone(&replies), socket };
+        let peer = SocketAddr::from(([127, 0, 0, 1], 1));
+        let limits = ConnectionLimits { max_connections: 1, ..ConnectionLimits::NONE };
+        let (ticket, _) = Arc::new(Admission::new(limits)).admit(peer).unwrap();
+        let rights = Arc::new(rights());
+        let memory = Arc::clone(&rights.targets[&1]);
+        let sending = raw.begin((stream, peer.into()), rights, &read.concat(), ticket);
+        let (_engine, stop) = watch::channel(false);
+        let context = Arc::new(ListenerContext::for_tests());
+        runtime.block_on(raw.serve_packets(context, sending, Box::new(|| None), stop));
+        outcome_of(&raw, &replies.lock().unwrap(), &memory)
+    }
+
     #[test]
-    fn bytes_behind_a_confirmed_packet_are_read_and_counted() {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().unwrap();
+    fn packets_have_the_same_outcome_however_they_are_cut() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let (_client, accepted, _) = connected();
+        accepted.set_nonblocking(true).unwrap();
+        let socket = runtime.block_on(async { TcpStream::from_std(accepted) }).unwrap();
+        for terms in terms() {
+            assert_same_outcome(&cases(terms.0.0), |pieces| {
+                let [outcome, other] = [false, true]
+                    .map(|is_read| outcome(terms, (&runtime, &socket), pieces, is_read));
+                assert_eq!(outcome, other, "{pieces:02x?}, the first one read before");
+                outcome
+            });
+        }
+    }
+
+    #[test]
+    fn packets_that_have_arrived_when_they_are_accepted_have_the_same_outcome() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let (_client, accepted, _) = connected();
+        accepted.set_nonblocking(true).unwrap();
+        let socket = runtime.block_on(async { TcpStream::from_std(accepted) }).unwrap();
+        for terms in terms() {
+            let cases = cases(terms.0.0);
+            let joined =
+                cases.iter().zip(&cases[1..]).map(|(case, next)| [&case[..], next].concat());
+            for sent in cases.iter().cloned().chain(joined) {
+                let expected = outcome(terms, (&runtime, &socket), &[&sent], false);
+                let found = runtime.block_on(arrived(listener_with(terms), &sent));
+                assert_eq!(found, expected, "{sent:02x?}");
+            }
+        }
+    }
+
+    /// What comes of bytes that have arrived when their connection is accepted.
+    async fn arrived(raw: RawIngest, sent: &[u8]) -> String {
+        let (mut client, accepted, peer) = connected();
+        client.write_all(sent).unwrap();
+        client.shutdown(std::net::Shutdown::Write).unwrap();
+        while accepted.peek(&mut vec![0; sent.len()]).unwrap() < sent.len() {}
+        let connection = admitted(accepted, peer, Vec::new());
+        let memory = Arc::clone(&connection.rights.targets[&1]);
+        let live = Arc::new(Live::new(raw));
+        let (raw, context) = (live.get(), Arc::new(ListenerContext::for_tests()));
+        let (_engine, stop) = watch::channel(false);
+        let connection = raw.serve_at_once(&context, connection);
+        Arc::clone(&raw).serve(live, context, connection, stop).await;
+        let mut replies = Vec::new();
+        client.read_to_end(&mut replies).unwrap();
+        outcome_of(&raw, &replies, &memory)
+    }
+
+    #[test]
+    fn what_follows_an_accepted_packet_is_read_counted_and_reported() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let _guard = runtime.enter();
         let (mut client, accepted, peer) = connected();
-        client.write_all(&[7; CHUNK + 3]).unwrap();
-        let mut all = vec![0; CHUNK + 3];
-        while accepted.peek(&mut all).unwrap() < all.len() {}
         accepted.set_nonblocking(true).unwrap();
         let mut stream = TcpStream::from_std(accepted).unwrap();
-
         let raw = listener(Format::V1, Flags::Strict);
-        let dropped = RawIngest::confirm(&mut stream, &mut Vec::new());
-        raw.drop_bytes(&ListenerContext::for_tests(), &peer.into(), dropped);
-        assert_eq!(raw.packets.dropped_bytes.get(), CHUNK as u64 + 3);
+        let (reporter, events) = event::channel(Verbosity::Refusals);
+        let context = ListenerContext::new("raw", None, reporter, None);
+        let (_engine, stop) = watch::channel(false);
+        let sender = std::thread::spawn(move || {
+            let sent = client.write_all(&[7; 1 << 20]);
+            sent.and_then(|()| client.shutdown(std::net::Shutdown::Write)).unwrap();
+            let mut end = Vec::new();
+            client.read_to_end(&mut end).unwrap();
+        });
+        let from = (&mut stream, &peer.into());
+        runtime.block_on(raw.drain_surplus(&context, from, 3, stop));
+        assert_eq!(raw.packets.surplus_bytes.get(), 3 + (1 << 20));
+        let event = events.next(Duration::ZERO).unwrap();
+        assert_eq!(event.kind, Kind::SurplusBytes(3 + (1 << 20)));
         drop(stream);
-        let mut reply = Vec::new();
-        client.read_to_end(&mut reply).unwrap();
-        assert_eq!(reply, [DONE]);
+        sender.join().unwrap();
     }
 }

@@ -51,7 +51,7 @@ pub(crate) async fn secured(
         Ok(certificate) => Arc::new(certificate),
         Err(end) => {
             context.ended_with(end, peer, stream.presented_subject().as_deref());
-            drain(&stream.into_socket(), usize::MAX, stop).await;
+            drain(&mut stream.into_socket(), stop, |_| ()).await;
             return None;
         }
     };

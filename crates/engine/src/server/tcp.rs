@@ -204,6 +204,7 @@ impl ModbusStream {
                 Beginning::Packet => {
                     let Admitted { stream, peer, received, ticket, .. } = admitted;
                     let Some(rights) = raw.rights(peer.ip()) else {
+                        ticket.set_answered();
                         return raw.refuse_peer(&context, (stream, peer), &received, stop).await;
                     };
                     let admitted = Admitted { stream, peer, rights, received, ticket };

@@ -94,7 +94,7 @@ impl ServerTlsStream {
         let mut unsent = Vec::new();
         self.channel.end(&mut unsent);
         let _ = stream::write(&self.socket, &mut unsent);
-        drain(&self.socket, usize::MAX, stop).await;
+        drain(&mut self.socket, stop, |_| ()).await;
     }
 
     pub(crate) fn into_socket(self) -> TcpStream {
