@@ -420,11 +420,11 @@ GARBAGE = [
 @pytest.mark.parametrize("sent", GARBAGE, ids=[str(number) for number in range(len(GARBAGE))])
 def test_what_is_not_http_is_refused(service: web.Service, connect: Connect, sent: bytes) -> None:
     connection = connect(service, sent)
-    answers = web.answers(connection.rest())
-    assert [answer.status for answer in answers] in ([400], [415, 400], [415])
-    assert answers[-1].json["status"] == "rejected"
-    assert answers[-1].headers["connection"] == "close"
-    assert "x-content-type-options" in answers[-1].headers
+    [answer] = web.answers(connection.rest())
+    # The type of the body may be refused before the body is seen.
+    assert answer.status == 415 or (answer.status, answer.headers["connection"]) == (400, "close")
+    assert answer.json["status"] == "rejected"
+    assert "x-content-type-options" in answer.headers
     service.until_counted("broken_request")
     assert service.memories["plant_a"].read("coils", 0, 1000) == [0] * 1000
     wire.until(lambda: is_well(service), "it serves")
@@ -527,17 +527,17 @@ def test_broken_bytes_behind_a_request_leave_it_its_answer(
     service: web.Service, connect: Connect
 ) -> None:
     connection = connect(service, web.post(GOOD) + b"\x00garbage")
-    [answer] = web.answers(connection.rest())
-    assert (answer.status, answer.headers["connection"]) == (200, "close")
+    written, refused = web.answers(connection.rest())
+    assert (written.status, refused.status, refused.headers["connection"]) == (200, 400, "close")
     assert coil(service) == 1
     assert service.connections()["broken_request"] == 1
 
 
 def test_what_follows_the_last_request_is_not_one(service: web.Service, connect: Connect) -> None:
     connection = connect(service, web.head("GET", "/api/v1/health", CLOSE) + web.post(GOOD))
-    answers = web.answers(connection.rest())
-    assert answers[0].json == {"status": "ok"}
-    assert len(answers) + coil(service) in (1, 2, 3)
+    [answer] = web.answers(connection.rest())
+    assert answer.json == {"status": "ok"}
+    assert coil(service) == 0
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,11 @@ import httptools
 import msgspec
 import uvicorn
 from uvicorn.protocols.http.flow_control import FlowControl
-from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from uvicorn.protocols.http.httptools_impl import (
+    STATUS_LINE,
+    HttpToolsProtocol,
+    RequestResponseCycle,
+)
 from uvicorn.server import ServerState
 
 from holdfast import logs
@@ -103,12 +107,19 @@ class Counts:
     open: int = 0
 
 
+class BrokenBody(Exception):
+    """The body of a request can't be parsed. Raised where the application receives it."""
+
+
 class Host:
     """Serves one ASGI application on a listening socket.
 
     `scope["state"]["peer"]` is the peer's address as text, for logs. When a request does not arrive
     in time, `scope["state"]["late"]` is set and `receive` returns. The application then has
     `LATE_ANSWER_TIMEOUT` seconds to answer before the connection is dropped.
+
+    `receive` raises `BrokenBody` if the body of the request is not valid HTTP. An application
+    leaves the response to the host then.
 
     An application that sets `scope["state"]["leaving"]` gets a half-close as a disconnect.
 
@@ -205,23 +216,9 @@ class Host:
                 loop.call_soon_threadsafe(stopped.set)
 
         stop.then(end)
-        config = uvicorn.Config(
-            self._guarded,
-            interface="asgi3",
-            ws="none",
-            log_config=None,
-            access_log=False,
-            proxy_headers=False,
-        )
-        config.load()
-        state = ServerState()
         self.counted.open = 0
         self._admission = Admission(self._limits)
-
-        def connection() -> asyncio.Protocol:
-            https, made = self.https, _Connection(config, state, {}, loop, host=self)
-            return made if https is None else TlsTransport(https.context, made)
-
+        state, connection = self.protocols(loop)
         with self._listener.dup() as listener:
             server = await loop.create_server(connection, sock=listener, backlog=BACKLOG)
             while not stopped.is_set():
@@ -232,10 +229,44 @@ class Host:
             await close(server)
             await _end(cast("set[_Connection]", state.connections), self._stop_timeout)
 
+    def protocols(
+        self, loop: asyncio.AbstractEventLoop
+    ) -> tuple[ServerState, Callable[[], asyncio.Protocol]]:
+        """Returns the open connections, and a function that makes the protocol of another one."""
+        config = uvicorn.Config(
+            self._guarded,
+            interface="asgi3",
+            ws="none",
+            log_config=None,
+            access_log=False,
+            proxy_headers=False,
+        )
+        config.load()
+        state = ServerState()
+
+        def connection() -> asyncio.Protocol:
+            https, made = self.https, _Connection(config, state, {}, loop, host=self)
+            return made if https is None else TlsTransport(https.context, made)
+
+        return state, connection
+
     async def _guarded(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Runs the application. Exceptions are logged, and answered without details."""
+
+        async def receive_valid() -> MutableMapping[str, Any]:
+            message = await receive()
+            if "broken" in scope["state"]:
+                raise BrokenBody
+            return message
+
         try:
-            await self._app(scope, receive, send)
+            await self._app(scope, receive_valid, send)
+        except BrokenBody:
+            self.note("broken_request", scope["state"]["peer"])
+            status, detail = scope["state"]["broken"]
+            headers, body = self.rejection("malformed", detail)
+            with contextlib.suppress(RuntimeError):  # The response has begun and is cut off.
+                await respond(send, status, [*headers, (b"connection", b"close")], body)
         except Exception:
             logs.problem("request_failed", listener=self.name, peer=scope["state"]["peer"])
             with contextlib.suppress(RuntimeError):  # The response has begun and is cut off.
@@ -317,6 +348,9 @@ class _Output:
 class _Connection(HttpToolsProtocol):
     """One connection.
 
+    Its responses do not depend on how the bytes of requests are cut: each request is answered
+    before what is wrong behind it, and what follows the last one is ignored.
+
     It has three deadlines, `math.inf` when they don't apply: for the request to arrive, for the
     reply to be sent, and for the next request to begin. A deadline is at least `_step` away when it
     is set, and the one alarm goes off at least that often, so the deadlines need no own timers.
@@ -336,6 +370,9 @@ class _Connection(HttpToolsProtocol):
         self.held = b""
         self._admitted = False
         self._ended = self._broken = False
+        self._refusal: bytes | None = None
+        self._is_last = self._over = False
+        self._running: RequestResponseCycle | None = None
         self._in_message = False
         self._in_header = False
         self._messages = 0
@@ -396,7 +433,7 @@ class _Connection(HttpToolsProtocol):
     def data_received(self, data: bytes) -> None:
         """Buffers and parses received bytes."""
         self.begun()
-        if not self._broken and not self.transport.is_closing():
+        if not (self._broken or self._over or self.transport.is_closing()):
             self.held += data
             self._parse()
 
@@ -426,12 +463,14 @@ class _Connection(HttpToolsProtocol):
 
     def plain_answer(self) -> bytes:
         """Returns the response to a request without TLS."""
-        return self._refusal(400, "this port takes HTTPS: use a URL that begins with https://")
+        return self._refused(400, "this port takes HTTPS: use a URL that begins with https://")
 
     # Called by the parser.
 
     def on_message_begin(self) -> None:
         """Called at the start of a request."""
+        if self._over:
+            raise httptools.HttpParserError("a request behind the last one")
         self._in_message = self._in_header = True
         super().on_message_begin()
 
@@ -444,9 +483,10 @@ class _Connection(HttpToolsProtocol):
         """Called after the header of a request; starts the application."""
         if self.parser.get_http_version() not in ("1.1", "1.0"):
             raise httptools.HttpParserError("unsupported HTTP version")
-        self._in_header = False
         self._overhead = 0
         super().on_headers_complete()
+        self._in_header = False
+        self._is_last = not self.cycle.keep_alive
         output = _Output(self)
         self.cycle.transport = cast("asyncio.Transport", output)
         self.cycle.on_response = output.end
@@ -471,6 +511,7 @@ class _Connection(HttpToolsProtocol):
 
     def _complete(self) -> None:
         self._in_message = False
+        self._over = self._is_last
         self._messages += 1
         self._overhead = 0
         super().on_message_complete()
@@ -481,6 +522,9 @@ class _Connection(HttpToolsProtocol):
         """Called after a response: the next request starts, or the connection becomes idle."""
         self.server_state.total_requests += 1
         if self.transport.is_closing():
+            return
+        if self._broken and not self.pipeline:
+            self._conclude()
             return
         if self.pipeline:
             self._start_asgi_task(*self.pipeline.pop())
@@ -511,9 +555,9 @@ class _Connection(HttpToolsProtocol):
         if self._request_due == math.inf:
             self._since = self.loop.time()
             self._request_due = self._since + self.host.request_timeout
-        while at < len(whole) and not self.pipeline and not self._broken:
+        while at < len(whole) and not (self.pipeline or self._broken or self._over):
             at += self._take(whole[at : at + SLICE])
-        self.held = b"" if self._broken else bytes(whole[at:])
+        self.held = b"" if self._broken or self._over else bytes(whole[at:])
         if self.held:
             self.flow.pause_reading()
         if self._broken or self._messages != messages:
@@ -537,27 +581,41 @@ class _Connection(HttpToolsProtocol):
         except httptools.HttpParserUpgrade as upgrade:  # The parser stops at the body.
             return int(upgrade.args[0])
         except httptools.HttpParserError:
-            self._refuse(400, "not an HTTP request")
+            if not self._over:
+                self._refuse(400, "not an HTTP request")
         else:
             if self._overhead > MAX_HEADER:
                 self._refuse(431, f"the header has more than {MAX_HEADER} bytes")
         return len(piece)
 
-    def _refuse(self, status: int, detail: str) -> None:
-        """Closes a connection that can no longer be parsed, after the pending response."""
-        self._broken = True
-        self.host.note("broken_request", self.app_state["peer"])
-        if self._busy() and not self.cycle.more_body:
-            self.cycle.keep_alive = False
-        elif self.pipeline or (self._busy() and self.cycle.response_started):
-            self.transport.abort()
-        else:
-            self.transport.write(self._refusal(status, detail))
-            self.transport.close()
+    def _start_asgi_task(self, cycle: RequestResponseCycle, app: Any) -> None:
+        self._running = cycle
+        super()._start_asgi_task(cycle, app)
 
-    def _refusal(self, status: int, detail: str) -> bytes:
+    def _refuse(self, status: int, detail: str) -> None:
+        """Refuses what can no longer be parsed, after the responses to the requests before it."""
+        self._broken = True
+        if not self._in_message or self._in_header:
+            self._refusal = self._refused(status, detail)
+        else:  # The application may respond without the body, whether it runs already or not.
+            self.cycle.scope["state"]["broken"] = status, detail
+            self.cycle.message_event.set()
+        self._conclude()
+
+    def _conclude(self) -> None:
+        """Closes a broken connection when all requests before were answered."""
+        is_answering = self._running is not None and not self._running.response_complete
+        if is_answering or self.pipeline or self.transport.is_closing():
+            return
+        self.host.note("broken_request", self.app_state["peer"])
+        if self._refusal is not None:
+            self.transport.write(self._refusal)
+        self.transport.close()
+
+    def _refused(self, status: int, detail: str) -> bytes:
         headers, body = self.host.rejection("malformed", detail)
-        lines = [b"%b: %b\r\n" % header for header in [*headers, (b"connection", b"close")]]
+        all_headers = [*self.server_state.default_headers, *headers, (b"connection", b"close")]
+        lines = [b"%b: %b\r\n" % header for header in all_headers]
         return b"".join([STATUS_LINE[status], *lines, b"\r\n", body])
 
     # A limit is reached.
