@@ -670,6 +670,21 @@ def test_connections_that_nobody_uses_give_way(server: holdfast.Server) -> None:
 # A client that goes away.
 
 
+def test_a_body_that_is_no_http_is_refused_and_is_no_error_of_the_gateway(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    kind, chunked = "Content-Type: application/json", "Transfer-Encoding: chunked"
+    head = web.head("POST", f"{gateways.API}/read", kind, chunked)
+    for pieces in ([head + b"x\r\n"], [head, b"x\r\n"]):
+        with gateways.running() as running, wire.Connection(running.address) as connection:
+            for piece in pieces:
+                connection.send(piece)
+                wire.until_taken(connection.socket)
+            [answer] = web.answers(connection.rest())
+            assert (answer.status, answer.headers["connection"]) == (400, "close")
+    assert "request_failed" not in [record.getMessage() for record in caplog.records]
+
+
 def ask_and_leave(running: gateways.Running, path: str, body: Any) -> wire.Connection:
     """A request on a connection of its own, to be reset."""
     text = json.dumps(body).encode()

@@ -38,7 +38,7 @@ from holdfast.net.resolver import Resolver
 from holdfast.web import health as probes
 from holdfast.web import openapi_page as page
 from holdfast.web.events import Stream
-from holdfast.web.host import SAFE, headers_of, respond
+from holdfast.web.host import SAFE, BrokenBody, headers_of, respond
 from holdfast.web.openapi import DOCUMENT, PAGE
 from holdfast.web.refusals import UNREAD, headers_with
 from holdfast.web.requests import BadRequest, ClientDisconnected, Request, respond_to_its_end, shown
@@ -158,6 +158,8 @@ class App:
             await self._reply(request, send, body, status=status, reason=failed.reason)
         except ClientDisconnected:
             pass
+        except BrokenBody:
+            raise
         except Exception:
             logs.problem("request_failed", listener="gateway", peer=request.peer)
             with contextlib.suppress(RuntimeError):  # The response has begun and is cut off.
