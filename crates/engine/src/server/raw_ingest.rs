@@ -1044,6 +1044,12 @@ mod tests {
         }
     }
 
+    async fn unused_socket() -> TcpStream {
+        let (_client, accepted, _) = connected();
+        accepted.set_nonblocking(true).unwrap();
+        TcpStream::from_std(accepted).unwrap()
+    }
+
     /// A format, what becomes of flags, how many packets a connection carries, and what follows a refusal.
     type Terms = ((Format, Flags), (Option<Duration>, AfterRefusal));
 
@@ -1146,9 +1152,7 @@ mod tests {
     #[test]
     fn packets_have_the_same_outcome_however_they_are_cut() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-        let (_client, accepted, _) = connected();
-        accepted.set_nonblocking(true).unwrap();
-        let socket = runtime.block_on(async { TcpStream::from_std(accepted) }).unwrap();
+        let socket = runtime.block_on(unused_socket());
         for terms in terms() {
             assert_same_outcome(&cases(terms.0.0), |pieces| {
                 let [outcome, other] = [false, true]
@@ -1162,9 +1166,7 @@ mod tests {
     #[test]
     fn packets_that_have_arrived_when_they_are_accepted_have_the_same_outcome() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-        let (_client, accepted, _) = connected();
-        accepted.set_nonblocking(true).unwrap();
-        let socket = runtime.block_on(async { TcpStream::from_std(accepted) }).unwrap();
+        let socket = runtime.block_on(unused_socket());
         for terms in terms() {
             let cases = cases(terms.0.0);
             let joined =
