@@ -20,11 +20,7 @@ import httptools
 import msgspec
 import uvicorn
 from uvicorn.protocols.http.flow_control import FlowControl
-from uvicorn.protocols.http.httptools_impl import (
-    STATUS_LINE,
-    HttpToolsProtocol,
-    RequestResponseCycle,
-)
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.server import ServerState
 
 from holdfast import logs
@@ -372,7 +368,7 @@ class _Connection(HttpToolsProtocol):
         self._ended = self._broken = False
         self._refusal: bytes | None = None
         self._is_last = self._over = False
-        self._running: RequestResponseCycle | None = None
+        self._running: Any = None
         self._in_message = False
         self._in_header = False
         self._messages = 0
@@ -588,7 +584,7 @@ class _Connection(HttpToolsProtocol):
                 self._refuse(431, f"the header has more than {MAX_HEADER} bytes")
         return len(piece)
 
-    def _start_asgi_task(self, cycle: RequestResponseCycle, app: Any) -> None:
+    def _start_asgi_task(self, cycle: Any, app: Any) -> None:
         self._running = cycle
         super()._start_asgi_task(cycle, app)
 
