@@ -157,6 +157,132 @@ def test_everything_there_takes_hardly_more_reads_than_blocks(exact: bool) -> No
     assert found.requests <= 65536 // 125 + 10
 
 
+def test_registers_at_usual_starts_come_first_then_other_registers_then_bits() -> None:
+    probes = carried_out(Survey(), device([]))
+    registers, bits = ("holding_registers", "input_registers"), ("coils", "discrete_inputs")
+    samples = discovery.sample_places(range(65536))
+    others = [each for each in samples if each not in discovery.USUAL_STARTS]
+    assert [(probe.area, probe.address) for probe in probes] == [
+        (area, address)
+        for areas in (registers, bits)
+        for addresses in (discovery.USUAL_STARTS, others)
+        for address in addresses
+        for area in areas
+    ]
+
+
+def test_usual_starts_come_first_in_an_exact_search_too() -> None:
+    probes = carried_out(Survey(HR, exact=True, span=range(90, 2001)), device([]))
+    assert [probe.address for probe in probes[:9]] == [
+        *(100, 200, 300, 500, 700, 1000, 1001, 2000),
+        90,
+    ]
+
+
+SHORT_RANGES = [
+    *((0, 2), (100, 4), (210, 3), (350, 2), (501, 2), (1000, 2), (2001, 4), (4096, 2), (5020, 2)),
+    *((8000, 1), (12300, 2), (20000, 5), (30001, 6), (40001, 100), (40230, 4), (50000, 2)),
+]
+
+
+@pytest.mark.parametrize(
+    ("layout", "largest", "by_address"),
+    [
+        ([range(first, first + count) for first, count in SHORT_RANGES], 2000, 2323),
+        ([range(1000)], 2000, 2063),
+        ([range(65536)], 2000, 532),
+        ([range(500), range(1000, 1300), range(5000, 5700)], 64, 2064),
+        ([range(40000, 40180)], 2000, 2164),
+        ([], 2000, 2161),
+    ],
+    ids=["sparse", "dense", "everything", "small blocks", "sunspec", "empty"],
+)
+def test_the_order_costs_no_more_reads_than_that_of_the_addresses(
+    layout: list[range], largest: int, by_address: int
+) -> None:
+    found = mapped(device(layout, largest=largest))
+    assert found.ranges == layout
+    assert found.requests <= by_address
+
+
+def test_ranges_are_findings_before_the_search_goes_on() -> None:
+    survey = Survey(["coils", "holding_registers", "input_registers"])
+    truth = device([range(300, 320), range(40000, 40100)])
+    seen: dict[Probe, list[tuple[str, int, int]]] = {}
+
+    def model(probe: Probe) -> Outcome:
+        seen.setdefault(probe, [(area, at.start, at.stop) for area, at in survey.findings])
+        return truth(probe)
+
+    carried_out(survey, model)
+    registers: list[tuple[str, int, int]] = [
+        ("holding_registers", 300, 320),
+        ("input_registers", 300, 320),
+        ("holding_registers", 40000, 40100),
+        ("input_registers", 40000, 40100),
+    ]
+    assert next(known for probe, known in seen.items() if probe.address == 500) == registers[:2]
+    assert next(known for probe, known in seen.items() if probe.area == "coils") == registers
+    assert survey.unfinished() == []
+
+
+def test_every_sample_between_two_ranges_is_read() -> None:
+    layout = [range(100, 110), range(130, 133), range(174, 180)]
+    assert mapped(device(layout)).ranges == layout
+
+
+def test_a_range_around_a_usual_start_is_found_whole_and_once() -> None:
+    survey = Survey(HR)
+    carried_out(survey, device([range(2871, 3333)]))
+    assert [finding.addresses for finding in survey.findings] == [range(2871, 3333)]
+
+
+def test_an_address_that_is_refused_alone_but_not_in_a_block_is_no_longer_absent() -> None:
+    truth = device([range(90, 201)])
+
+    def model(probe: Probe) -> Outcome:
+        return OUTSIDE if probe.address == 100 and probe.count == 1 else truth(probe)
+
+    found = mapped(model)
+    assert found.ranges == [range(90, 201)]
+    assert not any(100 in each for each in found.absent)
+    assert found.asked == len({*range(90, 201)} | {at for each in found.absent for at in each})
+
+
+def test_a_sample_that_shows_that_an_area_is_not_hopeless_has_its_range_found() -> None:
+    truth = device([range(65531, 65536)])
+    found = mapped(lambda probe: None if truth(probe) is None else 4)
+    assert found.ranges == [range(65531, 65536)]
+
+
+def test_a_device_that_is_mute_where_it_has_no_area_is_searched() -> None:
+    survey = Survey(span=range(200))
+    truth = device([range(10)])
+    carried_out(survey, lambda probe: truth(probe) if probe.area == "coils" else "timeout")
+    assert {found.area: found.ranges for found in survey.areas} == {
+        "coils": [range(10)],
+        "discrete_inputs": [],
+        "holding_registers": [],
+        "input_registers": [],
+    }
+    assert survey.areas[2].given_up == "timeout"
+
+
+def test_a_search_that_ends_early_says_where_it_did_not_look() -> None:
+    survey = Survey(["coils", "holding_registers", "input_registers"], max_requests=80)
+    with pytest.raises(discovery.LimitReached):
+        carried_out(survey, device([]))
+    # Two reads for each of the 29 starts, then by address, where 0 and 1 are known.
+    assert [survey.not_searched_from(found) for found in survey.areas] == [0, 13, 12]
+    assert [found.state for found in survey.areas] == ["not_asked", "partly", "partly"]
+    survey = Survey(HR, max_requests=5)
+    with pytest.raises(discovery.LimitReached):
+        carried_out(survey, device([range(65536)]))
+    assert [(finding.area, finding.addresses) for finding in survey.unfinished()] == [
+        ("holding_registers", range(1 + 1 + 2 + 4 + 8))
+    ]
+
+
 def test_ranges_close_behind_each_other_are_found_without_samples() -> None:
     layout = [range(300, 310), range(312, 330), range(345, 350)]
     assert mapped(device(layout)).ranges == layout
@@ -230,7 +356,7 @@ def test_a_device_that_ceases_to_answer_is_given_up() -> None:
 
     with pytest.raises(DeviceSilent, match="stopped answering"):
         carried_out(survey, model)
-    assert survey.areas[0].addresses > 0
+    assert survey.order[0].addresses > 0
     assert survey.requests < 50
 
 

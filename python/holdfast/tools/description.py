@@ -111,6 +111,8 @@ def describe(
         found.sunspec = sunspec.find(lambda address, count: _read_block(client, address, count))
     recorder = cast("SyncClient", _Recorder(client, found.seen))
     discovery.run_sync(found.survey, recorder, progress, delay=delay)
+    if progress is not None:
+        progress(found.survey)
     places = list(_places(found))
     for turn in range(reads):
         if turn and places:
