@@ -236,6 +236,33 @@ def test_a_map_tells_the_ranges_of_all_areas(gateway: Running, serve: Serve) -> 
     told = progress[0].data
     assert (told["at"], told["total"]) == (0, 4 * 65536)
     assert [area["area"] for area in told["areas"]] == list(AREAS)
+    assert [area["notSearchedFrom"] for area in told["areas"]] == [0] * 4
+    assert [area["notSearchedFrom"] for area in last.data["areas"]] == [None] * 4
+
+
+def test_a_map_tells_ranges_before_it_ends_registers_first(gateway: Running) -> None:
+    reached, go_on = threading.Event(), threading.Event()
+
+    def answer(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] < 3:
+            reached.set()
+            go_on.wait(wire.DEADLINE)
+        return registers(pdu) if pdu[0] >= 3 and first + count <= 8 else exception(pdu, 2)
+
+    with FakeDevice(answer) as device:
+        stream = mapped(gateway, device.port, last=20)
+        assert reached.wait(wire.DEADLINE)
+        found: list[Any] = []
+        while len(found) < 2:
+            told = stream.next("progress")
+            found += told["found"]
+        go_on.set()
+        result = stream.next("result")
+    assert found == [
+        {"area": area, "first": 0, "last": 7} for area in ("holding_registers", "input_registers")
+    ]
+    assert result["success"] is True
 
 
 def test_a_map_can_be_of_a_part_and_exact(gateway: Running, serve: Serve) -> None:
@@ -301,6 +328,7 @@ def test_a_device_that_stops_answering_ends_its_map(gateway: Running, end: bytes
     assert result["success"] is False
     assert "stopped answering" in result["error"]
     assert result["reason"] == "timeout"
+    assert result["areas"][0]["notSearchedFrom"] == 0
     [[first, last]] = result["areas"][0]["ranges"]
     assert first == 0
     assert last > 100

@@ -377,7 +377,17 @@ def _schemas_of_views() -> dict[str, Schema]:
 
 
 def _schemas_of_maps() -> dict[str, Schema]:
-    found = {"area": AREA, "addresses": COUNT, "ranges": RANGES}
+    found = {
+        "area": AREA,
+        "addresses": COUNT,
+        "ranges": RANGES,
+        "notSearchedFrom": {
+            "type": ["integer", "null"],
+            "description": "From where only usual start addresses were read; `null` after the "
+            "search of the area",
+        },
+    }
+    finding = object_of({"area": AREA, "first": ADDRESS_SCHEMA, "last": ADDRESS_SCHEMA})
     failures = {
         "type": "object",
         "additionalProperties": RANGES,
@@ -390,6 +400,10 @@ def _schemas_of_maps() -> dict[str, Schema]:
                 "at": {**COUNT, "description": "Addresses done so far"},
                 "total": COUNT,
                 "requests": COUNT,
+                "found": {
+                    **array_of(finding),
+                    "description": "The ranges whose ends were found since the last event",
+                },
                 "areas": array_of(object_of(found, optional=("ranges",))),
             }
         ),

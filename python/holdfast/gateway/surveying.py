@@ -24,11 +24,13 @@ from holdfast.types import AREAS, BIT_AREAS
 from holdfast.web.requests import BadRequest
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from holdfast.client import Client
     from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Given
     from holdfast.gateway.settings import GatewayLimits
-    from holdfast.tools.discovery import AreaMap
+    from holdfast.tools.discovery import AreaMap, Finding
     from holdfast.types import Area
     from holdfast.web.events import Stream
 
@@ -80,12 +82,15 @@ async def survey(
 ) -> None:
     """Maps a device. A failure before the first response raises, as for a read."""
     began = time.monotonic()
-    await _find(survey, device)
+    await _require_reply(survey, device)
     await stream.begin()
     running = asyncio.create_task(_run(survey, _Reader(device), longest))
+    told = 0
     try:
         while not running.done():
-            await stream.event("progress", _progress(survey))
+            found = survey.findings[told:]
+            told += len(found)
+            await stream.event("progress", _progress(survey, found))
             await asyncio.wait([running], timeout=BETWEEN)
         failure = running.result()
     finally:
@@ -97,22 +102,21 @@ async def survey(
     await stream.end()
 
 
-async def _find(survey: Survey, device: RequestedDevice) -> None:
-    """Moves the first area in which the device responds to the front.
+async def _require_reply(survey: Survey, device: RequestedDevice) -> None:
+    """Reads in one area after the other until the device responds.
 
-    Raises `Failed` and `BadRequest`.
+    Raises `Failed` and `BadRequest` if it does not respond in any.
     """
-    for found in list(survey.areas):
+    areas = survey.order
+    for found in areas:
         try:
             await _Reader(device).look(found.area, survey.span.start)
         except ModbusException:  # An exception is a response: the device is reachable.
             pass
         except Failed as error:
-            if error.reason != "timeout" or found is survey.areas[-1]:
+            if error.reason != "timeout" or found is areas[-1]:
                 raise
             continue
-        survey.areas.remove(found)
-        survey.areas.insert(0, found)
         return
 
 
@@ -153,16 +157,21 @@ class _Reader:
         )
 
 
-def _progress(survey: Survey) -> dict[str, Any]:
+def _progress(survey: Survey, findings: Sequence[Finding]) -> dict[str, Any]:
+    """The progress; `findings` are those since the last event."""
     few = sum(len(found.ranges) for found in survey.areas) <= MAX_SHOWN
     return {
         "at": survey.at,
         "total": survey.total,
         "requests": survey.requests,
+        "found": [
+            {"area": area, "first": each.start, "last": each.stop - 1} for area, each in findings
+        ],
         "areas": [
             {
                 "area": found.area,
                 "addresses": found.addresses,
+                "notSearchedFrom": survey.not_searched_from(found),
                 **({"ranges": _pairs(found.ranges)} if few else {}),
             }
             for found in _ordered(survey)
@@ -182,11 +191,11 @@ def _result(survey: Survey, failure: Failed | None) -> dict[str, Any]:
         "exact": survey.exact,
         "first": survey.span.start,
         "last": survey.span.stop - 1,
-        "areas": [_area(found, len(survey.span)) for found in _ordered(survey)],
+        "areas": [_area(survey, found) for found in _ordered(survey)],
     }
 
 
-def _area(found: AreaMap, size: int) -> dict[str, Any]:
+def _area(survey: Survey, found: AreaMap) -> dict[str, Any]:
     return {
         "area": found.area,
         "state": found.state,
@@ -194,7 +203,8 @@ def _area(found: AreaMap, size: int) -> dict[str, Any]:
         "ranges": _pairs(found.ranges),
         "absent": sum(map(len, found.absent)),
         "absentRanges": _pairs(found.absent),
-        "notAsked": size - found.asked,
+        "notAsked": len(survey.span) - found.asked,
+        "notSearchedFrom": survey.not_searched_from(found),
         "failures": {str(kind): _pairs(ranges) for kind, ranges in found.failures.items()},
         "givenUp": found.given_up,
         "largest": found.largest,

@@ -67,6 +67,7 @@ export class Discovery {
   }
 
   prepare(areas, first, last) {
+    this.areas = [];
     this.pictures = areas.map((area) => new Picture(area, first, last, this.open));
     $("pictures").replaceChildren(...this.pictures.map((each) => each.root));
     this.pictures.forEach((each) => each.draw());
@@ -77,6 +78,7 @@ export class Discovery {
   }
 
   happened(name, data) {
+    this.areas = data.areas;
     data.areas.forEach((area, at) => this.pictures[at].update(area));
     const found = data.areas.reduce((sum, area) => sum + area.addresses, 0);
     const counted = `${found.toLocaleString("en")} addresses, ${data.requests.toLocaleString("en")} requests`;
@@ -87,7 +89,14 @@ export class Discovery {
     }
     this.pictures.forEach((each) => each.list());
     if (data.success) say($("survey-state"), `Done in ${data.seconds.toFixed(1)} s: ${counted}.`, data.exact ? null : this.sampled(data.areas));
-    else say($("survey-state"), notice(Object.assign(new Error(data.error), { reason: data.reason ?? "timeout" })), `Until then: ${counted}.`);
+    else say($("survey-state"), notice(Object.assign(new Error(data.error), { reason: data.reason ?? "timeout" })), `Until then: ${counted}.`, this.unsearched());
+  }
+
+  /** Where a map that ended early did not look; `null` after a complete one. */
+  unsearched() {
+    const left = this.areas.filter((area) => area.notSearchedFrom !== null);
+    const named = left.map((area) => `${AREAS[area.area].title.toLowerCase()} from ${area.notSearchedFrom}`);
+    return left.length > 0 ? `Not searched: ${named.join(", ")}.` : null;
   }
 
   /** Explains that not every address was read, and offers to read them all. */
@@ -105,7 +114,7 @@ export class Discovery {
 
   stop() {
     this.running.abort();
-    say($("survey-state"), "Stopped. The map is incomplete: what it does not show as valid is unknown.");
+    say($("survey-state"), "Stopped. The map is incomplete: what it does not show as valid is unknown.", this.unsearched());
     this.pictures.forEach((each) => each.list());
     this.end();
   }
