@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 import threading
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -14,12 +16,12 @@ from holdfast import values
 from holdfast.config.tag_files import load_tags
 from support import cli, sunspec_device, wire
 from support.cli import answer, done, usage_error
+from support.commands import Command
 from support.fake_device import FakeDevice, Stream, exception, registers, silent
 from support.terminal import Terminal, plain
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
+    from support.fake_device import Asked
     from support.running import Serve
 
 QUICK = ("--reads", "1", "--areas", "hr,co")
@@ -39,11 +41,20 @@ def plant(serve: Serve) -> str:
 def test_a_device_is_a_table_and_a_file_that_is_read_again(plant: str, tmp_path: Path) -> None:
     file = tmp_path / "device.yaml"
     lines = done("describe", plant, "--units", "1", *QUICK, "--output", str(file))
-    assert lines[0] == f"{plant}: unit ids that answer: 1; not asked: all others"
+    assert lines[:2] == [
+        "Unit 1 answers.",
+        f"{plant}: unit ids that answer: 1; not asked: all others",
+    ]
+    assert [line.split() for line in lines[5:8]] == [
+        ["area", "first", "last", "count"],
+        ["holding_registers", "100", "111", "12"],
+        ["coils", "0", "19", "20"],
+    ]
     rows = [re.split(r" {2,}", line) for line in lines]
     assert ["co_0 … co_19", "coils", "0-19", "bool[20]", "0000000000000000…", "1.00"] in rows
-    assert rows[7][:5] == ["hr_100", "holding_registers", "100-101", "float32", "CDAB"]
-    assert "Byte order: probably CDAB" in lines[3]
+    place = ["hr_100", "holding_registers", "100-101", "float32", "CDAB"]
+    assert place in [row[:5] for row in rows]
+    assert "Byte order: probably CDAB" in lines[9]
     assert any(line.startswith("Nothing is known about addresses") for line in lines)
     assert lines[-1] == f"Written: {file}"
     tags = load_tags(file)
@@ -57,6 +68,7 @@ def test_every_unit_id_has_a_file(plant: str, tmp_path: Path) -> None:
     found = answer("describe", plant, "--units", "1-4", *QUICK, "--output", str(file))
     assert (found["answering"], found["silent"], found["ok"]) == ([1, 4], [2, 3], True)
     assert found["files"] == [str(tmp_path / f"device-unit{unit}.csv") for unit in (1, 4)]
+    assert found["not_described"] == []
     first, second = found["units"]
     assert first["sunspec"] is None
     assert [model["id"] for model in second["sunspec"]["models"]] == [1, 103]
@@ -106,7 +118,7 @@ def test_the_description_so_far_is_written_when_it_is_interrupted(tmp_path: Path
 
     def answers(pdu: bytes) -> bytes | None:
         first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
-        if pdu[0] == 3 and first == 500:
+        if pdu[0] == 3 and first == 450:
             reached.set()
             return None
         return registers(pdu, 455) if pdu[0] == 3 and first + count <= 9 else exception(pdu, 2)
@@ -119,7 +131,11 @@ def test_the_description_so_far_is_written_when_it_is_interrupted(tmp_path: Path
             terminal.process.send_signal(signal.SIGINT)
             assert terminal.end() == 1
     shown = plain(terminal.shown)
-    assert re.search(r"holding_registers +to 499 +9", shown)
+    assert re.search(r"holding_registers +to 449 +9", shown)
+    assert (
+        "Incomplete. Not searched: holding_registers from 450 on (only usual starts there)."
+        in shown
+    )
     assert f"holdfast: {device.url}: interrupted" in shown
     assert len(load_tags(file)) == 9
 
@@ -144,3 +160,104 @@ def test_a_file_is_not_replaced_without_force(plant: str, tmp_path: Path) -> Non
     assert file.read_text() == "mine"
     assert cli.invoke("describe", plant, *options, "--force").exit_code == 0
     assert len(load_tags(file)) > 20
+
+
+def small(pdu: bytes) -> bytes:
+    """The answer of a device with 9 holding registers."""
+    first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+    return registers(pdu, 455) if pdu[0] == 3 and first + count <= 9 else exception(pdu, 2)
+
+
+def test_findings_are_printed_before_the_search_ends() -> None:
+    reached, go_on = threading.Event(), threading.Event()
+
+    def answers(pdu: bytes) -> bytes:
+        if pdu[0] == 3 and int.from_bytes(pdu[1:3]) == 100:
+            reached.set()
+            go_on.wait(wire.DEADLINE)
+        return small(pdu)
+
+    with FakeDevice(answers) as device:
+        process = Command("describe", device.url, "--units", "1", "--range", "0-199", "--json")
+        assert reached.wait(wire.DEADLINE)
+        early = cli.early_lines(process, 5)
+        go_on.set()
+        output, _ = process.communicate(wire.DEADLINE)
+    assert cli.elements(early[3:]) == [
+        {"unit": 1, "identification": {}},
+        {"unit": 1, "area": "holding_registers", "first": 0, "last": 8},
+    ]
+    assert json.loads("".join(early) + output)["ok"] is True
+
+
+def test_a_unit_id_is_written_before_the_next_one_is_searched(tmp_path: Path) -> None:
+    reached = threading.Event()
+
+    def behave(asked: Asked) -> None:
+        if asked.unit == 7 and asked.pdu[0] == 3 and int.from_bytes(asked.pdu[1:3]) == 100:
+            reached.set()
+        elif asked.unit in (5, 7, 9):
+            asked.answer(small(asked.pdu))
+        else:
+            asked.answer(exception(asked.pdu, 0x0B))
+
+    file = tmp_path / "device.yaml"
+    with Stream("tcp", then=behave) as device:
+        options = ("--units", "5-9", *QUICK, "--range", "0-199", "--output", str(file))
+        process = Command("describe", device.url, *options, "--json")
+        assert reached.wait(wire.DEADLINE)
+        assert len(load_tags(tmp_path / "device-unit5.yaml")) == 9
+        process.send_signal(signal.SIGTERM)
+        output, _ = process.communicate(wire.DEADLINE)
+    found = json.loads(output)
+    assert process.returncode == 1
+    assert (found["ok"], found["detail"]) == (False, "interrupted")
+    assert (found["answering"], found["not_described"]) == ([5, 7, 9], [9])
+    assert found["files"] == [str(tmp_path / f"device-unit{unit}.yaml") for unit in (5, 7)]
+    assert [each["complete"] for each in found["units"]] == [True, False]
+    assert found["units"][1]["areas"]["holding_registers"]["not_searched_from"] == 0
+
+
+def test_a_device_that_goes_away_leaves_what_was_found(tmp_path: Path) -> None:
+    reads, again = [0], threading.Event()
+
+    def answers(pdu: bytes) -> bytes:
+        if pdu[0] == 3 and pdu[1:5] == bytes([0, 0, 0, 4]):
+            reads[0] += 1
+            if reads[0] > 5:
+                again.set()
+        return small(pdu)
+
+    file = tmp_path / "device.yaml"
+    options = ("--units", "1", "--areas", "hr", "--range", "0-99", "--max-quantity", "4")
+    with FakeDevice(answers) as device:
+        process = Command(
+            *("describe", device.url, *options, "--output", str(file)),
+            *("--reads", "100", "--every", "0.01", "--timeout", "5"),
+        )
+        assert again.wait(wire.DEADLINE)
+    output, log = process.communicate(wire.DEADLINE)
+    assert process.returncode == 1
+    assert log.startswith(f"holdfast: {device.url}: ")
+    assert re.search(r"^holding_registers +0 +8 +9$", output, re.M)
+    assert len(load_tags(file)) == 9
+
+
+def test_a_file_that_can_not_be_replaced_stays_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    file = tmp_path / "device.yaml"
+    file.write_text("mine")
+    monkeypatch.setattr(Path, "replace", fail)
+    options = ("--units", "1", *QUICK, "--range", "0-99", "--output", str(file), "--force")
+    with FakeDevice(small) as device:
+        result = cli.invoke("describe", device.url, *options)
+    problem = f"{file} can't be written: No space left on device"
+    assert (result.exit_code, result.stderr) == (1, f"holdfast: {device.url}: {problem}\n")
+    assert re.search(r"^hr_8 +holding_registers", result.stdout, re.M)
+    assert re.search(r"^holding_registers +0 +8 +9$", result.stdout, re.M)
+    assert file.read_text() == "mine"
+    assert list(tmp_path.iterdir()) == [file]

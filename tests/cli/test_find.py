@@ -18,13 +18,14 @@ from holdfast.server import Identity
 from holdfast.tools import finding
 from support import cli, lines, wire
 from support.cli import answer, done, failure, usage_error
+from support.commands import Command
 from support.fake_device import FakeDevice, Serial, Stream, exception, registers, silent
 from support.terminal import Terminal, plain
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from support.fake_device import Asked
+    from support.fake_device import Asked, Behaviour
     from support.running import Serve
 
 
@@ -68,6 +69,7 @@ def test_hosts_that_answer_are_found_and_others_told_apart(serve: Serve) -> None
         assert (found["ok"], found["complete"], found["asked"]) == (True, True, 2)
         assert found["counts"] == {"modbus": 1, "open": 1, "refused": 0, "silent": 0}
         assert found["hosts"][0]["identification"]["vendor_name"] == "Acme"
+        assert sorted(found["found"], key=lambda host: host["address"]) == found["hosts"]
         assert (found["hosts"][0]["url"], found["hosts"][0]["unit"]) == (cli.url(server), 1)
         return True
 
@@ -124,7 +126,7 @@ def test_hosts_so_far_are_shown_when_it_is_interrupted(serve: Serve) -> None:
         with Terminal("find", *networks, "--port", str(port), "--timeout", "60") as terminal:
             waiting, _ = deaf.accept()
             with waiting:
-                terminal.until("1 found")
+                terminal.until("1 found", f"tcp://127.0.0.1:{port}     1  answers")
                 terminal.process.send_signal(signal.SIGINT)
                 assert terminal.end() == 1
     shown = plain(terminal.shown)
@@ -132,6 +134,49 @@ def test_hosts_so_far_are_shown_when_it_is_interrupted(serve: Serve) -> None:
     assert "2 addresses: 1 answer Modbus" in shown
     assert ", 1 were not asked" in shown
     assert "interrupted" in shown
+
+
+def answering_before(unit: int, reached: threading.Event) -> Behaviour:
+    """A device that answers unit ids, but for one."""
+
+    def behave(asked: Asked) -> None:
+        if asked.unit == unit:
+            reached.set()
+        else:
+            asked.answer(registers(asked.pdu) if asked.pdu[0] == 3 else exception(asked.pdu, 1))
+
+    return behave
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_unit_ids_are_printed_as_they_are_found(number: signal.Signals) -> None:
+    reached = threading.Event()
+    with Stream("tcp", then=answering_before(3, reached)) as device:
+        process = Command("find", device.url, "--units", "1-9", "--timeout", "60", "--json")
+        assert reached.wait(wire.DEADLINE)
+        early = cli.early_lines(process, 5)
+        process.send_signal(number)
+        output, log = process.communicate(wire.DEADLINE)
+    assert [each["unit"] for each in cli.elements(early[3:])] == [1, 2]
+    found = json.loads("".join(early) + output)
+    assert (process.returncode, log) == (1, "")
+    assert (found["ok"], found["complete"], found["detail"]) == (False, False, "interrupted")
+    assert ([each["unit"] for each in found["units"]], found["not_asked"]) == (
+        [1, 2],
+        [3, 4, 5, 6, 7, 8, 9],
+    )
+
+
+def test_unit_ids_stay_known_if_the_device_goes_away() -> None:
+    reached = threading.Event()
+    with Stream("tcp", then=answering_before(2, reached)) as device:
+        process = Command("find", device.url, "--units", "1-3", "--timeout", "60")
+        assert reached.wait(wire.DEADLINE)
+    output, log = process.communicate(wire.DEADLINE)
+    assert re.search(r"^ +1  answers$", output, re.M)
+    assert re.search(r"^not asked: (2-)?3$", output, re.M)
+    assert log.startswith(f"holdfast: {device.url}: can't connect")
+    assert process.returncode == 1
 
 
 @pytest.mark.parametrize(

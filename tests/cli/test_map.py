@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 import threading
@@ -11,13 +12,17 @@ from typing import TYPE_CHECKING
 import pytest
 
 import holdfast
+from holdfast.tools.discovery import USUAL_STARTS
 from holdfast.types import AREAS
 from support import cli, wire
 from support.cli import answer, done, failure, usage_error
-from support.fake_device import FakeDevice, exception, registers
+from support.commands import Command
+from support.fake_device import HANG_UP, FakeDevice, exception, registers
+from support.paths import DOCS
 from support.terminal import Terminal, plain
 
 if TYPE_CHECKING:
+    from support.fake_device import Answer
     from support.running import Serve
 
 
@@ -27,32 +32,37 @@ def url(serve: Serve) -> str:
     return cli.url(serve({1: memory}))
 
 
+def split(lines: list[str]) -> tuple[list[str], list[str]]:
+    """The table of the ranges, and the lines behind it."""
+    end = lines.index("")
+    return lines[:end], lines[end + 1 :]
+
+
 def test_ranges_are_a_picture_and_a_table(url: str) -> None:
-    head, empty, *lines = done("map", url)
+    ranges, [head, empty, *lines] = split(done("map", url))
+    assert [line.split() for line in ranges] == [
+        ["area", "first", "last", "count"],
+        ["holding_registers", "1000", "17383", "16384"],
+        ["input_registers", "65000", "65009", "10"],
+        ["coils", "0", "63", "64"],
+    ]
     assert empty == ""
     assert re.fullmatch(
         rf"{url}, unit 1: 16458 addresses; samples read, \d+ requests in \d+\.\d s", head
     )
-    coils, inputs, holding, registers, scale, *table = lines
+    coils, inputs, holding, registers, scale, empty, *table = lines
+    assert empty == ""
     assert re.fullmatch(r"coils +▁·{59}", coils)
     assert re.fullmatch(r"discrete inputs +·{60}", inputs)
     assert re.fullmatch(r"holding registers +[▁-▇]█{14}[▁-▇]·{44}", holding)
     assert re.fullmatch(r"input registers +·{59}▁", registers)
     assert scale.split() == ["0", "16384", "32768", "49152", "65535"]
-    assert [line.split() for line in table[:6]] == [
-        [],
-        ["area", "first", "last", "count"],
-        ["coils", "0", "63", "64"],
-        ["holding_registers", "1000", "17383", "16384"],
-        ["input_registers", "65000", "65009", "10"],
-        [],
-    ]
-    rows = [line.split() for line in table[6:11]]
+    rows = [line.split() for line in table[:5]]
     assert rows[0] == ["area", "searched", "exist", "absent", "not", "asked"]
     for area, searched, *counts in rows[1:]:
         assert (area in AREAS, searched) == (True, "yes")
         assert sum(map(int, counts)) == 65536
-    assert table[12] == (
+    assert table[6] == (
         "Nothing is known about addresses that were not asked: a range without a sample is missed."
     )
 
@@ -66,6 +76,12 @@ def test_a_program_gets_the_same(url: str) -> None:
         "holding_registers": [[1000, 17383]],
         "input_registers": [[65000, 65009]],
     }
+    assert found["found"] == [
+        {"area": "holding_registers", "first": 1000, "last": 17383},
+        {"area": "input_registers", "first": 65000, "last": 65009},
+        {"area": "coils", "first": 0, "last": 63},
+    ]
+    assert {each["not_searched_from"] for each in found["areas"].values()} == {None}
     assert found["requests"] == sum(each["requests"] for each in found["areas"].values())
     assert found["areas"]["holding_registers"]["largest_read"] == 125
 
@@ -140,7 +156,7 @@ def test_a_device_that_does_not_answer_is_a_failure() -> None:
 
 def test_only_ascii_is_shown_where_there_is_no_more(url: str) -> None:
     with Terminal("map", url, "--areas", "hr", columns=80, PYTHONIOENCODING="ascii") as terminal:
-        assert re.search(r"holding registers  -#{14}-\.{44}\n", terminal.until("first"))
+        assert re.search(r"holding registers  -#{14}-\.{44}\n", terminal.until("searched"))
 
 
 @pytest.mark.parametrize(
@@ -170,8 +186,9 @@ def test_the_requests_are_announced_and_the_progress_fits_a_narrow_terminal(url:
 
 def test_progress_is_shown_on_a_terminal_and_the_picture_has_its_width(url: str) -> None:
     with Terminal("map", url, columns=60) as terminal:
-        shown = terminal.until("Mapping", "input_registers")
+        terminal.until("Mapping", "input_registers")
         assert terminal.end() == 0
+    shown = plain(terminal.shown)
     assert "100%" in shown
     assert re.search(r"\d+ requests", shown)
     assert re.search(r"^discrete inputs +·{40}$", shown, re.M)
@@ -197,10 +214,13 @@ def test_what_was_found_is_shown_when_it_is_interrupted() -> None:
     assert re.search(r"holding_registers +0 +\d+", shown)
     assert f"holdfast: {device.url}: interrupted" in shown
     assert "every address read" not in shown
-    [(reached, exist, unknown)] = re.findall(
-        r"holding_registers +to (\d+) +(\d+) +0 +(\d+)$", shown, re.M
+    assert re.search(r"^holding_registers +0 +(\d+) +\d+$", shown, re.M)
+    assert (
+        "Incomplete. Not searched: holding_registers from 0 on (only some usual starts there)."
+        in shown
     )
-    assert (int(exist), int(unknown)) == (int(reached) + 1, 65535 - int(reached))
+    [(exist, unknown)] = re.findall(r"^holding_registers +starts +(\d+) +0 +(\d+)$", shown, re.M)
+    assert int(exist) + int(unknown) == 65536
 
 
 def test_a_search_ends_after_its_requests_and_says_what_was_not_asked() -> None:
@@ -217,14 +237,14 @@ def test_a_search_ends_after_its_requests_and_says_what_was_not_asked() -> None:
     holding, inputs = found["areas"].values()
     assert (holding["state"], holding["ranges"]) == ("partly", [[0, 4]])
     assert holding["not_asked"] == 65536 - 5 - sum(b - a + 1 for a, b in holding["absent"])
-    assert (inputs["state"], inputs["searched_to"], inputs["not_asked"]) == (
-        "not_asked",
+    assert (inputs["state"], inputs["searched_to"], inputs["not_searched_from"]) == (
+        "partly",
         None,
-        65536,
+        0,
     )
     assert result.exit_code == 1
     assert "incomplete, 30 requests" in result.stdout
-    assert re.search(r"^input_registers +no +0 +0 +65536$", result.stdout, re.M)
+    assert re.search(r"^input_registers +starts +5 +\d+ +\d+$", result.stdout, re.M)
 
 
 def test_requests_can_be_apart(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -254,3 +274,127 @@ def test_short_ranges_at_usual_places_are_found() -> None:
         found = answer("map", device.url, "--areas", "hr")["areas"]["holding_registers"]
     assert found["ranges"] == [[first, first + count - 1] for first, count in layout]
     assert found["requests"] < 2700
+
+
+def held_at(address: int, reached: threading.Event, go_on: threading.Event) -> Answer:
+    """A device with 9 registers of each kind, which answers from an address on when it may."""
+
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if first == address:
+            reached.set()
+            go_on.wait(wire.DEADLINE)
+        return registers(pdu) if pdu[0] >= 3 and first + count <= 9 else exception(pdu, 2)
+
+    return answers
+
+
+def test_a_device_is_asked_for_registers_at_usual_starts_first() -> None:
+    with FakeDevice(lambda pdu: exception(pdu, 2)) as device:
+        done("map", device.url, "--range", "0-1100", "--step", "1000")
+        asked = [(pdu[0], int.from_bytes(pdu[1:3])) for pdu in device.asked]
+    starts = (0, 1, 100, 200, 300, 500, 700, 1000, 1001)
+    assert asked[: 2 * len(starts)] == [(code, start) for start in starts for code in (3, 4)]
+    others = asked[2 * len(starts) : len(asked) // 2]
+    assert others[:6] == [(3, 2), (4, 2), (3, 3), (4, 3), (3, 4), (4, 4)]
+    assert {code for code, _ in others} == {3, 4}
+    assert [code for code, _ in asked[len(asked) // 2 :]] == [1, 2] * (len(asked) // 4)
+
+
+def test_ranges_are_printed_before_the_search_ends() -> None:
+    reached, go_on = threading.Event(), threading.Event()
+    with (
+        FakeDevice(held_at(1000, reached, go_on)) as device,
+        Terminal("map", device.url, "--range", "0-1999", columns=80) as terminal,
+    ):
+        assert reached.wait(wire.DEADLINE)
+        shown = terminal.until("input_registers")
+        go_on.set()
+        assert terminal.end() == 0
+    assert re.search(r"^holding_registers +0 +8 +9$", shown, re.M)
+    assert re.search(r"input_registers +0 +8 +9$", shown, re.M)
+    assert "unit 1: 18 addresses" not in shown
+    assert plain(terminal.shown).count("holding_registers      0 ") == 1
+
+
+def test_a_program_can_read_ranges_before_the_search_ends() -> None:
+    reached, go_on = threading.Event(), threading.Event()
+    with FakeDevice(held_at(1000, reached, go_on)) as device:
+        process = Command("map", device.url, "--json", "--range", "0-1999")
+        assert reached.wait(wire.DEADLINE)
+        early = cli.early_lines(process, 6)
+        go_on.set()
+        output, log = process.communicate(wire.DEADLINE)
+    assert cli.elements(early[4:]) == [
+        {"area": area, "first": 0, "last": 8} for area in ("holding_registers", "input_registers")
+    ]
+    assert (json.loads("".join(early) + output)["ok"], log) == (True, "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_program_gets_what_was_found_before_an_interruption(number: signal.Signals) -> None:
+    reached, go_on = threading.Event(), threading.Event()
+    with FakeDevice(held_at(1000, reached, go_on)) as device:
+        process = Command("map", device.url, "--json", "--range", "0-1999")
+        assert reached.wait(wire.DEADLINE)
+        process.send_signal(number)
+        output, log = process.communicate(wire.DEADLINE)
+        go_on.set()
+    found = json.loads(output)
+    assert (process.returncode, log) == (1, "")
+    assert (found["ok"], found["detail"], found["complete"]) == (False, "interrupted", False)
+    assert [each["area"] for each in found["found"]] == ["holding_registers", "input_registers"]
+    assert found["areas"]["holding_registers"]["ranges"] == [[0, 8]]
+    assert {
+        area: each["not_searched_from"] for area, each in found["areas"].items()
+    } == dict.fromkeys(AREAS, 0)
+
+
+def test_a_second_interruption_ends_the_command_at_once() -> None:
+    enough, go_on = threading.Event(), threading.Event()
+
+    def answers(pdu: bytes) -> bytes:
+        if int.from_bytes(pdu[1:3]) == 4998:
+            enough.set()
+            go_on.wait(wire.DEADLINE)
+        return exception(pdu, 2)
+
+    with FakeDevice(answers) as device:
+        options = ("--areas", "hr", "--range", "0-4999", "--step", "2")
+        process = Command("map", device.url, "--json", *options)
+        assert enough.wait(wire.DEADLINE)
+        process.send_signal(signal.SIGINT)
+        # Nobody reads the pipe: what was found does not fit, so the command can't end by itself.
+        assert process.stdout is not None
+        process.stdout.read(1)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(wire.DEADLINE) == -signal.SIGINT
+        go_on.set()
+    process.communicate()
+
+
+def test_a_device_that_goes_away_leaves_what_was_found() -> None:
+    gone = threading.Event()
+
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if first == 1000:
+            gone.set()
+        if gone.is_set():
+            return HANG_UP
+        return registers(pdu) if pdu[0] >= 3 and first + count <= 9 else exception(pdu, 2)
+
+    with FakeDevice(answers) as device:
+        result = cli.invoke("map", device.url, "--areas", "hr")
+    assert (result.exit_code, result.stderr) == (
+        1,
+        f"holdfast: {device.url}: the device stopped answering\n",
+    )
+    assert re.search(r"^holding_registers +0 +8 +9$", result.stdout, re.M)
+    assert "Incomplete. Not searched: holding_registers from 0 on" in result.stdout
+
+
+def test_the_page_lists_the_usual_starts() -> None:
+    page = (DOCS / "cli.md").read_text(encoding="utf-8")
+    [listed] = re.findall(r"at the usual starts: ([^;]+);", page)
+    assert tuple(map(int, re.findall(r"\d+", listed))) == USUAL_STARTS

@@ -14,6 +14,7 @@ from support.commands import LONG_TIMEOUTS, Command
 
 if TYPE_CHECKING:
     import signal
+    from collections.abc import Iterable
     from pathlib import Path
 
     from click.testing import Result
@@ -48,6 +49,19 @@ def answer(*arguments: str, code: int = 0) -> Any:
     result = invoke(*arguments, "--json")
     assert (result.exit_code, result.stderr) == (code, "")
     return json.loads(result.stdout)
+
+
+def early_lines(process: Command, count: int) -> list[str]:
+    """Returns the first lines of a command that goes on."""
+    assert process.stdout is not None
+    lines = [process.stdout.readline() for _ in range(count)]
+    assert process.poll() is None
+    return lines
+
+
+def elements(lines: Iterable[str]) -> list[Any]:
+    """Returns the elements of a JSON list whose lines have one each, with the comma before it."""
+    return [json.loads(line.lstrip(" ,")) for line in lines]
 
 
 def failure(*arguments: str) -> list[str]:

@@ -8,7 +8,7 @@ from holdfast.cli import showing
 from holdfast.tools.discovery import FAR_STEP, NEAR, NEAR_STEP
 
 if TYPE_CHECKING:
-    from holdfast.tools.discovery import Survey
+    from holdfast.tools.discovery import AreaMap, Survey
 
 STATES = {
     "searched": "yes",
@@ -23,7 +23,7 @@ def counts(survey: Survey) -> list[str]:
     rows = [
         (
             found.area,
-            STATES[found.state].format(at=(found.reached or 0) - 1),
+            _searched(survey, found),
             str(found.addresses),
             str(sum(map(len, found.absent))),
             str(len(survey.span) - found.asked),
@@ -31,6 +31,29 @@ def counts(survey: Survey) -> list[str]:
         for found in survey.areas
     ]
     return showing.table(("area", "searched", "exist", "absent", "not asked"), rows, "<<>>>")
+
+
+def _searched(survey: Survey, found: AreaMap) -> str:
+    if found.state == "partly" and found.reached == survey.span.start:
+        return "starts"
+    return STATES[found.state].format(at=(found.reached or 0) - 1)
+
+
+def incomplete(survey: Survey) -> list[str]:
+    """Where a search that ended early did not look; nothing after a complete search."""
+    places: dict[str, list[str]] = {}
+    for found in survey.areas:
+        start = survey.not_searched_from(found)
+        if found.state == "partly" and start is not None:
+            some = "some " if start == survey.span.start else ""
+            where = f" from {start} on (only {some}usual starts there)"
+            places.setdefault(where, []).append(found.area)
+        elif found.state == "not_asked":
+            places.setdefault("", []).append(found.area)
+    if not places:
+        return []
+    listed = "; ".join(f"{', '.join(areas)}{where}" for where, areas in places.items())
+    return [f"Incomplete. Not searched: {listed}."]
 
 
 UNKNOWN = (

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from holdfast.certificates import files
 from holdfast.cli import device
-from holdfast.cli.describe_output import described_lines, described_told
-from holdfast.cli.progress import bar
+from holdfast.cli.describe_output import (
+    described_lines,
+    head_lines,
+    sunspec_told,
+    unit_told,
+    units_lines,
+    units_told,
+)
+from holdfast.cli.report import RangeReport, Report
+from holdfast.cli.signals import Interrupted, interruptions
 from holdfast.cli.surveying import announced, limited, planned, survey_options
-from holdfast.cli.unit_ids import unit_ids
+from holdfast.cli.unit_ids import listed, unit_ids
 from holdfast.client.url import SerialTarget, parse
 from holdfast.config.tag_files import KINDS
 from holdfast.config.tag_output import tags_as_csv, tags_as_yaml
@@ -24,9 +34,10 @@ from holdfast.tools.description import Description
 from holdfast.tools.discovery import LimitReached
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from typing import Unpack
 
+    from holdfast.cli.signals import Signals
     from holdfast.cli.surveying import Settings
     from holdfast.client import SyncClient
     from holdfast.tools.finding import Unit
@@ -111,7 +122,12 @@ def describe(
     guessed tags are not known: compare the values with a display or a manual, then edit the file.
     Registers that are always 0 say nothing about their type.
 
-    Ctrl-C prints and writes the results so far.
+    The registers at usual starts come first, then the other registers, then coils and discrete
+    inputs. Unit ids and ranges are printed when they are found; with --json, as elements of
+    "found". Each unit id is written to FILE when its description is complete.
+
+    Ctrl-C, or SIGTERM, prints and writes the results so far, and where the search did not look. A
+    second one ends the command at once. FILE is replaced as a whole, or not at all.
 
     Exit codes: 0 done; 1 no unit id answered, or the search ended early; 2 wrong usage.
     """
@@ -121,86 +137,188 @@ def describe(
         raise click.UsageError("Unit id 0 is the broadcast on a serial line: nobody answers it.")
     if output is not None and output.exists() and not force:
         raise click.UsageError(f"{output} exists; --force replaces it.")
-    found: list[Description] = []
-    seen: list[Unit] = []
-    why = None
-    ignores = False
-    with device.connect(url, asked[0], timeout) as client:
-        try:
-            with bar("Asking", len(asked), lambda: "") as advance:
-                for unit in finding.units(client, asked, delay=settings["delay"]):
-                    seen.append(unit)
-                    if advance:
-                        advance(len(seen))
-            answering = [each.unit for each in seen if each.answers]
-            if 1 < len(asked) == len(answering) and not is_line:
-                ignores = finding.ignores_unit(client, asked)
-                answering = answering[:1] if ignores else answering
-            for number in answering:
-                client.unit = number
-                found.append(Description(number, planned(settings)))
-                _describe(found[-1], client, reads, every, settings["delay"])
-        except ConnectFailed as error:
-            device.fail(error, url, {"url": url} if as_json else None)
-        except LimitReached as error:
-            why = limited(error)
-        except ModbusError as error:
-            why = str(error)
-        except KeyboardInterrupt:
-            why = "interrupted"
-    if found and sys.stderr.isatty():
-        click.echo("Inferring types.", err=True)
-    for each in found:
-        description.conclude(each, now=time.time())
-    if not any(unit.answers for unit in seen) and why is None:
-        why = "no unit id answered"
-    files = _written(found, output)
-    if as_json:
-        click.echo(
-            json.dumps(described_told(url, asked, seen, found, ignores, why, files), indent=2)
-        )
-    else:
-        lines = described_lines(url, asked, seen, found, ignores, None if everything else SHOWN)
-        click.echo("\n".join([*lines, *(f"Written: {file}" for file in files)]))
-        if why is not None:
-            click.echo(f"holdfast: {url}: {why}", err=True)
+    with interruptions() as signals:
+        report = Report({"url": url} if as_json else None, signals)
+        plan = _Plan(settings, reads, every, output, None if everything else SHOWN)
+        run = _Run(url, asked, plan, report, signals)
+        with device.connect(url, asked[0], timeout) as client:
+            why = run.carry_out(client, ignores_possible=not is_line)
+        run.end(why)
     if why is not None:
+        if not as_json:
+            click.echo(f"holdfast: {url}: {why}", err=True)
         sys.exit(device.FAILED)
 
 
-def _describe(
-    found: Description, client: SyncClient, reads: int, every: float, delay: float
-) -> None:
-    survey = found.survey
-    if sys.stderr.isatty():
-        click.echo(f"Unit {found.unit}: {announced(survey)}", err=True)
-    note = f"unit {found.unit}"
-    with bar("Mapping", survey.total, lambda: note) as advance:
-        description.describe(
-            found,
-            client,
-            reads=reads,
-            every=every,
-            delay=delay,
-            progress=advance and (lambda survey: advance(survey.at)),
+@dataclass(frozen=True)
+class _Plan:
+    """What to do with each unit id."""
+
+    settings: Settings
+    reads: int
+    every: float
+    output: Path | None
+    most: int | None
+    """The most lines of tags in the text."""
+
+
+class _Run:
+    """The search of a device, and what it has found so far."""
+
+    def __init__(
+        self, url: str, asked: Sequence[int], plan: _Plan, report: Report, signals: Signals
+    ) -> None:
+        self._url = url
+        self._asked = asked
+        self._plan = plan
+        self._report = report
+        self._signals = signals
+        self._seen: list[Unit] = []
+        self._ignores = False
+        self._found: list[Description] = []
+        self._files: list[str] = []
+        self._unwritten: str | None = None
+        """Why the first file that could not be written was not."""
+
+    @property
+    def _answering(self) -> list[int]:
+        return [each.unit for each in self._seen if each.answers]
+
+    @property
+    def _to_describe(self) -> list[int]:
+        return self._answering[:1] if self._ignores else self._answering
+
+    def carry_out(self, client: SyncClient, *, ignores_possible: bool) -> str | None:
+        """Asks unit ids, and describes those that answer. Returns why it ended early, or `None`."""
+        why = self._attempt(lambda: self._ask(client, ignores_possible=ignores_possible))
+        lines = units_lines(self._url, self._asked, self._seen, self._ignores)
+        self._report.text(*lines)
+        if why is not None:
+            return why
+        for number in self._to_describe:
+            client.unit = number
+            unit = _UnitReport(Description(number, planned(self._plan.settings)), self._report)
+            self._found.append(unit.found)
+            why = self._attempt(partial(self._describe, unit, client))
+            self._conclude(unit)
+            if why is not None:
+                return why
+        return self._unwritten if self._found else "no unit id answered"
+
+    def end(self, why: str | None) -> None:
+        """Prints what is known when the search has ended."""
+        left = self._to_describe[len(self._found) :]
+        if left:
+            self._report.text("", f"Incomplete. Not described: unit ids {listed(left)}.")
+        self._report.end(
+            {
+                "ok": why is None,
+                **({} if why is None else {"detail": why}),
+                **units_told(self._asked, self._seen, self._ignores),
+                "not_described": left,
+                "files": self._files,
+                "units": [unit_told(each) for each in self._found],
+            }
         )
 
+    def _attempt(self, work: Callable[[], None]) -> str | None:
+        """Does something that a signal can end. Returns why it ended early, or `None`."""
+        try:
+            with self._signals.interrupting():
+                work()
+        except LimitReached as error:
+            return limited(error)
+        except ModbusError as error:
+            if isinstance(error, ConnectFailed) and not self._answering:
+                device.fail(error, self._url, {"url": self._url} if self._report.is_json else None)
+            return str(error)
+        except Interrupted:
+            return "interrupted"
+        return None
 
-def _written(found: Sequence[Description], output: Path | None) -> list[str]:
-    """Writes the tag lists. Returns the paths of the files: one, or one for each unit id."""
-    if output is None:
-        return []
-    files = []
-    with_tags = [each for each in found if each.tags]
-    for each in with_tags:
-        tags = [tag.tag for tag in each.tags]
-        path = output
-        if len(with_tags) > 1:
-            path = output.with_stem(f"{output.stem}-unit{each.unit}")
+    def _ask(self, client: SyncClient, *, ignores_possible: bool) -> None:
+        asked = self._asked
+        with self._report.progress("Asking", len(asked), lambda: ""):
+            for unit in finding.units(client, asked, delay=self._plan.settings["delay"]):
+                with self._report.held():
+                    self._seen.append(unit)
+                    self._report.advance(len(self._seen))
+                    if unit.answers:
+                        self._report.text(f"Unit {unit.unit} answers.")
+                        about = dict(unit.identity.objects)
+                        self._report.entry({"unit": unit.unit, "identification": about})
+        if ignores_possible and 1 < len(asked) == len(self._answering):
+            self._ignores = finding.ignores_unit(client, asked)
+
+    def _describe(self, unit: _UnitReport, client: SyncClient) -> None:
+        survey = unit.found.survey
+        if sys.stderr.isatty():
+            click.echo(f"Unit {unit.found.unit}: {announced(survey)}", err=True)
+        with self._report.progress("Mapping", survey.total, lambda: f"unit {unit.found.unit}"):
+            description.describe(
+                unit.found,
+                client,
+                reads=self._plan.reads,
+                every=self._plan.every,
+                delay=self._plan.settings["delay"],
+                progress=lambda _: unit.update(),
+            )
+
+    def _conclude(self, unit: _UnitReport) -> None:
+        """Infers the tags of a unit id, writes its file, and prints them."""
+        unit.end()
+        if sys.stderr.isatty():
+            click.echo("Inferring types.", err=True)
+        description.conclude(unit.found, now=time.time())
+        file = self._written(unit.found)
+        self._report.text(*described_lines(unit.found, self._plan.most))
+        if file is not None:
+            self._files.append(str(file))
+            self._report.text(f"Written: {file}")
+
+    def _written(self, found: Description) -> Path | None:
+        """Writes the tag list of a unit id: to a file of its own if several answer."""
+        path = self._plan.output
+        if path is None or not found.tags:
+            return None
+        if len(self._to_describe) > 1:
+            path = path.with_stem(f"{path.stem}-unit{found.unit}")
+        tags = [each.tag for each in found.tags]
         text = tags_as_csv(tags) if path.suffix.lower() == ".csv" else tags_as_yaml(tags)
         try:
-            path.write_text(text, encoding="utf-8")
+            files.replace(path, text.encode())
         except OSError as error:
-            raise click.FileError(str(path), str(error.strerror)) from error
-        files.append(str(path))
-    return files
+            self._unwritten = self._unwritten or f"{path} can't be written: {error.strerror}"
+            return None
+        return path
+
+
+class _UnitReport:
+    """What is printed of a unit id while it is described."""
+
+    def __init__(self, found: Description, report: Report) -> None:
+        self.found = found
+        self._report = report
+        self._ranges = RangeReport(report, found.survey, {"unit": found.unit})
+        self._has_head = False
+
+    def update(self) -> None:
+        """Prints what was found since the last call."""
+        self._head()
+        self._ranges.update()
+        self._report.advance(self.found.survey.at)
+
+    def end(self) -> None:
+        """Prints the other findings."""
+        self._head()
+        self._ranges.end()
+
+    def _head(self) -> None:
+        if self._has_head:
+            return
+        with self._report.held():
+            self._has_head = True
+            self._report.text("", *head_lines(self.found))
+            if self.found.sunspec is not None:
+                told = {"unit": self.found.unit, "sunspec": sunspec_told(self.found.sunspec)}
+                self._report.entry(told)

@@ -16,37 +16,31 @@ if TYPE_CHECKING:
 
     from holdfast.tools.description import Described, Description
     from holdfast.tools.finding import Unit
+    from holdfast.tools.sunspec import SunSpec
 
 NOTHING = tuple(FILL_REASONS.values())
 BITS = 16
 """The most bits in a cell."""
 
 
-def described_lines(
-    url: str,
-    asked: Sequence[int],
-    seen: Sequence[Unit],
-    found: Sequence[Description],
-    ignores: bool,
-    most: int | None,
-) -> list[str]:
-    """A description as text, with at most so many lines of tags for each unit id."""
+def units_lines(
+    url: str, asked: Sequence[int], seen: Sequence[Unit], ignores: bool
+) -> Iterator[str]:
+    """Which unit ids answer, as text."""
     answering = [each.unit for each in seen if each.answers]
     silent = [each.unit for each in seen if not each.answers]
     unasked = set(asked) - set(answering) - set(silent)
-    lines = [f"{url}: unit ids that answer: {listed(answering)}"]
-    if silent:
-        lines[0] += f"; no device: {listed(silent)}"
-    lines[0] += f"; not asked: {listed(unasked) + ' and ' if unasked else ''}all others"
+    yield (
+        f"{url}: unit ids that answer: {listed(answering)}"
+        + (f"; no device: {listed(silent)}" if silent else "")
+        + f"; not asked: {listed(unasked) + ' and ' if unasked else ''}all others"
+    )
     if ignores:
-        lines.append("It also answers a rare unit id: it probably ignores them. One is described.")
-    for each in found:
-        lines += ["", *_device(each, most)]
-    return lines
+        yield "It also answers a rare unit id: it probably ignores them. One is described."
 
 
-def _device(found: Description, most: int | None) -> list[str]:
-    """One unit id."""
+def head_lines(found: Description) -> list[str]:
+    """What a unit id says about itself."""
     about = showing.plain(str(found.identity)) or "no identification"
     lines = [showing.styled(f"Unit {found.unit}: {about}", bold=True)]
     if found.sunspec is not None:
@@ -55,21 +49,25 @@ def _device(found: Description, most: int | None) -> list[str]:
         )
         end = "" if found.sunspec.is_complete else "; the end of the models was not found"
         lines.append(f"SunSpec at {found.sunspec.base}: models {models or 'none'}{end}")
+    return lines
+
+
+def described_lines(found: Description, most: int | None) -> list[str]:
+    """A description as text, with at most so many lines of tags."""
+    orders = []
     if found.orders:
         order, share = max(found.orders.items(), key=lambda each: each[1])
-        lines.append(f"Byte order: probably {order} ({share:.2f})")
+        orders.append(f"Byte order: probably {order} ({share:.2f})")
     rows = list(_rows(found.tags))
-    if rows:
-        head = ("name", "area", "address", "type", "order", "value", "unit", "confidence", "why")
-        lines += ["", *showing.table(head, rows[:most], "<<><<><>")]
+    head = ("name", "area", "address", "type", "order", "value", "unit", "confidence", "why")
+    tags = showing.table(head, rows[:most], "<<><<><>") if rows else []
     if most is not None and len(rows) > most:
-        lines.append(f"and {len(rows) - most} more lines; --all shows them")
+        tags.append(f"and {len(rows) - most} more lines; --all shows them")
     for (area, extent), error in found.unread.items():
-        lines.append(f"{area} {extent.start}-{extent.stop - 1} could not be read again: {error}")
-    lines += ["", *coverage.counts(found.survey)]
-    if not found.survey.exact:
-        lines += ["", *coverage.UNKNOWN]
-    return lines
+        tags.append(f"{area} {extent.start}-{extent.stop - 1} could not be read again: {error}")
+    counts = [*coverage.counts(found.survey), *coverage.incomplete(found.survey)]
+    parts = (orders, tags, counts, () if found.survey.exact else coverage.UNKNOWN)
+    return [line for part in parts if part for line in ("", *part)]
 
 
 def _rows(tags: Sequence[Described]) -> Iterator[tuple[str, ...]]:
@@ -155,46 +153,36 @@ def _shown(each: Described, raw: object) -> str:
     return f"{text} ({name})" if name else text
 
 
-def described_told(
-    url: str,
-    asked: Sequence[int],
-    seen: Sequence[Unit],
-    found: Sequence[Description],
-    ignores: bool,
-    why: str | None,
-    files: Sequence[str],
-) -> dict[str, object]:
-    """The result for JSON."""
+def units_told(asked: Sequence[int], seen: Sequence[Unit], ignores: bool) -> dict[str, object]:
+    """Which unit ids answer, for JSON."""
     done = [each.unit for each in seen]
     return {
-        "ok": why is None,
-        **({} if why is None else {"detail": why}),
-        "url": url,
         "answering": [each.unit for each in seen if each.answers],
         "silent": [each.unit for each in seen if not each.answers],
         "not_asked": [unit for unit in asked if unit not in done],
         "ignores_unit": ignores,
-        "files": list(files),
-        "units": [_unit(each) for each in found],
     }
 
 
-def _unit(found: Description) -> dict[str, object]:
-    models = () if found.sunspec is None else found.sunspec.models
+def sunspec_told(found: SunSpec) -> dict[str, object]:
+    """The SunSpec models of a unit id for JSON."""
+    return {
+        "base": found.base,
+        "complete": found.is_complete,
+        "models": [
+            {"id": each.id, "name": each.name, "address": each.address, "length": each.length}
+            for each in found.models
+        ],
+    }
+
+
+def unit_told(found: Description) -> dict[str, object]:
+    """The description of a unit id for JSON."""
     return {
         "unit": found.unit,
         "complete": found.survey.is_done,
         "identification": dict(found.identity.objects),
-        "sunspec": None
-        if found.sunspec is None
-        else {
-            "base": found.sunspec.base,
-            "complete": found.sunspec.is_complete,
-            "models": [
-                {"id": each.id, "name": each.name, "address": each.address, "length": each.length}
-                for each in models
-            ],
-        },
+        "sunspec": None if found.sunspec is None else sunspec_told(found.sunspec),
         "orders": {order: round(share, 4) for order, share in found.orders.items()},
         "areas": {
             each.area: {
@@ -202,6 +190,7 @@ def _unit(found: Description) -> dict[str, object]:
                 "exist": each.addresses,
                 "absent": sum(map(len, each.absent)),
                 "not_asked": len(found.survey.span) - each.asked,
+                "not_searched_from": found.survey.not_searched_from(each),
             }
             for each in found.survey.areas
         },

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import sys
 from collections import Counter
 from typing import TYPE_CHECKING
@@ -11,18 +10,22 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.cli import device, showing
-from holdfast.cli.progress import bar
+from holdfast.cli.report import Report
 from holdfast.config.ip_addresses import parse_source
 from holdfast.tools import finding
+from holdfast.tools.finding import Host
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from holdfast.net.addresses import Network
-    from holdfast.tools.finding import Host, State
+    from holdfast.tools.finding import State
 
 CONCURRENCY = 64
 """Hosts at a time."""
+
+SHOWN = ("modbus", "open")
+"""The states of hosts that are listed; others are counted."""
 
 
 def find_hosts(
@@ -34,13 +37,16 @@ def find_hosts(
     as_json: bool,
 ) -> None:
     """Finds hosts, prints them, and exits with 1 if there are none."""
-    total = sum(1 for _ in finding.addresses(networks))
+    urls = [Host(str(each), port, "silent").url for each in finding.addresses(networks)]
+    total = len(urls)
     if sys.stderr.isatty():
         click.echo(
             f"{showing.counted(total, 'address')}, port {port}, at most {rate:g} connections a "
             f"second. Ctrl-C stops.",
             err=True,
         )
+    report = Report({"port": port} if as_json else None)
+    hosts = HostReport(report, max(map(len, urls)))
     found: list[Host] = []
 
     async def look() -> None:
@@ -52,11 +58,11 @@ def find_hosts(
             concurrency=min(CONCURRENCY, total),
             units=units,
         )
-        with bar("Finding", total, lambda: f"{_answering(found)} found") as advance:
+        with report.progress("Finding", total, lambda: f"{_answering(found)} found"):
             async for host in seen:
                 found.append(host)
-                if advance:
-                    advance(len(found))
+                hosts.add(host)
+                report.advance(len(found))
 
     interrupted = False
     try:
@@ -65,23 +71,44 @@ def find_hosts(
         interrupted = True
     found.sort(key=lambda host: parse_source(host.address))
     counts = Counter(host.state for host in found)
-    if as_json:
-        told = {
+    report.text(*([""] if hosts.printed else []), _counted(counts, total, total - len(found)))
+    report.end(
+        {
             "ok": not interrupted and counts["modbus"] > 0,
             "complete": not interrupted,
-            "port": port,
             "asked": len(found),
             "not_asked": total - len(found),
             "counts": {state: counts[state] for state in ("modbus", "open", "refused", "silent")},
-            "hosts": [_host(host) for host in found if host.state in ("modbus", "open")],
+            "hosts": [_host(host) for host in found if host.state in SHOWN],
         }
-        click.echo(json.dumps(told, indent=2))
-    else:
-        click.echo("\n".join(_hosts(found, counts, total)))
-        if interrupted:
-            click.echo("holdfast: interrupted", err=True)
+    )
+    if interrupted and not as_json:
+        click.echo("holdfast: interrupted", err=True)
     if interrupted or not counts["modbus"]:
         sys.exit(device.FAILED)
+
+
+class HostReport:
+    """The table of the hosts that are found, as they come."""
+
+    def __init__(self, report: Report, width: int) -> None:
+        self.printed = 0
+        self._report = report
+        self._row = f"{{:{width}}}  {{:>4}}  {{:7}}  {{}}"
+
+    def add(self, host: Host) -> None:
+        """Prints a host, if it answers or has the port open."""
+        if host.state not in SHOWN:
+            return
+        if self.printed == 0:
+            head = self._row.format("url", "unit", "answer", "identification")
+            self._report.text(showing.styled(head, bold=True))
+        self.printed += 1
+        unit = "" if host.unit is None else str(host.unit)
+        answer = host.detail if host.state == "modbus" else f"no Modbus: {host.detail}"
+        identity = showing.plain(str(host.identity))
+        self._report.text(self._row.format(host.url, unit, answer, identity).rstrip())
+        self._report.entry(_host(host))
 
 
 def _answering(found: Iterable[Host]) -> int:
@@ -99,24 +126,10 @@ def _host(host: Host) -> dict[str, object]:
     }
 
 
-def _hosts(found: Sequence[Host], counts: Counter[State], total: int) -> list[str]:
-    rows = [
-        (
-            host.url,
-            "" if host.unit is None else str(host.unit),
-            host.detail if host.state == "modbus" else f"no Modbus: {host.detail}",
-            showing.plain(str(host.identity)),
-        )
-        for host in found
-        if host.state in ("modbus", "open")
-    ]
-    lines = showing.table(("url", "unit", "answer", "identification"), rows, "<>") if rows else []
-    left = total - len(found)
-    return [
-        *lines,
-        *([""] if lines else []),
+def _counted(counts: Counter[State], total: int, left: int) -> str:
+    return (
         f"{showing.counted(total, 'address')}: {counts['modbus']} answer Modbus, "
         f"{counts['open']} accept connections but do not answer Modbus, "
         f"{counts['refused']} refuse them, {counts['silent']} do not respond"
-        + (f", {left} were not asked" if left else ""),
-    ]
+        + (f", {left} were not asked" if left else "")
+    )

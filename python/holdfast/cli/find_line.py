@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,8 @@ import click
 
 from holdfast.cli import device, showing
 from holdfast.cli.find_units import unit_told
-from holdfast.cli.progress import bar
+from holdfast.cli.report import Report
+from holdfast.cli.signals import Interrupted, interruptions
 from holdfast.cli.unit_ids import listed
 from holdfast.errors import ConnectFailed
 from holdfast.tools import finding
@@ -46,26 +46,52 @@ def find_line(
             err=True,
         )
     attempts: list[Attempt] = []
-    why = None
-    try:
-        with bar("Finding", total, lambda: _tried(attempts)) as advance:
-            for attempt in finding.line(mode, path, settings, units, timeout):
-                attempts.append(attempt)
-                if advance:
-                    advance(len(attempts))
-    except ConnectFailed as error:
-        device.fail(error, path, {"device": path} if as_json else None)
-    except KeyboardInterrupt:
-        why = "interrupted"
-    found = [each for each in attempts if each.found is not None and each.found.answers]
-    if as_json:
-        click.echo(json.dumps(_line_told(mode, path, attempts, found, total, why), indent=2))
-    else:
-        click.echo("\n".join(_line(mode, path, attempts, found, units)))
-        if why is not None:
-            click.echo(f"holdfast: {path}: {why}", err=True)
+    with interruptions() as signals:
+        report = Report({"device": path} if as_json else None, signals, listed="units")
+        why = None
+        try:
+            with (
+                report.progress("Finding", total, lambda: _tried(attempts)),
+                signals.interrupting(),
+            ):
+                for attempt in finding.line(mode, path, settings, units, timeout):
+                    with report.held():
+                        attempts.append(attempt)
+                        _print(mode, path, attempts, report)
+                        report.advance(len(attempts))
+        except ConnectFailed as error:
+            if not _found(attempts):
+                device.fail(error, path, {"device": path} if as_json else None)
+            why = str(error)
+        except Interrupted:
+            why = "interrupted"
+        found = _found(attempts)
+        report.text(*_line(path, attempts, found, units))
+        report.end(_line_told(attempts, found, total, why))
+    if why is not None and not as_json:
+        click.echo(f"holdfast: {path}: {why}", err=True)
     if why is not None or not found:
         sys.exit(device.FAILED)
+
+
+def _found(attempts: Sequence[Attempt]) -> list[Attempt]:
+    return [each for each in attempts if each.found is not None and each.found.answers]
+
+
+def _print(mode: str, path: str, attempts: Sequence[Attempt], report: Report) -> None:
+    """Prints the last attempt, if it has found a unit id."""
+    found, [attempt] = _found(attempts), attempts[-1:]
+    if attempt.found is None or not attempt.found.answers:
+        return
+    url = attempt.settings.url(mode, path)
+    unit, identity = str(attempt.unit), showing.plain(str(attempt.found.identity))
+    # The search ends with the first settings that work: all rows have the same URL.
+    row = f"{{:>4}}  {{:{len(url)}}}  {{:7}}  {{}}"
+    if len(found) == 1:
+        head = row.format("unit", "url", "answer", "identification")
+        report.text(showing.styled(head, bold=True))
+    report.text(row.format(unit, url, attempt.detail, identity).rstrip())
+    report.entry({"url": url, **unit_told(attempt.found)})
 
 
 def _tried(attempts: Sequence[Attempt]) -> str:
@@ -90,51 +116,27 @@ def _unusable(attempts: Iterable[Attempt]) -> list[str]:
 
 
 def _line_told(
-    mode: str,
-    path: str,
-    attempts: Sequence[Attempt],
-    found: Sequence[Attempt],
-    total: int,
-    why: str | None,
+    attempts: Sequence[Attempt], found: Sequence[Attempt], total: int, why: str | None
 ) -> dict[str, object]:
     return {
         "ok": why is None and bool(found),
+        **({} if why is None else {"detail": why}),
         "complete": why is None,
-        "device": path,
         "attempts": len(attempts),
         "attempts_at_most": total,
         "garbled": _garbled(attempts),
         "unusable": _unusable(attempts),
-        "units": [
-            {"url": each.settings.url(mode, path), **unit_told(each.found)}
-            for each in found
-            if each.found is not None
-        ],
     }
 
 
 def _line(
-    mode: str,
-    path: str,
-    attempts: Sequence[Attempt],
-    found: Sequence[Attempt],
-    units: Sequence[int],
+    path: str, attempts: Sequence[Attempt], found: Sequence[Attempt], units: Sequence[int]
 ) -> list[str]:
-    rows = [
-        (
-            str(each.unit),
-            each.settings.url(mode, path),
-            each.detail,
-            showing.plain(str(each.found.identity)) if each.found else "",
-        )
-        for each in found
-    ]
-    lines = []
-    if rows:
-        lines = [*showing.table(("unit", "url", "answer", "identification"), rows, "><<<"), ""]
+    """What is known when the search has ended."""
+    lines = [""] if found else []
     settings = {each.settings for each in attempts}
     lines.append(
-        f"{path}: {showing.counted(len(rows), 'unit id')} found; unit ids asked: {listed(units)}, "
+        f"{path}: {showing.counted(len(found), 'unit id')} found; unit ids asked: {listed(units)}, "
         f"{showing.counted(len(settings), 'setting')} tried"
     )
     if not found and _garbled(attempts):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from typing import TYPE_CHECKING
 
 import click
 
 from holdfast.cli import device, showing
-from holdfast.cli.progress import bar
+from holdfast.cli.report import Report
+from holdfast.cli.signals import Interrupted, interruptions
 from holdfast.cli.unit_ids import listed
 from holdfast.client.url import SerialTarget, parse
 from holdfast.errors import ConnectFailed
@@ -18,11 +18,16 @@ from holdfast.tools import finding
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from holdfast.cli.signals import Signals
     from holdfast.client import SyncClient
     from holdfast.tools.finding import Unit
 
 ALL = 247
 """How many unit ids the standard has: with all asked, no other is rare."""
+
+
+ROW = "{:>4}  {:7}  {}"
+"""A row of the table: unit id, answer, identification."""
 
 
 def find_units(url: str, asked: Sequence[int], timeout: float, delay: float, as_json: bool) -> None:
@@ -33,38 +38,67 @@ def find_units(url: str, asked: Sequence[int], timeout: float, delay: float, as_
         most = len(asked) * (timeout + delay)
         click.echo(f"{len(asked)} unit ids, at most {most:.0f} s. Ctrl-C stops.", err=True)
     found: list[Unit] = []
-    why = None
-    ignores = False
-    with device.connect(url, asked[0], timeout) as client:
-        try:
-            with bar("Finding", len(asked), lambda: f"{_count(found)} found") as advance:
-                for unit in finding.units(client, asked, delay=delay):
-                    found.append(unit)
-                    if advance:
-                        advance(len(found))
-            ignores = _ignores(client, url, found)
-        except ConnectFailed as error:
-            device.fail(error, url, {"url": url} if as_json else None)
-        except KeyboardInterrupt:
-            why = "interrupted"
-    left = asked[len(found) :]
-    if as_json:
-        told = {
-            "ok": why is None and _count(found) > 0,
-            "complete": why is None,
-            "url": url,
-            "ignores_unit": ignores,
-            "asked": [each.unit for each in found],
-            "not_asked": list(left),
-            "units": [unit_told(each) for each in found if each.answers],
-        }
-        click.echo(json.dumps(told, indent=2))
-    else:
-        click.echo("\n".join(_units(url, found, left, ignores)))
-        if why is not None:
-            click.echo(f"holdfast: {url}: {why}", err=True)
+    with interruptions() as signals:
+        report = Report({"url": url} if as_json else None, signals, listed="units")
+        with device.connect(url, asked[0], timeout) as client:
+            why, ignores = _search(client, url, asked, delay, found, report, signals)
+        left = asked[len(found) :]
+        report.text(*_units(url, found, left, ignores))
+        report.end(
+            {
+                "ok": why is None and _count(found) > 0,
+                **({} if why is None else {"detail": why}),
+                "complete": why is None,
+                "ignores_unit": ignores,
+                "asked": [each.unit for each in found],
+                "not_asked": list(left),
+            }
+        )
+    if why is not None and not as_json:
+        click.echo(f"holdfast: {url}: {why}", err=True)
     if why is not None or not _count(found):
         sys.exit(device.FAILED)
+
+
+def _search(
+    client: SyncClient,
+    url: str,
+    asked: Sequence[int],
+    delay: float,
+    found: list[Unit],
+    report: Report,
+    signals: Signals,
+) -> tuple[str | None, bool]:
+    """Asks unit ids, and prints those that answer.
+
+    Returns why it ended early, or `None`, and whether the device ignores unit ids.
+    """
+    try:
+        with (
+            report.progress("Finding", len(asked), lambda: f"{_count(found)} found"),
+            signals.interrupting(),
+        ):
+            for unit in finding.units(client, asked, delay=delay):
+                with report.held():
+                    found.append(unit)
+                    if unit.answers:
+                        _print(unit, report, is_first=_count(found) == 1)
+                    report.advance(len(found))
+            return None, _ignores(client, url, found)
+    except ConnectFailed as error:
+        if not _count(found):
+            device.fail(error, url, {"url": url} if report.is_json else None)
+        return str(error), False
+    except Interrupted:
+        return "interrupted", False
+
+
+def _print(unit: Unit, report: Report, *, is_first: bool) -> None:
+    identity = showing.plain(str(unit.identity))
+    row = ROW.format(str(unit.unit), unit.detail, identity).rstrip()
+    head = showing.styled(ROW.format("unit", "answer", "identification"), bold=True)
+    report.text(*([head] if is_first else []), row)
+    report.entry(unit_told(unit))
 
 
 def _ignores(client: SyncClient, url: str, found: Sequence[Unit]) -> bool:
@@ -89,15 +123,11 @@ def unit_told(found: Unit) -> dict[str, object]:
 
 
 def _units(url: str, found: Sequence[Unit], left: Sequence[int], ignores: bool) -> list[str]:
-    rows = [
-        (str(each.unit), each.detail, showing.plain(str(each.identity)))
-        for each in found
-        if each.answers
-    ]
-    lines = showing.table(("unit", "answer", "identification"), rows, "><<") if rows else []
+    """What is known when the search has ended."""
+    count = _count(found)
     silent = [each.unit for each in found if not each.answers]
-    lines += [""] if lines else []
-    lines.append(f"{url}: {showing.counted(len(rows), 'unit id')} of {len(found)} asked answer")
+    lines = [""] if count else []
+    lines.append(f"{url}: {showing.counted(count, 'unit id')} of {len(found)} asked answer")
     if silent:
         lines.append(f"no device: {listed(silent)}")
     if left:

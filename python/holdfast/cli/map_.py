@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import sys
@@ -12,7 +11,8 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.cli import coverage, device, showing
-from holdfast.cli.progress import bar
+from holdfast.cli.report import RangeReport, Report
+from holdfast.cli.signals import Interrupted, interruptions
 from holdfast.cli.surveying import announced, limited, planned, survey_options
 from holdfast.errors import ModbusError
 from holdfast.tools import discovery
@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from typing import Unpack
 
+    from holdfast.cli.signals import Signals
     from holdfast.cli.surveying import Settings
+    from holdfast.client import SyncClient
     from holdfast.tools.discovery import AreaMap, Failure
 
 BLOCKS = "▁▂▃▄▅▆▇█"
@@ -64,7 +66,12 @@ def map_(
     to 65536 per area: minutes over TCP, hours on a serial line. --range and --areas limit the
     search.
 
-    Ctrl-C prints the results so far.
+    The registers at usual starts come first (0, 1, 100, 1000, …, 40000), then the other registers,
+    then coils and discrete inputs. Each range is printed when its ends are known; with --json, as
+    an element of "found".
+
+    Ctrl-C, or SIGTERM, prints the results so far, and where the search did not look. A second one
+    ends the command at once.
 
     Exit codes: 0 done; 1 the device did not answer, or the search ended early; 2 wrong usage.
     """
@@ -72,39 +79,62 @@ def map_(
     if sys.stderr.isatty():
         click.echo(announced(survey), err=True)
     began = time.monotonic()
-    why = None
-    with device.connect(url, unit, timeout) as client:
-        try:
-            with bar("Mapping", survey.total, lambda: _requests(survey)) as advance:
-                discovery.run_sync(
-                    survey,
-                    client,
-                    advance and (lambda survey: advance(survey.at)),
-                    delay=settings["delay"],
-                )
-        except LimitReached as error:
-            why = limited(error)
-        except ModbusError as error:
-            why = str(error)
-        except KeyboardInterrupt:
-            why = "interrupted"
-    seconds = time.monotonic() - began
-    if as_json:
-        about = {"ok": why is None, "url": url, "unit": unit}
-        click.echo(json.dumps(about | _told(survey, seconds, why), indent=2))
-    else:
+    with interruptions() as signals:
+        report = Report({"url": url, "unit": unit} if as_json else None, signals)
+        with device.connect(url, unit, timeout) as client:
+            why = _search(survey, client, settings["delay"], report, signals)
+        seconds = time.monotonic() - began
+        report.end({"ok": why is None, **_told(survey, seconds, why)})
         if why is None or any(each.ranges or each.failures for each in survey.areas):
-            found = showing.counted(sum(each.addresses for each in survey.areas), "address")
-            click.echo(
-                f"{url}, unit {unit}: {found}; {_how(survey)}, "
-                f"{_requests(survey)} in {seconds:.1f} s\n"
-            )
-            lines = [*_picture(survey), "", *_ranges(survey), *_others(survey), *_unknown(survey)]
-            click.echo("\n".join(lines))
-        if why is not None:
-            click.echo(f"holdfast: {url}: {why}", err=True)
+            report.text(*_summary(f"{url}, unit {unit}", survey, seconds))
     if why is not None:
+        if not as_json:
+            click.echo(f"holdfast: {url}: {why}", err=True)
         sys.exit(device.FAILED)
+
+
+def _search(
+    survey: Survey, client: SyncClient, delay: float, report: Report, signals: Signals
+) -> str | None:
+    """Carries out a survey, and prints its ranges. Returns why it ended early, or `None`."""
+    ranges = RangeReport(report, survey)
+    why = None
+
+    def progress(survey: Survey) -> None:
+        ranges.update()
+        report.advance(survey.at)
+
+    try:
+        with (
+            report.progress("Mapping", survey.total, lambda: _requests(survey)),
+            signals.interrupting(),
+        ):
+            discovery.run_sync(survey, client, progress, delay=delay)
+    except LimitReached as error:
+        why = limited(error)
+    except ModbusError as error:
+        why = str(error)
+    except Interrupted:
+        why = "interrupted"
+    ranges.end()
+    return why
+
+
+def _summary(device: str, survey: Survey, seconds: float) -> list[str]:
+    """What a survey has found, without the table of its ranges."""
+    found = showing.counted(sum(each.addresses for each in survey.areas), "address")
+    head = f"{device}: {found}; {_how(survey)}, {_requests(survey)} in {seconds:.1f} s"
+    is_empty = not any(each.ranges for each in survey.areas)
+    return [
+        *([] if is_empty else [""]),
+        head,
+        *coverage.incomplete(survey),
+        "",
+        *_picture(survey),
+        *(["", "No address was found."] if is_empty else []),
+        *_others(survey),
+        *_unknown(survey),
+    ]
 
 
 def _how(survey: Survey) -> str:
@@ -179,17 +209,6 @@ def _bounds(span: range, cells: int, cell: int) -> tuple[int, int]:
     return span.start + -(-cell * size // cells), span.start + -(-(cell + 1) * size // cells)
 
 
-def _ranges(survey: Survey) -> list[str]:
-    rows = [
-        (found.area, str(each.start), str(each.stop - 1), str(len(each)))
-        for found in survey.areas
-        for each in found.ranges
-    ]
-    if not rows:
-        return ["No address was found."]
-    return showing.table(("area", "first", "last", "count"), rows, "<>>>")
-
-
 def _others(survey: Survey) -> list[str]:
     """The failures other than exception 02, one line each."""
     lines = []
@@ -237,7 +256,8 @@ def _told(survey: Survey, seconds: float, why: str | None) -> dict[str, object]:
 def _area(survey: Survey, found: AreaMap) -> dict[str, object]:
     return {
         "state": found.state,
-        "searched_to": None if found.reached is None else found.reached - 1,
+        "searched_to": None if found.reached in (None, survey.span.start) else found.reached - 1,
+        "not_searched_from": survey.not_searched_from(found),
         "ranges": _pairs(found.ranges),
         "addresses": found.addresses,
         "absent": _pairs(found.absent),

@@ -6,14 +6,12 @@ import contextlib
 import os
 import sys
 import time
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, final
 
 import click
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-
-    Advance: TypeAlias = Callable[[int], None]
 
 ROOMY = 80
 TIGHT = 36
@@ -27,9 +25,34 @@ BETWEEN = 0.1
 """Seconds between updates of the bar."""
 
 
+@final
+class Bar:
+    """A progress bar."""
+
+    def __init__(self, shown: Any, length: int, columns: int) -> None:
+        self._shown = shown
+        self._length = length
+        self._columns = columns
+        self._seen = 0.0
+
+    def __call__(self, at: int) -> None:
+        """Sets the progress, from 0 to the length."""
+        now = time.monotonic()
+        if now - self._seen >= BETWEEN:
+            self._seen = now
+            self._shown.update(min(at, self._length) - self._shown.pos)
+            self._shown.render_progress()
+
+    def clear(self) -> None:
+        """Clears the line of the bar, for a line of output there. The bar comes back below it."""
+        if sys.stdout.isatty():
+            click.echo(f"\r{' ' * (self._columns - 1)}\r", file=sys.stderr, nl=False)
+            self._seen = 0.0
+
+
 @contextlib.contextmanager
-def bar(label: str, length: int, note: Callable[[], str]) -> Iterator[Advance | None]:
-    """Yields a function that sets the progress, from 0 to `length`; `None` without a terminal."""
+def bar(label: str, length: int, note: Callable[[], str]) -> Iterator[Bar | None]:
+    """Yields a bar with this length; `None` without a terminal."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -43,15 +66,6 @@ def bar(label: str, length: int, note: Callable[[], str]) -> Iterator[Advance | 
         show_eta=has_room,
         width=WIDTH if has_room else max(3, columns - len(label) - OTHERS),
     )
-    seen = 0.0
     with shown:
-
-        def advance(at: int) -> None:
-            nonlocal seen
-            now = time.monotonic()
-            if now - seen >= BETWEEN:
-                seen = now
-                shown.update(min(at, length) - shown.pos)
-
-        yield advance
+        yield Bar(shown, length, columns)
         shown.update(length - shown.pos)

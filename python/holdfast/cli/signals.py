@@ -74,6 +74,18 @@ class Signals:
         finally:
             self._interrupts = False
 
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Lets what is inside end, such as the output of a line, before a signal ends the rest."""
+        interrupts, self._interrupts = self._interrupts, False
+        try:
+            yield
+        finally:
+            self._interrupts = interrupts
+        if interrupts and self.received:
+            self._interrupts = False
+            raise Interrupted
+
     def take_reload(self) -> bool:
         """Whether a reload was requested since the last call."""
         requested, self._reload = self._reload, False
@@ -91,6 +103,24 @@ class Signals:
         if self._interrupts:
             self._interrupts = False
             raise Interrupted
+
+
+@contextmanager
+def interruptions() -> Iterator[Signals]:
+    """The signals that end a command which prints what it has found so far.
+
+    The first ends what is inside `interrupting`; the second ends the process at once.
+    """
+    before = {number: signal.getsignal(number) for number in ending_signals()}
+    try:
+        signals = Signals()
+        for number, handler in before.items():
+            if handler == signal.SIG_IGN:  # A script has started the command in the background.
+                signal.signal(number, handler)
+        yield signals
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 def _has_terminal() -> bool:

@@ -1,0 +1,133 @@
+"""What a command prints that searches: findings as they come, and the rest at its end."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from typing import TYPE_CHECKING
+
+import click
+
+from holdfast.cli import showing
+from holdfast.cli.progress import bar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from holdfast.cli.progress import Bar
+    from holdfast.cli.signals import Signals
+    from holdfast.tools.discovery import Finding, Survey
+
+RANGE = "{:17}  {:>5}  {:>5}  {:>5}"
+"""A row of the table of ranges: area, first, last, count."""
+
+
+class Report:
+    """The output of a search: lines of text; with `about`, one JSON object.
+
+    The object begins with `about` and a list, whose elements are the findings: each is written at
+    once, on a line of its own. An interruption does not cut a line.
+    """
+
+    def __init__(
+        self,
+        about: Mapping[str, object] | None,
+        signals: Signals | None = None,
+        *,
+        listed: str = "found",
+    ) -> None:
+        self.is_json = about is not None
+        self._about = about
+        self._bar: Bar | None = None
+        self._listed = listed
+        self._signals = signals
+        self._has_begun = False
+
+    @contextlib.contextmanager
+    def progress(self, label: str, length: int, note: Callable[[], str]) -> Iterator[None]:
+        """Shows a progress bar below what is printed, on a terminal."""
+        with bar(label, length, note) as self._bar:
+            try:
+                yield
+            finally:
+                self._bar = None
+
+    def advance(self, at: int) -> None:
+        """Sets the progress, from 0 to its length."""
+        if self._bar is not None:
+            self._bar(at)
+
+    def held(self) -> contextlib.AbstractContextManager[None]:
+        """Lets what is inside end before a signal ends the search."""
+        return contextlib.nullcontext() if self._signals is None else self._signals.held()
+
+    def text(self, *lines: str) -> None:
+        """Prints lines, unless the output is JSON."""
+        if not self.is_json and lines:
+            with self.held():
+                self._print("\n".join(lines))
+
+    def entry(self, entry: Mapping[str, object]) -> None:
+        """Prints an element of the list, if the output is JSON."""
+        if self.is_json:
+            with self.held():
+                # The comma is at the beginning: each line is complete when it is written.
+                comma = "," if self._has_begun else " "
+                self._begin()
+                self._print(f"   {comma}{json.dumps(entry)}")
+
+    def end(self, rest: Mapping[str, object]) -> None:
+        """Prints the rest of the object, if the output is JSON."""
+        if self.is_json:
+            self._begin()
+            self._print("  ],\n" + json.dumps(rest, indent=2).removeprefix("{\n"))
+
+    def _begin(self) -> None:
+        if not self._has_begun:
+            self._has_begun = True
+            fields = [(key, json.dumps(value)) for key, value in (self._about or {}).items()]
+            about = "".join(f'  "{key}": {value},\n' for key, value in fields)
+            self._print(f'{{\n{about}  "{self._listed}": [')
+
+    def _print(self, text: str) -> None:
+        if self._bar is not None:
+            self._bar.clear()
+        click.echo(text)
+
+
+class RangeReport:
+    """The table of the ranges that a survey finds, as they come.
+
+    `about` is part of the entries for JSON; with it, an empty line is before the table.
+    """
+
+    def __init__(
+        self, report: Report, survey: Survey, about: Mapping[str, object] | None = None
+    ) -> None:
+        self._report = report
+        self._survey = survey
+        self._about = about or {}
+        self._printed: list[Finding] = []
+
+    def update(self) -> None:
+        """Prints the ranges that were found since the last call."""
+        while len(self._printed) < len(self._survey.findings):
+            self._row(self._survey.findings[len(self._printed)])
+
+    def end(self) -> None:
+        """Prints the other ranges: those whose ends were not read."""
+        self.update()
+        for finding in self._survey.unfinished():
+            self._row(finding)
+
+    def _row(self, finding: Finding) -> None:
+        found = finding.addresses
+        rows = [RANGE.format(finding.area, found.start, found.stop - 1, len(found))]
+        if not self._printed:
+            head = RANGE.format("area", "first", "last", "count")
+            rows[:0] = [*([""] if self._about else []), showing.styled(head, bold=True)]
+        place = {"area": finding.area, "first": found.start, "last": found.stop - 1}
+        with self._report.held():
+            self._printed.append(finding)
+            self._report.text(*rows)
+            self._report.entry({**self._about, **place})

@@ -1,0 +1,55 @@
+"""A signal ends a search, but not the output of a finding."""
+
+from __future__ import annotations
+
+import signal
+from typing import TYPE_CHECKING
+
+import pytest
+
+from holdfast.cli.signals import Interrupted, interruptions
+
+if TYPE_CHECKING:
+    from holdfast.cli.signals import Signals
+
+
+def test_a_signal_ends_a_search_after_what_must_not_be_cut() -> None:
+    done: list[str] = []
+
+    def search(signals: Signals) -> None:
+        with signals.interrupting():
+            with signals.held():
+                signal.raise_signal(signal.SIGINT)
+                done.append("line")
+            done.append("search")
+
+    with interruptions() as signals:
+        with pytest.raises(Interrupted):
+            search(signals)
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_DFL
+        done.append("output")
+    assert done == ["line", "output"]
+
+
+def test_a_signal_behind_the_search_does_not_cut_the_output() -> None:
+    done: list[str] = []
+    with interruptions() as signals:
+        with signals.interrupting():
+            done.append("search")
+        signal.raise_signal(signal.SIGTERM)
+        done.append("output")
+        with pytest.raises(Interrupted), signals.interrupting():
+            done.append("next search")
+    assert done == ["search", "output"]
+
+
+def test_handlers_are_as_before_when_the_command_ends() -> None:
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        with interruptions():
+            assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
+            assert signal.getsignal(signal.SIGINT) != signal.default_int_handler
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
+        assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGTERM, before)
