@@ -559,7 +559,7 @@ fn an_invalid_reply_does_not_end_a_serial_line() {
         let second = client.send(read());
         client.after(SILENCE);
         assert_eq!(client.outgoing(), [], "the reply to the first may still come");
-        client.after(SECOND / 4);
+        client.after(SECOND);
         client.receive(&good);
         assert_eq!(client.got(), [], "another one may follow");
         client.after(GUARD);
@@ -640,6 +640,57 @@ fn an_echo_is_expected_of_writes_after_three_reads_until_a_read_without_one() {
     assert!(matches!(answered(&mut client, WRITE, 1)[..], [(_, Ok(_))]));
     assert!(matches!(answered(&mut client, read(), 0)[..], [(_, Ok(_))]), "it is unlearned");
     assert!(matches!(answered(&mut client, WRITE, 0)[..], [(_, Ok(_))]));
+}
+
+#[test]
+fn an_echo_of_a_write_is_no_confirmation_after_reads_with_echoes() {
+    for (reads, next_connection) in [(1, false), (2, false), (3, false), (3, true)] {
+        for transport in [RTU, Transport::RtuOverTcp] {
+            let mut client = Client::new(transport);
+            for _ in 0..reads {
+                client.send(read());
+                client.after(SECOND / 10);
+                let echo = client.outgoing();
+                client.receive(&[echo, rtu_frame(7, &[3, 2, 0, 5])].concat());
+                assert!(matches!(client.got()[..], [(_, Ok(_))]));
+            }
+            if next_connection {
+                let mut next = Connection::new(transport);
+                next.follow(client.connection.take_past(client.now));
+                client.connection = next;
+            }
+            client.send(WRITE);
+            client.after(SECOND / 10);
+            let echo = client.outgoing();
+            client.receive(&echo);
+            client.after(SECOND / 2);
+            assert_eq!(client.got(), [], "{reads} {next_connection}");
+            client.after(SECOND);
+            assert!(matches!(client.got()[..], [(_, Err(Failure::Timeout))]));
+        }
+    }
+}
+
+#[test]
+fn an_echo_is_still_expected_after_a_write_that_got_nothing() {
+    let mut client = Client::new(RTU);
+    for _ in 0..3 {
+        client.send(read());
+        client.after(SECOND / 10);
+        let echo = client.outgoing();
+        client.receive(&[echo, rtu_frame(7, &[3, 2, 0, 5])].concat());
+    }
+    client.got();
+    for echoes in [0, 1] {
+        client.send(WRITE);
+        while client.connection.outgoing().is_empty() {
+            client.after(SECOND / 10);
+        }
+        let echo = client.outgoing();
+        client.receive(&echo.repeat(echoes));
+        client.after(SECOND);
+        assert!(matches!(client.got()[..], [(_, Err(Failure::Timeout))]), "{echoes}");
+    }
 }
 
 #[test]
@@ -962,6 +1013,27 @@ fn stray_bytes_alone_are_an_invalid_reply() {
     client.after(SECOND);
     let invalid = InvalidResponse::Frame(FrameError::CheckSum);
     assert_eq!(client.got(), [(ticket, Err(Failure::Invalid(invalid)))]);
+}
+
+#[test]
+fn a_reply_that_is_cut_off_by_another_one_is_not_believed() {
+    let reply = mbap_frame(0, 7, &[3, 4, 0, 1, 0, 2]);
+    let request = Request::ReadHoldingRegisters(Range::new(3, 2).unwrap());
+    for cut in mbap::HEADER_LEN + 2..reply.len() {
+        let mut client = Client::new(Transport::Tcp);
+        let ticket = client.send(request);
+        client.receive(&[&reply[..cut], &reply].concat());
+        let got = client.got();
+        assert!(
+            matches!(got[..], [(of, Err(Failure::Invalid(_)))] if of == ticket),
+            "{cut} {got:?}"
+        );
+    }
+    // With nothing of another reply in it, what follows does not matter.
+    let mut client = Client::new(Transport::Tcp);
+    let ticket = client.send(request);
+    client.receive(&[&reply[..], &[9; 20]].concat());
+    assert_eq!(client.got(), [(ticket, Ok(vec![0, 1, 0, 2]))]);
 }
 
 #[test]

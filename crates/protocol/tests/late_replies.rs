@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use holdfast_protocol::client::{Closed, Connection, Done, Failure, Tolerance, Transport};
+use holdfast_protocol::client::{Attempt, Closed, Connection, Done, Failure, Tolerance, Transport};
 use holdfast_protocol::frame::{ascii, mbap, rtu};
 use holdfast_protocol::pdu::{EncodedRequest, Range, Request, Response};
 
@@ -24,6 +24,10 @@ const TRANSPORTS: [Transport; 7] = [
     Transport::Tcp,
     Transport::Udp,
 ];
+
+fn reading(address: u16, quantity: u16) -> Request<'static> {
+    Request::ReadHoldingRegisters(Range::new(address, quantity).unwrap())
+}
 
 /// A fixed sequence of numbers that look random.
 struct Numbers(u64);
@@ -46,6 +50,7 @@ type Vice = fn(number: u32, &mut Numbers) -> Vec<Duration>;
 /// A device behind a gateway that sends to whichever connection there is.
 struct World {
     transport: Transport,
+    tolerance: Tolerance,
     vice: Vice,
     connection: Connection,
     now: Duration,
@@ -72,6 +77,7 @@ impl World {
         let (now, coming) = (MS, Vec::new());
         World {
             transport,
+            tolerance: Tolerance::default(),
             vice,
             connection,
             now,
@@ -88,7 +94,7 @@ impl World {
     fn reconnect(&mut self) {
         self.late += self.connection.late();
         let past = self.connection.take_past(self.now);
-        let connection = Connection::tolerant(self.transport, Tolerance::default(), self.now);
+        let connection = Connection::tolerant(self.transport, self.tolerance, self.now);
         self.connection = connection.unpredictable(u64::from(self.requests));
         self.connection.follow(past);
     }
@@ -119,15 +125,39 @@ impl World {
 
     /// Reads this many registers. Returns the first one.
     fn read_some(&mut self, unit_id: u8, address: u16, quantity: u16) -> Result<u16, Failure> {
-        let request = Request::ReadHoldingRegisters(Range::new(address, quantity).unwrap());
-        let request = EncodedRequest::new(&request);
-        self.connection.send(unit_id, &request, TIMEOUT, self.now).unwrap();
-        let mut found = None;
+        self.read_within(TIMEOUT, unit_id, (address, quantity))
+    }
+
+    /// Reads, and again while the connection says so.
+    fn read_within(
+        &mut self,
+        timeout: Duration,
+        unit_id: u8,
+        range: (u16, u16),
+    ) -> Result<u16, Failure> {
+        let mut attempt = Attempt::default();
+        loop {
+            let (found, again) = self.attempt((timeout, attempt), unit_id, range);
+            let Some(again) = again else { return found };
+            attempt = again;
+        }
+    }
+
+    fn attempt(
+        &mut self,
+        (timeout, attempt): (Duration, Attempt),
+        unit_id: u8,
+        (address, quantity): (u16, u16),
+    ) -> (Result<u16, Failure>, Option<Attempt>) {
+        let request = EncodedRequest::new(&reading(address, quantity));
+        self.connection.send_again(unit_id, &request, timeout, attempt, self.now).unwrap();
+        let (mut found, mut again) = (None, None);
         loop {
             self.serve(unit_id, (address, quantity));
             let Some(deadline) = self.connection.deadline() else { break };
             let received = self.next(deadline);
             let sink = |done: Done<'_>| {
+                again = done.again;
                 found = Some(done.outcome.map(|response| match response {
                     Response::Registers(registers) => registers.iter().next().unwrap(),
                     _ => panic!("registers were read"),
@@ -150,7 +180,22 @@ impl World {
         if self.connection.closed().is_some() {
             self.reconnect();
         }
-        found.expect("every request has a result")
+        (found.expect("every request has a result"), again)
+    }
+
+    /// Sends a request, whose frame or end comes from a test.
+    fn send(&mut self, address: u16) {
+        let request = EncodedRequest::new(&reading(address, 1));
+        self.connection.send(1, &request, TIMEOUT, self.now).unwrap();
+        self.pass_until_sent();
+        self.serve(1, (address, 1));
+    }
+
+    fn pass_until_sent(&mut self) {
+        while self.connection.outgoing().is_empty() {
+            self.now = self.connection.deadline().unwrap();
+            self.connection.advance(self.now, |_| panic!("it has not been sent"));
+        }
     }
 
     /// Answers what the client has sent.
@@ -333,6 +378,112 @@ fn a_late_reply_to_another_unit_does_not_end_a_request() {
     assert_eq!(world.read(1, 200), Ok(200));
     assert_eq!(world.connection.late(), 1);
     assert_eq!(world.connection.take_strays().bytes, 0);
+}
+
+/// Reads of a device that is asked for `address`, on a line and in a stream, when something else has come or
+/// happened instead of the reply. That comes later. Every read after it has its own value.
+fn reads_after(happens: impl Fn(&mut World)) {
+    for transport in [SERIAL[0], Transport::RtuOverTcp] {
+        for late in 1..=TIMEOUT.as_millis() as u32 {
+            let mut world = World::new(transport, |_, _| vec![3 * MS]);
+            world.run(10, Duration::ZERO, 1);
+            world.send(800);
+            let [(_, reply)] = &mut world.coming[..] else { panic!("one reply is coming") };
+            let reply = std::mem::take(reply);
+            world.coming[0] = (world.now + late * MS, reply);
+            happens(&mut world);
+            if world.connection.closed().is_some() {
+                world.reconnect();
+            }
+            let until = world.now + TIMEOUT;
+            while world.now < until {
+                let counts = world.run(1, Duration::ZERO, 1);
+                assert_eq!(counts.wrong, 0, "{transport:?}, {late} ms");
+            }
+        }
+    }
+}
+
+fn receive(world: &mut World, unit_id: u8, pdu: &[u8]) {
+    let mut frame = [0; rtu::MAX_LEN];
+    let len = rtu::encode(unit_id, pdu, &mut frame).unwrap();
+    world.now += MS;
+    world.connection.receive(&frame[..len], world.now, |done| {
+        assert!(done.outcome.is_err());
+    });
+}
+
+#[test]
+fn the_reply_of_another_unit_does_not_end_the_wait_for_its_own() {
+    reads_after(|world| receive(world, 9, &[3, 2, 0, 9]));
+}
+
+#[test]
+fn a_reply_of_another_length_does_not_end_the_wait_for_its_own() {
+    reads_after(|world| receive(world, 1, &[3, 4, 0, 9, 0, 9]));
+}
+
+#[test]
+fn the_reply_of_a_device_may_follow_the_exception_of_a_gateway() {
+    reads_after(|world| receive(world, 1, &[0x83, 0x0B]));
+}
+
+#[test]
+fn a_reply_may_come_on_the_next_connection() {
+    for why in [Closed::ByPeer, Closed::BySelf] {
+        reads_after(|world| world.connection.close(why, |done| assert!(done.outcome.is_err())));
+    }
+}
+
+#[test]
+fn a_request_with_little_time_may_have_a_reply_as_late_as_others() {
+    for transport in TRANSPORTS {
+        for is_known in [false, true] {
+            let mut world = World::new(transport, |_, _| vec![200 * MS]);
+            if is_known {
+                assert_eq!(world.read(1, 100), Ok(100));
+            }
+            for address in 2..20 {
+                let timeout = if address % 3 == 0 { TIMEOUT } else { TIMEOUT / 50 };
+                let found = world.read_within(timeout, 1, (address, 1));
+                assert!(
+                    found.is_err() || found == Ok(address),
+                    "{transport:?} {address} {found:?}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn the_replies_to_all_attempts_of_a_read_are_waited_for() {
+    for transport in TRANSPORTS {
+        let mut world = World::new(transport, |number, _| match number {
+            // The second attempt gets the reply to the first one; its own comes later.
+            0 => vec![19 * TIMEOUT / 10],
+            1 => vec![22 * TIMEOUT / 10],
+            _ => vec![150 * MS],
+        });
+        world.tolerance.retries = 1;
+        world.reconnect();
+        for address in 100..110 {
+            let found = world.read(1, address);
+            assert!(found.is_err() || found == Ok(address), "{transport:?} {address} {found:?}");
+        }
+    }
+}
+
+#[test]
+fn a_reply_that_may_be_a_copy_is_believed_if_the_unit_sends_no_other_in_its_usual_time() {
+    let twice: Vice = |number, _| match number {
+        // The second one comes when the next request has been sent.
+        20 => vec![60 * MS, 63 * MS],
+        _ => vec![60 * MS],
+    };
+    for transport in [SERIAL[0], Transport::RtuOverTcp] {
+        let counts = World::new(transport, twice).run(40, Duration::ZERO, 1);
+        assert_eq!((counts.wrong, counts.failed), (0, 1), "{transport:?}");
+    }
 }
 
 /// The transaction ids of requests on a connection after another one that ended without a reply.

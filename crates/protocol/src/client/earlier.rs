@@ -14,8 +14,13 @@ use crate::pdu::{EncodedRequest, Request};
 /// Requests without a reply that are remembered. With the bounds on their time, there are never as many.
 const MAX_UNANSWERED: usize = 64;
 
-/// A late reply may take this many times the timeout, as long as nothing else is known.
+/// A late reply may take this many times the longest timeout of the last requests, as long as nothing else is
+/// known.
 const LATENESS: u32 = 3;
+
+/// A late reply may take so long however short the timeouts are: a request may have had only what was left of
+/// its time.
+const MIN_LATENESS: Duration = Duration::from_millis(250);
 
 /// Late replies after which the timeout of a unit is raised.
 const LATE_IN_A_ROW: u8 = 2;
@@ -46,10 +51,10 @@ const ONLY_TOO_FAST: u8 = 2;
 const RECENT: usize = 16;
 
 /// A reply that came longer ago is not repeated now.
-const RECENTLY: Duration = GUARD.saturating_mul(2);
+const RECENTLY: Duration = MAX_GUARD;
 
-/// How long after an invalid reply its own may come to a request, as long as nothing is known of the unit.
-const AFTER_INVALID: Duration = Duration::from_millis(250);
+/// How long after a damaged reply its own may come to a request, as long as nothing is known of the unit.
+const AFTER_DAMAGED: Duration = Duration::from_millis(250);
 
 /// What earlier requests may still bring.
 #[derive(Debug, Default)]
@@ -68,6 +73,8 @@ pub(super) struct Earlier {
     too_fast: bool,
     /// Requests in a row that had no other reply than one that came too fast.
     only_too_fast: u8,
+    /// Reads in a row whose echo came before their reply.
+    pub(super) echoes: u8,
     /// The newest first.
     recent: VecDeque<Recent>,
 }
@@ -93,9 +100,13 @@ pub(super) struct Unanswered {
 /// Why a request ended without its reply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Ended {
+    /// By its timeout, or because nobody waits any more.
     TimedOut,
-    /// By bytes that are not its reply, or with its connection.
-    Otherwise,
+    /// By a reply that is not its own, by an exception that a gateway sent in its place, or because the
+    /// device has closed the connection.
+    Unanswered,
+    /// By bytes that may have been its reply.
+    Damaged,
 }
 
 /// How long a unit takes.
@@ -108,6 +119,17 @@ struct Unit {
     /// Late replies since the last of [`IN_TIME`] that were not.
     late: u8,
     in_time: u8,
+    /// The longest timeout of its requests meanwhile, and of those before.
+    timeout: Duration,
+    former_timeout: Duration,
+}
+
+impl Unit {
+    /// How long it may take by the timeouts of its requests. One of them may have had little time.
+    fn note_timeout(&mut self, timeout: Duration) -> Duration {
+        self.timeout = self.timeout.max(timeout);
+        self.timeout.max(self.former_timeout)
+    }
 }
 
 /// Whether replies may come twice.
@@ -210,6 +232,47 @@ impl Earlier {
         };
     }
 
+    /// Until when the reply may come to a request that ended without it.
+    fn until_after(
+        &mut self,
+        unit_id: u8,
+        (sent, timeout): (Time, Duration),
+        how: Ended,
+        now: Time,
+    ) -> Time {
+        let is_known = self.units.get(&unit_id).is_some_and(|unit| !unit.longest.is_zero());
+        let unit = self.units.entry(unit_id).or_default();
+        let timeout = unit.note_timeout(timeout);
+        let usual = (unit.longest * 4).max(GUARD);
+        match how {
+            Ended::TimedOut => {
+                let lateness = (timeout * LATENESS).max(MIN_LATENESS).max(unit.latest * 2);
+                sent + lateness.min(timeout + MAX_LATENESS)
+            }
+            Ended::Unanswered => (sent + timeout).max(now + usual),
+            Ended::Damaged => {
+                (sent + timeout).min(now + if is_known { usual } else { AFTER_DAMAGED })
+            }
+        }
+    }
+
+    /// Notes that a request was answered that repeats an earlier one of the same call, sent at this time:
+    /// the reply may be that to the earlier one, and its own may still come.
+    pub(super) fn repeated(
+        &mut self,
+        (unit_id, request): (u8, &EncodedRequest),
+        (sent, timeout): (Time, Duration),
+        now: Time,
+    ) {
+        let until = self.until_after(unit_id, (sent, timeout), Ended::TimedOut, now);
+        let same = |earlier: &&mut Unanswered| {
+            earlier.unit_id == unit_id && earlier.request.pdu() == request.pdu()
+        };
+        for earlier in self.unanswered.iter_mut().filter(same) {
+            earlier.until = earlier.until.max(until);
+        }
+    }
+
     /// Notes a request that was sent at this time and ended without its reply.
     pub(super) fn ended(
         &mut self,
@@ -221,19 +284,9 @@ impl Earlier {
         if how == Ended::TimedOut {
             self.timed_out();
         }
-        let unit = self.units.get(&unit_id);
-        let until = match how {
-            Ended::TimedOut => {
-                let latest = unit.map_or(Duration::ZERO, |unit| unit.latest * 2);
-                let most = timeout + MAX_LATENESS;
-                sent + (timeout * LATENESS).max(latest).min(most)
-            }
-            Ended::Otherwise => {
-                let longest = unit.map(|unit| (unit.longest * 4).max(GUARD));
-                (sent + timeout).min(now + longest.unwrap_or(AFTER_INVALID))
-            }
-        };
+        let until = self.until_after(unit_id, (sent, timeout), how, now);
         if until <= now {
+            self.never_came.extend(request.pdu().first().map(|function| (unit_id, *function)));
             return;
         }
         if self.unanswered.len() == MAX_UNANSWERED {
@@ -305,6 +358,7 @@ impl Earlier {
         self.guard.clean = self.guard.clean.saturating_add(1);
         (self.too_fast, self.only_too_fast) = (false, 0);
         let unit = self.units.entry(unit_id).or_default();
+        unit.note_timeout(timeout);
         unit.longest = unit.longest.max(took.min(timeout));
         if took > timeout {
             unit.in_time = 0;
@@ -313,7 +367,8 @@ impl Earlier {
         }
         unit.in_time += 1;
         if unit.in_time == IN_TIME {
-            *unit = Unit { longest: took, ..Unit::default() };
+            let former_timeout = unit.timeout;
+            *unit = Unit { longest: took, former_timeout, ..Unit::default() };
         }
     }
 }

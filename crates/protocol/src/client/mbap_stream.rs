@@ -117,6 +117,10 @@ impl Stream {
                     flights.strays.bytes += rest.len() as u64;
                     Some(InvalidResponse::Length(length))
                 }
+                Next::Frame { len, .. } if is_cut_off(flights, rest, len) => {
+                    flights.strays.bytes += rest.len() as u64;
+                    Some(InvalidResponse::Unrequested)
+                }
                 Next::Frame { transaction_id, unit_id, pdu, len } => {
                     let received = rest.len();
                     rest = &rest[len..];
@@ -213,6 +217,22 @@ impl Stream {
             None => !self.partial.is_empty() && flights.len() == 0,
         }
     }
+}
+
+/// Whether another reply begins in the frame at the start of `bytes`, which was cut off: there is no check sum
+/// that would show it. What follows the frame is then no frame.
+fn is_cut_off(flights: &Flights, bytes: &[u8], len: usize) -> bool {
+    let behind = match mbap::next(bytes.get(len..).unwrap_or_default()) {
+        Next::Foreign { .. } | Next::Broken { .. } => true,
+        Next::Incomplete | Next::Frame { .. } => false,
+    };
+    behind
+        && (mbap::HEADER_LEN + 1..len).any(|at| match bytes.get(at..) {
+            Some([high, low, 0, 0, ..]) => {
+                flights.position(u16::from_be_bytes([*high, *low])).is_some()
+            }
+            _ => false,
+        })
 }
 
 fn frame_len(flight: &Flight) -> usize {

@@ -12,7 +12,7 @@ use super::flights::{Call, Done, Flight, Flights, Ticket};
 use super::tolerance::{Attempt, Echo};
 use super::{Closed, Failure, GUARD, InvalidResponse, TURNAROUND, Time};
 use crate::frame::{FrameError, ascii, rtu};
-use crate::pdu::{self, EncodedRequest, Response, ResponseError};
+use crate::pdu::{self, EncodedRequest, ExceptionCode, Response, ResponseError};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Framing {
@@ -23,6 +23,9 @@ pub(super) enum Framing {
 /// Reads in a row whose echo came before their reply, after which an echo is expected of writes too.
 const ECHOES: u8 = 3;
 
+/// The exception of a gateway that has no reply yet: that of the device may follow.
+const NO_REPLY: u8 = ExceptionCode::GatewayTargetFailedToRespond as u8;
+
 /// Bytes behind a reply that are no sign of another one: lines have some when a driver is switched off.
 const NOISE: usize = 2;
 
@@ -32,8 +35,6 @@ pub(super) struct OneAtATime {
     /// The silence between frames on a serial line; `None` for a stream.
     silence: Option<Duration>,
     echo: Echo,
-    /// Reads in a row whose echo came before their reply.
-    echoes: u8,
     pub(super) earlier: Earlier,
     /// The time of a character on a serial line; 0 elsewhere.
     pub(super) character: Duration,
@@ -94,7 +95,6 @@ impl OneAtATime {
             framing,
             silence,
             echo,
-            echoes: 0,
             earlier: Earlier::default(),
             character: Duration::ZERO,
             timeout: Duration::ZERO,
@@ -352,7 +352,7 @@ impl OneAtATime {
         let behind = core::mem::replace(&mut self.behind, Behind::NoFrame);
         let is_like_echo = self.is_like_echo(flights, &pdu);
         if is_like_echo && behind == Behind::Same {
-            self.echoes = self.echoes.saturating_add(1);
+            self.earlier.echoes = self.earlier.echoes.saturating_add(1);
             return self.replied(flights, unit_id, &pdu, now, sink);
         }
         if behind != Behind::NoFrame && !flights.tolerance.pad {
@@ -371,10 +371,15 @@ impl OneAtATime {
             if let (State::Sent { .. }, Some(flight)) = (self.state, flights.first()) {
                 self.learn_echo(is_no_reply(flight));
             }
-            let usual = if is_like_echo { self.earlier.longest(unit_id) * 4 } else { GUARD };
+            let until = flights.first().map_or(now, |flight| match is_like_echo {
+                // An echo is no reply, however long that takes.
+                true => flight.deadline,
+                // The unit may take as long as usual.
+                false => flight.sent + self.earlier.longest(flight.unit_id) * 2,
+            });
             (self.doubted, self.is_maybe_echo) = (Some((unit_id, pdu)), is_like_echo);
             self.received.clear();
-            self.state = State::Doubting { until: now + usual.max(GUARD) };
+            self.state = State::Doubting { until: until.max(now + GUARD) };
             return;
         }
         self.replied(flights, unit_id, &pdu, now, sink);
@@ -396,7 +401,7 @@ impl OneAtATime {
     fn is_like_echo(&self, flights: &Flights, pdu: &[u8]) -> bool {
         let State::Sent { echoed: false } = self.state else { return false };
         let equals = flights.first().is_some_and(|flight| flight.request.pdu() == pdu);
-        equals && self.echo == Echo::Auto && (1..ECHOES).contains(&self.echoes)
+        equals && self.echo == Echo::Auto && (1..ECHOES).contains(&self.earlier.echoes)
     }
 
     /// Handles bytes after a reply that is doubted.
@@ -410,7 +415,7 @@ impl OneAtATime {
         let room = self.max_received() - self.received.len();
         self.received.extend_from_slice(&bytes[..bytes.len().min(room)]);
         if self.is_maybe_echo && self.frame == self.received {
-            self.echoes = self.echoes.saturating_add(1);
+            self.earlier.echoes = self.earlier.echoes.saturating_add(1);
             return self.believe_doubted(flights, now, sink);
         }
         if self.is_maybe_echo && self.frame.starts_with(&self.received) {
@@ -420,6 +425,13 @@ impl OneAtATime {
         if self.received.len() > NOISE {
             self.contradicted(flights, now, sink);
         }
+    }
+
+    /// Nothing followed what may have been an echo, so it is no reply. If it was one, the next is believed.
+    fn was_echo(&mut self) {
+        self.earlier.echoes = self.earlier.echoes.saturating_sub(1);
+        self.doubted = None;
+        self.state = State::Sent { echoed: true };
     }
 
     fn believe_doubted(
@@ -434,8 +446,10 @@ impl OneAtATime {
 
     /// Believes a reply that is doubted: the stream has ended, so no other follows.
     pub(super) fn stream_ended(&mut self, flights: &mut Flights, sink: &mut impl FnMut(Done<'_>)) {
-        if let State::Doubting { until } = self.state {
-            self.believe_doubted(flights, until, sink);
+        match self.state {
+            State::Doubting { .. } if self.is_maybe_echo => self.was_echo(),
+            State::Doubting { until } => self.believe_doubted(flights, until, sink),
+            _ => {}
         }
     }
 
@@ -466,6 +480,13 @@ impl OneAtATime {
             self.earlier.believed(request, pdu, doubted, now);
             let took = now.saturating_sub(flight.sent);
             self.earlier.answered(flight.unit_id, took, self.timeout);
+            let (request, times) = ((flight.unit_id, &flight.request), (flight.sent, self.timeout));
+            if self.repeats {
+                self.earlier.repeated(request, times, now);
+            }
+            if pdu.first().is_some_and(|code| code & 0x80 != 0) && pdu.get(1) == Some(&NO_REPLY) {
+                self.earlier.ended(request, times, Ended::Unanswered, now);
+            }
             self.learn_echo(is_no_reply(flight));
         }
         let unanswered = flights.first().map(|flight| (flight.unit_id, flight.request.clone()));
@@ -474,7 +495,7 @@ impl OneAtATime {
         let Some(invalid) = flights.answer(0, pdu, now, sink) else { return };
         if let Some((unit_id, request)) = unanswered {
             let times = (sent, self.timeout);
-            self.earlier.ended((unit_id, &request), times, Ended::Otherwise, now);
+            self.earlier.ended((unit_id, &request), times, Ended::Unanswered, now);
         }
         if self.silence.is_none() {
             flights.close(Closed::Invalid(invalid), sink);
@@ -488,7 +509,11 @@ impl OneAtATime {
         now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
-        self.note_ended(flights, Ended::Otherwise, now);
+        let how = match invalid {
+            InvalidResponse::UnitId { .. } => Ended::Unanswered,
+            _ => Ended::Damaged,
+        };
+        self.note_ended(flights, how, now);
         self.rest(now);
         flights.finish(Err(Failure::Invalid(invalid)), sink);
         if self.silence.is_none() {
@@ -500,7 +525,11 @@ impl OneAtATime {
     pub(super) fn take_earlier(&mut self, flights: &Flights, now: Time) -> Earlier {
         if let (State::Sent { .. }, Some(cut_off)) = (self.state, &flights.cut_off) {
             let (unit_id, request, sent, timeout) = cut_off;
-            self.earlier.ended((*unit_id, request), (*sent, *timeout), Ended::Otherwise, now);
+            let how = match flights.closed {
+                Some(Closed::BySelf) => Ended::TimedOut,
+                _ => Ended::Unanswered,
+            };
+            self.earlier.ended((*unit_id, request), (*sent, *timeout), how, now);
         }
         core::mem::take(&mut self.earlier)
     }
@@ -510,8 +539,10 @@ impl OneAtATime {
         if let (State::Sent { echoed }, Some(flight)) = (self.state, flights.first()) {
             let times = (flight.sent, self.timeout);
             self.earlier.ended((flight.unit_id, &flight.request), times, how, now);
-            if how == Ended::TimedOut && !echoed && !is_no_reply(flight) {
-                self.echoes = 0;
+            // A reply came without the echo that was expected.
+            let is_mute = self.received.is_empty();
+            if how == Ended::TimedOut && !echoed && !is_mute && !is_no_reply(flight) {
+                self.earlier.echoes = 0;
             }
         }
     }
@@ -519,7 +550,7 @@ impl OneAtATime {
     /// An echo before the reply to a read shows that the adapter echoes, and no echo that it does not.
     fn learn_echo(&mut self, is_unmistakable: bool) {
         if let (State::Sent { echoed }, true) = (self.state, is_unmistakable) {
-            self.echoes = if echoed { self.echoes.saturating_add(1) } else { 0 };
+            self.earlier.echoes = if echoed { self.earlier.echoes.saturating_add(1) } else { 0 };
         }
     }
 
@@ -528,7 +559,7 @@ impl OneAtATime {
         match self.echo {
             Echo::Always => true,
             Echo::Never => false,
-            Echo::Auto => self.echoes >= ECHOES && !is_no_reply(flight),
+            Echo::Auto => self.earlier.echoes >= ECHOES && !is_no_reply(flight),
         }
     }
 
@@ -558,10 +589,13 @@ impl OneAtATime {
             return;
         }
         if let State::Doubting { until } = self.state {
-            if until <= now {
-                self.believe_doubted(flights, now, sink);
+            if until > now {
+                return;
             }
-            return;
+            if !self.is_maybe_echo {
+                return self.believe_doubted(flights, now, sink);
+            }
+            self.was_echo();
         }
         // First of all: where a thread wakes up late, its request is sent late, and not given up unsent.
         self.transmit(flights, now);
