@@ -23,6 +23,9 @@ use super::{ClientError, Endpoint, Lost, Place, StrayCounters};
 /// Bytes per read of a socket. No Modbus datagram is longer.
 const CHUNK: usize = 512;
 
+/// Reads before the time goes on: a flood does not end.
+const MAX_WAITING: usize = 64;
+
 /// A TCP connection that was unused for this time is checked before it is used again.
 const IDLE: Duration = Duration::from_millis(50);
 
@@ -388,6 +391,19 @@ impl Open {
         counters.take(&mut self.connection, &mut self.late);
     }
 
+    /// Takes what has come while the process had no processor: it is no reply to what is sent from now on.
+    fn receive_waiting(
+        &mut self,
+        chunk: &mut [u8],
+        sink: &mut impl FnMut(Done<'_>),
+    ) -> Result<(), StreamError> {
+        for _ in 0..MAX_WAITING {
+            let Some(len) = self.stream.receive_now(chunk)? else { break };
+            self.connection.receive(&chunk[..len], self.epoch.elapsed(), &mut *sink);
+        }
+        Ok(())
+    }
+
     /// Carries out a request. Returns the I/O error, if there was one.
     fn call(
         &mut self,
@@ -464,6 +480,7 @@ impl Open {
                 // The end of a slice.
                 Err(StreamError::TimedOut) if Instant::now() < until => {}
                 Err(StreamError::TimedOut) => {
+                    self.receive_waiting(&mut chunk, sink)?;
                     self.connection.advance(self.epoch.elapsed(), &mut *sink);
                 }
                 Err(error) => return Err(error),
@@ -475,13 +492,70 @@ impl Open {
 #[cfg(test)]
 mod tests {
     use std::cell::Cell;
+    use std::collections::VecDeque;
     use std::io::Read;
     use std::net::TcpListener;
 
     use holdfast_protocol::client::Tolerance;
-    use holdfast_protocol::pdu::Request;
+    use holdfast_protocol::frame::rtu;
+    use holdfast_protocol::pdu::{Range, Request};
 
     use super::*;
+
+    /// A stream whose second copy of a reply waits unread when the guard time is over, because the process had no
+    /// processor.
+    struct Stalled {
+        waiting: VecDeque<Vec<u8>>,
+        copy: Option<Vec<u8>>,
+    }
+
+    impl ByteStream for Stalled {
+        fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> Result<usize, StreamError> {
+            if self.waiting.is_empty()
+                && let Some(copy) = self.copy.take()
+            {
+                thread::sleep(deadline.saturating_duration_since(Instant::now()));
+                self.waiting.push_back(copy);
+                return Err(StreamError::TimedOut);
+            }
+            self.receive_now(buffer)?.ok_or(StreamError::TimedOut)
+        }
+
+        fn receive_now(&mut self, buffer: &mut [u8]) -> Result<Option<usize>, StreamError> {
+            let Some(bytes) = self.waiting.pop_front() else { return Ok(None) };
+            buffer[..bytes.len()].copy_from_slice(&bytes);
+            Ok(Some(bytes.len()))
+        }
+
+        fn send(&mut self, bytes: &[u8], _deadline: Instant) -> Result<(), StreamError> {
+            let mut reply = [0; rtu::MAX_LEN];
+            let len = rtu::encode(bytes[0], &[3, 2, bytes[2], bytes[3]], &mut reply);
+            let len = len.expect("a short reply fits");
+            self.waiting.push_back(reply[..len].to_vec());
+            self.copy = Some(reply[..len].to_vec());
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn what_came_while_the_process_was_held_up_answers_no_later_request() {
+        let place = Place::RtuOverTcp { host: String::new(), port: 0 };
+        let client = BlockingClient::new(Endpoint { place, tolerance: Tolerance::default() });
+        client.state.lock().unwrap().open = Some(Open {
+            stream: Box::new(Stalled { waiting: VecDeque::new(), copy: None }),
+            connection: Connection::new(Transport::RtuOverTcp),
+            transport: Transport::RtuOverTcp,
+            epoch: client.epoch,
+            used: Instant::now(),
+            late: 0,
+        });
+        for address in 1..4 {
+            let range = Range::new(address, 1).unwrap();
+            let request = EncodedRequest::new(&Request::ReadHoldingRegisters(range));
+            let pdu = client.call(1, &request, Duration::from_secs(60), |_, pdu| pdu.to_vec());
+            assert_eq!(pdu.unwrap(), [3, 2, 0, address as u8]);
+        }
+    }
 
     #[test]
     fn what_may_no_longer_begin_after_the_connect_is_not_sent() {
