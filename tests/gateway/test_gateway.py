@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
+from holdfast.gateway import pool
+from holdfast.gateway.pool import Pool
 from support import gateways, transports, web, wire
-from support.fake_device import HANG_UP, FakeDevice, exception, registers
+from support.fake_device import HANG_UP, FakeDevice, Stream, exception, registers
 from support.gateways import PLC, Dialed, Names, Running
 from support.machine import tool
 
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from support.fake_device import Asked, Connection
     from support.running import Serve
 
 
@@ -497,6 +500,56 @@ def test_a_connection_that_nobody_uses_is_closed(serve: Serve, memory: holdfast.
             return bool(client.get("/api/gateway").json["connections"] == 0)
 
         wire.until(is_closed, "it is closed")
+
+
+class Roaming:
+    """Behaves as a gateway that sends its first reply only on the next connection."""
+
+    def __init__(self) -> None:
+        self.kept = b""
+
+    def keep(self, asked: Asked) -> None:
+        self.kept = asked.frame()
+
+    def greet(self, connection: Connection, _number: int) -> None:
+        connection.send(self.kept)
+
+
+@pytest.mark.parametrize("factor", [1, 2], ids=["same timeout", "other timeout"])
+def test_a_reply_to_an_earlier_request_is_not_taken_for_the_next_one(
+    factor: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checks: list[Pool] = []
+    check = Pool._close_unused
+
+    async def checked(pool: Pool) -> None:
+        await check(pool)
+        checks.append(pool)
+
+    monkeypatch.setattr(Pool, "_close_unused", checked)
+    monkeypatch.setattr(pool, "CHECK_INTERVAL", 0.001)
+
+    def is_answered(timeout: float) -> bool:
+        roaming = Roaming()
+        with (
+            gateways.running() as running,
+            Stream("rtu+tcp", roaming.keep, greet=roaming.greet) as device,
+        ):
+            client = running.client()
+            where = {"host": "127.0.0.1", "port": device.port, "transport": "rtu+tcp"}
+            given = {"functionCode": 3, "timeout": round(1000 * timeout)}
+            first = ask(client, "/read", **where, address=5, **given)
+            assert first.headers["holdfast-reason"] == "timeout"
+            enough = len(checks) + 2
+            wire.until(lambda: len(checks) >= enough, "idle connections were looked for")
+            given["timeout"] *= factor
+            second = ask(client, "/read", **where, address=6, **given)
+        if second.headers.get("holdfast-reason") == "timeout":
+            return False
+        assert second.json["values"] == [6]
+        return True
+
+    wire.until_long_enough(is_answered, "the second request has a reply")
 
 
 def test_the_next_address_of_a_name_is_tried(device: tuple[str, int]) -> None:

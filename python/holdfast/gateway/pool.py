@@ -3,7 +3,9 @@
 In an appliance, devices that it uses itself are asked over its own connections (`sharing`).
 
 A connection is opened when it is needed. It is closed when it is idle for some time, and when the
-last request on it had no response, because the state of the connection is then unknown.
+last request on it had no response, because the state of the connection is then unknown. Where
+replies have no transaction ids, its client stays: it knows which ones may come on the next
+connection.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import asyncio
 import contextlib
 import time
 from dataclasses import dataclass, field, replace
+from math import inf
 from typing import TYPE_CHECKING, TypeVar
 
 from holdfast.client import Client
@@ -43,6 +46,9 @@ Result = TypeVar("Result")
 
 CHECK_INTERVAL = 0.5
 """Seconds between checks for idle connections."""
+
+MAX_LATENESS = 10.0
+"""Seconds after its timeout in which a late reply may come."""
 
 
 class Full(Exception):
@@ -76,6 +82,8 @@ class _Entry:
     used: float = field(default_factory=time.monotonic)
     doubtful: bool = False
     """Whether the last request had no response."""
+    needed: float = -inf
+    """Until then, late replies may come that only this client knows."""
 
 
 class Pool:
@@ -160,6 +168,8 @@ class Pool:
         finally:
             entry.users -= 1
             entry.used = time.monotonic()
+            if entry.doubtful:
+                entry.needed = entry.used + entry.timeout + MAX_LATENESS
 
     async def _call(self, entry: _Entry, call: Callable[[Client], Awaitable[Result]]) -> Result:
         """Runs a call, and updates the state of the connection."""
@@ -171,6 +181,13 @@ class Pool:
             raise
         entry.doubtful = False
         return result
+
+    async def _close_doubtful(self, entry: _Entry) -> None:
+        """Closes the connection of a client that stays."""
+        async with entry.turns:
+            if entry.doubtful:
+                entry.doubtful = False
+                await entry.client.close()
 
     async def _entry(self, key: NetworkTarget, timeout: float) -> _Entry:
         if key not in self._entries:
@@ -212,18 +229,18 @@ class Pool:
             raise
 
     async def _refresh(self, key: NetworkTarget, entry: _Entry, timeout: float) -> None:
-        """Replaces a client that is in doubt or has another timeout; reads TLS files again."""
-        other = key.transport not in IN_FLIGHT and timeout != entry.timeout
-        if entry.active > 1 or not (entry.doubtful or other):
+        """Closes a connection that is in doubt, and sets the timeout; reads TLS files again."""
+        if key.transport not in IN_FLIGHT:
+            entry.client.timeout = entry.timeout = timeout
+        if entry.active > 1 or not entry.doubtful:
             return
-        made = entry.client, entry.timeout
-        if other or key.transport == "tls":
-            made = await self._client(key, timeout)
+        made = entry.client
+        if key.transport == "tls":
+            made, _ = await self._client(key, timeout)
         if entry.active > 1:  # Another request uses it meanwhile.
             return
-        old = entry.client
+        old, entry.client = entry.client, made
         entry.doubtful = False
-        entry.client, entry.timeout = made
         await old.close()
 
     def _pushed_out(self) -> _Entry:
@@ -251,7 +268,12 @@ class Pool:
         if self._shared is not None:
             self._shared.forget_unused(latest)
         for key, entry in list(self._entries.items()):
-            if entry.users == 0 and (entry.doubtful or entry.used < latest or self._is_shared(key)):
+            if entry.users > 0:
+                continue
+            is_needed = key.transport not in IN_FLIGHT and time.monotonic() < entry.needed
+            if is_needed and not self._is_shared(key):
+                await self._close_doubtful(entry)
+            elif entry.doubtful or entry.used < latest or self._is_shared(key):
                 del self._entries[key]
                 await entry.client.close()
 
