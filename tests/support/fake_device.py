@@ -429,7 +429,7 @@ class Udp(ScriptedDevice):
 
 
 FAST = {"parity": "none", "baud": 4_000_000}
-"""A pseudo-terminal carries bytes at once: clients doubt replies that are faster than their line."""
+"""A pseudo-terminal carries bytes at once: clients doubt replies faster than their line."""
 
 
 class Serial(ScriptedDevice):
