@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import re
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -202,12 +204,83 @@ def test_a_tag_that_keeps_what_is_written_only_has_a_first_value() -> None:
     assert device.memory.read("holding_registers", 0, 1) == [5]
 
 
-def test_a_value_that_the_registers_can_not_hold_becomes_the_nearest() -> None:
-    tag = Tag("t", "holding_registers", 0, "int16", scale=0.1, null=frozenset([32767, 32766]))
-    chosen = {"t": generators.parsed(tag, "ramp:0:100000:2")}
-    device = SimulatedDevice(TagList([tag]), chosen=chosen)
-    device.step()
-    assert device.memory.read("holding_registers", 0, 1) == [32765]
+def simulated(tags: list[Tag], **texts: str) -> SimulatedDevice:
+    known = TagList(tags)
+    chosen = {name: generators.parsed(known[name], text) for name, text in texts.items()}
+    return SimulatedDevice(known, chosen=chosen)
+
+
+TENTHS = {"scale": 0.1, "unit": "V"}
+U = "t holds 0 to 6553.5 V (uint16, scale 0.1), found"
+
+
+@pytest.mark.parametrize(
+    ("type", "more", "text", "message"),
+    [
+        ("uint16", TENTHS, "constant:9999999", f"{U} 9999999 V; the nearest is 6553.5 V"),
+        ("uint16", TENTHS, "ramp:0:6553.6:9", f"{U} 6553.6 V; the nearest is 6553.5 V"),
+        ("uint16", TENTHS, "sine:-0.1:9:9", f"{U} -0.1 V; the nearest is 0 V"),
+        ("uint16", TENTHS, "walk:1:7000:9", f"{U} 7000 V; the nearest is 6553.5 V"),
+        ("uint16", TENTHS, "counter:7000", f"{U} 7000 V; the nearest is 6553.5 V"),
+        ("uint16", TENTHS, "counter:-0.01", f"{U} -0.1 V; the nearest is 0 V"),
+        ("uint16", {"offset": 5}, "counter:9", "t holds 5 to 65540 (uint16, offset 5), found 0; "),
+        ("int16", {"scale": -1}, "constant:-32768", "t holds -32767 to 32768 (int16, scale -1), "),
+        ("bcd16", {}, "ramp:0:10000:9", "t holds 0 to 9999 (bcd16), found 10000; the nearest is"),
+        ("float16", {}, "sine:0:70000:9", "t holds -65504 to 65504 (float16), found 70000; the"),
+        ("float32", {}, "constant:1e39", "t holds -3.4028235e+38 to 3.4028235e+38 (float32), "),
+        ("uint16", {"null": frozenset([65535])}, "constant:70000", "t holds 0 to 65534 (uint16)"),
+        ("uint16", {"null": frozenset([7])}, "constant:7", "t: found 7, which stands for no value"),
+        ("uint16", {"states": {70000: "on"}}, "constant:on", "t holds 0 to 65535 (uint16), found"),
+        ("int16[2]", {}, "constant:[1, 40000]", "t holds -32768 to 32767 (int16[2]), found 40000"),
+        ("int16[2]", {}, "constant:[1]", "t: int16[2] takes 2 values, found 1"),
+        ("bool[2]", {}, "constant:[true, 5]", "t: 5 is not False, True, 0 or 1, which bool"),
+        ("string:4", {}, "constant:longer", "t: 'longer' has 6 bytes in ascii, allowed in string"),
+    ],
+)
+def test_values_that_the_registers_can_not_hold_are_refused(
+    type: str, more: dict[str, Any], text: str, message: str
+) -> None:
+    tag = Tag("t", "holding_registers", 0, type, **more)
+    generator = generators.parsed(tag, text)
+    with pytest.raises(Refused, match=re.escape(message)):
+        SimulatedDevice(TagList([tag]), chosen={"t": generator})
+    with pytest.raises(Refused):
+        SimulatedDevice(TagList([tag]), played={"t": generator.items or [0, 70000, 1e39]})
+    if generator.items:
+        tag = replace(tag, writable=True)
+        with pytest.raises(Refused, match=re.escape(message)):
+            SimulatedDevice(TagList([tag]), chosen={"t": generator})
+
+
+def test_values_at_the_ends_of_the_registers_fit() -> None:
+    tag = Tag("t", "holding_registers", 0, "int16", scale=0.1, null=frozenset([-32768, 32767]))
+    device = simulated([tag], t="ramp:-3276.74:3276.64:2")
+    assert device.memory.read("holding_registers", 0, 1) == [0x10000 - 32767]
+    assert simulated([tag], t="constant:3276.6").memory.read("holding_registers", 0, 1) == [32766]
+
+
+def test_a_counter_begins_again_at_the_end_of_its_registers_and_says_so() -> None:
+    tag = Tag("t", "holding_registers", 0, "uint16", scale=0.1)
+    told: list[str] = []
+    chosen = {"t": generators.parsed(tag, "counter:2000")}
+    device = SimulatedDevice(TagList([tag]), chosen=chosen, warn=told.append)
+    found = []
+    for _ in range(9):
+        found += device.memory.read("holding_registers", 0, 1)
+        device.step()
+    assert found == [at * 20000 % 65536 for at in range(9)]
+    assert told == ["t has counted to the end of uint16, and begins again at 0"]
+
+
+def test_usual_values_fit_into_every_type() -> None:
+    for tag in [
+        Tag("t", "input_registers", 0, "bcd16", unit="kWh", offset=-3),
+        Tag("t", "input_registers", 0, "uint16", scale=1e-4, unit="V"),
+        Tag("t", "input_registers", 0, "uint16", min=-5, max=70000),
+        Tag("t", "input_registers", 0, "uint16", states={70000: "never", 2: "on"}),
+        Tag("t", "input_registers", 0, "uint16", states={70000: "never"}),
+    ]:
+        SimulatedDevice(TagList([tag]))
 
 
 def test_values_are_played_back_and_begin_again(tmp_path: Path) -> None:
@@ -239,6 +312,7 @@ def test_values_are_played_back_and_begin_again(tmp_path: Path) -> None:
         ("t\n1\nmuch\n", ":3: t: 'much' is not a number"),
         ("time,t\n1\n", ":2: found 1 cells, allowed: 2"),
         ('t\n"1,5"\n', ":2: t: '1,5' has a decimal comma"),
+        ("t\n1\n70000\n", r":3: t holds 0 to 65535 \(uint16\), found 70000; the nearest is 65535"),
     ],
 )
 def test_a_file_that_can_not_be_played_back_is_refused(
@@ -293,7 +367,7 @@ def test_values_are_simulated_with_the_scale_of_their_register(serve_simulated: 
 def test_a_simulated_scale_can_move(serve_simulated: Any) -> None:
     tags = scaled_tags()
     chosen = {
-        "power": generators.parsed(tags["power"], "constant:4300"),
+        "power": generators.parsed(tags["power"], "constant:3200"),
         "sf": generators.parsed(tags["sf"], "ramp:-1:2:3"),
     }
     device = SimulatedDevice(tags, chosen=chosen)
@@ -303,7 +377,57 @@ def test_a_simulated_scale_can_move(serve_simulated: Any) -> None:
         device.step()
         found = values_of(client, tags)
         moved.add((found["sf"], found["power"]))
-    assert moved == {(0, 4300), (1, 4300), (-1, 3276.7)}
+    assert moved == {(0, 3200), (1, 3200), (-1, 3200)}
+
+
+@pytest.mark.parametrize(
+    ("power", "scale", "message"),
+    [
+        ("constant:4300", None, "power holds -3276.8 to 3276.7 W (int16, scale 0.1 in holding_reg"),
+        ("ramp:0:4300:60", "ramp:-1:2:3", "scale 0.1 in holding_registers 4), found 4300 W; the"),
+        ("sine:-400:0:60", "sine:-2:2:3", "power holds -327.68 to 327.67 W (int16, scale 0.01 in"),
+        ("counter:4300", None, "power holds -3276.8 to 3276.7 W (int16, scale 0.1 in holding_reg"),
+    ],
+)
+def test_values_that_do_not_fit_with_a_scale_that_the_register_will_have_are_refused(
+    power: str, scale: str | None, message: str
+) -> None:
+    tags = list(scaled_tags())
+    with pytest.raises(Refused, match=re.escape(message)):
+        simulated(tags, power=power, **({} if scale is None else {"sf": scale}))
+
+
+def test_usual_values_fit_with_all_scales_that_the_register_will_have() -> None:
+    device = simulated(list(scaled_tags()), sf="ramp:-3:3:6")
+    for _ in range(130):
+        [power] = device.memory.read("holding_registers", 0, 1)
+        [scale] = device.memory.read("holding_registers", 4, 1)
+        assert (scale, power) != (0x10000 - 3, 32767)
+        device.step()
+
+
+def test_a_factor_that_passes_by_0_is_refused_for_values_that_do_not_fit_then() -> None:
+    scale = RegisterScale("factor", source=Tag("", "holding_registers", 1, "int16"))
+    tag = Tag("t", "holding_registers", 0, "int16", scale=scale)
+    source = "holding_registers 1"
+    chosen = {"t": generators.constant(100_000), source: generators.Generator("ramp", (-9, 9, 18))}
+    with pytest.raises(Refused, match=r"t holds -32767 to 32768 \(int16, scale -1 in"):
+        SimulatedDevice(TagList([tag]), chosen=chosen)
+
+
+def test_rows_are_played_with_the_scale_of_their_row() -> None:
+    tags = scaled_tags()
+    played = {"power": [300, 300_000], "sf": [-2, 1]}
+    device = SimulatedDevice(tags, played=played)
+    found = []
+    for _ in range(3):
+        found.append(device.memory.read("holding_registers", 0, 5)[::4])
+        device.step()
+    assert found == [[30000, 0x10000 - 2], [30000, 1], [30000, 0x10000 - 2]]
+    with pytest.raises(Refused, match=r"scale 1 in holding_registers 4.*found 300000 W"):
+        SimulatedDevice(tags, played={"power": [300, 300_000], "sf": [1, 0]})
+    with pytest.raises(Refused, match=r"scale 0.01 in holding_registers 4.*found 300000 W"):
+        SimulatedDevice(tags, played={"power": [300_000], "sf": [1, -2]})
 
 
 def test_a_written_scale_is_that_of_the_next_values(serve_simulated: Any) -> None:
@@ -318,6 +442,23 @@ def test_a_written_scale_is_that_of_the_next_values(serve_simulated: Any) -> Non
     client.write_register(4, 0x8000)
     device.step()
     assert device.memory.read("holding_registers", 0, 1) == [30]
+
+
+def test_a_value_that_does_not_fit_with_a_written_scale_is_told(serve_simulated: Any) -> None:
+    tags = scaled_tags(writable=True)
+    told: list[str] = []
+    chosen = {"power": generators.parsed(tags["power"], "constant:300")}
+    device = SimulatedDevice(tags, chosen=chosen, warn=told.append)
+    client = serve_simulated(device)
+    for scale in (0x10000 - 3, 0x10000 - 3, 0, 0x10000 - 2, 0x10000 - 3):
+        client.write_register(4, scale)
+        device.step()
+    message = (
+        "power holds -32.768 to 32.767 W (int16, scale 0.001 in holding_registers 4), "
+        "found 300 W; the nearest is 32.767 W"
+    )
+    assert told == [message] * 2
+    assert device.memory.read("holding_registers", 0, 1) == [32767]
 
 
 def test_a_scale_that_is_none_is_refused() -> None:

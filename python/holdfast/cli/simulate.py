@@ -226,18 +226,30 @@ def _device(
     """Raises `click.UsageError` for what the tags can't do."""
     try:
         played = {} if play is None else playback.load(play, tags)
-        return SimulatedDevice(
-            tags, step=every, seed=seed, chosen=_chosen(tags, chosen), played=played
-        )
     except OSError as error:
         raise click.UsageError(f"{play}: {error.strerror}.") from error
-    except (Refused, playback.Unplayable) as error:
+    except playback.Unplayable as error:
         raise click.UsageError(f"{error}.") from error
+    words = _chosen(tags, chosen)
+    generators = {name: generator for name, (generator, _) in words.items()}
+    try:
+        return SimulatedDevice(
+            tags, step=every, seed=seed, chosen=generators, played=played, warn=_warn
+        )
+    except Refused as error:
+        if error.tag in played:
+            raise click.UsageError(f"{play}: {error}.") from error
+        where = f"--set {words[error.tag][1]}: " if error.tag in words else ""
+        raise click.UsageError(f"{where}{error}.") from error
 
 
-def _chosen(tags: TagList, words: Iterable[str]) -> dict[str, Generator]:
-    """The generators of `--set`; a later one takes precedence."""
-    found: dict[str, Generator] = {}
+def _warn(message: str) -> None:
+    click.echo(f"holdfast: {message}.", err=True)
+
+
+def _chosen(tags: TagList, words: Iterable[str]) -> dict[str, tuple[Generator, str]]:
+    """The generators of `--set`, and their words; a later one takes precedence."""
+    found: dict[str, tuple[Generator, str]] = {}
     for word in words:
         pattern, sign, text = word.partition("=")
         if not sign:
@@ -247,7 +259,7 @@ def _chosen(tags: TagList, words: Iterable[str]) -> dict[str, Generator]:
             raise click.UsageError(f"--set: no tag has the name {pattern!r}.")
         for tag in named:
             try:
-                found[tag.name] = generators.parsed(tag, text)
+                found[tag.name] = generators.parsed(tag, text), word
             except ValueError as error:
                 raise click.UsageError(f"--set: {tag.name}: {error}.") from error
     return found

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 from holdfast import values
 from holdfast._core import Memory, Rule
 from holdfast.simulation import generators
-from holdfast.simulation.raw import nearest
+from holdfast.simulation.raw import Capacity, nearest
+from holdfast.simulation.scales import Scales
 from holdfast.tags.register_scale import RegisterScale
 from holdfast.types import AREAS
+from holdfast.values import DoesNotFit
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from holdfast.simulation.generators import Generator, Series
     from holdfast.tags import Tag, TagList
@@ -24,7 +26,11 @@ if TYPE_CHECKING:
 
 
 class Refused(ValueError):
-    """A generator that a tag can't have."""
+    """Values that a tag can't have."""
+
+    def __init__(self, tag: str, message: str) -> None:
+        super().__init__(message)
+        self.tag = tag
 
 
 class SimulatedDevice:
@@ -34,7 +40,10 @@ class SimulatedDevice:
     first value. `chosen` are generators by name, `played` are whole series of values, which take
     precedence; other tags have a usual generator. Registers of scales exist even if no tag names
     them, and values are written with the scale that they contain. The same
-    seed gives the same values. Raises `Refused`.
+    seed gives the same values. Raises `Refused`, also for values that the registers can't hold.
+
+    A client that writes a scale can make values too large for their registers, which then hold the
+    nearest: `warn` is called with a message when this begins, and when a counter begins again at 0.
     """
 
     def __init__(
@@ -45,6 +54,7 @@ class SimulatedDevice:
         seed: str = "",
         chosen: Mapping[str, Generator] | None = None,
         played: Mapping[str, Sequence[Any]] | None = None,
+        warn: Callable[[str], None] | None = None,
     ) -> None:
         chosen, played = chosen or {}, played or {}
         everything = [*tags, *_unnamed(tags)]
@@ -61,20 +71,28 @@ class SimulatedDevice:
         self._registers: dict[Area, dict[int, int]] = {area: {} for area in AREAS}
         self._written = _spans((tag.area, range(tag.address, tag.end)) for tag in writable)
         self._readable = _spans((tag.area, tag.span) for tag in everything)
+        self._warn = warn or (lambda _: None)
+        self._counted: dict[str, float] = {}
+        """The last value of each counter."""
+        self._misfits: set[str] = set()
+        """Tags whose value does not fit with the scale that a client has written."""
+        self._scales = Scales(self._content)
         self._series: list[tuple[Tag, list[Series]]] = []
+        sources = {(tag.source.area, tag.source.address) for tag in tags if tag.source is not None}
         scaled = [tag for tag in everything if tag.source is not None]
         for some in ([tag for tag in everything if tag.source is None], scaled):
+            begun = len(self._series)
             for tag in some:
+                of, values = chosen.get(tag.name), played.get(tag.name)
                 if not kept.isdisjoint(_places(tag)):
-                    self._keep(tag, chosen.get(tag.name), played.get(tag.name))
-                else:
-                    generator = chosen.get(tag.name) or self._usual(tag)
-                    self._series.append(
-                        (tag, _all_series(tag, generator, played.get(tag.name), step, seed))
-                    )
+                    self._keep(tag, of, values)
+                    continue
+                generator = self._generator(tag, of, values, step)
+                self._series.append((tag, _all_series(tag, generator, values, step, seed)))
+                if (tag.area, tag.address) in sources:
+                    self._scales.note(tag, generator, values)
             self._write()
-            if some:
-                self.step()
+            self._advance(self._series[begun:])
 
     def rule(self, unit: int, sources: Sequence[str]) -> Rule:
         """The rights of clients: to read what tags have, and to write what is writable."""
@@ -87,44 +105,84 @@ class SimulatedDevice:
 
     def step(self) -> None:
         """Gives all tags that are not writable their next values, in one step."""
+        self._advance(self._series)
+
+    def _advance(self, all_series: Iterable[tuple[Tag, list[Series]]]) -> None:
         self._registers = {area: {} for area in AREAS}
-        for tag, series in self._series:  # Those that contain scales come before those with them.
+        for tag, series in all_series:  # Those that contain scales come before those with them.
             numbers = [next(each) for each in series]
+            self._note_turn(tag, numbers[0])
             self._put(tag, numbers if tag.of_type.count is not None else numbers[0])
         self._write()
 
-    def _usual(self, tag: Tag) -> Generator:
+    def _note_turn(self, tag: Tag, number: Any) -> None:
+        """Warns when a counter begins again, the first time."""
+        before = self._counted.get(tag.name)
+        if before is None:
+            return
+        self._counted[tag.name] = number
+        if abs(number) < abs(before):
+            del self._counted[tag.name]
+            self._warn(f"{tag.name} has counted to the end of {tag.type}, and begins again at 0")
+
+    def _generator(
+        self, tag: Tag, of: Generator | None, played: Sequence[Any] | None, step: float
+    ) -> Generator:
+        """What the values of a tag do. Raises `Refused` if they, or those played, do not fit."""
+        within = self._scales.within(tag) if tag.is_number else (0.0, 0.0)
         try:
-            return generators.usual(self._with_scale(tag))
+            found = of or generators.usual(self._with_scale(tag), *within)
+            if played is not None:
+                self._scales.check_played(tag, played)
+            elif found.kind == "counter":
+                least_step = self._scales.least_step(tag)
+                self._scales.check(tag, [0, found.first_count(step, least_step)])
+                found = found.turning(*within, least_step)
+                self._counted[tag.name] = 0
+            else:
+                self._scales.check(tag, found.ends)
+        except DoesNotFit as error:
+            raise Refused(tag.name, str(error)) from None
         except ValueError as error:
-            raise Refused(f"{tag.name}: {error}") from None
+            raise Refused(tag.name, f"{tag.name}: {error}") from None
+        return found
 
     def _with_scale(self, tag: Tag) -> Tag:
         """The tag with the scale that its register contains. Raises `ValueError` without one."""
-        source = tag.source
-        if source is None:
-            return tag
+        return tag if tag.source is None else tag.with_scale(self._content(tag.source))
+
+    def _content(self, source: Tag) -> Any:
+        """What a register contains that has the scale of other tags."""
         changed = self._registers[source.area]
         now = self.memory.read(source.area, source.address, source.count)
         registers = [changed.get(at, old) for at, old in enumerate(now, source.address)]
-        return tag.with_scale(values.decode(registers, source.type, source.order))
+        return values.decode(registers, source.type, source.order)
 
     def _keep(self, tag: Tag, generator: Generator | None, played: Sequence[Any] | None) -> None:
         """Gives a tag its first value."""
         if generator is not None and generator.kind != "constant":
             raise Refused(
-                f"{tag.name} keeps what is written to its registers, allowed: constant:VALUE"
+                tag.name,
+                f"{tag.name} keeps what is written to its registers, allowed: constant:VALUE",
             )
         value = (generator or generators.still(tag)).items[0] if played is None else played[0]
+        if generator is not None or played is not None:
+            try:
+                self._scales.check(tag, [value])
+            except DoesNotFit as error:
+                raise Refused(tag.name, str(error)) from None
         whole = tag.of_type.count is None or isinstance(value, list)
         self._put(tag, value if whole else [value] * (tag.of_type.count or 1))
 
     def _put(self, tag: Tag, value: Any) -> None:
         """Puts a value into registers that `_write` writes; without a scale, they do not change."""
         try:
-            tag = self._with_scale(tag)
+            scaled = self._with_scale(tag)
         except ValueError:
             return
+        if isinstance(tag.scale, RegisterScale):
+            self._note_misfit(Capacity(scaled, tag.scale.where), tag.name, value)
+        tag = scaled
         registers = self._registers[tag.area]
         raw: Any = (
             [nearest(tag, each) for each in value]
@@ -143,6 +201,17 @@ class SimulatedDevice:
         else:
             made = values.encode(raw, tag.type, tag.order, encoding=tag.encoding)
             registers.update(enumerate(made, tag.address))
+
+    def _note_misfit(self, capacity: Capacity, name: str, value: Any) -> None:
+        """Warns when a value begins not to fit, because a client has written its scale."""
+        try:
+            capacity.check(value)
+        except DoesNotFit as error:
+            if name not in self._misfits:
+                self._misfits.add(name)
+                self._warn(str(error))
+        else:
+            self._misfits.discard(name)
 
     def _write(self) -> None:
         writes = [

@@ -11,8 +11,9 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast.simulation.raw import extremes
+from holdfast.simulation.raw import Capacity, extremes
 from holdfast.tags.text import value_from
+from holdfast.values import DoesNotFit
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -43,11 +44,31 @@ class Generator:
     kind: str
     numbers: tuple[float, ...] = ()
     items: tuple[Any, ...] = ()
-    """The value of `constant`, and the values of `cycle`."""
+    """The value of `constant`, and the values of `cycle`; otherwise nothing."""
 
     def series(self, step: float, random: Random) -> Series:
         """The values at intervals of `step` seconds."""
         return _SERIES[self.kind](self, step, random)
+
+    @property
+    def ends(self) -> tuple[Any, ...]:
+        """Values between which, or among which, all of the series are. A counter: see `turning`."""
+        if self.items:
+            return self.items
+        if self.kind == "counter":
+            rate, most, _ = self.numbers
+            return 0, math.copysign(most, rate)
+        return self.numbers[:2]
+
+    def first_count(self, step: float, least_step: float) -> float:
+        """What a counter has to be able to count to, so that it counts at all."""
+        [rate] = self.numbers
+        return math.copysign(max(abs(rate * step), least_step), rate) if rate else 0
+
+    def turning(self, low: float, high: float, least_step: float) -> Generator:
+        """A counter that begins again at 0 after `low` or `high`, as that of a meter does."""
+        [rate] = self.numbers
+        return Generator("counter", (rate, max(0, high if rate >= 0 else -low), least_step))
 
 
 def constant(value: Any) -> Generator:
@@ -87,9 +108,25 @@ def _numbers(kind: str, text: str) -> tuple[float, ...]:
 def _items(tag: Tag) -> tuple[Any, ...]:
     if tag.of_type.count is None and tag.of_type.base in ("bool", "bit"):
         return False, True
-    if tag.states and tag.of_type.count is None:
-        return tuple(tag.states)
+    if tag.of_type.count is None and (states := _states(tag)):
+        return states
     raise ValueError("cycle requires states, or a tag with one bit")
+
+
+def _states(tag: Tag) -> tuple[int, ...]:
+    """The states that the registers can hold."""
+    if tag.source is not None:
+        return tuple(tag.states)
+    capacity = Capacity(tag)
+    return tuple(value for value in tag.states if _fits(capacity, value))
+
+
+def _fits(capacity: Capacity, value: Any) -> bool:
+    try:
+        capacity.check(value)
+    except DoesNotFit:
+        return False
+    return True
 
 
 def _constant(of: Generator, _step: float, _random: Random) -> Series:
@@ -119,8 +156,11 @@ def _walk(of: Generator, step: float, random: Random) -> Series:
 
 
 def _counter(of: Generator, step: float, _random: Random) -> Series:
-    [rate] = of.numbers
-    return (at * step * rate for at in itertools.count())
+    rate, *ends = of.numbers
+    most, least_step = ends or (math.inf, 0)
+    for at in itertools.count():
+        turned = abs(at * step * rate) % (most + least_step)
+        yield math.copysign(min(turned, most), rate)
 
 
 def _cycle(of: Generator, step: float, random: Random) -> Series:
@@ -164,25 +204,30 @@ CYCLE = 10.0
 """Seconds for which a tag stays in a state."""
 
 
-def usual(tag: Tag) -> Generator:
-    """What the values of a tag do unless something else is chosen."""
+def usual(tag: Tag, low: float, high: float) -> Generator:
+    """What the values of a tag do unless something else is chosen: numbers from `low` to `high`."""
     base = tag.of_type.base
     if base == "string":
-        return constant(tag.name.encode("ascii", "replace").decode()[: tag.of_type.parameter])
+        return _name(tag)
     if base == "bytes":
         return constant(None)
     if base in ("bool", "bit"):
         return Generator("cycle", (CYCLE,), (False, True))
-    if tag.states:
-        return Generator("cycle", (CYCLE,), tuple(tag.states))
-    low, high = tag.min, tag.max
-    if low is not None and high is not None and low < high:
-        return Generator("walk", (low, high, (high - low) / 10))
+    if states := _states(tag):
+        return Generator("cycle", (CYCLE,), states)
+    if tag.min is not None and tag.max is not None:
+        least, most = max(low, tag.min), min(high, tag.max)
+        if least < most:
+            return Generator("walk", (least, most, (most - least) / 10))
     found = next((made for units, made in USUAL if tag.unit in units), OTHER)
-    low, high = extremes(tag)
-    if found.kind == "counter" or low <= found.numbers[0] < found.numbers[1] <= high:
+    first, last = (0, 0) if found.kind == "counter" else found.numbers[:2]
+    if low <= first <= last <= high:
         return found
     return Generator("sine", (low + (high - low) * 0.1, low + (high - low) * 0.9, 60))
+
+
+def _name(tag: Tag) -> Generator:
+    return constant(tag.name.encode("ascii", "replace").decode()[: tag.of_type.parameter])
 
 
 def scale(tag: Tag, form: Form) -> Generator:
@@ -199,7 +244,7 @@ def scale(tag: Tag, form: Form) -> Generator:
 def still(tag: Tag) -> Generator:
     """The first value of a tag that keeps what is written to it."""
     if not tag.is_number:
-        return usual(tag) if tag.of_type.base == "string" else constant(None)
+        return _name(tag) if tag.of_type.base == "string" else constant(None)
     if tag.states:
         return constant(next(iter(tag.states)))
     low, high = tag.min, tag.max

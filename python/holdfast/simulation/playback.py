@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 from typing import TYPE_CHECKING, Any
 
+from holdfast.simulation.raw import Capacity
 from holdfast.tags.text import value_from
+from holdfast.values import DoesNotFit
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
     from holdfast.tags import TagList
@@ -44,6 +46,7 @@ def _columns(rows: Any, file: str, tags: TagList) -> dict[str, list[Any]]:
     found: dict[str, list[Any]] = {name: [] for name in names if name != TIME}
     if len(found) < len(names) - names.count(TIME):
         raise Unplayable(f"{file}:1: two columns have the same name")
+    capacities = {name: Capacity(tags[name]) for name in found if tags[name].source is None}
     for row in rows:
         if not row:
             continue
@@ -52,14 +55,18 @@ def _columns(rows: Any, file: str, tags: TagList) -> dict[str, list[Any]]:
             raise Unplayable(f"{where}: found {len(row)} cells, allowed: {len(names)}")
         if len(next(iter(found.values()), ())) == MAX_ROWS:
             raise Unplayable(f"{where}: more than {MAX_ROWS} rows")
-        _take(found, zip(names, row, strict=True), where, tags)
+        _take(found, zip(names, row, strict=True), where, tags, capacities)
     if not any(found.values()):
         raise Unplayable(f"{file}: no values")
     return found
 
 
 def _take(
-    found: dict[str, list[Any]], cells: Iterable[tuple[str, str]], where: str, tags: TagList
+    found: dict[str, list[Any]],
+    cells: Iterable[tuple[str, str]],
+    where: str,
+    tags: TagList,
+    capacities: Mapping[str, Capacity],
 ) -> None:
     for name, cell in cells:
         if name == TIME:
@@ -69,6 +76,12 @@ def _take(
             before.append(before[-1] if before else None)
             continue
         try:
-            before.append(value_from(tags[name], cell))
+            value = value_from(tags[name], cell)
         except ValueError as error:
             raise Unplayable(f"{where}: {name}: {error}") from error
+        before.append(value)
+        if name in capacities:
+            try:
+                capacities[name].check(value)
+            except DoesNotFit as error:
+                raise Unplayable(f"{where}: {error}") from error

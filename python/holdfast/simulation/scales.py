@@ -1,0 +1,113 @@
+"""The scales that simulated tags will have, and whether values fit with all of them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Any
+
+from holdfast import values
+from holdfast.simulation.raw import Capacity, extremes, nearest
+from holdfast.tags.register_scale import RegisterScale
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from holdfast.simulation.generators import Generator
+    from holdfast.tags import Tag
+    from holdfast.types import Area
+
+AROUND_ZERO = (-1, 0, 1)
+"""The whole numbers with which a scale is smallest, or the value is none."""
+
+
+class Scales:
+    """What registers that contain scales will contain. `content` decodes what one contains now.
+
+    That is all that is known of a register that clients write.
+    """
+
+    def __init__(self, content: Callable[[Tag], Any]) -> None:
+        self._content = content
+        self._contents: dict[tuple[Area, int], list[Any]] = {}
+        self._rows: dict[tuple[Area, int], list[Any]] = {}
+        """Those that are played: one for each row."""
+
+    def note(self, register: Tag, generator: Generator, played: Sequence[Any] | None) -> None:
+        """Notes what a register will contain. The generator's series stays between its ends."""
+        place = register.area, register.address
+        if played is not None:
+            self._rows[place] = [_decoded(register, value) for value in played]
+            return
+        found = [_decoded(register, value) for value in generator.ends]
+        if not register.is_float and len(found) > 1:
+            found += [each for each in AROUND_ZERO if min(found) < each < max(found)]
+        self._contents[place] = found
+
+    def check(self, tag: Tag, values: Iterable[Any]) -> None:
+        """Raises `DoesNotFit` if one of these values does not fit with one of the scales."""
+        capacities = self._capacities(self._all_contents(tag), tag)
+        for value, capacity in itertools.product(values, capacities):
+            capacity.check(value)
+
+    def check_played(self, tag: Tag, values: Sequence[Any]) -> None:
+        """The same for values that are played. A scale that is played belongs to one row."""
+        source = tag.source
+        rows = None if source is None else self._rows.get((source.area, source.address))
+        if rows is None or len(rows) != len(values):
+            self.check(tag, values)
+            return
+        by_content = {each: self._capacities([each], tag) for each in dict.fromkeys(rows)}
+        for content, value in zip(rows, values, strict=True):
+            for capacity in by_content[content]:
+                capacity.check(value)
+
+    def within(self, tag: Tag) -> tuple[float, float]:
+        """The range that registers of a number can hold with all of the scales."""
+        ranges = [extremes(each) for each in _scaled(self._all_contents(tag), tag)]
+        least = max((low for low, _ in ranges), default=-math.inf)
+        return least, min((high for _, high in ranges), default=math.inf)
+
+    def least_step(self, tag: Tag) -> float:
+        """The smallest difference between two values with one of the scales."""
+        if tag.is_float:
+            return 0
+        scaled = _scaled(self._all_contents(tag), tag)
+        return min(
+            (abs(each.scale) for each in scaled if isinstance(each.scale, int | float)), default=1
+        )
+
+    def _all_contents(self, tag: Tag) -> list[Any]:
+        """Without a register for the scale, one content that is not used."""
+        source = tag.source
+        if source is None:
+            return [None]
+        place = source.area, source.address
+        if place in self._rows:
+            return list(dict.fromkeys(self._rows[place]))
+        return self._contents.get(place) or [self._content(source)]
+
+    def _capacities(self, contents: Iterable[Any], tag: Tag) -> list[Capacity]:
+        place = tag.scale.where if isinstance(tag.scale, RegisterScale) else ""
+        return [Capacity(each, place) for each in _scaled(contents, tag)]
+
+
+def _scaled(contents: Iterable[Any], tag: Tag) -> list[Tag]:
+    """The tag with each of its scales. Contents that are no scale are left out: nothing is written
+    then.
+    """
+    if tag.source is None:
+        return [tag]
+    found = []
+    for content in contents:
+        try:
+            found.append(tag.with_scale(content))
+        except ValueError:
+            continue
+    return found
+
+
+def _decoded(register: Tag, value: Any) -> Any:
+    """What the register contains for a value, as it is read."""
+    made = values.encode(nearest(register, value), register.type, register.order)
+    return values.decode(made, register.type, register.order)
