@@ -66,6 +66,7 @@ def sections(folder: Path, nats: str, device: tuple[str, int]) -> dict[str, Any]
                 "url": url,
                 "interval": 0.1,
                 "reads": reads,
+                "stale": {"after": 60},
                 "tags": tags,
                 "forward": forward,
             },
