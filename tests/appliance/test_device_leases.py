@@ -24,7 +24,7 @@ from support import wire
 from support.brokers import NatsServer
 from support.cli import RunCommand, invoke
 from support.config_folder import written
-from support.fake_device import Stream
+from support.fake_device import Stream, silent
 from support.leases import BRIEF, ENDLESS, make_settled
 from support.running import endpoint
 
@@ -275,6 +275,26 @@ def test_without_its_log_a_node_stops_polling_and_comes_back(
     assert len(device.peers) == polls
     server.start()
     wire.until(lambda: health(one) == "ok", "it polls again")
+
+
+def test_values_that_a_node_replays_are_stale_until_the_device_is_read(
+    settings: Callable[..., Path], device: Device
+) -> None:
+    never = {"after": 3600, "answer": "exception"}
+    both, stale, beside = "03000a0002", "830b", "0300000001"
+
+    def started() -> Appliance:
+        return Appliance(load(settings("a", stale=never, timeout=0.1)), lease_times=LEASE_TIMES)
+
+    with started() as appliance:
+        wire.until(lambda: ask(appliance, both) == "030400070008", "the device was read")
+    device.then = silent
+    with started() as appliance:
+        polls = len(device.peers)
+        wire.until(lambda: len(device.requests) > polls + 3, "it is polled in vain")
+        assert (ask(appliance, both), ask(appliance, beside)) == (stale, "03020000")
+        device.then = device._note
+        wire.until(lambda: ask(appliance, both) == "030400070008", "the device was read again")
 
 
 def test_replicas_shows_who_polls_what(settings: Callable[..., Path], device: Device) -> None:

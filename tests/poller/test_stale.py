@@ -173,6 +173,26 @@ def test_before_the_first_read_there_is_no_value(run: Run, meter: Meter) -> None
         wire.until(lambda: code(lambda: plc.read_holding_registers(10, 1)) is None, "read")
 
 
+def test_what_a_file_has_kept_is_stale_until_the_device_was_read(
+    tmp_path: Path, meter: Meter
+) -> None:
+    file = tmp_path / "appliance.yaml"
+    text = config(meter, NEVER)
+    assert '"mirror": {' in text
+    keep = '"keep": {"file": "kept.redb", "sync": 0}'
+    file.write_text(text.replace('"mirror": {', f'"mirror": {{{keep}, '))
+    with Appliance(load(file)) as appliance, client(appliance) as plc:
+        wire.until(lambda: code(lambda: plc.read_holding_registers(10, 3)) is None, "read")
+        plc.write_register(0, 5)
+    meter.is_gone = True
+    with Appliance(load(file)) as appliance, client(appliance) as plc:
+        wire.until(lambda: counters(appliance, "meter")["failures"] > 1, "it is polled in vain")
+        assert code(lambda: plc.read_holding_registers(10, 3)) == DEAD
+        assert plc.read_holding_registers(0, 1) == [5]
+        meter.is_gone = False
+        wire.until(lambda: code(lambda: plc.read_holding_registers(10, 3)) is None, "read again")
+
+
 def test_each_read_has_an_age_of_its_own(run: Run, meter: Meter) -> None:
     meter.refuses_coils = True
     with client(run(config(meter, NEVER))) as plc:

@@ -2,14 +2,15 @@
 
 mod support;
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use holdfast_journal::file::{
     Disk, FileError, FileOnDisk, MemoryFile, Options, read_from, release,
 };
 use holdfast_memory::{
-    Access, Area, Gate, GateMode, Layout, Memory, Refusal, Span, Write, write_across,
+    Access, Area, Freshness, Gate, GateMode, Layout, Memory, Mirrored, Refusal, Span, Write,
+    write_across,
 };
 use support::sim::SimDisk;
 use support::{
@@ -55,6 +56,42 @@ fn contents_survive_a_restart() {
         let names: Vec<_> = std::fs::read_dir(path.parent().unwrap()).unwrap().collect();
         assert_eq!(names.len(), 1, "{names:?}");
     }
+}
+
+/// Notes how old the values are that a range gets.
+#[derive(Debug, Default)]
+struct Ages(Mutex<Vec<Duration>>);
+
+impl Freshness for Ages {
+    fn renew(&self, age: Duration) {
+        self.0.lock().unwrap().push(age);
+    }
+
+    fn is_stale(&self) -> bool {
+        false
+    }
+}
+
+#[test]
+fn values_of_a_device_are_as_old_as_the_disk_has_taken_and_have_no_age_after_a_restart() {
+    let path = folder("ages").join("memories.redb");
+    let disk = Arc::new(FileOnDisk::new(&path));
+    let watched = || {
+        let (one, ages) = (memory(layout(0, 10), None), Arc::new(Ages::default()));
+        let freshness = Some(Arc::clone(&ages) as Arc<dyn Freshness>);
+        one.mirror(vec![Mirrored { freshness, ..Mirrored::reserved(REGISTERS, 3, 1) }]).unwrap();
+        (one, ages)
+    };
+    let (one, ages) = watched();
+    let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+    let write = Write { area: REGISTERS, address: 3, count: 1, bytes: &[0, 7] };
+    one.write(Access::Mirror, write).unwrap();
+    assert!(matches!(ages.0.lock().unwrap()[..], [age] if age > Duration::ZERO));
+    file.stop().unwrap();
+    let (one, ages) = watched();
+    keep(&disk, &[("one", &one)], at_once()).unwrap();
+    assert_eq!(get(&one, 3), 7);
+    assert!(ages.0.lock().unwrap().is_empty());
 }
 
 #[test]

@@ -3,14 +3,15 @@
 mod nodes;
 
 use std::io::{BufRead, BufReader, Write as _};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use futures_util::StreamExt;
 use holdfast_journal::log::{Follower, LogError, Next, Phase, Settings, Until};
 use holdfast_memory::{
-    Access, Action, Memory, Operation, Read, Refusal, Step, StepWrite, Write, write_across,
+    Access, Action, Freshness, Memory, Mirrored, Operation, Read, Refusal, Step, StepWrite, Write,
+    write_across,
 };
 use nodes::process::{Answer, Process};
 use nodes::{Node, REGISTERS, Server, cluster, memory_of, until};
@@ -472,6 +473,64 @@ fn a_restarted_node_goes_on_where_it_was() {
     drop(a);
     let b = Node::started(&[&server], "b");
     assert_eq!(b.read(0), Ok(2));
+}
+
+/// Notes how old the values are that a range gets.
+#[derive(Debug, Default)]
+struct Ages(Mutex<Vec<Duration>>);
+
+impl Freshness for Ages {
+    fn renew(&self, age: Duration) {
+        self.0.lock().unwrap().push(age);
+    }
+
+    fn is_stale(&self) -> bool {
+        false
+    }
+}
+
+/// Watches register 3.
+fn watched(node: &Node) -> Arc<Ages> {
+    let ages = Arc::new(Ages::default());
+    let freshness = Some(Arc::clone(&ages) as Arc<dyn Freshness>);
+    let range = Mirrored { freshness, ..Mirrored::reserved(REGISTERS, 3, 1) };
+    node.memory.mirror(vec![range]).unwrap();
+    ages
+}
+
+fn mirror(node: &Node, value: u16) {
+    let bytes = value.to_be_bytes();
+    let write = Write { area: REGISTERS, address: 3, count: 1, bytes: &bytes };
+    node.memory.write(Access::Mirror, write).unwrap();
+}
+
+#[test]
+fn values_of_a_device_that_a_node_replays_have_no_age_and_later_ones_that_of_the_contact() {
+    let server = Server::new();
+    let a = Node::started(&[&server], "a");
+    mirror(&a, 7);
+    let b = Node::new(&[&server], "b", |settings| settings.max_lag = Duration::from_secs(3600));
+    let of_b = watched(&b);
+    b.start();
+    assert_eq!(b.read(3), Ok(7));
+    assert!(of_b.0.lock().unwrap().is_empty(), "nobody knows how old the value is");
+    // The last message of the node is the one with which it has caught up.
+    let (began, passed) = (Instant::now(), Duration::from_millis(20));
+    until("time passes", || began.elapsed() > passed);
+    let (of_a, began) = (watched(&a), Instant::now());
+    mirror(&a, 8);
+    until("the other node has it", || b.read(3) == Ok(8));
+    let (of_a, of_b) = (of_a.0.lock().unwrap(), of_b.0.lock().unwrap());
+    assert!(of_a.len() == 1 && of_a[0] <= began.elapsed(), "{of_a:?}");
+    assert!(of_b.len() == 1 && of_b[0] >= passed, "{of_b:?}");
+    drop(of_a);
+    // The node that has sent the value replays it too.
+    drop(a);
+    let a = Node::new(&[&server], "a", |_| {});
+    let of_a = watched(&a);
+    a.start();
+    assert_eq!(a.read(3), Ok(8));
+    assert!(of_a.0.lock().unwrap().is_empty());
 }
 
 /// Digests are compared often.

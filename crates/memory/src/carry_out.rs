@@ -1,6 +1,7 @@
 //! Carries out steps.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::error::Refused;
 use crate::memory::{Memory, carry_out_across};
@@ -18,6 +19,18 @@ impl Step {
     /// # Panics
     /// The step names a member that does not exist.
     pub fn carry_out(&self, members: &[Arc<Memory>]) -> Outcome {
+        self.carry_out_late(members, Some(Duration::ZERO))
+    }
+
+    /// The same for a step whose values are that old: ranges that mirror a device are no newer then. If
+    /// nobody knows their age, such ranges stay as old as they were.
+    ///
+    /// # Errors
+    /// As [`Step::carry_out`].
+    ///
+    /// # Panics
+    /// As [`Step::carry_out`].
+    pub fn carry_out_late(&self, members: &[Arc<Memory>], age: Option<Duration>) -> Outcome {
         let alone = |refusal| Refused { index: 0, refusal };
         let read = match &self.action {
             Action::Write(writes) => {
@@ -25,7 +38,7 @@ impl Step {
                     .iter()
                     .map(|write| (&*members[usize::from(write.member)], write.borrowed()))
                     .collect();
-                carry_out_across(self.access, &writes).map(|()| Vec::new())?
+                carry_out_across((self.access, age), &writes).map(|()| Vec::new())?
             }
             &Action::Mask { member, area, address, and_mask, or_mask } => members
                 [usize::from(member)]
@@ -36,7 +49,7 @@ impl Step {
                 let mut out = vec![0; area.byte_len(count)];
                 let read = Read { area, address, count, out: &mut out };
                 members[usize::from(write.member)]
-                    .carry_out_then_read(self.access, write.borrowed(), read)
+                    .carry_out_then_read((self.access, age), write.borrowed(), read)
                     .map_err(alone)?;
                 out
             }

@@ -3,12 +3,13 @@
 use std::ptr;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
+use std::time::Duration;
 
 use crate::area::{Area, Layout, Span};
 use crate::batch::{self, Run};
 use crate::bits;
 use crate::error::{LayoutError, Refusal, Refused};
-use crate::mirrored::{Freshness, Mirrored, MirroredRanges};
+use crate::mirrored::{Mirrored, MirroredRanges};
 use crate::observer::{Observers, WriteQueue};
 use crate::operation::{Access, Read, Write};
 use crate::step::{Action, Done, Journal, Operation, Step, StepWrite, wait};
@@ -88,6 +89,9 @@ const GUARDED: u8 = 2;
 
 /// Mirrored ranges can be stale.
 const AGING: u8 = 4;
+
+/// The age of values that are written when they are known.
+const NOW: Option<Duration> = Some(Duration::ZERO);
 
 static NEXT_RANK: AtomicU64 = AtomicU64::new(0);
 
@@ -191,14 +195,15 @@ impl Memory {
         Ok(())
     }
 
-    /// Notes which mirrored ranges were written as a whole.
+    /// Notes which mirrored ranges were written as a whole, with values of this age.
     #[inline(never)]
-    fn renew<'w>(&self, writes: impl IntoIterator<Item = &'w Write<'w>>) {
+    fn renew<'w>(&self, age: Duration, writes: impl IntoIterator<Item = &'w Write<'w>>) {
         let mirrored = self.mirrored();
         for write in writes {
             let touched = mirrored.touched(write.area, write.address, write.count);
             let written = touched.filter(|range| range.is_in(write));
-            written.filter_map(|range| range.freshness.as_deref()).for_each(Freshness::renew);
+            let freshness = written.filter_map(|range| range.freshness.as_deref());
+            freshness.for_each(|freshness| freshness.renew(age));
         }
     }
 
@@ -434,7 +439,7 @@ impl Memory {
         let mut content = self.exclusive();
         content.admit(access).map_err(|refusal| Refused { index: 0, refusal })?;
         valid?;
-        self.apply(access, &mut content, writes);
+        self.apply((access, NOW), &mut content, writes);
         Ok(())
     }
 
@@ -513,22 +518,22 @@ impl Memory {
             let fits = out.len() == bytes.len();
             return fits.then(|| out.copy_from_slice(&bytes)).ok_or(Refusal::WrongLength);
         }
-        self.change_then_read(access, write, read, Ranges::Unreserved)
+        self.change_then_read((access, NOW), write, read, Ranges::Unreserved)
     }
 
     /// As [`Memory::write_then_read`], by a journal.
     pub(crate) fn carry_out_then_read(
         &self,
-        access: Access,
+        (access, age): (Access, Option<Duration>),
         write: Write<'_>,
         read: Read<'_>,
     ) -> Result<(), Refusal> {
-        self.change_then_read(access, write, read, Ranges::All)
+        self.change_then_read((access, age), write, read, Ranges::All)
     }
 
     fn change_then_read(
         &self,
-        access: Access,
+        (access, age): (Access, Option<Duration>),
         write: Write<'_>,
         read: Read<'_>,
         ranges: Ranges,
@@ -543,7 +548,7 @@ impl Memory {
         if ranges == Ranges::Unreserved {
             self.fresh(&content, access, (read.area, read.address, read.count))?;
         }
-        self.apply(access, &mut content, &writes);
+        self.apply((access, age), &mut content, &writes);
         content.copy_out(offset, read);
         Ok(())
     }
@@ -608,10 +613,11 @@ impl Memory {
         Ok(())
     }
 
-    /// Carries out writes that have been checked, then updates the seal.
+    /// Carries out writes that have been checked, then updates the seal. Without an age, mirrored ranges
+    /// stay as old as they were.
     fn apply<'w>(
         &self,
-        access: Access,
+        (access, age): (Access, Option<Duration>),
         content: &mut Content,
         writes: impl IntoIterator<Item = &'w Write<'w>> + Clone,
     ) {
@@ -619,8 +625,11 @@ impl Memory {
             self.copy_in(content, write);
         }
         content.written(access, writes.clone());
-        if access == Access::Mirror && content.door & AGING != 0 {
-            self.renew(writes);
+        if access == Access::Mirror
+            && content.door & AGING != 0
+            && let Some(age) = age
+        {
+            self.renew(age, writes);
         }
         self.settle(access, content);
     }
@@ -719,12 +728,12 @@ pub fn write_across(
     if writes.iter().any(|(memory, _)| memory.has_journal()) {
         return wait(|done| submit_across(access, writes, done)).map(|done| done.sequence);
     }
-    write_checked(access, writes).map(|()| None)
+    write_checked((access, NOW), writes).map(|()| None)
 }
 
 /// As [`write_across`], by a journal.
 pub(crate) fn carry_out_across(
-    access: Access,
+    (access, age): (Access, Option<Duration>),
     writes: &[(&Memory, Write<'_>)],
 ) -> Result<(), Refused> {
     for (index, (memory, write)) in writes.iter().enumerate() {
@@ -732,7 +741,7 @@ pub(crate) fn carry_out_across(
             .writable(access, std::slice::from_ref(write), Ranges::All)
             .map_err(|Refused { refusal, .. }| Refused { index, refusal })?;
     }
-    write_checked(access, writes)
+    write_checked((access, age), writes)
 }
 
 /// Gives writes that were checked to the journal of their memories, as one step.
@@ -757,7 +766,10 @@ fn submit_across(
     Ok(())
 }
 
-fn write_checked(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
+fn write_checked(
+    (access, age): (Access, Option<Duration>),
+    writes: &[(&Memory, Write<'_>)],
+) -> Result<(), Refused> {
     let mut placed: Vec<Placed> = writes
         .iter()
         .enumerate()
@@ -766,7 +778,7 @@ fn write_checked(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), 
     // The sort is stable: writes to one area of one memory keep their order.
     placed.sort_by_key(|placed| (placed.memory.rank, placed.write.area));
     if !batch::is_large(placed.iter().map(|placed| &placed.write)) {
-        return apply_across(access, &placed);
+        return apply_across((access, age), &placed);
     }
     let flat: Vec<(&Placed, Vec<Run>)> = placed
         .chunk_by(|a, b| ptr::eq(a.memory, b.memory) && a.write.area == b.write.area)
@@ -778,7 +790,7 @@ fn write_checked(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), 
             runs.iter().map(|run| Placed { write: run.writing(first.write.area), ..**first })
         })
         .collect();
-    apply_across(access, &runs)
+    apply_across((access, age), &runs)
 }
 
 /// Checks what [`write_across`] checks before it takes the locks: everything but seals and journals.
@@ -810,7 +822,10 @@ struct Target<'p, 'a> {
 }
 
 /// Carries out writes to several memories. The writes are sorted by the rank of their memory.
-fn apply_across(access: Access, placed: &[Placed<'_>]) -> Result<(), Refused> {
+fn apply_across(
+    (access, age): (Access, Option<Duration>),
+    placed: &[Placed<'_>],
+) -> Result<(), Refused> {
     debug_assert!(
         placed.is_sorted_by_key(|placed| placed.memory.rank),
         "locks are taken in rank order"
@@ -835,7 +850,7 @@ fn apply_across(access: Access, placed: &[Placed<'_>]) -> Result<(), Refused> {
         return Err(first);
     }
     for Target { memory, content, writes } in &mut targets {
-        memory.apply(access, content, writes.iter().map(|placed| &placed.write));
+        memory.apply((access, age), content, writes.iter().map(|placed| &placed.write));
     }
     Ok(())
 }
@@ -844,6 +859,7 @@ fn apply_across(access: Access, placed: &[Placed<'_>]) -> Result<(), Refused> {
 mod tests {
     use super::*;
     use crate::follower::Follower;
+    use crate::mirrored::Freshness;
 
     const REGISTERS: Area = Area::HoldingRegisters;
 
@@ -905,8 +921,8 @@ mod tests {
     struct Aged(std::sync::atomic::AtomicBool);
 
     impl Freshness for Aged {
-        fn renew(&self) {
-            self.0.store(false, Ordering::Relaxed);
+        fn renew(&self, age: Duration) {
+            self.0.store(age > Duration::ZERO, Ordering::Relaxed);
         }
 
         fn is_stale(&self) -> bool {
@@ -980,7 +996,7 @@ mod tests {
         let (stale, mirrored) = (Err(Refusal::Stale), Err(Refusal::Mirrored));
         let refused = [stale, stale, stale, mirrored, mirrored, mirrored];
         assert_eq!(accesses(&memory, Access::Client, 5, 3), refused);
-        aged.renew();
+        aged.renew(Duration::ZERO);
         let refused = [Ok(()), Ok(()), Ok(()), mirrored, mirrored, mirrored];
         assert_eq!(accesses(&memory, Access::Client, 5, 3), refused);
     }
@@ -991,12 +1007,12 @@ mod tests {
         let memory = Arc::new(memory);
         let mut follower = Follower::new(Arc::clone(&memory), [(REGISTERS, 7, 2)]).unwrap();
         assert_eq!(follower.changes(), Err(Refusal::Stale));
-        aged.renew();
+        aged.renew(Duration::ZERO);
         let all = follower.changes().unwrap();
         assert!(follower.changes().unwrap().1.is_empty());
         aged.0.store(true, Ordering::Relaxed);
         assert_eq!(follower.changes(), Err(Refusal::Stale), "nothing was written since");
-        aged.renew();
+        aged.renew(Duration::ZERO);
         assert_eq!(follower.changes(), Ok(all));
     }
 
@@ -1015,6 +1031,31 @@ mod tests {
         assert_eq!(step.carry_out(&[Arc::clone(&memory)]).unwrap().read, [3, 4]);
         memory.write(Access::Mirror, writing(REGISTERS, 5, &[1; 6])).unwrap();
         assert_eq!(accesses(&memory, Access::Client, 5, 3), [Ok(()); 6]);
+    }
+
+    #[test]
+    fn a_step_makes_a_range_as_old_as_its_values_are() {
+        let stale = || {
+            let (memory, aged) = aging(false);
+            (Arc::new(memory), aged)
+        };
+        let write = StepWrite::new(0, &writing(REGISTERS, 5, &[1; 6]));
+        let then = write.clone();
+        let then = Action::WriteThenRead { write: then, area: REGISTERS, address: 5, count: 1 };
+        for action in [Action::Write(vec![write]), then] {
+            let step = Step { access: Access::Mirror, action };
+            let ages = [Some(Duration::ZERO), Some(Duration::from_secs(1)), None];
+            let found = ages.map(|age| {
+                let (memory, aged) = stale();
+                step.carry_out_late(&[memory], age).unwrap();
+                aged.is_stale()
+            });
+            assert_eq!(found, [false, true, true]);
+            let (memory, aged) = aging(false);
+            aged.renew(Duration::ZERO);
+            step.carry_out_late(&[Arc::new(memory)], None).unwrap();
+            assert!(!aged.is_stale(), "newer values are not older");
+        }
     }
 
     /// Carries out each step at once, and refuses accesses while it has a refusal.

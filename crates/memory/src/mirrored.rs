@@ -2,6 +2,7 @@
 
 use std::fmt;
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::area::Area;
 use crate::operation::Write;
@@ -9,8 +10,9 @@ use crate::operation::Write;
 /// Whether the values of a range are too old. It is called with the locks of a memory, for each access
 /// to the range: it must not wait.
 pub trait Freshness: fmt::Debug + Send + Sync {
-    /// [`Access::Mirror`](crate::Access::Mirror) has written the whole range.
-    fn renew(&self);
+    /// [`Access::Mirror`](crate::Access::Mirror) has written the whole range, with values that are at most
+    /// this old. Those of before were older.
+    fn renew(&self, age: Duration);
 
     /// Whether nobody else may read or write the range now.
     fn is_stale(&self) -> bool;

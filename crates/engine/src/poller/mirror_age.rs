@@ -56,8 +56,10 @@ impl MirrorAge {
 }
 
 impl Freshness for MirrorAge {
-    fn renew(&self) {
-        self.renewed.store(nanos((self.clock)()).max(1), Ordering::Relaxed);
+    fn renew(&self, age: Duration) {
+        let known = (self.clock)().saturating_sub(age);
+        // Values that are written later are no older, also if less is known of their age.
+        self.renewed.fetch_max(nanos(known).max(1), Ordering::Relaxed);
     }
 
     fn is_stale(&self) -> bool {
@@ -93,7 +95,7 @@ mod tests {
         pass(3);
         assert_eq!((age.age(), age.stale_for()), (None, Some(Duration::from_secs(3))));
         assert!(age.is_stale());
-        age.renew();
+        age.renew(Duration::ZERO);
         assert_eq!((age.age(), age.stale_for()), (Some(Duration::ZERO), None));
         pass(9);
         assert!(!age.is_stale());
@@ -104,8 +106,20 @@ mod tests {
         assert!(!age.is_stale());
         pass(60);
         assert!(age.is_stale());
-        age.renew();
+        age.renew(Duration::ZERO);
         assert!(!age.is_stale());
+    }
+
+    #[test]
+    fn values_are_as_old_as_they_were_when_they_came() {
+        let age = of(true);
+        age.renew(Duration::from_secs(8));
+        assert_eq!((age.age(), age.is_stale()), (Some(Duration::from_secs(8)), false));
+        pass(2);
+        assert!(age.is_stale());
+        age.renew(Duration::from_secs(3));
+        age.renew(Duration::from_secs(9));
+        assert_eq!(age.age(), Some(Duration::from_secs(3)), "later values are no older");
     }
 
     #[test]

@@ -3,14 +3,18 @@
 use std::mem;
 use std::process;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use holdfast_memory::{Action, Done, Journal, Memory, Refusal, Refused, Step};
 
 use super::status::Status;
 
-/// A step, and who receives its outcome.
-pub(super) type Waiting = (Step, Done);
+/// A step, who receives its outcome, and since when it waits.
+pub(super) struct Waiting {
+    pub step: Step,
+    pub done: Done,
+    pub since: Instant,
+}
 
 /// The journal of the memories of a file.
 #[derive(Debug)]
@@ -94,7 +98,7 @@ impl Queue {
         state.bytes = 0;
         let waiting = mem::take(&mut state.waiting);
         drop(state);
-        self.refuse(waiting.into_iter().map(|(_, done)| done), Refusal::Unavailable);
+        self.refuse(waiting.into_iter().map(|each| each.done), Refusal::Unavailable);
     }
 
     /// Waits until there is something to do, or for this time.
@@ -152,7 +156,7 @@ impl Journal for Queue {
                 let bytes = state.bytes + size(&step);
                 if state.waiting.len() < self.limits.steps && bytes <= self.limits.bytes {
                     state.bytes = bytes;
-                    state.waiting.push((step, done));
+                    state.waiting.push(Waiting { step, done, since: Instant::now() });
                     drop(state);
                     return self.changed.notify_one();
                 }

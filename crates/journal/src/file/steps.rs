@@ -56,7 +56,7 @@ impl Steps {
     fn carry_out(&mut self, steps: Vec<Waiting>) {
         let mut touched = BTreeSet::new();
         let mut outcomes: Vec<Outcome> = Vec::with_capacity(steps.len());
-        for (step, _) in &steps {
+        for Waiting { step, .. } in &steps {
             let outcome = step.carry_out(&self.shadows);
             if outcome.is_ok() {
                 self.touch(step, &mut touched);
@@ -66,10 +66,11 @@ impl Steps {
         let pages = touched.into_iter().filter_map(|place| self.changed(place)).collect();
         if self.store.store(Changes { pages, ..Changes::default() }).is_err() {
             self.restore_shadows();
-            return self.queue.refuse(steps.into_iter().map(|(_, done)| done), Refusal::NotStored);
+            return self.queue.refuse(steps.into_iter().map(|each| each.done), Refusal::NotStored);
         }
-        for ((step, done), expected) in steps.into_iter().zip(outcomes) {
-            let outcome = step.carry_out(&self.memories);
+        for (Waiting { step, done, since }, expected) in steps.into_iter().zip(outcomes) {
+            // The disk may have taken its time.
+            let outcome = step.carry_out_late(&self.memories, Some(since.elapsed()));
             debug_assert_eq!(outcome, expected, "a step does the same to equal memories");
             done(outcome);
         }

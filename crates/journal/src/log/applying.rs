@@ -41,7 +41,12 @@ impl Node {
         let counters = &self.shared.counters;
         let (mut compared, mut for_snapshot) = (false, false);
         session.last_applied = Instant::now();
-        let applied = self.state.apply(place, payload)?;
+        let (shared, sent, own) = (&self.shared, &self.sent, &self.origin);
+        let applied = self.state.apply(place, payload, |origin| {
+            let is_own = origin.node == own.node && origin.start == own.start;
+            let first_sent = is_own.then(|| sent.first_sent(origin.counter)).flatten();
+            shared.age_since(first_sent)
+        })?;
         counters.sequence.set(place.sequence);
         match applied {
             Applied::Fresh { origin, compares, outcomes } => {

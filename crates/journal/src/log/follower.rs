@@ -188,7 +188,7 @@ impl Reading {
                 return Ok(None);
             }
             let decoded = message::decode(&payload, &self.state.members).ok();
-            let applied = self.state.apply(place, &payload)?;
+            let applied = self.state.apply(place, &payload, |_| None)?;
             let fresh = matches!(applied, super::state::Applied::Fresh { .. });
             let (origin, steps) =
                 decoded.map(|message| (Some(message.origin), message.steps)).unwrap_or_default();

@@ -58,6 +58,12 @@ impl Sent {
         self.messages.push_back(Message { counter, payload, steps, first_sent, times: 1, until });
     }
 
+    /// When a message was sent first, if it is remembered.
+    pub(super) fn first_sent(&self, counter: u64) -> Option<Moment> {
+        let message = self.messages.iter().find(|message| message.counter == counter);
+        message.map(|message| message.first_sent)
+    }
+
     /// A message was applied. Returns when it was sent first. Those before it will never be.
     pub(super) fn applied(
         &mut self,

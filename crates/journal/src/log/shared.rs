@@ -157,6 +157,14 @@ impl Shared {
         contact.map(|contact| self.now().since(contact))
     }
 
+    /// How long ago, at most, the log has taken the message that is applied next: it has taken it after the
+    /// last one of this node that was applied, and its own not before it was sent. `None` before there
+    /// was one, while the node only replays what others have sent.
+    pub(super) fn age_since(&self, first_sent: Option<Moment>) -> Option<Duration> {
+        let contact = Moment::from_nanos(self.contact.load(Ordering::Acquire));
+        contact.max(first_sent).map(|moment| self.now().since(moment))
+    }
+
     /// The contents have all that the log had at this time.
     pub(super) fn contact(&self, at: Moment) {
         self.contact.fetch_max(at.as_nanos(), Ordering::Release);
@@ -363,5 +371,20 @@ mod tests {
         assert_eq!(shared.admit(), Err(Refusal::Behind));
         shared.contact(shared.now());
         assert_eq!(shared.admit(), Ok(()));
+    }
+
+    #[test]
+    fn a_message_is_as_old_as_the_last_contact_before_it_or_as_its_own_sending() {
+        let time = Arc::new(Mutex::new(Duration::from_secs(100)));
+        let shared = Shared::new(&Settings::new("site", "a", Vec::new()));
+        let shared = Shared { clock: Clock::Test(Arc::clone(&time)), ..shared };
+        let pass = |seconds| *lock(&time) += Duration::from_secs(seconds);
+        assert_eq!(shared.age_since(None), None, "what others have sent is replayed");
+        shared.contact(shared.now());
+        pass(60);
+        let sent = shared.now();
+        pass(3);
+        assert_eq!(shared.age_since(None), Some(Duration::from_secs(63)), "after an outage");
+        assert_eq!(shared.age_since(Some(sent)), Some(Duration::from_secs(3)));
     }
 }

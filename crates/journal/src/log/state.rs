@@ -4,9 +4,10 @@
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
+use std::time::Duration;
 
 use aws_lc_rs::digest::{SHA256, digest};
-use holdfast_memory::{Area, CarriedOut, Contents, Memory, Outcome};
+use holdfast_memory::{Area, CarriedOut, Contents, Memory, Outcome, Step};
 use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
 
@@ -80,11 +81,17 @@ impl State {
         last.filter(|(start, _)| *start == origin.start).map_or(0, |(_, counter)| *counter)
     }
 
-    /// Applies the next message.
+    /// Applies the next message. `age` tells how old the values of a device are in it, at most; `None` if
+    /// that is not known.
     ///
     /// # Errors
     /// [`LogError::Version`]: nobody knows what the message does.
-    pub(super) fn apply(&mut self, place: Place, payload: &[u8]) -> Result<Applied, LogError> {
+    pub(super) fn apply(
+        &mut self,
+        place: Place,
+        payload: &[u8],
+        age: impl FnOnce(&Origin) -> Option<Duration>,
+    ) -> Result<Applied, LogError> {
         debug_assert_eq!(place.sequence, self.place.sequence + 1, "messages are applied in order");
         let Message { origin, compares, steps } = match message::decode(payload, &self.members) {
             Ok(message) => message,
@@ -108,7 +115,9 @@ impl State {
         self.origins.insert(origin.node.clone(), now);
         self.steps += steps.len() as u64;
         let at = |done| CarriedOut { sequence: Some(place.sequence), ..done };
-        let outcomes = steps.iter().map(|step| step.carry_out(&self.members).map(at)).collect();
+        let age = age(&origin);
+        let carried_out = |step: &Step| step.carry_out_late(&self.members, age).map(at);
+        let outcomes = steps.iter().map(carried_out).collect();
         Ok(Applied::Fresh { origin, compares, outcomes })
     }
 
