@@ -801,6 +801,10 @@ class BlockingClient:
     def late(self) -> int:
         """How many replies arrived after their timeout."""
 
+    @property
+    def longest_late(self) -> float:
+        """How many seconds the slowest of them took; 0 if there were none."""
+
 @final
 class Connection:
     """The protocol of a client's TCP connection, with or without TLS. The caller owns the socket.
@@ -857,6 +861,10 @@ class Connection:
     @property
     def late(self) -> int:
         """How many replies arrived after their timeout."""
+
+    @property
+    def longest_late(self) -> float:
+        """How many seconds the slowest of them took; 0 if there were none."""
 
 @final
 class Attempt:

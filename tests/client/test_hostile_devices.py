@@ -820,6 +820,27 @@ def test_a_late_reply_is_not_taken_for_that_of_a_call_that_waits(
     wire.until_long_enough(is_told_apart, "the late reply comes while the next call waits", SHORT)
 
 
+def test_a_device_that_is_always_late_gets_more_time(make: Make, dial: Dial) -> None:
+    """One that does nothing else meanwhile: without more time, no request ever has its reply."""
+    timeout = 0.1
+
+    def slow(asked: Asked) -> None:
+        threading.Event().wait(1.4 * timeout)
+        asked.answer()
+
+    client = connected(dial, make("tcp", good, then=slow).url, timeout)
+
+    def has_value() -> bool:
+        try:
+            assert client.read_holding_registers(7, 1) == [7]
+        except (holdfast.RequestTimeout, holdfast.ConnectionLost):
+            return False
+        return client.late >= 2
+
+    wire.until(has_value, "after two late replies, a request has its reply")
+    assert 0 < client.longest_late <= 4 * timeout
+
+
 # Two replies
 
 

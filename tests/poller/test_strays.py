@@ -125,6 +125,29 @@ def test_a_late_reply_is_no_unexpected_one(run: Run) -> None:
     wire.until_long_enough(is_late, "one reply is late")
 
 
+@pytest.mark.usefixtures("health_is_checked_at_once")
+def test_a_device_that_is_always_late_is_polled_with_more_time(
+    run: Run, records: web.Records
+) -> None:
+    timeout = 0.1
+
+    def slow(request: wire.Frame) -> bytes:
+        threading.Event().wait(1.4 * timeout)
+        return data(request, 7)
+
+    with Fake(slow) as fake:
+        appliance = polled(run, fake.url, timeout=timeout)
+        until_counted(appliance, "raised_timeouts", 2)
+        mirror = appliance.memories["mirror"]
+        wire.until(lambda: mirror.read("holding_registers", 0, 1) == [7], "it has a value")
+
+        def logged() -> bool:
+            appliance.log_events(timeout=0.01)
+            return bool(records.of("timeout_raised"))
+
+        wire.until(logged, "it is logged")
+
+
 def test_a_good_device_has_no_strays(run: Run) -> None:
     with Fake(data) as fake:
         appliance = polled(run, fake.url)

@@ -347,6 +347,12 @@ impl BlockingClient {
     fn late(&self) -> u64 {
         self.core.late()
     }
+
+    /// The seconds that the longest of these replies took; 0 if there was none.
+    #[getter]
+    fn longest_late(&self) -> f64 {
+        self.core.longest_late().as_secs_f64()
+    }
 }
 
 thread_local! {

@@ -217,6 +217,12 @@ impl Connection {
     fn late(&self) -> u64 {
         self.state().core.late()
     }
+
+    /// The seconds that the longest of these replies took; 0 if there was none.
+    #[getter]
+    fn longest_late(&self) -> f64 {
+        self.state().core.longest_late().as_secs_f64()
+    }
 }
 
 impl Connection {

@@ -316,6 +316,76 @@ fn a_device_that_is_always_late_gets_more_time_until_it_is_not() {
     }
 }
 
+/// Transports with transaction ids, and the failed reads before the timeout is raised.
+const WITH_IDS: [(Transport, u32); 2] = [(Transport::Tcp, 2), (Transport::Udp, 3)];
+
+#[test]
+fn a_device_that_is_always_late_gets_more_time_with_transaction_ids_too() {
+    for (transport, failed) in WITH_IDS {
+        let mut world = World::new(transport, |_, _| vec![320 * MS]);
+        let counts = world.run(40, Duration::ZERO, 1);
+        assert_eq!(counts, Counts { right: 40 - failed, wrong: 0, failed }, "{transport:?}");
+        assert_eq!(world.connection.longest_late(), 320 * MS);
+        assert!(world.connection.take_raised() >= 36);
+        // The next connection knows it.
+        world.reconnect();
+        assert_eq!(world.run(40, Duration::ZERO, 1), Counts { right: 40, wrong: 0, failed: 0 });
+        assert_eq!(world.connection.take_raised(), 40);
+    }
+}
+
+#[test]
+fn a_device_that_is_no_longer_late_has_its_timeout_again() {
+    for (transport, failed) in WITH_IDS {
+        let mut world =
+            World::new(transport, |number, _| vec![if number < 12 { 320 * MS } else { 3 * MS }]);
+        let counts = world.run(80, Duration::ZERO, 1);
+        assert_eq!(counts, Counts { right: 80 - failed, wrong: 0, failed }, "{transport:?}");
+        let raised = world.connection.take_raised();
+        assert!((33..50).contains(&raised), "{transport:?}: {raised}");
+        world.vice = |_, _| vec![];
+        let began = world.now;
+        assert_eq!(world.read(1, 100), Err(Failure::Timeout));
+        assert_eq!(world.now - began, TIMEOUT);
+    }
+}
+
+#[test]
+fn a_timeout_is_raised_for_one_unit_and_to_four_times_at_most() {
+    for (transport, _) in WITH_IDS {
+        let mut world = World::new(transport, |_, _| vec![4 * TIMEOUT + 50 * MS]);
+        world.listens = false;
+        for _ in 0..3 {
+            let _ = world.read(1, 100);
+            world.pass(8 * TIMEOUT);
+        }
+        world.vice = |_, _| vec![];
+        for (unit_id, waited) in [(1, 4 * TIMEOUT), (2, TIMEOUT)] {
+            let began = world.now;
+            assert_eq!(world.read(unit_id, 100), Err(Failure::Timeout));
+            assert_eq!(world.now - began, waited, "{transport:?}, unit {unit_id}");
+        }
+    }
+}
+
+#[test]
+fn replies_to_requests_that_their_callers_have_ended_raise_nothing() {
+    let request = EncodedRequest::new(&Request::ReadHoldingRegisters(Range::new(1, 1).unwrap()));
+    let mut connection = Connection::new(Transport::Tcp);
+    let mut now = MS;
+    for id in 0..3 {
+        let ticket = connection.send(1, &request, TIMEOUT, now).unwrap();
+        connection.sent(12);
+        connection.cancel(ticket);
+        let late = [&mbap::header(id, 1, 4)[..], &[3, 2, 0, 9]].concat();
+        now += 200 * MS;
+        connection.receive(&late, now, |_| panic!("nobody waits for it"));
+    }
+    assert_eq!((connection.late(), connection.take_raised()), (3, 0));
+    let ticket = connection.send(1, &request, TIMEOUT, now).unwrap();
+    assert_eq!(connection.deadline_of(ticket), Some(now + TIMEOUT));
+}
+
 #[test]
 fn a_good_line_is_as_fast_as_before_after_its_first_replies() {
     for transport in [SERIAL[0], SERIAL[1], Transport::RtuOverTcp] {
@@ -549,5 +619,5 @@ fn a_line_that_repeats_its_first_reply_and_is_faster_than_its_settings_is_believ
     world.connection = Connection::new(SERIAL[0]).on_line(MS);
     let found: Vec<_> = (1..=5).map(|number| world.read(1, 100 * number)).collect();
     let lost = Err(Failure::Timeout);
-    assert_eq!(found, [Ok(100), lost.clone(), lost, Ok(400), Ok(500)]);
+    assert_eq!(found, [Ok(100), lost, lost, Ok(400), Ok(500)]);
 }

@@ -35,6 +35,10 @@ if TYPE_CHECKING:
         @property
         def late(self) -> int:
             """How many replies arrived after their timeout."""
+
+        @property
+        def longest_late(self) -> float:
+            """How many seconds the slowest of them took; 0 if there were none."""
             ...
 
 
@@ -258,6 +262,14 @@ class Client(BaseClient):
     def late(self) -> int:
         """How many replies were dropped because they arrived after the timeout."""
         return self._transport.late
+
+    @property
+    def longest_late(self) -> float:
+        """How many seconds the slowest of these replies took; 0 if there were none.
+
+        At most four times the timeout: what comes even later counts as that.
+        """
+        return self._transport.longest_late
 
     async def close(self) -> None:
         """Closes the connection: pending calls raise `ConnectionLost`, a later call reconnects."""

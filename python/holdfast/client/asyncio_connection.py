@@ -37,6 +37,7 @@ class AsyncConnection:
         self._endpoint = endpoint
         self._max_in_flight = 1 if target.tolerance.is_one_at_a_time else max_in_flight
         self._late = 0
+        self._longest_late = 0.0
         self._here: _LoopConnection | None = None
 
     def call(self, request: Request, unit: int, timeout: float) -> Awaitable[Any]:
@@ -63,6 +64,12 @@ class AsyncConnection:
         """How many replies arrived after their timeout."""
         return self._late + (0 if self._here is None else self._here.late)
 
+    @property
+    def longest_late(self) -> float:
+        """How many seconds the slowest of them took; 0 if there were none."""
+        here = 0.0 if self._here is None else self._here.longest_late
+        return max(self._longest_late, here)
+
     def _move(self, loop: asyncio.AbstractEventLoop) -> _LoopConnection:
         """Starts over in another loop; drops everything of a closed loop."""
         old = self._here
@@ -70,6 +77,7 @@ class AsyncConnection:
             if old.in_use and not old.loop.is_closed():
                 raise RuntimeError("the client is in use in another event loop: close it there")
             self._late += old.late
+            self._longest_late = max(self._longest_late, old.longest_late)
         self._here = here = _LoopConnection(self._target, self._endpoint, self._max_in_flight, loop)
         return here
 
@@ -97,6 +105,7 @@ class _LoopConnection:
         """Whether the attempt to connect waits, or has waited, for the addresses of the host."""
         self._connect_at = -inf
         self._late = 0
+        self._longest_late = 0.0
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
         if self._free:
@@ -150,6 +159,11 @@ class _LoopConnection:
     @property
     def late(self) -> int:
         return self._late + (0 if self._open is None else self._open.core.late)
+
+    @property
+    def longest_late(self) -> float:
+        here = 0.0 if self._open is None else self._open.core.longest_late
+        return max(self._longest_late, here)
 
     async def _turn(self) -> None:
         """Waits for a free place in flight, in the order of the calls."""
@@ -229,6 +243,7 @@ class _LoopConnection:
         """The connection has ended: the next call makes a new one."""
         self._connect_at = self.loop.time() + self._target.tolerance.reconnect
         self._late += connection.core.late
+        self._longest_late = max(self._longest_late, connection.core.longest_late)
         if self._open is connection:
             self._open = None
 

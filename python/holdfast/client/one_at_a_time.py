@@ -59,3 +59,8 @@ class OneAtATime:
     def late(self) -> int:
         """How many replies arrived after their timeout."""
         return self._core.late
+
+    @property
+    def longest_late(self) -> float:
+        """How many seconds the slowest of them took; 0 if there were none."""
+        return self._core.longest_late

@@ -235,6 +235,14 @@ class SyncClient(BaseClient):
         """How many replies were dropped because they arrived after the timeout."""
         return self._core.late
 
+    @property
+    def longest_late(self) -> float:
+        """How many seconds the slowest of these replies took; 0 if there were none.
+
+        At most four times the timeout: what comes even later counts as that.
+        """
+        return self._core.longest_late
+
     def close(self) -> None:
         """Closes the connection after the calls before it. A later call reconnects."""
         self._core.close()

@@ -139,7 +139,7 @@ class _Turns:
         self._deadline = time.monotonic() + timeout
         self.is_sent = False
         self.broadcasts = False
-        self.late = 0
+        self.late, self.longest_late = 0, 0.0
         """The link drops late replies."""
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:

@@ -35,6 +35,8 @@ pub struct BlockingClient {
     turns: Turns,
     state: Mutex<State>,
     late: AtomicU64,
+    /// The longest time of a late reply, in nanoseconds.
+    longest_late: AtomicU64,
     strays: Arc<StrayCounters>,
     /// The zero of the clock of all its connections.
     epoch: Instant,
@@ -97,6 +99,7 @@ impl BlockingClient {
             turns: Turns::default(),
             state: Mutex::default(),
             late: AtomicU64::new(0),
+            longest_late: AtomicU64::new(0),
             strays: Arc::default(),
             epoch: Instant::now(),
         }
@@ -196,6 +199,8 @@ impl BlockingClient {
                 });
             });
             self.late.fetch_add(open.connection.late() - late, Ordering::Relaxed);
+            let longest = open.connection.longest_late().as_nanos();
+            self.longest_late.fetch_max(longest.try_into().unwrap_or(u64::MAX), Ordering::Relaxed);
             open.count_strays(&self.strays);
             if open.connection.closed().is_some() {
                 state.end();
@@ -329,6 +334,11 @@ impl BlockingClient {
     /// The number of replies that came after their request had ended.
     pub fn late(&self) -> u64 {
         self.late.load(Ordering::Relaxed)
+    }
+
+    /// The longest time that one of them took; 0 if there was none.
+    pub fn longest_late(&self) -> Duration {
+        Duration::from_nanos(self.longest_late.load(Ordering::Relaxed))
     }
 }
 

@@ -2,10 +2,12 @@
 
 use alloc::boxed::Box;
 use alloc::vec::Vec;
+use core::mem::take;
 use core::time::Duration;
 
 use super::earlier::Earlier;
 use super::flights::{Call, Done, Flights, Strays, Ticket};
+use super::lateness::Lateness;
 use super::mbap_datagrams::Datagrams;
 use super::mbap_stream::Stream;
 use super::rtu_and_ascii::{Framing, OneAtATime};
@@ -54,8 +56,10 @@ pub struct Past(Left);
 enum Left {
     #[default]
     Nothing,
-    /// The next transaction id, and those that may still be answered.
-    Ids(u16, Vec<u16>),
+    /// The next transaction id, those that may still be answered, and how late replies are.
+    Ids(u16, Vec<u16>, Lateness),
+    /// How late replies are.
+    Lateness(Lateness),
     Earlier(Earlier),
 }
 
@@ -123,9 +127,9 @@ impl Connection {
         match &mut self.wire {
             Wire::Stream(stream) => {
                 let (next_id, given_up) = stream.take_ids(&self.flights);
-                Past(Left::Ids(next_id, given_up))
+                Past(Left::Ids(next_id, given_up, take(&mut stream.lateness)))
             }
-            Wire::Datagrams(_) => Past::default(),
+            Wire::Datagrams(datagrams) => Past(Left::Lateness(take(&mut datagrams.lateness))),
             Wire::OneAtATime(line) => Past(Left::Earlier(line.take_earlier(&self.flights, now))),
         }
     }
@@ -133,16 +137,19 @@ impl Connection {
     /// Goes on where another connection to the same address ended, whose clock was the same.
     pub fn follow(&mut self, past: Past) {
         match (&mut self.wire, past.0) {
-            (Wire::Stream(stream), Left::Ids(next_id, given_up)) => {
-                stream.go_on(next_id, &given_up)
+            (Wire::Stream(stream), Left::Ids(next_id, given_up, lateness)) => {
+                stream.go_on(next_id, &given_up);
+                stream.lateness = lateness;
             }
+            (Wire::Datagrams(datagrams), Left::Lateness(lateness)) => datagrams.lateness = lateness,
             (Wire::OneAtATime(line), Left::Earlier(earlier)) => line.earlier = earlier,
             _ => {}
         }
     }
 
     /// Sends a request, or queues it until the line is silent. `timeout` runs from now, and again
-    /// from each reply to a request that was sent before it.
+    /// from each reply to a request that was sent before it. If late replies of the unit repeat, it is
+    /// longer, up to four times; end the request with [`Connection::cancel`] if it must not be.
     ///
     /// # Errors
     /// [`Closed`]: the reason why the connection has ended, or [`Closed::NoTransactionId`].
@@ -325,5 +332,10 @@ impl Connection {
     /// The number of late replies, which were dropped.
     pub fn late(&self) -> u64 {
         self.flights.late
+    }
+
+    /// The longest time that one of them took; 0 if there was none.
+    pub fn longest_late(&self) -> Duration {
+        self.flights.longest_late
     }
 }

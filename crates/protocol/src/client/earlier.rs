@@ -4,9 +4,10 @@
 //! A request that ended without its reply stays here until that reply has come, or until late replies are
 //! known to have ended. Meanwhile, nothing is sent whose reply could be taken for it.
 
-use alloc::collections::{BTreeMap, BTreeSet, VecDeque};
+use alloc::collections::{BTreeSet, VecDeque};
 use core::time::Duration;
 
+use super::lateness::Lateness;
 use super::tolerance::{AcceptUnit, Tolerance};
 use super::{GUARD, MAX_LATENESS, Time};
 use crate::pdu::{EncodedRequest, Request};
@@ -21,15 +22,6 @@ const LATENESS: u32 = 3;
 /// A late reply may take so long however short the timeouts are: a request may have had only what was left of
 /// its time.
 const MIN_LATENESS: Duration = Duration::from_millis(250);
-
-/// Late replies after which the timeout of a unit is raised.
-const LATE_IN_A_ROW: u8 = 2;
-
-/// A raised timeout is at most this many times the timeout.
-const MAX_RAISED: u32 = 4;
-
-/// Replies within the timeout after which it is no longer raised.
-const IN_TIME: u8 = 32;
 
 /// Replies that a new line or stream has to give, none of them twice, before it needs no guard time.
 const PROBATION: u32 = 8;
@@ -63,7 +55,7 @@ pub(super) struct Earlier {
     unanswered: VecDeque<Unanswered>,
     /// Units and functions of which a reply never came: a device may send it with the next one.
     never_came: BTreeSet<(u8, u8)>,
-    units: BTreeMap<u8, Unit>,
+    lateness: Lateness,
     guard: Guard,
     /// When something was received the last time, or a request ended.
     pub(super) used: Time,
@@ -109,29 +101,6 @@ pub(super) enum Ended {
     Damaged,
 }
 
-/// How long a unit takes.
-#[derive(Debug, Default)]
-struct Unit {
-    /// The longest time of a reply that was not late.
-    longest: Duration,
-    /// The longest time of a late reply.
-    latest: Duration,
-    /// Late replies since the last of [`IN_TIME`] that were not.
-    late: u8,
-    in_time: u8,
-    /// The longest timeout of its requests meanwhile, and of those before.
-    timeout: Duration,
-    former_timeout: Duration,
-}
-
-impl Unit {
-    /// How long it may take by the timeouts of its requests. One of them may have had little time.
-    fn note_timeout(&mut self, timeout: Duration) -> Duration {
-        self.timeout = self.timeout.max(timeout);
-        self.timeout.max(self.former_timeout)
-    }
-}
-
 /// Whether replies may come twice.
 #[derive(Debug, Default)]
 struct Guard {
@@ -147,12 +116,7 @@ struct Guard {
 impl Earlier {
     /// The timeout of a request to this unit: more than `timeout` if late replies repeat.
     pub(super) fn timeout(&self, unit_id: u8, timeout: Duration) -> Duration {
-        match self.units.get(&unit_id) {
-            Some(unit) if unit.late >= LATE_IN_A_ROW => {
-                timeout.max((unit.latest * 3 / 2).min(timeout * MAX_RAISED))
-            }
-            _ => timeout,
-        }
+        self.lateness.timeout(unit_id, timeout)
     }
 
     /// Until when a reply may come that could be taken for the one to this request.
@@ -240,19 +204,17 @@ impl Earlier {
         how: Ended,
         now: Time,
     ) -> Time {
-        let is_known = self.units.get(&unit_id).is_some_and(|unit| !unit.longest.is_zero());
-        let unit = self.units.entry(unit_id).or_default();
-        let timeout = unit.note_timeout(timeout);
-        let usual = (unit.longest * 4).max(GUARD);
+        let longest = self.lateness.longest(unit_id);
+        let usual = longest.map(|longest| (longest * 4).max(GUARD));
+        let timeout = self.lateness.note_timeout(unit_id, timeout);
         match how {
             Ended::TimedOut => {
-                let lateness = (timeout * LATENESS).max(MIN_LATENESS).max(unit.latest * 2);
+                let latest = self.lateness.latest(unit_id) * 2;
+                let lateness = (timeout * LATENESS).max(MIN_LATENESS).max(latest);
                 sent + lateness.min(timeout + MAX_LATENESS)
             }
-            Ended::Unanswered => (sent + timeout).max(now + usual),
-            Ended::Damaged => {
-                (sent + timeout).min(now + if is_known { usual } else { AFTER_DAMAGED })
-            }
+            Ended::Unanswered => (sent + timeout).max(now + usual.unwrap_or(GUARD)),
+            Ended::Damaged => (sent + timeout).min(now + usual.unwrap_or(AFTER_DAMAGED)),
         }
     }
 
@@ -298,7 +260,7 @@ impl Earlier {
 
     /// The longest time of a reply of this unit that was not late.
     pub(super) fn longest(&self, unit_id: u8) -> Duration {
-        self.units.get(&unit_id).map_or(Duration::ZERO, |unit| unit.longest)
+        self.lateness.longest(unit_id).unwrap_or_default()
     }
 
     /// Requests whose replies may still come.
@@ -306,15 +268,13 @@ impl Earlier {
         self.unanswered.iter()
     }
 
-    /// Notes the late reply to the request at this place.
-    pub(super) fn late(&mut self, place: usize, now: Time) {
-        let Some(earlier) = self.unanswered.remove(place) else { return };
+    /// Notes the late reply to the request at this place. Returns how long it took.
+    pub(super) fn late(&mut self, place: usize, now: Time) -> Duration {
+        let Some(earlier) = self.unanswered.remove(place) else { return Duration::ZERO };
         self.guard.has_begun = true;
-        let unit = self.units.entry(earlier.unit_id).or_default();
         let took = now.saturating_sub(earlier.sent).min(earlier.until - earlier.sent);
-        unit.latest = unit.latest.max(took);
-        unit.late = unit.late.saturating_add(1);
-        unit.in_time = 0;
+        self.lateness.late(earlier.unit_id, took);
+        took
     }
 
     /// Whether this reply is believed only if no other follows: one to an earlier request never came, or it
@@ -357,19 +317,7 @@ impl Earlier {
         self.guard.has_begun = true;
         self.guard.clean = self.guard.clean.saturating_add(1);
         (self.too_fast, self.only_too_fast) = (false, 0);
-        let unit = self.units.entry(unit_id).or_default();
-        unit.note_timeout(timeout);
-        unit.longest = unit.longest.max(took.min(timeout));
-        if took > timeout {
-            unit.in_time = 0;
-            unit.latest = unit.latest.max(took);
-            return;
-        }
-        unit.in_time += 1;
-        if unit.in_time == IN_TIME {
-            let former_timeout = unit.timeout;
-            *unit = Unit { longest: took, former_timeout, ..Unit::default() };
-        }
+        self.lateness.answered(unit_id, took, timeout);
     }
 }
 

@@ -53,11 +53,21 @@ pub(super) struct Flight {
     pub(super) unit_id: u8,
     pub(super) request: EncodedRequest,
     pub(super) sent: Time,
+    /// The timeout that it was given, or the raised one.
     timeout: Duration,
+    /// The timeout that it was given.
+    pub(super) within: Duration,
     attempt: Attempt,
     pub(super) deadline: Time,
     /// Whether the result is to be dropped.
     abandoned: bool,
+}
+
+impl Flight {
+    /// From when on the device can have handled it: since it was sent, and since the reply before.
+    pub(super) fn began(&self) -> Time {
+        self.deadline.saturating_sub(self.timeout)
+    }
 }
 
 /// All requests in flight, in the order in which they were sent.
@@ -69,6 +79,8 @@ pub(super) struct Flights {
     pub(super) closed: Option<Closed>,
     /// The number of late replies, which were dropped.
     pub(super) late: u64,
+    /// The longest time that one of them took, as far as it is known.
+    pub(super) longest_late: Duration,
     pub(super) strays: Strays,
     /// The number of requests that had more than their timeout, because late replies repeat.
     pub(super) raised: u64,
@@ -116,11 +128,27 @@ impl Flights {
             request,
             sent,
             timeout,
+            within: timeout,
             attempt,
             deadline,
             abandoned: false,
         });
         ticket
+    }
+
+    /// Gives the request that was pushed last more time than its timeout.
+    pub(super) fn raise_last(&mut self, timeout: Duration) {
+        if let Some(flight) = self.waiting.back_mut().filter(|flight| timeout > flight.timeout) {
+            self.raised += 1;
+            flight.timeout = timeout;
+            flight.deadline = flight.sent + timeout;
+        }
+    }
+
+    /// Counts a late reply, which took this time; 0 if that is not known.
+    pub(super) fn came_late(&mut self, took: Duration) {
+        self.late += 1;
+        self.longest_late = self.longest_late.max(took);
     }
 
     /// When the timeout of a request ends.

@@ -4,6 +4,7 @@ use alloc::collections::VecDeque;
 use core::time::Duration;
 
 use super::flights::{Call, Done, Flights, Ticket};
+use super::lateness::{Lateness, MAX_RAISED};
 use super::mbap_stream;
 use super::{Closed, Failure, InvalidResponse, MAX_STRAY_DATAGRAMS, Time, Tolerance, UDP_ATTEMPTS};
 use crate::frame::mbap::{self, Next};
@@ -16,12 +17,26 @@ pub(super) struct Datagrams {
     next_id: u16,
     /// The state from which transaction ids follow; `None` while they count up.
     random: Option<u64>,
-    /// The last transaction ids, and how many replies to each may still come.
-    recent: VecDeque<(u16, u32)>,
+    /// The last requests.
+    recent: VecDeque<Recent>,
+    pub(super) lateness: Lateness,
     /// Datagrams that matched no request, since the last reply.
     strays: u32,
     /// When to send the request again, and how many times.
     repeat: Option<Repeat>,
+}
+
+/// A request whose replies are recognized.
+#[derive(Debug, Clone, Copy)]
+struct Recent {
+    transaction_id: u16,
+    unit_id: u8,
+    sent: Time,
+    within: Duration,
+    /// How many replies to it may still come.
+    left: u32,
+    /// Whether one of them has come.
+    is_answered: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -45,31 +60,46 @@ impl Datagrams {
                 None => next.wrapping_add(1),
                 Some(state) => split_mix(state),
             };
-            if self.recent.iter().all(|(recent, _)| *recent != next) {
+            if self.recent.iter().all(|recent| recent.transaction_id != next) {
                 return next;
             }
         }
     }
 
-    /// Whether a reply with that id may come.
-    fn expects(&mut self, id: u16) -> bool {
-        let recent = self.recent.iter_mut().find(|(recent, _)| *recent == id);
-        recent.is_some_and(|(_, left)| {
-            let is_expected = *left > 0;
-            *left = left.saturating_sub(1);
-            is_expected
-        })
+    /// Takes a reply with that id, if one may come: the first one of its request says how long it took.
+    fn take(&mut self, id: u16) -> Option<Recent> {
+        let recent = self.recent.iter_mut().find(|recent| recent.transaction_id == id)?;
+        recent.left = recent.left.checked_sub(1)?;
+        let found = *recent;
+        recent.is_answered = true;
+        Some(found)
+    }
+
+    /// Notes a late reply.
+    fn late(&mut self, flights: &mut Flights, request: Recent, now: Time) {
+        let Recent { unit_id, sent, within, is_answered, .. } = request;
+        let took = if is_answered { Duration::ZERO } else { now.saturating_sub(sent) };
+        let took = took.min(within * MAX_RAISED);
+        flights.came_late(took);
+        if took > within {
+            self.lateness.late(unit_id, took);
+        }
     }
 
     pub(super) fn send(&mut self, flights: &mut Flights, call: Call<'_>, now: Time) -> Ticket {
         let id = self.next_id;
-        let every = call.timeout / UDP_ATTEMPTS;
+        let Call { unit_id, timeout: within, .. } = call;
+        let every = within / UDP_ATTEMPTS;
         let left = if call.request.is_read() { UDP_ATTEMPTS - 1 } else { 0 };
         self.repeat = (left > 0).then_some(Repeat { at: now + every, every, left });
         self.recent.truncate(RECENT - 1);
-        self.recent.push_front((id, left + 1));
+        let (left, is_answered) = (left + 1, false);
+        let sent = now;
+        let recent = Recent { transaction_id: id, unit_id, sent, within, left, is_answered };
+        self.recent.push_front(recent);
         self.next_id = self.following(id);
         let ticket = flights.push(call, id, now);
+        flights.raise_last(self.lateness.timeout(unit_id, within));
         write(flights);
         ticket
     }
@@ -92,11 +122,13 @@ impl Datagrams {
                 let is_expected = in_flight
                     && flights.first().is_some_and(|one| accept_unit.accepts(one.unit_id, unit_id));
                 if is_expected {
-                    self.expects(transaction_id);
+                    if let Some(Recent { unit_id, sent, within, .. }) = self.take(transaction_id) {
+                        self.lateness.answered(unit_id, now.saturating_sub(sent), within);
+                    }
                     (self.repeat, self.strays) = (None, 0);
                     flights.answer(0, pdu, now, sink)
-                } else if !in_flight && self.expects(transaction_id) {
-                    flights.late += 1;
+                } else if !in_flight && let Some(request) = self.take(transaction_id) {
+                    self.late(flights, request, now);
                     None
                 } else {
                     flights.strays.replies += 1;

@@ -3,8 +3,10 @@
 
 use alloc::collections::BTreeMap;
 use alloc::vec::Vec;
+use core::time::Duration;
 
 use super::flights::{Call, Done, Flight, Flights, Ticket};
+use super::lateness::{Lateness, MAX_RAISED};
 use super::{Closed, Failure, InvalidResponse, MAX_CONSECUTIVE_TIMEOUTS, Time};
 use crate::frame::mbap::{self, Next};
 
@@ -18,8 +20,9 @@ const IDS: usize = 65_536;
 pub(super) struct Stream {
     next_id: u16,
     /// Transaction ids of requests that were given up: their replies may still come. Those of an earlier
-    /// connection have no ticket.
-    given_up: BTreeMap<u16, Option<Ticket>>,
+    /// connection are only known by their ids.
+    given_up: BTreeMap<u16, Option<GivenUp>>,
+    pub(super) lateness: Lateness,
     /// The beginning of a frame.
     partial: Vec<u8>,
     /// The number of timeouts since the last received byte, and the time of the last one.
@@ -27,6 +30,22 @@ pub(super) struct Stream {
     timed_out: Time,
     /// Bytes that the header of an exception reply counted beyond its end. They may come, or not.
     surplus: usize,
+}
+
+/// A request that was given up.
+#[derive(Debug, Clone, Copy)]
+struct GivenUp {
+    ticket: Ticket,
+    unit_id: u8,
+    began: Time,
+    within: Duration,
+}
+
+impl GivenUp {
+    fn new(flight: &Flight) -> Option<GivenUp> {
+        let Flight { ticket, unit_id, within, .. } = *flight;
+        Some(GivenUp { ticket, unit_id, began: flight.began(), within })
+    }
 }
 
 /// Given up requests whose transaction ids the next connection knows.
@@ -68,7 +87,9 @@ impl Stream {
         let pdu = call.request.pdu();
         flights.out.extend_from_slice(&mbap::header(id, call.unit_id, pdu.len()));
         flights.out.extend_from_slice(pdu);
-        Some(flights.push(call, id, now))
+        let ticket = flights.push(call, id, now);
+        flights.raise_last(self.lateness.timeout(call.unit_id, call.timeout));
+        Some(ticket)
     }
 
     /// Gives a request up: its reply, should it come, is dropped. One that waits for a pause is not
@@ -78,7 +99,7 @@ impl Stream {
         let behind: usize = flights.after(ticket).map(frame_len).sum();
         let Some(flight) = flights.take(ticket) else { return };
         if flights.held.is_none() {
-            self.given_up.insert(flight.transaction_id, Some(flight.ticket));
+            self.given_up.insert(flight.transaction_id, GivenUp::new(&flight));
             return;
         }
         let end = flights.out.len().saturating_sub(behind);
@@ -169,21 +190,38 @@ impl Stream {
         sink: &mut impl FnMut(Done<'_>),
     ) -> Option<InvalidResponse> {
         let Some(position) = flights.position(id) else {
-            if let Some(ticket) = self.given_up.remove(&id) {
-                flights.late += 1;
-                flights.reply_begun = false;
-                if let Some(ticket) = ticket {
-                    flights.restart_after(ticket, now);
-                }
-                return None;
-            }
-            return Some(InvalidResponse::TransactionId(id));
+            let Some(request) = self.given_up.remove(&id) else {
+                return Some(InvalidResponse::TransactionId(id));
+            };
+            self.late(flights, request, now);
+            return None;
         };
-        let expected = flights.get(position)?.unit_id;
+        let flight = flights.get(position)?;
+        let expected = flight.unit_id;
         if !flights.tolerance.accept_unit.accepts(expected, unit_id) {
             return Some(InvalidResponse::UnitId { expected, found: unit_id });
         }
+        self.lateness.answered(expected, now.saturating_sub(flight.began()), flight.within);
         flights.answer(position, pdu, now, sink)
+    }
+
+    /// Notes a late reply to a request, of which an earlier connection has left only its transaction id.
+    fn late(&mut self, flights: &mut Flights, request: Option<GivenUp>, now: Time) {
+        flights.reply_begun = false;
+        let Some(GivenUp { ticket, unit_id, began, within }) = request else {
+            return flights.came_late(Duration::ZERO);
+        };
+        // The owner of the socket may not have read for a while.
+        let took = now.saturating_sub(began).min(within * MAX_RAISED);
+        flights.came_late(took);
+        flights.restart_after(ticket, now);
+        // A device that handles one request at a time can't have begun those after it before.
+        let after = self.given_up.values_mut().flatten().filter(|other| other.ticket > ticket);
+        after.for_each(|other| other.began = now);
+        // A call that its caller has ended before its timeout says nothing of the unit.
+        if took > within {
+            self.lateness.late(unit_id, took);
+        }
     }
 
     pub(super) fn advance(
@@ -195,7 +233,7 @@ impl Stream {
         let mut timed_out = false;
         while let Some(flight) = flights.expired(now) {
             timed_out = true;
-            self.given_up.insert(flight.transaction_id, Some(flight.ticket));
+            self.given_up.insert(flight.transaction_id, GivenUp::new(&flight));
             if self.timeouts == 0 || flight.sent >= self.timed_out {
                 self.timeouts += 1;
                 self.timed_out = now;

@@ -10,7 +10,8 @@
 //! * A reply counts only when transaction id (where there is one), unit id, function and length are
 //!   those of the request. On a stream, anything else ends the connection: the two sides no longer
 //!   mean the same thing.
-//! * A request that timed out is given up. Its late reply is dropped and counted. Where no transaction id
+//! * A request that timed out is given up. Its late reply is dropped and counted; if that repeats, the next
+//!   requests to this unit have more time. Where no transaction id
 //!   tells it apart, a stream ends, and nothing is sent whose reply could be taken for it until it has
 //!   come or late replies are known to have ended. The next connection gets this as [`Past`].
 //! * Transaction ids go on from one connection to the next, and none is used again while a reply to it may
@@ -27,6 +28,7 @@
 mod connection;
 mod earlier;
 mod flights;
+mod lateness;
 mod mbap_datagrams;
 mod mbap_stream;
 mod rtu_and_ascii;

@@ -278,9 +278,9 @@ impl OneAtATime {
     fn take_late(&mut self, flights: &mut Flights, now: Time) -> usize {
         let mut taken = 0;
         while let Some((place, at, len)) = self.late_reply(flights.tolerance.pad) {
-            self.earlier.late(place, now);
+            let took = self.earlier.late(place, now);
             self.received.drain(at..at + len);
-            flights.late += 1;
+            flights.came_late(took);
             taken += len;
         }
         taken
