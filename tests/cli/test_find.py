@@ -19,7 +19,7 @@ from holdfast.tools import finding
 from support import cli, lines, wire
 from support.cli import answer, done, failure, usage_error
 from support.commands import Command
-from support.fake_device import FakeDevice, Serial, Stream, exception, registers, silent
+from support.fake_device import FakeDevice, Late, Serial, Stream, exception, registers, silent
 from support.terminal import Terminal, plain
 
 if TYPE_CHECKING:
@@ -31,6 +31,20 @@ if TYPE_CHECKING:
 
 TCGETS2 = 0x802C542A
 """Linux: reads the settings of a line, with the speed as a number."""
+
+
+@pytest.mark.parametrize("as_json", [(), ("--json",)])
+def test_replies_after_the_timeout_are_a_hint(as_json: tuple[str, ...]) -> None:
+    with Stream("tcp", then=Late()) as device:
+        port = device.url.rpartition(":")[2]
+        for arguments in (
+            (device.url, "--units", "1-3"),
+            ("127.0.0.1", "--port", port, "--units", "1-3"),
+        ):
+            found = cli.invoke("find", *arguments, "--timeout", "0.05", *as_json)
+            assert cli.LATE.fullmatch(found.stderr)
+            if as_json:
+                assert json.loads(found.stdout)["ok"] is False
 
 
 def test_hosts_that_answer_are_found_and_others_told_apart(serve: Serve) -> None:

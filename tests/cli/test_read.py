@@ -15,7 +15,8 @@ from holdfast.cli import pace
 from support import cli, transports, wire
 from support.cli import answer, done, failure, invoke, usage_error
 from support.commands import Command
-from support.fake_device import FakeDevice, exception, registers
+from support.fake_device import FakeDevice, Late, Stream, exception, registers
+from support.paths import ROOT
 from support.terminal import Terminal, plain
 
 if TYPE_CHECKING:
@@ -34,6 +35,30 @@ def test_registers_are_shown_in_three_ways(
         "      8    65535  0xFFFF  1111 1111 1111 1111",
         "      9        0  0x0000  0000 0000 0000 0000",
     ]
+
+
+REPEATED = ("--every", "0.01", "--times", "3")
+SLOW_READS = {
+    "read": ("read", "hr:7", *REPEATED),
+    "tags": ("read", "--tags", str(ROOT / "examples" / "tags" / "heater.yaml"), *REPEATED),
+    "describe": ("describe", "--units", "1-3"),
+}
+
+
+@pytest.mark.parametrize("as_json", [(), ("--json",)])
+@pytest.mark.parametrize("arguments", SLOW_READS.values(), ids=SLOW_READS)
+def test_replies_after_the_timeout_are_a_hint(
+    arguments: tuple[str, ...], as_json: tuple[str, ...]
+) -> None:
+    with Stream("tcp", then=Late()) as device:
+        command, *rest = arguments
+        found = invoke(command, device.url, *rest, "--timeout", "0.05", *as_json)
+    *_, last = found.stderr.splitlines(keepends=True)
+    assert cli.LATE.fullmatch(last), found.stderr
+
+
+def test_without_late_replies_there_is_no_hint(server: holdfast.Server) -> None:
+    assert invoke("read", cli.url(server), "hr:7", *REPEATED).stderr == ""
 
 
 def test_bits_are_shown_sixteen_a_line(server: holdfast.Server, memory: holdfast.Memory) -> None:

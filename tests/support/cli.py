@@ -71,6 +71,13 @@ def failure(*arguments: str) -> list[str]:
     return result.stderr.splitlines()
 
 
+LATE = re.compile(
+    r"hint: replies take (up to )?0\.\d+ s( or more)?, longer than --timeout 0\.05 s: "
+    r"use --timeout [0-9.]+\n"
+)
+"""What a command says at its end, if replies have come after its timeout."""
+
+
 def usage_error(*arguments: str) -> str:
     """Returns the last line of the error for wrong usage."""
     result = invoke(*arguments)

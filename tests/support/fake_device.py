@@ -221,6 +221,18 @@ def silent(asked: Asked) -> None:
     """Does nothing."""
 
 
+class Late:
+    """Answers each request when the next one has come."""
+
+    def __init__(self) -> None:
+        self._held: Asked | None = None
+
+    def __call__(self, asked: Asked) -> None:
+        held, self._held = self._held, asked
+        if held is not None:
+            held.answer()
+
+
 class ScriptedDevice(ABC):
     """A device that runs from `start` to `stop`, any number of times. One thread serves all
     connections, so none is left after `stop`.

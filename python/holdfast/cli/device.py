@@ -40,6 +40,12 @@ ADDRESS_6 = re.compile(r"[0-9a-fA-F:.]*:[0-9a-fA-F.]*:[0-9a-fA-F:.]*")
 FILES = (".yaml", ".yml", ".json", ".csv")
 """How names of files end that are no hosts."""
 
+TIMEOUTS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, MAX_TIMEOUT)
+"""Timeouts to suggest."""
+
+MAX_LATENESS = 4
+"""What comes later than this many times the timeout counts as that."""
+
 REASONS: tuple[tuple[type[ModbusError], str], ...] = (
     (ModbusException, "exception"),
     (RequestTimeout, "timeout"),
@@ -131,9 +137,26 @@ def device_options(command: Command) -> Command:
 
 
 def connect(url: str, unit: int, timeout: float) -> SyncClient:
-    """A client. It connects on its first request."""
+    """A client. It connects on its first request. At its end, the command tells of late replies."""
     with usable():
-        return SyncClient(url, unit=unit, timeout=timeout)
+        client = SyncClient(url, unit=unit, timeout=timeout)
+    context = click.get_current_context()
+    context.call_on_close(lambda: tell_late(client.longest_late, timeout))
+    return client
+
+
+def tell_late(longest: float, timeout: float) -> None:
+    """Hints on standard error that replies took `longest`, more than the timeout; 0 is none."""
+    if longest <= timeout:
+        return
+    least = next(each for each in TIMEOUTS if each >= longest * 1.5 or each == TIMEOUTS[-1])
+    found = (
+        f"up to {longest:.2g} s" if longest < MAX_LATENESS * timeout else f"{longest:.2g} s or more"
+    )
+    click.echo(
+        f"hint: replies take {found}, longer than --timeout {timeout:g} s: use --timeout {least:g}",
+        err=True,
+    )
 
 
 @contextlib.contextmanager

@@ -84,6 +84,7 @@ def find_hosts(
     )
     if interrupted and not as_json:
         click.echo("holdfast: interrupted", err=True)
+    device.tell_late(max((host.longest_late for host in found), default=0.0), timeout)
     if interrupted or not counts["modbus"]:
         sys.exit(device.FAILED)
 

@@ -70,6 +70,7 @@ def find_line(
         report.end(_line_told(attempts, found, total, why))
     if why is not None and not as_json:
         click.echo(f"holdfast: {path}: {why}", err=True)
+    device.tell_late(max((each.longest_late for each in attempts), default=0.0), timeout)
     if why is not None or not found:
         sys.exit(device.FAILED)
 

@@ -73,6 +73,8 @@ class Host:
     """The unit id that answered."""
     detail: str = ""
     identity: Identity = field(default_factory=Identity)
+    longest_late: float = 0.0
+    """How many seconds its slowest late reply took; 0 if there was none."""
 
     @property
     def url(self) -> str:
@@ -180,31 +182,37 @@ async def hosts(
 async def _host(address: str, port: int, timeout: float, units: Sequence[int]) -> Host:
     host = Host(address, port, "silent")
     async with Client(host.url, timeout=timeout) as client:
-        for unit in units:
-            try:
-                await client.read("holding_registers", 0, "uint16", unit=unit)
-                host.detail = "answers"
-            except ModbusException as error:
-                host.detail = str(error)
-                if error.code in BEHIND_GATEWAY:
-                    host.state = "modbus"
-                    continue
-            except ConnectFailed as error:
-                host.detail = error.detail
-                host.state = _unreachable(error) if host.state == "silent" else host.state
-                return host
-            except (RequestTimeout, ConnectionLost, InvalidResponse) as error:
-                if str(error).startswith(NOT_CONNECTED):
-                    return host
-                if host.state != "modbus":
-                    host.state = "open"
-                    host.detail = str(error)
-                continue
-            host.state, host.unit = "modbus", unit
-            with contextlib.suppress(ModbusError):
-                host.identity = identity(await client.identify(unit=unit))
-            return host
+        await _ask(host, client, units)
+        host.longest_late = client.longest_late
     return host
+
+
+async def _ask(host: Host, client: Client, units: Sequence[int]) -> None:
+    """Asks unit ids until one answers, and notes in `host` what was found."""
+    for unit in units:
+        try:
+            await client.read("holding_registers", 0, "uint16", unit=unit)
+            host.detail = "answers"
+        except ModbusException as error:
+            host.detail = str(error)
+            if error.code in BEHIND_GATEWAY:
+                host.state = "modbus"
+                continue
+        except ConnectFailed as error:
+            host.detail = error.detail
+            host.state = _unreachable(error) if host.state == "silent" else host.state
+            return
+        except (RequestTimeout, ConnectionLost, InvalidResponse) as error:
+            if str(error).startswith(NOT_CONNECTED):
+                return
+            if host.state != "modbus":
+                host.state = "open"
+                host.detail = str(error)
+            continue
+        host.state, host.unit = "modbus", unit
+        with contextlib.suppress(ModbusError):
+            host.identity = identity(await client.identify(unit=unit))
+        return
 
 
 def _unreachable(error: ConnectFailed) -> State:
@@ -283,6 +291,13 @@ class Attempt:
     detail: str
     is_garbled: bool = False
     """Whether bytes came that are not a valid reply: the settings may be wrong."""
+    longest_late: float = 0.0
+    """How many seconds the slowest late reply with these settings took so far."""
+
+
+def _attempt(settings: LineSettings, found: Unit, client: SyncClient) -> Attempt:
+    late = client.longest_late
+    return Attempt(settings, found.unit, found, found.detail, found.is_garbled, late)
 
 
 def line(
@@ -312,11 +327,11 @@ def line(
                         yield Attempt(each, unit, None, error.detail)
                         break
                     answered = answered or found.answers
-                    yield Attempt(each, unit, found, found.detail, found.is_garbled)
+                    yield _attempt(each, found, client)
                 if answered:
                     for unit in asked[1:] if part == asked[:1] else ():
                         found = probe(client, unit)
-                        yield Attempt(each, unit, found, found.detail, found.is_garbled)
+                        yield _attempt(each, found, client)
                     return
         if len(failures) == len(settings):
             raise failures[settings[0]]
