@@ -11,7 +11,7 @@ from holdfast import _core, faults, protocol, types
 from holdfast.gateway.assets import FOLDER
 from holdfast.scanner.messages import FunctionCode
 from holdfast.scanner.tags import AREA_OF_CODE
-from support import oracle
+from support import server_model
 
 COILS, DISCRETE_INPUTS, HOLDING_REGISTERS, INPUT_REGISTERS = (
     "coils",
@@ -40,7 +40,7 @@ FUNCTIONS = [
 
 def test_the_functions_are_those_of_the_standard() -> None:
     assert [tuple(each) for each in protocol.FUNCTIONS] == FUNCTIONS
-    assert protocol.WRITING_CODES == oracle.WRITES == (5, 6, 15, 16, 22, 23)
+    assert protocol.WRITING_CODES == server_model.WRITES == (5, 6, 15, 16, 22, 23)
     assert protocol.BROADCAST_CODES == (5, 6, 15, 16, 22)
 
 
@@ -115,7 +115,7 @@ def test_exceptions_have_the_names_of_the_standard() -> None:
 
 def test_diagnostics_that_change_nothing_are_the_echo_the_register_and_the_counters() -> None:
     assert (0, 2, *range(11, 19)) == protocol.HARMLESS_DIAGNOSTICS
-    assert [code for code, _, _ in _core.SUB_FUNCTIONS] == list(oracle.SUB_FUNCTIONS)
+    assert [code for code, _, _ in _core.SUB_FUNCTIONS] == list(server_model.SUB_FUNCTIONS)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 import holdfast
 from holdfast.types import AREAS
 from support import wire
-from support.oracle import pack_bits, pack_registers, unpack_bits, unpack_registers
+from support.server_model import pack_bits, pack_registers, unpack_bits, unpack_registers
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -1,7 +1,7 @@
 """A TCP stream as peers really send it: in pieces, joined, cut, late, foreign, endless, garbage.
 
 Random tests are replayed by their seed, which is written here. What random requests must be
-answered says the oracle, or, for the long run, rules that need none.
+answered says the model, or, for the long run, rules that need none.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from holdfast.types import AREAS
 from support import wire
 from support.cases import examples
 from support.machine import resident
-from support.oracle import COUNTERS, Oracle
 from support.running import content
+from support.server_model import COUNTERS, ServerModel
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -401,7 +401,7 @@ def test_garbage_behind_a_good_header_is_answered_or_closed(
     assert client.ask(READ)[0] == 3
 
 
-# Random requests against the oracle
+# Random requests against the model
 
 EXTENTS = {
     "coils": (3, 60),
@@ -484,7 +484,7 @@ def malformed(draw: st.DrawFn) -> bytes:
 
 
 def is_modelled(pdu: bytes) -> bool:
-    """Counters and identification are not in the oracle."""
+    """Counters and identification are not in the model."""
     counter = pdu[0] == 8 and len(pdu) >= 3 and int.from_bytes(pdu[1:3], "big") in COUNTERS
     return pdu[0] not in (11, 17, 43) and not counter
 
@@ -499,7 +499,7 @@ units = st.sampled_from([1] * 12 + [0, 2, 255])
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(asked=st.lists(st.tuples(units, requests), min_size=1, max_size=60), seed=st.integers(0, 99))
-def test_pipelined_requests_are_answered_as_the_oracle_says(
+def test_pipelined_requests_are_answered_as_the_model_says(
     access: Access, asked: list[tuple[int, bytes]], seed: int
 ) -> None:
     chance = random.Random(seed)
@@ -509,16 +509,16 @@ def test_pipelined_requests_are_answered_as_the_oracle_says(
         holding_registers=EXTENTS["holding_registers"],
         input_registers=EXTENTS["input_registers"],
     )
-    oracle = Oracle(EXTENTS, read_only=access == "read-only")
+    model = ServerModel(EXTENTS, read_only=access == "read-only")
     for area, (start, size) in EXTENTS.items():
         top = 1 if area in ("coils", "discrete_inputs") else 0xFFFF
         values = [chance.randint(0, top) for _ in range(size)]
         memory.write(named(area), start, values)
-        oracle.values[area].update(enumerate(values, start))
+        model.values[area].update(enumerate(values, start))
     expected = [
         wire.Frame(index, unit, reply)
         for index, (unit, pdu) in enumerate(asked)
-        if (reply := oracle.answer(unit, pdu)) is not None
+        if (reply := model.answer(unit, pdu)) is not None
     ]
     stream = b"".join(wire.frame(pdu, unit, at) for at, (unit, pdu) in enumerate(asked))
     with (
@@ -532,7 +532,7 @@ def test_pipelined_requests_are_answered_as_the_oracle_says(
     assert replies == expected
     assert left == b""
     for area, (start, size) in EXTENTS.items():
-        assert memory.read(named(area), start, size) == list(oracle.values[area].values())
+        assert memory.read(named(area), start, size) == list(model.values[area].values())
 
 
 def named(area: str) -> Area:

@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
 from support import lines, wire
-from support.oracle import Oracle
+from support.server_model import ServerModel
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,11 +46,11 @@ def registers(pdu: bytes, value: int = 0) -> bytes:
     return bytes([pdu[0], 2 * count]) + value.to_bytes(2) * count
 
 
-def good_unit() -> Oracle:
+def good_unit() -> ServerModel:
     """A unit 1 as described above."""
-    oracle = Oracle(dict.fromkeys(AREAS, (0, 1000)))
-    oracle.values["holding_registers"] = {address: address for address in range(1000)}
-    return oracle
+    model = ServerModel(dict.fromkeys(AREAS, (0, 1000)))
+    model.values["holding_registers"] = {address: address for address in range(1000)}
+    return model
 
 
 class Asked:
@@ -247,7 +247,7 @@ class ScriptedDevice(ABC):
     def __init__(self, *script: Behaviour, then: Behaviour = good) -> None:
         self.script = list(script)
         self.then = then
-        self.oracle = good_unit()
+        self.model = good_unit()
         self.requests: list[Asked] = []
         """All received requests, in order."""
         self.connections = 0
@@ -319,7 +319,7 @@ class ScriptedDevice(ABC):
 
     def _deal_with(self, asked: Asked) -> None:
         if self.is_modelled:
-            asked.reply = self.oracle.answer(asked.unit, asked.pdu) or b""
+            asked.reply = self.model.answer(asked.unit, asked.pdu) or b""
         number = len(self.requests)
         self.requests.append(asked)
         behaviour = self.script[number] if number < len(self.script) else self.then

@@ -59,7 +59,7 @@ def unpack_registers(packed: bytes) -> list[int]:
     return list(struct.unpack(f">{len(packed) // 2}H", packed))
 
 
-class Oracle:
+class ServerModel:
     """One unit of one listener."""
 
     def __init__(
