@@ -1,0 +1,119 @@
+"""Many writers and readers over every face of a running appliance, while everything is disturbed.
+
+Nobody may see what no order of their requests explains. In short by default; with
+HOLDFAST_TORTURE=1 for HOLDFAST_MINUTES (10), half of them with `holdfast run` in a process of its
+own. HOLDFAST_SEED repeats the requests of a run, though not how threads meet.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import time
+from collections import Counter
+from contextlib import nullcontext
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import pytest
+
+from oracle.checker import check
+from oracle.plant import InProcess, OwnProcess, Plant
+from oracle.planted_faults import FAULTS, Evidence
+from oracle.rounds import WAYS, Round, started
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+IS_LONG = os.environ.get("HOLDFAST_TORTURE") == "1"
+MINUTES = float(os.environ.get("HOLDFAST_MINUTES", "10"))
+SEED = int(os.environ.get("HOLDFAST_SEED") or (time.time() if IS_LONG else 1))
+
+REQUESTS = 120
+"""Of each client, in the short form."""
+EVERY = 90
+"""So many operations are between two disturbances."""
+
+LONG_REQUESTS = 1500
+LONG_EVERY = 500
+
+EACH = 3
+"""Faults of each kind that are planted."""
+
+ENDS = {
+    "write done",
+    "write refused",
+    "cut within refused",
+    "cut behind unknown",
+    "read done",
+    "write and read done",
+    "publish done",
+    "passed write done",
+    "passed write refused",
+}
+"""What became of requests."""
+
+FACES = {way.name for way, _ in WAYS} | {"mqtt"}
+
+
+def report(found: Round) -> str:
+    """What is wrong with a round; empty if nothing is."""
+    return "\n".join([*map(str, check(found.history)), *found.surprises][:20])
+
+
+def missed(found: Round, each: int) -> list[str]:
+    """Plants some faults of each kind. Returns the kinds of those that are not found."""
+    evidence = Evidence(found.history, random.Random(SEED))
+    planted = {name: list(islice(fault(evidence), each)) for name, fault in FAULTS.items()}
+    return [
+        name
+        for name, histories in planted.items()
+        if not histories or not all(check(history) for history in histories)
+    ]
+
+
+def test_an_order_of_the_requests_explains_all_that_was_seen(tmp_path: Path) -> None:
+    with started(InProcess, tmp_path, SEED) as oracle:
+        found = oracle.round(REQUESTS, EVERY)
+    assert report(found) == ""
+    assert missed(found, EACH) == []
+    assert {face: count for face, count in found.by_face.items() if count < REQUESTS / 3} == {}
+    assert set(found.by_face) == FACES
+    assert found.sights > 2000
+    assert len(set(found.disturbances)) > 4
+    assert set(found.ends) >= ENDS
+
+
+@pytest.mark.skipif(not IS_LONG, reason="minutes to hours: HOLDFAST_TORTURE=1 runs it")
+@pytest.mark.timeout(MINUTES * 60 + 600)
+@pytest.mark.parametrize("kind", [InProcess, OwnProcess])
+def test_nothing_unexplained_is_seen_for_long(
+    kind: type[Plant], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def say(text: str) -> None:
+        with capsys.disabled() if IS_LONG else nullcontext():
+            print(text, flush=True)
+
+    say(f"\nHOLDFAST_SEED={SEED}, {kind.__name__}")
+    began = time.monotonic()
+    by_face: Counter[str] = Counter()
+    ends: Counter[str] = Counter()
+    disturbances: Counter[str] = Counter()
+    sights = planted = 0
+    with started(kind, tmp_path, SEED) as oracle:
+        while time.monotonic() < began + MINUTES * 30:
+            start = time.monotonic()
+            found = oracle.round(LONG_REQUESTS, LONG_EVERY)
+            seconds = time.monotonic() - start
+            by_face += found.by_face
+            ends += found.ends
+            disturbances.update(found.disturbances)
+            sights += found.sights
+            count = found.by_face.total()
+            say(f"{count} operations, {count / seconds:.0f} a second, {found.sights} values seen")
+            assert report(found) == ""
+            assert missed(found, 1) == []
+            planted += len(FAULTS)
+    say(f"{by_face.total()} operations, {sights} values seen, 0 violations, {planted} faults found")
+    for counts in (by_face, ends, disturbances):
+        say(", ".join(f"{name} {count}" for name, count in sorted(counts.items())))
