@@ -105,7 +105,7 @@ torture: .venv/core.stamp .venv/dev.stamp
 	HOLDFAST_TORTURE=1 cargo test --locked --release --quiet -p holdfast-engine --test route
 	HOLDFAST_TORTURE=1 cargo test --locked --release --quiet -p holdfast-journal -- --test-threads 1
 	HOLDFAST_TORTURE=1 $(BIN)/pytest tests/server/test_slow_connections.py tests/outputs/test_mqtt_outage.py \
-	  tests/fleet/test_moves.py tests/fleet/test_faults.py tests/hostile
+	  tests/fleet/test_moves.py tests/fleet/test_faults.py tests/hostile tests/oracle/test_running_appliance.py
 
 bench: .venv/core.stamp .venv/dev.stamp
 	cargo build --locked --quiet --release -p holdfast-benches

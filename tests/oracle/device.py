@@ -38,7 +38,8 @@ class Fates(NamedTuple):
     cut_before: int = 10
     cut_after: int = 10
     silent: int = 2
-    cut_read: int = 2
+    cut_read: int = 15
+    silent_read: int = 1
 
 
 FATES = Fates()
@@ -114,7 +115,7 @@ class MirroredDevice(Stream):
             if pdu[0] <= 4:
                 if dice < fates.cut_read:
                     asked.peer.hang_up()
-                else:
+                elif dice >= fates.cut_read + fates.silent_read:
                     asked.answer(self._read(pdu))
                 return
             for name, limit in (("refused", fates.refused), ("cut_before", fates.cut_before)):

@@ -6,7 +6,7 @@ import threading
 from typing import TYPE_CHECKING
 
 from oracle.history import Write
-from oracle.plant import GATE, NAMED, PARTS
+from oracle.plant import GATE, MAX_REGISTERS, NAMED, PARTS
 from oracle.requests import Request
 from oracle.workload import TWIN
 from support import wire
@@ -172,7 +172,8 @@ class Disturbances(threading.Thread):
         change = {
             "interval": self._chance.choice([0.01, 0.02, 0.03]),
             "timeout": self._chance.choice([0.2, 0.25]),
-            "max_gap": self._chance.choice([0, 5]),
+            "max_registers": self._chance.choice(MAX_REGISTERS),
+            "emulate": self._chance.random() < 0.5,
         }
         self._plant.change(lambda settings: settings["devices"]["drive"].update(change))
 

@@ -64,7 +64,7 @@ DEVICE_REFUSAL = 4
 NO_ANSWER = (0x0A, 0x0B)
 """Exceptions of requests that were sent to the device, or could not be."""
 
-TIMEOUT_S = 5.0
+TIMEOUT_S = wire.DEADLINE / 4
 """After this time, a reply is lost. Datagrams may be dropped by the system; nothing else is."""
 
 
