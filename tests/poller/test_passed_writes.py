@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -131,6 +133,33 @@ def test_function_22_can_be_a_read_and_a_write(run: Run) -> None:
             scada.mask_write(12, and_mask=0xFF00, or_mask=0x0011)
             assert scada.read_holding_registers(12, 1) == [0x0111]
         assert requests_of(source)[asked:] == [b"\x03\x01\xf6\x00\x01", b"\x06\x01\xf6\x01\x11"]
+
+
+def test_nothing_comes_between_the_read_and_the_write_of_function_22(run: Run) -> None:
+    """A route leads to the same device: its write waits for both, and keeps its bits."""
+    is_read, goes_on = threading.Event(), threading.Event()
+
+    def slow(asked: Asked) -> None:
+        if asked.pdu == b"\x03\x01\xf6\x00\x01":
+            is_read.set()
+            assert goes_on.wait(wire.DEADLINE)
+        asked.answer()
+
+    with plc(slow) as source, ThreadPoolExecutor(2) as threads:
+        meter = device(source.url, *READS, **RARELY, emulate=True, timeout=wire.DEADLINE)
+        rule = {**RULE, "units": {1: "mirror", 9: {"route": "meter"}}}
+        scada = {**MORE["listeners"]["scada"], "rules": [rule]}
+        appliance = run(configuration({"meter": meter}, **{**MORE, "listeners": {"scada": scada}}))
+        until_read(appliance)
+        with client(appliance) as mirror, client(appliance) as route:
+            low = threads.submit(mirror.mask_write, 12, and_mask=0xFF00, or_mask=0x0011)
+            assert is_read.wait(wire.DEADLINE)
+            high = threads.submit(route.mask_write, 502, and_mask=0x00FF, or_mask=0x2200, unit=9)
+            links = appliance.diagnostics.stats
+            wire.until(lambda: links()["links"]["meter"]["waiting"], "the other write waits")
+            goes_on.set()
+            assert (low.result(), high.result()) == (None, None)
+        assert source.model.values["holding_registers"][502] == 0x2211
 
 
 def test_what_is_read_from_input_registers_is_never_written(run: Run) -> None:

@@ -11,7 +11,7 @@ use tokio::time::Instant;
 use super::backoff::Retry;
 use super::blocking::BlockingLink;
 use super::fault::{Answer, Exchanged, Fault, fault};
-use super::pace::{InFlight, Pace, Place as Turn};
+use super::pace::{Alone, InFlight, Pace, Place as Turn};
 use super::permit::Permit;
 use super::queue::Priority;
 use super::tcp::TcpLink;
@@ -70,6 +70,24 @@ impl Link {
         };
         let eager = priority == Priority::Urgent;
         let answer = self.exchange(unit_id, request, timeout, eager, permit).await;
+        answer.map_err(|error| fault(&error))
+    }
+
+    /// As [`call`](Link::call), for a read and then the write that `write` makes of its answer. No other
+    /// request is sent between the two. There is nothing to write if `write` returns `None`: the answer
+    /// is [`Fault::Invalid`] then.
+    pub(crate) async fn read_then_write(
+        &self,
+        unit_id: u8,
+        read: &EncodedRequest,
+        write: impl FnOnce(&[u8]) -> Option<EncodedRequest>,
+        timeout: Duration,
+        permit: &Permit,
+    ) -> Answer {
+        let _alone: Alone<'_> = self.pace.alone(POLLER, Priority::Urgent).await;
+        let answer = self.exchange(unit_id, read, timeout, true, permit).await;
+        let write = write(&answer.map_err(|error| fault(&error))?).ok_or(Fault::Invalid)?;
+        let answer = self.exchange(unit_id, &write, timeout, true, permit).await;
         answer.map_err(|error| fault(&error))
     }
 

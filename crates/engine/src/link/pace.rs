@@ -4,7 +4,7 @@ use std::cell::{Cell, RefCell};
 use std::rc::Rc;
 use std::time::Duration;
 
-use tokio::sync::{Semaphore, SemaphorePermit, oneshot};
+use tokio::sync::{RwLock, RwLockReadGuard, RwLockWriteGuard, Semaphore, SemaphorePermit, oneshot};
 use tokio::time::Instant;
 
 use super::queue::{Priority, Queue};
@@ -34,6 +34,8 @@ pub enum InFlight {
 pub(super) struct Pace {
     places: Rc<Places>,
     doubtful: Semaphore,
+    /// Shared by all requests in flight. Who has a place takes it for itself to be alone.
+    in_flight: RwLock<()>,
     auto: Option<RefCell<Auto>>,
 }
 
@@ -46,7 +48,10 @@ struct Places {
 }
 
 /// A request may be in flight while it lasts.
-pub(super) type Place<'p> = (Free, Option<SemaphorePermit<'p>>);
+pub(super) type Place<'p> = (Free, Option<SemaphorePermit<'p>>, RwLockReadGuard<'p, ()>);
+
+/// While it lasts, no other request is in flight.
+pub(super) type Alone<'p> = (Free, RwLockWriteGuard<'p, ()>);
 
 /// A place, which is given back when it is dropped.
 pub(super) struct Free(Option<Rc<Places>>);
@@ -69,7 +74,8 @@ impl Pace {
         };
         let places = Rc::<Places>::default();
         places.free.set(limit);
-        Pace { places, doubtful: Semaphore::new((limit / 2).max(1)), auto }
+        let doubtful = Semaphore::new((limit / 2).max(1));
+        Pace { places, doubtful, in_flight: RwLock::default(), auto }
     }
 
     /// Waits for a place, which is taken while the result lasts. Doubtful requests leave room for the
@@ -79,15 +85,21 @@ impl Pace {
             Priority::Doubtful => Some(self.doubtful.acquire().await.expect("it is never closed")),
             _ => None,
         };
-        let place = match self.places.take() {
-            Some(place) => place,
-            None => {
-                let (sender, place) = oneshot::channel();
-                self.places.waiting.borrow_mut().push(source, priority, sender);
-                place.await.expect("places outlive those who wait for one")
-            }
-        };
-        (place, doubtful)
+        (self.free(source, priority).await, doubtful, self.in_flight.read().await)
+    }
+
+    /// Waits for a place, and then until no other request is in flight.
+    pub(super) async fn alone(&self, source: u64, priority: Priority) -> Alone<'_> {
+        (self.free(source, priority).await, self.in_flight.write().await)
+    }
+
+    async fn free(&self, source: u64, priority: Priority) -> Free {
+        if let Some(place) = self.places.take() {
+            return place;
+        }
+        let (sender, place) = oneshot::channel();
+        self.places.waiting.borrow_mut().push(source, priority, sender);
+        place.await.expect("places outlive those who wait for one")
     }
 
     /// The time, if the round trips of requests matter.
@@ -285,6 +297,22 @@ mod tests {
         drop(urgent.await);
         drop(usual.await);
         assert_eq!(pace.places.free.get(), 1);
+    }
+
+    #[tokio::test]
+    async fn who_is_alone_waits_for_the_others_and_they_wait_for_it() {
+        let pace = Pace::new(InFlight::Fixed(3));
+        let first = pace.place(0, Priority::Usual).await;
+        let mut alone = Box::pin(pace.alone(0, Priority::Urgent));
+        assert!(is_pending(&mut alone));
+        let mut later = Box::pin(pace.place(0, Priority::Urgent));
+        assert!(is_pending(&mut later));
+        drop(first);
+        let alone = alone.await;
+        assert!(is_pending(&mut later));
+        drop(alone);
+        drop(later.await);
+        assert_eq!(pace.places.free.get(), 3);
     }
 
     /// Whether a future waits still.

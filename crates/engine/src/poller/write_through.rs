@@ -223,16 +223,14 @@ impl PassedWrite {
         let mut value = None;
         let answered = match mask {
             Some((address, and_mask, or_mask)) if self.range.emulate => {
-                match call(&read(address)).await.map(|pdu| register(&pdu)) {
-                    Ok(Some(now)) => {
-                        let new = (now & and_mask) | (or_mask & !and_mask);
-                        value = Some(new);
-                        let write = Request::WriteSingleRegister { address, value: new };
-                        call(&EncodedRequest::new(&write)).await
-                    }
-                    Ok(None) => Err(Fault::Invalid),
-                    Err(fault) => Err(fault),
-                }
+                let masked = |pdu: &[u8]| {
+                    let now = register(pdu)?;
+                    let new = (now & and_mask) | (or_mask & !and_mask);
+                    value = Some(new);
+                    let write = Request::WriteSingleRegister { address, value: new };
+                    Some(EncodedRequest::new(&write))
+                };
+                link.read_then_write(unit_id, &read(address), masked, timeout, permit).await
             }
             Some((address, ..)) => {
                 let answered = call(&self.request).await;
