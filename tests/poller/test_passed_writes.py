@@ -162,6 +162,30 @@ def test_nothing_comes_between_the_read_and_the_write_of_function_22(run: Run) -
         assert source.model.values["holding_registers"][502] == 0x2211
 
 
+@pytest.mark.parametrize("way", ["hang up", "do not answer", "refuse"])
+def test_function_22_is_not_confirmed_if_its_value_is_not_known(way: str, run: Run) -> None:
+    """The device has carried it out, and does not tell what it has now."""
+    is_written = threading.Event()
+
+    def tell_nothing(asked: Asked) -> None:
+        if asked.pdu[0] == 22:
+            is_written.set()
+        elif is_written.is_set() and way == "hang up":
+            return asked.peer.hang_up()
+        elif is_written.is_set():
+            return asked.answer(exception(asked.pdu, 4)) if way == "refuse" else None
+        asked.answer()
+        return None
+
+    with plc(tell_nothing) as source:
+        appliance = started(run, source, timeout=0.2, tolerance={"retries": 3})
+        with client(appliance) as scada:
+            with refused_with(11):
+                scada.mask_write(12, and_mask=0xFF00, or_mask=0x0011)
+            assert scada.read_holding_registers(12, 1) == [502]
+        assert is_written.is_set()
+
+
 def test_what_is_read_from_input_registers_is_never_written(run: Run) -> None:
     with plc() as source:
         appliance = started(run, source)

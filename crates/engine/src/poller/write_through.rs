@@ -232,14 +232,17 @@ impl PassedWrite {
                 };
                 link.read_then_write(unit_id, &read(address), masked, timeout, permit).await
             }
-            Some((address, ..)) => {
-                let answered = call(&self.request).await;
-                if answered.is_ok() {
-                    // The memory may not know what the device had before.
+            Some((address, ..)) => match call(&self.request).await {
+                Ok(answer) => {
+                    // The memory may not know what the device had before. What it can't show is not
+                    // confirmed, although the device has carried it out.
                     value = call(&read(address)).await.ok().and_then(|pdu| register(&pdu));
+                    let unknown =
+                        Fault::Exception(ExceptionCode::GatewayTargetFailedToRespond.code());
+                    if value.is_some() { Ok(answer) } else { Err(unknown) }
                 }
-                answered
-            }
+                refused => refused,
+            },
             None => call(&self.request).await,
         };
         let pdu = match answered {
