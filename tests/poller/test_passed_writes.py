@@ -282,6 +282,33 @@ def test_a_read_that_takes_several_requests_keeps_what_was_written_meanwhile(run
                     assert scada.read_holding_registers(5, 1) == [value]
 
 
+@pytest.mark.parametrize("address", [5, 395], ids=["in the first request", "in the last"])
+def test_a_read_that_takes_several_requests_keeps_what_was_read_meanwhile(
+    address: int, run: Run
+) -> None:
+    """The device changes at once after each write, and tells that in the reply to function 23."""
+
+    def goes_on(asked: Asked) -> None:
+        if asked.pdu[0] != 23:
+            return asked.answer()
+        value = int.from_bytes(asked.pdu[10:12]) + 1
+        source.model.values["holding_registers"][address] = value
+        return asked.answer(b"\x17\x02" + value.to_bytes(2))
+
+    with plc(goes_on) as source:
+        wide = read("holding_registers", 0, 400, ("holding_registers", 0))
+        meter = device(source.url, wide, interval=0.01, writes="pass")
+        appliance = run(configuration({"meter": meter}, **MORE))
+        until_polled(appliance, "meter")
+        mirror = appliance.memories["mirror"]
+        with client(appliance) as scada:
+            for value in range(0, 600, 2):
+                assert scada.read_write(address, 1, address, [value]) == [value + 1]
+                for _ in range(5):
+                    assert mirror.read("holding_registers", address, 1) == [value + 1]
+                    assert scada.read_holding_registers(address, 1) == [value + 1]
+
+
 def test_rest_writes_through_too_and_tells_the_exception(run: Run) -> None:
     with plc() as source:
         appliance = started(run, source)

@@ -663,8 +663,9 @@ impl Device {
             if whole && !field.area.is_bits() {
                 let end = offset + usize::from(field.count);
                 self.hand_on(read, &bytes[offset * 2..end * 2]);
-            } else if let Some(mut bytes) = gathered.put(settings, read, at, field, bytes, offset) {
-                self.turn.amend(settings.area, settings.address, settings.count, &mut bytes);
+            } else if let Some(bytes) =
+                gathered.put(&self.turn, (read, settings), at, field, (bytes, offset))
+            {
                 self.hand_on(read, &bytes);
             }
         }
@@ -744,9 +745,18 @@ fn first_from(now: Instant, due: Instant, interval: Duration) -> (Instant, u64) 
 /// blocks, if they are reported.
 #[derive(Default)]
 struct Gathered {
-    parts: HashMap<usize, (Vec<u8>, u32)>,
+    parts: HashMap<usize, Partial>,
     blocks: Vec<BlockResult>,
     report: bool,
+}
+
+/// A read of which some items have been read.
+struct Partial {
+    bytes: Vec<u8>,
+    /// The number of items that have not been read.
+    missing: u32,
+    /// How many of the changes of the current poll are in it.
+    known_changes: usize,
 }
 
 impl Gathered {
@@ -758,35 +768,41 @@ impl Gathered {
         }
     }
 
-    /// Adds a field to its read. Returns the read when it is complete.
+    /// Adds a field that has just been read to its read. Returns the read when it is complete.
     fn put(
         &mut self,
-        settings: &ReadSettings,
-        read: usize,
+        turn: &Turn,
+        (read, settings): (usize, &ReadSettings),
         at: u32,
         field: Field,
-        block: &[u8],
-        offset: usize,
+        (block, offset): (&[u8], usize),
     ) -> Option<Vec<u8>> {
-        let len = settings.area.byte_len(settings.count as usize);
-        let (whole, missing) =
-            self.parts.entry(read).or_insert_with(|| (vec![0; len], settings.count));
+        let ReadSettings { area, address, count: all, .. } = *settings;
+        let partial = self.parts.entry(read).or_insert_with(|| Partial {
+            bytes: vec![0; area.byte_len(all as usize)],
+            missing: all,
+            known_changes: 0,
+        });
+        let whole = &mut partial.bytes;
+        // What was written since the fields before were read is not in them.
+        partial.known_changes = turn.amend(partial.known_changes, (area, address, all), whole);
         let (count, at) = (usize::from(field.count), at as usize);
         if field.area.is_bits() {
             for index in 0..count {
                 let bit = block[(offset + index) / 8] >> ((offset + index) % 8) & 1;
-                whole[(at + index) / 8] |= bit << ((at + index) % 8);
+                let (byte, to) = ((at + index) / 8, (at + index) % 8);
+                whole[byte] = whole[byte] & !(1 << to) | bit << to;
             }
         } else {
             whole[at * 2..(at + count) * 2]
                 .copy_from_slice(&block[offset * 2..(offset + count) * 2]);
         }
-        assert!(*missing >= u32::from(field.count), "each field of a read arrives once per poll");
-        *missing -= u32::from(field.count);
-        if *missing > 0 {
+        let missing = partial.missing.checked_sub(field.count.into());
+        partial.missing = missing.expect("each field of a read arrives once per poll");
+        if partial.missing > 0 {
             return None;
         }
-        self.parts.remove(&read).map(|(whole, _)| whole)
+        self.parts.remove(&read).map(|partial| partial.bytes)
     }
 }
 

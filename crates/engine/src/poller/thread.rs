@@ -543,10 +543,11 @@ impl Running {
             let Some(taken) = turn.take_to_write(fence, timeout).await else {
                 return write.refuse(ExceptionCode::GatewayPathUnavailable);
             };
-            if let Some(change) = write.carry_out(&link, unit_id, timeout, &permit).await {
-                turn.note(change);
+            let changes = write.carry_out(&link, unit_id, timeout, &permit).await;
+            if !changes.is_empty() {
                 inbox.wake();
             }
+            changes.into_iter().for_each(|change| turn.note(change));
             drop(taken);
             if release || has_ended(fence) {
                 link.release();

@@ -52,11 +52,19 @@ impl Turn {
         }
     }
 
-    /// Puts what was written during the poll into a read that took several requests: what it was written
-    /// over may have been read before.
-    pub(super) fn amend(&self, area: Area, address: u16, count: u32, bytes: &mut [u8]) {
+    /// Puts what was written to the device into the parts of a read that were read before. `known` of the
+    /// changes are in them already. Returns how many are in them now.
+    ///
+    /// What is read after a write must not be replaced by it: the device may have changed meanwhile.
+    pub(super) fn amend(
+        &self,
+        known: usize,
+        (area, address, count): (Area, u16, u32),
+        bytes: &mut [u8],
+    ) -> usize {
         let first = u32::from(address);
-        for change in self.changes.borrow().iter().filter(|change| change.area == area) {
+        let changes = self.changes.borrow();
+        for change in changes.iter().skip(known).filter(|change| change.area == area) {
             let start = u32::from(change.address);
             for item in start.max(first)..(start + change.count).min(first + count) {
                 let (from, to) = ((item - start) as usize, (item - first) as usize);
@@ -69,6 +77,7 @@ impl Turn {
                 }
             }
         }
+        changes.len()
     }
 }
 
@@ -87,15 +96,21 @@ mod tests {
         turn.polls(true);
         turn.note(change(Area::HoldingRegisters, 9, 2, &[1, 2, 3, 4]));
         turn.note(change(Area::Coils, 8, 3, &[0b101]));
+        let (holding, coils) = ((Area::HoldingRegisters, 10, 3), (Area::Coils, 1, 12));
         let mut registers = [0; 6];
-        turn.amend(Area::HoldingRegisters, 10, 3, &mut registers);
+        assert_eq!(turn.amend(0, holding, &mut registers), 2);
         assert_eq!(registers, [3, 4, 0, 0, 0, 0]);
-        let mut coils = [0b1111_1111, 0b1111];
-        turn.amend(Area::Coils, 1, 12, &mut coils);
-        assert_eq!(coils, [0b1111_1111, 0b1110]);
+        let mut bits = [0b1111_1111, 0b1111];
+        turn.amend(0, coils, &mut bits);
+        assert_eq!(bits, [0b1111_1111, 0b1110]);
+        turn.note(change(Area::HoldingRegisters, 11, 1, &[5, 6]));
+        assert_eq!(turn.amend(2, holding, &mut registers), 3);
+        assert_eq!(registers, [3, 4, 5, 6, 0, 0]);
+        let mut later = [7; 6];
+        assert_eq!(turn.amend(3, holding, &mut later), 3);
+        assert_eq!(later, [7; 6]);
         turn.polls(false);
-        let mut after = [0; 6];
-        turn.amend(Area::HoldingRegisters, 10, 3, &mut after);
-        assert_eq!(after, [0; 6]);
+        assert_eq!(turn.amend(0, holding, &mut later), 0);
+        assert_eq!(later, [7; 6]);
     }
 }

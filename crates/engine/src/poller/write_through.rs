@@ -55,7 +55,7 @@ pub(super) struct PassedWrite {
     _place: Place,
 }
 
-/// What a device has taken over, in its own addresses.
+/// What a device has taken over or told, in its own addresses.
 pub(super) struct Change {
     pub(super) area: Area,
     pub(super) address: u16,
@@ -192,20 +192,21 @@ impl PassedWrite {
         self.reply.send(pdu);
     }
 
-    /// Carries it out. Returns what has changed in the device, if that is known.
+    /// Carries it out. Returns what memory has of it: what has changed in the device, and what
+    /// function 23 has read.
     pub(super) async fn carry_out(
         self,
         link: &Link,
         unit_id: u8,
         timeout: Duration,
         permit: &Permit,
-    ) -> Option<Change> {
+    ) -> Vec<Change> {
         if self.reply.is_unwanted() {
-            return None;
+            return Vec::new();
         }
         if link.retry_at().is_some() {
             self.refuse(ExceptionCode::GatewayPathUnavailable);
-            return None;
+            return Vec::new();
         }
         let call = async |request: &EncodedRequest| {
             link.call(unit_id, request, timeout, Priority::Urgent, permit).await
@@ -250,26 +251,26 @@ impl PassedWrite {
             Err(fault) => exception(&self.pdu, fault.exception(link.retry_at().is_some())),
         };
         self.reply.send(pdu);
-        None
+        Vec::new()
     }
 
     /// Takes what the device has confirmed into memory, then replies. `value` is what the device holds
     /// after function 22.
-    async fn confirm(self, answer: &[u8], value: Option<u16>) -> Option<Change> {
-        let change = self.change(value);
-        if let Some(change) = &change {
+    async fn confirm(self, answer: &[u8], value: Option<u16>) -> Vec<Change> {
+        let mut changes: Vec<Change> = self.change(value).into_iter().collect();
+        if let Ok(Request::ReadWriteMultipleRegisters { read, .. }) = Request::parse(&self.pdu)
+            && let Some(bytes) = answer.get(2..)
+        {
+            let (address, count) = (self.there(read.address()), read.quantity().into());
+            let area = Area::HoldingRegisters;
+            changes.push(Change { area, address, count, bytes: bytes.to_vec() });
+        }
+        for change in &changes {
             self.store(change).await;
         }
         let mut buffer = [0; pdu::MAX_LEN];
         let reply = match Request::parse(&self.pdu) {
-            Ok(Request::ReadWriteMultipleRegisters { read, .. }) => {
-                if let Some(bytes) = answer.get(2..) {
-                    let (address, count) = (self.there(read.address()), read.quantity().into());
-                    let area = Area::HoldingRegisters;
-                    self.store(&Change { area, address, count, bytes: bytes.to_vec() }).await;
-                }
-                answer
-            }
+            Ok(Request::ReadWriteMultipleRegisters { .. }) => answer,
             Ok(Request::WriteMultipleCoils { address, bits }) => {
                 let len = reply::write_multiple_coils(address, bits, &mut buffer);
                 &buffer[..len]
@@ -282,7 +283,7 @@ impl PassedWrite {
             _ => &self.pdu,
         };
         self.reply.send(reply.to_vec());
-        change
+        changes
     }
 
     /// What the device has taken over.
