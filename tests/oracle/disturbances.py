@@ -104,8 +104,12 @@ class Disturbances(threading.Thread):
 
     def bring_guest(self) -> None:
         """Lets the clients of the guest go on."""
-        new = self._plant.listener("modbus-tcp")
-        self._plant.change(lambda settings: settings["listeners"].setdefault(GUEST, new))
+
+        def edit(settings: Settings) -> None:
+            if GUEST not in settings["listeners"]:
+                settings["listeners"][GUEST] = self._plant.listener("modbus-tcp")
+
+        self._plant.change(edit)
 
     def _kinds(self) -> list[Callable[[], None]]:
         return [
@@ -208,4 +212,11 @@ class Disturbances(threading.Thread):
         """The device goes away, and comes back."""
         self._plant.device.stop()
         self._wait(MEANWHILE)
-        self._plant.device.start()
+        wire.until(self._is_back, "the port of the device is free")
+
+    def _is_back(self) -> bool:
+        try:
+            self._plant.device.start()
+        except OSError:
+            return False
+        return True

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 Settings = dict[str, Any]
 
+ATTEMPTS = 5
+"""To start and to reload."""
+
 PLANT, ANNEX, DEVICE = "plant", "annex", "device"
 MIRROR_AT = 200
 """The first mirrored coil and the first mirrored register of the memory."""
@@ -111,12 +114,14 @@ class Plant(ABC):
             "key_file": str(server.key),
             "ca_file": str(authority.ca),
         }
-        self.settings = self._first(broker_url)
+        self._broker_url = broker_url
+        self._ports: set[int] = set()
         self._lock = threading.Lock()
+        self.settings: Settings = {}
 
     @abstractmethod
-    def start(self) -> None:
-        """Runs until `stop`."""
+    def _start(self) -> None:
+        """Runs until `stop`. Raises `OSError` if it can't."""
 
     @abstractmethod
     def stop(self) -> None:
@@ -132,7 +137,7 @@ class Plant(ABC):
 
     @abstractmethod
     def _reload(self) -> None:
-        """Has the appliance read the file again. It must succeed."""
+        """Has the appliance read the file again. Raises `OSError` if it can't take it over."""
 
     memories: Mapping[str, holdfast.Memory] | None = None
     """The memories, if they are in this process."""
@@ -140,7 +145,7 @@ class Plant(ABC):
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
         with self.device:
-            self.start()
+            self._retry(self._begin)
             try:
                 yield
             finally:
@@ -148,12 +153,29 @@ class Plant(ABC):
 
     def change(self, edit: Callable[[Settings], object]) -> None:
         """Changes the configuration, and reloads it."""
-        with self._lock:
+
+        def reload() -> None:
             changed = copy.deepcopy(self.settings)
             edit(changed)
             self._write(changed)
             self._reload()
             self.settings = changed
+
+        with self._lock:
+            self._retry(reload)
+
+    def _begin(self) -> None:
+        self.settings = self._first(self._broker_url)
+        self._write(self.settings)
+        self._start()
+
+    @staticmethod
+    def _retry(attempt: Callable[[], None]) -> None:
+        """Another program may have taken a port: each attempt has others."""
+        for _ in range(ATTEMPTS - 1):
+            with contextlib.suppress(OSError):
+                return attempt()
+        return attempt()
 
     def locate(self, name: str) -> tuple[str, int]:
         """Where a listener or REST is. Raises `ConnectionRefusedError` if there is none."""
@@ -190,10 +212,13 @@ class Plant(ABC):
             target = {"memories": [PLANT]}
         return {**kind, "rules": [{**rule, **target}], **more}
 
-    @staticmethod
-    def _bind() -> str:
-        # A port that stays the same when a service starts again.
-        return f"127.0.0.1:{free_port()}"
+    def _bind(self) -> str:
+        """An address that stays the same when a service starts again."""
+        port = free_port()
+        while port in self._ports:
+            port = free_port()
+        self._ports.add(port)
+        return f"127.0.0.1:{port}"
 
     def _first(self, broker_url: str) -> Settings:
         listeners = {
@@ -255,9 +280,8 @@ class InProcess(Plant):
 
     appliance: Appliance
 
-    def start(self) -> None:
-        self._write(self.settings)
-        self.appliance = Appliance(load(self.file)).start()
+    def _start(self) -> None:
+        self.appliance = Appliance(load(self.file), retries_ports=False).start()
         self.memories = self.appliance.memories
 
     def stop(self) -> None:
@@ -278,10 +302,12 @@ class OwnProcess(Plant):
 
     _command: RunCommand
 
-    def start(self) -> None:
-        self._write(self.settings)
+    def _start(self) -> None:
         self._command = RunCommand(self.file)
-        self._command.wait_for_greeting()
+        try:
+            self._command.wait_for_greeting()
+        except AssertionError as error:
+            raise OSError(str(error)) from None
 
     def stop(self) -> None:
         code, log = self._command.end(signal.SIGTERM)
@@ -296,4 +322,5 @@ class OwnProcess(Plant):
 
     def _reload(self) -> None:
         result = invoke("reload", str(self.file))
-        assert result.exit_code == 0, result.output
+        if result.exit_code != 0:
+            raise OSError(result.output)
