@@ -151,6 +151,27 @@ def test_a_message_of_qos_2_is_written_once_until_it_is_released(
         assert running.status()["received"] == 3
 
 
+def test_a_message_of_qos_2_is_written_once_also_if_the_adapter_is_replaced(
+    rig: Rig, fake: FakeBroker
+) -> None:
+    """As a reload does, if the settings of MQTT have changed."""
+    message = publish("plant/ingest", text(command([1])), 2, 7, version=fake.version)
+    first = run(rig, fake)
+    with fake.accept() as peer:
+        peer.welcome()
+        peer.send(message)
+        assert peer.expect(mqtt.PUBREC).identifier == 7  # and the broker does not get it
+    first.stop()
+    rig.memory.write("holding_registers", 0, [2])
+
+    run(rig, fake, keep_alive=30)
+    with fake.accept() as peer:
+        peer.welcome(resumed=True)
+        peer.send(message)
+        assert peer.expect(mqtt.PUBREC).identifier == 7
+        assert rig.registers(0, 1) == [2]
+
+
 def test_a_release_of_something_unknown_is_answered(rig: Rig, fake: FakeBroker) -> None:
     run(rig, fake)
     with fake.accept() as peer:

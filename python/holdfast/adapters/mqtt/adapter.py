@@ -41,6 +41,10 @@ SILENCE = 600.0
 _TICK = 1.0
 """Seconds between checks of the keep-alive."""
 
+_UNRELEASED: dict[tuple[str, str], set[int]] = {}
+"""QoS 2 packet identifiers of each session, by broker and client id. A session goes on when the
+adapter is replaced by another one, after a reload or a failure."""
+
 
 class Mqtt:
     """Receives messages from a broker and passes them to the memory access."""
@@ -65,7 +69,7 @@ class Mqtt:
         self._topics = [_Topic(entry) for entry in settings.subscriptions]
         self._topics += [_Topic(entry) for entry in settings.map]
         self._asked: dict[int, _Topic] = {}
-        self._unreleased: set[int] = set()
+        self._unreleased = _UNRELEASED.setdefault((self._broker, settings.client_id), set())
         self._failures = _Failures(self._broker)
         self._connected_at: float | None = None
         self._connects = 0
