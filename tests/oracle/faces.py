@@ -388,10 +388,10 @@ class RestFace(Face):
         body = json.dumps(asked[0] if len(asked) == 1 else asked)
         head = f"Host: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: {len(body)}"
         data = f"POST /api/v1/ingest HTTP/1.1\r\n{head}\r\n\r\n{body}".encode()
-        assert self._connection is not None
-        with contextlib.suppress(OSError):
-            assert self._connection.sock is not None
-            self._connection.sock.sendall(data[: _length(data, part)])
+        # REST may have announced the end of the connection with its last reply.
+        if self._connection is not None and self._connection.sock is not None:
+            with contextlib.suppress(OSError):
+                self._connection.sock.sendall(data[: _length(data, part)])
         self.close()
 
     def close(self) -> None:

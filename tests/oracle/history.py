@@ -86,6 +86,16 @@ class History:
             for block, offset in self.layout.inside(reading.range):
                 yield block, block.decode(reading.values[offset : offset + block.count])
 
+    def lines(self) -> str:
+        """All operations by their begin, for people who look for a cause."""
+        lines = []
+        for operation in sorted(self.operations, key=lambda each: each.begin):
+            seen = " ".join(f"{block.name}:{found}" for block, found in self.decoded(operation))
+            lines.append(f"{operation}  {seen} {operation.is_open or ''}\n")
+        for block, versions in self.versions.items():
+            lines += [f"{block.name}={each.id} at {each.begin / 1e9:.6f}\n" for each in versions]
+        return "".join(lines)
+
 
 class Recorder:
     """Collects the operations of all clients. Appending to a list is safe in all threads."""

@@ -116,7 +116,10 @@ def test_nothing_unexplained_is_seen_for_long(
             sights += found.sights
             count = found.by_face.total()
             say(f"{count} operations, {count / seconds:.0f} a second, {found.sights} values seen")
-            assert report(found) == ""
+            if wrong := report(found):
+                file = tmp_path / "history.txt"
+                file.write_text(found.history.lines())
+                raise AssertionError(f"{wrong}\nThe history is in {file}")
             some = chance.sample(list(FAULTS), SAMPLE)
             faults = planted(found, 1, some)
             assert [name for name, is_found in faults.items() if not is_found] == []
