@@ -1,7 +1,7 @@
 """Many writers and readers over every face of a running appliance, while everything is disturbed.
 
 Nobody may see what no order of their requests explains. In short by default; with
-HOLDFAST_TORTURE=1 for HOLDFAST_MINUTES (10), half of them with `holdfast run` in a process of its
+HOLDFAST_TORTURE=1 for HOLDFAST_TORTURE_SECONDS (600), half of them with `holdfast run` in a process of its
 own. HOLDFAST_SEED repeats the requests of a run, though not how threads meet.
 """
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 IS_LONG = os.environ.get("HOLDFAST_TORTURE") == "1"
-MINUTES = float(os.environ.get("HOLDFAST_MINUTES", "10"))
+SECONDS = float(os.environ.get("HOLDFAST_TORTURE_SECONDS", "600"))
 SEED = int(os.environ.get("HOLDFAST_SEED") or (time.time() if IS_LONG else 1))
 
 REQUESTS = 120
@@ -89,7 +89,7 @@ def test_an_order_of_the_requests_explains_all_that_was_seen(tmp_path: Path) -> 
 
 
 @pytest.mark.skipif(not IS_LONG, reason="minutes to hours: HOLDFAST_TORTURE=1 runs it")
-@pytest.mark.timeout(MINUTES * 60 + 600)
+@pytest.mark.timeout(SECONDS + 600)
 @pytest.mark.parametrize("kind", [InProcess, OwnProcess])
 def test_nothing_unexplained_is_seen_for_long(
     kind: type[Plant], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -106,7 +106,7 @@ def test_nothing_unexplained_is_seen_for_long(
     sights = count_of_faults = 0
     chance = random.Random(SEED)
     with started(kind, tmp_path, SEED) as oracle:
-        while time.monotonic() < began + MINUTES * 30:
+        while time.monotonic() < began + SECONDS / 2:
             start = time.monotonic()
             found = oracle.round(LONG_REQUESTS, LONG_EVERY)
             seconds = time.monotonic() - start
