@@ -559,7 +559,7 @@ fn an_invalid_reply_does_not_end_a_serial_line() {
         let second = client.send(read());
         client.after(SILENCE);
         assert_eq!(client.outgoing(), [], "the reply to the first may still come");
-        client.after(SECOND);
+        client.after(SECOND / 2);
         client.receive(&good);
         assert_eq!(client.got(), [], "another one may follow");
         client.after(GUARD);

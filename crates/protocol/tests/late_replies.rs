@@ -544,6 +544,19 @@ fn the_replies_to_all_attempts_of_a_read_are_waited_for() {
 }
 
 #[test]
+fn a_copy_of_the_reply_to_one_attempt_is_not_that_to_another() {
+    for transport in TRANSPORTS {
+        let mut world = World::new(transport, |_, _| vec![13 * TIMEOUT / 10, 133 * TIMEOUT / 100]);
+        world.tolerance.retries = 1;
+        world.reconnect();
+        for address in 100..130 {
+            let found = world.read(1, address);
+            assert!(found.is_err() || found == Ok(address), "{transport:?} {address} {found:?}");
+        }
+    }
+}
+
+#[test]
 fn a_reply_that_may_be_a_copy_is_believed_if_the_unit_sends_no_other_in_its_usual_time() {
     let twice: Vice = |number, _| match number {
         // The second one comes when the next request has been sent.

@@ -45,6 +45,10 @@ const RECENT: usize = 16;
 /// A reply that came longer ago is not repeated now.
 const RECENTLY: Duration = MAX_GUARD;
 
+/// How long after a reply that is not its own that may come to a request within its timeout, if the unit is usually
+/// faster.
+const AFTER_OTHER: Duration = Duration::from_millis(500);
+
 /// How long after a damaged reply its own may come to a request, as long as nothing is known of the unit.
 const AFTER_DAMAGED: Duration = Duration::from_millis(250);
 
@@ -87,16 +91,17 @@ pub(super) struct Unanswered {
     sent: Time,
     /// The reply may come until then.
     until: Time,
+    /// What comes before is a copy of the reply to another attempt of the same call.
+    from: Time,
 }
 
 /// Why a request ended without its reply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Ended {
-    /// By its timeout, or because nobody waits any more.
     TimedOut,
-    /// By a reply that is not its own, by an exception that a gateway sent in its place, or because the
-    /// device has closed the connection.
-    Unanswered,
+    WithConnection,
+    /// By a reply that is not its own, or by an exception that a gateway sent in its place.
+    Other,
     /// By bytes that may have been its reply.
     Damaged,
 }
@@ -213,7 +218,13 @@ impl Earlier {
                 let lateness = (timeout * LATENESS).max(MIN_LATENESS).max(latest);
                 sent + lateness.min(timeout + MAX_LATENESS)
             }
-            Ended::Unanswered => (sent + timeout).max(now + usual.unwrap_or(GUARD)),
+            Ended::Other | Ended::WithConnection => {
+                let left = (sent + timeout).saturating_sub(now).min(AFTER_OTHER);
+                // It may have been given up as late as by a timeout.
+                let is_silent = how == Ended::WithConnection;
+                let took = if is_silent { now.saturating_sub(sent) } else { Duration::ZERO };
+                now + usual.unwrap_or(GUARD).max(left).max(took * (LATENESS - 1)).min(MAX_LATENESS)
+            }
             Ended::Damaged => (sent + timeout).min(now + usual.unwrap_or(AFTER_DAMAGED)),
         }
     }
@@ -232,6 +243,7 @@ impl Earlier {
         };
         for earlier in self.unanswered.iter_mut().filter(same) {
             earlier.until = earlier.until.max(until);
+            earlier.from = now + GUARD;
         }
     }
 
@@ -255,7 +267,7 @@ impl Earlier {
             self.unanswered.pop_front();
         }
         let request = request.clone();
-        self.unanswered.push_back(Unanswered { unit_id, request, sent, until });
+        self.unanswered.push_back(Unanswered { unit_id, request, sent, until, from: Time::ZERO });
     }
 
     /// The longest time of a reply of this unit that was not late.
@@ -270,6 +282,9 @@ impl Earlier {
 
     /// Notes the late reply to the request at this place. Returns how long it took.
     pub(super) fn late(&mut self, place: usize, now: Time) -> Duration {
+        if self.unanswered.get(place).is_some_and(|earlier| now < earlier.from) {
+            return Duration::ZERO;
+        }
         let Some(earlier) = self.unanswered.remove(place) else { return Duration::ZERO };
         self.guard.has_begun = true;
         let took = now.saturating_sub(earlier.sent).min(earlier.until - earlier.sent);

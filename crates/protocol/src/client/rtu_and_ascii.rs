@@ -485,7 +485,7 @@ impl OneAtATime {
                 self.earlier.repeated(request, times, now);
             }
             if pdu.first().is_some_and(|code| code & 0x80 != 0) && pdu.get(1) == Some(&NO_REPLY) {
-                self.earlier.ended(request, times, Ended::Unanswered, now);
+                self.earlier.ended(request, times, Ended::Other, now);
             }
             self.learn_echo(is_no_reply(flight));
         }
@@ -495,7 +495,7 @@ impl OneAtATime {
         let Some(invalid) = flights.answer(0, pdu, now, sink) else { return };
         if let Some((unit_id, request)) = unanswered {
             let times = (sent, self.timeout);
-            self.earlier.ended((unit_id, &request), times, Ended::Unanswered, now);
+            self.earlier.ended((unit_id, &request), times, Ended::Other, now);
         }
         if self.silence.is_none() {
             flights.close(Closed::Invalid(invalid), sink);
@@ -510,7 +510,7 @@ impl OneAtATime {
         sink: &mut impl FnMut(Done<'_>),
     ) {
         let how = match invalid {
-            InvalidResponse::UnitId { .. } => Ended::Unanswered,
+            InvalidResponse::UnitId { .. } => Ended::Other,
             _ => Ended::Damaged,
         };
         self.note_ended(flights, how, now);
@@ -525,11 +525,7 @@ impl OneAtATime {
     pub(super) fn take_earlier(&mut self, flights: &Flights, now: Time) -> Earlier {
         if let (State::Sent { .. }, Some(cut_off)) = (self.state, &flights.cut_off) {
             let (unit_id, request, sent, timeout) = cut_off;
-            let how = match flights.closed {
-                Some(Closed::BySelf) => Ended::TimedOut,
-                _ => Ended::Unanswered,
-            };
-            self.earlier.ended((*unit_id, request), (*sent, *timeout), how, now);
+            self.earlier.ended((*unit_id, request), (*sent, *timeout), Ended::WithConnection, now);
         }
         core::mem::take(&mut self.earlier)
     }
