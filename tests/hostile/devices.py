@@ -152,6 +152,8 @@ class Device:
         self.held: dict[tuple[int, int], int] = {}
         self.kept: list[bytes] = []
         """Replies that are not sent yet."""
+        self.busy = 0.0
+        """Until when replies are sent that take a while."""
         self.silences = 0
         """How often it stayed silent because it was held up."""
         self._vice = vice

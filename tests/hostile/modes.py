@@ -5,6 +5,7 @@ What no client can tell from a correct device says so, with the reason; docs/cli
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from hostile.devices import Vice
 
 MS = 0.001
+PIECE = 0.7 * MS
 DATAGRAMS = ("udp", "rtu+udp")
 
 
@@ -101,13 +103,16 @@ def joined(*parts: Callable[[Turn], bytes]) -> Vice:
 
 
 def in_pieces(turn: Turn) -> Iterable[Action]:
-    """The reply comes byte by byte."""
+    """The reply comes byte by byte, after those before it."""
     reply = turn.reply()
     assert reply.data is not None
+    now = time.monotonic()
+    begins = max(turn.device.busy - now, 0.0)
     pieces = [reply.data[at : at + 1] for at in range(len(reply.data))]
     last = len(pieces) - 1
+    turn.device.busy = now + begins + PIECE * len(pieces)
     return [
-        Action(0.7 * MS * at, piece, reply.executes and at == last)
+        Action(begins + PIECE * at, piece, reply.executes and at == last)
         for at, piece in enumerate(pieces)
     ]
 
@@ -331,14 +336,16 @@ IN_PIECES = {
     ),
 }  # fmt: skip
 
+CONFIRMS = "the reply to function 5 or 6 is the request"
+
 ECHOES = {
-    "echo: always": Mode(before(echo, MS), has_ids),
-    "echo: joined": Mode(joined(echo, right), has_ids),
+    "echo: always": Mode(before(echo, MS), has_ids, has_ids, CONFIRMS),
+    "echo: joined": Mode(joined(echo, right), has_ids, has_ids, CONFIRMS),
     "echo: once": Mode(once(before(echo, MS), 6)),
     "echo: cut off": Mode(sometimes(before(half_an_echo, MS))),
     "echo: of writes, which are not executed": Mode(
         echo_of_a_write, is_undetectable=always,
-        reason="the reply to function 5 or 6 is the request",
+        reason=CONFIRMS,
     ),
 }  # fmt: skip
 
