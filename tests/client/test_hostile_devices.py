@@ -1333,8 +1333,8 @@ def test_whatever_comes_is_a_reply_only_if_it_is_one(
 
     if not hasattr(make, "device"):
         make.device = make(kind)  # type: ignore[attr-defined]
-        make.client = dial(make.device.url)  # type: ignore[attr-defined]
-    device, client = make.device, make.client  # type: ignore[attr-defined]
+    # A new one, which does not wait for replies to earlier requests.
+    device, client = make.device, dial(make.device.url)  # type: ignore[attr-defined]
     first = len(device.requests)
     device.then = behave
     try:

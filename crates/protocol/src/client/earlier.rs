@@ -15,9 +15,11 @@ use crate::pdu::{EncodedRequest, Request};
 /// Requests without a reply that are remembered. With the bounds on their time, there are never as many.
 const MAX_UNANSWERED: usize = 64;
 
-/// A late reply may take this many times the longest timeout of the last requests, as long as nothing else is
-/// known.
+/// A late reply may take this many times the timeout, as long as nothing else is known.
 const LATENESS: u32 = 3;
+
+/// By the timeouts of other requests, a late reply may take no longer than this.
+const MAX_BY_OTHERS: Duration = Duration::from_secs(1);
 
 /// A late reply may take so long however short the timeouts are: a request may have had only what was left of
 /// its time.
@@ -211,15 +213,16 @@ impl Earlier {
     ) -> Time {
         let longest = self.lateness.longest(unit_id);
         let usual = longest.map(|longest| (longest * 4).max(GUARD));
-        let timeout = self.lateness.note_timeout(unit_id, timeout);
+        let longest_timeout = self.lateness.note_timeout(unit_id, timeout);
         match how {
             Ended::TimedOut => {
                 let latest = self.lateness.latest(unit_id) * 2;
-                let lateness = (timeout * LATENESS).max(MIN_LATENESS).max(latest);
-                sent + lateness.min(timeout + MAX_LATENESS)
+                let by_others = (longest_timeout * LATENESS).min(MAX_BY_OTHERS);
+                let known = usual.unwrap_or(GUARD).max(latest).max(by_others).max(MIN_LATENESS);
+                sent + (timeout * LATENESS).max(known).min(timeout + MAX_LATENESS)
             }
             Ended::Other | Ended::WithConnection => {
-                let left = (sent + timeout).saturating_sub(now).min(AFTER_OTHER);
+                let left = (sent + longest_timeout).saturating_sub(now).min(AFTER_OTHER);
                 // It may have been given up as late as by a timeout.
                 let is_silent = how == Ended::WithConnection;
                 let took = if is_silent { now.saturating_sub(sent) } else { Duration::ZERO };
