@@ -33,6 +33,8 @@ class Evidence:
         self.history = history
         self.chance = chance
         self.writes: dict[Block, dict[int, Operation]] = {}
+        """By their ids; only the last one of each value of an owned block."""
+        self.writers: dict[Block, list[Operation]] = {}
         self.refused: dict[Block, list[int]] = {}
         self.seen: dict[Block, list[Seen]] = {}
         for operation in history.operations:
@@ -41,6 +43,7 @@ class Evidence:
                     self.refused.setdefault(block, []).append(write_id)
                 else:
                     self.writes.setdefault(block, {})[write_id] = operation
+                    self.writers.setdefault(block, []).append(operation)
             for block, found in history.decoded(operation):
                 assert found is not None
                 self.seen.setdefault(block, []).append(Seen(operation, found))
@@ -295,10 +298,9 @@ def untaken_writes(evidence: Evidence) -> Iterator[History]:
 def wrong_values_of_owners(evidence: Evidence) -> Iterator[History]:
     """A read beside which nobody writes has another value than the last one that was written."""
     for block, seen in evidence.shuffled(Kind.OWNED):
-        writes = list(evidence.writes.get(block, {}).values())
         is_alone = not any(
             write.begin <= seen.operation.end and write.end >= seen.operation.begin
-            for write in writes
+            for write in evidence.writers.get(block, [])
         )
         if is_alone:
             flip = 0x0100 if block.form is Form.HIGH_BYTE else 1
