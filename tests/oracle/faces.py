@@ -61,8 +61,11 @@ REFUSALS = (1, 2)
 DEVICE_REFUSAL = 4
 """The exception with which the device of the oracle refuses a write."""
 
-NO_ANSWER = (0x0A, 0x0B)
-"""Exceptions of requests that were sent to the device, or could not be."""
+NO_PATH = 0x0A
+"""The exception of requests that were not sent to the device."""
+
+NO_ANSWER = 0x0B
+"""The exception of requests that were sent, and may have been carried out."""
 
 TIMEOUT_S = wire.DEADLINE / 4
 """After this time, a reply is lost. Datagrams may be dropped by the system; nothing else is."""
@@ -153,14 +156,12 @@ def reply_of(request: Request, sent: bytes, received: bytes) -> Reply:
 
 
 def _refusal(request: Request, code: int) -> Reply:
-    passed = is_passed([write.block for write in request.writes])
     if code == BUSY and request.memory == SEALED:
         return Reply(Outcome.REFUSED, (), is_open=False)
-    if request.memory == "device" and code in (BUSY, *NO_ANSWER):
-        return Reply(Outcome.REFUSED if code == BUSY else Outcome.UNKNOWN)
-    if passed and code in NO_ANSWER:
+    is_for_device = request.memory == "device" or is_passed([each.block for each in request.writes])
+    if is_for_device and code == NO_ANSWER:
         return Reply(Outcome.UNKNOWN)
-    if code in REFUSALS or (passed and code == DEVICE_REFUSAL):
+    if code in REFUSALS or (is_for_device and code in (BUSY, NO_PATH, DEVICE_REFUSAL)):
         return Reply(Outcome.REFUSED)
     raise Surprise(f"exception {code:#04x} to {request}")
 
