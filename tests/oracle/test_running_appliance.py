@@ -1,8 +1,8 @@
 """Many writers and readers over every face of a running appliance, while everything is disturbed.
 
 Nobody may see what no order of their requests explains. In short by default; with
-HOLDFAST_TORTURE=1 for HOLDFAST_TORTURE_SECONDS (600), half of them with `holdfast run` in a process of its
-own. HOLDFAST_SEED repeats the requests of a run, though not how threads meet.
+HOLDFAST_TORTURE=1 for HOLDFAST_TORTURE_SECONDS (600), half of them with `holdfast run` in a
+process of its own. HOLDFAST_SEED repeats the requests of a run, though not how threads meet.
 """
 
 from __future__ import annotations

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
     from holdfast.tools.inference import Guess
 
+NOW = 1_764_064_800.0
+"""2025-11-25 10:00 UTC."""
+
 ORDERS = ("ABCD", "CDAB", "BADC", "DCBA")
 COMMON = ("ABCD", "CDAB")
 
@@ -228,6 +231,55 @@ def test_a_clock_is_recognised_by_the_time() -> None:
     seconds = [int(now) - 2, int(now) - 1, int(now)]
     found = guess([[*values.encode(each, "uint32"), 0, 0] for each in seconds], now=now)[0]
     assert (found.type, found.reasons[0]) == ("uint32", "the current Unix time")
+
+
+def test_voltages_in_tenths_are_no_clock() -> None:
+    """2307, 2321, 2325 are also 15 September 2015, 09:03:09, in decimal digits."""
+    for reads_ in ([[2307, 2321, 2325, 4998]] * 5, [[2307, 2321, 2325, 0]]):
+        for now in (None, NOW):
+            best = guess(reads_, now=now)[0]
+            assert (best.type, best.also) == ("uint16", "int16")
+
+
+@pytest.mark.parametrize("seconds", [[0x5930] * 5, [0x5930, 0x5930, 0x5931, 0x5931, 0x5932]])
+def test_a_clock_in_decimal_digits_is_recognised_if_it_shows_the_present_or_advances(
+    seconds: list[int],
+) -> None:
+    is_still = seconds[0] == seconds[-1]
+    found = [[0x2511, 0x2510, each] for each in seconds]
+    assert guess(found, now=NOW if is_still else None)[0].type == "bcd16"
+    assert (guess(found)[0].type == "bcd16") is not is_still
+
+
+@pytest.mark.parametrize("order", COMMON)
+@pytest.mark.parametrize("number", [0xC0A80A64, 0x44A024DA, 0x43A1B2C3, 0x41F21A33])
+@pytest.mark.parametrize("behind", [[0, 0], [0, 17]])
+def test_a_constant_number_is_not_surely_a_float(
+    number: int, order: str, behind: list[int]
+) -> None:
+    """An address, a status word, serial numbers: their bits are also floats of usual size."""
+    best = guess([values.encode(number, "uint32", order) + behind] * 5)[0]
+    assert best.type != "float32" or best.score < 0.9
+
+
+def test_two_constant_floats_of_one_order_are_recognised() -> None:
+    found = values.encode(230.41, "float32", "CDAB") + values.encode(231.87, "float32", "CDAB")
+    best = guess([found] * 5)[0]
+    assert (best.type, best.order) == ("float32", "CDAB")
+    assert best.score > 0.9
+
+
+def test_text_that_goes_on_has_no_sure_length() -> None:
+    best = guess([values.encode("Delta Meter", "string:12")[:4]])[0]
+    assert best.type == "string:8"
+    assert best.score < 0.6
+
+
+def test_zeros_say_nothing_about_a_type() -> None:
+    for registers in ([0, 0, 0, 0], [0, 230, 0, 0]):
+        zeros = [each for each in guess([registers] * 5) if not any(each.values)]
+        assert zeros
+        assert all(each.score <= 0.3 for each in zeros)
 
 
 @pytest.mark.parametrize("found", [[], [[]], [[1], [1, 2]]])

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast import values
-from holdfast.tools.clock_fields import length
-from holdfast.tools.segments import divide
+from holdfast.tools import clock_fields
+from holdfast.tools.segments import confidence, divide
 from support.cases import examples
 
 
@@ -58,6 +58,47 @@ def test_a_value_of_the_other_common_order_is_recognised() -> None:
     assert (found[0], found[15]) == (("float32", "CDAB"), ("uint32", "ABCD"))
 
 
+def texts(*fields: tuple[str, int]) -> list[tuple[str, float]]:
+    """What texts in fields of these lengths are divided into, with numbers behind them."""
+    registers = [each for text, size in fields for each in values.encode(text, f"string:{size}")]
+    division = divide([[*registers, 455, 600]] * 3, is_open=False)
+    return [(value.type, chance) for value, chance in division.best if value.kind == "string"]
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [("iEM-3155", "V2.13"), ("20240312", "V1.02"), ("SN123456", "ACME")]
+)
+def test_text_without_padding_may_be_two_texts(first: str, second: str) -> None:
+    [(_, chance), *_] = texts((first, 8), (second, 8))
+    assert confidence(chance) < 0.9
+
+
+@pytest.mark.parametrize("padding", ["", " " * 8])
+def test_padding_separates_texts(padding: str) -> None:
+    found = texts((f"Voltwerk{padding}", 16), ("PM5000", 8))
+    assert [kind for kind, _ in found] == ["string:16", "string:8"]
+    assert all(confidence(chance) > 0.9 for _, chance in found)
+
+
+def test_neighbours_of_one_type_are_alike() -> None:
+    """Three voltages in tenths are three numbers; the last two alone may be one."""
+    [(value, alone), *_] = divide([[2321, 2325]]).best
+    [(_, _), (second, beside), *_] = divide([[2307, 2321, 2325]]).best
+    assert (value.type, second.type) == ("uint16", "uint16")
+    assert beside > alone
+
+
+def test_a_negative_number_is_no_other_type_than_its_neighbours() -> None:
+    division = divide([[215, 230, 0xC000, 221, 198]] * 3)
+    assert confidence(division.best[2][1]) < 0.9
+
+
+def test_single_registers_of_a_device_have_their_bytes_swapped_together() -> None:
+    volts = [2307, 2321, 2325, 2318, 2299, 2310]
+    reads = [[values.encode(each + turn, "uint16", "BADC")[0] for each in volts] for turn in (0, 1)]
+    assert {(value.type, value.order) for value, _ in divide(reads).best} == {("uint16", "BADC")}
+
+
 def test_registers_that_contain_nothing_are_one_value() -> None:
     [(value, _), (one, _)] = divide([[0] * 20 + [455]]).best
     assert (value.type, value.registers, value.reasons) == ("uint16", 20, ("always 0",))
@@ -78,4 +119,5 @@ def test_registers_that_contain_nothing_are_one_value() -> None:
     ],
 )
 def test_a_date_and_time_in_decimal_digits_is_recognised(registers: list[int], size: int) -> None:
-    assert length(registers) == size
+    clock = clock_fields.description([registers], None)
+    assert (clock[1] if clock else 0) == size

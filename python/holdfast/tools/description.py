@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from holdfast.client import SyncClient
     from holdfast.tools.discovery import Survey
-    from holdfast.tools.segments import Value
+    from holdfast.tools.segments import Habit, Value
     from holdfast.tools.sunspec import Model, Point, SunSpec
     from holdfast.types import Area
 
@@ -47,14 +47,11 @@ REGISTERS_A_TAG = READ_LIMITS["holding_registers"]
 EMPTY = 8
 """So many registers that contain nothing separate the values before them from those behind."""
 
-NOTHING_KNOWN = 0.3
-"""The confidence in the type of registers that contain nothing."""
-
 SUREST = 0.99
 """The highest confidence of a guess."""
 
 IMPROBABLE = 0.01
-"""The probability up to which an order is not considered."""
+"""The probability up to which a habit is not considered."""
 
 VOTES = 400
 """Registers from which the order of a device is inferred; more would cost time only."""
@@ -183,13 +180,14 @@ def conclude(found: Description, now: float | None = None) -> None:
         if (area, extent) not in found.reads and (area, extent) not in found.unread:
             found.reads[area, extent] = [[found.seen[area][each] for each in extent]]
     pieces = list(_pieces(found))
-    found.orders = _orders(pieces, now)
+    habits = _habits(pieces, now)
+    found.orders = segments.order_shares(habits)
     tags = list(_of_sunspec(found.sunspec)) if found.sunspec is not None else []
     for (area, extent), contents in found.reads.items():
         if area in BIT_AREAS:
             tags += _bits(area, extent, contents)
     for piece in pieces:
-        tags += _values(piece, found.orders, now)
+        tags += _values(piece, habits, now)
     areas = [each.area for each in found.survey.areas]
     found.tags = sorted(tags, key=lambda each: (areas.index(each.tag.area), each.tag.address))
 
@@ -240,8 +238,8 @@ def _empty(reads: list[list[int]]) -> Iterator[tuple[int, int]]:
         first = max(stop, first + 1)
 
 
-def _orders(pieces: Sequence[_Piece], now: float | None) -> dict[str, float]:
-    """The probability of each order, from the first pieces with content."""
+def _habits(pieces: Sequence[_Piece], now: float | None) -> dict[Habit, float]:
+    """The probability of each habit of the device, from the first pieces with content."""
     parts: list[list[list[int]]] = []
     seen = 0
     for piece in pieces:
@@ -250,18 +248,20 @@ def _orders(pieces: Sequence[_Piece], now: float | None) -> dict[str, float]:
             seen += len(parts[-1][0])
     if not parts:
         return {}
-    shares = segments.order_shares(parts, now=now)
-    return {order: share for order, share in shares.items() if share > IMPROBABLE}
+    shares = segments.habits(parts, now=now)
+    return {habit: share for habit, share in shares.items() if share > IMPROBABLE}
 
 
-def _values(piece: _Piece, orders: Mapping[str, float], now: float | None) -> Iterator[Described]:
+def _values(piece: _Piece, habits: Mapping[Habit, float], now: float | None) -> Iterator[Described]:
     if piece.is_empty:
         yield from _filled(piece)
         return
-    for value, chance in segments.divide(piece.reads, now=now, shares=orders).best:
-        if not any(value.found):
-            chance = min(chance, NOTHING_KNOWN)
-        yield _described(piece, value, min(chance, SUREST))
+    division = segments.divide(piece.reads, now=now, habits=habits, is_open=False)
+    for value, chance in division.best:
+        sure = segments.confidence(chance)
+        if not any(value.found) or value.reasons == (segments.FILL_REASONS[0xFFFF],):
+            sure = min(sure, segments.NOTHING_KNOWN)
+        yield _described(piece, value, min(sure, SUREST))
 
 
 def _filled(piece: _Piece) -> Iterator[Described]:
@@ -272,15 +272,15 @@ def _filled(piece: _Piece) -> Iterator[Described]:
         count = min(REGISTERS_A_TAG, size - first)
         reasons = (segments.FILL_REASONS[content],)
         kind = "uint16" if count == 1 else f"uint16[{count}]"
-        tag = _tag(piece.area, piece.address + first, kind, "ABCD", NOTHING_KNOWN, reasons)
-        yield Described(tag, NOTHING_KNOWN, (content,) * len(piece.reads), reasons)
+        tag = _tag(piece.area, piece.address + first, kind, "ABCD", segments.NOTHING_KNOWN, reasons)
+        yield Described(tag, segments.NOTHING_KNOWN, (content,) * len(piece.reads), reasons)
 
 
 def _described(piece: _Piece, value: Value, confidence: float) -> Described:
     kind = value.type
     if kind == segments.PART:
         kind = "uint16"
-        confidence = min(confidence, NOTHING_KNOWN)
+        confidence = min(confidence, segments.NOTHING_KNOWN)
     reasons = value.reasons if any(value.found) else (segments.FILL_REASONS[0],)
     if value.also is not None and any(value.found):
         reasons = (*reasons, f"or {value.also}")

@@ -2,8 +2,9 @@
 
 The score of a guess is its probability among all types and orders, from how common each is and how
 plausible its values are together with those in the registers behind them (`segments`). A rare type
-requires evidence: values that are much more plausible than those of common types. A known value
-takes precedence.
+requires evidence: values that are much more plausible than those of common types. Registers that
+are 0 say nothing about their type. Text that goes on behind the registers that were read has a
+length that nobody knows: its type gets a small score. A known value takes precedence.
 """
 
 from __future__ import annotations
@@ -23,9 +24,6 @@ SCALES = {1.0: 0.0, 0.1: 1.0, 0.01: 1.5, 0.001: 3.0, 10.0: 3.0}
 
 PLAUSIBLE = 12.0
 """The maximum weight of all other criteria with a known value, in bits."""
-
-ZERO = 2.0**-3
-"""How rarely people ask about a value that is 0 in all reads."""
 
 CLOSEST = 1e-6
 UNLIKE = 0.1
@@ -70,29 +68,18 @@ def guess(
     guesses = [
         found
         for starting in division.starting[: None if anywhere else 1]
-        for value, chance in _asked_about(starting)
+        for value, chance in starting
+        if value.type != segments.PART
         for found in _guesses(value, chance, like)
     ]
     return sorted(guesses, key=lambda each: -each.score)
 
 
-def _asked_about(starting: Sequence[tuple[Value, float]]) -> list[tuple[Value, float]]:
-    """The values that start at a register, with their probabilities: people ask about values other
-    than 0.
-    """
-    asked = [
-        (value, chance * (ZERO if not any(value.found) else 1))
-        for value, chance in starting
-        if value.type != segments.PART
-    ]
-    whole = sum(chance for _, chance in asked) or 1.0
-    return [(value, chance / whole) for value, chance in asked]
-
-
 def _guesses(value: Value, chance: float, like: float | None) -> Iterator[Guess]:
     """A value as a guess; with a known value, in all scales that come close to it."""
     if like is None:
-        yield _guess(value, chance)
+        sure = segments.confidence(chance)
+        yield _guess(value, sure if any(value.found) else min(sure, segments.NOTHING_KNOWN))
         return
     if isinstance(value.found[0], str):
         return
