@@ -45,7 +45,7 @@ ZERO = {16: 2.2, 32: 2.5, 64: 2.5}
 """Bits for zero: one register in four contains it."""
 
 NEGATIVE = 3.0
-LEAST = 11.0
+MIN_BITS = 11.0
 """The bits of the least integer and of half of it, as limits have: those of a bit field."""
 
 ALL_SET = 7.0
@@ -114,7 +114,7 @@ FIELD = 7.5
 
 ALIKE = 0.3
 NEAR = 2.0
-MOST_ALIKE = 11.0
+MAX_ALIKE = 11.0
 """How many values are like their neighbour of the same type; the bits for it beside those of the
 difference; and what it can save at most.
 """
@@ -173,7 +173,7 @@ def likeness(near: Sequence[Any], described: Description, after: Any, kind: str)
         return 0.0
     alike = min(far + change(before, after, kind) for far, before in enumerate(near) if before)
     saved = described.bits - described.later - NEAR - alike
-    return math.log2(1 - ALIKE + ALIKE * 2.0 ** min(MOST_ALIKE, saved))
+    return math.log2(1 - ALIKE + ALIKE * 2.0 ** min(MAX_ALIKE, saved))
 
 
 def _constant(value: int, bits: int) -> float:
@@ -229,7 +229,7 @@ def _negative(amount: int, bits: int, reasons: list[str]) -> float:
     if bits > 16 and amount > USUAL_MIN[bits]:
         reasons.append("large")
     if amount.bit_count() == 1 and amount >> (bits - 2):
-        return LEAST
+        return MIN_BITS
     unusual = 1.5 * _excess(amount, USUAL_MIN[bits], bits) / UNUSUAL[bits]
     plain = math.log2(amount + 1) + SPREAD[bits] + unusual
     return NEGATIVE + min(plain, _round(amount, bits))
