@@ -237,15 +237,15 @@ impl Earlier {
     pub(super) fn repeated(
         &mut self,
         (unit_id, request): (u8, &EncodedRequest),
-        (sent, timeout): (Time, Duration),
+        sent: Time,
         now: Time,
     ) {
-        let until = self.until_after(unit_id, (sent, timeout), Ended::TimedOut, now);
         let same = |earlier: &&mut Unanswered| {
             earlier.unit_id == unit_id && earlier.request.pdu() == request.pdu()
         };
         for earlier in self.unanswered.iter_mut().filter(same) {
-            earlier.until = earlier.until.max(until);
+            // As long after this request as it would have been waited for after the earlier one.
+            earlier.until += sent.saturating_sub(earlier.sent);
             earlier.from = now + GUARD;
         }
     }

@@ -482,7 +482,7 @@ impl OneAtATime {
             self.earlier.answered(flight.unit_id, took, self.timeout);
             let (request, times) = ((flight.unit_id, &flight.request), (flight.sent, self.timeout));
             if self.repeats {
-                self.earlier.repeated(request, times, now);
+                self.earlier.repeated(request, flight.sent, now);
             }
             if pdu.first().is_some_and(|code| code & 0x80 != 0) && pdu.get(1) == Some(&NO_REPLY) {
                 self.earlier.ended(request, times, Ended::Other, now);
