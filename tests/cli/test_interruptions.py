@@ -44,12 +44,13 @@ def test_a_signal_behind_the_search_does_not_cut_the_output() -> None:
 
 
 def test_handlers_are_as_before_when_the_command_ends() -> None:
-    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    handlers = {signal.SIGTERM: signal.SIG_IGN, signal.SIGINT: signal.default_int_handler}
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         with interruptions():
             assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
             assert signal.getsignal(signal.SIGINT) != signal.default_int_handler
-        assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
-        assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
+        assert {number: signal.getsignal(number) for number in handlers} == handlers
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

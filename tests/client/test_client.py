@@ -78,7 +78,7 @@ def device(request: pytest.FixtureRequest, run: Run, tmp_path: Path) -> Iterator
             appliance = run(
                 lines.configuration(mode, cable.devices[0], memories=MEMORIES, units=UNITS, **MORE)
             )
-            url = f"{kind}://{cable.devices[1]}?parity=none"
+            url = f"{kind}://{cable.devices[1]}?parity=none&baud=4000000"
         else:
             rules = [transports.rule(["127.0.0.1"], units=UNITS)]
             listener = "rtu" if kind == "rtu+tcp" else kind

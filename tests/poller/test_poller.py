@@ -961,7 +961,7 @@ def test_a_stop_does_not_wait_for_those_who_hang(run: Run, tmp_path: Path) -> No
             fake.url,
             f"rtu+tcp://127.0.0.1:{port}",
             f"udp://127.0.0.1:{free_port()}",
-            f"rtu://{cable.devices[0]}?parity=none",
+            f"rtu://{cable.devices[0]}?parity=none&baud=4000000",
         ]
         devices = {
             f"d{number}": device(

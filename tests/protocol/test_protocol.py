@@ -141,12 +141,15 @@ def test_no_fault_is_called_none() -> None:
 
 def test_the_console_has_the_same_areas_and_limits() -> None:
     script = (FOLDER / "standard.js").read_text()
-    rows = re.findall(r'(\w+): \{ title: "([\w ]+)", code: (\d+), most: (\d+) \}', script)
-    assert [(area, int(code), int(most)) for area, _, code, most in rows] == [
+    row = r'(\w+): \{ title: "([\w ]+)", code: (\d+), most: (\d+)(?:, mostWritten: (\d+))? \}'
+    rows = re.findall(row, script)
+    assert [(area, int(code), int(most)) for area, _, code, most, _ in rows] == [
         (area, function.code, function.most_read)
         for area, function in protocol.READ_FUNCTIONS.items()
     ]
-    assert [title.lower().replace(" ", "_") for _, title, _, _ in rows] == list(types.AREAS)
+    written = {area: int(most) for area, *_, most in rows if most}
+    assert written == protocol.WRITE_LIMITS
+    assert [title.lower().replace(" ", "_") for _, title, *_ in rows] == list(types.AREAS)
     assert f"LAST = {protocol.LAST_ADDRESS};" in script
 
 

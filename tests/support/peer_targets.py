@@ -94,7 +94,9 @@ def routed(scheme: str, folder: Path, access: str) -> Iterator[Target]:
                 {
                     "memories": {"plant": peer_tour.SIZES},
                     "identity": peer_tour.IDENTITY,
-                    "links": {"line": {"url": f"rtu://{cable.devices[1]}?parity=none"}},
+                    "links": {
+                        "line": {"url": f"rtu://{cable.devices[1]}?parity=none&baud=4000000"}
+                    },
                     "listeners": {
                         "scada": listener,
                         "device": {"type": "modbus-rtu", "serial": line, "rules": [served]},

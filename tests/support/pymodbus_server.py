@@ -44,7 +44,7 @@ class Pymodbus:
         self._thread.start()
         self._server: Any = self._run(self._started(kind, cable))
         if cable is not None:
-            self.url = f"{kind}://{cable.devices[1]}?parity=none"
+            self.url = f"{kind}://{cable.devices[1]}?parity=none&baud=4000000"
         else:
             transport = self._server.transport
             own = transport.sockets[0] if kind != "udp" else transport.get_extra_info("socket")

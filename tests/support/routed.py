@@ -95,7 +95,7 @@ def to_rtu_server(
         cable = stack.enter_context(Cable(folder))
         poller = _core.Poller([])
         stack.callback(poller.stop)
-        target = parse(f"rtu://{cable.devices[1]}?parity=none")
+        target = parse(f"rtu://{cable.devices[1]}?parity=none&baud=4000000")
         route = poller.link("line", endpoint(target)).route("line", timeout=wire.DEADLINE)
         rules = [
             _core.Rule({unit: behind}, sources=LOOPBACK, access="read-write")

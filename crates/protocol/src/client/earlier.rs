@@ -175,6 +175,14 @@ impl Earlier {
         self.is_fast
     }
 
+    /// Whether a reply that came too fast shows that the line is faster than its settings say: a copy of an
+    /// earlier one would equal it.
+    pub(super) fn shows_fast_line(&mut self, reply: &[u8]) -> bool {
+        let reply = crc32fast::hash(reply);
+        self.is_fast |= self.recent.iter().all(|recent| recent.reply != reply);
+        self.is_fast
+    }
+
     /// Notes that the reply to a request came too fast to be its own.
     pub(super) fn came_too_fast(&mut self) {
         self.too_fast = true;

@@ -343,7 +343,7 @@ impl OneAtATime {
         now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
-        if self.is_too_fast(flights, pdu.len(), now) {
+        if self.is_too_fast(flights, pdu.len(), now) && !self.earlier.shows_fast_line(&pdu) {
             flights.strays.replies += 1;
             flights.strays.bytes += self.received.len() as u64;
             self.received.clear();
