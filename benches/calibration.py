@@ -33,7 +33,7 @@ def main() -> None:
         if importlib.util.find_spec(f"calibration.{name}") is None:
             print(f"\ntests/calibration/{name}.py does not exist.")
             continue
-        cases = importlib.import_module(f"calibration.{name}").cases()
+        cases = list(importlib.import_module(f"calibration.{name}").cases())
         values = sum(truth.type != "empty" for case in cases for truth in case.values)
         print(f"\n## {name}: {len(cases)} blocks with {values} values")
         claims = judge.judged(cases)
