@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -44,7 +44,10 @@ def test_a_signal_behind_the_search_does_not_cut_the_output() -> None:
 
 
 def test_handlers_are_as_before_when_the_command_ends() -> None:
-    handlers = {signal.SIGTERM: signal.SIG_IGN, signal.SIGINT: signal.default_int_handler}
+    handlers: dict[signal.Signals, Any] = {
+        signal.SIGTERM: signal.SIG_IGN,
+        signal.SIGINT: signal.default_int_handler,
+    }
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         with interruptions():
