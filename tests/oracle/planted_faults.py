@@ -314,7 +314,7 @@ def wrong_values_of_owners(evidence: Evidence) -> Iterator[History]:
 
 
 def wrong_answers_of_a_seal(evidence: Evidence) -> Iterator[History]:
-    """A client got an answer while the memory was sealed, or was told that while it was open."""
+    """A client got an answer while the memory was sealed, or a refusal while it was open."""
     [gate] = [block for block in evidence.history.layout.blocks if block.kind is Kind.GATE]
     turns = sorted(evidence.writes.get(gate, {}).items())
     spans = [

@@ -1050,7 +1050,7 @@ mod tests {
         TcpStream::from_std(accepted).unwrap()
     }
 
-    /// A format, what becomes of flags, how many packets a connection carries, and what follows a refusal.
+    /// A format, whether flags are ignored, how many packets a connection carries, and what follows a refusal.
     type Terms = ((Format, Flags), (Option<Duration>, AfterRefusal));
 
     fn terms() -> impl Iterator<Item = Terms> {

@@ -67,6 +67,8 @@ pub(super) struct Earlier {
     pub(super) used: Time,
     /// The line is faster than its settings say: replies showed it that were the first ones, or the only ones.
     is_fast: bool,
+    /// A late reply has come.
+    has_late: bool,
     /// A reply to the request came too fast.
     too_fast: bool,
     /// Requests in a row that had no other reply than one that came too fast.
@@ -175,11 +177,13 @@ impl Earlier {
         self.is_fast
     }
 
-    /// Whether a reply that came too fast shows that the line is faster than its settings say: a copy of an
-    /// earlier one would equal it.
+    /// Whether a reply that came too fast shows that the line is faster than its settings say: it is no copy
+    /// of a recent one, and the line has never brought a late reply, of which it may be a copy, or one that
+    /// nobody asked for, such as one to another master.
     pub(super) fn shows_fast_line(&mut self, reply: &[u8]) -> bool {
         let reply = crc32fast::hash(reply);
-        self.is_fast |= self.recent.iter().all(|recent| recent.reply != reply);
+        let is_copy = self.recent.iter().any(|recent| recent.reply == reply);
+        self.is_fast |= self.guard.learned.is_none() && !self.has_late && !is_copy;
         self.is_fast
     }
 
@@ -293,6 +297,7 @@ impl Earlier {
 
     /// Notes the late reply to the request at this place. Returns how long it took.
     pub(super) fn late(&mut self, place: usize, now: Time) -> Duration {
+        self.has_late = true;
         if self.unanswered.get(place).is_some_and(|earlier| now < earlier.from) {
             return Duration::ZERO;
         }
