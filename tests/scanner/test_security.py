@@ -6,6 +6,7 @@ import asyncio
 import logging
 import socket
 import time
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import pytest
@@ -130,6 +131,31 @@ def test_no_secret_goes_to_a_server_without_tls(run_scanner: Run, tmp_path: Path
             connection.settimeout(wire.DEADLINE)
             connection.sendall(b'INFO {"server_id":"x","version":"2.11.0","max_payload":1000}\r\n')
             assert connection.recv(1000) == b""
+
+
+def test_connections_that_a_server_refuses_are_closed(run_scanner: Run) -> None:
+    hello = b'INFO {"server_id":"x","version":"2.11.0","max_payload":1000,"headers":true}\r\n'
+    with ExitStack() as opened:
+        listening = opened.enter_context(socket.create_server(("127.0.0.1", 0)))
+        listening.settimeout(wire.DEADLINE)
+
+        def answered(reply: bytes) -> socket.socket:
+            connection = opened.enter_context(listening.accept()[0])
+            connection.settimeout(wire.DEADLINE)
+            connection.sendall(hello)
+            sent = b""
+            while not sent.endswith(b"PING\r\n"):
+                sent += connection.recv(4096)
+            connection.sendall(reply)
+            return connection
+
+        run_scanner(
+            wait=False, servers=Servers((f"nats://127.0.0.1:{listening.getsockname()[1]}",))
+        )
+        answered(b"PONG\r\n").shutdown(socket.SHUT_RDWR)
+        for _ in range(3):
+            refused = answered(b"-ERR 'Authorization Violation'\r\n")
+            assert refused.recv(1) == b"", "it is closed, though this side is still open"
 
 
 def test_a_token_opens_the_door(run_scanner: Run, serve_nats: Serve, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from nats.aio.client import Client
+from nats.aio.client import Client, Srv
 from nats.aio.msg import Msg
 from nats.errors import Error, ProtocolError
 from nats.protocol.parser import AWAITING_CONTROL_LINE, AWAITING_MSG_PAYLOAD, Parser
@@ -53,6 +53,12 @@ class SafeClient(Client):
         """Pings the server, unless that was done after `since`."""
         if self.is_connected and self._last_ping < since:
             await self._send_ping()
+
+    async def _connect_to_server(self, s: Srv) -> None:
+        # A connection that was refused, such as for its credentials: nats-py would forget it open.
+        if self._transport is not None:
+            self._transport.close()  # type: ignore[no-untyped-call]
+        await super()._connect_to_server(s)
 
     async def _process_connect_init(self) -> None:
         began = now()
