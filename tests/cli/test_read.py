@@ -39,9 +39,11 @@ def test_registers_are_shown_in_three_ways(
 
 REPEATED = ("--every", "0.01", "--times", "3")
 SLOW_READS = {
+    "once": ("read", "hr", "7"),
+    "one tag": ("read", "hr:7"),
     "read": ("read", "hr:7", *REPEATED),
     "tags": ("read", "--tags", str(ROOT / "examples" / "tags" / "heater.yaml"), *REPEATED),
-    "describe": ("describe", "--units", "1-3"),
+    "describe": ("describe", "--units", "1-10"),
 }
 
 

@@ -159,6 +159,12 @@ def tell_late(longest: float, timeout: float) -> None:
     )
 
 
+def listen(client: SyncClient, area: Area, address: int) -> None:
+    """Asks once more after a timeout, so that a late reply is noticed, which `tell_late` tells."""
+    with contextlib.suppress(ModbusError):
+        read_raw(client, area, address, 1)
+
+
 @contextlib.contextmanager
 def usable() -> Iterator[None]:
     """Turns errors of a client's arguments, or of files in its URL, into usage errors."""
@@ -184,14 +190,19 @@ def problem(error: ModbusError) -> dict[str, object]:
     return {"reason": reason, **code, "detail": str(error)}
 
 
-def fail(
-    error: ModbusError, url: str, answer: Mapping[str, object] | None, hint: str | None = None
-) -> NoReturn:
+def fail(error: ModbusError, url: str, answer: Mapping[str, object] | None) -> NoReturn:
     """Prints an error and exits with 1; with `answer`, as JSON on standard output."""
+    tell(error, url, answer)
+    sys.exit(FAILED)
+
+
+def tell(
+    error: ModbusError, url: str, answer: Mapping[str, object] | None, hint: str | None = None
+) -> None:
+    """Prints an error; with `answer`, as JSON on standard output."""
     if answer is not None:
         click.echo(json.dumps({"ok": False, **answer, **problem(error)}))
     else:
         click.echo(f"holdfast: {url}: {error}", err=True)
         if hint is not None:
             click.echo(f"hint: {hint}", err=True)
-    sys.exit(FAILED)

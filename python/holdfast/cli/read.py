@@ -12,7 +12,7 @@ import click
 from holdfast.cli import device, pace, places, showing, tag_options, tag_source, tagged_read
 from holdfast.cli.tag_options import TagFiles
 from holdfast.cli.typed import typed, typed_options
-from holdfast.errors import ModbusError, ModbusException
+from holdfast.errors import ModbusError, ModbusException, RequestTimeout
 from holdfast.protocol import ADDRESSES, ILLEGAL_ADDRESS, LAST_ADDRESS
 from holdfast.types import BIT_AREAS
 from holdfast.values import ConversionError
@@ -120,7 +120,10 @@ def read(
         try:
             raw = query.read(client)
         except ModbusError as error:
-            device.fail(error, url, told if as_json else None, _hint(error, query))
+            device.tell(error, url, told if as_json else None, _hint(error, query))
+            if isinstance(error, RequestTimeout):
+                device.listen(client, place.area, place.address)
+            sys.exit(device.FAILED)
     if as_json:
         click.echo(json.dumps({"ok": True, **told, **query.found(raw)}))
     else:

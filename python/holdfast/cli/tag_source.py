@@ -66,6 +66,10 @@ class TagSource:
                 raise RecordingFailed(f"{self._file}: {error.strerror}") from error
         return moment, readings
 
+    def listen(self, tag: Tag) -> None:
+        """Waits for a late reply, after the read of this tag has timed out."""
+        device.listen(self._client, tag.area, tag.address)
+
 
 @contextlib.contextmanager
 def opened(of: TaggedDevice, max_gap: int, record: Path | None) -> Iterator[TagSource]:

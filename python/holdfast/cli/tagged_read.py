@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import click
 
 from holdfast.cli import device, pace, recording, showing
-from holdfast.errors import ModbusError
+from holdfast.errors import ModbusError, RequestTimeout
 from holdfast.tags.text import plain, text_of
 
 if TYPE_CHECKING:
@@ -53,12 +53,21 @@ def read_tags(source: TagSource, form: Form, every: float | None, times: int | N
                 if every is not None:
                     click.echo(showing.clock())
                 _show(source, readings)
+            if every is None:
+                _listen(source, readings)
     except KeyboardInterrupt:
         if every is None:
             raise
         if form == "text" and sys.stdout.isatty():
             click.echo()
     return code
+
+
+def _listen(source: TagSource, readings: Sequence[Reading]) -> None:
+    """Waits for a late reply to the last request that timed out."""
+    late = [each.tag for each in readings if isinstance(each.error, RequestTimeout)]
+    if late:
+        source.listen(late[-1])
 
 
 def _told(source: TagSource, readings: Sequence[Reading], timed: bool) -> dict[str, Any]:
