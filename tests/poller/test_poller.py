@@ -285,6 +285,22 @@ def test_a_line_that_is_not_there_is_unreachable_and_nobody_refuses(
     assert fault_word(counters(appliance, "meter")["last_error"]) == "unreachable"
 
 
+def test_seconds_in_error_count_while_the_first_reply_is_awaited(run: Run) -> None:
+    over = threading.Event()
+
+    def late(request: wire.Frame) -> bytes:
+        over.wait(wire.DEADLINE)
+        return data(request, 1)
+
+    with Fake(late) as fake:
+        meter = device(fake.url, read("coils", 0, 1), timeout=60, status=block(0))
+        appliance = run(configuration({"meter": meter}))
+        waiting = until_told(appliance, also=lambda told: told.seconds_in_error, health=UNKNOWN)
+        assert (waiting.failures, waiting.last_error) == (0, 0)
+        over.set()
+        assert until_told(appliance, health=OK).seconds_in_error == 0
+
+
 def wrong_length(request: wire.Frame) -> bytes:
     return reply(request, bytes([request.pdu[0], 2, 0, 1]))
 

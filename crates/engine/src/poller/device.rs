@@ -233,6 +233,7 @@ impl Device {
     /// Polls forever, first after `phase`, and keeps the status block up to date.
     pub(super) async fn run(mut self, phase: Duration, inbox: Rc<Inbox>) {
         self.due.set(Instant::now() + phase);
+        self.state.begun();
         loop {
             self.tell();
             let polled = caught(pin!(async {

@@ -253,6 +253,30 @@ fn a_task_that_panics_puts_its_device_in_error() {
     });
 }
 
+#[test]
+fn seconds_in_error_begin_with_the_polls_and_end_with_a_complete_one() {
+    with_device(async |_| {
+        let state = DeviceState::default();
+        let in_error = || state.in_error() > Duration::ZERO;
+        assert!(!in_error(), "it is not polled yet");
+        state.begun();
+        until(in_error).await;
+        let before_the_first_poll = state.in_error();
+        state.bad(Fault::Timeout);
+        assert!(state.in_error() >= before_the_first_poll, "a failure does not begin it anew");
+        state.set_standby(true);
+        assert!(!in_error(), "another node polls it");
+        state.set_standby(false);
+        until(in_error).await;
+        state.good();
+        // A device that replaces it goes on, at a reload.
+        state.begun();
+        assert!(!in_error());
+        state.bad(Fault::Timeout);
+        until(in_error).await;
+    });
+}
+
 async fn until(done: impl Fn() -> bool) {
     while !done() {
         sleep(Duration::from_millis(1)).await;
