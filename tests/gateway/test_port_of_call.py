@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 NAME = "gateway.plant.example"
 TEXT = {"Content-Type": "text/plain"}
 
-# The command lines of its document, and whether `jq` shows a part of the answer.
+# The command lines of its document, and the answers of the device below.
 
 CURL = [
     """\
@@ -317,9 +317,9 @@ def device() -> Iterator[int]:
         yield server.address[1]
 
 
-def by_name(gateway: Running, command: str) -> str:
-    """A printed command line with the URL of the gateway, in which its host is a name."""
-    url = f"http://{NAME}:{gateway.address[1]}"
+def here(gateway: Running, command: str, host: str = NAME) -> str:
+    """A printed command line with another host in its URL."""
+    url = f"http://{host}:{gateway.address[1]}"
     found = re.sub(r"https://portofcall\.ross\.gg|(?<= )\.\.\.(?=/api)", url, command)
     assert found.count(url) == 1
     return found
@@ -332,7 +332,7 @@ def test_a_printed_command_line_works_with_the_name_of_the_gateway(
     tool("curl")
     resolve = f"resolve = {NAME}:{gateway.address[1]}:127.0.0.1\n"
     (tmp_path / ".curlrc").write_text(resolve)
-    command, _, _ = by_name(gateway, CURL[number]).partition(" | jq")
+    command, _, _ = here(gateway, CURL[number]).partition(" | jq")
     done = subprocess.run(
         [tool("sh"), "-c", command],
         env={"CURL_HOME": str(tmp_path), "PATH": "/usr/local/bin:/usr/bin:/bin"},
@@ -343,16 +343,20 @@ def test_a_printed_command_line_works_with_the_name_of_the_gateway(
     alike(json.loads(done.stdout), ANSWERS[number])
 
 
+@pytest.mark.parametrize("host", [NAME, "127.0.0.1", "localhost"])
 @pytest.mark.parametrize("number", range(len(CURL)))
-def test_the_bytes_of_a_printed_command_line_are_answered(gateway: Running, number: int) -> None:
+def test_the_bytes_of_a_printed_command_line_are_answered(
+    gateway: Running, number: int, host: str
+) -> None:
     """What curl sends, without curl."""
-    words = shlex.split(by_name(gateway, CURL[number]).partition(" | jq")[0].replace("\\\n", ""))
+    command, _, _ = here(gateway, CURL[number], host).partition(" | jq")
+    words = shlex.split(command.replace("\\\n", ""))
     url, body = words[4], words[words.index("-d") + 1]
     _, _, rest = url.partition("://")
-    host, _, path = rest.partition("/")
+    its_host, _, path = rest.partition("/")
     kind = "application/json" if "-H" in words else "application/x-www-form-urlencoded"
     sent = (
-        f"POST /{path} HTTP/1.1\r\nHost: {host}\r\nUser-Agent: curl/8.5.0\r\nAccept: */*\r\n"
+        f"POST /{path} HTTP/1.1\r\nHost: {its_host}\r\nUser-Agent: curl/8.5.0\r\nAccept: */*\r\n"
         f"Content-Type: {kind}\r\nContent-Length: {len(body)}\r\nConnection: close\r\n\r\n{body}"
     )
     with socket.create_connection(gateway.address, wire.DEADLINE) as connection:
