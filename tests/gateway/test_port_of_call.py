@@ -376,6 +376,22 @@ def test_a_printed_request_gets_the_printed_answer(
     alike(got.json, answer)
 
 
+def test_a_device_that_does_not_reply_has_the_printed_error(lenient: Running) -> None:
+    with FakeDevice(lambda _: None) as mute:
+        body = f'{{"host":"127.0.0.1","port":{mute.port},"timeout":50}}'
+        answer = ask(lenient, "/connect", body, web.JSON)
+    assert answer.status == 500
+    alike(
+        answer.json,
+        """\
+{
+  "success": false,
+  "error": "Connection timeout"
+}
+""",
+    )
+
+
 # Names of the gateway.
 
 
