@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import http.client
 import json
 import re
 import shlex
@@ -425,6 +427,22 @@ def test_a_name_opens_the_gateway_to_no_page_of_another_site(
     gateway: Running, headers: dict[str, str]
 ) -> None:
     assert status(gateway, **headers) == 403
+
+
+def test_under_a_name_no_get_asks_a_device(lenient: Running, device: int) -> None:
+    """A browser may send it for a page of another site without a header that says so."""
+    query = f"host=127.0.0.1&port={device}&functionCode=3&address=0"
+    connection = http.client.HTTPConnection(*lenient.address, timeout=wire.DEADLINE)
+    with contextlib.closing(connection):
+        connection.request("GET", f"{API}/watch?{query}", headers={"Host": NAME})
+        answer = connection.getresponse()
+        assert (answer.status, answer.headers["Holdfast-Reason"]) == (403, "foreign_page")
+        error = json.loads(answer.read())["error"]
+    assert error.endswith("or use POST /api/modbus/watch/view")
+    assert lenient.client().get("/api/gateway").json["connections"] == 0
+    part = '"once":true,"parts":[{"functionCode":3,"address":0}]'
+    body = f'{{"host":"127.0.0.1","port":{device},{part}}}'
+    assert ask(lenient, "/watch/view", body, {**web.JSON, "Host": NAME}).status == 200
 
 
 def test_without_names_an_error_says_how_to_add_one() -> None:

@@ -249,6 +249,13 @@ class App:
         elif not request.is_direct(self._settings.hosts):
             detail = "Host is a name, allowed without tokens: an IP address, localhost"
             raise BadRequest("foreign_page", f"{detail}, or a name in {HOSTS}")
+        elif request.path == watching.PATH and not request.is_direct():
+            # The only GET that asks a device. Over HTTP and to a name, browsers send neither Origin
+            # nor Sec-Fetch-Site with the GET of a page.
+            detail = (
+                f"Host is a name, allowed without tokens for GET {watching.PATH}: an IP address"
+            )
+            raise BadRequest("foreign_page", f"{detail}, localhost; or use POST {viewing.PATH}")
 
     @contextlib.contextmanager
     def _place(self, kind: str, most: int) -> Iterator[None]:
