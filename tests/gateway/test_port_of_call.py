@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import os
 import re
 import shlex
 import socket
@@ -337,7 +338,7 @@ def test_a_printed_command_line_works_with_the_name_of_the_gateway(
     command, _, _ = here(gateway, CURL[number]).partition(" | jq")
     done = subprocess.run(
         [tool("sh"), "-c", command],
-        env={"CURL_HOME": str(tmp_path), "PATH": "/usr/local/bin:/usr/bin:/bin"},
+        env={**os.environ, "CURL_HOME": str(tmp_path), "no_proxy": "*"},
         capture_output=True,
         check=True,
         timeout=wire.DEADLINE,
