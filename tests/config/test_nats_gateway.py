@@ -41,6 +41,7 @@ listeners:
     serial: {device: /dev/ttyUSB0}
     rules: [{units: {1: plant}, access: read-only}]
 """
+HOST_NAME = "a host name without a port, as in gateway.plant.example"
 NAME = "1 to 64 letters, digits, '_', '.' and '-'"
 SOME = "a list with at least one entry"
 URL = "nats://host:port or tls://host:port"
@@ -162,6 +163,21 @@ def test_the_gateway_needs_no_tokens_for_this_machine(folder: Folder, source: st
     assert (settings.tokens, settings.writes, settings.limits.in_flight) == ((), False, 1)
 
 
+def test_the_gateway_has_names_without_tokens(folder: Folder) -> None:
+    text = changed(WITHOUT, "sources: [10.0.0.0/8]", "sources: ['::1']")
+    more = "  tokens: none\n  hosts: [gw, Gateway.Plant.example]\n  compat: port-of-call\n"
+    settings = assembly.gateway(gateway_of(folder, text + more))
+    assert settings.hosts == {"gw", "gateway.plant.example"}
+    assert settings.compat == "port-of-call"
+    assert folder.warnings(text + more) == []
+    assert assembly.gateway(gateway_of(folder, GATEWAY)).compat is None
+
+
+def test_with_tokens_names_have_no_effect(folder: Folder) -> None:
+    [warning] = folder.warnings(GATEWAY + "  hosts: [gw]\n")
+    assert warning.endswith("gateway.hosts: has no effect with tokens")
+
+
 def test_the_effective_configuration_shows_every_default(folder: Folder) -> None:
     dump = folder.config(NATS + GATEWAY).dump()
     assert dump[dump.index("nats:") : dump.index("adapters:")] == (
@@ -185,6 +201,7 @@ def test_the_effective_configuration_shows_every_default(folder: Folder) -> None
         "  tokens:\n"
         f"    - {{name: panel, sha256: {HASH}}}\n"
         "  in_flight: 1\n"
+        "  hosts: []\n"
         "outputs: {}\n"
     )
     assert folder.config(dump) == folder.config(NATS + GATEWAY)
@@ -401,7 +418,22 @@ def test_a_line_of_a_listener_or_a_device_is_not_polled_for_subscribers(folder: 
         ("  access", "  in_flight: 65\n  access",
          "5: in_flight: found 65, allowed: an integer from 1 to 64"),
         ("  access", "  writes: true\n  access", "5: writes: unknown key, allowed: bind, sources, "
-         "allow, access, tokens, tls, device_tls, in_flight"),
+         "allow, access, tokens, tls, device_tls, in_flight, hosts, compat"),
+        ("  access", "  compat: tentacle\n  access",
+         "5: compat: found 'tentacle', allowed: port-of-call"),
+        ("  access", "  compat:\n  access", "5: compat: found nothing, allowed: port-of-call"),
+        ("  access", "  hosts: gateway\n  access",
+         "5: hosts: found 'gateway', allowed: a list"),
+        ("  access", "  hosts: [10.0.0.5]\n  access",
+         f"5: hosts[0]: found '10.0.0.5', allowed: {HOST_NAME}"),
+        ("  access", "  hosts: ['a b']\n  access",
+         f"5: hosts[0]: found 'a b', allowed: {HOST_NAME}"),
+        ("  access", "  hosts: ['plant:80']\n  access",
+         f"5: hosts[0]: found 'plant:80', allowed: {HOST_NAME}"),
+        ("  access", "  hosts: [.plant]\n  access",
+         f"5: hosts[0]: found '.plant', allowed: {HOST_NAME}"),
+        ("  access", "  hosts: ['*']\n  access", f"5: hosts[0]: found '*', allowed: {HOST_NAME}"),
+        ("  access", "  hosts: [7]\n  access", f"5: hosts[0]: found 7, allowed: {HOST_NAME}"),
         ("panel", "''", f"7: tokens[0].name: found '', allowed: {NAME}"),
         ("    - name: panel\n      sha256", "    - sha256",
          "7: tokens[0].name: missing, allowed: text"),

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import shlex
 import struct
-import subprocess
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
@@ -18,7 +16,6 @@ from holdfast.gateway.pool import Pool
 from support import gateways, transports, web, wire
 from support.fake_device import HANG_UP, FakeDevice, Stream, exception, registers
 from support.gateways import PLC, Dialed, Names, Running
-from support.machine import tool
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -69,95 +66,6 @@ def done(client: web.Client, path: str, **body: Any) -> Any:
 
 
 TARGET = {"host": PLC, "port": 502, "unitId": 1}
-
-# Command lines as a shell runs them, with the whole answer.
-
-CURL = {
-    """curl -s -X POST URL/api/modbus/connect \
-  -H 'Content-Type: application/json' \
-  -d '{"host":"plc.factory.local","unitId":1}'""": {
-        "success": True,
-        "message": "Modbus server reachable",
-        **TARGET,
-        "testRegister": 42,
-    },
-    """curl -s -X POST URL/api/modbus/read \
-  -H 'Content-Type: application/json' \
-  -d '{"host":"plc.factory.local","functionCode":3,"address":100,"quantity":10}'""": {
-        "success": True,
-        **TARGET,
-        "functionCode": 3,
-        "functionName": "READ_HOLDING_REGISTERS",
-        "address": 100,
-        "quantity": 10,
-        "format": "registers",
-        "values": [1234, 0, 65535, 42, 7, 0, 0, 0, 0, 0],
-    },
-    """curl -s -X POST URL/api/modbus/read \
-  -H 'Content-Type: application/json' \
-  -d '{"host":"plc.factory.local","functionCode":1,"address":0,"quantity":16}'""": {
-        "success": True,
-        **TARGET,
-        "functionCode": 1,
-        "functionName": "READ_COILS",
-        "address": 0,
-        "quantity": 16,
-        "format": "coils",
-        "values": [True, False, True, True, *[False] * 12],
-    },
-    """curl -s -X POST URL/api/modbus/write/coil \
-  -H 'Content-Type: application/json' \
-  -d '{"host":"plc.factory.local","address":17,"value":true}'""": {
-        "success": True,
-        **TARGET,
-        "address": 17,
-        "coilValue": 65280,
-        "written": True,
-    },
-    """curl -s -X POST URL/api/modbus/write/registers \
-  -H 'Content-Type: application/json' \
-  -d '{"host":"plc.factory.local","address":100,"values":[1000,2000,3000]}'""": {
-        "success": True,
-        **TARGET,
-        "startAddress": 100,
-        "quantity": 3,
-    },
-    """curl -s -X POST URL/api/modbus/connect \
-  -H 'Content-Type: application/json' \
-  -d '{"host":"192.168.1.50","port":5020,"unitId":3}'""": {
-        "success": True,
-        "message": "Modbus server reachable",
-        "host": "192.168.1.50",
-        "port": 5020,
-        "unitId": 3,
-        "testRegister": 42,
-    },
-    """curl -s -X POST URL/api/modbus/read \
-  -d '{"host":"192.168.1.50","port":5020,"functionCode":3,"address":0,"quantity":10}'""": {
-        "success": True,
-        "host": "192.168.1.50",
-        "port": 5020,
-        "unitId": 1,
-        "functionCode": 3,
-        "functionName": "READ_HOLDING_REGISTERS",
-        "address": 0,
-        "quantity": 10,
-        "format": "registers",
-        "values": [42, *[0] * 9],
-    },
-}
-
-
-@pytest.mark.parametrize("command", CURL, ids=range(len(CURL)))
-def test_a_command_line_with_another_host_works(gateway: Running, command: str) -> None:
-    tool("curl")
-    words = shlex.split(command.replace("URL", gateway.url))
-    result = subprocess.run(words, capture_output=True, check=True, timeout=wire.DEADLINE)
-    answer = json.loads(result.stdout)
-    if "write" in command:
-        assert type(answer.pop("rtt")) is int
-    assert answer == CURL[command]
-
 
 # Connecting.
 

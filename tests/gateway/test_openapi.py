@@ -16,7 +16,7 @@ from schemathesis.specs.openapi.checks import positive_data_acceptance
 
 import holdfast
 from holdfast import __version__
-from holdfast.gateway import Settings, app, openapi
+from holdfast.gateway import Settings, app, openapi, port_of_call
 from support import gateways
 from support.cases import examples
 from support.gateways import Dialed
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from schemathesis.specs.openapi.schemas import OpenApiSchema
 
     from holdfast.client.url import NetworkTarget
+    from holdfast.config.services import Compat
     from support.gateways import Running
 
 EXCLUDED: list[Any] = [
@@ -63,7 +64,7 @@ class Everywhere(Dialed):
 
 
 @contextlib.contextmanager
-def serving(**limits: float) -> Iterator[Running]:
+def serving(compat: Compat | None = None, **limits: float) -> Iterator[Running]:
     """A gateway for which all names and addresses are the same device."""
 
     async def anybody(_: str) -> list[str]:
@@ -79,6 +80,7 @@ def serving(**limits: float) -> Iterator[Running]:
             resolve=anybody,
             dialed=Everywhere(server.address),
             limits={"discovery": 0.02, **limits},
+            compat=compat,
         ) as running,
     ):
         yield running
@@ -92,7 +94,13 @@ def gateway() -> Iterator[Running]:
 
 
 @pytest.fixture(scope="module")
-def schema(gateway: Running) -> OpenApiSchema:
+def lenient() -> Iterator[Running]:
+    """As `gateway`, with requests and errors as of Port of Call."""
+    with serving("port-of-call", timeout=0.2, body=2**20) as running:
+        yield running
+
+
+def schema_of(gateway: Running) -> OpenApiSchema:
     """The document, without the pattern of any text: the generator counts with it for seconds."""
 
     def plain(each: dict[str, Any]) -> dict[str, Any]:
@@ -102,24 +110,46 @@ def schema(gateway: Running) -> OpenApiSchema:
     return schemathesis.openapi.from_dict(json.loads(text, object_hook=plain))
 
 
-@pytest.mark.parametrize(("path", "method", "mode"), OPERATIONS)
-def test_what_is_answered_is_what_the_document_says(
-    gateway: Running, schema: OpenApiSchema, path: str, method: str, mode: GenerationMode
-) -> None:
-    strategy = schema[path][method].as_strategy(generation_mode=mode)
+@pytest.fixture(scope="module")
+def schema(gateway: Running) -> OpenApiSchema:
+    return schema_of(gateway)
+
+
+@pytest.fixture(scope="module")
+def lenient_schema(lenient: Running) -> OpenApiSchema:
+    return schema_of(lenient)
+
+
+def check_answers(gateway: Running, operation: Any, mode: GenerationMode, count: int) -> None:
+    """Compares the answers to `count` generated requests with the document."""
 
     @settings(
-        max_examples=examples(25),
+        max_examples=examples(count),
         database=None,
         phases=[Phase.explicit, Phase.generate],
         suppress_health_check=list(HealthCheck),
     )
-    @given(case=strategy)
+    @given(case=operation.as_strategy(generation_mode=mode))
     def asked(case: Case[Any]) -> None:
         response = case.call_and_validate(base_url=gateway.url, excluded_checks=EXCLUDED)
         assert response.headers.get("holdfast-reason") != ["internal_error"]
 
     asked()
+
+
+@pytest.mark.parametrize(("path", "method", "mode"), OPERATIONS)
+def test_what_is_answered_is_what_the_document_says(
+    gateway: Running, schema: OpenApiSchema, path: str, method: str, mode: GenerationMode
+) -> None:
+    check_answers(gateway, schema[path][method], mode, 25)
+
+
+@pytest.mark.parametrize("mode", GenerationMode)
+@pytest.mark.parametrize("path", sorted(port_of_call.PATHS))
+def test_what_port_of_call_is_answered_is_what_the_document_says(
+    lenient: Running, lenient_schema: OpenApiSchema, path: str, mode: GenerationMode
+) -> None:
+    check_answers(lenient, lenient_schema[path]["POST"], mode, 10)
 
 
 def test_every_request_of_a_device_may_have_tls() -> None:

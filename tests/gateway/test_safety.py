@@ -822,6 +822,8 @@ def test_it_needs_an_egress_list() -> None:
     [
         (("--allow", "plc.local"), "NETWORK[:PORTS]"),
         (("--allow", "10.0.0.0/8", "--bind", "8090"), "address:port"),
+        (("--allow", "10.0.0.0/8", "--hosts", "10.0.0.5"), "a host name without a port"),
+        (("--allow", "10.0.0.0/8", "--compat", "tentacle"), "port-of-call"),
         (("--allow", "10.0.0.0/8", "--sources", "10.0.0.0/8"), "--token-file"),
         (("--allow", "10.0.0.0/8", "--token-file", "/nowhere"), "No such file"),
         (("--allow", "10.0.0.0/8", "--in-flight", "0"), "--in-flight"),

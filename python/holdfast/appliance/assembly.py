@@ -361,6 +361,8 @@ def gateway(
         sources=settings.sources,
         limits=GatewayLimits(in_flight=settings.in_flight),
         profiles=_tag_lists(profiles),
+        hosts=frozenset(settings.hosts),
+        compat=settings.compat,
         tls=gateway_tls(settings),
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
@@ -16,7 +16,9 @@ from holdfast.cli.tls_options import DEVICES, https_config, https_options, tls_o
 from holdfast.client.endpoint import check_files
 from holdfast.config import Config
 from holdfast.config.egress import parse_allowed
+from holdfast.config.host_names import parse_host_name
 from holdfast.config.ip_addresses import parse_bind, parse_source
+from holdfast.config.services import Compat
 from holdfast.gateway import tokens
 from holdfast.net.addresses import LOOPBACK, joined, reachable, unbracketed
 from holdfast.protocol import PORT
@@ -64,6 +66,18 @@ if TYPE_CHECKING:
     metavar="NETWORK",
     help="Clients that may connect to the gateway; repeatable.",
 )
+@click.option(
+    "--hosts",
+    type=by(parse_host_name),
+    multiple=True,
+    metavar="NAME",
+    help="Names under which clients without tokens may reach the gateway; repeatable.",
+)
+@click.option(
+    "--compat",
+    type=click.Choice(get_args(Compat)),
+    help="Accept the requests of this program, and send its errors.",
+)
 @tls_options("tls", DEVICES, " for devices")
 @https_options
 @click.option(
@@ -81,6 +95,8 @@ def gateway(
     writes: bool,
     token_file: Path | None,
     sources: tuple[Network, ...],
+    hosts: tuple[str, ...],
+    compat: Compat | None,
     tls_ca: str | None,
     tls_cert: str | None,
     tls_key: str | None,
@@ -99,6 +115,7 @@ def gateway(
     list. Without --writes, the gateway only reads.
 
     By default, only clients on this machine may connect. Other --sources require --token-file.
+    Without it, a URL has an IP address, localhost, or a name in --hosts.
 
     With TLS, certificates of devices are verified with --tls-ca. Devices that require a client
     certificate receive --tls-cert.
@@ -127,6 +144,8 @@ def gateway(
             "tokens": [{"name": name, "sha256": digest.hex()} for name, digest in found] or "none",
             "in_flight": in_flight,
         }
+        settings |= {"hosts": list(hosts)} if hosts else {}
+        settings |= {"compat": compat} if compat is not None else {}
         if https is not None:
             settings["tls"] = https
         if device_tls is not None:
@@ -193,12 +212,16 @@ def _told(served: str, settings: Settings) -> str:
         header += ' -H "Authorization: Bearer $TOKEN"'
     if scheme == "https":
         header += " --cacert ca.pem"
+    names = [f"  names: {', '.join(sorted(settings.hosts))}"] if settings.hosts else []
+    form = [f"  compatible with: {settings.compat}"] if settings.compat is not None else []
     return "\n".join(
         [
             f"Console: {url}/, API documentation: {url}/docs",
             "",
             f"  {can} devices at {', '.join(map(str, settings.allow))}",
             f"  clients: {', '.join(map(str, settings.sources))}; {who}",
+            *names,
+            *form,
             "",
             "Try:",
             "",

@@ -37,6 +37,7 @@ from holdfast.client.receiver import (
 from holdfast.client.url import FORMS, in_folder, parse
 from holdfast.config.broker import MAX_TEXT, parse_broker, parse_topic_filter
 from holdfast.config.egress import parse_allowed
+from holdfast.config.host_names import parse_host_name
 from holdfast.config.http_url import parse_http
 from holdfast.config.ip_addresses import Bind, parse_bind, parse_peer, parse_source
 from holdfast.config.scanning import (
@@ -388,6 +389,11 @@ EgressEntry = Annotated[
     PlainValidator(parse_allowed),
     PlainSerializer(str, return_type=str),
     WithJsonSchema({"type": "string", "examples": ["10.0.0.0/24", "10.0.0.7:5020", "[fd00::]/64"]}),
+]
+HostName = Annotated[
+    str,
+    PlainValidator(parse_host_name),
+    WithJsonSchema({"type": "string", "examples": ["gateway.plant.example"]}),
 ]
 DeviceUrl = Annotated[
     str,

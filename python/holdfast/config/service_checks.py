@@ -79,6 +79,8 @@ class ServiceChecks:
         self._tokens("gateway", gateway)
         self._tls(("gateway", "device_tls"), gateway.get("device_tls"))
         if gateway.get("tokens") != "none":
+            if gateway.get("hosts"):
+                self.report.doubt(("gateway", "hosts"), "has no effect with tokens")
             return
         for index, source in enumerate(entries(gateway.get("sources"))):
             network = parsed(parse_source, source)

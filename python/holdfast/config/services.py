@@ -17,6 +17,7 @@ from holdfast.config.scalars import (
     EgressEntry,
     FilePath,
     FleetMember,
+    HostName,
     MemoryNames,
     MqttText,
     MqttVersion,
@@ -320,6 +321,10 @@ class NatsConfig(NatsServersConfig):
     """The fleet of scanners that share the devices. Default: none."""
 
 
+Compat: TypeAlias = Literal["port-of-call"]
+"""A program in whose form the gateway takes requests and sends errors."""
+
+
 class GatewayConfig(Model):
     """The gateway: access to devices over HTTP, with a web console."""
 
@@ -339,6 +344,10 @@ class GatewayConfig(Model):
     """Certificates for TLS connections to devices."""
     in_flight: Annotated[int, Field(ge=1, le=64)] = 1
     """Maximum number of requests in flight to one device."""
+    hosts: Annotated[tuple[HostName, ...], Strict(False)] = ()
+    """With tokens none: the names under which the gateway may be reached."""
+    compat: Annotated[Compat | None, NotNull()] = None
+    """The program whose requests it accepts, and whose errors it sends. Default: none."""
 
 
 class AdapterConfig(Model):

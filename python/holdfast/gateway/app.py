@@ -20,6 +20,7 @@ from holdfast.gateway import (
     identifying,
     listing,
     openapi,
+    port_of_call,
     reading,
     surveying,
     viewing,
@@ -44,10 +45,11 @@ from holdfast.web.refusals import UNREAD, headers_with
 from holdfast.web.requests import BadRequest, ClientDisconnected, Request, respond_to_its_end, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine, Iterator
+    from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
 
     from holdfast._core import Poller
     from holdfast.gateway.endpoint import Operation
+    from holdfast.gateway.fields import Field
     from holdfast.gateway.listing import Local
     from holdfast.gateway.pool import Dial
     from holdfast.gateway.settings import Settings
@@ -64,7 +66,11 @@ REASON = b"holdfast-reason"
 FORM = b"application/x-www-form-urlencoded"
 """The default Content-Type of `curl -d`. The gateway treats it as JSON."""
 
+MAX_IGNORED = 4
+"""The most ignored keys of a request in the log."""
+
 STOPPING = "the gateway is stopping; a pending write may have been carried out"
+HOSTS = "--hosts, or hosts in the configuration"
 WRITES_ON = "enable them with --writes, or with access: read-write in the configuration"
 
 
@@ -104,7 +110,11 @@ class App:
         self._refused: dict[str, int] = {}
         self._ending = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
+        self._lenient = port_of_call.PATHS if settings.compat == "port-of-call" else frozenset()
+        """The paths of endpoints that take requests as Port of Call does."""
         document = openapi.document(__version__, ENDPOINTS, settings)
+        if self._lenient:
+            port_of_call.describe(document)
         self._document = msgspec.json.encode(document)
         self._page = page.render(document, url)
         self.routes: dict[str, tuple[str, Handler]] = {
@@ -184,11 +194,16 @@ class App:
             methods = "GET, HEAD, OPTIONS"
         request.more_headers.append((b"allow", methods.encode()))
         if request.method != "OPTIONS":
-            raise BadRequest("method_not_allowed", f"Method not allowed; allowed: {methods}")
+            detail = port_of_call.METHOD_NOT_ALLOWED
+            if request.path not in self._lenient:
+                detail += f"; allowed: {methods}"
+            raise BadRequest("method_not_allowed", detail)
         await respond(send, 204, [*SAFE, *request.more_headers])
 
     async def _refuse(self, request: Request, send: Send, unfit: BadRequest) -> None:
-        status = REFUSALS.status(unfit.reason)
+        body, status = _error(unfit.detail), REFUSALS.status(unfit.reason)
+        if isinstance(unfit, port_of_call.Rejected):
+            body, status = unfit.body, unfit.status
         self._refused[unfit.reason] = self._refused.get(unfit.reason, 0) + 1
         logs.refused(
             "gateway_refused",
@@ -201,7 +216,6 @@ class App:
             detail="-" if unfit.reason == "malformed" else unfit.detail,
         )
         request.more_headers += headers_with(status)
-        body = _error(unfit.detail)
         if status in UNREAD:
             await respond_to_its_end(request, send, status, *rejection(unfit.reason, unfit.detail))
             return
@@ -232,9 +246,16 @@ class App:
             raise BadRequest("foreign_page", "the request is from a page of another site")
         if self._settings.tokens:
             request.who = request.owner(self._settings.tokens)
-        elif not request.is_direct:
-            detail = "Host is a name, allowed without tokens: an IP address or localhost"
-            raise BadRequest("foreign_page", detail)
+        elif not request.is_direct(self._settings.hosts):
+            detail = "Host is a name, allowed without tokens: an IP address, localhost"
+            raise BadRequest("foreign_page", f"{detail}, or a name in {HOSTS}")
+        elif request.path == watching.PATH and not request.is_direct():
+            # The only GET that asks a device. Over HTTP and to a name, browsers send neither Origin
+            # nor Sec-Fetch-Site with the GET of a page.
+            detail = (
+                f"Host is a name, allowed without tokens for GET {watching.PATH}: an IP address"
+            )
+            raise BadRequest("foreign_page", f"{detail}, localhost; or use POST {viewing.PATH}")
 
     @contextlib.contextmanager
     def _place(self, kind: str, most: int) -> Iterator[None]:
@@ -299,9 +320,9 @@ class App:
 
         async def handle(request: Request, send: Send) -> None:
             self._admit(request)
-            request.check_json(b"", FORM, parameters=True)
+            self._check_type(request)
             with self._place("requests", self._limits.requests):
-                given = from_json(await request.body(self._limits.body), fields)
+                given = self._parsed(request, await request.body(self._limits.body), fields)
                 changes = endpoint.writes(given)
                 if changes and not self._settings.writes:
                     raise BadRequest("writes_off", f"writes are disabled: {WRITES_ON}")
@@ -313,6 +334,30 @@ class App:
                     await self._while_there_or_told(request, work)
 
         return handle
+
+    def _check_type(self, request: Request) -> None:
+        """Raises `BadRequest` for a body that is not JSON by its type."""
+        if request.path in self._lenient:
+            port_of_call.check_type(request)
+        else:
+            request.check_json(b"", FORM, parameters=True)
+
+    def _parsed(self, request: Request, body: bytes, fields: Sequence[Field]) -> dict[str, Any]:
+        """Returns the fields of a request with defaults. Raises `BadRequest`."""
+        if request.path not in self._lenient:
+            return from_json(body, fields)
+        given, ignored = port_of_call.parsed(request.path, body, fields)
+        if ignored:
+            logs.refused(
+                "keys_ignored",
+                kind="gateway",
+                listener="gateway",
+                peer=request.peer,
+                who=request.who,
+                path=request.path,
+                found=", ".join(map(shown, ignored[:MAX_IGNORED])),
+            )
+        return given
 
     async def _while_there_or_told(self, request: Request, work: Coroutine[Any, Any, None]) -> None:
         """As `_while_there`, but a request that a stop cancels is answered with `stopping`."""
@@ -376,7 +421,7 @@ class App:
 
     async def _map(self, request: Request, send: Send) -> None:
         self._admit(request)
-        request.check_json(b"", FORM, parameters=True)
+        self._check_type(request)
         with self._stream(request):
             body = await request.body(self._limits.body)
             given = from_json(body, surveying.fields(self._limits))
@@ -399,7 +444,7 @@ class App:
 
     async def _view(self, request: Request, send: Send) -> None:
         self._admit(request)
-        request.check_json(b"", FORM, parameters=True)
+        self._check_type(request)
         with self._place("requests", self._limits.requests):
             body = await request.body(self._limits.body)
             given = from_json(body, viewing.fields(self._limits))
@@ -442,7 +487,7 @@ class App:
 
         async def handle(request: Request, send: Send) -> None:
             self._admit(request)
-            request.check_json(b"", FORM, parameters=True)
+            self._check_type(request)
             with self._place("requests", self._limits.requests):
                 given = from_json(await request.body(self._limits.body), endpoint.fields)
                 answer = await endpoint.answer(given, self._settings.profiles)

@@ -169,16 +169,26 @@ def with_default(field: Field, default: Any) -> Field:
     return replace(field, default=default)
 
 
+class NotJson(BadRequest):
+    """A body is not JSON."""
+
+
 def from_json(body: bytes, fields: Sequence[Field]) -> dict[str, Any]:
     """Parses the fields of a JSON object and fills in defaults. Raises `BadRequest`."""
+    given = decoded(body)
+    if not isinstance(given, dict):
+        raise malformed("the body is not a JSON object")
+    return filled(given, fields)
+
+
+def decoded(body: bytes) -> Any:
+    """Parses JSON. Raises `NotJson`, and `BadRequest` for a duplicate name."""
     try:
         given = msgspec.json.decode(body)
         json.loads(body, object_pairs_hook=_without_twins)
     except (msgspec.MsgspecError, RecursionError, UnicodeError, ValueError) as error:
-        raise malformed(f"the body is not JSON: {str(error)[:100]}") from None
-    if not isinstance(given, dict):
-        raise malformed("the body is not a JSON object")
-    return filled(given, fields)
+        raise NotJson("malformed", f"the body is not JSON: {str(error)[:100]}") from None
+    return given
 
 
 def _without_twins(pairs: list[tuple[str, Any]]) -> None:

@@ -47,7 +47,8 @@ FUNCTION_SCHEMA = integer(min(FUNCTIONS), max(FUNCTIONS))
 ALLOWED = ", ".join(f"0x{code:02x} ({each.name})" for code, each in FUNCTIONS.items())
 
 
-def _no_read_function(value: Any) -> str:
+def not_a_read_function(value: Any) -> str:
+    """Returns the error for another function code than those of reads."""
     code = f"0x{value:x}" if type(value) is int else told(value)
     return f"Invalid read function code: {code}. Allowed: {ALLOWED}"
 
@@ -56,7 +57,7 @@ FUNCTION = Field(
     "functionCode",
     {"type": "integer", "enum": list(FUNCTIONS)},
     ", ".join(f"{code} {area.replace('_', ' ')}" for area, (code, *_) in READ_FUNCTIONS.items()),
-    refusal=_no_read_function,
+    refusal=not_a_read_function,
 )
 QUANTITY = Field(
     "quantity",

@@ -11,6 +11,7 @@ from holdfast.net.tls import NO_FILES
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from holdfast.config.services import Compat
     from holdfast.gateway.tokens import Token
     from holdfast.net.addresses import Network
     from holdfast.net.allow_list import AllowedNetwork
@@ -69,5 +70,9 @@ class Settings:
     limits: GatewayLimits = field(default_factory=GatewayLimits)
     profiles: Mapping[str, TagList] = field(default_factory=dict)
     """Tag lists that clients can choose by name."""
+    hosts: frozenset[str] = frozenset()
+    """Without tokens: the names of the gateway that Host may have, in lower case."""
+    compat: Compat | None = None
+    """The program whose requests and errors are accepted and sent as by that program."""
     tls: Tls = NO_FILES
     """The TLS files for connections to devices. Requests can't change them."""

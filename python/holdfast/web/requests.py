@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from holdfast.net.addresses import address_in
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Container, Iterable
 
     from holdfast.web.host import Headers, Receive, Scope, Send
 
@@ -86,6 +86,10 @@ class Request:
             raise BadRequest(
                 "not_json", f"Content-Type is {_found(kind)}, allowed: application/json"
             )
+        self.check_uncompressed()
+
+    def check_uncompressed(self) -> None:
+        """Raises `BadRequest` for a compressed body."""
         coding = self.header(b"content-encoding")
         if coding is not None and coding.lower() != b"identity":
             raise BadRequest("not_json", f"Content-Encoding is {_found(coding)}, allowed: none")
@@ -129,14 +133,19 @@ class Request:
         return self.header(b"sec-fetch-site") in (b"cross-site", b"same-site")
 
     @property
-    def is_direct(self) -> bool:
-        """Whether Host is missing, an IP address or `localhost`.
+    def is_from_page(self) -> bool:
+        """Whether a web page sent the request, also one of this server."""
+        return any(self.headers(name) for name in (b"origin", b"referer", b"sec-fetch-site"))
+
+    def is_direct(self, names: Container[str] = ()) -> bool:
+        """Whether Host is missing, an IP address, `localhost`, or one of `names` in lower case.
 
         This prevents DNS rebinding: a web page can point its own name at this machine, but the
         browser still sends that name as Host.
         """
         host = self.header(b"host")
-        return host is None or _is_direct(host)
+        name = None if host is None else _name_in(host)
+        return name is None or name in names
 
     def owner(self, tokens: Iterable[tuple[str, bytes]]) -> str:
         """Returns the name of the request's token. Raises `BadRequest` if there is none.
@@ -195,6 +204,7 @@ def _too_large(most: int) -> BadRequest:
 
 
 @functools.lru_cache(maxsize=64)
-def _is_direct(host: bytes) -> bool:
+def _name_in(host: bytes) -> str | None:
+    """Returns the name in a Host header; `None` for an IP address, `localhost` or nothing."""
     name = re.sub(r":[0-9]*\Z", "", host.decode("latin-1")).lower()
-    return name in ("", "localhost") or address_in(name) is not None
+    return None if name in ("", "localhost") or address_in(name) is not None else name

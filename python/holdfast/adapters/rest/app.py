@@ -250,7 +250,7 @@ class App:
     def _authorize(self, request: Request) -> Grant:
         """Returns the grant of the request's client. Raises `Declined` and `BadRequest`."""
         if self._anyone is not None:
-            if not request.is_direct:
+            if not request.is_direct():
                 # DNS rebinding: a web page can point its own name at this machine, but the browser
                 # still sends that name as Host.
                 host = shown((request.header(b"host") or b"").decode("latin-1"))
