@@ -427,7 +427,8 @@ def test_other_answers_to_what_is_not_allowed_are_noted(imported: Import) -> Non
 def raw_ingest(units: dict[int, str], areas: list[str]) -> dict[str, Any]:
     """What everybody may write by Raw Ingest."""
     rule = {"sources": ["0.0.0.0/0", "::/0"], "units": units, "areas": areas}
-    return {"packets": "many", "after_refusal": "continue", "rules": [rule]}
+    compat = {"packets": "many", "after_refusal": "continue"}
+    return {"compat": compat, "rules": [rule]}
 
 
 def test_a_listener_keeps_its_name_and_names_its_memory(imported: Import) -> None:
@@ -724,9 +725,7 @@ def test_raw_ingest_becomes_a_listener_without_crc(imported: Import) -> None:
         "type": "raw-ingest",
         "bind": "[::]:9000",
         "format": "crc",
-        "crc": "none",
-        "flags": "ignore",
-        "packets": "many",
+        "compat": {"crc": "none", "flags": "ignore", "packets": "many"},
         "max_connections_per_source": None,
         "when_full": "evict",
         "request_timeout": 1.5,

@@ -39,7 +39,7 @@ listeners:
   raw-crc:
     type: raw-ingest
     format: crc
-    crc: none
+    compat: {{crc: none}}
     bind: 127.0.0.1:0
     rules: [{{sources: [127.0.0.0/8], memories: [plant], areas: [discrete_inputs]}}]
 rest:

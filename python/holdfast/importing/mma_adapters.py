@@ -294,8 +294,8 @@ class Adapters:
         sources = self._sources(raw, "Raw Ingest")
         if bind is None or not sources:
             return
-        listener: dict[str, Any] = {"type": "raw-ingest", "bind": str(bind)}
-        listener |= {"format": "crc", "crc": "none", "flags": "ignore", "packets": "many"}
+        listener: dict[str, Any] = {"type": "raw-ingest", "bind": str(bind), "format": "crc"}
+        listener["compat"] = {"crc": "none", "flags": "ignore", "packets": "many"}
         listener |= ADMISSION
         if timeout is not None:
             listener |= {"request_timeout": seconds(timeout), "idle_timeout": seconds(timeout)}

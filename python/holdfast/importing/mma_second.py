@@ -157,7 +157,8 @@ class SecondGeneration:
         told = f"{message} policies are for Modbus only. List only the senders in the sources of"
         self.desk.note("check", listener.path, f"{told} raw_ingest, or remove raw_ingest")
         rule = {"sources": admitted.written(), "units": units, "areas": areas}
-        return {"packets": "many", "after_refusal": "continue", "rules": [rule]}
+        compat = {"packets": "many", "after_refusal": "continue"}
+        return {"compat": compat, "rules": [rule]}
 
     def _memory(self, memory: _Memory) -> Policy | None:
         one = memory.section
