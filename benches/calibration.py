@@ -39,10 +39,10 @@ def main() -> None:
         claims = judge.judged(cases)
         show(claims, options)
         kept[name] = sorted(judge.held(claims))
+        if options.against:
+            compare(claims, json.loads(options.against.read_text())[name])
     if options.held:
         options.held.write_text(json.dumps(kept, indent=0))
-    if options.against:
-        compare(kept, json.loads(options.against.read_text()))
 
 
 def arguments() -> argparse.Namespace:
@@ -87,13 +87,19 @@ def table(title: str, rows: Iterable[Row]) -> None:
         print(f"| {row.name} | {row.count} | {row.true} | {row.wrong} | {share} |")
 
 
-def compare(kept: dict[str, Any], before: dict[str, Any]) -> None:
-    """Prints how many of the sure and true claims of an earlier version are still made."""
-    for name in kept.keys() & before.keys():
-        old = {tuple(each) for each in before[name]}
-        now = {tuple(each) for each in kept[name]}
-        share = len(old & now) / len(old) if old else 1.0
-        print(f"\n{name}: {len(old & now)} of {len(old)} sure and true claims remain ({share:.3f})")
+def compare(claims: Sequence[Claim], before: Iterable[Sequence[Any]]) -> None:
+    """Prints how many of the sure and true claims of an earlier version are still made, and what is
+    claimed with less confidence, or something else, instead of the others.
+    """
+    old = {tuple(each) for each in before}
+    now = judge.held(claims)
+    share = len(old & now) / len(old) if old else 1.0
+    print(f"\n{len(old & now)} of {len(old)} sure and true claims remain ({share:.3f})")
+    others = [each for each in claims if each.key in old - now]
+    for face in ("guess", "describe"):
+        some = [each for each in others if each.face == face]
+        rows = judge.by(some, lambda one: f"{family(one.type)}, {change(one)}", at_least=0.0)
+        table(f"{face}, no longer sure", rows)
 
 
 if __name__ == "__main__":

@@ -121,3 +121,40 @@ def test_registers_that_contain_nothing_are_one_value() -> None:
 def test_a_date_and_time_in_decimal_digits_is_recognised(registers: list[int], size: int) -> None:
     clock = clock_fields.description([registers], None)
     assert (clock[1] if clock else 0) == size
+
+
+def test_registers_that_contain_nothing_are_no_reason_for_the_type_before_them() -> None:
+    """A small number of two registers may have its high word behind it: that is no single one."""
+    best, *_ = divide([[2291, 0, 0, 0]] * 5).starting[0]
+    assert (best[0].type, best[0].order) == ("uint16", "ABCD")
+    assert confidence(best[1]) < 0.9
+
+
+def test_evident_long_values_tell_something_about_small_ones() -> None:
+    """What is before counters of two registers more probably has two registers as well."""
+    chances = []
+    for count in (0, 6):
+        reads = []
+        for turn in range(3):
+            words = [*values.encode(230 + turn, "uint32"), *values.encode(16, "uint32"), 455, 17]
+            for counter in range(count):
+                words += values.encode(1234567 * (counter + 1) + 7 * turn, "uint32")
+            reads.append(words)
+        found = {(each.type, each.order): sure for each, sure in divide(reads).starting[2]}
+        chances.append(found["uint32", "ABCD"])
+    assert chances[1] > chances[0] + 0.05
+
+
+def test_the_best_division_follows_the_probabilities_of_all_habits() -> None:
+    reads = [[0, 230 + turn, 0, 17, 2306, 2310 + turn] for turn in range(3)]
+    division = divide(reads)
+    registers = sum(value.registers * chance for value, chance in division.best)
+    single = sum(
+        next(chance for value, chance in division.starting[at] if value.type == "uint16")
+        for at in range(2)
+    )
+    assert registers > single
+
+
+def test_confidence_in_a_float_is_higher_than_in_the_length_of_a_text() -> None:
+    assert confidence(0.95, "float32") > confidence(0.95) > confidence(0.95, "string")

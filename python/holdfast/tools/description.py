@@ -258,7 +258,7 @@ def _values(piece: _Piece, habits: Mapping[Habit, float], now: float | None) -> 
         return
     division = segments.divide(piece.reads, now=now, habits=habits, is_open=False)
     for value, chance in division.best:
-        sure = segments.confidence(chance)
+        sure = segments.confidence(chance, value.kind)
         if not any(value.found) or value.reasons == (segments.FILL_REASONS[0xFFFF],):
             sure = min(sure, segments.NOTHING_KNOWN)
         yield _described(piece, value, min(sure, SUREST))

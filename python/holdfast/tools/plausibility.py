@@ -41,7 +41,7 @@ USUAL_MIN = {16: 3_000, 32: 1_000_000, 64: 1 << 40}
 """The same for the amount of a negative integer."""
 
 UNUSUAL = {16: 2.4, 32: 0.8, 64: 1.0}
-ZERO = {16: 2.2, 32: 2.5, 64: 2.5}
+ZERO = {16: 1.8, 32: 2.7, 64: 2.5}
 """Bits for zero: one register in four contains it."""
 
 NEGATIVE = 3.0
@@ -76,8 +76,8 @@ FAR = 1000
 JUMP = 3.0
 """The change of an integer that is unusual between two reads, and its additional bits."""
 
-STEPS = {"uint16": 3.8, "int16": 3.8, "uint32": 4.0, "int32": 4.0, "uint64": 4.2, "int64": 4.2,
-         "float32": 4.3, "float64": 4.5}  # fmt: skip
+STEPS = {"uint16": 4.0, "int16": 4.0, "uint32": 4.0, "int32": 4.0, "uint64": 4.2, "int64": 4.2,
+         "float32": 4.8, "float64": 4.5}  # fmt: skip
 OTHER_STEP = 5.0
 """The bits of a change by one step, by type. A change of k steps has a probability of 1/k, so its
 bits and those of all others add up if they are 1 + log2(ln(largest change)): 3.8 for 1000 steps.
@@ -108,15 +108,23 @@ ANY_BITS = {16: 5.0, 32: 2.0, 64: 6.0}
 number, a checksum or a status of 32 bits.
 """
 
+BOTH_REGISTERS = 1.2
+STILL_IN_BOTH = 2.2
+"""How rare it is that a number of 32 bits needs both registers, in bits: most counters of devices
+began lately, and states, set points and powers are small. Two registers that never change are still
+more often two numbers.
+"""
+
 FIELD_BITS = 4
 FIELD = 7.5
 """The most bits that are set in a bit field of which that is typical, and how rare it is."""
 
-ALIKE = 0.3
+ALIKE = 0.35
 NEAR = 2.0
-MAX_ALIKE = 11.0
+MAX_ALIKE = 9.0
 """How many values are like their neighbour of the same type; the bits for it beside those of the
-difference; and what it can save at most.
+difference; and what it can save at most: more would decide alone, and the halves of long values
+are alike too.
 """
 
 
@@ -151,6 +159,8 @@ def description(
     total = first + later
     if not smooth and kind in UNSIGNED:
         total = min(total, _constant(found[0], bits))
+    if kind == "uint32" and found[0] > 0xFFFF:
+        total += BOTH_REGISTERS if smooth else STILL_IN_BOTH
     return Description(total, later, tuple(reasons))
 
 

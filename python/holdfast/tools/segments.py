@@ -16,7 +16,7 @@ import itertools
 import math
 import struct
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from holdfast import values
@@ -24,9 +24,11 @@ from holdfast.tools import clock_fields, plausibility, text_fields
 from holdfast.values import ConversionError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     Key: TypeAlias = tuple[str, str]
+    Place: TypeAlias = tuple[str, str, int]
+    Likely: TypeAlias = tuple["Value", float]
 
 PART = "part"
 CUT_OFF = 19.0
@@ -40,13 +42,13 @@ and of each change.
 """
 
 RARE = {
-    "uint16": 1.3,
-    "int16": 1.8,
-    "float32": 2.8,
-    "uint32": 3.4,
-    "int32": 4.2,
+    "uint16": 1.0,
+    "int16": 0.9,
+    "float32": 5.3,
+    "uint32": 2.1,
+    "int32": 4.5,
     "float64": 6.0,
-    "uint64": 5.5,
+    "uint64": 7.3,
     "int64": 8.0,
     "bcd16": 8.0,
     "bcd32": 8.5,
@@ -66,55 +68,95 @@ ORDERS = ("ABCD", "CDAB", "DCBA", "BADC")
 
 
 class Habit(NamedTuple):
-    """How a device orders bytes."""
+    """How a device orders bytes, and which values it prefers."""
 
     order: str
     swaps_registers: bool = False
     """Whether the bytes of values of one register are swapped too."""
+    prefers: str = ""
+    """A key of `PREFERENCES`."""
 
+
+ORDER_HABITS = {
+    Habit("ABCD"): 0.8,
+    Habit("CDAB"): 1.2,
+    Habit("DCBA"): 4.0,
+    Habit("BADC"): 4.0,
+    Habit("DCBA", swaps_registers=True): 5.0,
+    Habit("BADC", swaps_registers=True): 5.0,
+}
+"""How rare a habit with bytes is among devices, in bits."""
+
+PREFERENCES = {"": 0.7, "short": 2.3, "long": 2.3, "floats": 2.5}
+"""How rare a preference is among devices, in bits."""
+
+PREFERRED = {
+    "": {},
+    "short": {"uint16": -0.4, "float32": 3.0, "uint32": 3.0, "int32": 3.0},
+    "long": {"uint16": 3.0, "int16": 3.0, "uint32": -2.0, "int32": -2.0},
+    "floats": {"uint16": 1.0, "float32": -2.0, "uint32": 1.0, "int32": 1.0},
+}
+"""What a preference adds to the bits of a type. Many devices have numbers of one register only, and
+many have long ones throughout, also for states and other small numbers, or floats. So one evident
+value tells something about all the others.
+"""
 
 HABITS = {
-    Habit("ABCD"): 0.8,
-    Habit("CDAB"): 1.8,
-    Habit("DCBA"): 5.0,
-    Habit("BADC"): 5.0,
-    Habit("DCBA", swaps_registers=True): 6.0,
-    Habit("BADC", swaps_registers=True): 6.0,
+    habit._replace(prefers=preference): rare + more
+    for habit, rare in ORDER_HABITS.items()
+    for preference, more in PREFERENCES.items()
 }
 """How rare a habit is among devices, in bits."""
 
 COMMON = ("ABCD", "CDAB")
-MIXED = 3.0
-"""The common orders, and how rare it is that a value has one that is not that of its device."""
+MIXED = 4.0
+"""The common orders, and how rare it is that a value has one that is not that of its device: a
+single register between long values would else be half of one in the other order.
+"""
 
 SWAPPED_BYTES = ("BADC", "DCBA")
 """The orders of devices that may also swap the bytes of single registers."""
 
-TRUST = 0.78
-"""The power of the odds that makes a confidence from a probability. The bits of neighbours are not
-independent, so probabilities promise too much: of claims about simulated devices
-(`tests/calibration`) with a probability of 0.9 to 0.95, 85 to 90 % were true.
+TRUST = {"float32": 1.15, "int32": 0.65, "string": 0.6}
+OTHER_TRUST = 0.78
+"""The power of the odds that makes a confidence from a probability, by type. The bits of neighbours
+are not independent, so probabilities promise too much, least for floats: half of their bits are
+none of neighbours, and nearly always say the same. The length of a text and the sign of a number
+depend on few bits. The powers are those with which so many claims about simulated devices
+(`tests/calibration`) are true as their confidence says.
 """
 
 NEGLIGIBLE = 1e-6
-"""The probability up to which an order is not considered."""
+"""The probability up to which a habit is not considered."""
+
+IMPROBABLE = 8.0
+"""The bits by which an order is worse than the best if its preferences are not considered."""
 
 SWAPPED_TEXT = {True: 1.0, False: 5.5}
 """How rare swapped bytes in text are, in bits, on a device that swaps those of numbers and on
 others. The former leaves the text as it is as often.
 """
 
-SAME_TYPE = -math.log2(0.5)
-OTHER_TYPE = -math.log2(0.5)
-"""The bits for the type of a neighbour: the same again, or any."""
+SAME_TYPE = 0.4
+OTHER_TYPE = 0.2
+"""The bits for the type of a neighbour: the same again, or any, which has the bits of its rarity
+besides.
+"""
 
-FILL = {0: 1.5, 0xFFFF: 6.0}
-FILLED = 0.3
+FILL = {0: 2.3, 0xFFFF: 6.0}
+FILLED = {0: 0.7, 0xFFFF: 0.3}
 FILL_REASONS = {0: "always 0", 0xFFFF: "all bits set: often no value"}
-"""The bits of registers that contain nothing: of all, of each, and why."""
+"""The bits of registers that contain nothing: of all, of each, and why. Zeros are not free: behind
+a number, they are as often its high word or values at rest.
+"""
 
 LATER = plausibility.SAME
 """The bits of a text that is the same again."""
+
+NOTHING = ("", "")
+"""The type and order of registers that contain nothing: they follow values of each type as often,
+so the register behind a number is not its own because it continues a type.
+"""
 
 NOTHING_KNOWN = 0.3
 """The confidence in the type of registers that contain nothing."""
@@ -140,6 +182,8 @@ class Value:
     """Another type that decodes to the same values in all reads."""
     saved: float = 0.0
     """The bits that the description saves behind a value of the same type and order."""
+    is_nothing: bool = False
+    """Whether these are registers that contain nothing."""
 
     @cached_property
     def kind(self) -> str:
@@ -149,8 +193,10 @@ class Value:
     @cached_property
     def key(self) -> Key:
         """The order, and the type without length and sign: a negative number between others is no
-        other type.
+        other type. Registers that contain nothing have no type.
         """
+        if self.is_nothing:
+            return NOTHING
         return UNSIGNED.get(self.kind, self.kind), self.order
 
     @property
@@ -163,9 +209,9 @@ class Value:
 class Division:
     """The divisions of registers: the best one, and how probable each value is."""
 
-    best: tuple[tuple[Value, float], ...]
+    best: tuple[Likely, ...]
     """The values of the best division, each with the probability that it is one."""
-    starting: tuple[tuple[tuple[Value, float], ...], ...]
+    starting: tuple[tuple[Likely, ...], ...]
     """For each register, the values that can start there, most probable first; their probabilities
     are those if a value starts there.
     """
@@ -193,36 +239,56 @@ def divide(
     """
     possible = _possible(reads, now, is_open)
     if habits is None:
-        lattices = [_Lattice(possible, habit) for habit in HABITS]
-        habits = _shares({each.habit: each.total - HABITS[each.habit] for each in lattices})
+        totals, known = _totals([possible])
+        habits = _shares(totals)
+        lattices = [each for [each] in known]
     else:
         lattices = [_Lattice(possible, habit) for habit in habits]
     lattices = [each for each in lattices if habits[each.habit] > NEGLIGIBLE]
-    chances: list[dict[Key, tuple[Value, float]]] = [{} for _ in reads[0]]
+    chances: list[dict[Place, Likely]] = [{} for _ in reads[0]]
     for lattice in lattices:
         for value in lattice.values():
             at = chances[value.offset]
-            _, before = at.get((value.type, value.order), (value, 0.0))
-            chance = before + habits[lattice.habit] * lattice.chance(value)
-            at[value.type, value.order] = value, chance
-    best = max(lattices, key=lambda each: habits[each.habit]).best()
+            place = value.type, value.order, value.stop
+            _, before = at.get(place, (value, 0.0))
+            at[place] = value, before + habits[lattice.habit] * lattice.chance(value)
     joined = [_with_padding(each) for each in chances]
-    return Division(
-        tuple((each, min(1.0, joined[each.offset][each.type, each.order][1])) for each in best),
-        tuple(_ranked(each.values()) for each in joined),
-        habits,
+    best = tuple(
+        (value, min(1.0, joined[value.offset][value.type, value.order, value.stop][1]))
+        for value in _best(chances)
     )
+    return Division(best, tuple(_ranked(each.values()) for each in joined), habits)
 
 
-def confidence(chance: float) -> float:
-    """The share of claims with this probability that are true."""
+def confidence(chance: float, kind: str = "") -> float:
+    """The share of claims of a type with this probability that are true."""
     if not 0.0 < chance < 1.0:
         return chance
-    odds: float = (chance / (1.0 - chance)) ** TRUST
+    odds: float = (chance / (1.0 - chance)) ** TRUST.get(kind, OTHER_TRUST)
     return odds / (1.0 + odds)
 
 
-def _with_padding(found: dict[Key, tuple[Value, float]]) -> dict[Key, tuple[Value, float]]:
+def _best(chances: Sequence[Mapping[Place, Likely]]) -> list[Value]:
+    """The division of which most registers are probably divided right, whatever the habit of the
+    device is.
+    """
+    right = [0.0, *[-math.inf] * len(chances)]
+    last: dict[int, Value] = {}
+    for at, found in enumerate(chances):
+        for value, chance in found.values():
+            total = right[at] + value.registers * chance
+            if total > right[value.stop]:
+                right[value.stop] = total
+                last[value.stop] = value
+    chosen = []
+    stop = len(chances)
+    while stop:
+        chosen.append(last[stop])
+        stop = last[stop].offset
+    return chosen[::-1]
+
+
+def _with_padding(found: dict[Place, Likely]) -> dict[Place, Likely]:
     """The values that start at a register, each text with the probability of all fields that differ
     in their padding only: the text is right if any of them is.
     """
@@ -243,12 +309,27 @@ def habits(
     parts: Iterable[Sequence[Sequence[int]]], *, now: float | None = None
 ) -> dict[Habit, float]:
     """The probability of each habit of a device, from the reads of several parts."""
-    weights = {habit: -rare for habit, rare in HABITS.items()}
-    for reads in parts:
-        possible = _possible(reads, now, is_open=False)
-        for habit in weights:
-            weights[habit] += _Lattice(possible, habit).total
-    return _shares(weights)
+    totals, _ = _totals([_possible(reads, now, is_open=False) for reads in parts])
+    return _shares(totals)
+
+
+def _totals(
+    parts: Sequence[Sequence[Sequence[Value]]],
+) -> tuple[dict[Habit, float], list[list[_Lattice]]]:
+    """The weight of each habit of a device, and with it the divisions of each part. Preferences are
+    considered in probable orders only.
+    """
+    totals: dict[Habit, float] = {}
+    found: list[list[_Lattice]] = []
+    orders = list(ORDER_HABITS)
+    for preference in PREFERENCES:
+        for order in orders:
+            habit = order._replace(prefers=preference)
+            found.append([_Lattice(possible, habit) for possible in parts])
+            totals[habit] = sum(each.total for each in found[-1]) - HABITS[habit]
+        best = max(totals.values())
+        orders = [each for each in orders if totals[each] > best - IMPROBABLE]
+    return totals, found
 
 
 def order_shares(habits: Mapping[Habit, float]) -> dict[str, float]:
@@ -265,11 +346,17 @@ def _shares(weights: Mapping[Habit, float]) -> dict[Habit, float]:
     return {habit: 2 ** (weight - whole) for habit, weight in weights.items()}
 
 
-def _ranked(found: Iterable[tuple[Value, float]]) -> tuple[tuple[Value, float], ...]:
-    """Values by their probability among each other; texts that differ in padding are one."""
-    ranked: list[tuple[Value, float]] = []
+def _ranked(found: Iterable[Likely]) -> tuple[Likely, ...]:
+    """Values by their probability among each other; texts that differ in padding are one, and so
+    are registers that contain nothing and the first of them.
+    """
+    ranked: list[Likely] = []
     texts: set[Key] = set()
-    for value, chance in sorted(found, key=lambda each: (-each[1], each[0].bits)):
+    known: dict[Key, Likely] = {}
+    for value, chance in found:
+        first, before = known.get((value.type, value.order), (value, 0.0))
+        known[value.type, value.order] = first, before + chance
+    for value, chance in sorted(known.values(), key=lambda each: (-each[1], each[0].bits)):
         text = value.order, value.found[0]
         if value.kind != "string" or text not in texts:
             ranked.append((value, chance))
@@ -300,51 +387,19 @@ class _Lattice:
     def chance(self, value: Value) -> float:
         """The probability that a value is one, with this habit."""
         ahead = self._ahead(value, self._after, self._beginning)
-        before = self._entering(value, self._before, self._ending, _either)
+        before = self._entering(value)
         return float(2 ** (before - value.bits + ahead - self.total))
 
-    def best(self) -> list[Value]:
-        """The values of the best division."""
-        before = [0.0]
-        ending: list[dict[Key, float]] = [{} for _ in range(self._size + 1)]
-        last: list[dict[Key, Value]] = [{} for _ in range(self._size + 1)]
-        incoming = self._incoming()
-        for stop in range(1, self._size + 1):
-            for value in incoming[stop]:
-                weight = self._entering(value, before, ending, max) - value.bits
-                if weight > ending[stop].get(value.key, -math.inf):
-                    ending[stop][value.key] = weight
-                    last[stop][value.key] = value
-            before.append(max(ending[stop].values(), default=-math.inf))
-        chosen: list[Value] = []
-        stop = self._size
-        key = max(ending[stop], key=ending[stop].__getitem__)
-        while True:
-            value = last[stop][key]
-            chosen.append(value)
-            stop = value.offset
-            if stop == 0:
-                return chosen[::-1]
-            same = ending[stop].get(key, -math.inf) - SAME_TYPE + value.saved
-            if before[stop] - OTHER_TYPE - _rarity(value, self.habit) > same:
-                key = max(ending[stop], key=ending[stop].__getitem__)
-
-    def _entering(
-        self,
-        value: Value,
-        before: Sequence[float],
-        ending: Sequence[Mapping[Key, float]],
-        joined: Callable[[float, float], float],
-    ) -> float:
+    def _entering(self, value: Value) -> float:
         """The weight of all that is before a value, and of its type."""
         at = value.offset
-        any_type = before[at] - _rarity(value, self.habit)
+        any_type = self._before[at] - _rarity(value, self.habit)
         if at == 0:
             return any_type
-        same = ending[at].get(value.key)
+        same = self._ending[at].get(value.key)
         if same is None:
             return any_type - OTHER_TYPE
-        return joined(any_type - OTHER_TYPE, same - SAME_TYPE + value.saved)
+        return _either(any_type - OTHER_TYPE, same - SAME_TYPE + value.saved)
 
     def _ahead(
         self, value: Value, after: Sequence[float], beginning: Sequence[Mapping[Key, float]]
@@ -370,7 +425,7 @@ class _Lattice:
         for stop in range(1, self._size + 1):
             ending = self._ending[stop]
             for value in incoming[stop]:
-                weight = self._entering(value, self._before, self._ending, _either) - value.bits
+                weight = self._entering(value) - value.bits
                 ending[value.key] = _either(ending.get(value.key, -math.inf), weight)
             self._before.append(_sum(ending.values()))
 
@@ -393,13 +448,18 @@ class _Lattice:
 
 def _rarity(value: Value, habit: Habit) -> float:
     """How rare the type and order of a value are in a device with this habit."""
-    rare = RARE[value.kind]
-    if value.kind == "string":
+    return 0.0 if value.is_nothing else _type_rarity(value.kind, value.order, habit)
+
+
+@cache
+def _type_rarity(kind: str, order: str, habit: Habit) -> float:
+    rare = RARE[kind] + PREFERRED[habit.prefers].get(kind, 0.0)
+    if kind == "string":
         swaps = habit.order in SWAPPED_BYTES
-        return rare + (SWAPPED_TEXT[swaps] if swaps or value.order == "BADC" else 0)
-    if value.kind in NARROW:
+        return rare + (SWAPPED_TEXT[swaps] if swaps or order == "BADC" else 0)
+    if kind in NARROW:
         return rare
-    return rare + (MIXED if value.order != habit.order else 0)
+    return rare + (MIXED if order != habit.order else 0)
 
 
 def _fits(value: Value, habit: Habit) -> bool:
@@ -526,8 +586,11 @@ def _fill(reads: Sequence[Sequence[int]], at: int, is_open: bool) -> Value | Non
         return None
     found = tuple(content for _ in reads)
     is_rest = not is_open and not content and at + registers == len(reads[0])
-    bits = 0.0 if is_rest else FILL[content] + FILLED * registers
-    return Value("uint16", "ABCD", at, registers, found, bits, (FILL_REASONS[content],))
+    bits = 0.0 if is_rest else FILL[content] + FILLED[content] * registers
+    reasons = (FILL_REASONS[content],)
+    return Value(
+        "uint16", "ABCD", at, registers, found, bits, reasons, saved=-math.inf, is_nothing=True
+    )
 
 
 def _clock(reads: Sequence[Sequence[int]], at: int, now: float | None) -> Value | None:
