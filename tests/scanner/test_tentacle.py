@@ -391,6 +391,34 @@ def test_the_settings_say_which_tags_are_written(
     assert memory.read("holding_registers", 0, 3) == [9 * each for each in expected.values()]
 
 
+def test_the_start_says_what_may_be_written_where_and_by_whom(
+    run_scanner: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "holdfast")
+    run_scanner()
+    run_scanner(writes="explicit", prefix="plant", allow=("192.0.2.0/24", "/dev/ttyUSB0"))
+    run_scanner(writes="none")
+    wire.until(lambda: len(logged(caplog, "write_access")) == 3, "each has logged it")
+    usual, explicit, none = logged(caplog, "write_access")
+    assert usual == {
+        "tags": 'every subscribed coil and holding register without "writable": false',
+        "devices": "at private and loopback addresses",
+        "by": "every NATS client that may publish to modbus.subscribe, modbus.command.>",
+        "narrowed_by": "nats.writes (--writes): explicit or none; nats.devices (--allow); "
+        "permissions in NATS",
+    }
+    assert explicit == {
+        "tags": 'subscribed coils and holding registers with "writable": true',
+        "devices": "192.0.2.0/24, /dev/ttyUSB0",
+        "by": "every NATS client that may publish to plant.subscribe, plant.command.>",
+        "narrowed_by": "nats.writes (--writes): none; nats.devices (--allow); permissions in NATS",
+    }
+    assert none == {
+        "tags": "none: all commands are refused",
+        "set_by": "nats.writes (--writes): none",
+    }
+
+
 def test_a_write_outside_the_allow_list_is_impossible(
     run_scanner: Run, caller: Caller, server: holdfast.Server
 ) -> None:

@@ -8,7 +8,7 @@ with NATS, `polling` and `commands` with devices. `registry` holds the subscript
 `decoding` and `publishing` convert values to messages. `registry` and these three do no I/O.
 `adjusting` reads inexact requests; `tentacle` has the rules of the first generation of programs.
 `keeping` and `kept` store subscriptions, and restore them. `expiring` ends those that are not
-renewed.
+renewed. `write_access` says at the start what may be written.
 
 `fleet` shares devices with other scanners.
 

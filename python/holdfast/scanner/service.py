@@ -38,6 +38,7 @@ from holdfast.scanner import (
     tentacle,
     tentacle_next,
     wire,
+    write_access,
 )
 from holdfast.scanner.adjusting import Adjustments, adjusted
 from holdfast.scanner.broker import MAX_PAUSE, Broker, Ping, Servers
@@ -173,6 +174,11 @@ class Settings:
     standstill_s: float = LONG
     """The shortest time without the event loop after which commands that waited are refused."""
 
+    @property
+    def write_access(self) -> dict[str, str]:
+        """What may be written, where, by whom, and what narrows it, in words."""
+        return write_access.described(self.writes, self.allow, self.prefix, self.dialect)
+
 
 class Scanner:
     """One service, from `run` to its end."""
@@ -260,6 +266,7 @@ class Scanner:
             queue="" if settings.fleet is None else f"holdfast-{settings.fleet.name}",
             max_pause_s=settings.max_pause_s,
         )
+        self._has_logged_access = False
         self._due = asyncio.Event()
         """Set when the next heartbeat is due immediately."""
 
@@ -326,6 +333,9 @@ class Scanner:
                 part.connected(client)
         self._due.set()
         if client is not None:
+            if not self._has_logged_access:
+                self._has_logged_access = True
+                logs.write(logging.INFO, "write_access", **self._settings.write_access)
             for device in self._registry.devices.values():
                 self._publishers[device.id].renew(self._lease(device))
                 self._publish_state(device)
