@@ -1014,9 +1014,10 @@ class PolledDevice:
     (default: the interval). `report` takes the polls; `fields` are areas, addresses and counts that
     are read only for it, and not forwarded. `release` closes the
     connection after each poll. With `measured`, measurements replace `cost` after a while. `retry`
-    are the first and the longest pause after failures (default: 1 and 60). With a `fence`, the
-    device is polled and written to while that is open; devices of one link have the same. Times are
-    in seconds; interval 0 polls without a pause.
+    are the first and the longest pause after failures (default: 1 and 60). With `jitter`, they are
+    up to a quarter shorter, and the device is retried at the next time of its schedule; without,
+    when they end. With a `fence`, the device is polled and written to while that is open; devices
+    of one link have the same. Times are in seconds; interval 0 polls without a pause.
     """
 
     def __new__(
@@ -1043,6 +1044,7 @@ class PolledDevice:
         release: bool = False,
         measured: bool = False,
         retry: tuple[float, float] | None = None,
+        jitter: bool = True,
         fence: Fence | None = None,
     ) -> PolledDevice: ...
 

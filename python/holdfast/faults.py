@@ -11,6 +11,7 @@ another code is an exception of the device.
 """
 
 NO_CONNECTION = FAULTS["refused"]
+UNREACHABLE = FAULTS["unreachable"]
 STANDBY = FAULTS["standby"]
 EXPIRED = FAULTS["expired"]
 
@@ -22,6 +23,7 @@ _WORDS = {code: word for word, code in FAULTS.items()}
 _TEXTS = {
     FAULTS["timeout"]: "no reply in time",
     NO_CONNECTION: "no connection",
+    UNREACHABLE: "the device can't be reached",
     FAULTS["reset"]: "the connection was lost",
     FAULTS["invalid reply"]: "an invalid reply",
     FAULTS["no plan"]: "no plan to read the device",

@@ -76,6 +76,12 @@ def test_it_says_what_it_does_and_a_signal_ends_it(
     said = greeting(process)
     assert f"Scanning for subscribers at nats://127.0.0.1:{nats.port}." in said
     assert "plant.subscribe, plant.unsubscribe, plant.browse" in said
+    assert (
+        '  writes     every subscribed coil and holding register without "writable": false\n'
+        "             by every NATS client that may publish to plant.subscribe, plant.command.>\n"
+        "             narrowed by nats.writes (--writes): explicit or none; "
+        "nats.devices (--allow); permissions in NATS\n"
+    ) in said
     connected(process)
     process.send_signal(number)
     out, log = process.communicate(timeout=wire.DEADLINE)

@@ -173,8 +173,8 @@ def test_servers_that_lose_their_storage_get_everything_again(
             each.stop()
         share(node("d", server.url))
         until_scanned(judges)
-        reply = caller.request("modbus.unsubscribe", {"deviceId": "d0", "subscriberId": "hmi"})
-        assert reply == {"success": True}
+        ended = {"deviceId": "d0", "subscriberId": "hmi", "tagIds": "all"}
+        assert caller.request("modbus.unsubscribe", ended) == {"success": True}
         wire.until(lambda: "d0" not in known(caller), "it is gone")
     check(judges)
 
@@ -208,7 +208,7 @@ def test_the_newest_of_what_nodes_know_is_restored(
         wire.until(lambda: all(len(each.devices) == DEVICES for each in registries), "known")
         proxies[0].down()
         wire.until(lambda: partitions(other) == PARTITIONS, "the other node has all")
-        ended = {"deviceId": "d0", "subscriberId": "hmi"}
+        ended = {"deviceId": "d0", "subscriberId": "hmi", "tagIds": "all"}
         assert caller.request("modbus.unsubscribe", ended)["success"]
         added = wanted(judges.devices[1], 1, subscriberId="trend")
         assert caller.request("modbus.subscribe", added)["success"]

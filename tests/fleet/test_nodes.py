@@ -142,9 +142,8 @@ def test_a_subscription_is_known_to_all_and_survives_all(
     wire.until(lambda: len(judge.polls) > polls + 2, "it is polled again")
     # Both requests may reach any node.
     node("d")
-    assert caller.request("modbus.unsubscribe", {"deviceId": "d0", "subscriberId": "hmi"}) == {
-        "success": True
-    }
+    ended = {"deviceId": "d0", "subscriberId": "hmi", "tagIds": "all"}
+    assert caller.request("modbus.unsubscribe", ended) == {"success": True}
     wire.until(lambda: caller.request("modbus.browse", "")["count"] == 0, "it is gone")
     wire.until(lambda: judge.busy is None, "its last poll has ended")
 

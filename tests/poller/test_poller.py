@@ -13,6 +13,7 @@ import pytest
 
 import holdfast
 from holdfast import logs
+from holdfast.faults import fault_word
 from holdfast.types import AREAS
 from support import polled, web, wire
 from support.brokers import free_port
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
     from support.polled import Status
     from support.running import Run, Serve
 
-TIMEOUT, REFUSED, RESET, INVALID = 0x8001, 0x8002, 0x8003, 0x8004
+TIMEOUT, REFUSED, RESET, INVALID, UNREACHABLE = 0x8001, 0x8002, 0x8003, 0x8004, 0x800B
 UNKNOWN, OK, ERROR, STALE, DISABLED = range(5)
 
 SOON = {"first": 0.01, "most": 0.02}
@@ -272,6 +273,32 @@ def test_a_source_that_is_killed_and_comes_back(run: Run, serve: Serve) -> None:
         )
         told = counters(appliance, name)
         assert (told["health"], told["failures"], told["seconds_in_error"]) == ("ok", 0, 0)
+
+
+def test_a_line_that_is_not_there_is_unreachable_and_nobody_refuses(
+    run: Run, tmp_path: Path
+) -> None:
+    meter = device(f"rtu://{tmp_path}/line?baud=9600", read("coils", 0, 1), status=block(0))
+    appliance = run(configuration({"meter": meter}))
+    told = until_told(appliance, health=ERROR, last_error=UNREACHABLE)
+    assert told.transport_errors > 0
+    assert fault_word(counters(appliance, "meter")["last_error"]) == "unreachable"
+
+
+def test_seconds_in_error_count_while_the_first_reply_is_awaited(run: Run) -> None:
+    over = threading.Event()
+
+    def late(request: wire.Frame) -> bytes:
+        over.wait(wire.DEADLINE)
+        return data(request, 1)
+
+    with Fake(late) as fake:
+        meter = device(fake.url, read("coils", 0, 1), timeout=60, status=block(0))
+        appliance = run(configuration({"meter": meter}))
+        waiting = until_told(appliance, also=lambda told: told.seconds_in_error, health=UNKNOWN)
+        assert (waiting.failures, waiting.last_error) == (0, 0)
+        over.set()
+        assert until_told(appliance, health=OK).seconds_in_error == 0
 
 
 def wrong_length(request: wire.Frame) -> bytes:

@@ -86,7 +86,7 @@ def test_a_value_is_written_in_the_order_of_its_tag(
     assert memory.read("holding_registers", 10, 2) == registers
 
 
-@pytest.mark.parametrize(("text", "bit"), [("true", 1), ("1", 1), ("FALSE", 0), ("0", 0)])
+@pytest.mark.parametrize(("text", "bit"), [("true", 1), ("1", 1), ("false", 0), ("0", 0)])
 def test_a_coil_is_written(
     caller: Caller, server: holdfast.Server, memory: holdfast.Memory, text: str, bit: int
 ) -> None:
@@ -96,6 +96,25 @@ def test_a_coil_is_written(
     assert caller.request("modbus.command.plc1.a", text) == {"success": True}
     assert memory.read("coils", 3, 1) == [bit]
     assert functions(server) == {5: 1}
+
+
+@pytest.mark.parametrize(
+    "text", ["True", "TRUE", "False", "on", "off", "yes", "2", "1.0", "01", "", " ", " true", "1\n"]
+)
+def test_a_coil_takes_no_other_word_for_true_or_false(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory, text: str
+) -> None:
+    memory.write("coils", 3, [0, 1])
+    coil = {"datatype": "boolean", "functionCode": "coil"}
+    tags = [tag("off", 3, **coil), tag("on", 4, **coil)]
+    caller.request("modbus.subscribe", subscription(server, *tags, scanRate=60_000))
+    for name in ("off", "on"):
+        assert caller.request(f"modbus.command.{name}", text) == {
+            "success": False,
+            "error": f"{text!r} is not a valid boolean, allowed: true, false, 1 and 0",
+        }
+    assert memory.read("coils", 3, 2) == [0, 1]
+    assert functions(server) == {}
 
 
 @pytest.mark.parametrize(

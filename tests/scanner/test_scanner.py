@@ -468,12 +468,12 @@ def test_a_subscriber_can_leave_without_naming_its_tags(
         assert caller.request("modbus.subscribe", request)["success"]
     assert caller.request("modbus.unsubscribe", leaving()) == {"success": True}
     assert len(device(caller)["subscribers"]) == 2
-    first = {"deviceId": "plc1", "subscriberId": "hmi"}
+    first = {"deviceId": "plc1", "subscriberId": "hmi", "tagIds": "all"}
     assert caller.request("modbus.unsubscribe", first) == {"success": True}
     found = device(caller)
     assert [each["id"] for each in found["subscribers"]] == ["historian"]
     assert [each["id"] for each in found["tags"]] == ["a", "historian"]
-    last = {"deviceId": "plc1", "subscriberId": "historian", "tagIds": None}
+    last = {"deviceId": "plc1", "subscriberId": "historian", "tagIds": "all"}
     assert caller.request("modbus.unsubscribe", last) == {"success": True}
     assert caller.request("modbus.browse", b"")["count"] == 0
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 import holdfast
-from holdfast.scanner import Defaults
+from holdfast import _core
+from holdfast.scanner import Defaults, Settings
 from support import wire
 from support.nats_bus import leaving, logged, subscription, tag
 from support.tentacle import (
@@ -127,6 +129,205 @@ def test_little_is_the_order_dcba(
     assert values(data, "a", "b") == {"a": 0x01020304, "b": 0x01020304}
 
 
+def words_of(value: float, *words: int) -> list[int]:
+    """The registers of a float64 whose words are sent in this order."""
+    found = struct.unpack(">4H", struct.pack(">d", value))
+    return [found[word] for word in words]
+
+
+@pytest.mark.usefixtures("scanner")
+@pytest.mark.parametrize("order_of", ["tag", "device"])
+def test_cdab_of_a_float64_swaps_the_words_of_each_half(
+    caller: Caller,
+    server: holdfast.Server,
+    memory: holdfast.Memory,
+    caplog: pytest.LogCaptureFixture,
+    order_of: str,
+) -> None:
+    memory.write("holding_registers", 0, words_of(123.456, 1, 0, 3, 2))
+    memory.write("holding_registers", 4, words_of(-7.25, 3, 2, 1, 0))
+    data = caller.listen("modbus.data.pump-skid")
+    tags = [
+        plc_tag("total", 0, "float64", order="CDAB"),
+        plc_tag("exact", 4, "float64", order="GHEFCDAB"),
+        plc_tag("flow", 8, "float32", order="CDAB"),
+    ]
+    if order_of == "device":
+        del tags[0]["byteOrder"], tags[2]["byteOrder"]
+    request = plc_subscribe(server, *tags, order="CDAB")
+    for _ in range(2):
+        assert caller.request("modbus.subscribe", request) == {"success": True, "count": 3}
+    assert values(data, "total", "exact") == {"total": 123.456, "exact": -7.25}
+    shown = {each["id"]: each["byteOrder"] for each in device(caller, "pump-skid")["tags"]}
+    assert shown == {"total": "CDABGHEF", "exact": "GHEFCDAB", "flow": "CDAB"}
+
+    assert caller.request("modbus.command.total", "2.5e-3") == {"success": True}
+    assert caller.request("modbus.command.exact", "2.5e-3") == {"success": True}
+    assert memory.read("holding_registers", 0, 4) == words_of(2.5e-3, 1, 0, 3, 2)
+    assert memory.read("holding_registers", 4, 4) == words_of(2.5e-3, 3, 2, 1, 0)
+    assert logged(caplog, "float64_order") == [
+        {
+            "subscriber": "my-project",
+            "device": "pump-skid",
+            "tag": "total",
+            "note": "CDAB of a float64 is read and written as CDABGHEF, as tentacle-modbus does; "
+            "write CDABGHEF, or the order that you mean, with eight letters",
+        }
+    ]
+
+
+def test_a_restored_float64_keeps_its_order(
+    run_scanner: Run, caller: Caller, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 0, words_of(123.456, 1, 0, 3, 2))
+    first = run_scanner()
+    request = plc_subscribe(server, plc_tag("total", 0, "float64", order="CDAB"))
+    assert caller.request("modbus.subscribe", request)["success"]
+    first.stop()
+    data = caller.listen("modbus.data.pump-skid")
+    run_scanner()
+    assert values(data, "total") == {"total": 123.456}
+
+
+@pytest.mark.usefixtures("scanner")
+def test_each_register_whose_bytes_are_swapped_in_writes_too_is_named(
+    caller: Caller,
+    server: holdfast.Server,
+    memory: holdfast.Memory,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    memory.write("holding_registers", 0, [0x0102, 0x0102])
+    data = caller.listen("modbus.data.pump-skid")
+    tags = [
+        plc_tag("speed", 0, "int16", order="BADC"),
+        plc_tag("level", 1, "uint16", order="little"),
+        # Nothing of these is written in another way than before.
+        plc_tag("plain", 2, "uint16", order="ABCD"),
+        plc_tag("wide", 3, "uint32", order="BADC"),
+        plc_tag("flag", 5, "boolean", order="DCBA"),
+        plc_tag("input", 0, "uint16", order="DCBA", function="input"),
+        plc_tag("coil", 0, "uint16", order="DCBA", function="coil"),
+        plc_tag("fixed", 6, "uint16", order="DCBA") | {"writable": False},
+    ]
+    request = plc_subscribe(server, *tags)
+    for _ in range(2):
+        assert caller.request("modbus.subscribe", request)["success"]
+    assert values(data, "speed", "level") == {"speed": 0x0201, "level": 0x0201}
+    for name in ("speed", "level"):
+        assert caller.request(f"modbus.command.{name}", str(0x0304)) == {"success": True}
+    assert memory.read("holding_registers", 0, 2) == [0x0403, 0x0403]
+
+    found = logged(caplog, "writes_swapped")
+    assert [(each["device"], each["tag"]) for each in found] == [
+        ("pump-skid", "speed"),
+        ("pump-skid", "level"),
+    ]
+    assert found[1]["note"] == (
+        "DCBA swaps the bytes of the uint16 in reads and in writes; tentacle-modbus swaps them in "
+        "reads only: a program that swaps the bytes of its commands itself must not do so any more"
+    )
+
+
+# Subscribing again, and leaving.
+
+
+def test_a_request_that_is_repeated_publishes_no_value_again(
+    run_scanner: Run, caller: Caller, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    run_scanner(defaults=Defaults(publish="change"))
+    memory.write("holding_registers", 0, [7, 8])
+    data = caller.listen("modbus.data.pump-skid")
+    request = plc_subscribe(server, plc_tag("a", 0), rate=50)
+    assert caller.request("modbus.subscribe", request)["success"]
+    assert values(data, "a") == {"a": 7}
+    for _ in range(2):
+        assert caller.request("modbus.subscribe", request) == {"success": True, "count": 1}
+    more = plc_subscribe(server, plc_tag("a", 0), plc_tag("b", 1), rate=50)
+    assert caller.request("modbus.subscribe", more) == {"success": True, "count": 2}
+    assert data.next()["variableId"] == "b"
+    # Another subscriber gets a first value of its tags.
+    late = plc_subscribe(server, plc_tag("b", 1), rate=50, project="other")
+    assert caller.request("modbus.subscribe", late)["success"]
+    assert data.next()["variableId"] == "b"
+    memory.write("holding_registers", 0, [9])
+    assert values(data, "a") == {"a": 9}
+    # Who has left a tag, or has it in another form, gets its value.
+    caller.request("modbus.unsubscribe", plc_unsubscribe("a"))
+    assert caller.request("modbus.subscribe", request)["success"]
+    assert (data.next()["value"], data.take()) == (9, [])
+    boolean = plc_subscribe(server, plc_tag("a", 0, "boolean"), rate=50)
+    assert caller.request("modbus.subscribe", boolean)["success"]
+    assert data.next()["value"] is True
+
+
+def test_a_request_that_is_repeated_causes_no_scan(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    run_scanner(defaults=Defaults(publish="change"))
+    data = caller.listen("modbus.data.pump-skid")
+    request = plc_subscribe(server, plc_tag("a", 0), rate=60_000)
+    assert caller.request("modbus.subscribe", request)["success"]
+    values(data, "a")
+    for _ in range(2):
+        assert caller.request("modbus.subscribe", request)["success"]
+    more = plc_subscribe(server, plc_tag("b", 1), rate=60_000)
+    assert caller.request("modbus.subscribe", more)["success"]
+    assert data.next()["variableId"] == "b"
+
+
+@pytest.mark.usefixtures("scanner")
+def test_who_leaves_must_say_what(
+    caller: Caller, server: holdfast.Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    caller.request("modbus.subscribe", plc_subscribe(server, plc_tag("a", 0), plc_tag("b", 1)))
+    left = {"deviceId": "pump-skid", "subscriberId": "my-project"}
+    error = 'tagIds is missing, allowed: a list of tag ids, or "all"'
+    for request in (left, left | {"tagIds": None}, left | {"subscriberId": "nobody"}):
+        refused = {"success": False, "error": error}
+        assert caller.request("modbus.unsubscribe", request) == refused
+    other = caller.request("modbus.unsubscribe", left | {"tagIds": "some"})
+    assert other["error"].endswith('at `$.tagIds`, allowed: a list of tag ids, "all"')
+    assert device(caller, "pump-skid")["tagCount"] == 2
+    caplog.set_level("INFO", "holdfast")
+    assert caller.request("modbus.unsubscribe", left | {"tagIds": "all"}) == {"success": True}
+    assert caller.request("modbus.browse", b"")["count"] == 0
+    assert [each["tags"] for each in logged(caplog, "unsubscribed")] == ["all"]
+
+
+# A device that can't be reached.
+
+
+def test_the_pauses_of_the_first_generation_are_2_s_to_60_s() -> None:
+    assert Settings().exact_pauses_s == (2.0, 60.0)
+
+
+@pytest.mark.parametrize("dialect", ["tentacle", "tentacle-next"])
+def test_only_the_first_generation_waits_for_exact_pauses(
+    run_scanner: Run, caller: Caller, dialect: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[dict[str, Any]] = []
+    polled_device = _core.PolledDevice
+
+    def noted(*args: Any, **more: Any) -> _core.PolledDevice:
+        made.append(more)
+        return polled_device(*args, **more)
+
+    monkeypatch.setattr(_core, "PolledDevice", noted)
+    running = run_scanner(dialect=dialect, exact_pauses_s=(0.01, 0.04))
+    units = {1: holdfast.Memory(holding_registers=1)}
+    with holdfast.Server(units, bind="127.0.0.1:0", access="read-only") as gone:
+        # Without them, the next scan would be tried in a minute.
+        request = subscription(gone, tag("a", 0), scanRate=60_000)
+    assert caller.request("modbus.subscribe", request)["success"]
+    if dialect == "tentacle":
+        wire.until(lambda: device(caller, "plc1")["failures"] > 3, "it is tried again and again")
+    pauses = ((0.01, 0.04), False) if dialect == "tentacle" else (None, True)
+    assert {(each["retry"], each["jitter"]) for each in made} == {pauses}
+    running.stop()
+    for bucket in ("scanner_config_modbus", "service_enabled"):
+        caller.forget(bucket)
+
+
 # What requests leave out.
 
 
@@ -188,6 +389,34 @@ def test_the_settings_say_which_tags_are_written(
         assert answer["success"] is allowed
         assert allowed or f"tag '{id}' of plc1 is not writable: " in answer["error"]
     assert memory.read("holding_registers", 0, 3) == [9 * each for each in expected.values()]
+
+
+def test_the_start_says_what_may_be_written_where_and_by_whom(
+    run_scanner: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "holdfast")
+    run_scanner()
+    run_scanner(writes="explicit", prefix="plant", allow=("192.0.2.0/24", "/dev/ttyUSB0"))
+    run_scanner(writes="none")
+    wire.until(lambda: len(logged(caplog, "write_access")) == 3, "each has logged it")
+    usual, explicit, none = logged(caplog, "write_access")
+    assert usual == {
+        "tags": 'every subscribed coil and holding register without "writable": false',
+        "devices": "at private and loopback addresses",
+        "by": "every NATS client that may publish to modbus.subscribe, modbus.command.>",
+        "narrowed_by": "nats.writes (--writes): explicit or none; nats.devices (--allow); "
+        "permissions in NATS",
+    }
+    assert explicit == {
+        "tags": 'subscribed coils and holding registers with "writable": true',
+        "devices": "192.0.2.0/24, /dev/ttyUSB0",
+        "by": "every NATS client that may publish to plant.subscribe, plant.command.>",
+        "narrowed_by": "nats.writes (--writes): none; nats.devices (--allow); permissions in NATS",
+    }
+    assert none == {
+        "tags": "none: all commands are refused",
+        "set_by": "nats.writes (--writes): none",
+    }
 
 
 def test_a_write_outside_the_allow_list_is_impossible(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -648,6 +649,25 @@ def test_its_plc_library_reads_and_writes(
     request = library_subscribe(server, library_register("speed", 0))
     assert caller.request("modbus.subscribe", request) == {"success": True, "count": 1}
     assert tags(caller) == {"speed"}
+
+
+@pytest.mark.usefixtures("scanner")
+def test_what_only_the_first_generation_has_is_not_here(
+    caller: Caller,
+    server: holdfast.Server,
+    memory: holdfast.Memory,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    memory.write("holding_registers", 0, struct.unpack(">4H", struct.pack(">d", 123.456))[::-1])
+    data = caller.listen("modbus.data.plc1.total")
+    found = [tag("total", 0, "float64", byteOrder="CDAB"), tag("a", 4, byteOrder="BADC")]
+    for _ in range(2):  # It gets all values again with each request.
+        assert caller.request("modbus.subscribe", subscription(server, *found))["success"]
+        assert data.next()["value"] == 123.456
+    assert logged(caplog, "float64_order") == logged(caplog, "writes_swapped") == []
+    left = {"deviceId": "plc1", "subscriberId": "hmi"}
+    assert caller.request("modbus.unsubscribe", left) == {"success": True}
+    assert devices(caller) == {}
 
 
 def test_missing_keys_of_a_tag_have_its_defaults() -> None:

@@ -52,7 +52,10 @@ def test_every_type_in_every_order_of_the_vectors(
         if case["type"].startswith("bit:"):
             continue
         memory.write("holding_registers", address, case["registers"])
-        tags.append(tag(f"t{number}", address, case["type"], byteOrder=case["order"]))
+        order = case["order"]
+        if (case["type"], order) == ("float64", "CDAB"):
+            order = "GHEFCDAB"  # The four letters are those of tentacle-modbus.
+        tags.append(tag(f"t{number}", address, case["type"], byteOrder=order))
         expected[f"t{number}"] = as_json(case["value"], case["type"])
         address += len(case["registers"])
     assert len(tags) > 80

@@ -42,6 +42,7 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
         Fault::Flooded,
         Fault::Standby,
         Fault::Expired,
+        Fault::Unreachable,
     ];
     for fault in all {
         if let Some(word) = word(fault) {
@@ -65,6 +66,7 @@ fn word(fault: Fault) -> Option<&'static str> {
         Fault::Flooded => Some("flooded"),
         Fault::Standby => Some("standby"),
         Fault::Expired => Some("expired"),
+        Fault::Unreachable => Some("unreachable"),
     }
 }
 

@@ -36,7 +36,7 @@ pub(crate) fn in_flight(number: Option<i128>) -> PyResult<InFlight> {
 /// The first and the longest pause before another try, in seconds; `None` for the defaults.
 pub(crate) fn retry(pauses: Option<(f64, f64)>) -> PyResult<Retry> {
     let Some((first, most)) = pauses else { return Ok(Retry::default()) };
-    Ok(Retry { first: seconds("first", first)?, most: seconds("most", most)? })
+    Ok(Retry { first: seconds("first", first)?, most: seconds("most", most)?, jitter: true })
 }
 
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]

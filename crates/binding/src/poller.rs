@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
 use holdfast_engine::client::Place as HostPlace;
-use holdfast_engine::link::Fault;
+use holdfast_engine::link::{Fault, Retry};
 use holdfast_engine::poller::plan::{self, Field, PlanLimits, Strategy, Stretch};
 use holdfast_engine::poller::{
     self, Batch, BlockSettings, Destination, DeviceSettings, DeviceState, ForwardSettings, Poll,
@@ -50,7 +50,7 @@ pub struct PolledDevice {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl PolledDevice {
     #[new]
-    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, report=None, fields=None, release=false, measured=false, retry=None, fence=None))]
+    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, report=None, fields=None, release=false, measured=false, retry=None, jitter=true, fence=None))]
     fn new(
         name: String,
         endpoint: PyRef<'_, Endpoint>,
@@ -73,6 +73,7 @@ impl PolledDevice {
         release: bool,
         measured: bool,
         retry: Option<(f64, f64)>,
+        jitter: bool,
         fence: Option<PyRef<'_, Fence>>,
     ) -> PyResult<PolledDevice> {
         let place = |area: String, address, count| -> PyResult<_> {
@@ -94,7 +95,7 @@ impl PolledDevice {
             name,
             endpoint: endpoint.core.clone(),
             in_flight: link::in_flight(in_flight)?,
-            retry: link::retry(retry)?,
+            retry: Retry { jitter, ..link::retry(retry)? },
             unit_id: byte("unit", unit)?,
             interval: seconds("interval", interval)?,
             timeout: seconds("timeout", timeout)?,

@@ -100,7 +100,8 @@ fn resolve(host: &str) -> io::Result<Vec<SocketAddr>> {
 }
 
 fn with_port(found: Found, port: u16) -> io::Result<Vec<SocketAddr>> {
-    let mut addresses = found.map_err(|error| io::Error::new(error.kind(), error))?;
+    // The system's error has no kind that says so.
+    let mut addresses = found.map_err(|error| io::Error::new(io::ErrorKind::NotFound, error))?;
     addresses.iter_mut().for_each(|address| address.set_port(port));
     Ok(addresses)
 }
@@ -214,7 +215,8 @@ mod tests {
         let unknown = |_: &str| Err(io::Error::other("the name is not known"));
         match addresses_by("unknown.test", 502, later(60), unknown) {
             Err(Unresolved::Failed(error)) => {
-                assert_eq!(error.to_string(), "the name is not known")
+                assert_eq!(error.to_string(), "the name is not known");
+                assert_eq!(error.kind(), io::ErrorKind::NotFound);
             }
             other => panic!("{other:?}"),
         }

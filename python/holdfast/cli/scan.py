@@ -47,7 +47,6 @@ from holdfast.config.scanning import (
     parse_pollable,
     parse_prefix,
     parse_server,
-    written_pollable,
 )
 from holdfast.net import event_loop
 from holdfast.net.allow_list import AllowedNetwork
@@ -66,10 +65,11 @@ from holdfast.scanner.configured import BUCKET
 from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
 from holdfast.scanner.hosts import PRIVATE
 from holdfast.scanner.schema import json_schema
+from holdfast.scanner.write_access import places
 from holdfast.standstill import WallClock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
 
     from holdfast.config.remote import Remote
     from holdfast.net.allow_list import AllowEntry
@@ -492,15 +492,21 @@ def _greeting(settings: Settings) -> str:
         f"  published  {data}, {prefix}.status.DEVICE",
         *([f"  entries    bucket {BUCKET}{prefix}"] if is_next else []),
         *([] if fleet is None else [f"  fleet      {fleet.name}, as node {fleet.node}"]),
-        f"  devices    {_places(settings.allow)}",
+        f"  devices    {places(settings.allow)}",
+        *_write_access(settings),
         "",
         "Ctrl-C stops it.",
     ]
     return "\n".join(lines)
 
 
-def _places(allow: Iterable[AllowEntry]) -> str:
-    return ", ".join(map(written_pollable, allow)) or "at private and loopback addresses"
+def _write_access(settings: Settings) -> Iterator[str]:
+    """What may be written: without this, nobody expects that every client may."""
+    found = settings.write_access
+    yield f"  writes     {found['tags']}"
+    for key in ("by", "narrowed_by", "set_by"):
+        if key in found:
+            yield f"             {key.replace('_', ' ')} {found[key]}"
 
 
 def _without_secrets(servers: Servers) -> Iterator[str]:

@@ -6,8 +6,9 @@ and disconnects after the last one ends. It keeps subscriptions over a restart i
 The modules: `service` connects the parts. `broker`, `receiving`, `outbox` and `wire` communicate
 with NATS, `polling` and `commands` with devices. `registry` holds the subscriptions. `groups`,
 `decoding` and `publishing` convert values to messages. `registry` and these three do no I/O.
-`adjusting` reads inexact requests. `keeping` and `kept` store subscriptions, and restore them.
-`expiring` ends those that are not renewed.
+`adjusting` reads inexact requests; `tentacle` has the rules of the first generation of programs.
+`keeping` and `kept` store subscriptions, and restore them. `expiring` ends those that are not
+renewed. `write_access` says at the start what may be written.
 
 `fleet` shares devices with other scanners.
 

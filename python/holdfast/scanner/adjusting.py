@@ -39,16 +39,22 @@ _NUMBER = re.compile(r"[+-]?[0-9]{1,15}(\.[0-9]{0,15})?([eE][+-]?[0-9]{1,2})?")
 
 
 class Adjustments:
-    """What was changed in a request, by kind."""
+    """What was changed in a request, by kind; and what its caller must know of its tags."""
 
     def __init__(self) -> None:
         self._found: dict[str, list[str]] = {}
+        self.warnings: list[tuple[str, str, str]] = []
+        """Log events about tags: event, tag id and text."""
 
     def add(self, kind: str, what: str) -> None:
         """Adds a change. Equal ones are listed once."""
         listed = self._found.setdefault(kind, [])
         if what not in listed:
             listed.append(what)
+
+    def warn(self, event: str, tag: str, note: str) -> None:
+        """Adds a log event about a tag."""
+        self.warnings.append((event, tag, note))
 
     def __iter__(self) -> Iterator[tuple[str, str]]:
         """Yields each kind with its changes as text."""

@@ -7,7 +7,14 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from holdfast.faults import EXPIRED, NO_CONNECTION, STANDBY, fault_text, is_exception
+from holdfast.faults import (
+    EXPIRED,
+    NO_CONNECTION,
+    STANDBY,
+    UNREACHABLE,
+    fault_text,
+    is_exception,
+)
 from holdfast.protocol import (
     BUSY,
     ILLEGAL_ADDRESS,
@@ -39,6 +46,7 @@ UNWRITTEN = (
     BUSY,
     PATH_UNAVAILABLE,
     NO_CONNECTION,
+    UNREACHABLE,
     STANDBY,
     EXPIRED,
 )
@@ -88,7 +96,7 @@ class Health:
             self.state, self.failures, self.last_answer = "online", 0, answers[-1]
         else:
             self.failures += 1
-            unreached = any(fault == NO_CONNECTION for fault, _ in faults)
+            unreached = any(fault in (NO_CONNECTION, UNREACHABLE) for fault, _ in faults)
             if self.state != "online" or self.failures > FORGIVEN or unreached:
                 self.state = "offline"
         if self.state != before[0]:

@@ -68,7 +68,7 @@ class Kept:
     def unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Removes tags of a subscription, also of a pending one."""
         unit = Unit(request.device_id, request.subscriber_id)
-        ids = request.tag_ids
+        ids = request.ids
         left = [] if ids is None else without(self._pending.get(unit, []), set(ids))
         self._touch(unit)
         if left:

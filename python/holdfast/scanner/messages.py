@@ -39,6 +39,7 @@ CHOICES = {
     "functionCode": get_args(FunctionCode),
     "transport": TRANSPORTS,
     "publish": get_args(Publish),
+    "tagIds": ("a list of tag ids", '"all"'),
 }
 
 
@@ -125,8 +126,14 @@ class UnsubscribeRequest(_Request):
 
     device_id: str
     subscriber_id: str
-    tag_ids: list[str] | None = None
-    """Default: all tags of the subscriber."""
+    tag_ids: list[str] | Literal["all"] | None = None
+    """`all` is all tags of the subscriber. Required with dialect `tentacle`; otherwise the default
+    is `all`."""
+
+    @property
+    def ids(self) -> list[str] | None:
+        """The ids of the tags; `None` for all of the subscriber."""
+        return None if self.tag_ids == "all" else self.tag_ids
 
 
 class BrowseRequest(_Request):

@@ -59,9 +59,14 @@ class Polling:
         take: Callable[[ScannedDevice, float, list[PolledBlock]], None],
         poller: _core.Poller | None = None,
         fence: Callable[[ScannedDevice], _core.Fence | None] = lambda _: None,
+        exact_pauses_s: tuple[float, float] | None = None,
     ) -> None:
-        """`fence` returns what says when another node may poll a device."""
+        """`fence` returns what says when another node may poll a device.
+
+        `exact_pauses_s` are the first and the longest pause after failures, without jitter.
+        """
         self._fence = fence
+        self._exact_pauses_s = exact_pauses_s
         self._take = take
         self._devices: dict[str, ScannedDevice] = {}
         """The devices by their name in the poller."""
@@ -192,6 +197,8 @@ class Polling:
             start_within=min(interval if fence is None else interval / 2, FIRST_WITHIN),
             report=self._results,
             release=source.release,
+            retry=self._exact_pauses_s,
+            jitter=self._exact_pauses_s is None,
             fence=fence,
         )
 

@@ -31,7 +31,7 @@ from holdfast.scanner.tags import ORDERS, profiled, tag
 from holdfast.types import SERIAL_FRAMES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Collection, Iterable, Mapping
 
     from holdfast.client.url import Target
     from holdfast.config.scanning import Dialect, Publish, Writes
@@ -224,6 +224,18 @@ class Registry:
             return device
         return None
 
+    def fresh(self, asked: Subscription) -> Collection[str]:
+        """Returns the tags of a request that its subscriber does not have yet, or not alike."""
+        device = self.devices.get(asked.device)
+        subscriber = None if device is None else device.subscribers.get(asked.subscriber)
+        if device is None or subscriber is None:
+            return asked.tags
+        return {
+            id
+            for id, tag in asked.tags.items()
+            if id not in subscriber.tags or device.tags[id] != tag
+        }
+
     def subscribe(self, asked: Subscription, address: Target) -> Change:
         """Adds a subscription. Returns what has changed.
 
@@ -299,7 +311,7 @@ class Registry:
         if device is None or subscriber is None:
             return device, False
         before = device.rate
-        ids = list(subscriber.tags) if request.tag_ids is None else request.tag_ids
+        ids = list(subscriber.tags) if request.ids is None else request.ids
         for id in ids:
             subscriber.tags.pop(id, None)
         if not subscriber.tags:

@@ -14,6 +14,7 @@ from collections.abc import (
     AsyncIterator,
     Awaitable,
     Callable,
+    Collection,
     Coroutine,
     Iterable,
     Mapping,
@@ -29,7 +30,16 @@ import msgspec
 from holdfast import _core, logs, tasks
 from holdfast.config.scanning import written_pollable
 from holdfast.net.tls import NO_FILES, Tls
-from holdfast.scanner import browsing, commands, device_tls, kept_entries, tentacle_next, wire
+from holdfast.scanner import (
+    browsing,
+    commands,
+    device_tls,
+    kept_entries,
+    tentacle,
+    tentacle_next,
+    wire,
+    write_access,
+)
 from holdfast.scanner.adjusting import Adjustments, adjusted
 from holdfast.scanner.broker import MAX_PAUSE, Broker, Ping, Servers
 from holdfast.scanner.browsing import browsed
@@ -157,10 +167,17 @@ class Settings:
     """The tags that requests can name by their profile."""
     fleet: FleetSettings | None = None
     """The fleet of scanners that it is a node of."""
+    exact_pauses_s: tuple[float, float] = tentacle.PAUSES_S
+    """The first and the longest pause after failures of a device; only with dialect `tentacle`."""
     watch_times: WatchTimes = WATCH_TIMES
     """Those of the buckets of tentacle-next."""
     standstill_s: float = LONG
     """The shortest time without the event loop after which commands that waited are refused."""
+
+    @property
+    def write_access(self) -> dict[str, str]:
+        """What may be written, where, by whom, and what narrows it, in words."""
+        return write_access.described(self.writes, self.allow, self.prefix, self.dialect)
 
 
 class Scanner:
@@ -249,6 +266,7 @@ class Scanner:
             queue="" if settings.fleet is None else f"holdfast-{settings.fleet.name}",
             max_pause_s=settings.max_pause_s,
         )
+        self._has_logged_access = False
         self._due = asyncio.Event()
         """Set when the next heartbeat is due immediately."""
 
@@ -258,7 +276,8 @@ class Scanner:
         Raises `OSError` for a file of the settings that can't be used.
         """
         device_tls.check(self._settings.device_tls)
-        self._polling = Polling(self._take, self._poller, self._fence)
+        pauses = None if self._is_next else self._settings.exact_pauses_s
+        self._polling = Polling(self._take, self._poller, self._fence, pauses)
         works = [self._broker.run(), self.outbox.run(), self._beat(), self._ended.wait()]
         works.append(self._expiring.run(self._expire))
         works.append(self._lateness.run(lambda: self._broker.client))
@@ -314,6 +333,9 @@ class Scanner:
                 part.connected(client)
         self._due.set()
         if client is not None:
+            if not self._has_logged_access:
+                self._has_logged_access = True
+                logs.write(logging.INFO, "write_access", **self._settings.write_access)
             for device in self._registry.devices.values():
                 self._publishers[device.id].renew(self._lease(device))
                 self._publish_state(device)
@@ -504,6 +526,7 @@ class Scanner:
             asked = understood(request, self._rules, changes)
             self._check_not_configured(asked.device, asked.subscriber)
         async with self._turn(asked.device):
+            fresh = self._registry.fresh(asked)
             if self._part is not None:
                 change = partial(self._add, asked, kept=True)
                 await self._part.store(asked.device, change, asked.subscriber)
@@ -513,6 +536,7 @@ class Scanner:
                 self._remove_others(asked)
         await self._kept.settled(asked.device, asked.subscriber)
         self._log_adjustments(asked.subscriber, asked.device, changes)
+        self._log_warnings(asked, changes, fresh)
         self._log_subscribed(asked)
         own = len(request.tags)
         return Answer(success=True, count=own if request.profile is None else len(asked.tags))
@@ -591,9 +615,11 @@ class Scanner:
         """Carries out a kept request, unless an entry has replaced it. Raises `Refused`."""
         if self._key_of(request.device_id, request.subscriber_id) is not None:
             return
-        asked = understood(request, self._rules)
+        changes = Adjustments()
+        asked = understood(request, self._rules, changes)
         async with self._turn(asked.device):
             await self._add(asked, kept=True)
+        self._log_warnings(asked, changes, asked.tags)
 
     async def _add(self, asked: Subscription, *, kept: bool = False, renewed: bool = True) -> None:
         """Adds a subscription, and polls and publishes accordingly. Raises `Refused`.
@@ -604,6 +630,7 @@ class Scanner:
         address, endpoint = await self._place(asked)
         known = self._registry.devices.get(asked.device)
         is_extended = known is not None and known.is_extended_by(asked.subscriber, asked.tags)
+        fresh = self._registry.fresh(asked)
         change = self._registry.subscribe(asked, address)
         device = change.device
         if device is None or asked.subscriber not in device.subscribers:
@@ -613,12 +640,14 @@ class Scanner:
         if change.former is not None:
             self._drop(change.former)
         device.endpoint = endpoint
-        self._begin_publishing(device, asked)
+        if change.former is not None or self._is_next or asked.publish == "scan":
+            fresh = asked.tags
+        self._begin_publishing(device, fresh)
         if not kept:
             self._kept.changed(device.id, asked.subscriber)
         if change.former is not None or not is_extended:
             self._publish_state(device)
-        if change.polling or change.former or (asked.tags and device.rate > SOON):
+        if change.polling or change.former or (fresh and device.rate > SOON):
             self._poll(device)
 
     def _poll(self, device: ScannedDevice, *, at_once: bool = True) -> None:
@@ -644,14 +673,23 @@ class Scanner:
             self._adjusted.add((subscriber, kind))
             logs.write(logging.WARNING, kind, subscriber=subscriber, device=device, found=what)
 
-    def _begin_publishing(self, device: ScannedDevice, asked: Subscription) -> None:
+    @staticmethod
+    def _log_warnings(asked: Subscription, changes: Adjustments, fresh: Collection[str]) -> None:
+        """Logs what callers must know of the tags that they had not subscribed to before."""
+        about = {"subscriber": asked.subscriber, "device": asked.device}
+        for event, tag, note in changes.warnings:
+            if tag in fresh:
+                logs.write(logging.WARNING, event, **about, tag=tag, note=note)
+
+    def _begin_publishing(self, device: ScannedDevice, fresh: Collection[str]) -> None:
+        """Publishes a device as it is now, and the next value of `fresh` tags in any case."""
         if self._part is not None:
             self._part.added(device)
         publisher = self._publishers.get(device.id)
         if publisher is None:
             publisher = self._publishers[device.id] = self._publisher(device)
         # Where a device is only known, `begin` makes all of its tags new.
-        publisher.want(lambda: grouped(device), asked.tags if self._is_own(device) else ())
+        publisher.want(lambda: grouped(device), fresh if self._is_own(device) else ())
 
     def _publisher(self, device: ScannedDevice) -> Publisher:
         settings, lease = self._settings, self._lease(device)
@@ -686,6 +724,8 @@ class Scanner:
         async with self._in_order(message):
             changes = Adjustments()
             request = self._decoded(message.data, UnsubscribeRequest, changes)
+            if not self._is_next:
+                tentacle.check_unsubscribe(request)
             self._check_not_configured(request.device_id, request.subscriber_id)
         async with self._turn(request.device_id):
             await self._remove_wanted(request)
@@ -696,7 +736,7 @@ class Scanner:
             "unsubscribed",
             device=request.device_id,
             subscriber=request.subscriber_id,
-            tags="all" if request.tag_ids is None else len(request.tag_ids),
+            tags="all" if request.ids is None else len(request.ids),
         )
         return Answer(success=True)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from holdfast import tags
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS
+from holdfast.scanner import tentacle
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages import FunctionCode, TagRequest
 from holdfast.tags.decoding import Undecoded
@@ -158,6 +159,10 @@ def tag(request: TagRequest, order: str, where: str, changes: Adjustments, rules
             name, type = "bool", parsed("bool")
         if type.base == "bool":
             order = "ABCD"
+        elif rules.dialect == "tentacle" and area not in BIT_AREAS:
+            for event, note in tentacle.warnings(request, area, order):
+                changes.warn(event, request.id, note)
+            order = tentacle.order(name, order)
         codec_for(area, name, order, request.encoding)
     except WrongArea:
         raise Refused(

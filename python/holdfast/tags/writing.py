@@ -55,7 +55,8 @@ def from_text(text: str, type: Type, named: str) -> Any:
 
 
 def _boolean(text: str, named: str) -> bool:
-    found = BOOLEANS.get(text.strip().lower())
+    # Not `True`: programs take other words for false than for true, and a guess can start a motor.
+    found = BOOLEANS.get(text)
     if found is None:
         raise ValueError(f"{_shown(text)} is not a valid {named}, allowed: true, false, 1 and 0")
     return found

@@ -1,4 +1,4 @@
-//! Pauses after failures: doubled with each failure up to a limit, and randomized.
+//! Pauses after failures: doubled with each failure up to a limit, and usually randomized.
 
 use std::hash::{BuildHasher, RandomState};
 use std::time::Duration;
@@ -10,11 +10,14 @@ pub struct Retry {
     pub first: Duration,
     /// The longest pause.
     pub most: Duration,
+    /// Whether each pause is up to a quarter shorter at random, so that devices that failed together are
+    /// not retried together.
+    pub jitter: bool,
 }
 
 impl Default for Retry {
     fn default() -> Retry {
-        Retry { first: Duration::from_secs(1), most: Duration::from_secs(60) }
+        Retry { first: Duration::from_secs(1), most: Duration::from_secs(60), jitter: true }
     }
 }
 
@@ -24,13 +27,16 @@ impl Retry {
         Retry { most: self.most.min(most), ..self }
     }
 
-    /// The pause after `failures` consecutive failures, at least one. It is up to a quarter shorter
-    /// at random, so that devices that failed together are not retried together.
+    /// The pause after `failures` consecutive failures, at least one.
     pub(crate) fn pause(self, failures: u32) -> Duration {
         let doubled = self.first.saturating_mul(1 << failures.saturating_sub(1).min(31));
+        let pause = doubled.min(self.most);
+        if !self.jitter {
+            return pause;
+        }
         // The keys of a hasher are random, which suffices here.
         let chance = RandomState::new().hash_one(failures) as u32;
-        doubled.min(self.most).mul_f64(1.0 - 0.25 * f64::from(chance) / f64::from(u32::MAX))
+        pause.mul_f64(1.0 - 0.25 * f64::from(chance) / f64::from(u32::MAX))
     }
 }
 
@@ -48,10 +54,19 @@ mod tests {
         for (failures, most) in [(1, 1), (2, 2), (3, 4), (6, 32), (7, 60), (8, 60), (4000, 60)] {
             check(Retry::default(), failures, Duration::from_secs(most));
         }
-        let soon = Retry { first: Duration::from_millis(50), most: Duration::from_secs(3600) };
+        let most = Duration::from_secs(3600);
+        let soon = Retry { first: Duration::from_millis(50), most, jitter: true };
         for (failures, most) in [(1, 50), (5, 800), (13, 204_800), (32, 3_600_000)] {
             check(soon, failures, Duration::from_millis(most));
             check(soon.up_to(soon.first), failures, soon.first);
         }
+    }
+
+    #[test]
+    fn pauses_without_jitter_are_exact() {
+        let retry = Retry { first: Duration::from_secs(2), jitter: false, ..Retry::default() };
+        let seconds: Vec<u64> = (1..9).map(|failures| retry.pause(failures).as_secs()).collect();
+        assert_eq!(seconds, [2, 4, 8, 16, 32, 60, 60, 60]);
+        assert_eq!(retry.pause(3), Duration::from_secs(8));
     }
 }

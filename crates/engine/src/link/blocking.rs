@@ -144,7 +144,7 @@ fn carried_out(
     let answer = client.call_under(&conditions, unit_id, request, timeout, |_, pdu| pdu.to_vec());
     let answer = answer.map_err(Arc::new);
     *failed = match &answer {
-        Err(error) if fault(error) == Fault::Refused => {
+        Err(error) if matches!(fault(error), Fault::Refused | Fault::Unreachable) => {
             let attempts = failed.take().map_or(0, |failed| failed.attempts).saturating_add(1);
             let until = Instant::now() + retry.pause(attempts);
             Some(Failed { attempts, until, error: Arc::clone(error) })

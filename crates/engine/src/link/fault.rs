@@ -1,5 +1,6 @@
 //! Why a request to a device failed.
 
+use std::io::ErrorKind;
 use std::sync::Arc;
 
 use holdfast_protocol::client::InvalidResponse;
@@ -16,6 +17,8 @@ pub enum Fault {
     Exception(u8),
     Timeout,
     Refused,
+    /// There is no way to the host, or nothing has its name. Nothing was sent.
+    Unreachable,
     Reset,
     Invalid,
     /// The device has no plan, so no request is sent.
@@ -65,6 +68,7 @@ impl Fault {
             Fault::Flooded => NO_EXCEPTION + 8,
             Fault::Standby => NO_EXCEPTION + 9,
             Fault::Expired => NO_EXCEPTION + 10,
+            Fault::Unreachable => NO_EXCEPTION + 11,
         }
     }
 }
@@ -90,11 +94,50 @@ pub(super) fn fault(error: &ClientError) -> Fault {
         ClientError::Timeout(_)
         | ClientError::ConnectTimeout { .. }
         | ClientError::LookupTimeout { .. } => Fault::Timeout,
+        ClientError::Connect { error, .. } if is_unreachable(error.kind()) => Fault::Unreachable,
         ClientError::Connect { .. } | ClientError::Tls { maybe_sent: false, .. } => Fault::Refused,
         ClientError::Invalid(InvalidResponse::Flood) => Fault::Flooded,
         ClientError::Invalid(_) => Fault::Invalid,
         ClientError::Fenced => Fault::Standby,
         ClientError::Expired => Fault::Expired,
         ClientError::Lost(_) | ClientError::Tls { .. } => Fault::Reset,
+    }
+}
+
+/// Whether nobody has refused the connection, because it has reached nobody.
+fn is_unreachable(why: ErrorKind) -> bool {
+    matches!(
+        why,
+        ErrorKind::HostUnreachable
+            | ErrorKind::NetworkUnreachable
+            | ErrorKind::NetworkDown
+            | ErrorKind::TimedOut
+            // A name, or a serial device.
+            | ErrorKind::NotFound
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_reaches_nobody_is_not_refused() {
+        let failed = |kind: ErrorKind| {
+            fault(&ClientError::Connect { to: "tcp://192.0.2.1:502".into(), error: kind.into() })
+        };
+        for kind in [
+            ErrorKind::HostUnreachable,
+            ErrorKind::NetworkUnreachable,
+            ErrorKind::NetworkDown,
+            ErrorKind::TimedOut,
+            ErrorKind::NotFound,
+        ] {
+            assert_eq!(failed(kind), Fault::Unreachable, "{kind:?}");
+        }
+        for kind in [ErrorKind::ConnectionRefused, ErrorKind::PermissionDenied] {
+            assert_eq!(failed(kind), Fault::Refused, "{kind:?}");
+        }
+        assert_eq!(Fault::Unreachable.code(), 0x800B);
     }
 }

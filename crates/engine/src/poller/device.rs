@@ -233,6 +233,7 @@ impl Device {
     /// Polls forever, first after `phase`, and keeps the status block up to date.
     pub(super) async fn run(mut self, phase: Duration, inbox: Rc<Inbox>) {
         self.due.set(Instant::now() + phase);
+        self.state.begun();
         loop {
             self.tell();
             let polled = caught(pin!(async {
@@ -315,8 +316,10 @@ impl Device {
             self.state.counters.missed.add_many(missed);
             let rest = self.rest();
             if let Some(until) = rest {
-                // Polls that are skipped on purpose do not count as missed.
-                (due, _) = first_from(until, due, interval);
+                // Polls that are skipped on purpose do not count as missed. An exact pause ends when it
+                // ends, and the schedule begins anew then.
+                due =
+                    if self.link.retry.jitter { first_from(until, due, interval).0 } else { until };
             }
             self.backing_off.set(rest.is_some());
             self.due.set(due);

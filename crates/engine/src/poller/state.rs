@@ -37,6 +37,7 @@ pub struct DeviceState {
 #[derive(Debug, Default)]
 struct Times {
     last_good: Option<Instant>,
+    /// Since when the last poll has failed, or nothing is known.
     error_since: Option<Instant>,
 }
 
@@ -134,7 +135,7 @@ impl DeviceState {
     pub(super) fn set_standby(&self, standby: bool) {
         if !standby {
             self.health.store(Health::Unknown.code(), Ordering::Relaxed);
-            self.times().error_since = None;
+            self.times().error_since = Some(Instant::now());
         }
         self.standby.store(standby, Ordering::Relaxed);
     }
@@ -160,8 +161,12 @@ impl DeviceState {
         self.times().last_good.map(|time| time.elapsed())
     }
 
+    /// The time since the device is in error; before its first complete poll, since it is polled.
     pub fn in_error(&self) -> Duration {
-        self.times().error_since.map_or(Duration::ZERO, |time| time.elapsed())
+        match self.times().error_since {
+            Some(time) if !self.stands_by() => time.elapsed(),
+            _ => Duration::ZERO,
+        }
     }
 
     fn stale_after(&self) -> Duration {
@@ -170,6 +175,13 @@ impl DeviceState {
 
     fn times(&self) -> std::sync::MutexGuard<'_, Times> {
         self.since.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Records that polling begins. A device that was in error before still is.
+    pub(super) fn begun(&self) {
+        if Health::from_code(self.health.load(Ordering::Relaxed)) == Health::Unknown {
+            self.times().error_since.get_or_insert_with(Instant::now);
+        }
     }
 
     /// Records a valid answer.

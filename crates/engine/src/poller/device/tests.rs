@@ -253,6 +253,53 @@ fn a_task_that_panics_puts_its_device_in_error() {
     });
 }
 
+/// A place that refuses connections.
+fn nobody() -> Endpoint {
+    let gone = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let (host, port) = ("127.0.0.1".to_owned(), gone.local_addr().unwrap().port());
+    Place::Tcp { host, port, tls: None }.into()
+}
+
+#[test]
+fn an_exact_pause_ends_when_it_ends_and_not_with_the_next_interval() {
+    with_device(async |_| {
+        let memory = memory();
+        let most = Duration::from_millis(4);
+        let retry = Retry { first: Duration::from_millis(1), most, jitter: false };
+        let interval = Duration::from_secs(3600);
+        let settings = DeviceSettings { retry, interval, ..settings(nobody(), &memory, 0) };
+        let (device, state, _) = device(settings);
+        let running = spawn_local(device.run(Duration::ZERO, Rc::default()));
+        until(|| state.failures() > 3).await;
+        assert_eq!((state.last_error(), state.counters.missed.get()), (0x8002, 0));
+        running.abort();
+    });
+}
+
+#[test]
+fn seconds_in_error_begin_with_the_polls_and_end_with_a_complete_one() {
+    with_device(async |_| {
+        let state = DeviceState::default();
+        let in_error = || state.in_error() > Duration::ZERO;
+        assert!(!in_error(), "it is not polled yet");
+        state.begun();
+        until(in_error).await;
+        let before_the_first_poll = state.in_error();
+        state.bad(Fault::Timeout);
+        assert!(state.in_error() >= before_the_first_poll, "a failure does not begin it anew");
+        state.set_standby(true);
+        assert!(!in_error(), "another node polls it");
+        state.set_standby(false);
+        until(in_error).await;
+        state.good();
+        // A device that replaces it goes on, at a reload.
+        state.begun();
+        assert!(!in_error());
+        state.bad(Fault::Timeout);
+        until(in_error).await;
+    });
+}
+
 async fn until(done: impl Fn() -> bool) {
     while !done() {
         sleep(Duration::from_millis(1)).await;
