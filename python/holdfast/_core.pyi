@@ -347,6 +347,7 @@ class BatchRefused(ValueError):
         "invalid_value",
         "invalid_type",
         "sealed",
+        "unsealed",
         "gate_bit",
         "wrong_length",
         "not_registers",
@@ -360,14 +361,19 @@ class BatchRefused(ValueError):
     sequence of integers. `invalid_value`: an integer out of range."""
 
 def write_across(
-    writes: Iterable[tuple[Memory, Area, int, Iterable[int]]],
+    writes: Iterable[
+        tuple[Memory, Area, int, Iterable[int]] | tuple[Memory, Area, int, Iterable[int], bool]
+    ],
     before: Callable[[bool], object] | None = None,
 ) -> tuple[int, int | None]:
     """Writes to several memories (memory, area, address, values) in one step.
 
     Returns the number of written values, and the sequence of the step if a log has carried it out.
-    Readers of the memories see all writes or none. `before` is called once every check has passed,
-    with whether a journal carries out the writes; if it raises, nothing is written.
+    Readers of the memories see all writes or none. If one write ends with `True`, the batch is
+    written only while all its memories are sealed: they are judged under the locks of the write.
+
+    `before` is called once all other checks have passed, with whether the writes can still be
+    refused: by a journal, or because a memory is not sealed. If it raises, nothing is written.
 
     Raises `BatchRefused` for the first write with an invalid area, number of values or range, else
     for the first invalid value. An error prevents all writes. An exception from the iterable

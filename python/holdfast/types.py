@@ -241,7 +241,7 @@ class LogStep(TypedDict, total=False):
     area and address; the AND mask and the OR mask. `read` follows the write of `write_then_read`.
     """
 
-    access: Literal["client", "ingest", "mirror"]
+    access: Literal["client", "ingest", "mirror", "restore"]
     action: Literal["write", "mask", "write_then_read"]
     writes: list[tuple[str, Area, int, list[int]]]
     place: tuple[str, Area, int]

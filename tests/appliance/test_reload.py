@@ -272,8 +272,7 @@ def test_a_raw_ingest_connection_has_its_new_rights_before_its_next_packet(rig: 
             "raw": {
                 "type": "raw-ingest",
                 "bind": "127.0.0.1:0",
-                "packets": "many",
-                "after_refusal": "continue",
+                "compat": {"packets": "many", "after_refusal": "continue"},
                 "rules": [grant],
             }
         }

@@ -38,7 +38,7 @@ listeners:
   raw:
     type: raw-ingest
     format: crc
-    crc: none
+    compat: {crc: none}
     bind: 127.0.0.1:0
     rules: [{sources: [127.0.0.0/8], memories: [plant], areas: [coils, holding_registers]}]
 """

@@ -244,7 +244,8 @@ def test_an_appliance_can_do_without_a_file(run: Run, udp: socket.socket) -> Non
     host, port = udp.getsockname()
     appliance = run(
         "memories: {plant: {id: 3, coils: 16}}\n"
-        "listeners: {raw: {type: raw-ingest, format: crc, crc: none, bind: '127.0.0.1:0', "
+        "listeners: {raw: {type: raw-ingest, format: crc, compat: {crc: none}, "
+        "bind: '127.0.0.1:0', "
         "rules: [{sources: [127.0.0.0/8], memories: [plant], areas: [coils]}]}}\n"
         f"audit: {{syslog: {{url: 'udp://{host}:{port}'}}}}\n"
     )

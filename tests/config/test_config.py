@@ -269,20 +269,22 @@ def test_raw_ingest_speaks_v1_unless_it_says_otherwise(loaded: Callable[..., Con
     rule = "{sources: [10.0.0.7], units: {65535: plant}, areas: [coils]}"
     text = f"type: raw-ingest, bind: '127.0.0.1:1', rules: [{rule}]"
     listener = listener_of(loaded, text, RawIngestListener)
-    assert (listener.format, listener.crc) == ("v1", None)
+    assert (listener.format, listener.compat) == ("v1", None)
     assert (listener.max_connections, listener.max_connections_per_source) == (256, 128)
-    assert (listener.flags, listener.when_full, listener.after_refusal) == (None, "refuse", "close")
+    assert listener.when_full == "refuse"
     assert (listener.rules[0].units, listener.rules[0].memories) == ({65535: "plant"}, ())
 
 
-@pytest.mark.parametrize(("written", "crc"), [("", "required"), ("crc: none, ", "none")])
-def test_raw_ingest_of_format_crc_needs_the_crc_unless_it_says_otherwise(
-    loaded: Callable[..., Config], written: str, crc: str
+@pytest.mark.parametrize(("written", "compat"), [("", None), ("crc: none", {"crc": "none"})])
+def test_raw_ingest_of_format_crc_needs_the_crc_unless_compat_says_otherwise(
+    loaded: Callable[..., Config], written: str, compat: dict[str, str] | None
 ) -> None:
     rule = f"{{sources: [10.0.0.7], {GRANT}}}"
-    text = f"type: raw-ingest, format: crc, {written}bind: '127.0.0.1:1', rules: [{rule}]"
+    group = f"compat: {{{written}}}, " if written else ""
+    text = f"type: raw-ingest, format: crc, {group}bind: '127.0.0.1:1', rules: [{rule}]"
     listener = listener_of(loaded, text, RawIngestListener)
-    assert (listener.crc, listener.flags) == (crc, "strict")
+    given = listener.compat and listener.compat.model_dump(exclude_none=True)
+    assert given == compat
     assert (listener.rules[0].units, listener.rules[0].memories) == ({}, ("plant",))
 
 
@@ -712,6 +714,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "OffsetsConfig": None,
         "ProfileConfig": ["tags"],
         "RangeConfig": ["area", "start"],
+        "RawCompatConfig": None,
         "RawIngestConfig": ["rules"],
         "RawRuleConfig": ["sources", "areas"],
         "SecureRawRuleConfig": ["sources", "areas"],

@@ -62,10 +62,7 @@ SERIAL_UNIT = (
     "a unit id from 1 to 247, or a range, as in 20-40; 0 is the broadcast, 248 to 255 are reserved"
 )
 SOME = "a list with at least one entry"
-REMOVED = (
-    "found 'if-present', which was removed, allowed: required, if all senders send a CRC, "
-    "otherwise none"
-)
+MOVED = "moved, allowed: no key for the strict protocol, otherwise compat"
 
 
 @pytest.fixture
@@ -228,18 +225,29 @@ def test_serial_lines_need_ports_of_their_own(folder: Folder, device: str) -> No
     ("old", "new", "problem"),
     [
         ("    bind", "    format: v2\n    bind", "7: format: found 'v2', allowed: v1 or crc"),
-        ("    bind", "    crc: none\n    bind",
-         "7: crc: found with format v1, allowed: only with format crc"),
-        ("    bind", "    flags: ignore\n    bind",
-         "7: flags: found with format v1, allowed: only with format crc"),
+        ("    bind", "    compat: {crc: none}\n    bind",
+         "7: compat.crc: found with format v1, allowed: only with format crc"),
+        ("    bind", "    compat: {flags: ignore}\n    bind",
+         "7: compat.flags: found with format v1, allowed: only with format crc"),
+        ("    bind", "    compat: {after_refusal: continue}\n    bind",
+         "7: compat.after_refusal: found without packets: many, allowed: only with it"),
+        ("    bind", "    compat: {packets: one}\n    bind",
+         "7: compat.packets: found 'one', allowed: many"),
+        ("    bind", "    compat: \n    bind", "7: compat: found nothing, allowed: a mapping with "
+         "the keys packets, after_refusal, crc, flags"),
+        ("    bind", "    packets: many\n    bind",
+         "7: packets: moved, allowed: compat: {packets: many}"),
+        ("    bind", "    packets: one\n    bind", f"7: packets: {MOVED}: {{packets: many}}"),
         ("    bind", "    after_refusal: continue\n    bind",
-         "7: after_refusal: found continue with packets: one, allowed: close, or packets: many"),
+         "7: after_refusal: moved, allowed: compat: {after_refusal: continue}"),
+        ("    bind", "    crc: none\n    bind", "7: crc: moved, allowed: compat: {crc: none}"),
+        ("    bind", "    flags: ignore\n    bind",
+         "7: flags: moved, allowed: compat: {flags: ignore}"),
         ("    bind", "    when_full: wait\n    bind",
          "7: when_full: found 'wait', allowed: refuse or evict"),
         ("    bind", "    listen_only: true\n    bind", "7: listen_only: unknown key, allowed: "
-         "type, format, crc, flags, bind, tls, max_connections, max_connections_per_source, "
-         "when_full, max_handshakes, request_timeout, packets, "
-         "after_refusal, idle_timeout, rules"),
+         "type, format, bind, tls, max_connections, max_connections_per_source, "
+         "when_full, max_handshakes, request_timeout, compat, idle_timeout, rules"),
         ("    bind", "    tls: 1\n    bind", "7: tls: found 1, allowed: a mapping with the keys "
          "cert_file, key_file, key_passphrase_file, ca_file, crl_file, expired_crl, review"),
         ("    bind", "    max_writes_per_source: 20\n    bind",
@@ -278,13 +286,16 @@ def test_raw_ingest_of_format_v1_is_checked(
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [
-        ("    bind", "    crc: maybe\n    bind",
-         "8: crc: found 'maybe', allowed: required or none"),
-        ("    bind", "    crc: \n    bind",
-         "8: crc: found nothing, allowed: required or none"),
-        ("    bind", "    crc: if-present\n    bind", f"8: crc: {REMOVED}"),
-        ("    bind", "    flags: any\n    bind",
-         "8: flags: found 'any', allowed: strict or ignore"),
+        ("    bind", "    compat: {crc: required}\n    bind",
+         "8: compat.crc: found 'required', allowed: none"),
+        ("    bind", "    compat: {crc: }\n    bind",
+         "8: compat.crc: found nothing, allowed: none"),
+        ("    bind", "    crc: if-present\n    bind", "8: crc: moved, allowed: no key, if all "
+         "senders send a CRC, otherwise compat: {crc: none}"),
+        ("    bind", "    crc: required\n    bind", f"8: crc: {MOVED}: {{crc: none}}"),
+        ("    bind", "    flags: strict\n    bind", f"8: flags: {MOVED}: {{flags: ignore}}"),
+        ("    bind", "    compat: {flags: any}\n    bind",
+         "8: compat.flags: found 'any', allowed: ignore"),
         ("memories: [plant], ", "",
          f"10: rules[0].memories: missing with format crc, allowed: {SOME}"),
         ("[plant]", "[]", f"10: rules[0].memories: found an empty list, allowed: {SOME}"),
@@ -316,26 +327,17 @@ def test_packets_on_a_modbus_port_are_checked_as_those_of_a_listener(folder: Fol
     rules:
       - {sources: [10.0.0.0/8], units: {1: plant}, access: read-only}
     raw_ingest:
-      crc: if-present
       flags: ignore
-      after_refusal: continue
+      compat: {crc: none, after_refusal: continue}
       rules:
         - {sources: [10.0.0.0/8], units: {1: plant}, areas: [coils]}
 """
-    only = "found with format v1, allowed: only with format crc"
     at = "listeners.both.raw_ingest"
     assert folder.problems(MEMORIES + text) == [
-        f"p.yaml:11: {at}.crc: {only}",
-        f"p.yaml:11: {at}.crc: {REMOVED}",
-        f"p.yaml:12: {at}.flags: {only}",
-        f"p.yaml:13: {at}.after_refusal: found continue with packets: one, allowed: close, or "
-        "packets: many",
+        f"p.yaml:11: {at}.flags: moved, allowed: compat: {{flags: ignore}}",
+        f"p.yaml:12: {at}.compat.crc: found with format v1, allowed: only with format crc",
+        f"p.yaml:12: {at}.compat.after_refusal: found without packets: many, allowed: only with it",
     ]
-    crc = text.replace("flags: ignore", "format: crc").replace(
-        "units: {1: plant}, areas", "memories: [plant], areas"
-    )
-    crc = crc.replace("after_refusal: continue", "packets: many")
-    assert folder.problems(MEMORIES + crc) == [f"p.yaml:11: {at}.crc: {REMOVED}"]
 
 
 def test_all_problems_of_a_raw_ingest_rule_are_told_at_once(folder: Folder) -> None:

@@ -106,6 +106,9 @@ def test_listeners_are_not_empty_text(folder: Folder) -> None:
         ("[plant]", "[plant, other, plant]",
          "10: tokens[0].memories[2]: found 'plant' again, allowed: once"),
         ("[coils]", "[]", f"11: tokens[0].areas: found an empty list, allowed: {SOME}"),
+        ("read-write", "read-only\n      while_sealed: [holding_registers]",
+         "13: tokens[0].while_sealed: found with access: read-only, allowed: only with "
+         "read-write"),
         ("read-write", "all",
          "12: tokens[0].access: found 'all', allowed: read-only or read-write"),
         ("      access: read-write\n", "",
@@ -159,7 +162,7 @@ def test_tokens_are_a_list_or_none(folder: Folder, tokens: str, problem: str) ->
 
 def test_a_secret_in_the_place_of_a_token_is_not_repeated(folder: Folder) -> None:
     text = MEMORIES + REST[: REST.index("tokens:")] + "tokens: [my-secret-token, 12345]\n"
-    keys = "name, sha256, memories, areas, access, manage"
+    keys = "name, sha256, memories, areas, access, while_sealed, manage"
     assert folder.problems(text) == [
         f"p.yaml:7: rest.tokens[0]: found text of 15 characters, allowed: a mapping with the keys "
         f"{keys}",
@@ -294,6 +297,13 @@ def test_a_topic_filter_that_mqtt_allows_is_right(folder: Folder, topic: str) ->
         ("[plant]", "[plnt]", "8: subscriptions[0].memories[0]: found 'plnt', "
          "allowed: plant, other; did you mean 'plant'?"),
         (", areas: [coils]", "", f"8: subscriptions[0].areas: missing, allowed: {SOME}"),
+        ("[coils]}", "[coils], while_sealed: []}",
+         f"8: subscriptions[0].while_sealed: found an empty list, allowed: {SOME}"),
+        ("[coils]}", "[coils], while_sealed: [input_registers, input_registers]}",
+         "8: subscriptions[0].while_sealed[1]: found 'input_registers' again, allowed: once"),
+        ("[coils]}", "[coils], while_sealed: [coils]}",
+         "8: subscriptions[0].while_sealed[0]: found 'coils', allowed: an area that is not in "
+         "areas"),
         ("    - {topic: plant/+/in/#, memories: [plant], areas: [coils]}\n", "    []\n",
          f"7: subscriptions: found an empty list, allowed: {SOME} (optional with map)"),
     ],
@@ -449,6 +459,14 @@ devices:
         count: 2
         into: {memory: plant, area: coils, address: 0}
 """
+
+
+def test_a_right_while_sealed_without_a_seal_is_a_warning(folder: Folder) -> None:
+    mqtt = MQTT.replace("[coils]}", "[coils], while_sealed: [input_registers]}")
+    no_effect = "has no effect: none of its memories with a seal has this area"
+    at = "mqtt.subscriptions[0].while_sealed[0]"
+    assert folder.warnings(MEMORIES + mqtt) == [f"p.yaml:8: {at}: input_registers {no_effect}"]
+    assert folder.warnings(SEALED + mqtt) == []
 
 
 @pytest.mark.parametrize(

@@ -41,9 +41,7 @@ if TYPE_CHECKING:
     class Import(Protocol):
         """Imports a text."""
 
-        def __call__(
-            self, text: str, *, as_meant: bool = False, keep_published_tokens: bool = False
-        ) -> Imported: ...
+        def __call__(self, text: str, **options: Any) -> Imported: ...
 
 
 MMA = DATA / "mma"
@@ -53,7 +51,9 @@ MEMORY = "memory: {memories: {plant: {coils: {start: 0, size: 8}}}}\n"
 ROUTING = "routing: {unit_id_map: {1: plant}}\n"
 PORT = "ports: {502: {unit_ids: all, memories: all, access: read-write%s}}\n"
 FIRST = MEMORY + ROUTING + PORT % ""
-RULE = "{id: a, source_ip: [10.0.0.0/8], allow: rw}"
+RULE = "{id: a, source_ip: [10.0.0.0/8], allow_fc: [1, 2, 3, 4, 5, 6, 15, 16]}"
+ALLOW = RULE.partition("allow_fc")[0] + "allow: %s}"
+READ_WRITE = {"access": "read-write", "functions": [1, 2, 3, 4, 5, 6, 15, 16]}
 SECOND = """\
 listeners:
   - id: main
@@ -78,14 +78,17 @@ rest:
 MQTT = "mqtt: {enabled: true, broker: %s, client_id: c, topic: t%s}\n"
 RAW = "raw_ingest: {enabled: true, listen: ':9000', max_packet_bytes: 99, read_timeout_ms: 1500}\n"
 NUMBERED = FIRST.replace("{plant:", "{5:").replace("plant", "5")
+FOUR_AREAS = FIRST.replace(
+    "coils: {start: 0, size: 8}", ", ".join(f"{area}: {{size: 8}}" for area in AREAS)
+)
 
 
 @pytest.fixture
 def imported(tmp_path: Path) -> Import:
-    def read(text: str, *, as_meant: bool = False, keep_published_tokens: bool = False) -> Imported:
+    def read(text: str, **options: Any) -> Imported:
         path = tmp_path / "mma.yaml"
         path.write_text(text, encoding="utf-8")
-        found = read_mma(path, as_meant=as_meant, keep_published_tokens=keep_published_tokens)
+        found = read_mma(path, **options)
         (tmp_path / "mqtt.password").write_text("x")
         (tmp_path / "new.yaml").write_text(found.to_yaml(), encoding="utf-8")
         load(tmp_path / "new.yaml")
@@ -95,10 +98,10 @@ def imported(tmp_path: Path) -> Import:
 
 
 @pytest.fixture
-def refused(imported: Import) -> Callable[[str], list[str]]:
-    def problems(text: str) -> list[str]:
+def refused(imported: Import) -> Callable[..., list[str]]:
+    def problems(text: str, **options: Any) -> list[str]:
         with pytest.raises(NotImportable) as error:
-            imported(text)
+            imported(text, **options)
         return [str(problem).partition("mma.yaml:")[2] for problem in error.value.problems]
 
     return problems
@@ -168,7 +171,7 @@ def test_the_example_of_the_page_is_what_the_command_makes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page = (DOCS / "moving-from-mma.md").read_text()
-    old, new, _ = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    old, new, *_ = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     Path("config.yaml").write_text(old)
     assert read_mma("config.yaml").to_yaml() == new
@@ -427,7 +430,8 @@ def test_other_answers_to_what_is_not_allowed_are_noted(imported: Import) -> Non
 def raw_ingest(units: dict[int, str], areas: list[str]) -> dict[str, Any]:
     """What everybody may write by Raw Ingest."""
     rule = {"sources": ["0.0.0.0/0", "::/0"], "units": units, "areas": areas}
-    return {"packets": "many", "after_refusal": "continue", "rules": [rule]}
+    compat = {"packets": "many", "after_refusal": "continue"}
+    return {"compat": compat, "rules": [rule]}
 
 
 def test_a_listener_keeps_its_name_and_names_its_memory(imported: Import) -> None:
@@ -439,7 +443,7 @@ def test_a_listener_keeps_its_name_and_names_its_memory(imported: Import) -> Non
         "max_connections_per_source": None,
         "when_full": "evict",
         "idle_timeout": 0,
-        "rules": [{"sources": ["10.0.0.0/8"], "units": {1: "main-1"}, "access": "read-write"}],
+        "rules": [{"sources": ["10.0.0.0/8"], "units": {1: "main-1"}, **READ_WRITE}],
         "raw_ingest": raw_ingest({1: "main-1"}, ["coils", "holding_registers"]),
     }
 
@@ -455,13 +459,50 @@ def test_a_listener_keeps_its_name_and_names_its_memory(imported: Import) -> Non
     ],
 )
 def test_what_a_policy_rule_allows(imported: Import, allowed: str, rights: dict[str, Any]) -> None:
-    found = rule(imported(SECOND % (RULE.replace("allow: rw", allowed), "")), "main")
+    text = SECOND % (ALLOW.replace("allow: %s", allowed), "")
+    found = rule(imported(text, as_meant=allowed.startswith("allow: ")), "main")
     assert {key: found[key] for key in ("access", "functions") if key in found} == rights
 
 
 def test_write_only_is_noted(imported: Import) -> None:
-    found = imported(SECOND % (RULE.replace("rw", "wo"), ""))
+    found = imported(SECOND % (ALLOW % "wo", ""), as_meant=True)
     assert noted(found, "policy.rules[0].allow: changed: only functions 5, 6, 15, 16")
+
+
+@pytest.mark.parametrize("word", ["ro", "rw", "wo"])
+def test_allow_had_no_effect_so_its_rule_allows_nothing(imported: Import, word: str) -> None:
+    """Its peers are refused, also by later rules: the first rule that names a peer decides."""
+    rules = ALLOW.replace("10.0.0.0/8", "10.0.0.0/9") % word + ", " + RULE
+    found = imported(SECOND % (rules, ""))
+    assert rule(found, "main")["sources"] == ["10.128.0.0/9"]
+    at = "listeners[0].memory[0].policy.rules[0].allow"
+    assert noted(
+        found,
+        f"{at}: left out: as it ran: it had no effect: the rule allowed no function",
+        "as it was meant: its peers may",
+        "--as-it-was-meant",
+    )
+    meant = imported(SECOND % (rules, ""), as_meant=True)
+    assert [len(one["sources"]) for one in port(meant, "main")["rules"]] == [1, 1]
+    assert noted(
+        meant, f"{at}: changed: as it was meant: its peers may", "as it ran: it had no effect"
+    )
+
+
+def test_beside_allow_fc_allow_had_no_effect(imported: Import) -> None:
+    found = imported(SECOND % (ALLOW % "rw, allow_fc: [3]", ""))
+    assert rule(found, "main")["functions"] == [3]
+    assert noted(found, "rules[0].allow: left out: as it ran: it had no effect: allow_fc decided")
+
+
+def test_a_word_that_allow_never_had_is_an_error_only_if_it_is_to_have_an_effect(
+    imported: Import, refused: Callable[..., list[str]]
+) -> None:
+    text = SECOND % (ALLOW % "all" + ", " + RULE.replace("10.", "11."), "")
+    assert rule(imported(text), "main")["sources"] == ["11.0.0.0/8"]
+    assert noted(imported(text), "rules[0].allow: left out", "an error: it is not ro, rw or wo")
+    (problem,) = refused(text, as_meant=True)
+    assert "allow: found 'all', allowed: ro, rw or wo" in problem
 
 
 def test_a_sealing_coil_is_followed(imported: Import) -> None:
@@ -486,7 +527,8 @@ def test_a_memory_without_a_policy_is_served_to_nobody(imported: Import) -> None
 
 
 def test_each_unit_of_a_sample_has_rules_of_its_own() -> None:
-    rules = read_mma(MMA / "policies.yaml").data["listeners"]["ems"]["rules"]
+    imported = read_mma(MMA / "policies.yaml", as_meant=True)
+    rules = imported.data["listeners"]["ems"]["rules"]
     assert [(one["units"], one["access"], one.get("functions")) for one in rules] == [
         ({1: "inverter"}, "read-only", None),
         ({2: "setpoints"}, "read-write", None),
@@ -502,14 +544,14 @@ def test_each_unit_of_a_sample_has_rules_of_its_own() -> None:
 
 def test_a_unit_that_allows_nothing_is_noted(imported: Import) -> None:
     other = "{unit_id: 2, holding_registers: {start: 0, count: 1}, policy: {rules: [%s]}}"
-    nothing = RULE.replace("allow: rw", "allow_fc: [4]")
+    nothing = ALLOW.replace("allow: %s", "allow_fc: [4]")
     found = imported(SECOND % (RULE, "") + f"      - {other % nothing}\n")
     assert rule(found, "main")["units"] == {1: "main-1"}
     assert noted(found, "listeners[0]: check: no rule serves unit 2")
 
 
 def test_each_unit_keeps_its_own_rules(imported: Import) -> None:
-    rules = "{source_ip: [10.1.0.0/16], allow_fc: [3]}, {source_ip: [10.0.0.0/8], allow: rw}"
+    rules = "{source_ip: [10.1.0.0/16], allow_fc: [3]}, " + RULE
     other = "{unit_id: 2, holding_registers: {start: 0, count: 1}, policy: {rules: [" + RULE + "]}}"
     found = imported(SECOND % (rules, "") + f"      - {other}\n")
     both = {1: "main-1", 2: "main-2"}
@@ -520,13 +562,13 @@ def test_each_unit_keeps_its_own_rules(imported: Import) -> None:
             "access": "read-only",
             "functions": [3],
         },
-        {"sources": ["10.0.0.0/8"], "units": both, "access": "read-write"},
+        {"sources": ["10.0.0.0/8"], "units": both, **READ_WRITE},
     ]
     assert not noted(found, "listeners[0]: changed")
 
 
 def test_a_rule_that_allows_nothing_is_cut_out_of_later_ones(imported: Import) -> None:
-    rules = "{source_ip: [10.0.0.0/9], allow_fc: []}, {source_ip: [10.0.0.0/8], allow: rw}"
+    rules = "{source_ip: [10.0.0.0/9], allow_fc: []}, " + RULE
     found = imported(SECOND % (rules, ""))
     assert rule(found, "main")["sources"] == ["10.128.0.0/9"]
 
@@ -549,7 +591,7 @@ def test_what_has_no_counterpart_is_noted_with_the_reason(imported: Import, key:
 
 def test_everybody_may_write_by_raw_ingest_whatever_the_policies_say(imported: Import) -> None:
     nobody = "      - {unit_id: 2, name: silent, input_registers: {start: 0, count: 1}}\n"
-    found = imported(SECOND % (RULE.replace("rw", "ro"), "") + nobody)
+    found = imported(SECOND % (RULE, "") + nobody)
     areas = ["coils", "holding_registers", "input_registers"]
     assert port(found, "main")["raw_ingest"] == raw_ingest({1: "main-1", 2: "silent"}, areas)
     assert rule(found, "main")["units"] == {1: "main-1"}
@@ -568,7 +610,7 @@ def test_the_filter_of_the_whole_file_can_limit_raw_ingest(imported: Import) -> 
 
 
 def test_a_listener_without_policies_takes_only_raw_ingest(imported: Import) -> None:
-    found = imported(SECOND % (RULE.replace("allow: rw", "allow_fc: []"), ""))
+    found = imported(SECOND % (ALLOW.replace("allow: %s", "allow_fc: []"), ""))
     assert port(found, "main") == {
         "type": "raw-ingest",
         "bind": "127.0.0.1:502",
@@ -611,6 +653,52 @@ def test_tokens_only_read_where_there_is_nothing_that_rest_could_write(imported:
     assert noted(found, "rest.auth: check: no memory has discrete inputs or input registers")
 
 
+def test_an_option_grants_rest_other_areas(imported: Import) -> None:
+    text = FOUR_AREAS + REST % ("127.0.0.1:8080", "a-long-secret-token-of-a-gate")
+    found = imported(text)
+    (token,) = found.data["rest"]["tokens"]
+    assert token["areas"] == ["discrete_inputs", "input_registers"]
+    assert noted(found, "rest.auth: check", "holding_registers", "--grant-rest AREA[,AREA]")
+    more = imported(text, grant_rest=["holding_registers"])
+    (token,) = more.data["rest"]["tokens"]
+    assert token["areas"] == ["discrete_inputs", "holding_registers", "input_registers"]
+    assert noted(more, "rest.auth: check", "and holding registers, by --grant-rest")
+
+
+def test_an_option_grants_mqtt_other_areas(imported: Import) -> None:
+    text = FOUR_AREAS + MQTT % ("broker", "")
+    found = imported(text)
+    (topic,) = found.data["mqtt"]["subscriptions"]
+    assert topic["areas"] == ["discrete_inputs", "input_registers"]
+    assert noted(found, "mqtt.topic: check", "holding_registers", "--grant-mqtt AREA[,AREA]")
+    more = imported(text, grant_mqtt=["coils"])
+    (topic,) = more.data["mqtt"]["subscriptions"]
+    assert topic["areas"] == ["coils", "discrete_inputs", "input_registers"]
+
+
+@pytest.mark.parametrize("as_meant", [False, True])
+def test_messages_may_restore_all_areas_of_a_sealed_memory_but_rest_may_not(
+    imported: Import, as_meant: bool
+) -> None:
+    rest = REST % ("127.0.0.1:8080", "a-long-secret-token-of-a-gate")
+    sealed = FOUR_AREAS.replace("{plant: {", f"{{plant: {{{SEAL}, ")
+    found = imported(sealed + MQTT % ("broker", "") + rest, as_meant=as_meant)
+    (topic,) = found.data["mqtt"]["subscriptions"]
+    assert topic["areas"] == ["discrete_inputs", "input_registers"]
+    assert topic["while_sealed"] == ["coils", "holding_registers"]
+    assert noted(found, "mqtt.topic: check", "coils and holding registers", "while_sealed")
+    (token,) = found.data["rest"]["tokens"]
+    assert "while_sealed" not in token
+    more = imported(sealed + MQTT % ("broker", ""), grant_mqtt=["coils"])
+    (topic,) = more.data["mqtt"]["subscriptions"]
+    assert topic["while_sealed"] == ["holding_registers"]
+
+
+def test_without_a_seal_there_is_nothing_to_restore(imported: Import) -> None:
+    found = imported(FOUR_AREAS + MQTT % ("broker", ""))
+    assert "while_sealed" not in found.data["mqtt"]["subscriptions"][0]
+
+
 @pytest.mark.parametrize("token", ["CHANGE_ME_LONG_RANDOM", "INGEST_ONLY_TOKEN"])
 def test_published_tokens_are_left_out_unless_they_are_to_be_kept(
     imported: Import, token: str
@@ -630,7 +718,9 @@ def test_published_tokens_are_left_out_unless_they_are_to_be_kept(
 def test_the_token_that_was_always_accepted_can_be_kept(imported: Import, auth: str) -> None:
     text = f"{SEALED}rest: {{enabled: true, address: ':8080'{auth}}}\n"
     assert "rest" not in imported(text).data
-    rest = imported(text, keep_published_tokens=True).data["rest"]
+    found = imported(text, keep_published_tokens=True)
+    assert noted(found, "each token may write discrete inputs", "--grant-rest AREA[,AREA]")
+    rest = found.data["rest"]
     assert rest["bind"] == "[::]:8080"
     assert [(each["name"], each["sha256"], each["areas"]) for each in rest["tokens"]] == [
         ("published", hashlib.sha256(b"INGEST_ONLY_TOKEN").hexdigest(), ["discrete_inputs"])
@@ -724,9 +814,7 @@ def test_raw_ingest_becomes_a_listener_without_crc(imported: Import) -> None:
         "type": "raw-ingest",
         "bind": "[::]:9000",
         "format": "crc",
-        "crc": "none",
-        "flags": "ignore",
-        "packets": "many",
+        "compat": {"crc": "none", "flags": "ignore", "packets": "many"},
         "max_connections_per_source": None,
         "when_full": "evict",
         "request_timeout": 1.5,
@@ -803,8 +891,8 @@ def test_an_impossible_value_is_refused(
         ("id: main", "name: main", "listeners[0].id: missing, allowed: text"),
         ("    listen: 127.0.0.1:502\n", "", "listeners[0].listen: missing"),
         ("unit_id: 1", "name: x", "unit_id: missing, allowed: a unit id from 0 to 255"),
-        ("allow: rw", "allow: all", "allow: found 'all', allowed: ro, rw or wo"),
-        ("allow: rw", "allow: rw, allow_fc: [1]", "allow: found together with allow_fc"),
+        ("allow_fc: [", "allow: all, x: [", "allow: found 'all', allowed: ro, rw or wo"),
+        ("allow_fc", "allow: rw, allow_fc", "allow: found together with allow_fc"),
         ("source_ip: [10.0.0.0/8], ", "", "source_ip: missing, allowed: a list"),
         ("[10.0.0.0/8]", "10.0.0.0/8", "source_ip: found '10.0.0.0/8', allowed: a list"),
         (AREA_LINES, "", "memory[0]: no area, allowed: at least one of"),
@@ -813,9 +901,9 @@ def test_an_impossible_value_is_refused(
     ],
 )
 def test_an_impossible_value_of_the_second_generation_is_refused(
-    refused: Callable[[str], list[str]], old: str, new: str, problem: str
+    refused: Callable[..., list[str]], old: str, new: str, problem: str
 ) -> None:
-    (found,) = refused((SECOND % (RULE, "")).replace(old, new))
+    (found,) = refused((SECOND % (RULE, "")).replace(old, new), as_meant=True)
     assert problem in found
 
 
@@ -937,6 +1025,19 @@ def test_options_choose_between_the_meanings(options: list[str], sealed: bool) -
     assert digest not in json.dumps(found)
     kept = run(MMA / "plant.yaml", "--json", "--keep-published-tokens", *options).stdout
     assert digest in kept
+
+
+def test_options_grant_areas(tmp_path: Path) -> None:
+    path = tmp_path / "mma.yaml"
+    rest = REST % ("127.0.0.1:8080", "a-long-secret-token-of-a-gate")
+    path.write_text(FOUR_AREAS + rest + MQTT % ("broker", ""))
+    options = ["--grant-rest", "holding_registers,coils", "--grant-mqtt", "hr"]
+    config = json.loads(run(path, "--json", *options).stdout)["config"]
+    assert config["rest"]["tokens"][0]["areas"] == list(AREAS)
+    assert config["mqtt"]["subscriptions"][0]["areas"] == [*AREAS[1:]]
+    wrong = run(path, "--grant-rest", "registers")
+    assert wrong.exit_code == 2
+    assert "'registers' is not an area, allowed: coils" in wrong.stderr
 
 
 def test_programs_get_json() -> None:

@@ -210,3 +210,24 @@ def test_a_batch_is_written_in_order_or_refused_as_a_whole(
             single.read(area, 0, SIZE) for area in single.areas
         ]
         assert batched.sealed == single.sealed
+
+
+def test_a_write_can_require_that_all_memories_of_the_batch_are_sealed() -> None:
+    sealed, other = (Memory(coils=8, holding_registers=8, seal=("coils", 0)) for _ in range(2))
+    only: Any = (sealed, "holding_registers", 0, [7], True)
+    told: list[bool] = []
+    assert write_across([only, (other, "holding_registers", 0, [8])], told.append) == (2, None)
+    assert write_across([(other, "coils", 0, [1])], told.append) == (1, None)
+    assert told == [True, False]
+    assert refusal([only, (other, "holding_registers", 0, [9])]) == (1, None, "unsealed")
+    assert refusal([(other, "coils", 0, [1], True)]) == (0, None, "unsealed")
+    assert write_across([(other, "coils", 0, [1], False)]) == (1, None)
+    assert write_across([only, (sealed, "coils", 0, [1])]) == (2, None)
+    assert refusal([only]) == (0, None, "unsealed")
+    assert other.read("holding_registers", 0, 1) == [8]
+
+
+@pytest.mark.parametrize("write", [[], (1, 2, 3), "text", (1, 2, 3, 4, 5, 6)])
+def test_what_is_no_write_is_a_type_error(write: object) -> None:
+    with pytest.raises((TypeError, ValueError)):
+        write_across([write])  # type: ignore[list-item]

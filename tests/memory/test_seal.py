@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import http.client
 import json
 import logging
@@ -39,7 +40,7 @@ listeners:
   raw-crc:
     type: raw-ingest
     format: crc
-    crc: none
+    compat: {{crc: none}}
     bind: 127.0.0.1:0
     rules: [{{sources: [127.0.0.0/8], memories: [plant], areas: [discrete_inputs]}}]
 rest:
@@ -67,10 +68,10 @@ def by_raw_crc(appliance: Appliance, bit: int) -> None:
     by_raw(appliance, bit, "raw-crc")
 
 
-def post(appliance: Appliance, body: object) -> int:
+def post(appliance: Appliance, body: object, token: str = "") -> int:
     client = http.client.HTTPConnection(*endpoint(appliance, "rest"), timeout=wire.DEADLINE)
     try:
-        headers = {"Content-Type": "application/json"}
+        headers = {"Content-Type": "application/json", "Authorization": f"Bearer {token}"}
         client.request("POST", "/api/v1/ingest", json.dumps(body), headers)
         return client.getresponse().status
     finally:
@@ -149,3 +150,26 @@ def test_what_a_seal_does_is_logged(run: Run, caplog: pytest.LogCaptureFixture) 
     appliance.log_events(timeout=0)
     [record] = [record for record in caplog.records if record.message == "seal"]
     assert vars(record)["fields"] == {"memory": "plant", "state": "open", "opened": 2, "closed": 1}
+
+
+def test_a_token_restores_a_memory_while_it_is_sealed(run: Run, connect: Connect) -> None:
+    text = CONFIGURATION.format(mode="once").replace(
+        "  tokens: none\n",
+        f"""\
+  tokens:
+    - name: restorer
+      sha256: {hashlib.sha256(b"secret").hexdigest()}
+      memories: [plant]
+      areas: [discrete_inputs]
+      access: read-write
+      while_sealed: [holding_registers]
+""",
+    )
+    appliance = run(text)
+    client = connect(endpoint(appliance, "scada"))
+    setpoint = {"memory": "plant", "area": "holding_registers", "address": 0, "values": [7]}
+    assert post(appliance, setpoint, "secret") == 200
+    gate = {"memory": "plant", "area": "discrete_inputs", "address": 9, "values": [1]}
+    assert post(appliance, gate, "secret") == 200
+    assert post(appliance, setpoint | {"values": [8]}, "secret") == 403
+    assert client.ask(READ) == bytes.fromhex("030400070000")

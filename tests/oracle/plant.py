@@ -228,7 +228,7 @@ class Plant(ABC):
             "ascii": self.listener("modbus-ascii-over-tcp"),
             "secure": self.listener("modbus-tls", tls=self._tls),
             "packets": self._packets(),
-            "checked": self._packets(format="crc", packets="many"),
+            "checked": self._packets(format="crc", compat={"packets": "many"}),
         }
         subscription = {"topic": TOPIC, "qos": QOS, "memories": [PLANT, ANNEX]}
         return {

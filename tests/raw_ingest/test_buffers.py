@@ -97,11 +97,11 @@ def half_sent(process: Process, opened: contextlib.ExitStack, count: int) -> lis
 
 @needs_proc
 @pytest.mark.usefixtures("many_files")
-@pytest.mark.parametrize("packets", ["one", "many"])
+@pytest.mark.parametrize("settings", [{}, {"compat": {"packets": "many"}}], ids=["one", "many"])
 def test_the_memory_of_incomplete_packets_is_bounded_and_given_back_when_they_leave(
-    tmp_path: Path, packets: str
+    tmp_path: Path, settings: dict[str, Any]
 ) -> None:
-    with serving(tmp_path, packets=packets, request_timeout=600) as process:
+    with serving(tmp_path, **settings, request_timeout=600) as process:
         with contextlib.ExitStack() as opened:
             half_sent(process, opened, 10)
         wire.until(lambda: process.open() == 0, "all are gone")
@@ -146,7 +146,7 @@ def test_a_header_takes_no_memory_for_what_it_announces(tmp_path: Path) -> None:
 
 def test_a_connection_that_waits_keeps_no_memory_of_its_packets(tmp_path: Path) -> None:
     with (
-        serving(tmp_path, packets="many", idle_timeout=0) as process,
+        serving(tmp_path, compat={"packets": "many"}, idle_timeout=0) as process,
         socket.create_connection(process.address, wire.DEADLINE) as client,
     ):
         client.sendall(LONG + SHORT)

@@ -40,10 +40,10 @@ SIZES: dict[str, int] = CASES["memory"]
 DONE, REFUSED = b"\x00", b"\x01"
 
 # The names of the kinds of listeners, and what a configuration says for them.
-KINDS: dict[str, dict[str, str]] = {
+KINDS: dict[str, dict[str, Any]] = {
     "v1": {"format": "v1"},
     "crc": {"format": "crc"},
-    "none": {"format": "crc", "crc": "none"},
+    "none": {"format": "crc", "compat": {"crc": "none"}},
 }
 
 
@@ -130,7 +130,7 @@ class Plant:
     @property
     def kind(self) -> str:
         settings: Any = self.appliance.config.listeners["raw"]
-        return "v1" if settings.format == "v1" else "none" if settings.crc == "none" else "crc"
+        return "v1" if settings.format == "v1" else "crc" if settings.compat is None else "none"
 
 
 def good(kind: str, area: Area, address: int, values: Any) -> bytes:

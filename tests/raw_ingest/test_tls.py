@@ -196,7 +196,7 @@ def test_refusals_sessions_and_the_audit_log_name_the_sender(
     run: Run, party: Party, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     audit = tmp_path / "audit.jsonl"
-    text = secured(party, packets="many", after_refusal="continue")
+    text = secured(party, compat={"packets": "many", "after_refusal": "continue"})
     plant = run(f'{text[:-1]}, "audit": {{"file": "{audit}"}}}}')
     with connected(party, plant, party.line) as client:
         client.sendall(raw_ingest.encode("coils", 0, [1], unit=1) + PACKET)
@@ -221,7 +221,7 @@ def test_refusals_sessions_and_the_audit_log_name_the_sender(
 def test_half_a_packet_and_half_a_record_end_in_time(
     run: Run, party: Party, caplog: pytest.LogCaptureFixture
 ) -> None:
-    plant = run(secured(party, request_timeout=2, packets="many"))
+    plant = run(secured(party, request_timeout=2, compat={"packets": "many"}))
     with (
         TlsPeer(address(plant), party.trust(party.line)) as half,
         connected(party, plant, party.line) as client,
@@ -236,7 +236,7 @@ def test_half_a_packet_and_half_a_record_end_in_time(
 
 
 def test_several_packets_are_answered_in_order_however_they_are_cut(run: Run, party: Party) -> None:
-    plant = run(secured(party, packets="many"))
+    plant = run(secured(party, compat={"packets": "many"}))
     with connected(party, plant, party.line) as client:
         client.sendall(PACKET * 3 + LONG)
         client.sendall(LONG[:70_000])
@@ -274,7 +274,7 @@ def test_silent_connections_displace_each_other_and_no_sender(
     run: Run, party: Party, when_full: str
 ) -> None:
     limits = {"max_connections": 4, "max_handshakes": 5, "max_connections_per_source": None}
-    settings: dict[str, Any] = {"packets": "many", "when_full": when_full, **limits}
+    settings: dict[str, Any] = {"compat": {"packets": "many"}, "when_full": when_full, **limits}
     plant = run(secured(party, **settings))
     with contextlib.ExitStack() as opened:
         client = opened.enter_context(connected(party, plant, party.line))
@@ -364,7 +364,7 @@ def test_a_reload_takes_new_certificates_and_ends_senders_that_are_revoked(
     ]
     one, two, server, renewed = issued
     own = Party(tmp_path, authority, server, one, two, two)
-    text = secured(own, packets="many")
+    text = secured(own, compat={"packets": "many"})
     with Appliance(_loaded(tmp_path, text)) as plant, contextlib.ExitStack() as opened:
         first, second = (opened.enter_context(connected(own, plant, each)) for each in (one, two))
         for client in (first, second):
@@ -372,7 +372,7 @@ def test_a_reload_takes_new_certificates_and_ends_senders_that_are_revoked(
             assert client.recv(1) == DONE
         revoked = authority.revoke(two)
         changed = Party(tmp_path, authority, renewed, one, two, two)
-        text = secured(changed, packets="many", crl_file=revoked)
+        text = secured(changed, compat={"packets": "many"}, crl_file=revoked)
         plant.reload(_loaded(tmp_path, text))
         assert second.recv(1) == b""
         first.sendall(PACKET)

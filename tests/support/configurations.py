@@ -142,12 +142,13 @@ def raw_ingest(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, Any
     names = st.lists(name, min_size=1, unique=True)
     form = draw(st.sampled_from(["v1", "crc"]))
     named = {"units": units} if form == "v1" else {"memories": names}
-    own: dict[str, st.SearchStrategy[str]] = {"when_full": st.sampled_from(["refuse", "evict"])}
+    compat = {"packets": st.just("many")}
     if form == "crc":
-        own |= {
-            "crc": st.sampled_from(["required", "none"]),
-            "flags": st.sampled_from(["strict", "ignore"]),
-        }
+        compat |= {"crc": st.just("none"), "flags": st.just("ignore")}
+    own: dict[str, st.SearchStrategy[Any]] = {
+        "when_full": st.sampled_from(["refuse", "evict"]),
+        "compat": st.fixed_dictionaries({}, optional=compat),
+    }
     return {
         "type": "raw-ingest",
         "format": form,

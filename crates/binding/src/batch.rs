@@ -6,7 +6,7 @@
 use holdfast_memory::{Access, Area, Memory as Core, Refusal, Refused, Write};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyList, PyString};
+use pyo3::types::{PyList, PyString, PyTuple};
 
 use crate::memory::{Memory, Unfit, integer, is_text, item};
 
@@ -24,10 +24,15 @@ struct Pending<'py> {
     address: u16,
     count: usize,
     values: Bound<'py, PyList>,
+    /// Whether it is granted only while the memory is sealed.
+    restores: bool,
 }
 
+type Place<'py> = (Bound<'py, Memory>, Bound<'py, PyString>, Bound<'py, PyAny>);
+
 /// Writes to several memories atomically. Returns the number of values written, and the sequence of the
-/// step if a log has carried it out. `before` receives whether a journal carries out the writes.
+/// step if a log has carried it out. `before` receives whether the writes can still be refused: by a
+/// journal, or because a memory is not sealed.
 #[pyfunction]
 #[pyo3(signature = (writes, before=None))]
 pub fn write_across(
@@ -50,22 +55,20 @@ pub fn write_across(
         packed.push((&write.memory.get().core, write.packed(command, bytes)?));
     }
     let refused = |refused: Refused| refusal(py, refused.index, None, reason(refused.refusal));
+    // A batch is one step, so one write that requires a seal requires it of all memories.
+    let restores = pending.iter().any(|write| write.restores);
+    let access = if restores { Access::Restore } else { Access::Ingest };
     if let Some(before) = before {
-        holdfast_memory::check_across(Access::Ingest, &packed).map_err(refused)?;
-        before.call1((packed.iter().any(|(memory, _)| memory.has_journal()),))?;
+        holdfast_memory::check_across(access, &packed).map_err(refused)?;
+        before.call1((restores || packed.iter().any(|(memory, _)| memory.has_journal()),))?;
     }
-    let sequence = py.detach(|| holdfast_memory::write_across(Access::Ingest, &packed));
+    let sequence = py.detach(|| holdfast_memory::write_across(access, &packed));
     Ok((pending.iter().map(|write| write.count).sum(), sequence.map_err(refused)?))
 }
 
 impl<'py> Pending<'py> {
     fn new(command: usize, write: &Bound<'py, PyAny>) -> PyResult<Pending<'py>> {
-        let (memory, area, address, values): (
-            Bound<'py, Memory>,
-            Bound<'py, PyString>,
-            Bound<'py, PyAny>,
-            Bound<'py, PyAny>,
-        ) = write.extract()?;
+        let ((memory, area, address), values, restores) = parts(write)?;
         let refused = |reason| Err(refusal(write.py(), command, None, reason));
         let Some(area) = Area::from_name(area.to_str()?) else { return refused("invalid_area") };
         let values = match values.cast_into_exact::<PyList>() {
@@ -84,7 +87,7 @@ impl<'py> Pending<'py> {
         let Some(address) = address.filter(|address| span.holds(*address, count)) else {
             return refused("out_of_range");
         };
-        Ok(Pending { memory, area, address, count, values })
+        Ok(Pending { memory, area, address, count, values, restores })
     }
 
     /// Checks the values and packs them into `bytes`.
@@ -109,6 +112,16 @@ impl<'py> Pending<'py> {
         }
         Ok(Write { area, address, count, bytes })
     }
+}
+
+/// The parts of a write. The last one can be left out.
+fn parts<'py>(write: &Bound<'py, PyAny>) -> PyResult<(Place<'py>, Bound<'py, PyAny>, bool)> {
+    if write.cast::<PyTuple>()?.len() == 5 {
+        let (memory, area, address, values, restores) = write.extract()?;
+        return Ok(((memory, area, address), values, restores));
+    }
+    let (memory, area, address, values) = write.extract()?;
+    Ok(((memory, area, address), values, false))
 }
 
 /// Lists the items of an iterable. `None` if it is not iterable, or is text or bytes.
@@ -138,6 +151,7 @@ fn refusal(py: Python<'_>, command: usize, index: Option<usize>, reason: &'stati
 const fn reason(refusal: Refusal) -> &'static str {
     match refusal {
         Refusal::Sealed => "sealed",
+        Refusal::Unsealed => "unsealed",
         Refusal::OutOfRange => "out_of_range",
         Refusal::GateBit => "gate_bit",
         Refusal::WrongLength => "wrong_length",

@@ -283,6 +283,7 @@ impl LogFollower {
             Access::Client => "client",
             Access::Ingest => "ingest",
             Access::Mirror => "mirror",
+            Access::Restore => "restore",
         };
         shown.set_item("access", access)?;
         let name = |member: u16| &self.names[usize::from(member)];

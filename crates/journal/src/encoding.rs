@@ -40,6 +40,7 @@ pub fn encode(step: &Step, out: &mut Vec<u8>) {
         Access::Client => 0,
         Access::Ingest => 1,
         Access::Mirror => 2,
+        Access::Restore => 3,
     });
     match &step.action {
         Action::Write(writes) => {
@@ -100,6 +101,7 @@ pub fn decode(bytes: &[u8], members: &[Arc<Memory>]) -> Result<Step, DecodeError
         0 => Access::Client,
         1 => Access::Ingest,
         2 => Access::Mirror,
+        3 => Access::Restore,
         found => return Err(DecodeError::Unknown { what: "the access", found }),
     };
     let action = match rest.byte()? {

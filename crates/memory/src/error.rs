@@ -20,6 +20,8 @@ pub enum LayoutError {
 pub enum Refusal {
     #[error("the memory is sealed")]
     Sealed,
+    #[error("the memory is not sealed, and the source writes only while it is")]
+    Unsealed,
     #[error("the range is outside the area")]
     OutOfRange,
     #[error("the gate bit can't be written by a client")]

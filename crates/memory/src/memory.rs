@@ -223,7 +223,7 @@ impl Memory {
     /// Whether the seal and the journal admit an access.
     #[inline]
     fn admit(&self, content: &Content, access: Access) -> Result<(), Refusal> {
-        if content.door == 0 { Ok(()) } else { self.judge(content, access) }
+        if content.is_open_to(access) { Ok(()) } else { self.judge(content, access) }
     }
 
     #[inline(never)]
@@ -336,7 +336,7 @@ impl Memory {
     pub fn read(&self, access: Access, read: Read<'_>) -> Result<(), Refusal> {
         let offset = self.readable(&read);
         let content = self.shared();
-        if content.door != 0 {
+        if !content.is_open_to(access) {
             self.judge_read(&content, access, (read.area, read.address, read.count), offset)?;
         }
         content.copy_out(offset?, read);
@@ -421,8 +421,8 @@ impl Memory {
     /// Writes one range atomically.
     ///
     /// # Errors
-    /// [`Refusal::Sealed`] (for a client), then `WrongLength`, `OutOfRange`, `GateBit`, `Mirrored`,
-    /// `Stale`. Nothing has changed then.
+    /// [`Refusal::Sealed`] (for a client) or [`Refusal::Unsealed`] (for [`Access::Restore`]), then
+    /// `WrongLength`, `OutOfRange`, `GateBit`, `Mirrored`, `Stale`. Nothing has changed then.
     pub fn write(&self, access: Access, write: Write<'_>) -> Result<(), Refusal> {
         self.write_many(access, &[write]).map_err(|refused| refused.refusal)
     }
@@ -686,9 +686,19 @@ impl Content {
         self.door = self.door & !SEALED | if sealed { SEALED } else { 0 };
     }
 
-    /// Whether the seal admits a write.
+    /// Whether an access needs no further judgement.
+    const fn is_open_to(&self, access: Access) -> bool {
+        self.door == 0 && !matches!(access, Access::Restore)
+    }
+
+    /// Whether the seal admits an access. Called with the lock under which the write is carried out, so
+    /// no write is judged by a seal that has changed since.
     fn admit(&self, access: Access) -> Result<(), Refusal> {
-        if self.sealed() && access == Access::Client { Err(Refusal::Sealed) } else { Ok(()) }
+        match (access, self.sealed()) {
+            (Access::Client, true) => Err(Refusal::Sealed),
+            (Access::Restore, false) => Err(Refusal::Unsealed),
+            _ => Ok(()),
+        }
     }
 
     /// Counts a write that was carried out, and passes it to the observers.
@@ -718,7 +728,8 @@ impl Content {
 /// # Errors
 /// `WrongLength`, `OutOfRange` or `GateBit`, with the index of the first write that fails one of
 /// these checks. Then [`Refusal::NotOneStep`] where a memory has another journal than the first, and
-/// [`Refusal::Sealed`] (for a client), with the index of the first write to a sealed memory. Nothing
+/// [`Refusal::Sealed`] (for a client), with the index of the first write to a sealed memory, or
+/// [`Refusal::Unsealed`] (for [`Access::Restore`]), with that of the first one to another memory. Nothing
 /// has changed then. If the memories have a journal, see also [`Journal::submit`].
 pub fn write_across(
     access: Access,
@@ -796,7 +807,7 @@ fn write_checked(
 /// Checks what [`write_across`] checks before it takes the locks: everything but seals and journals.
 ///
 /// # Errors
-/// As [`write_across`], without [`Refusal::Sealed`] and [`Refusal::NotOneStep`].
+/// As [`write_across`], without [`Refusal::Sealed`], [`Refusal::Unsealed`] and [`Refusal::NotOneStep`].
 pub fn check_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
     for (index, (memory, write)) in writes.iter().enumerate() {
         memory

@@ -9,6 +9,8 @@ pub enum Access {
     Client,
     /// A source of data. It ignores the seal and can open it.
     Ingest,
+    /// A source of data that a memory admits only while it is sealed. It can open the seal.
+    Restore,
     /// A source of data that alone writes the mirrored ranges.
     Mirror,
 }

@@ -83,7 +83,11 @@ impl Model {
     }
 
     fn admit(&self, access: Access) -> Result<(), Refusal> {
-        if self.sealed && access == Access::Client { Err(Refusal::Sealed) } else { Ok(()) }
+        match access {
+            Access::Client if self.sealed => Err(Refusal::Sealed),
+            Access::Restore if !self.sealed => Err(Refusal::Unsealed),
+            _ => Ok(()),
+        }
     }
 
     fn read(
@@ -126,7 +130,7 @@ impl Model {
                 self.areas[*area as usize].insert(address + index as u16, value);
             }
         }
-        if let (Access::Ingest, Some(gate)) = (access, self.gate) {
+        if let (Access::Ingest | Access::Restore, Some(gate)) = (access, self.gate) {
             let open = self.areas[gate.area as usize][&gate.address] == 1;
             self.sealed = !open && (gate.mode == GateMode::Level || self.sealed);
         }
@@ -218,7 +222,7 @@ fn a_range() -> impl Strategy<Value = (Area, u16, usize)> {
 }
 
 fn an_access() -> impl Strategy<Value = Access> {
-    prop_oneof![Just(Access::Client), Just(Access::Ingest)]
+    prop_oneof![Just(Access::Client), Just(Access::Ingest), Just(Access::Restore)]
 }
 
 fn some_values() -> impl Strategy<Value = Values> {

@@ -36,7 +36,8 @@ pub const DONE: u8 = 0x00;
 /// The reply to a packet that was not written.
 pub const REFUSED: u8 = 0x01;
 
-const MAGIC: [u8; 2] = *b"RI";
+/// The first two bytes of a packet. The transaction id of a Modbus frame can be the same.
+pub const MAGIC: [u8; 2] = *b"RI";
 const VERSION: u8 = 1;
 
 /// The longest header, in bytes.

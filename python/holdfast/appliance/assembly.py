@@ -24,6 +24,7 @@ from holdfast.config import (
     RawIngestListener,
     SecureRawRuleConfig,
 )
+from holdfast.config.listeners import STRICT
 from holdfast.config.rights import items, together, unit_rights
 from holdfast.config.route_checks import routed
 from holdfast.config.scalars import MAX_TIME
@@ -221,20 +222,21 @@ def listener(
                 rs485=line.rs485,
             )
         case RawIngestListener():
+            compat = settings.compat or STRICT
             return _core.Listener.raw_ingest(
                 name,
                 str(settings.bind),
                 [_raw_rule(rule, config, memories) for rule in settings.rules],
                 format=settings.format,
-                crc=settings.crc or "required",
-                flags=settings.flags or "strict",
+                crc=compat.crc or "required",
+                flags=compat.flags or "strict",
                 max_connections=settings.max_connections,
                 max_connections_per_source=settings.max_connections_per_source,
                 when_full=settings.when_full,
                 request_timeout=settings.request_timeout,
-                packets=settings.packets,
+                packets=compat.packets or "one",
                 idle_timeout=settings.idle_timeout or MAX_TIME,
-                after_refusal=settings.after_refusal,
+                after_refusal=compat.after_refusal or "close",
                 tls=None if settings.tls is None else server_tls(settings.tls),
                 max_handshakes=settings.max_handshakes or _HANDSHAKES,
             )
@@ -249,17 +251,18 @@ def _shared_port(
     if not isinstance(settings, ModbusTcpListener) or settings.raw_ingest is None:
         return None
     part = settings.raw_ingest
+    compat = part.compat or STRICT
     return _core.Listener.raw_ingest(
         name,
         str(settings.bind),
         [_raw_rule(rule, config, memories) for rule in part.rules],
         format=part.format,
-        crc=part.crc or "required",
-        flags=part.flags or "strict",
+        crc=compat.crc or "required",
+        flags=compat.flags or "strict",
         request_timeout=settings.request_timeout,
-        packets=part.packets,
+        packets=compat.packets or "one",
         idle_timeout=settings.idle_timeout or MAX_TIME,
-        after_refusal=part.after_refusal,
+        after_refusal=compat.after_refusal or "close",
     )
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.cli.configuration import WRONG, show_problems
+from holdfast.cli.places import areas_of
 from holdfast.cli.suggesting import SuggestingGroup
 from holdfast.config import ConfigError
 from holdfast.importing import ORDINALS, NotImportable, read_mma, read_replicator
@@ -20,8 +21,13 @@ if TYPE_CHECKING:
 
     from holdfast.config import Problem
     from holdfast.importing import Imported, Note
+    from holdfast.types import Area
 
 FAILED = 1
+
+
+def _areas(_context: click.Context, _parameter: click.Parameter, text: str) -> tuple[Area, ...]:
+    return areas_of(text) if text else ()
 
 
 def _common(command: Callable[..., None]) -> Callable[..., None]:
@@ -58,6 +64,20 @@ def import_() -> None:
     is_flag=True,
     help="Keep REST tokens that are in the documentation of the source.",
 )
+@click.option(
+    "--grant-rest",
+    metavar="AREA[,AREA]",
+    default="",
+    callback=_areas,
+    help="Areas that REST may write too, such as holding_registers.",
+)
+@click.option(
+    "--grant-mqtt",
+    metavar="AREA[,AREA]",
+    default="",
+    callback=_areas,
+    help="The same for MQTT.",
+)
 def mma(
     file: Path,
     output: Path | None,
@@ -65,6 +85,8 @@ def mma(
     as_json: bool,
     as_meant: bool,
     keep_published_tokens: bool,
+    grant_rest: tuple[Area, ...],
+    grant_mqtt: tuple[Area, ...],
 ) -> None:
     """Convert FILE, a configuration of the Modbus Memory Appliance, to a Holdfast configuration.
 
@@ -74,7 +96,13 @@ def mma(
     """
 
     def read() -> Imported:
-        return read_mma(file, as_meant=as_meant, keep_published_tokens=keep_published_tokens)
+        return read_mma(
+            file,
+            as_meant=as_meant,
+            keep_published_tokens=keep_published_tokens,
+            grant_rest=grant_rest,
+            grant_mqtt=grant_mqtt,
+        )
 
     _convert(read, file, output, force, as_json)
 

@@ -65,7 +65,7 @@ def _receiver(text: str) -> Receiver:
 @click.option(
     "--no-crc",
     is_flag=True,
-    help="With --memory-id: omit the CRC, for a listener with `crc: none`.",
+    help="With --memory-id: omit the CRC, for a listener with `compat: {crc: none}`.",
 )
 @click.option(
     "--file",

@@ -33,6 +33,17 @@ class GrantChecks:
         """Checks the `memories` and `areas` of a grant."""
         self.memories((*path, "memories"), grant.get("memories"))
         self.areas((*path, "areas"), grant.get("areas"))
+        self._while_sealed((*path, "while_sealed"), grant)
+
+    def _while_sealed(self, path: KeyPath, grant: dict[Any, Any]) -> None:
+        self.areas(path, grant.get("while_sealed"))
+        for index, area in enumerate(entries(grant.get("while_sealed"))):
+            if area in entries(grant.get("areas")):
+                message = f"found {show(area)}, allowed: an area that is not in areas"
+                self.report.add((*path, index), message)
+        if "while_sealed" in grant and grant.get("access") == "read-only":
+            message = "found with access: read-only, allowed: only with read-write"
+            self.report.add(path, message, of_key=True)
 
     def memories(self, path: KeyPath, names: object) -> None:
         """Checks a list of memories."""
@@ -58,6 +69,7 @@ class WriterGrant(NamedTuple):
     memories: Sequence[str]
     areas: Sequence[Area]
     writes: bool
+    while_sealed: Sequence[Area] = ()
 
 
 def grants(config: Config) -> Iterator[WriterGrant]:
@@ -75,11 +87,14 @@ def grants(config: Config) -> Iterator[WriterGrant]:
     if config.rest is not None and config.rest.tokens != "none":
         for index, token in enumerate(config.rest.tokens):
             writes = token.access == "read-write"
-            yield WriterGrant(("rest", "tokens", index), token.memories, token.areas, writes)
+            path = ("rest", "tokens", index)
+            sealed = token.while_sealed or ()
+            yield WriterGrant(path, token.memories, token.areas, writes, sealed)
     if config.mqtt is not None:
         for index, topic in enumerate(config.mqtt.subscriptions):
             path = ("mqtt", "subscriptions", index)
-            yield WriterGrant(path, topic.memories, topic.areas, writes=True)
+            sealed = topic.while_sealed or ()
+            yield WriterGrant(path, topic.memories, topic.areas, True, sealed)
         for index, mapped in enumerate(config.mapped().values()):
             path = ("mqtt", "map", index)
             yield WriterGrant(path, [mapped.memory], [mapped.tag.area], writes=True)
@@ -96,6 +111,7 @@ def doubt_grants(config: Config, report: Report) -> None:
             if area not in there:
                 message = f"{area} has no effect: {_have(grant.memories)} no such area"
                 report.doubt((*grant.path, "areas", index), message)
+        _doubt_while_sealed(config, grant, report)
     if config.rest is not None and config.rest.tokens == "none":
         return  # Every REST client may write everything, including the gate bits.
     for name, memory in config.memories.items():
@@ -103,13 +119,23 @@ def doubt_grants(config: Config, report: Report) -> None:
         if seal is not None and not (
             _reads_into(config, name, seal)
             or any(
-                grant.writes and name in grant.memories and seal.area in grant.areas
+                grant.writes
+                and name in grant.memories
+                and seal.area in (*grant.areas, *grant.while_sealed)
                 for grant in grants(config)
             )
         ):
             writers = "raw-ingest rule, token, subscription, adapter or device"
             message = f"can never be opened: no {writers} may write {seal.area} of {name}"
             report.doubt(("memories", name, "seal"), message)
+
+
+def _doubt_while_sealed(config: Config, grant: WriterGrant, report: Report) -> None:
+    sealed = [config.memories[name] for name in grant.memories if config.memories[name].seal]
+    for index, area in enumerate(grant.while_sealed):
+        if not any(area in memory.areas() for memory in sealed):
+            message = f"{area} has no effect: none of its memories with a seal has this area"
+            report.doubt((*grant.path, "while_sealed", index), message)
 
 
 def _reads_into(config: Config, memory: str, gate: Seal) -> bool:

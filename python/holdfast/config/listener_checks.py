@@ -30,6 +30,9 @@ _NAMING = {"v1": "units", "crc": "memories"}
 """The key with which a raw ingest rule names memories, by packet format."""
 _REMOVED = ("max_requests_per_source", "max_writes_per_source")
 """Former keys of listeners, whose null was what always holds now."""
+_RELAXED = {"packets": "many", "after_refusal": "continue", "crc": "none", "flags": "ignore"}
+"""What relaxes the raw ingest protocol, with the only value of each key. They were keys of the
+listener itself before."""
 
 
 @dataclass
@@ -114,17 +117,18 @@ class ListenerChecks:
         doubt_order(self._rules(path, part), "raw-ingest", self.report)
 
     def _raw(self, path: KeyPath, listener: dict[Any, Any]) -> None:
+        for key, relaxed in _RELAXED.items():
+            if key in listener:
+                message = f"moved, {_place(key, relaxed, listener[key])}"
+                self.report.settle((*path, key), message, of_key=True)
+        compat, path = mapping(listener.get("compat")), (*path, "compat")
         for key in ("crc", "flags"):
-            if key in listener and listener.get("format", "v1") == "v1":
+            if key in compat and listener.get("format", "v1") == "v1":
                 message = "found with format v1, allowed: only with format crc"
-                self.report.add((*path, key), message, of_key=True)
-        if listener.get("crc") == "if-present":
-            allowed = "allowed: required, if all senders send a CRC, otherwise none"
-            message = f"found 'if-present', which was removed, {allowed}"
-            self.report.settle((*path, "crc"), message)
-        if listener.get("after_refusal") == "continue" and listener.get("packets", "one") == "one":
-            message = "found continue with packets: one, allowed: close, or packets: many"
-            self.report.add((*path, "after_refusal"), message)
+                self.report.settle((*path, key), message, of_key=True)
+        if "after_refusal" in compat and "packets" not in compat:
+            message = "found without packets: many, allowed: only with it"
+            self.report.settle((*path, "after_refusal"), message, of_key=True)
 
     def _secure_raw(self, path: KeyPath, listener: dict[Any, Any]) -> None:
         """Checks keys of a raw ingest listener that belong to TLS."""
@@ -166,3 +170,13 @@ class ListenerChecks:
             if isinstance(memory, dict) and "id" not in memory:
                 message = f"found {show(name)}, which has no id, allowed: a memory with an id"
                 self.report.add((*path, index), message)
+
+
+def _place(key: str, relaxed: str, found: object) -> str:
+    """What to write in place of a former key of a listener."""
+    where = f"compat: {{{key}: {relaxed}}}"
+    if found == relaxed:
+        return f"allowed: {where}"
+    if (key, found) == ("crc", "if-present"):
+        return f"allowed: no key, if all senders send a CRC, otherwise {where}"
+    return f"allowed: no key for the strict protocol, otherwise {where}"

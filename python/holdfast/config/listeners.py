@@ -196,14 +196,6 @@ class _ConnectionListener(Model):
     """For each unit id, the first rule whose sources contain the peer and that names it applies."""
 
 
-def _crc(data: dict[str, Any]) -> Literal["required"] | None:
-    return "required" if data["format"] == "crc" else None
-
-
-def _flags(data: dict[str, Any]) -> Literal["strict"] | None:
-    return "strict" if data["format"] == "crc" else None
-
-
 def _handshakes(data: dict[str, Any]) -> int:
     most: int = data["max_connections"]
     return max(256, most)
@@ -213,22 +205,33 @@ def _secure_handshakes(data: dict[str, Any]) -> int | None:
     return None if data.get("tls") is None else _handshakes(data)
 
 
+class RawCompatConfig(Model):
+    """What old senders need that the locked raw ingest protocol does not allow."""
+
+    packets: Annotated[Literal["many"] | None, NotNull()] = None
+    """many: a connection carries packets until the sender closes, or one is refused. Default: one
+    packet."""
+    after_refusal: Annotated[Literal["continue"] | None, NotNull()] = None
+    """With packets: many. continue: after a refused packet whose header and CRC are valid, the next
+    packet is read. Default: the connection ends."""
+    crc: Annotated[Literal["none"] | None, NotNull()] = None
+    """Format crc. none: packets have no CRC; what follows the payload is not part of the packet.
+    Default: a CRC is required."""
+    flags: Annotated[Literal["ignore"] | None, NotNull()] = None
+    """Format crc. ignore: flags and the reserved byte may be anything. Default: they must be 0."""
+
+
+STRICT = RawCompatConfig()
+"""The raw ingest protocol as it is specified."""
+
+
 class RawIngestConfig(Model):
     """Raw ingest packets on the port of a Modbus TCP server: the first bytes decide."""
 
     format: Literal["v1", "crc"] = "v1"
     """v1: a 10-byte header with a unit id; crc: a 12-byte header with a memory id, and a CRC."""
-    crc: Annotated[Literal["required", "none"] | None, NotNull()] = Field(default_factory=_crc)
-    """Format crc: whether packets end with a CRC. none: what follows the payload is not part of the
-    packet. Default: required."""
-    flags: Annotated[Literal["strict", "ignore"] | None, NotNull()] = Field(default_factory=_flags)
-    """Format crc: strict, flags and the reserved byte must be 0; ignore: may be anything. Default:
-    strict."""
-    packets: Literal["one", "many"] = "one"
-    """Packets that a connection carries; many: until the sender closes, or one is refused."""
-    after_refusal: Literal["close", "continue"] = "close"
-    """With packets: many, after a refused packet whose header and CRC are valid: close ends the
-    connection; continue reads the next packet."""
+    compat: Annotated[RawCompatConfig | None, NotNull()] = None
+    """What old senders need that the protocol does not allow. Default: the strict protocol."""
     rules: Annotated[tuple[RawRuleConfig, ...], Strict(False), Field(min_length=1)]
     """The first rule whose sources contain the sender applies."""
 
@@ -399,12 +402,6 @@ class RawIngestListener(Model):
     """The protocol."""
     format: Literal["v1", "crc"] = "v1"
     """v1: a 10-byte header with a unit id; crc: a 12-byte header with a memory id, and a CRC."""
-    crc: Annotated[Literal["required", "none"] | None, NotNull()] = Field(default_factory=_crc)
-    """Format crc: whether packets end with a CRC. none: what follows the payload is not part of the
-    packet. Default: required."""
-    flags: Annotated[Literal["strict", "ignore"] | None, NotNull()] = Field(default_factory=_flags)
-    """Format crc: strict, flags and the reserved byte must be 0; ignore: may be anything. Default:
-    strict."""
     bind: BindAddress
     """Where to listen: an IP address and a port."""
     tls: Annotated[ServerTlsConfig | None, NotNull()] = None
@@ -425,13 +422,10 @@ class RawIngestListener(Model):
     request_timeout: Duration = 10.0
     """Seconds from the start of a connection to the last byte of its packet; with tls, also for the
     handshake, before that."""
-    packets: Literal["one", "many"] = "one"
-    """Packets that a connection carries; many: until the sender closes, or one is refused."""
-    after_refusal: Literal["close", "continue"] = "close"
-    """With packets: many, after a refused packet whose header and CRC are valid: close ends the
-    connection; continue reads the next packet."""
+    compat: Annotated[RawCompatConfig | None, NotNull()] = None
+    """What old senders need that the protocol does not allow. Default: the strict protocol."""
     idle_timeout: DurationOrZero = 300.0
-    """With packets: many, seconds without a packet after which a connection is closed; 0:
+    """With compat: {packets: many}, seconds without a packet after which a connection is closed; 0:
     unlimited."""
     rules: Annotated[tuple[SecureRawRuleConfig, ...], Strict(False), Field(min_length=1)]
     """The first rule that matches the sender applies: its sources and, with tls, its roles."""

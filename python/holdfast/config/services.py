@@ -82,6 +82,8 @@ class TokenConfig(GatewayTokenConfig):
     """The areas it can access."""
     access: Access
     """Whether it may write."""
+    while_sealed: Annotated[Areas | None, NotNull()] = None
+    """Areas that it may also write, but not read, while their memory is sealed. Default: none."""
     manage: bool = False
     """Whether it may list and end the connections of listeners."""
 
@@ -164,6 +166,8 @@ class SubscriptionConfig(Model):
     """The memories that messages may write."""
     areas: Areas
     """The areas that messages may write."""
+    while_sealed: Annotated[Areas | None, NotNull()] = None
+    """Areas that messages may also write while their memory is sealed. Default: none."""
 
 
 class BrokerConfig(Model):

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from holdfast.types import AREAS
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable
+
+    from holdfast.types import Area
 
 _INGEST = {"discrete_inputs", "input_registers"}
 """The areas that REST and MQTT could write in the source."""
@@ -39,15 +44,21 @@ class Draft:
         there = {area for name in memories for area in self.memories[name]}
         return {"memories": memories, "areas": [area for area in AREAS if area in there]}
 
-    def ingest_grant(self) -> dict[str, Any]:
+    def ingest_grant(self, more: Iterable[Area] = ()) -> dict[str, Any]:
         """A grant of what REST and MQTT may write, for the memories that have some of it.
 
-        Empty if no memory has these areas.
+        That is what they could write, and `more` areas. Empty if no memory has these areas.
         """
-        names = [name for name, memory in self.memories.items() if _INGEST & memory.keys()]
+        ingested = _INGEST | set(more)
+        names = [name for name, memory in self.memories.items() if ingested & memory.keys()]
         grant = self.grant(names)
-        areas = [area for area in grant["areas"] if area in _INGEST]
+        areas = [area for area in grant["areas"] if area in ingested]
         return {**grant, "areas": areas} if areas else {}
+
+    def restored(self, granted: Collection[str]) -> list[Area]:
+        """The areas that MQTT could also write while their memory was sealed, to restore it."""
+        there = {area for name in self.seals for area in self.memories[name]}
+        return [area for area in AREAS if area in there and area not in granted]
 
     def raw_ingest_may_open(self, memory: str) -> bool:
         """Whether a listener takes Raw Ingest packets for a memory: they may write all areas."""

@@ -18,22 +18,30 @@ from holdfast.importing.mma_second import TOP_REASONS, SecondGeneration
 from holdfast.importing.sections import Section
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from holdfast.importing.notes import Desk
+    from holdfast.types import Area
 
 _FIRST = ("memory", "routing", "ports")
 _SECOND = "listeners"
 
 
 def read_mma(
-    path: Path | str, *, as_meant: bool = False, keep_published_tokens: bool = False
+    path: Path | str,
+    *,
+    as_meant: bool = False,
+    keep_published_tokens: bool = False,
+    grant_rest: Sequence[Area] = (),
+    grant_mqtt: Sequence[Area] = (),
 ) -> Imported:
     """Converts a configuration of either generation.
 
     The source ignores some keys. By default, the result does what it did; with `as_meant`, these
     keys have an effect. Tokens that its documentation publishes are left out, unless
-    `keep_published_tokens` is set.
+    `keep_published_tokens` is set. REST and MQTT may write the areas that they could write, and
+    those of `grant_rest` and `grant_mqtt`.
 
     Raises `ConfigError` with every problem that prevents the import.
     """
@@ -41,7 +49,8 @@ def read_mma(
     desk, draft = read.desk, Draft()
     generation = _generation(desk) if read.is_mapping() else None
     if generation is not None:
-        _read(desk, draft, generation, Choices(as_meant, keep_published_tokens))
+        choices = Choices(as_meant, keep_published_tokens, grant_rest, grant_mqtt)
+        _read(desk, draft, generation, choices)
         if not (draft.listeners or draft.rest or draft.mqtt or desk.report.problems):
             desk.problem((), "nothing to serve, allowed: at least one listener, REST or MQTT")
     read.finish()
@@ -74,6 +83,6 @@ def _read(desk: Desk, draft: Draft, generation: Generation, choices: Choices) ->
     if generation == 1:
         FirstGeneration(desk, draft, binds, admitted, choices).read(root)
     else:
-        SecondGeneration(desk, draft, binds, admitted).read(root)
+        SecondGeneration(desk, draft, binds, admitted, choices).read(root)
     Adapters(desk, draft, binds, admitted, choices).read(root)
     root.close(TOP_REASONS if generation == 2 else None)

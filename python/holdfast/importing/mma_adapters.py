@@ -18,6 +18,8 @@ from holdfast.net.addresses import LOOPBACK
 from holdfast.protocol import MAX_WORD
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from holdfast.config.ip_addresses import Bind
     from holdfast.config.source import KeyPath
     from holdfast.importing.binds import Binds
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from holdfast.importing.draft import Draft
     from holdfast.importing.notes import Desk
     from holdfast.importing.sections import Section
+    from holdfast.types import Area
 
 SHORT = 16
 """Secrets with fewer characters can be guessed."""
@@ -35,10 +38,6 @@ QOS = 0
 _SCHEMES = {"tcp": "mqtt", "mqtt": "mqtt", "ssl": "mqtts", "tls": "mqtts", "mqtts": "mqtts"}
 _BROKER = re.compile(
     r"((?P<scheme>[A-Za-z]{1,8})://)?(?P<user>.*@)?(?P<host>[^/?#@]+)(?P<more>([/?#].*)?)"
-)
-_INGEST_TOLD = (
-    "may write discrete inputs and input registers of all memories, as it ran; list only those"
-    " that it needs"
 )
 
 INGEST_TOKEN = "INGEST_ONLY_TOKEN"
@@ -135,7 +134,7 @@ class Adapters:
         """The tokens; empty without authentication, `None` if no client could have access."""
         auth = rest.mapping("auth")
         if auth is None:
-            return self._token_list(rest, []) if self._keeps_ingest_token else []
+            return self._published(rest)
         enabled = auth.flag("enabled")
         auth.word("type", ["bearer"], required=bool(enabled))
         bearer = auth.mapping("bearer", required=bool(enabled))
@@ -145,20 +144,31 @@ class Adapters:
         auth.close()
         if not enabled:
             self.desk.note("left out", auth.path, "not enabled")
-            return self._token_list(rest, []) if self._keeps_ingest_token else []
+            return self._published(rest)
         tokens = self._token_list(rest, entries)
         if not tokens:
             self.desk.note("left out", rest.path, "REST is left out: it has no usable token")
             return None
-        if self.draft.ingest_grant():
-            message = f"each token {_INGEST_TOLD}. To read other areas, create another token with"
-            self.desk.note("check", auth.path, f"{message} `holdfast token`")
-        else:
-            message = "no memory has discrete inputs or input registers, so each token only reads"
-            self.desk.note("check", auth.path, message)
+        self._tell_grant(auth.path)
         ran = "these tokens had no effect: one published token wrote, and reads failed"
         self.desk.note("check", auth.path, f"as it ran: {ran}; as it was meant: each has access")
         return tokens
+
+    def _published(self, rest: Section) -> list[dict[str, Any]]:
+        """The only token that the source accepted, if it is to be kept."""
+        tokens = self._token_list(rest, []) if self._keeps_ingest_token else []
+        if tokens:
+            self._tell_grant(rest.path)
+        return tokens
+
+    def _tell_grant(self, path: KeyPath) -> None:
+        if self.draft.ingest_grant(self.choices.grant_rest):
+            told = f"each token {_written('rest', self.choices.grant_rest)}. To read other areas,"
+            message = f"{told} create another token with `holdfast token`"
+            self.desk.note("check", path, message)
+        else:
+            message = "no memory has discrete inputs or input registers, so each token only reads"
+            self.desk.note("check", path, message)
 
     @property
     def _keeps_ingest_token(self) -> bool:
@@ -195,7 +205,10 @@ class Adapters:
             message = "the token of the documentation that the source always accepted is kept"
             self.desk.note("check", rest.path, f"{message}, as published; everybody knows it")
         names = unique_names(self.desk, list(found.values()))
-        grant: dict[str, Any] = {**self.draft.ingest_grant(), "access": "read-write"}
+        grant: dict[str, Any] = {
+            **self.draft.ingest_grant(self.choices.grant_rest),
+            "access": "read-write",
+        }
         if "memories" not in grant:
             grant = {**self.draft.grant(list(self.draft.memories)), "access": "read-only"}
         return [
@@ -222,13 +235,19 @@ class Adapters:
             message = f"no client_id: set to {CLIENT_ID}, which must be unique at the broker"
             self.desk.note("changed", mqtt.path, message)
         found["client_id"] = client_id or CLIENT_ID
-        grant = self.draft.ingest_grant()
+        grant = self.draft.ingest_grant(self.choices.grant_mqtt)
         if not grant:
             message = "MQTT is left out: no memory has discrete inputs or input registers, and"
             self.desk.note("left out", mqtt.path, f"{message} it could write nothing else")
             return
+        if restored := self.draft.restored(grant["areas"]):
+            grant["while_sealed"] = restored
+            told = f"as it ran, messages may also write {_areas(restored)} while their memory"
+            message = f"{told} is sealed, to restore it: while_sealed"
+            self.desk.note("check", mqtt.at("topic"), message)
         found["subscriptions"] = [{"topic": topic, "qos": QOS, **grant}]
-        self.desk.note("check", mqtt.at("topic"), f"the topic {_INGEST_TOLD}")
+        message = f"the topic {_written('mqtt', self.choices.grant_mqtt)}"
+        self.desk.note("check", mqtt.at("topic"), message)
         self.draft.mqtt = found
 
     def _is_topic(self, path: KeyPath, topic: str) -> bool:
@@ -294,10 +313,24 @@ class Adapters:
         sources = self._sources(raw, "Raw Ingest")
         if bind is None or not sources:
             return
-        listener: dict[str, Any] = {"type": "raw-ingest", "bind": str(bind)}
-        listener |= {"format": "crc", "crc": "none", "flags": "ignore", "packets": "many"}
+        listener: dict[str, Any] = {"type": "raw-ingest", "bind": str(bind), "format": "crc"}
+        listener["compat"] = {"crc": "none", "flags": "ignore", "packets": "many"}
         listener |= ADMISSION
         if timeout is not None:
             listener |= {"request_timeout": seconds(timeout), "idle_timeout": seconds(timeout)}
         listener["rules"] = [{"sources": sources, **self.draft.grant(memories)}]
         self.draft.listeners[free_name("raw-ingest", set(self.draft.listeners))] = listener
+
+
+def _areas(areas: Iterable[str]) -> str:
+    return " and ".join(area.replace("_", " ") for area in areas)
+
+
+def _written(adapter: str, granted: Sequence[Area]) -> str:
+    """What an adapter may write, for a note."""
+    option = f"--grant-{adapter}"
+    message = "may write discrete inputs and input registers of all memories, as it ran"
+    more = f", and {_areas(granted)}, by {option}" if granted else ""
+    example = f"as holding_registers in the example of its README: {option} AREA[,AREA]"
+    other = "" if granted else f". To grant other areas, {example}"
+    return f"{message}{more}; list only those that it needs{other}"

@@ -17,6 +17,7 @@ from holdfast.protocol import LAST_ADDRESS
 if TYPE_CHECKING:
     from holdfast.config.source import KeyPath
     from holdfast.importing.binds import Binds
+    from holdfast.importing.choices import Choices
     from holdfast.importing.draft import Draft
     from holdfast.importing.notes import Desk
     from holdfast.importing.peers import Peers
@@ -40,6 +41,11 @@ _MEMORY_REASONS = {
     "persistence": TOP_REASONS["persistence"],
 }
 _ALLOW = {"ro": functions.READING, "rw": functions.ALL, "wo": functions.WRITING_ONLY}
+_MEANT = {
+    "ro": "its peers may read",
+    "rw": "its peers may read and write",
+    "wo": "its peers may write",
+}
 BUSY = 6
 
 
@@ -61,6 +67,7 @@ class SecondGeneration:
     binds: Binds
     admitted: Peers | None
     """The peers that the filter of the whole file admits, `None` without a filter."""
+    choices: Choices
 
     def read(self, root: Section) -> None:
         """Reads all sections."""
@@ -157,7 +164,8 @@ class SecondGeneration:
         told = f"{message} policies are for Modbus only. List only the senders in the sources of"
         self.desk.note("check", listener.path, f"{told} raw_ingest, or remove raw_ingest")
         rule = {"sources": admitted.written(), "units": units, "areas": areas}
-        return {"packets": "many", "after_refusal": "continue", "rules": [rule]}
+        compat = {"packets": "many", "after_refusal": "continue"}
+        return {"compat": compat, "rules": [rule]}
 
     def _memory(self, memory: _Memory) -> Policy | None:
         one = memory.section
@@ -219,19 +227,33 @@ class SecondGeneration:
 
     def _allowed(self, rule: Section) -> frozenset[int]:
         codes = functions.read_codes(rule, "allow_fc")
-        word = rule.word("allow", list(_ALLOW))
-        if codes is not None and word is not None:
-            message = "found together with allow_fc, allowed: only one of them"
-            self.desk.problem(rule.at("allow"), message, of_key=True)
-        if codes is not None:
-            return frozenset(codes)
-        if word is None:
-            if rule.get("allow") is None:
-                message = "neither allow_fc nor allow: the rule allows nothing"
-                self.desk.note("check", rule.path, message)
+        if rule.get("allow") is not None:
+            meant = self._allow(rule, codes)
+            return meant if self.choices.as_meant else frozenset(codes or ())
+        if codes is None:
+            message = "neither allow_fc nor allow: the rule allows nothing"
+            self.desk.note("check", rule.path, message)
+        return frozenset(codes or ())
+
+    def _allow(self, rule: Section, codes: list[int] | None) -> frozenset[int]:
+        """What `allow` was meant to allow. The source did not read it, in none of its versions."""
+        path = rule.at("allow")
+        if not self.choices.as_meant:
+            nothing = "the rule allowed no function, and refused its peers"
+            ran = f"it had no effect: {nothing if codes is None else 'allow_fc decided'}"
+            meant = _MEANT.get(str(rule.get("allow")), "an error: it is not ro, rw or wo")
+            self.choices.note(self.desk, path, ran=ran, meant=meant)
             return frozenset()
+        word = rule.word("allow", list(_ALLOW))
+        if codes is not None:
+            message = "found together with allow_fc, allowed: only one of them"
+            self.desk.problem(path, message, of_key=True)
+        if word is None:
+            return frozenset()
+        ran = "it had no effect: the rule allowed no function, and refused its peers"
+        self.choices.note(self.desk, path, ran=ran, meant=_MEANT[word])
         if word == "wo":
             message = f"only functions {functions.spelled(_ALLOW[word])}, which write; 22 and 23"
             told = f"{message} also read. A rule has no other way to forbid reading"
-            self.desk.note("changed", rule.at("allow"), told)
+            self.desk.note("changed", path, told)
         return _ALLOW[word]

@@ -33,7 +33,8 @@ MAX_SHOWN = 40
 _KEYS = {"memory", "area", "address", "values"}
 _BOOLS_KEYS = {"memory", "area", "address", "bools"}
 
-Write: TypeAlias = "tuple[Memory, str, int, list[Any]]"
+Write: TypeAlias = "tuple[Memory, str, int, list[Any]] | tuple[Memory, str, int, list[Any], bool]"
+"""A write; the last item says that it is granted only while the memory is sealed."""
 
 
 class Refused(Exception):
@@ -70,6 +71,8 @@ class Grant:
     memories: Collection[str]
     areas: Collection[str]
     writes: bool = True
+    while_sealed: Collection[str] = ()
+    """Areas that may also be written while the memory is sealed, such as to restore them."""
 
 
 @dataclass(frozen=True)
@@ -291,9 +294,11 @@ class MemoryAccess:
             raise _unrecorded(batch[0] if single else None) from None
         except _core.BatchRefused as refused:
             command = batch[refused.command]
-            device = self._device(command) if single and refused.reason == "mirrored" else None
+            device = None
+            if single and refused.reason == "mirrored" and command["area"] in grant.areas:
+                device = self._device(command)
             if device is None:
-                error = self._refused(command, refused, None if single else refused.command)
+                error = self._refused(command, refused, grant, None if single else refused.command)
                 if refused.reason == "not_confirmed" and recording is not None:
                     recording.not_confirmed()
                     error.is_recorded = True
@@ -364,7 +369,11 @@ class MemoryAccess:
         memory, area, address = command["memory"], command["area"], command["address"]
         if type(memory) is not str or type(area) is not str or type(address) is not int:
             raise _malformed(index, _type_wrong(command))
-        target = self._granted(memory, area, address, grant, index)
+        restores = bool(grant.while_sealed) and self._restores(memory, area, grant)
+        if restores:
+            target = self.memories[memory]
+        else:
+            target = self._granted(memory, area, address, grant, index)
         if not grant.writes:
             where = _where(index, memory, area, address)
             raise Refused("not_granted", f"{grant.name} may not write", **where)
@@ -375,7 +384,18 @@ class MemoryAccess:
         if type(values) is not list:
             where = _where(index, memory, area, address)
             raise _malformed(index, f"values are {_shown(values)}, not an array", where)
-        return target, area, address, values
+        write = (target, area, address, values)
+        return (*write, True) if restores else write
+
+    def _restores(self, memory: str, area: str, grant: Grant) -> bool:
+        """Whether a write is granted only while the memory is sealed."""
+        return (
+            area in grant.while_sealed
+            and area not in grant.areas
+            and grant.writes
+            and memory in grant.memories
+            and memory in self.memories
+        )
 
     def _granted(
         self, memory: str, area: str, address: int, grant: Grant, index: int | None = None
@@ -396,7 +416,11 @@ class MemoryAccess:
         raise Refused("not_granted", f"{of}{detail}", **where)
 
     def _refused(
-        self, command: Mapping[str, Any], refused: _core.BatchRefused, index: int | None
+        self,
+        command: Mapping[str, Any],
+        refused: _core.BatchRefused,
+        grant: Grant,
+        index: int | None,
     ) -> Refused:
         """Converts a refusal of native code. Raises it again if no command can cause it."""
         memory, area, address = command["memory"], command["area"], command["address"]
@@ -410,6 +434,8 @@ class MemoryAccess:
                 found = f"{_of(index)}{len(values)} from address {_shown(address)} of {area}"
                 detail = f"{found} overlap a range that mirrors a device"
                 return Refused("mirrored", detail, **where)
+            case "unsealed":
+                return Refused("not_granted", f"{_of(index)}{_not_sealed(command, grant)}", **where)
             case "stale":
                 detail = f"{_of(index)}a range mirrors a device, and its values are too old"
                 return Refused("stale", detail, **where)
@@ -494,6 +520,13 @@ def _where(index: int | None, memory: str, area: str, address: int) -> dict[str,
         "area": area[:MAX_SHOWN],
         "address": address if -(2**63) < address < 2**63 else _shown(address),
     }
+
+
+def _not_sealed(command: Mapping[str, Any], grant: Grant) -> str:
+    memory, area = command["memory"], command["area"]
+    if area in grant.areas:
+        return f"{memory} is not sealed, which another command of the batch requires of all"
+    return f"area {area} is granted to {grant.name} only while {memory} is sealed"
 
 
 def _unrecorded(command: Mapping[str, Any] | None) -> Refused:

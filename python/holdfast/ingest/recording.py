@@ -13,8 +13,9 @@ if TYPE_CHECKING:
 class Recording:
     """Records commands that are carried out together.
 
-    Their lines are written before memory is. What a journal carries out is recorded after it: only
-    then the outcome is known, and the sequence in a log.
+    Their lines are written before memory is. What a journal carries out, and what is written only
+    while memory is sealed, is recorded after it: only then the outcome is known, and the sequence
+    in a log.
     """
 
     def __init__(
@@ -25,10 +26,13 @@ class Recording:
         self._lines = lines
         self._is_later = False
 
-    def begin(self, by_journal: bool) -> None:
-        """The commands are about to be carried out. Raises `Unrecorded`."""
-        self._is_later = by_journal
-        if by_journal:
+    def begin(self, is_later: bool) -> None:
+        """The commands are about to be carried out, or refused. Raises `Unrecorded`.
+
+        `is_later`: whether the outcome is known only later.
+        """
+        self._is_later = is_later
+        if is_later:
             self._audit.require()
         else:
             self._audit.write_first(self._lines({"outcome": "done"}))

@@ -27,5 +27,6 @@ pub(super) fn exception_of(refusal: Refusal) -> ExceptionCode {
             ExceptionCode::ServerDeviceFailure
         }
         Refusal::NotOneStep => unreachable!("a request writes to one memory"),
+        Refusal::Unsealed => unreachable!("clients never restore"),
     }
 }

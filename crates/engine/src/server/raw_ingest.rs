@@ -18,7 +18,7 @@ use std::task::ready;
 use std::time::Duration;
 
 use holdfast_memory::{Access, Area, Memory, Operation, Refusal as MemoryRefusal, Write};
-use holdfast_protocol::raw_ingest::{DONE, Format, Header, REFUSED, Refusal};
+use holdfast_protocol::raw_ingest::{DONE, Format, Header, MAGIC, REFUSED, Refusal};
 use ipnet::IpNet;
 use socket2::SockRef;
 use tokio::net::TcpStream;
@@ -44,10 +44,6 @@ use crate::tls::server::ServerTls;
 
 /// The most bytes that are needed to tell a packet from a Modbus frame.
 pub(crate) const DECISIVE: usize = 4;
-
-/// The bytes of a packet before its flags: magic and version. The third byte of a Modbus frame is that
-/// of its protocol id, 0.
-const BEFORE_FLAGS: usize = 3;
 
 /// Bytes per read of a new connection.
 const CHUNK: usize = 16 * 1024;
@@ -118,6 +114,25 @@ pub(crate) enum Beginning {
     SomethingElse,
     /// More bytes are needed.
     Unknown,
+}
+
+impl Beginning {
+    /// Tells by the first bytes. Behind the magic, a Modbus frame has its protocol id, which is 0. What
+    /// is not 0 there is the version of a packet and what follows it, which may be wrong: then the packet
+    /// is refused, so that its sender gets its reply.
+    pub(crate) fn of(bytes: &[u8]) -> Beginning {
+        let magic = &bytes[..bytes.len().min(MAGIC.len())];
+        let after = &bytes[magic.len()..];
+        if !MAGIC.starts_with(magic) {
+            Beginning::SomethingElse
+        } else if after.iter().take(2).any(|byte| *byte != 0) {
+            Beginning::Packet
+        } else if bytes.len() >= DECISIVE {
+            Beginning::SomethingElse
+        } else {
+            Beginning::Unknown
+        }
+    }
 }
 
 #[derive(Debug)]
@@ -245,21 +260,6 @@ impl RawIngest {
             request_timeout: settings.request_timeout,
             many,
             after_refusal,
-        }
-    }
-
-    /// Whether the first bytes of a connection are those of a packet. A Modbus frame never is: its
-    /// protocol id, bytes 3 and 4, is 0, and the third byte of a packet is its version, 1.
-    pub(crate) fn beginning(&self, bytes: &[u8]) -> Beginning {
-        let decisive = match (self.format, self.flags) {
-            (Format::Crc { .. }, Flags::Ignore) => BEFORE_FLAGS,
-            _ => DECISIVE,
-        };
-        match self.header(bytes) {
-            Err(Refusal::Magic | Refusal::Version | Refusal::Flags) => Beginning::SomethingElse,
-            Err(Refusal::Area) if bytes.len() <= DECISIVE => Beginning::SomethingElse,
-            _ if bytes.len() < decisive => Beginning::Unknown,
-            _ => Beginning::Packet,
         }
     }
 
@@ -964,8 +964,8 @@ mod tests {
     }
 
     /// Whether these bytes begin a packet; `None` if more are needed.
-    fn begins(raw: &RawIngest, bytes: &[u8]) -> Option<bool> {
-        match raw.beginning(bytes) {
+    fn begins(bytes: &[u8]) -> Option<bool> {
+        match Beginning::of(bytes) {
             Beginning::Packet => Some(true),
             Beginning::SomethingElse => Some(false),
             Beginning::Unknown => None,
@@ -973,29 +973,29 @@ mod tests {
     }
 
     #[test]
-    fn three_or_four_bytes_tell_packets_from_modbus_frames() {
-        let crc = Format::Crc { required: false };
-        for (format, flags) in
-            [(Format::V1, Flags::Strict), (crc, Flags::Strict), (crc, Flags::Ignore)]
-        {
-            let raw = listener(format, flags);
-            for transaction in [[0x52, 0x49], [0x52, 0x00], [0x00, 0x49], [0x00, 0x00]] {
-                let frame = [transaction[0], transaction[1], 0, 0];
-                let begins: Vec<_> = (0..=4).map(|len| begins(&raw, &frame[..len])).collect();
-                assert!(!begins.contains(&Some(true)), "{format:?}, {flags:?}, {frame:?}");
-                assert_eq!(begins[3], Some(false), "the protocol id has begun");
-            }
-            assert_eq!(begins(&raw, b"RI"), None);
-            let fourth = |byte| begins(&raw, &[b'R', b'I', 1, byte]);
-            let packets: Vec<u8> = (0..=255).filter(|byte| fourth(*byte) == Some(true)).collect();
-            match (format, flags) {
-                (Format::V1, _) => assert_eq!(packets, [1, 2, 3, 4]),
-                (_, Flags::Strict) => assert_eq!(packets, [0]),
-                (_, Flags::Ignore) => assert_eq!(packets.len(), 256),
-            }
-            let decided_by_three = (flags == Flags::Ignore).then_some(true);
-            assert_eq!(begins(&raw, b"RI\x01"), decided_by_three);
+    fn modbus_frames_are_told_from_packets_by_their_protocol_id() {
+        for transaction in 0..=u16::MAX {
+            let [high, low] = transaction.to_be_bytes();
+            assert_eq!(begins(&[high, low, 0, 0]), Some(false), "{transaction:04x}");
         }
+        for len in 0..4 {
+            assert_eq!(begins(&b"RI\0\0"[..len]), None, "{len} bytes");
+        }
+    }
+
+    #[test]
+    fn what_has_the_magic_and_no_protocol_id_is_a_packet_whatever_its_version_and_area() {
+        for version in 0..=255 {
+            for area in 0..=255 {
+                let packet = (version, area) != (0, 0);
+                assert_eq!(begins(&[b'R', b'I', version, area]), Some(packet));
+            }
+            assert_eq!(begins(&[b'R', b'I', version]), (version != 0).then_some(true));
+        }
+        assert_eq!(
+            (begins(b"rI\x01\x03"), begins(b"Ri"), begins(b"S")),
+            (Some(false), Some(false), Some(false))
+        );
     }
 
     /// A stream whose bytes arrive in these pieces. Then the peer closes its side.

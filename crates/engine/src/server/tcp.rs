@@ -193,7 +193,7 @@ impl ModbusStream {
         let peer = admitted.peer;
         let begun = Instant::now();
         loop {
-            match raw.beginning(&admitted.received) {
+            match Beginning::of(&admitted.received) {
                 Beginning::Unknown => {}
                 Beginning::SomethingElse => {
                     admitted.ticket.set_amid_packet(false);

@@ -23,7 +23,12 @@ class Filters:
 
     def __init__(self, subscriptions: Sequence[SubscriptionConfig]) -> None:
         self._grants = [
-            Grant(entry.topic, frozenset(entry.memories), frozenset(entry.areas))
+            Grant(
+                entry.topic,
+                frozenset(entry.memories),
+                frozenset(entry.areas),
+                while_sealed=frozenset(entry.while_sealed or ()),
+            )
             for entry in subscriptions
         ]
         self._matcher = MQTTMatcher()  # type: ignore[no-untyped-call]

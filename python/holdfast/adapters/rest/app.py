@@ -84,6 +84,7 @@ class App:
                 frozenset(token.memories),
                 frozenset(token.areas),
                 token.access == "read-write",
+                frozenset(token.while_sealed or ()),
             )
             for token in tokens
         }
