@@ -181,7 +181,11 @@ def table(original: Original, theirs: Answers, ours: Answers) -> str:
 
 def _cell(answer: object) -> str:
     text = json.dumps(answer, ensure_ascii=False).replace("|", "\\|")
-    return text if len(text) <= MAX_CELL_CHARS else f"{text[:MAX_CELL_CHARS]}… ({len(text)} characters)"
+    return (
+        text
+        if len(text) <= MAX_CELL_CHARS
+        else f"{text[:MAX_CELL_CHARS]}… ({len(text)} characters)"
+    )
 
 
 MAX_CELL_CHARS = 160

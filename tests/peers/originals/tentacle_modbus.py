@@ -113,7 +113,7 @@ def answers(run: Bench) -> Answers:
         _mark(run, number)
         coil = int(run.memory.read("coils", SCRATCH, 1)[0])
         found[f"command {id} {text!r}"] = [run.registers(SCRATCH, 4), coil]
-    return found | requests(run)
+    return found | several(run) | refusal(run) | requests(run)
 
 
 ON = ("true", "1")
@@ -124,6 +124,31 @@ def _mark(run: Bench, number: int) -> None:
     """Waits until the device has the mark, which is written after everything before it."""
     run.caller.publish("modbus.command.mark", str(number))
     wire.until(lambda: run.registers(MARK, 1) == [number], f"command {number} is carried out")
+
+
+def several(run: Bench) -> Answers:
+    """Returns what a command writes whose tag two devices have, each at its own address."""
+    for at, device in enumerate(("plc5", "plc6")):
+        twice = tag("twice", SCRATCH + at)
+        request = subscription(run.device, twice, tag(f"after_{device}", 0), deviceId=device)
+        run.reply("modbus.subscribe", request)
+        run.values(f"after_{device}")
+    run.memory.write("holding_registers", SCRATCH, [7] * 8)
+    run.caller.publish("modbus.command.twice", "5")
+    _mark(run, 999)
+    return {"command of a tag of two devices": run.registers(SCRATCH, 2)}
+
+
+def refusal(run: Bench) -> Answers:
+    """Returns whether a tag is published whose block has an address that the device refuses."""
+    tags = (tag("last", 999), tag("beyond", 1005), tag("bit", 0, "boolean", functionCode="coil"))
+    run.reply("modbus.subscribe", subscription(run.device, *tags, deviceId="plc7"))
+    found: dict[str, object] = {}
+    for value in (False, True, False, True):
+        # The bit is in a block of its own: what it shows comes with a scan of all blocks.
+        found |= run.values("bit")
+        run.memory.write("coils", 0, [value])
+    return {f"a block with a refused address: {id}": found.get(id) for id in ("last", "beyond")}
 
 
 def changes(run: Bench) -> Answers:
@@ -200,6 +225,16 @@ ONE_WORD = Reason(
     PAGE,
     "`CDAB` of an `int16` or `uint16` is always read as 0.",
 )
+SEVERAL = Reason(
+    "a wrong value must not reach a device",
+    PAGE,
+    "A command writes the first tag with this id, of any device.",
+)
+BLOCK = Reason(
+    "other tags keep their values",
+    PAGE,
+    "A failed block is left out. | Only the refused addresses are left out",
+)
 ORDER = Reason(
     "the error is visible",
     PAGE,
@@ -235,6 +270,10 @@ def differences() -> Iterator[Difference]:
             yield Difference(read, [0, "number"], [WORDS[0], "number"], ONE_WORD)
     accepted, refused = {"success": True, "count": 1}, {"success": False}
     yield Difference("subscribe, unknown byteOrder", accepted, refused, ORDER)
+
+    registers = [7, 7]
+    yield Difference("command of a tag of two devices", [5, 7], registers, SEVERAL)
+    yield Difference("a block with a refused address: last", None, [0, "number"], BLOCK)
 
 
 def _written(tag: str, text: str, theirs: list[int], ours: list[int], reason: Reason) -> Difference:
