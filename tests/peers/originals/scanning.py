@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from nats.errors import NoRespondersError
 from nats.errors import TimeoutError as NoReply
+from nats.js.errors import NotFoundError
 
 import holdfast
 from peers.originals.comparison import Command
@@ -46,6 +47,13 @@ class Bench:
         except NoReply:
             return None
         return {key: value for key, value in found.items() if key != "error"}
+
+    def has_bucket(self, name: str) -> bool:
+        try:
+            self.caller.do(self.caller.client.jetstream().key_value(name))
+        except NotFoundError:
+            return False
+        return True
 
     def registers(self, address: int, count: int) -> list[int]:
         return [int(value) for value in self.memory.read("holding_registers", address, count)]

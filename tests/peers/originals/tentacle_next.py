@@ -85,6 +85,7 @@ def commands() -> Iterator[tuple[str, object]]:
 def answers(run: Bench) -> Answers:
     found: Answers = {}
     tags = read_tags()
+    wire.until(lambda: run.has_bucket(BUCKET), "the scanner has made its bucket")
     run.caller.put(BUCKET, key("plc1"), gateway_entry(run.device, *tags, order="CDAB", rate=50))
     ids = [each["id"] for each in tags]
     found |= {f"read {name}": value for name, value in run.values(*ids).items()}
