@@ -20,6 +20,7 @@ import contextlib
 import json
 import os
 import shlex
+import socket
 import subprocess
 from dataclasses import dataclass
 from functools import partial
@@ -125,6 +126,14 @@ class Command:
                     yield ports
                     return
         raise AssertionError((folder / "original.log").read_text(errors="replace"))
+
+
+@contextlib.contextmanager
+def closed_port() -> Iterator[int]:
+    """Keeps a port of this machine where nothing listens, and nothing else begins to."""
+    with socket.socket() as bound:
+        bound.bind(("127.0.0.1", 0))
+        yield int(bound.getsockname()[1])
 
 
 def is_open(port: int) -> bool:

@@ -16,8 +16,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import holdfast
-from peers.originals.comparison import Command, Difference, Original, Reason
-from support.brokers import free_port
+from peers.originals.comparison import Command, Difference, Original, Reason, closed_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -143,8 +142,8 @@ def body_of(body: object, ports: Mapping[str, int]) -> bytes | None:
 
 
 def answers(address: tuple[str, int], device: holdfast.Server) -> Answers:
-    with socket.create_server(("127.0.0.1", 0)) as silent:
-        ports = {"device": device.address[1], SILENT: silent.getsockname()[1], CLOSED: free_port()}
+    with socket.create_server(("127.0.0.1", 0)) as silent, closed_port() as closed:
+        ports = {"device": device.address[1], SILENT: silent.getsockname()[1], CLOSED: closed}
         return _answers(address, ports)
 
 

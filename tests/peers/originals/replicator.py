@@ -23,9 +23,8 @@ from holdfast.appliance import Appliance
 from holdfast.config import load
 from holdfast.config.dump import to_yaml
 from holdfast.importing import read_replicator
-from peers.originals.comparison import Difference, Original, Reason
+from peers.originals.comparison import Difference, Original, Reason, closed_port
 from support import wire
-from support.brokers import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -135,9 +134,10 @@ def plant() -> Iterator[tuple[str, Receiver, holdfast.Memory]]:
         holdfast.Server({1: memory}, bind="127.0.0.1:0", access="read-only") as good,
         socket.create_server(("127.0.0.1", 0)) as silent,
         receiver.server,
+        closed_port() as absent,
     ):
         ports = dict.fromkeys(READS, good.address[1])
-        ports |= {"silent": silent.getsockname()[1], "absent": free_port()}
+        ports |= {"silent": silent.getsockname()[1], "absent": absent}
         text = "replicator:\n  units:\n" + "".join(
             UNIT.replace("NAME", name)
             .replace("DEVICE", str(ports[name]))
