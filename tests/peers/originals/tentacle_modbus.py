@@ -1,7 +1,7 @@
 """tentacle-modbus (TypeScript, for Deno): `HOLDFAST_ORIGINAL_TENTACLE_MODBUS`.
 
-The command gets the URL of a NATS server in the environment variable `NATS_SERVERS`. It needs
-`deno run --allow-net --allow-env main.ts`. No package registry has the program.
+The command gets the URL of a NATS server in the environment variable `NATS_SERVERS`. No package
+registry has the program.
 """
 
 from __future__ import annotations
