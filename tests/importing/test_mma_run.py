@@ -8,25 +8,19 @@ the differences; `differences` explains each.
 from __future__ import annotations
 
 import json
-from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from holdfast.config.dump import to_yaml
 from holdfast.importing import read_mma
-from support import wire
+from support.exchanges import play
 from support.paths import DOCS
 from support.running import endpoint
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from support.running import Run
-
-    Exchange: TypeAlias = Mapping[str, Any]
-    Answer: TypeAlias = str | list[Any]
 
 HERE = Path(__file__).parent
 RECORDED = json.loads((HERE / "mma_run.json").read_text())
@@ -34,37 +28,6 @@ DIFFERENCES: dict[str, str] = RECORDED["differences"]
 SCENARIOS: list[dict[str, Any]] = RECORDED["scenarios"]
 NAMES = {"raw": "raw-ingest", "rest": "rest"}
 """Listeners and services by their names in the recording; others are ports."""
-
-
-def play(exchange: Exchange, addresses: Mapping[str, tuple[str, int]]) -> Answer:
-    """Sends a request on a connection of its own. Returns everything that is received."""
-    at = exchange["at"]
-    source = exchange.get("source", "127.0.0.1")
-    with ExitStack() as opened:
-        for _ in range(exchange.get("idle", 0)):
-            opened.enter_context(wire.Connection(addresses[at], source=source))
-        connection = opened.enter_context(wire.Connection(addresses[at], source=source))
-        if at == "rest":
-            connection.send(exchange["send"].encode())
-            return http(connection.rest())
-        try:
-            connection.send(bytes.fromhex(exchange["send"]))
-            connection.finish()
-        except OSError:  # It was closed at once.
-            pass
-        return connection.rest().hex()
-
-
-def http(received: bytes) -> Answer:
-    """Returns the status and the body: text, or JSON without what changes from run to run."""
-    top, _, body = received.partition(b"\r\n\r\n")
-    status, text = int(top.split()[1]), body.decode()
-    if b"application/json" not in top:
-        return [status, text]
-    found = json.loads(text)
-    if "uptime" in found:
-        return [status, sorted(found)]
-    return [status, found]
 
 
 @pytest.fixture

@@ -616,6 +616,7 @@ STAGES: dict[str, Callable[[Stage], None]] = {
     "docs/durability.md": durability,
     "docs/fleet.md": fleet,
     "docs/gateway.md": gateway,
+    "docs/just-the-memory.md": own_plant("docs/just-the-memory.md"),
     "docs/library.md": library,
     "docs/metrics.md": metrics,
     "docs/monitoring.md": monitoring,
