@@ -102,7 +102,7 @@ value tells something about all the others.
 """
 
 HABITS = {
-    habit._replace(prefers=preference): rare + more
+    Habit(habit.order, habit.swaps_registers, preference): rare + more
     for habit, rare in ORDER_HABITS.items()
     for preference, more in PREFERENCES.items()
 }
@@ -117,7 +117,7 @@ single register between long values would else be half of one in the other order
 SWAPPED_BYTES = ("BADC", "DCBA")
 """The orders of devices that may also swap the bytes of single registers."""
 
-TRUST = {"float32": 1.15, "int32": 0.65, "string": 0.6}
+TRUST = {"float32": 1.4, "int32": 0.65, "string": 0.6, "uint16": 0.76}
 OTHER_TRUST = 0.78
 """The power of the odds that makes a confidence from a probability, by type. The bits of neighbours
 are not independent, so probabilities promise too much, least for floats: half of their bits are
