@@ -324,7 +324,7 @@ def _totals(
     orders = list(ORDER_HABITS)
     for preference in PREFERENCES:
         for order in orders:
-            habit = order._replace(prefers=preference)
+            habit = Habit(order.order, order.swaps_registers, preference)
             found.append([_Lattice(possible, habit) for possible in parts])
             totals[habit] = sum(each.total for each in found[-1]) - HABITS[habit]
         best = max(totals.values())
