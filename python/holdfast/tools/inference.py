@@ -79,7 +79,7 @@ def _guesses(value: Value, chance: float, like: float | None) -> Iterator[Guess]
     """A value as a guess; with a known value, in all scales that come close to it."""
     if like is None:
         sure = segments.confidence(chance, value.kind)
-        yield _guess(value, sure if any(value.found) else min(sure, segments.NOTHING_KNOWN))
+        yield _guess(value, sure if any(value.found) else sure * segments.NOTHING_KNOWN)
         return
     if isinstance(value.found[0], str):
         return
