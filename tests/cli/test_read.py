@@ -39,8 +39,6 @@ def test_registers_are_shown_in_three_ways(
 
 REPEATED = ("--every", "0.01", "--times", "3")
 SLOW_READS = {
-    "once": ("read", "hr", "7"),
-    "one tag": ("read", "hr:7"),
     "read": ("read", "hr:7", *REPEATED),
     "tags": ("read", "--tags", str(ROOT / "examples" / "tags" / "heater.yaml"), *REPEATED),
     "describe": ("describe", "--units", "1-10"),
@@ -57,6 +55,14 @@ def test_replies_after_the_timeout_are_a_hint(
         found = invoke(command, device.url, *rest, "--timeout", "0.05", *as_json)
     *_, last = found.stderr.splitlines(keepends=True)
     assert cli.LATE.fullmatch(last), found.stderr
+
+
+@pytest.mark.parametrize("place", [("hr", "7"), ("hr:7",)], ids=["once", "one tag"])
+def test_a_single_read_waits_for_a_late_reply_to_hint_at(place: tuple[str, ...]) -> None:
+    with Stream("tcp", then=Late()) as device:
+        found = invoke("read", device.url, *place, "--timeout", "0.5")
+    *_, last = found.stderr.splitlines(keepends=True)
+    assert "longer than --timeout 0.5 s: use --timeout " in last, found.stderr
 
 
 def test_without_late_replies_there_is_no_hint(server: holdfast.Server) -> None:
