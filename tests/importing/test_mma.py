@@ -663,6 +663,9 @@ def test_an_option_grants_rest_other_areas(imported: Import) -> None:
     (token,) = more.data["rest"]["tokens"]
     assert token["areas"] == ["discrete_inputs", "holding_registers", "input_registers"]
     assert noted(more, "rest.auth: check", "and holding registers, by --grant-rest")
+    same = imported(text, grant_rest=["input_registers"])
+    assert same.data == found.data
+    assert not noted(same, "rest.auth: check", "by --grant-rest")
 
 
 def test_an_option_grants_mqtt_other_areas(imported: Import) -> None:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from holdfast.types import Area
 
-_INGEST = {"discrete_inputs", "input_registers"}
+INGESTED = {"discrete_inputs", "input_registers"}
 """The areas that REST and MQTT could write in the source."""
 
 ADMISSION = {"max_connections_per_source": None, "when_full": "evict"}
@@ -49,7 +49,7 @@ class Draft:
 
         That is what they could write, and `more` areas. Empty if no memory has these areas.
         """
-        ingested = _INGEST | set(more)
+        ingested = INGESTED | set(more)
         names = [name for name, memory in self.memories.items() if ingested & memory.keys()]
         grant = self.grant(names)
         areas = [area for area in grant["areas"] if area in ingested]

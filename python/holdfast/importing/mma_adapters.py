@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.config.broker import parse_broker, parse_topic_filter
 from holdfast.config.words import listing, show
-from holdfast.importing.draft import ADMISSION
+from holdfast.importing.draft import ADMISSION, INGESTED
 from holdfast.importing.filters import ALL
 from holdfast.importing.names import free_name, unique_names
 from holdfast.importing.peers import Peers, written
@@ -162,8 +162,8 @@ class Adapters:
         return tokens
 
     def _tell_grant(self, path: KeyPath) -> None:
-        if self.draft.ingest_grant(self.choices.grant_rest):
-            told = f"each token {_written('rest', self.choices.grant_rest)}. To read other areas,"
+        if grant := self.draft.ingest_grant(self.choices.grant_rest):
+            told = f"each token {_written('rest', grant['areas'])}. To read other areas,"
             message = f"{told} create another token with `holdfast token`"
             self.desk.note("check", path, message)
         else:
@@ -246,7 +246,7 @@ class Adapters:
             message = f"{told} is sealed, to restore it: while_sealed"
             self.desk.note("check", mqtt.at("topic"), message)
         found["subscriptions"] = [{"topic": topic, "qos": QOS, **grant}]
-        message = f"the topic {_written('mqtt', self.choices.grant_mqtt)}"
+        message = f"the topic {_written('mqtt', grant['areas'])}"
         self.desk.note("check", mqtt.at("topic"), message)
         self.draft.mqtt = found
 
@@ -330,7 +330,8 @@ def _written(adapter: str, granted: Sequence[Area]) -> str:
     """What an adapter may write, for a note."""
     option = f"--grant-{adapter}"
     message = "may write discrete inputs and input registers of all memories, as it ran"
-    more = f", and {_areas(granted)}, by {option}" if granted else ""
+    beyond = [area for area in granted if area not in INGESTED]
+    more = f", and {_areas(beyond)}, by {option}" if beyond else ""
     example = f"as holding_registers in the example of its README: {option} AREA[,AREA]"
-    other = "" if granted else f". To grant other areas, {example}"
+    other = "" if beyond else f". To grant other areas, {example}"
     return f"{message}{more}; list only those that it needs{other}"
