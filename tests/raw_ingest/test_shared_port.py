@@ -112,14 +112,18 @@ def test_a_modbus_request_whose_transaction_id_is_that_of_a_packet_is_modbus(
     assert received == expected
 
 
-@pytest.mark.parametrize("area", [3, 9])
-def test_a_packet_among_modbus_frames_ends_the_connection(run: Run, dial: Any, area: int) -> None:
+@pytest.mark.parametrize(("version", "area"), [(1, 3), (1, 9), (2, 3), (0, 3)])
+def test_a_packet_among_modbus_frames_ends_the_connection(
+    run: Run, dial: Any, version: int, area: int
+) -> None:
     """The unit id of the packet is the length of a frame, behind which the payload is a request."""
     appliance = run(configuration())
     client = dial(appliance)
     client.sendall(wire.frame(READ, 1, 1))
     assert client.recv(100) == wire.frame(b"\x03\x04\x00\x00\x00\x00", 1, 1)
-    client.sendall(packet(0, 0, area=area, unit=2)[:8] + wire.frame(b"\x06\x00\x00\x00\x07", 1, 1))
+    start = packet(0, 0, area=area, unit=2)[:8]
+    start = start[:2] + bytes([version]) + start[3:]
+    client.sendall(start + wire.frame(b"\x06\x00\x00\x00\x07", 1, 1))
     with suppress(ConnectionResetError):
         assert client.recv(100) == b""
     counted = counters(appliance)

@@ -46,11 +46,6 @@ const MAX_HEADER_LEN: usize = 12;
 /// Bytes of a CRC-32.
 const CRC_LEN: usize = 4;
 
-/// Whether `bytes` begin with the three bytes that all packets begin with: magic and version.
-pub fn is_start(bytes: &[u8]) -> bool {
-    bytes.strip_prefix(&MAGIC).is_some_and(|rest| rest.first() == Some(&VERSION))
-}
-
 /// The layout of packets. Sender and receiver agree on the format; it is never guessed from the
 /// bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

@@ -1,7 +1,9 @@
 //! The framings of streams and datagrams: an MBAP header, RTU frames, or ASCII frames.
 
 use holdfast_protocol::frame::{ascii, mbap, rtu};
-use holdfast_protocol::{pdu, raw_ingest};
+use holdfast_protocol::pdu;
+
+use super::raw_ingest::Beginning;
 
 /// What is at the start of received bytes.
 pub(crate) enum Next<'a> {
@@ -145,8 +147,10 @@ impl Framing for MbapBesidePackets {
         _delimiter: impl FnOnce() -> u8,
         _decoded: &'a mut (),
     ) -> Next<'a> {
-        // No Modbus request starts like this: byte 3 is that of a protocol id other than 0.
-        if raw_ingest::is_start(bytes) { Next::Broken } else { mbap_next(bytes) }
+        match Beginning::of(bytes) {
+            Beginning::Packet => Next::Broken,
+            Beginning::SomethingElse | Beginning::Unknown => mbap_next(bytes),
+        }
     }
 
     #[inline]
