@@ -941,8 +941,12 @@ mod tests {
             let frames = &shared.unit_server.counters.frames;
             assert_eq!((frames.broken.get(), frames.foreign.get()), (1, 0));
         }
+        // A version that is wrong makes no difference: its sender takes it for a packet too.
+        let input = [&frame(1, &[17])[..], b"RI\x02\x03\x00\x02\x00\x00\x00\x06", &write].concat();
+        let answered = answering::<MbapBesidePackets>().answer(&input, &mut vec![0; OUTPUT]);
+        assert_eq!((answered.requests, answered.broken), (1, true));
         // Frames of other protocols, and transaction ids like the start of a packet, are as before.
-        let foreign = [0x52, 0x49, 2, 1, 0, 2, 1, 17];
+        let foreign = [0x52, 0x48, 2, 1, 0, 2, 1, 17];
         let mut harmless = frame(1, &[17]);
         harmless[..2].copy_from_slice(b"RI");
         let input = [&foreign[..], &harmless].concat();
