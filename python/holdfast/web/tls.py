@@ -52,6 +52,20 @@ _REASONS = {
 }
 """Reasons by OpenSSL's names of errors."""
 
+_ALERTS = {
+    "UNKNOWN_CA": "peer_refused_certificate",
+    "CERTIFICATE_EXPIRED": "peer_refused_certificate",
+    "CERTIFICATE_REVOKED": "peer_refused_certificate",
+    "ACCESS_DENIED": "peer_refused_certificate",
+    "UNSUPPORTED_CERTIFICATE": "peer_refused_certificate",
+    "BAD_CERTIFICATE": "peer_refused_certificate",
+    "CERTIFICATE_UNKNOWN": "peer_refused_certificate",
+    "HANDSHAKE_FAILURE": "peer_refused_handshake",
+    "PROTOCOL_VERSION": "no_common_version_or_cipher",
+    "INSUFFICIENT_SECURITY": "no_common_version_or_cipher",
+}
+"""Reasons by the names of the alerts of a peer."""
+
 
 class Plain(Protocol):
     """The connection inside TLS."""
@@ -90,7 +104,7 @@ def reason(error: ssl.SSLError) -> str:
         return _VERIFICATION.get(error.verify_code, "untrusted_certificate")
     name = str(error.reason)
     if "_ALERT_" in name:
-        return "peer_ended"
+        return _ALERTS.get(name.partition("_ALERT_")[2], "peer_ended")
     return _REASONS.get(name, "other")
 
 
@@ -165,7 +179,7 @@ class TlsTransport(asyncio.Transport, asyncio.Protocol):
             return not self.handshaking
         if self.handshaking:
             if self._begun:
-                self._plain.tls_failed("closed")
+                self._plain.tls_failed("closed_during_handshake")
             return False
         self._deaf = True
         return self._plain.eof_received()
