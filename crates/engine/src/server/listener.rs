@@ -35,7 +35,7 @@ const SYSTEM_BUFFER: usize = 256 * 1024;
 const KEEPALIVE: (Duration, u32, Duration) = (Duration::from_secs(60), 4, Duration::from_secs(15));
 
 /// The pause after a failed accept, usually for lack of file descriptors.
-const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+pub(crate) const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
 /// The longest time that a peer is read after its last reply, the bytes per read, and the most reads
 /// after that time.
@@ -113,6 +113,7 @@ impl ListenerContext {
             Kind::Ended => self.connections.ended.add(),
             Kind::RequestTimeout => self.connections.request_timeout.add(),
             Kind::SlowReader => self.connections.slow_reader.add(),
+            Kind::BrokenRequest => self.connections.broken_request.add(),
             Kind::TlsFailed(reason) => self.connections.tls_failed.add(reason),
             _ => {}
         }
@@ -325,7 +326,7 @@ pub(crate) fn set_options(stream: &TcpStream) {
 
 /// Shuts down the sending side, then reads until the peer closes, and passes the number of bytes on.
 /// Closing a socket with unread bytes resets the connection, and the peer may lose the last reply.
-pub(crate) async fn drain<S: Stream>(
+pub(crate) async fn drain<S: Stream + ?Sized>(
     stream: &mut S,
     mut stop: watch::Receiver<bool>,
     mut drained: impl FnMut(usize),
@@ -353,7 +354,7 @@ pub(crate) async fn drain<S: Stream>(
 }
 
 /// Whether an error of `accept` concerns one peer, not the listener.
-fn is_of_one_peer(error: &io::Error) -> bool {
+pub(crate) fn is_of_one_peer(error: &io::Error) -> bool {
     use io::ErrorKind::{ConnectionAborted, ConnectionReset, Interrupted, WouldBlock};
     matches!(error.kind(), ConnectionAborted | ConnectionReset | Interrupted | WouldBlock)
 }
