@@ -68,6 +68,7 @@ __all__ = [
     "WriteQueue",
     "__version__",
     "encode_raw_ingest",
+    "https_server_tls",
     "pack_raw_ingest",
     "plan_blocks",
     "read_memory_file",
@@ -447,6 +448,23 @@ class ServerTls:
     @property
     def warnings(self) -> list[str]:
         """What is doubtful about the files: dates, and revocation lists."""
+
+def https_server_tls(
+    *,
+    cert_file: str | PathLike[str],
+    key_file: str | PathLike[str],
+    client_ca_file: str | PathLike[str] | None = None,
+    crl_file: str | PathLike[str] | None = None,
+    expired_crl: Literal["refuse", "accept"] = "refuse",
+    roles: Sequence[str] | None = None,
+    key: bytes | None = None,
+) -> ServerTls:
+    """Settings of the TLS of an HTTPS server. Reads the PEM files at once.
+
+    Without `client_ca_file`, clients need no certificate. `roles` are the allowed roles of their
+    certificates: "" is a certificate without a role, `None` is any role. The rest is that of
+    `ServerTls`, also what it raises.
+    """
 
 @final
 class Listener:

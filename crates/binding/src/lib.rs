@@ -24,6 +24,7 @@ mod mirror_age;
 mod peer;
 mod poller;
 mod raw_ingest;
+mod server_tls;
 mod write_queue;
 
 use pyo3::prelude::*;
@@ -49,7 +50,7 @@ mod _core {
     #[pymodule_export]
     use super::link::{Caller, Link, Passage, Route};
     #[pymodule_export]
-    use super::listener::{Listener, RawRule, Rule, ServerTls};
+    use super::listener::{Listener, RawRule, Rule};
     #[pymodule_export]
     use super::log::{Log, LogError, LogFollower};
     #[pymodule_export]
@@ -62,6 +63,8 @@ mod _core {
     use super::poller::{PolledDevice, Poller, Results, plan_blocks, tell_disabled};
     #[pymodule_export]
     use super::raw_ingest::{encode_raw_ingest, pack_raw_ingest};
+    #[pymodule_export]
+    use super::server_tls::{ServerTls, https_server_tls};
     #[pymodule_export]
     use super::write_queue::WriteQueue;
 

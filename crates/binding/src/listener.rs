@@ -1,7 +1,6 @@
-//! `Rule`, `RawRule`, `ServerTls` and `Listener`: settings of listeners.
+//! `Rule`, `RawRule` and `Listener`: settings of listeners.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -14,7 +13,6 @@ use holdfast_engine::server::{
     PacketsPerConnection, RawRule as CoreRawRule, RawSettings, SerialSettings, StreamFraming,
     StreamSettings, UdpSettings, WhenFull,
 };
-use holdfast_engine::tls::server::{ExpiredLists, ServerFiles, ServerTls as CoreServerTls};
 use holdfast_memory::Memory as CoreMemory;
 use holdfast_protocol::raw_ingest::Format;
 use ipnet::IpNet;
@@ -26,6 +24,7 @@ use crate::arguments::{address, byte, network, seconds, within, word};
 use crate::client::line;
 use crate::link::{Passage, Route};
 use crate::memory::{Memory, named};
+use crate::server_tls::ServerTls;
 
 /// The access of rules.
 const ACCESS: [(&str, AccessMode); 2] =
@@ -126,46 +125,6 @@ impl RawRule {
     }
 }
 
-/// Settings of a TLS server with mutual authentication. Reads the PEM files at once.
-///
-/// `ca_file` has the authorities of client certificates, and self-signed certificates of clients;
-/// `crl_file` has the revocation lists of these authorities, and `expired_crl` is what happens to
-/// their clients after `nextUpdate`. `key` is the content of `key_file` without its passphrase, if
-/// it has one. Raises `ValueError` for a file that can't be used.
-#[pyclass(frozen, module = "holdfast")]
-pub struct ServerTls {
-    core: Arc<CoreServerTls>,
-}
-
-#[pymethods]
-impl ServerTls {
-    #[new]
-    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None, expired_crl="refuse", key=None))]
-    fn new(
-        py: Python<'_>,
-        cert_file: PathBuf,
-        key_file: PathBuf,
-        ca_file: PathBuf,
-        crl_file: Option<PathBuf>,
-        expired_crl: &str,
-        key: Option<&[u8]>,
-    ) -> PyResult<ServerTls> {
-        let allowed = [("refuse", ExpiredLists::Refuse), ("accept", ExpiredLists::Accept)];
-        let expired_lists = word("expired_crl", expired_crl, &allowed)?;
-        let files = ServerFiles { cert_file, key_file, ca_file, crl_file, expired_lists };
-        // A file that does not answer stops no other thread.
-        let core = py.detach(|| CoreServerTls::load(&files, key));
-        let core = core.map_err(|error| PyValueError::new_err(error.to_string()))?;
-        Ok(ServerTls { core: Arc::new(core) })
-    }
-
-    /// What is doubtful about the files: dates, and revocation lists.
-    #[getter]
-    fn warnings(&self) -> Vec<String> {
-        self.core.warnings().to_vec()
-    }
-}
-
 #[pyclass(frozen, module = "holdfast")]
 pub struct Listener {
     pub core: ListenerSettings,
@@ -223,7 +182,7 @@ impl Listener {
                 .map(|time| time_to_wait("frame_timeout", time))
                 .transpose()?,
             listen_only,
-            tls: tls.map(|tls| Arc::clone(&tls.core)),
+            tls: tls.map(|tls| tls.of_listener()).transpose()?,
             raw_ingest,
         });
         Ok(Listener { core: ListenerSettings { name, kind } })
@@ -303,7 +262,7 @@ impl Listener {
             limits: secure_limits(limits, tls.is_some(), max_handshakes)?,
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
             packets,
-            tls: tls.map(|tls| Arc::clone(&tls.core)),
+            tls: tls.map(|tls| tls.of_listener()).transpose()?,
         });
         Ok(Listener { core: ListenerSettings { name, kind } })
     }

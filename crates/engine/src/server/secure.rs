@@ -48,15 +48,17 @@ pub(crate) async fn secured(
         Err(_) => return ended(Kind::TlsFailed("timeout")),
     };
     let certificate = match certificate {
-        Ok(certificate) => Arc::new(certificate),
+        Ok(certificate) => certificate.map(Arc::new),
         Err(end) => {
             context.ended_with(end, peer, stream.presented_subject().as_deref());
             drain(&mut stream.into_socket(), stop, |_| ()).await;
             return None;
         }
     };
-    ticket.identify(Arc::clone(&certificate));
-    let peer = Peer { address: peer, certificate: Some(certificate) };
+    if let Some(certificate) = &certificate {
+        ticket.identify(Arc::clone(certificate));
+    }
+    let peer = Peer { address: peer, certificate };
     match ticket.establish() {
         Ok(evicted) => context.evicted(evicted),
         Err(Full) => {

@@ -79,8 +79,8 @@ impl ServerTlsStream {
         Ok(())
     }
 
-    /// The certificate of the peer, after the handshake.
-    pub(crate) fn peer_certificate(&self) -> Result<PeerCertificate, Kind> {
+    /// The certificate of the peer, after the handshake; `None` if clients need none.
+    pub(crate) fn peer_certificate(&self) -> Result<Option<PeerCertificate>, Kind> {
         self.channel.peer_certificate().map_err(|failure| failed(&failure).into())
     }
 

@@ -17,7 +17,7 @@ use super::files::FileError;
 use super::notes::{Chain, noted};
 use super::provider::{ALGORITHMS, verify_tls12, verify_tls13};
 use super::revocation::{List, Lists};
-use super::server_files::ServerFiles;
+use super::server_files::{Protocol, ServerFiles};
 use super::trust::{Listed, Trust};
 
 /// Verifies the certificates of clients.
@@ -25,16 +25,26 @@ use super::trust::{Listed, Trust};
 pub(super) struct Clients {
     trust: Trust,
     subjects: Vec<DistinguishedName>,
+    /// The allowed roles; `None` is any.
+    roles: Option<Vec<String>>,
 }
 
 impl Clients {
-    pub(super) fn load(files: &ServerFiles, doubts: &mut Doubts<'_>) -> Result<Clients, FileError> {
-        let listed = listed(&files.ca_file)?;
+    /// `None`: clients need no certificate.
+    pub(super) fn load(
+        files: &ServerFiles,
+        doubts: &mut Doubts<'_>,
+    ) -> Result<Option<Clients>, FileError> {
+        let ca_key = files.protocol.ca_key();
+        let Some(ca_file) = &files.ca_file else {
+            return may_lack_authorities(files).map(|()| None);
+        };
+        let listed = listed(ca_file)?;
         let subjects = listed.iter().filter_map(Listed::subject).collect();
-        doubts.of_listed(&listed);
+        doubts.of_listed(ca_file, &listed);
         let lists = match &files.crl_file {
             Some(file) if !listed.iter().any(Listed::is_authority) => {
-                let flaw = "crl_file requires an authority (CA:TRUE) in ca_file";
+                let flaw = format!("crl_file requires an authority (CA:TRUE) in {ca_key}");
                 return Err(FileError::content(file, flaw));
             }
             Some(file) => {
@@ -45,7 +55,7 @@ impl Clients {
             None => Vec::new(),
         };
         let trust = Trust::new(listed, Lists { lists, expired: files.expired_lists });
-        Ok(Clients { trust, subjects })
+        Ok(Some(Clients { trust, subjects, roles: files.roles.clone() }))
     }
 
     /// Verifies the certificate of a client, its own first, and its role.
@@ -56,9 +66,31 @@ impl Clients {
     ) -> Result<(), TlsFailure> {
         let (own, intermediates) = chain.split_first().ok_or(TlsFailure::NoCertificate)?;
         self.trust.judge(own, intermediates, Purpose::Client, now)?;
-        Parsed::new(own).map_err(Error::from)?.role()?;
-        Ok(())
+        let role = Parsed::new(own).map_err(Error::from)?.role()?;
+        match &self.roles {
+            Some(allowed) if !allowed.contains(&role) => Err(TlsFailure::WrongRole { role }),
+            _ => Ok(()),
+        }
     }
+}
+
+/// # Errors
+/// The protocol, or another setting, requires the authorities of clients.
+fn may_lack_authorities(files: &ServerFiles) -> Result<(), FileError> {
+    let ca_key = files.protocol.ca_key();
+    if files.protocol == Protocol::Modbus {
+        let flaw = format!("found without {ca_key}, which Modbus/TCP Security requires");
+        return Err(FileError::content(&files.cert_file, flaw));
+    }
+    if let Some(file) = &files.crl_file {
+        let flaw = format!("found without {ca_key}, allowed: only with it");
+        return Err(FileError::content(file, flaw));
+    }
+    if files.roles.is_some() {
+        let flaw = format!("found with roles and without {ca_key}, allowed: roles only with it");
+        return Err(FileError::content(&files.cert_file, flaw));
+    }
+    Ok(())
 }
 
 /// Reads authorities and self-signed certificates. Any other certificate is a mistake.
@@ -140,6 +172,7 @@ fn refused(failure: &TlsFailure) -> Error {
         | TlsFailure::TwoRoles
         | TlsFailure::RoleType
         | TlsFailure::UnsupportedExtension => CertificateError::BadEncoding,
+        TlsFailure::WrongRole { .. } => CertificateError::ApplicationVerificationFailure,
         other => return CertificateError::Other(OtherError(Arc::new(other.clone()))).into(),
     };
     error.into()

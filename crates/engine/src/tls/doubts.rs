@@ -36,14 +36,14 @@ impl<'f> Doubts<'f> {
         }
     }
 
-    pub(super) fn of_listed(&mut self, listed: &[Listed]) {
+    pub(super) fn of_listed(&mut self, file: &Path, listed: &[Listed]) {
         for (each, number) in listed.iter().zip(1..) {
             let parsed = each.parsed();
             let outcome = match each.is_authority() {
                 true => "its clients are refused",
                 false => "this client is refused",
             };
-            self.of_dates(&self.files.ca_file, parsed, number, outcome);
+            self.of_dates(file, parsed, number, outcome);
         }
     }
 
@@ -66,6 +66,7 @@ impl<'f> Doubts<'f> {
     }
 
     pub(super) fn of_lists(&mut self, file: &Path, lists: &[List], listed: &[Listed]) {
+        let ca_key = self.files.protocol.ca_key();
         let authorities: Vec<_> =
             listed.iter().zip(1..).filter(|(each, _)| each.is_authority()).collect();
         for list in lists {
@@ -76,13 +77,13 @@ impl<'f> Doubts<'f> {
             };
             if named().next().is_none() {
                 self.add(file, &format!(
-                    "{name} is not of an authority in ca_file: it applies only to clients that send \
-                     its authority"
+                    "{name} is not of an authority in {ca_key}: it applies only to clients that \
+                     send its authority"
                 ));
             } else if !named().any(|(each, _)| list.is_signed_by(each.parsed())) {
                 self.add(file, &format!(
-                    "{name} is not signed by the authority of that name in ca_file: clients of that \
-                     authority are refused"
+                    "{name} is not signed by the authority of that name in {ca_key}: clients of \
+                     that authority are refused"
                 ));
             }
             self.of_age(file, list, &name);
@@ -99,7 +100,7 @@ impl<'f> Doubts<'f> {
             if !lists.iter().any(|list| each.parsed().has_subject(list.issuer())) {
                 let subject = each.parsed().subject_text();
                 self.add(file, &format!(
-                    "found no list of certificate {number} of ca_file ({subject}): its clients are \
+                    "found no list of certificate {number} of {ca_key} ({subject}): its clients are \
                      refused"
                 ));
             }

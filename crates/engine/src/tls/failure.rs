@@ -74,6 +74,9 @@ pub enum TlsFailure {
     TwoRoles,
     #[error("the role of the certificate is not a UTF8String")]
     RoleType,
+    /// It is not among the allowed roles.
+    #[error("the role {role:?} of the certificate is not allowed")]
+    WrongRole { role: String },
     /// The key of the certificate is for other purposes than signing handshakes.
     #[error("the keyUsage of the certificate lacks digitalSignature")]
     WrongKeyUsage,
@@ -147,6 +150,7 @@ impl TlsFailure {
             TlsFailure::BadCertificate => "bad_certificate",
             TlsFailure::TwoRoles => "two_roles",
             TlsFailure::RoleType => "role_type",
+            TlsFailure::WrongRole { .. } => "wrong_role",
             TlsFailure::WrongKeyUsage => "wrong_key_usage",
             TlsFailure::UnsupportedExtension => "unsupported_extension",
             TlsFailure::UnsupportedCertificate { .. } => "unsupported_certificate",
@@ -390,6 +394,7 @@ mod tests {
             TlsFailure::BadCertificate,
             TlsFailure::TwoRoles,
             TlsFailure::RoleType,
+            TlsFailure::WrongRole { role: "engineer".into() },
             TlsFailure::WrongKeyUsage,
             TlsFailure::UnsupportedExtension,
             TlsFailure::UnsupportedCertificate { flaw: flaw.clone() },

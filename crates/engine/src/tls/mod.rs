@@ -9,7 +9,7 @@ mod clients;
 mod doubts;
 mod failure;
 mod files;
-mod fragment;
+mod hello;
 mod notes;
 mod own;
 mod p521;

@@ -1,7 +1,8 @@
 //! The server side: its certificate, and the channels of its connections.
 //!
-//! Mutual authentication is mandatory, as MB-TCP-Security requires. The certificate of a client and its
-//! dates are checked for every connection, also if it resumes a session.
+//! For Modbus, mutual authentication is mandatory, as MB-TCP-Security requires; for HTTP, it is a
+//! setting. The certificate of a client and its dates are checked for every connection, also if it
+//! resumes a session. Everything else is the same for both protocols.
 
 use std::fmt;
 use std::sync::Arc;
@@ -15,22 +16,62 @@ use super::certificate::Parsed;
 use super::clients::Clients;
 use super::doubts::Doubts;
 use super::files::FileError;
-use super::fragment::{Asked, LENGTHS, RECORD_HEADER_LEN, asked};
+use super::hello::{Hello, LENGTHS, RECORD_HEADER_LEN};
 use super::notes::Notes;
 use super::own::own;
 use super::provider::provider;
-pub use super::server_files::{ExpiredLists, ServerFiles};
+pub use super::server_files::{ExpiredLists, Protocol, ServerFiles};
 use super::sessions::Sessions;
 use super::{Channel, TlsFailure};
 
 /// The TLS configuration of a server.
 pub struct ServerTls {
-    config: Arc<ServerConfig>,
-    /// The same for clients that ask for shorter fragments.
-    short: Arc<[Arc<ServerConfig>; LENGTHS.len()]>,
-    clients: Arc<Clients>,
+    protocol: Protocol,
+    configs: Arc<Configs>,
+    /// `None`: clients need no certificate.
+    clients: Option<Arc<Clients>>,
     sessions: Arc<Sessions>,
     warnings: Vec<String>,
+}
+
+/// The configurations of rustls. A ClientHello decides between them.
+struct Configs {
+    protocol: Protocol,
+    usual: ByLength,
+    /// For clients that offer other protocols only: without an answer to their offer.
+    silent: ByLength,
+}
+
+/// The same configuration for fragments of any length, and for clients that ask for shorter ones.
+struct ByLength {
+    any: Arc<ServerConfig>,
+    short: [Arc<ServerConfig>; LENGTHS.len()],
+}
+
+impl Configs {
+    fn new(protocol: Protocol, mut config: ServerConfig) -> Configs {
+        let silent = ByLength::new(config.clone());
+        config.alpn_protocols = protocol.alpn().into_iter().map(<[u8]>::to_vec).collect();
+        Configs { protocol, usual: ByLength::new(config), silent }
+    }
+
+    /// The configuration for a client.
+    fn of(&self, hello: &Hello) -> &Arc<ServerConfig> {
+        let is_other = self.protocol.alpn().is_some_and(|alpn| hello.offers_others_than(alpn));
+        let configs = if is_other { &self.silent } else { &self.usual };
+        hello.fragment_length().map_or(&configs.any, |index| &configs.short[index])
+    }
+}
+
+impl ByLength {
+    fn new(config: ServerConfig) -> ByLength {
+        let short = LENGTHS.map(|len| {
+            let mut short = config.clone();
+            short.max_fragment_size = Some(len + RECORD_HEADER_LEN);
+            Arc::new(short)
+        });
+        ByLength { any: Arc::new(config), short }
+    }
 }
 
 impl ServerTls {
@@ -50,28 +91,41 @@ impl ServerTls {
         let own = own(&files.cert_file, &files.key_file, key)?;
         let mut doubts = Doubts::new(files, clock.current_time().unwrap_or(UnixTime::now()));
         doubts.of_own(&own.cert);
-        let clients = Arc::new(Clients::load(files, &mut doubts)?);
-        let sessions = Arc::new(Sessions::new(Arc::clone(&clients), Arc::clone(&clock)));
+        let clients = Clients::load(files, &mut doubts)?.map(Arc::new);
+        let sessions = Arc::new(Sessions::new(clients.clone(), Arc::clone(&clock)));
         let config = ServerConfig::builder_with_details(provider(), clock)
             .with_safe_default_protocol_versions()
             .map_err(|error| FileError::content(&files.cert_file, error.to_string()))?;
-        let mut config = config
-            .with_client_cert_verifier(Arc::clone(&clients) as _)
-            .with_cert_resolver(Arc::new(SingleCertAndKey::from(own)));
+        let config = match &clients {
+            Some(clients) => config.with_client_cert_verifier(Arc::clone(clients) as _),
+            None => config.with_no_client_auth(),
+        };
+        let mut config = config.with_cert_resolver(Arc::new(SingleCertAndKey::from(own)));
         config.session_storage = Arc::clone(&sessions) as _;
         config.send_tls13_tickets = 1;
-        let short = LENGTHS.map(|len| {
-            let mut short = config.clone();
-            short.max_fragment_size = Some(len + RECORD_HEADER_LEN);
-            Arc::new(short)
-        });
-        let (config, short, warnings) = (Arc::new(config), Arc::new(short), doubts.found());
-        Ok(ServerTls { config, short, clients, sessions, warnings })
+        Ok(ServerTls {
+            protocol: files.protocol,
+            configs: Arc::new(Configs::new(files.protocol, config)),
+            clients,
+            sessions,
+            warnings: doubts.found(),
+        })
+    }
+
+    /// The protocol that it is for.
+    pub fn protocol(&self) -> Protocol {
+        self.protocol
+    }
+
+    /// Whether clients need a certificate.
+    pub fn requires_certificate(&self) -> bool {
+        self.clients.is_some()
     }
 
     /// Judges the certificate of an open session again, as a handshake would now.
     pub(crate) fn judge(&self, certificate: &PeerCertificate) -> Result<(), TlsFailure> {
-        self.clients.judge(&certificate.chain, UnixTime::now())
+        let clients = self.clients.as_ref();
+        clients.map_or(Ok(()), |clients| clients.judge(&certificate.chain, UnixTime::now()))
     }
 
     /// What is doubtful about the files: certificates outside their dates, revocation lists that are
@@ -82,11 +136,12 @@ impl ServerTls {
 
     /// Creates the channel of an accepted connection.
     pub(crate) fn channel(&self) -> Result<ServerChannel, Error> {
-        let channel = Channel::new(ServerConnection::new(Arc::clone(&self.config))?);
+        let channel = Channel::new(ServerConnection::new(Arc::clone(&self.configs.usual.any))?);
         Ok(ServerChannel {
             channel,
             first: Some(Vec::new()),
-            short: Arc::clone(&self.short),
+            configs: Arc::clone(&self.configs),
+            requires_certificate: self.requires_certificate(),
             notes: Notes::default(),
             sessions: Arc::clone(&self.sessions),
         })
@@ -115,9 +170,10 @@ pub struct PeerCertificate {
 /// The channel of an accepted connection.
 pub(crate) struct ServerChannel {
     channel: Channel,
-    /// The first bytes of the client, until they tell how long fragments may be.
+    /// The first bytes of the client, until they are a whole ClientHello.
     first: Option<Vec<u8>>,
-    short: Arc<[Arc<ServerConfig>; LENGTHS.len()]>,
+    configs: Arc<Configs>,
+    requires_certificate: bool,
     notes: Notes,
     sessions: Arc<Sessions>,
 }
@@ -137,16 +193,13 @@ impl ServerChannel {
             return self.process(bytes, plain, out);
         };
         first.extend_from_slice(bytes);
-        match asked(&first) {
-            Asked::Unknown => {
-                self.first = Some(first);
-                return Ok(());
-            }
-            Asked::Length(index) => {
-                let connection = ServerConnection::new(Arc::clone(&self.short[index]))?;
-                self.channel = Channel::new(connection);
-            }
-            Asked::Nothing => {}
+        let Some(hello) = Hello::of(&first) else {
+            self.first = Some(first);
+            return Ok(());
+        };
+        let config = self.configs.of(&hello);
+        if !Arc::ptr_eq(config, &self.configs.usual.any) {
+            self.channel = Channel::new(ServerConnection::new(Arc::clone(config))?);
         }
         self.process(&first, plain, out)
     }
@@ -207,17 +260,20 @@ impl ServerChannel {
         self.channel.has_ended()
     }
 
-    /// The certificate of the peer, after the handshake.
-    pub(crate) fn peer_certificate(&self) -> Result<PeerCertificate, TlsFailure> {
+    /// The certificate of the peer, after the handshake; `None` if clients need none.
+    pub(crate) fn peer_certificate(&self) -> Result<Option<PeerCertificate>, TlsFailure> {
         let chain = self.channel.0.peer_certificates().unwrap_or_default();
-        let presented = chain.first().ok_or(TlsFailure::NoCertificate)?;
+        let Some(presented) = chain.first() else {
+            let is_required = self.requires_certificate;
+            return if is_required { Err(TlsFailure::NoCertificate) } else { Ok(None) };
+        };
         let parsed = Parsed::new(presented).map_err(Error::from)?;
-        Ok(PeerCertificate {
+        Ok(Some(PeerCertificate {
             role: parsed.role()?,
             subject: parsed.subject_text(),
             serial: parsed.serial_text(),
             chain: chain.iter().cloned().map(CertificateDer::into_owned).collect(),
-        })
+        }))
     }
 }
 
@@ -251,6 +307,7 @@ mod tests {
 
     const DAY: u64 = 24 * 60 * 60;
     const VERSIONS: [&SupportedProtocolVersion; 2] = [&TLS12, &TLS13];
+    const PROTOCOLS: [Protocol; 2] = [Protocol::Modbus, Protocol::Http];
 
     /// A clock that tests set, in seconds since 1970.
     #[derive(Debug)]
@@ -276,7 +333,9 @@ mod tests {
     fn shake(tls: &ServerTls, client: &Arc<ClientConfig>) -> Result<HandshakeKind, &'static str> {
         let mut server = tls.channel().unwrap();
         talk(&mut server, client, b"").map_err(|failure| failure.reason())?;
-        assert_eq!(server.peer_certificate().unwrap().role, "operator");
+        let certificate = server.peer_certificate().unwrap();
+        assert_eq!(certificate.is_some(), tls.requires_certificate());
+        assert!(certificate.is_none_or(|certificate| certificate.role == "operator"));
         Ok(server.channel.0.handshake_kind().unwrap())
     }
 
@@ -326,9 +385,11 @@ mod tests {
     fn a_session_is_not_resumed_when_the_certificate_has_expired_since() {
         let party = Party::with_client(|params| params.not_after = date_time_ymd(2040, 1, 1));
         let last = 2_208_988_800;
-        for version in VERSIONS {
+        let cases = PROTOCOLS.map(|protocol| VERSIONS.map(|version| (protocol, version)));
+        for (protocol, version) in cases.into_iter().flatten() {
             let clock = Arc::new(Clock(AtomicU64::new(last - 10)));
-            let tls = ServerTls::with_clock(&party.files(), None, Arc::clone(&clock) as _).unwrap();
+            let files = ServerFiles { protocol, ..party.files() };
+            let tls = ServerTls::with_clock(&files, None, Arc::clone(&clock) as _).unwrap();
             let client = party.client(version);
             assert_eq!(shake(&tls, &client), Ok(FULL));
             assert_eq!(shake(&tls, &client), Ok(RESUMED));
@@ -386,26 +447,37 @@ mod tests {
     #[test]
     fn a_client_gets_no_longer_fragments_than_it_asks_for() {
         let party = Party::new();
-        let tls = ServerTls::load(&party.files(), None).unwrap();
-        for version in VERSIONS {
-            for (code, len) in LENGTHS.iter().zip(1..).map(|(len, code)| (code, *len)) {
-                let mut server = tls.channel().unwrap();
-                let (mut hello, mut sent) = (Vec::new(), Vec::new());
-                connection(&party.client(version)).write_tls(&mut hello).unwrap();
-                with_extension(&mut hello, &[0, 1, 0, 1, code]);
-                let cut = hello.len() - 1;
-                for part in [&hello[..cut], &hello[cut..]] {
-                    assert!(sent.is_empty());
-                    server.receive(part, &mut Vec::new(), &mut sent).unwrap();
-                }
-                server.send(&[7; 10_000], &mut sent);
-                let longest = lengths(&sent).into_iter().max().unwrap();
+        for (protocol, offered) in
+            [(Protocol::Modbus, "h2"), (Protocol::Http, "h2"), (Protocol::Http, "http/1.1")]
+        {
+            let tls = ServerTls::load(&ServerFiles { protocol, ..party.files() }, None).unwrap();
+            for (version, (code, len)) in
+                VERSIONS.into_iter().flat_map(|each| (1..).zip(LENGTHS).map(move |len| (each, len)))
+            {
+                let mut client = ClientConfig::clone(&party.client(version));
+                client.alpn_protocols = vec![offered.into()];
+                let longest = longest_fragment(&tls, &Arc::new(client), code);
                 // The certificate of the server is longer than the shortest fragment.
                 let overhead = if version == &TLS13 { 1 + 16 } else { 0 };
                 assert!(longest <= len + overhead, "{longest} of {len} over {version:?}");
                 assert!(len > 512 || longest == len + overhead, "{longest}");
             }
         }
+    }
+
+    /// The length of the longest fragment for a client that asks for the length with that code.
+    fn longest_fragment(tls: &ServerTls, client: &Arc<ClientConfig>, code: u8) -> usize {
+        let mut server = tls.channel().unwrap();
+        let (mut hello, mut sent) = (Vec::new(), Vec::new());
+        connection(client).write_tls(&mut hello).unwrap();
+        with_extension(&mut hello, &[0, 1, 0, 1, code]);
+        let cut = hello.len() - 1;
+        for part in [&hello[..cut], &hello[cut..]] {
+            assert!(sent.is_empty());
+            server.receive(part, &mut Vec::new(), &mut sent).unwrap();
+        }
+        server.send(&[7; 10_000], &mut sent);
+        lengths(&sent).into_iter().max().unwrap()
     }
 
     /// Inserts an extension as the first of a ClientHello in one record.
@@ -439,12 +511,117 @@ mod tests {
         let two = vec![role("operator"), role("engineer")];
         for (roles, reason) in [(two, "two_roles"), (vec![wrong_type], "role_type")] {
             let party = Party::with_client(|params| params.custom_extensions = roles.clone());
-            let tls = ServerTls::load(&party.files(), None).unwrap();
+            for protocol in PROTOCOLS {
+                let tls = ServerTls::load(&ServerFiles { protocol, ..party.files() }, None);
+                for version in VERSIONS {
+                    refuses(tls.as_ref().unwrap(), &party.client(version), reason);
+                }
+            }
+        }
+    }
+
+    /// Asserts why a client is refused, and that its subject is known.
+    fn refuses(tls: &ServerTls, client: &Arc<ClientConfig>, reason: &str) {
+        let mut server = tls.channel().unwrap();
+        assert_eq!(talk(&mut server, client, b"").unwrap_err().reason(), reason);
+        assert_eq!(server.presented_subject().as_deref(), Some("CN=panel 7"));
+    }
+
+    fn http(party: &Party) -> ServerFiles {
+        ServerFiles { protocol: Protocol::Http, ..party.files() }
+    }
+
+    fn open(party: &Party) -> ServerFiles {
+        ServerFiles { ca_file: None, ..http(party) }
+    }
+
+    #[test]
+    fn http_clients_need_no_certificate_without_authorities_and_resume_sessions() {
+        let party = Party::new();
+        for version in VERSIONS {
+            let clock = Clock::new();
+            let tls = ServerTls::with_clock(&open(&party), None, Arc::clone(&clock) as _).unwrap();
+            assert!(!tls.requires_certificate());
+            let client = party.anonymous(version);
+            assert_eq!(shake(&tls, &client), Ok(FULL));
+            assert_eq!(shake(&tls, &client), Ok(RESUMED));
+            clock.pass(DAY / 2);
+            assert_eq!(shake(&tls, &client), Ok(RESUMED));
+            clock.pass(DAY / 2 + 1);
+            assert_eq!(shake(&tls, &client), Ok(FULL), "{version:?}");
+        }
+    }
+
+    #[test]
+    fn http_clients_need_a_certificate_with_authorities() {
+        let party = Party::new();
+        let tls = ServerTls::load(&http(&party), None).unwrap();
+        for version in VERSIONS {
+            assert_eq!(shake(&tls, &party.client(version)), Ok(FULL));
+            assert_eq!(shake(&tls, &party.anonymous(version)), Err("no_certificate"));
+        }
+    }
+
+    #[test]
+    fn what_requires_authorities_is_refused_without_them() {
+        let party = Party::new();
+        let crl_file = Some(party.folder.write("crl.pem", ""));
+        let roles = Some(vec!["operator".to_owned()]);
+        for (files, expected) in [
+            (
+                ServerFiles { ca_file: None, ..party.files() },
+                "server.pem: found without ca_file, which Modbus/TCP Security requires",
+            ),
+            (
+                ServerFiles { crl_file, ..open(&party) },
+                "crl.pem: found without client_ca_file, allowed: only with it",
+            ),
+            (
+                ServerFiles { roles, ..open(&party) },
+                "server.pem: found with roles and without client_ca_file, allowed: roles only \
+                 with it",
+            ),
+        ] {
+            let refused = ServerTls::load(&files, None).unwrap_err().to_string();
+            assert!(refused.ends_with(expected), "{refused}");
+        }
+    }
+
+    #[test]
+    fn only_clients_with_an_allowed_role_are_served() {
+        let party = Party::new();
+        for version in VERSIONS {
+            let tls = |role: &str| {
+                let files = ServerFiles { roles: Some(vec![role.to_owned()]), ..http(&party) };
+                ServerTls::load(&files, None).unwrap()
+            };
+            let client = party.client(version);
+            assert_eq!(shake(&tls("operator"), &client), Ok(FULL));
+            for other in ["engineer", ""] {
+                refuses(&tls(other), &client, "wrong_role");
+            }
+        }
+    }
+
+    #[test]
+    fn http_is_chosen_among_the_protocols_that_a_client_offers() {
+        const H1: &[u8] = b"http/1.1";
+        let party = Party::new();
+        for (files, offered, chosen) in [
+            (open(&party), &[&b"h2"[..], H1][..], Some(H1)),
+            (http(&party), &[H1], Some(H1)),
+            (open(&party), &[b"h2"], None),
+            (http(&party), &[b"h2"], None),
+            (open(&party), &[], None),
+            (party.files(), &[H1], None),
+        ] {
+            let tls = ServerTls::load(&files, None).unwrap();
             for version in VERSIONS {
+                let mut client = ClientConfig::clone(&party.client(version));
+                client.alpn_protocols = offered.iter().map(|name| name.to_vec()).collect();
                 let mut server = tls.channel().unwrap();
-                let refused = talk(&mut server, &party.client(version), b"").unwrap_err();
-                assert_eq!(refused.reason(), reason);
-                assert_eq!(server.presented_subject().as_deref(), Some("CN=panel 7"));
+                talk(&mut server, &Arc::new(client), b"").unwrap();
+                assert_eq!(server.channel.0.alpn_protocol(), chosen, "{offered:?}");
             }
         }
     }

@@ -28,7 +28,8 @@ const MAX_LEN: usize = 8 * 1024;
 const LIFETIME: Duration = Duration::from_secs(24 * 60 * 60);
 
 pub(super) struct Sessions {
-    clients: Arc<Clients>,
+    /// `None`: clients need no certificate.
+    clients: Option<Arc<Clients>>,
     clock: Arc<dyn TimeProvider>,
     stored: Mutex<Stored>,
 }
@@ -44,12 +45,13 @@ struct Stored {
 struct Session {
     secrets: Vec<u8>,
     chain: Chain,
-    /// When the client proved that it has the key of its certificate.
+    /// When the client proved that it has the key of its certificate, if it needs one: the time of
+    /// the full handshake.
     proved: UnixTime,
 }
 
 impl Sessions {
-    pub(super) fn new(clients: Arc<Clients>, clock: Arc<dyn TimeProvider>) -> Sessions {
+    pub(super) fn new(clients: Option<Arc<Clients>>, clock: Arc<dyn TimeProvider>) -> Sessions {
         Sessions { clients, clock, stored: Mutex::default() }
     }
 
@@ -63,7 +65,11 @@ impl Sessions {
         let now = self.clock.current_time()?;
         let age = now.as_secs().checked_sub(session.proved.as_secs());
         let is_fresh = age.is_some_and(|age| age <= LIFETIME.as_secs());
-        if !is_fresh || self.clients.judge(&session.chain, now).is_err() {
+        let is_trusted = match &self.clients {
+            Some(clients) => clients.judge(&session.chain, now).is_ok(),
+            None => true,
+        };
+        if !is_fresh || !is_trusted {
             self.forget(key);
             return None;
         }
@@ -82,7 +88,11 @@ impl Sessions {
 
 impl StoresServerSessions for Sessions {
     fn put(&self, key: Vec<u8>, secrets: Vec<u8>) -> bool {
-        let (chain, proved) = noted(|notes| (notes.chain.clone(), notes.proved));
+        let (mut chain, mut proved) = noted(|notes| (notes.chain.clone(), notes.proved));
+        if self.clients.is_none() {
+            chain = chain.or_else(|| Some(Chain::default()));
+            proved = proved.or_else(|| self.clock.current_time());
+        }
         let (Some(chain), Some(proved)) = (chain, proved) else { return false };
         let len = secrets.len() + chain.iter().map(|certificate| certificate.len()).sum::<usize>();
         if len > MAX_LEN {

@@ -9,11 +9,14 @@ use rcgen::{
     BasicConstraints, Certificate, CertificateParams, CustomExtension, DnType, IsCa, Issuer,
     KeyPair, KeyUsagePurpose, date_time_ymd,
 };
+use rustls::client::WantsClientCert;
 use rustls::pki_types::{PrivateKeyDer, ServerName};
-use rustls::{ClientConfig, ClientConnection, RootCertStore, SupportedProtocolVersion};
+use rustls::{
+    ClientConfig, ClientConnection, ConfigBuilder, RootCertStore, SupportedProtocolVersion,
+};
 
 use super::provider::provider;
-use super::server_files::{ExpiredLists, ServerFiles};
+use super::server_files::{ExpiredLists, Protocol, ServerFiles};
 
 /// A certificate and its key.
 pub(crate) struct Owner {
@@ -117,26 +120,41 @@ impl Party {
     pub(crate) fn files(&self) -> ServerFiles {
         let write = |name, content: String| self.folder.write(name, &content);
         ServerFiles {
+            protocol: Protocol::Modbus,
             cert_file: write("server.pem", self.server.certificate.pem()),
             key_file: write("server.key", self.server.key.serialize_pem()),
-            ca_file: write("ca.pem", self.authority.certificate.pem()),
+            ca_file: Some(write("ca.pem", self.authority.certificate.pem())),
             crl_file: None,
             expired_lists: ExpiredLists::Refuse,
+            roles: None,
         }
     }
 
     /// The settings of the client. They keep sessions, so that the next connection resumes one.
     pub(crate) fn client(&self, version: &'static SupportedProtocolVersion) -> Arc<ClientConfig> {
-        let mut roots = RootCertStore::empty();
-        roots.add(self.authority.certificate.der().clone()).unwrap();
         let key = PrivateKeyDer::try_from(self.client.key.serialize_der()).unwrap();
         let chain = vec![self.client.certificate.der().clone()];
-        let config = ClientConfig::builder_with_provider(provider())
+        Arc::new(self.trusting(version).with_client_auth_cert(chain, key).unwrap())
+    }
+
+    /// The settings of a client without a certificate.
+    pub(crate) fn anonymous(
+        &self,
+        version: &'static SupportedProtocolVersion,
+    ) -> Arc<ClientConfig> {
+        Arc::new(self.trusting(version).with_no_client_auth())
+    }
+
+    fn trusting(
+        &self,
+        version: &'static SupportedProtocolVersion,
+    ) -> ConfigBuilder<ClientConfig, WantsClientCert> {
+        let mut roots = RootCertStore::empty();
+        roots.add(self.authority.certificate.der().clone()).unwrap();
+        ClientConfig::builder_with_provider(provider())
             .with_protocol_versions(&[version])
             .unwrap()
             .with_root_certificates(roots)
-            .with_client_auth_cert(chain, key);
-        Arc::new(config.unwrap())
     }
 }
 

@@ -1,0 +1,110 @@
+//! `ServerTls`: the certificates of a TLS server, of a listener or of HTTPS.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use holdfast_engine::tls::server::{
+    ExpiredLists, Protocol, ServerFiles, ServerTls as CoreServerTls,
+};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+
+use crate::arguments::word;
+
+/// Settings of a TLS server with mutual authentication. Reads the PEM files at once.
+///
+/// `ca_file` has the authorities of client certificates, and self-signed certificates of clients;
+/// `crl_file` has the revocation lists of these authorities, and `expired_crl` is what happens to
+/// their clients after `nextUpdate`. `key` is the content of `key_file` without its passphrase, if
+/// it has one. Raises `ValueError` for a file that can't be used.
+#[pyclass(frozen, module = "holdfast")]
+pub struct ServerTls {
+    pub(crate) core: Arc<CoreServerTls>,
+}
+
+#[pymethods]
+impl ServerTls {
+    #[new]
+    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None, expired_crl="refuse", key=None))]
+    fn new(
+        py: Python<'_>,
+        cert_file: PathBuf,
+        key_file: PathBuf,
+        ca_file: PathBuf,
+        crl_file: Option<PathBuf>,
+        expired_crl: &str,
+        key: Option<&[u8]>,
+    ) -> PyResult<ServerTls> {
+        let files = ServerFiles {
+            protocol: Protocol::Modbus,
+            cert_file,
+            key_file,
+            ca_file: Some(ca_file),
+            crl_file,
+            expired_lists: expired_lists(expired_crl)?,
+            roles: None,
+        };
+        load(py, &files, key)
+    }
+
+    /// What is doubtful about the files: dates, and revocation lists.
+    #[getter]
+    fn warnings(&self) -> Vec<String> {
+        self.core.warnings().to_vec()
+    }
+}
+
+/// Settings of the TLS of an HTTPS server. Reads the PEM files at once.
+///
+/// Without `client_ca_file`, clients need no certificate. `roles` are the allowed roles of their
+/// certificates: "" is a certificate without a role, `None` is any role. The rest is that of
+/// `ServerTls`, also what it raises.
+#[pyfunction]
+#[pyo3(signature = (*, cert_file, key_file, client_ca_file=None, crl_file=None, expired_crl="refuse", roles=None, key=None))]
+#[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
+pub fn https_server_tls(
+    py: Python<'_>,
+    cert_file: PathBuf,
+    key_file: PathBuf,
+    client_ca_file: Option<PathBuf>,
+    crl_file: Option<PathBuf>,
+    expired_crl: &str,
+    roles: Option<Vec<String>>,
+    key: Option<&[u8]>,
+) -> PyResult<ServerTls> {
+    let files = ServerFiles {
+        protocol: Protocol::Http,
+        cert_file,
+        key_file,
+        ca_file: client_ca_file,
+        crl_file,
+        expired_lists: expired_lists(expired_crl)?,
+        roles,
+    };
+    load(py, &files, key)
+}
+
+impl ServerTls {
+    /// The settings for a listener of Modbus or Raw Ingest.
+    pub(crate) fn of_listener(&self) -> PyResult<Arc<CoreServerTls>> {
+        match self.core.protocol() {
+            Protocol::Modbus => Ok(Arc::clone(&self.core)),
+            Protocol::Http => {
+                let message = "tls is that of an HTTPS server, allowed: ServerTls(cert_file=…)";
+                Err(PyValueError::new_err(message))
+            }
+        }
+    }
+}
+
+fn expired_lists(text: &str) -> PyResult<ExpiredLists> {
+    let allowed = [("refuse", ExpiredLists::Refuse), ("accept", ExpiredLists::Accept)];
+    word("expired_crl", text, &allowed)
+}
+
+fn load(py: Python<'_>, files: &ServerFiles, key: Option<&[u8]>) -> PyResult<ServerTls> {
+    // A file that does not answer stops no other thread.
+    let core = py.detach(|| CoreServerTls::load(files, key));
+    let core = core.map_err(|error| PyValueError::new_err(error.to_string()))?;
+    Ok(ServerTls { core: Arc::new(core) })
+}
