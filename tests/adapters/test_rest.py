@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from holdfast.web.requests import Request, Response
+
 ADMIN, READER, NARROW, OTHER = "secret-admin", "secret-reader", "secret-narrow", "secret-other"
 TOKENS = [
     web.token("admin", ADMIN, memories=("plant_a", "plant_b"), manage=True),
@@ -507,12 +509,14 @@ def test_every_answer_is_not_to_be_kept_and_names_no_server(client: web.Client, 
 
 
 def test_a_fault_is_answered_without_a_detail_and_logged(log: web.Records) -> None:
-    async def app(*_: object) -> None:
+    def fail(_: Request) -> Response:
         raise RuntimeError("the secret of the house")
 
     listener = listen("127.0.0.1", 0)
     loopback = [ip_network("127.0.0.0/8")]
-    host = Host("x", app, listener, sources=loopback, limits=ConnectionLimits(1), request_timeout=9)
+    host = Host(
+        "x", fail, listener, sources=loopback, limits=ConnectionLimits(1), request_timeout=9
+    )
     with (
         contextlib.closing(listener),
         web.in_a_thread(host),
@@ -860,7 +864,7 @@ def test_the_document_is_served_and_names_every_route(
         path: method.upper() for path, methods in served["paths"].items() for method in methods
     }
     assert named == ROUTES
-    app: Any = service.made()._host._app
+    app: Any = service.made()._app
     assert app.routes.keys() == named.keys()
     assert served["paths"].keys() == document["paths"].keys()
 

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 import holdfast
 from holdfast.adapters import Stop
 from holdfast.web import host as http_host
-from holdfast.web import requests
 from holdfast.web.port import listen
 from support import web, wire
 from support.cases import examples
@@ -158,7 +157,7 @@ def test_a_chunked_body_at_the_limit_is_taken_and_one_above_is_not(
 def test_a_length_above_the_limit_is_refused_before_the_body_is_read(
     start: Start, connect: Connect, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(requests, "LINGER_TIMEOUT", 0.1)
+    monkeypatch.setattr(http_host, "LINGER_TIMEOUT", 0.1)
     service = start(max_body=1024)
     connection = connect(service, web.post(GOOD).replace(b": 60", b": 999999999999")[:-5])
     [answer] = web.answers(connection.rest())
@@ -180,7 +179,7 @@ def test_a_length_that_is_no_number_is_not_http(
 def test_an_endless_chunked_body_is_cut_off(
     start: Start, connect: Connect, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(requests, "LINGER_TIMEOUT", 0.1)
+    monkeypatch.setattr(http_host, "LINGER_TIMEOUT", 0.1)
     service = start(max_body=1024)
     connection = connect(service, post_chunked(b"", 1)[:-5])
     chunk = b"1000\r\n" + b" " * 4096 + b"\r\n"

@@ -1,4 +1,4 @@
-"""The ASGI application of the gateway: routing, authorization, limits and responses.
+"""The application of the gateway: routing, authorization, limits and responses.
 
 Only `device` communicates with devices. A request is cancelled when its client disconnects.
 """
@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import logging
 from collections import Counter
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import msgspec
 
@@ -39,13 +39,22 @@ from holdfast.net.resolver import Resolver
 from holdfast.web import health as probes
 from holdfast.web import openapi_page as page
 from holdfast.web.events import Stream
-from holdfast.web.host import SAFE, BrokenBody, headers_of, respond
 from holdfast.web.openapi import DOCUMENT, PAGE
 from holdfast.web.refusals import UNREAD, headers_with
-from holdfast.web.requests import BadRequest, ClientDisconnected, Request, respond_to_its_end, shown
+from holdfast.web.requests import (
+    JSON,
+    SAFE,
+    BadRequest,
+    BrokenBody,
+    ClientDisconnected,
+    Request,
+    Response,
+    response,
+    shown,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
+    from collections.abc import Callable, Coroutine, Iterator, Sequence
 
     from holdfast._core import Poller
     from holdfast.gateway.endpoint import Operation
@@ -55,13 +64,14 @@ if TYPE_CHECKING:
     from holdfast.gateway.settings import Settings
     from holdfast.net.resolver import Resolve
     from holdfast.web.health import HealthSource
-    from holdfast.web.host import Headers, Receive, Scope, Send
 
-    Handler: TypeAlias = Callable[[Request, Send], Awaitable[None]]
+    Later: TypeAlias = Coroutine[Any, Any, Response | None]
+    Handler: TypeAlias = Callable[[Request], Response | Later]
+
+Result = TypeVar("Result")
 
 ENDPOINTS: tuple[Operation, ...] = (*reading.ENDPOINTS, *writing.ENDPOINTS, *identifying.ENDPOINTS)
 
-JSON = b"application/json"
 REASON = b"holdfast-reason"
 FORM = b"application/x-www-form-urlencoded"
 """The default Content-Type of `curl -d`. The gateway treats it as JSON."""
@@ -75,7 +85,7 @@ WRITES_ON = "enable them with --writes, or with access: read-write in the config
 
 
 class App:
-    """The ASGI application."""
+    """The application."""
 
     def __init__(
         self,
@@ -152,34 +162,27 @@ class App:
             with contextlib.suppress(RuntimeError):  # The loop is already closed.
                 self._loop.call_soon_threadsafe(self._ending.set)
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    def __call__(self, request: Request) -> Response | Later:
         """Answers one request."""
         self._loop = asyncio.get_running_loop()
-        request = Request(scope, receive)
         self._requests += 1
         try:
-            await self._answer(request, send)
-        except BadRequest as unfit:
-            await self._refuse(request, send, unfit)
-        except Failed as failed:
-            self._failed += 1
-            body = _error(failed.detail)
-            status = FAILURE.status
-            await self._reply(request, send, body, status=status, reason=failed.reason)
-        except ClientDisconnected:
-            pass
-        except BrokenBody:
-            raise
-        except Exception:
-            logs.problem("request_failed", listener="gateway", peer=request.peer)
-            with contextlib.suppress(RuntimeError):  # The response has begun and is cut off.
-                body = _error("internal error, see the log")
-                status = FAILURE.status
-                await self._reply(request, send, body, status=status, reason="internal_error")
+            answer = self._answer(request)
+        except Exception as error:
+            return self._refusal(request, error)
+        return answer if isinstance(answer, Response) else self._finished(request, answer)
 
-    async def _answer(self, request: Request, send: Send) -> None:
-        hosts = len(request.headers(b"host"))
-        if hosts > 1 or (hosts == 0 and request.scope["http_version"] == "1.1"):
+    async def _finished(self, request: Request, answer: Later) -> Response | None:
+        try:
+            return await answer
+        except (BrokenBody, ClientDisconnected):
+            raise
+        except Exception as error:
+            return self._refusal(request, error)
+
+    def _answer(self, request: Request) -> Response | Later:
+        hosts = len(request.values(b"host"))
+        if hosts > 1 or (hosts == 0 and request.version == "1.1"):
             raise malformed(f"{hosts} Host headers, HTTP/1.1 requires exactly one")
         route = self.routes.get(request.path)
         if route is None:
@@ -187,23 +190,33 @@ class App:
         allowed, handler = route
         head = request.method == "HEAD" and allowed == "GET" and request.path != watching.PATH
         if request.method == allowed or head:
-            await handler(request, send)
-            return
+            return handler(request)
         methods = f"{allowed}, OPTIONS"
         if allowed == "GET" and request.path != watching.PATH:
             methods = "GET, HEAD, OPTIONS"
-        request.more_headers.append((b"allow", methods.encode()))
-        if request.method != "OPTIONS":
+        if request.method == "OPTIONS":
+            answer = Response(204, headers=list(SAFE))
+        else:
             detail = port_of_call.METHOD_NOT_ALLOWED
             if request.path not in self._lenient:
                 detail += f"; allowed: {methods}"
-            raise BadRequest("method_not_allowed", detail)
-        await respond(send, 204, [*SAFE, *request.more_headers])
+            answer = self._refusal(request, BadRequest("method_not_allowed", detail))
+        answer.headers.append((b"allow", methods.encode()))
+        return answer
 
-    async def _refuse(self, request: Request, send: Send, unfit: BadRequest) -> None:
-        body, status = _error(unfit.detail), REFUSALS.status(unfit.reason)
-        if isinstance(unfit, port_of_call.Rejected):
-            body, status = unfit.body, unfit.status
+    def _refusal(self, request: Request, error: Exception) -> Response:
+        """Returns the answer to a request that was refused or has failed."""
+        if isinstance(error, BadRequest):
+            return self._refused_by(request, error)
+        reason, detail = "internal_error", "internal error, see the log"
+        if isinstance(error, Failed):
+            self._failed += 1
+            reason, detail = error.reason, error.detail
+        else:
+            logs.problem("request_failed", listener="gateway", peer=request.peer)
+        return rejection(FAILURE.status, reason, detail)
+
+    def _refused_by(self, request: Request, unfit: BadRequest) -> Response:
         self._refused[unfit.reason] = self._refused.get(unfit.reason, 0) + 1
         logs.refused(
             "gateway_refused",
@@ -215,28 +228,13 @@ class App:
             # The detail may contain values to be written, which are never logged.
             detail="-" if unfit.reason == "malformed" else unfit.detail,
         )
-        request.more_headers += headers_with(status)
-        if status in UNREAD:
-            await respond_to_its_end(request, send, status, *rejection(unfit.reason, unfit.detail))
-            return
-        await self._reply(request, send, body, status=status, reason=unfit.reason)
-
-    async def _reply(
-        self,
-        request: Request,
-        send: Send,
-        body: bytes,
-        *,
-        kind: bytes = JSON,
-        status: int = 200,
-        reason: str | None = None,
-    ) -> None:
-        headers: Headers = headers_of(kind, body) + request.more_headers
-        if reason is not None:
-            headers.append((REASON, reason.encode()))
-        if request.header(b"expect") is not None:
-            headers.append((b"connection", b"close"))
-        await respond(send, status, headers, body)
+        status = REFUSALS.status(unfit.reason)
+        answer = rejection(status, unfit.reason, unfit.detail)
+        if isinstance(unfit, port_of_call.Rejected):
+            answer.body, answer.status = unfit.body, unfit.status
+        answer.headers += headers_with(answer.status)
+        answer.closes = status in UNREAD or request.header(b"expect") is not None
+        return answer
 
     # Authorization and limits.
 
@@ -291,8 +289,8 @@ class App:
         await asyncio.sleep(grace)
 
     async def _while_there(
-        self, request: Request, work: Coroutine[Any, Any, None], *, grace: float
-    ) -> None:
+        self, request: Request, work: Coroutine[Any, Any, Result], *, grace: float
+    ) -> Result:
         """Runs work. Cancels it when the client disconnects, or `grace` seconds after a stop.
 
         Raises `ClientDisconnected` in both cases.
@@ -306,7 +304,7 @@ class App:
             await asyncio.wait([task, *others], return_when=asyncio.FIRST_COMPLETED)
             if not task.done():
                 raise ClientDisconnected
-            task.result()
+            return task.result()
         finally:
             for each in (task, *others):
                 each.cancel()
@@ -318,7 +316,7 @@ class App:
         longest = round(1000 * self._limits.timeout)
         fields = (*endpoint.fields, timeout(min(endpoint.timeout, longest), longest))
 
-        async def handle(request: Request, send: Send) -> None:
+        async def handle(request: Request) -> Response:
             self._admit(request)
             self._check_type(request)
             with self._place("requests", self._limits.requests):
@@ -330,8 +328,8 @@ class App:
                     self._egress, self._pool, given, broadcast=endpoint.broadcast
                 )
                 with self._share(device):
-                    work = self._carry_out(request, send, endpoint, given, device, changes)
-                    await self._while_there_or_told(request, work)
+                    work = self._carry_out(request, endpoint, given, device, changes)
+                    return await self._while_there_or_told(request, work)
 
         return handle
 
@@ -359,10 +357,12 @@ class App:
             )
         return given
 
-    async def _while_there_or_told(self, request: Request, work: Coroutine[Any, Any, None]) -> None:
+    async def _while_there_or_told(
+        self, request: Request, work: Coroutine[Any, Any, Result]
+    ) -> Result:
         """As `_while_there`, but a request that a stop cancels is answered with `stopping`."""
         try:
-            await self._while_there(request, work, grace=self._limits.ending)
+            return await self._while_there(request, work, grace=self._limits.ending)
         except ClientDisconnected:
             if self._ending.is_set():
                 raise BadRequest("stopping", STOPPING) from None
@@ -371,12 +371,11 @@ class App:
     async def _carry_out(
         self,
         request: Request,
-        send: Send,
         endpoint: Operation,
         given: dict[str, Any],
         device: RequestedDevice,
         changes: bool,
-    ) -> None:
+    ) -> Response:
         outcome = "failed"
         try:
             answer = await endpoint.carry_out(given, device)
@@ -394,7 +393,7 @@ class App:
                 sent = device.asked and outcome != "refused"
                 told = outcome if sent or outcome == "refused" else "not sent"
                 self._note_write(request, given, device, told, sent=sent)
-        await self._reply(request, send, msgspec.json.encode(answer))
+        return response(JSON, msgspec.json.encode(answer))
 
     def _note_write(
         self,
@@ -419,7 +418,7 @@ class App:
             outcome=outcome,
         )
 
-    async def _map(self, request: Request, send: Send) -> None:
+    async def _map(self, request: Request) -> None:
         self._admit(request)
         self._check_type(request)
         with self._stream(request):
@@ -428,21 +427,21 @@ class App:
             self._require_stream(request, given["maxStreams"])
             device = RequestedDevice(self._egress, self._pool, given)
             survey = surveying.planned(given)
-            stream = Stream(send, self._limits.heartbeat)
+            stream = Stream(request, self._limits.heartbeat)
             work = surveying.survey(
                 survey, device, stream, step=given["step"], longest=self._limits.discovery
             )
             await self._while_streaming(request, stream, work)
 
-    async def _watch(self, request: Request, send: Send) -> None:
+    async def _watch(self, request: Request) -> None:
         self._admit(request)
         with self._stream(request):
-            given = from_query(request.scope["query_string"], watching.fields(self._limits))
+            given = from_query(request.query, watching.fields(self._limits))
             device = RequestedDevice(self._egress, self._pool, given)
-            stream = Stream(send, self._limits.heartbeat)
+            stream = Stream(request, self._limits.heartbeat)
             await self._while_streaming(request, stream, watching.watch(given, device, stream))
 
-    async def _view(self, request: Request, send: Send) -> None:
+    async def _view(self, request: Request) -> None:
         self._admit(request)
         self._check_type(request)
         with self._place("requests", self._limits.requests):
@@ -453,7 +452,7 @@ class App:
         streaming = not given["once"] and self._has_stream(request, given["maxStreams"])
         once = self._place("requests", self._limits.requests)
         with self._stream(request) if streaming else once:
-            stream = Stream(send, self._limits.heartbeat)
+            stream = Stream(request, self._limits.heartbeat)
             work = viewing.follow(given, viewing.View(parts, device), stream, streaming=streaming)
             await self._while_streaming(request, stream, work)
 
@@ -485,20 +484,19 @@ class App:
     def _local(self, endpoint: Local) -> Handler:
         """Returns the handler of an endpoint that asks no device."""
 
-        async def handle(request: Request, send: Send) -> None:
+        async def handle(request: Request) -> Response:
             self._admit(request)
             self._check_type(request)
             with self._place("requests", self._limits.requests):
                 given = from_json(await request.body(self._limits.body), endpoint.fields)
                 answer = await endpoint.answer(given, self._settings.profiles)
-            await self._reply(request, send, msgspec.json.encode(answer))
+            return response(JSON, msgspec.json.encode(answer))
 
         return handle
 
-    async def _profiles(self, request: Request, send: Send) -> None:
+    def _profiles(self, request: Request) -> Response:
         self._admit(request)
-        answer = listing.profiles(self._settings.profiles)
-        await self._reply(request, send, msgspec.json.encode(answer))
+        return response(JSON, msgspec.json.encode(listing.profiles(self._settings.profiles)))
 
     async def _while_streaming(
         self, request: Request, stream: Stream, work: Coroutine[Any, Any, None]
@@ -513,7 +511,7 @@ class App:
 
     # Status, documents and console.
 
-    async def _status(self, request: Request, send: Send) -> None:
+    def _status(self, request: Request) -> Response:
         self._admit(request)
         limits = self._limits
         status = {
@@ -527,25 +525,22 @@ class App:
             },
             "connections": len(self._pool),
         }
-        await self._reply(request, send, msgspec.json.encode(status))
+        return response(JSON, msgspec.json.encode(status))
 
-    async def _probe(self, request: Request, send: Send) -> None:
+    def _probe(self, request: Request) -> Response:
         """Answers a probe. It needs no token, so the answer has no names."""
         assert self._health is not None, "there is a route"
-        status, body = probes.answer(self._health, request.path, details=False)
-        await self._reply(request, send, body, status=status)
+        return probes.answer(self._health, request.path, details=False)
 
-    async def _openapi(self, request: Request, send: Send) -> None:
-        await self._reply(request, send, self._document)
+    def _openapi(self, _: Request) -> Response:
+        return response(JSON, self._document)
 
-    async def _docs(self, request: Request, send: Send) -> None:
-        request.more_headers.append((b"content-security-policy", page.POLICY))
-        await self._reply(request, send, self._page, kind=page.KIND)
+    def _docs(self, _: Request) -> Response:
+        return response(page.KIND, self._page, (b"content-security-policy", page.POLICY))
 
-    async def _asset(self, request: Request, send: Send) -> None:
+    def _asset(self, request: Request) -> Response:
         kind, body = assets.read(request.path)
-        request.more_headers += assets.HEADERS
-        await self._reply(request, send, body, kind=kind)
+        return response(kind, body, *assets.HEADERS)
 
 
 def host_of(peer: str) -> str:
@@ -553,11 +548,7 @@ def host_of(peer: str) -> str:
     return peer.rpartition(":")[0]
 
 
-def rejection(reason: str, detail: str) -> tuple[Headers, bytes]:
-    """Returns the headers and the JSON of a refusal."""
-    body = _error(detail)
-    return [*headers_of(JSON, body), (REASON, reason.encode())], body
-
-
-def _error(detail: str) -> bytes:
-    return msgspec.json.encode({"success": False, "error": detail})
+def rejection(status: int, reason: str, detail: str) -> Response:
+    """Returns the response to a refused or failed request."""
+    body = msgspec.json.encode({"success": False, "error": detail})
+    return response(JSON, body, (REASON, reason.encode()), status=status)

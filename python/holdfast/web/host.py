@@ -1,4 +1,4 @@
-"""A host for ASGI applications: HTTP/1.1 with allowed source networks, limits and timeouts.
+"""A host of HTTP/1.1, with allowed source networks, limits and timeouts.
 
 uvicorn and httptools implement the protocol. This module protects it from hostile and broken peers:
 a peer from another network gets no byte, the number of connections is limited, receiving a request
@@ -17,7 +17,6 @@ from email.utils import formatdate
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import httptools
-import msgspec
 import uvicorn
 from uvicorn.protocols.http.flow_control import FlowControl
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
@@ -29,6 +28,7 @@ from holdfast.net.addresses import holds, joined, parse_address
 from holdfast.net.closing import close
 from holdfast.web.admission import Admission, Full, Waiting
 from holdfast.web.port import BACKLOG
+from holdfast.web.requests import BrokenBody, ClientDisconnected, Request, Response, rejection
 from holdfast.web.tls import TlsTransport
 
 if TYPE_CHECKING:
@@ -39,13 +39,9 @@ if TYPE_CHECKING:
     from holdfast.stop import Stop
     from holdfast.web.admission import ConnectionLimits
     from holdfast.web.https import Https
+    from holdfast.web.requests import Handler, Headers
 
-    Scope: TypeAlias = MutableMapping[str, Any]
-    Receive: TypeAlias = Callable[[], Awaitable[MutableMapping[str, Any]]]
-    Send: TypeAlias = Callable[[MutableMapping[str, Any]], Awaitable[None]]
-    App: TypeAlias = Callable[[Scope, Receive, Send], Awaitable[None]]
-    Headers: TypeAlias = list[tuple[bytes, bytes]]
-    Rejection: TypeAlias = Callable[[str, str], tuple[Headers, bytes]]
+    Rejection: TypeAlias = Callable[[int, str, str], Response]
 
 MAX_HEADER = 65536
 """The largest request header in bytes; also the limit for chunk extensions and trailers."""
@@ -57,14 +53,14 @@ KEEP_ALIVE = 60.0
 """Seconds after which an idle connection is closed."""
 
 LATE_ANSWER_TIMEOUT = 1.0
-"""Seconds for the application to answer a request that did not arrive in time."""
+"""Seconds for the handler to answer a request that did not arrive in time."""
+
+LINGER_TIMEOUT = 2.0
+"""Seconds to keep reading an oversized body, so that the client receives the response."""
 
 STOP_TIMEOUT = 3.0
 """Seconds for pending requests to finish when the host stops, by default. Longer than applications
 need to end them, so that a loaded machine can still send the answers."""
-
-SAFE: Headers = [(b"cache-control", b"no-store"), (b"x-content-type-options", b"nosniff")]
-"""Headers of every response: no caching, no guessing of content types."""
 
 # uvicorn's own log is discarded. This module logs events in the project's format.
 logging.getLogger("uvicorn").addHandler(logging.NullHandler())
@@ -74,17 +70,6 @@ logging.getLogger("uvicorn").propagate = False
 def address_of(host: str, port: int) -> str:
     """Formats `10.0.0.9:51200` or `[fd00::9]:51200`. An IPv4-mapped address is shown as IPv4."""
     return joined(str(parse_address(host)), port)
-
-
-def rejection(reason: str, detail: str, status: str = "rejected") -> tuple[Headers, bytes]:
-    """Returns the headers and the JSON of a refusal."""
-    body = msgspec.json.encode({"status": status, "reason": reason, "detail": detail})
-    return headers_of(b"application/json", body), body
-
-
-def headers_of(kind: bytes, body: bytes) -> Headers:
-    """Returns the headers of a response with this body."""
-    return [(b"content-type", kind), (b"content-length", b"%d" % len(body)), *SAFE]
 
 
 @dataclass
@@ -103,23 +88,14 @@ class Counts:
     open: int = 0
 
 
-class BrokenBody(Exception):
-    """The body of a request can't be parsed. Raised where the application receives it."""
-
-
 class Host:
-    """Serves one ASGI application on a listening socket.
+    """Serves the requests on a listening socket: calls a handler for each, one at a time.
 
-    `scope["state"]["peer"]` is the peer's address as text, for logs. When a request does not arrive
-    in time, `scope["state"]["late"]` is set and `receive` returns. The application then has
+    When a request does not arrive in time, `Request.is_late` is set. The handler then has
     `LATE_ANSWER_TIMEOUT` seconds to answer before the connection is dropped.
 
-    `receive` raises `BrokenBody` if the body of the request is not valid HTTP. An application
-    leaves the response to the host then.
-
-    An application that sets `scope["state"]["leaving"]` gets a half-close as a disconnect.
-
-    `rejection` creates the response to requests that never reach the application.
+    `rejection` creates the response to requests that never reach the handler, from the status, the
+    reason and a sentence.
 
     With `https`, connections use TLS; the limits and `request_timeout` include the handshake.
 
@@ -130,7 +106,7 @@ class Host:
     def __init__(
         self,
         name: str,
-        app: App,
+        handler: Handler,
         listener: socket.socket,
         *,
         sources: Iterable[Network],
@@ -156,7 +132,7 @@ class Host:
         self.address = address_of(host, port)
         self._limits = limits
         self._admission: Admission[_Connection] = Admission(limits)
-        self._app = app
+        self._handler = handler
         self._listener = listener
 
     def counts(self) -> dict[str, int]:
@@ -246,27 +222,30 @@ class Host:
 
         return state, connection
 
-    async def _guarded(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Runs the application. Exceptions are logged, and answered without details."""
-
-        async def receive_valid() -> MutableMapping[str, Any]:
-            message = await receive()
-            if "broken" in scope["state"]:
-                raise BrokenBody
-            return message
-
+    async def _guarded(
+        self,
+        scope: MutableMapping[str, Any],
+        receive: Callable[[], Awaitable[MutableMapping[str, Any]]],
+        send: Callable[[MutableMapping[str, Any]], Awaitable[None]],
+    ) -> None:
+        """Runs the handler. Exceptions are logged, and answered without details."""
+        request = _AsgiRequest(scope, receive, send)
+        answer: Response | None
         try:
-            await self._app(scope, receive_valid, send)
+            outcome = self._handler(request)
+            answer = outcome if isinstance(outcome, Response) else await outcome
         except BrokenBody:
-            self.note("broken_request", scope["state"]["peer"])
+            self.note("broken_request", request.peer)
             status, detail = scope["state"]["broken"]
-            headers, body = self.rejection("malformed", detail)
-            with contextlib.suppress(RuntimeError):  # The response has begun and is cut off.
-                await respond(send, status, [*headers, (b"connection", b"close")], body)
+            answer = self.rejection(status, "malformed", detail)
+            answer.closes = True
+        except ClientDisconnected:
+            return
         except Exception:
-            logs.problem("request_failed", listener=self.name, peer=scope["state"]["peer"])
-            with contextlib.suppress(RuntimeError):  # The response has begun and is cut off.
-                await respond(send, 500, *rejection("internal_error", "see the log", "failed"))
+            logs.problem("request_failed", listener=self.name, peer=request.peer)
+            answer = rejection(500, "internal_error", "see the log", "failed")
+        if answer is not None and not request.has_begun:  # Otherwise it is cut off.
+            await request.respond(answer)
 
     def _fault(self, loop: asyncio.AbstractEventLoop, context: Mapping[str, Any]) -> None:  # noqa: ARG002
         """Logs errors of the event loop, such as no file descriptor for a new connection."""
@@ -280,10 +259,94 @@ class Host:
         )
 
 
-async def respond(send: Send, status: int, headers: Headers, body: bytes = b"") -> None:
-    """Sends a complete response."""
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": body})
+class _AsgiRequest(Request):
+    """A request over the ASGI of uvicorn."""
+
+    __slots__ = ("_at_end", "_cycle", "_receive", "_send", "_state", "has_begun")
+
+    def __init__(
+        self,
+        scope: MutableMapping[str, Any],
+        receive: Callable[[], Awaitable[MutableMapping[str, Any]]],
+        send: Callable[[MutableMapping[str, Any]], Awaitable[None]],
+    ) -> None:
+        state = self._state = scope["state"]
+        self._receive, self._send = receive, send
+        self.has_begun = False
+        cycle = self._cycle = state["cycle"]
+        self._at_end = not (cycle.more_body or cycle.waiting_for_100_continue or "broken" in state)
+        super().__init__(
+            scope["method"],
+            scope["path"],
+            scope["query_string"],
+            scope["headers"],
+            state["peer"],
+            version=scope["http_version"],
+            whole=bytes(cycle.body) if self._at_end else None,
+        )
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the request did not arrive in time."""
+        return "late" in self._state
+
+    async def piece(self) -> bytes | None:
+        """Returns the next piece of the body."""
+        if self._at_end:
+            return None
+        message = await self._receive()
+        if "broken" in self._state:
+            raise BrokenBody
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnected
+        self._at_end = not message["more_body"]
+        return cast("bytes", message["body"])
+
+    async def gone(self) -> None:
+        """Returns when the client is gone."""
+        while (await self._receive())["type"] != "http.disconnect":
+            pass
+
+    async def begin(self, status: int, headers: Headers) -> None:
+        """Begins a stream."""
+        self.has_begun = True
+        self._state["leaving"] = True
+        await self._send({"type": "http.response.start", "status": status, "headers": headers})
+
+    async def send(self, data: bytes) -> None:
+        """Sends a part of a stream."""
+        if self._cycle.disconnected:
+            raise ClientDisconnected
+        await self._send({"type": "http.response.body", "body": data, "more_body": True})
+
+    async def end(self) -> None:
+        """Ends a stream."""
+        await self._send({"type": "http.response.body", "body": b""})
+
+    async def respond(self, answer: Response) -> None:
+        """Sends a response. One that closes the connection is followed by reading more of the body.
+
+        Closing a connection while the client still sends would reset it, and the client would lose
+        the response.
+        """
+        headers = list(answer.headers)
+        if answer.body or (self.method != "HEAD" and answer.status != 204):
+            headers.append((b"content-length", b"%d" % len(answer.body)))
+        if answer.closes:
+            headers.append((b"connection", b"close"))
+        await self._send(
+            {"type": "http.response.start", "status": answer.status, "headers": headers}
+        )
+        ends = not answer.closes or self._at_end or self.is_late or "broken" in self._state
+        if not ends and self.header(b"expect") is None:
+            part = {"type": "http.response.body", "body": answer.body, "more_body": True}
+            await self._send(part)
+            answer.body = b""
+            with contextlib.suppress(TimeoutError, BrokenBody, ClientDisconnected):
+                async with asyncio.timeout(LINGER_TIMEOUT):
+                    while await self.piece() is not None and not self.is_late:
+                        pass
+        await self._send({"type": "http.response.body", "body": answer.body})
 
 
 async def _end(connections: set[_Connection], timeout: float) -> None:
@@ -586,6 +649,7 @@ class _Connection(HttpToolsProtocol):
 
     def _start_asgi_task(self, cycle: Any, app: Any) -> None:
         self._running = cycle
+        cycle.scope["state"]["cycle"] = cycle
         super()._start_asgi_task(cycle, app)
 
     def _refuse(self, status: int, detail: str) -> None:
@@ -609,10 +673,12 @@ class _Connection(HttpToolsProtocol):
         self.transport.close()
 
     def _refused(self, status: int, detail: str) -> bytes:
-        headers, body = self.host.rejection("malformed", detail)
-        all_headers = [*self.server_state.default_headers, *headers, (b"connection", b"close")]
-        lines = [b"%b: %b\r\n" % header for header in all_headers]
-        return b"".join([STATUS_LINE[status], *lines, b"\r\n", body])
+        refusal = self.host.rejection(status, "malformed", detail)
+        length = (b"content-length", b"%d" % len(refusal.body))
+        more: Headers = [length, (b"connection", b"close")]
+        headers = [*self.server_state.default_headers, *refusal.headers, *more]
+        lines = [b"%b: %b\r\n" % header for header in headers]
+        return b"".join([STATUS_LINE[status], *lines, b"\r\n", refusal.body])
 
     # A limit is reached.
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.web.host import Headers
+    from holdfast.web.requests import Headers
 
 UNREAD = (408, 413)
 """Status codes of requests whose body is not fully read; the connection is closed after them."""

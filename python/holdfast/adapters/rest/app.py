@@ -1,4 +1,4 @@
-"""The ASGI application of REST: routing, authorization and responses.
+"""The application of REST: routing, authorization and responses.
 
 The memory access checks everything about memories. A request that is refused here never reaches it.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import parse_qsl
@@ -22,28 +21,25 @@ from holdfast.adapters.rest.routes import CHANGES, INGEST, READ, ROUTES
 from holdfast.adapters.sessions import parse_session_id
 from holdfast.ingest import Grant, Refused
 from holdfast.types import AREAS
+from holdfast.web import events
 from holdfast.web import openapi_page as page
-from holdfast.web.events import headers_of_stream
-from holdfast.web.host import SAFE, address_of, headers_of, respond
+from holdfast.web.host import address_of
 from holdfast.web.refusals import UNREAD, headers_with
-from holdfast.web.requests import BadRequest, ClientDisconnected, Request, respond_to_its_end, shown
+from holdfast.web.requests import JSON, SAFE, BadRequest, Request, Response, response, shown
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Coroutine, Mapping, Sequence
 
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.rest.routes import Parameter
     from holdfast.adapters.sessions import SessionControl
     from holdfast.config import RestConfig
     from holdfast.ingest import MemoryAccess
-    from holdfast.web.host import Receive, Scope, Send
 
-    Answer: TypeAlias = tuple[bytes, bytes]
-    Following: TypeAlias = Callable[[Send], Awaitable[None]]
-    Handler: TypeAlias = Callable[[Request], Answer | Following | Awaitable[Answer]]
+    Later: TypeAlias = Coroutine[Any, Any, Response | None]
+    Handler: TypeAlias = Callable[[Request], Response | Later]
 
-JSON = b"application/json"
 MORE_PARAMETERS = 4
 """Parameters that are read in excess of the allowed ones, for an error that names the wrong one."""
 ANYONE = "anyone"
@@ -61,7 +57,7 @@ class EndSession(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class App:
-    """The ASGI application."""
+    """The application."""
 
     def __init__(
         self,
@@ -115,25 +111,20 @@ class App:
         }
         self.routes = {each.path: (each.method, handlers[each.name]) for each in ROUTES}
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answers one request."""
+    def __call__(self, request: Request) -> Response | Later:
+        """Answers one request; at once, unless its body still arrives or something must wait."""
         self._loop = asyncio.get_running_loop()
-        request = Request(scope, receive)
         try:
-            answer = await self._answer(request)
-        except BadRequest as unfit:
-            await self._refuse(request, Declined(unfit.reason, unfit.detail), send)
-        except Refused as refused:
-            await self._refuse(request, refused, send)
-        except ClientDisconnected:
-            pass
-        else:
-            if not isinstance(answer, tuple):
-                await answer(send)
-                return
-            kind, body = answer
-            headers = headers_of(kind, body) if body else list(SAFE)
-            await respond(send, 200 if body else 204, headers + request.more_headers, body)
+            answer = self._answer(request)
+        except (BadRequest, Refused) as refused:
+            return self._refusal(request, refused)
+        return answer if isinstance(answer, Response) else self._finished(request, answer)
+
+    async def _finished(self, request: Request, answer: Later) -> Response | None:
+        try:
+            return await answer
+        except (BadRequest, Refused) as refused:
+            return self._refusal(request, refused)
 
     @property
     def open_streams(self) -> int:
@@ -146,88 +137,93 @@ class App:
             with contextlib.suppress(RuntimeError):  # The loop is already closed.
                 self._loop.call_soon_threadsafe(self._streams.end)
 
-    async def _answer(self, request: Request) -> Answer | Following:
-        path, method = request.scope["path"], request.scope["method"]
-        route = self.routes.get(path)
+    def _answer(self, request: Request) -> Response | Later:
+        route = self.routes.get(request.path)
         if route is None:
-            raise Declined("not_found", f"no resource at {shown(path)}")
+            raise Declined("not_found", f"no resource at {shown(request.path)}")
         allowed, handler = route
-        if method == allowed or (method == "HEAD" and allowed == "GET"):
-            answer = handler(request)
-            return await answer if isinstance(answer, Awaitable) else answer
+        if request.method == allowed or (request.method == "HEAD" and allowed == "GET"):
+            return handler(request)
         methods = "POST, OPTIONS" if allowed == "POST" else "GET, HEAD, OPTIONS"
-        request.more_headers.append((b"allow", methods.encode()))
-        if method == "OPTIONS":
-            return JSON, b""
-        raise Declined("method_not_allowed", f"allowed: {methods}")
+        if request.method == "OPTIONS":
+            answer = Response(204, headers=list(SAFE))
+        else:
+            refused = Declined("method_not_allowed", f"allowed: {methods}")
+            answer = self._refusal(request, refused)
+        answer.headers.append((b"allow", methods.encode()))
+        return answer
 
-    async def _refuse(self, request: Request, refused: Refused, send: Send) -> None:
-        """Sends the refusal, and counts it unless the memory access has."""
+    def _refusal(self, request: Request, refused: BadRequest | Refused) -> Response:
+        """Returns the refusal, and counts it unless the memory access has."""
+        if isinstance(refused, BadRequest):
+            refused = Declined(refused.reason, refused.detail)
         if isinstance(refused, Declined):
-            asked = request.scope["path"], request.scope["method"]
-            write = asked == (INGEST.path, INGEST.method)
+            write = (request.path, request.method) == (INGEST.path, INGEST.method)
             note = self._memory_access.refuse if write else self._memory_access.note
             note(refused, request.who, request.peer)
         status = REFUSALS.status(refused.reason)
-        body = msgspec.json.encode(refused.answer())
-        headers = headers_of(JSON, body) + request.more_headers + headers_with(status)
-        if status in UNREAD or request.header(b"expect") is not None:
-            await respond_to_its_end(request, send, status, headers, body)
-        else:
-            await respond(send, status, headers, body)
+        answer = _json(refused.answer(), *headers_with(status), status=status)
+        answer.closes = status in UNREAD or request.header(b"expect") is not None
+        return answer
 
-    async def _ingest(self, request: Request) -> Answer:
+    def _ingest(self, request: Request) -> Response | Later:
         grant = self._authorize(request)
         request.check_json()
+        body = request.arrived(self._max_body)
+        if body is None or self._memory_access.may_wait:
+            return self._ingest_later(request, grant)
+        return _json(self._memory_access.ingest(body, grant, request.peer).answer())
+
+    async def _ingest_later(self, request: Request, grant: Grant) -> Response:
+        """Writes a body that still arrives, or to a memory whose writes can wait."""
         body = await request.body(self._max_body)
         ingest = partial(self._memory_access.ingest, body, grant, request.peer)
         written = await asyncio.to_thread(ingest) if self._memory_access.may_wait else ingest()
-        return JSON, msgspec.json.encode(written.answer())
+        return _json(written.answer())
 
-    def _read(self, request: Request) -> Answer:
+    def _read(self, request: Request) -> Response:
         grant = self._authorize(request)
-        given = _given(request.scope["query_string"], READ.parameters)
+        given = _given(request.query, READ.parameters)
         values = self._memory_access.read(**given, grant=grant, peer=request.peer)
-        return JSON, msgspec.json.encode({"values": values})
+        return _json({"values": values})
 
-    def _changes(self, request: Request) -> Following:
+    def _changes(self, request: Request) -> Response | Later:
         grant = self._authorize(request)
-        given = _given(request.scope["query_string"], CHANGES.parameters)
+        given = _given(request.query, CHANGES.parameters)
         memory, ranges = given["memory"], _ranges(given)
         self._streams.check_room()
         follower = self._memory_access.follow(memory, ranges, grant, request.peer)
         if request.method == "HEAD":
-            headers = headers_of_stream() + request.more_headers
-            return lambda send: respond(send, 200, headers)
+            return Response(200, headers=list(events.HEADERS))
         places = [(memory, area) for area, _, _ in ranges]
-        return partial(self._streams.serve, request, follower, places, given["min_interval"])
+        return self._streams.serve(request, follower, places, given["min_interval"])
 
-    def _health(self, _: Request) -> Answer:
-        return JSON, b'{"status":"ok"}'
+    def _health(self, _: Request) -> Response:
+        return _json({"status": "ok"})
 
-    def _memories(self, request: Request) -> Answer:
+    def _memories(self, request: Request) -> Response:
         grant = self._authorize(request)
         memories = self._diagnostics.memories()
         shown = {name: entry for name, entry in memories.items() if name in grant.memories}
-        return JSON, msgspec.json.encode({"memories": shown})
+        return _json({"memories": shown})
 
-    def _stats(self, request: Request) -> Answer:
+    def _stats(self, request: Request) -> Response:
         self._authorize(request)
-        return JSON, _encoded(self._diagnostics.stats())
+        return _json(self._diagnostics.stats())
 
-    def _mqtt(self, request: Request) -> Answer:
+    def _mqtt(self, request: Request) -> Response:
         self._authorize(request)
         status = self._diagnostics.adapter("mqtt")
         if status is None:
             raise Declined("not_configured", "the configuration has no mqtt")
         least: dict[str, object] = {"connected": False, "broker": None, "topics": []}
-        return JSON, _encoded(least | status)
+        return _json(least | status)
 
-    def _list_sessions(self, request: Request) -> Answer:
+    def _list_sessions(self, request: Request) -> Response:
         self._authorize_manager(request)
-        return JSON, msgspec.json.encode({"sessions": self._sessions.sessions()})
+        return _json({"sessions": self._sessions.sessions()})
 
-    async def _end_session(self, request: Request) -> Answer:
+    async def _end_session(self, request: Request) -> Response:
         grant = self._authorize_manager(request)
         request.check_json()
         body = await request.body(self._max_body)
@@ -239,14 +235,13 @@ class App:
         by = {"listener": "rest", "peer": request.peer, "source": grant.name}
         if not await asyncio.to_thread(self._sessions.end_session, listener, number, by):
             raise Declined("unknown_session", f"no session {shown(asked.id)}")
-        return JSON, msgspec.json.encode({"status": "ended", "id": asked.id})
+        return _json({"status": "ended", "id": asked.id})
 
-    def _openapi(self, _: Request) -> Answer:
-        return JSON, self._document
+    def _openapi(self, _: Request) -> Response:
+        return response(JSON, self._document)
 
-    def _docs(self, request: Request) -> Answer:
-        request.more_headers.append((b"content-security-policy", page.POLICY))
-        return page.KIND, self._page
+    def _docs(self, _: Request) -> Response:
+        return response(page.KIND, self._page, (b"content-security-policy", page.POLICY))
 
     def _authorize(self, request: Request) -> Grant:
         """Returns the grant of the request's client. Raises `Declined` and `BadRequest`."""
@@ -315,6 +310,6 @@ def _malformed(detail: str) -> Declined:
     return Declined("malformed", detail)
 
 
-def _encoded(document: Any) -> bytes:
-    """Encodes the status of adapters as JSON; values of other types as their text."""
-    return msgspec.json.encode(document, enc_hook=str)
+def _json(document: Any, *more: tuple[bytes, bytes], status: int = 200) -> Response:
+    """Returns a response in JSON; values of other types are as their text."""
+    return response(JSON, msgspec.json.encode(document, enc_hook=str), *more, status=status)
