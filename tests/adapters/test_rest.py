@@ -17,7 +17,7 @@ from holdfast import logs
 from holdfast.adapters import Grant, MemoryAccess, Stop
 from holdfast.adapters.rest import openapi
 from holdfast.audit import Audit
-from holdfast.web.admission import ConnectionLimits
+from holdfast.web.host import ConnectionLimits
 from holdfast.web.host import Host
 from holdfast.web.port import listen
 from support import web, wire

@@ -15,7 +15,7 @@ import pytest
 
 import holdfast
 from holdfast.adapters.rest.app import App
-from holdfast.web.admission import ConnectionLimits
+from holdfast.web.host import ConnectionLimits
 from holdfast.web.host import Host
 from support import web, wire
 

@@ -22,12 +22,11 @@ from prometheus_client.registry import Collector
 from holdfast import __version__
 from holdfast.tags.text import plain
 from holdfast.web import health as probes
-from holdfast.web.admission import ConnectionLimits
-from holdfast.web.host import Host
+from holdfast.web.host import ConnectionLimits, Host
 from holdfast.web.requests import SAFE, Response, rejection, response
 
 if TYPE_CHECKING:
-    import socket
+    from holdfast._core import ListeningSocket
     from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
 
     from prometheus_client.metrics_core import Metric
@@ -98,7 +97,7 @@ class Metrics:
         settings: MetricsConfig,
         diagnostics: DiagnosticsSource,
         health: HealthSource,
-        listener: socket.socket,
+        listener: ListeningSocket,
         *,
         https: Https | None = None,
     ) -> None:

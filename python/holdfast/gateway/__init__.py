@@ -8,13 +8,10 @@ from holdfast.gateway.app import App, rejection
 from holdfast.gateway.pool import dial
 from holdfast.gateway.settings import GatewayLimits, Settings
 from holdfast.net.allow_list import AllowedNetwork
-from holdfast.web.admission import ConnectionLimits
-from holdfast.web.host import Host, address_of
+from holdfast.web.host import ConnectionLimits, Host, address_of
 
 if TYPE_CHECKING:
-    import socket
-
-    from holdfast._core import Poller
+    from holdfast._core import ListeningSocket, Poller
     from holdfast.gateway.pool import Dial
     from holdfast.net.resolver import Resolve
     from holdfast.stop import Stop
@@ -34,7 +31,7 @@ class Gateway:
     def __init__(
         self,
         settings: Settings,
-        listener: socket.socket,
+        listener: ListeningSocket,
         *,
         resolve: Resolve | None = None,
         dial: Dial = dial,

@@ -1,6 +1,5 @@
 //! One connection: its requests one after the other, and its end.
 
-use std::convert::Infallible;
 use std::error::Error as _;
 use std::future::poll_fn;
 use std::io;
@@ -20,7 +19,7 @@ use tokio::net::TcpStream;
 use tokio::sync::watch;
 use tokio::time::{Sleep, sleep_until, timeout};
 
-use super::exchange::{Exchange, Order, Output, RequestHead, ResponseHead};
+use super::exchange::{Abandoned, Exchange, Order, Output, RequestHead, ResponseHead};
 use super::inbox::Event;
 use super::line::{SharedLine, Verdict, Wire};
 use super::refusal::Refusal;
@@ -99,7 +98,8 @@ async fn begin(
         Ok(Ok(1)) if first == [HANDSHAKE] => {
             let context = &front.context;
             let limit = front.request_timeout;
-            let (stream, peer) = secured(&tls, context, (stream, peer), ticket, limit, stop).await?;
+            let (stream, peer) =
+                secured(&tls, context, (stream, peer), ticket, limit, stop).await?;
             return Some((Box::new(stream), peer));
         }
         Ok(Ok(1)) => {
@@ -112,7 +112,12 @@ async fn begin(
 }
 
 /// Answers an HTTP request without TLS; closes anything else.
-async fn refuse_plain(front: &Front, mut stream: TcpStream, first: u8, stop: watch::Receiver<bool>) {
+async fn refuse_plain(
+    front: &Front,
+    mut stream: TcpStream,
+    first: u8,
+    stop: watch::Receiver<bool>,
+) {
     if !first.is_ascii_alphabetic() {
         return;
     }
@@ -213,7 +218,7 @@ async fn answered(
     front: Arc<Front>,
     line: SharedLine,
     request: Request<Incoming>,
-) -> Result<Response<Output>, Infallible> {
+) -> Result<Response<Output>, Abandoned> {
     let (parts, body) = request.into_parts();
     let len = body.size_hint().exact();
     let exchange = front.exchange();
@@ -243,6 +248,7 @@ async fn answered(
             Output::whole(parts, head, body, closes)
         }
         Answered::Stream(head) => Output::stream(parts, head),
+        Answered::Nothing => return Err(Abandoned),
     };
     line.lock().note_answering();
     handled.is_answered = true;
@@ -266,6 +272,7 @@ impl Drop for Handled {
 enum Answered {
     Whole { head: ResponseHead, body: Bytes, closes: bool },
     Stream(ResponseHead),
+    Nothing,
 }
 
 /// The body of a request, as far as the handler wants it.
@@ -348,6 +355,7 @@ impl Upload {
                     return Answered::Whole { head, body, closes };
                 }
                 Order::Begin(head) => return Answered::Stream(head),
+                Order::Abandon => return Answered::Nothing,
             }
         }
     }

@@ -63,6 +63,8 @@ pub(super) enum Order {
     Respond { head: ResponseHead, body: Bytes, closes: bool },
     /// To answer with a stream.
     Begin(ResponseHead),
+    /// Nothing more: there will be no response.
+    Abandon,
     /// From the connection itself: the rest of the request did not arrive in time.
     Late,
 }
@@ -83,8 +85,8 @@ struct State {
     is_unsent: bool,
     /// Whether the handler waits for room.
     is_awaited: bool,
-    /// Whether the handler has sent its last data.
-    is_ended: bool,
+    /// Whether the stream is complete, once it has ended.
+    end: Option<bool>,
     /// Whether a peer that sends no more is gone.
     leaves: bool,
     /// Whether the connection has ended, or has sent the response.
@@ -121,8 +123,10 @@ impl Exchange {
         self.order(Order::Respond { head, body, closes });
     }
 
-    /// Answers the request with a stream.
+    /// Answers the request with a stream. A client that sends no more is gone from here on, because a
+    /// stream has no other end.
     pub fn begin(&self, head: ResponseHead) {
+        self.state().leaves = true;
         self.order(Order::Begin(head));
     }
 
@@ -141,18 +145,16 @@ impl Exchange {
         Sent::Taken
     }
 
-    /// Ends a stream.
-    pub fn end(&self) {
+    /// Ends a stream. One that is not complete is cut off, so that its client notices.
+    pub fn end(&self, is_complete: bool) {
         let mut state = self.state();
-        state.is_ended = true;
+        state.end.get_or_insert(is_complete);
         wake(state);
     }
 
-    /// From now on, a client that sends no more is gone: it waits for a stream without an end.
-    pub fn let_leave(&self) {
-        let mut state = self.state();
-        state.leaves = true;
-        wake(state);
+    /// There will be no response: the connection is cut off, unless there has been one.
+    pub fn abandon(&self) {
+        self.order(Order::Abandon);
     }
 
     pub(super) fn leaves(&self) -> bool {
@@ -204,14 +206,19 @@ impl Exchange {
         }
     }
 
-    fn poll_data(&self, context: &Context<'_>) -> Poll<Option<Bytes>> {
+    fn poll_data(&self, context: &Context<'_>) -> Poll<Option<Result<Bytes, Abandoned>>> {
         let mut state = self.state();
         if let Some(data) = state.data.take() {
             state.is_unsent = true;
-            return Poll::Ready(Some(data));
+            return Poll::Ready(Some(Ok(data)));
         }
-        if state.is_ended {
-            return Poll::Ready(None);
+        // The handler may be dropped without a word.
+        let is_abandoned = matches!(state.orders.front(), Some(Order::Abandon));
+        match state.end {
+            Some(true) => return Poll::Ready(None),
+            Some(false) => return Poll::Ready(Some(Err(Abandoned))),
+            None if is_abandoned => return Poll::Ready(Some(Err(Abandoned))),
+            None => {}
         }
         state.waker = Some(context.waker().clone());
         Poll::Pending
@@ -230,6 +237,11 @@ fn wake(mut state: MutexGuard<'_, State>) {
         waker.wake();
     }
 }
+
+/// The handler has left its request without a response, or with half of one.
+#[derive(Debug, thiserror::Error)]
+#[error("the response is cut off")]
+pub(super) struct Abandoned;
 
 /// The body of a response. When it is dropped, the response is complete, or the connection is broken.
 pub(super) struct Output {
@@ -268,14 +280,14 @@ impl Output {
 
 impl Body for Output {
     type Data = Bytes;
-    type Error = std::convert::Infallible;
+    type Error = Abandoned;
 
     fn poll_frame(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, Self::Error>>> {
         let data = match &mut self.content {
-            Content::Whole(body) => body.take(),
+            Content::Whole(body) => body.take().map(Ok),
             Content::Stream => match self.exchange.poll_data(context) {
                 Poll::Ready(data) => data,
                 Poll::Pending => return Poll::Pending,
@@ -285,7 +297,7 @@ impl Body for Output {
         if data.is_none() || matches!(self.content, Content::Whole(_)) {
             self.content = Content::Ended;
         }
-        Poll::Ready(data.map(|data| Ok(Frame::data(data))))
+        Poll::Ready(data.map(|data| data.map(Frame::data)))
     }
 
     fn is_end_stream(&self) -> bool {

@@ -214,11 +214,6 @@ impl Line {
         matches!(self.answer, Answer::Awaited | Answer::Begun)
     }
 
-    /// Whether there is no request, and no part of one.
-    pub(super) fn is_between_requests(&self) -> bool {
-        !self.is_busy() && self.taken == self.held.len() && self.request_due.is_none()
-    }
-
     /// Whether the peer may still send what nobody reads. Closing the socket then could destroy the
     /// response on its way.
     pub(super) fn has_unread(&self) -> bool {
@@ -253,9 +248,7 @@ impl Line {
     fn note_waiting(&mut self) {
         let is_taken = self.reply_due.is_none();
         let has_arrived = matches!(self.portion, Portion::Body(0));
-        let waiting = if self.is_busy()
-            && is_taken
-            && (self.answer == Answer::Begun || has_arrived)
+        let waiting = if self.is_busy() && is_taken && (self.answer == Answer::Begun || has_arrived)
         {
             Waiting::ForHandler
         } else if is_taken && (self.idle_due.is_some() || !self.is_used) {

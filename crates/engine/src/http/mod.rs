@@ -15,7 +15,7 @@ mod line;
 mod refusal;
 mod server;
 
-pub use exchange::{Exchange, RequestHead, ResponseHead};
+pub use exchange::{Exchange, RequestHead, ResponseHead, Sent};
 pub use inbox::Event;
 pub use refusal::{Refusal, RefusalBody};
-pub use server::{HttpServer, HttpSettings};
+pub use server::{HttpServer, HttpSettings, bind};

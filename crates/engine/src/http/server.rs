@@ -18,14 +18,16 @@ use super::inbox::{Event, Inbox};
 use super::refusal::{Refusal, RefusalBody};
 use crate::heartbeat::Heartbeat;
 use crate::own_threads::OwnThreads;
+use crate::server::Peer;
 use crate::server::admission::ConnectionLimits;
 use crate::server::counters::ConnectionCounters;
 use crate::server::event::{self, Events, Kind, Verbosity};
 use crate::server::listener::{Admitted, ListenerContext, Service, accept};
 use crate::server::live::Live;
-use crate::server::Peer;
 use crate::tls::server::ServerTls;
 use crate::wake::Wakes;
+
+pub use crate::server::listener::bind_tcp as bind;
 
 /// How often the end of the last connection is looked for when the server ends.
 const ENDING_PERIOD: Duration = Duration::from_millis(5);
@@ -118,6 +120,8 @@ pub struct HttpServer {
 }
 
 impl HttpServer {
+    pub const HTTP_10: hyper::Version = hyper::Version::HTTP_10;
+
     /// Serves in a thread of its own.
     ///
     /// # Errors

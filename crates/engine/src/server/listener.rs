@@ -283,7 +283,10 @@ fn admit<S: Service>(
 }
 
 /// Binds a listening socket that is not registered with a runtime.
-pub(crate) fn bind_tcp(address: SocketAddr) -> io::Result<std::net::TcpListener> {
+///
+/// # Errors
+/// The address can't be had.
+pub fn bind_tcp(address: SocketAddr) -> io::Result<std::net::TcpListener> {
     let socket = Socket::new(Domain::for_address(address), Type::STREAM, Some(Protocol::TCP))?;
     // On other systems, the option lets two programs bind the same port.
     #[cfg(unix)]

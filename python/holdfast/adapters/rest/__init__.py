@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.adapters.rest.app import App
-from holdfast.web.admission import ConnectionLimits
-from holdfast.web.host import STOP_TIMEOUT, Host
+from holdfast.web.host import STOP_TIMEOUT, ConnectionLimits, Host
 
 if TYPE_CHECKING:
-    import socket
-
+    from holdfast._core import ListeningSocket
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.sessions import SessionControl
     from holdfast.config import RestConfig
@@ -30,7 +28,7 @@ class Rest:
         memory_access: MemoryAccess,
         diagnostics: DiagnosticsSource,
         sessions: SessionControl,
-        listener: socket.socket,
+        listener: ListeningSocket,
         *,
         https: Https | None = None,
         stop_timeout: float = STOP_TIMEOUT,

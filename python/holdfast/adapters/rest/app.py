@@ -28,9 +28,9 @@ from holdfast.web.refusals import UNREAD, headers_with
 from holdfast.web.requests import JSON, SAFE, BadRequest, Request, Response, response, shown
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Callable, Coroutine, Mapping, Sequence
 
+    from holdfast._core import ListeningSocket
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.rest.routes import Parameter
     from holdfast.adapters.sessions import SessionControl
@@ -65,7 +65,7 @@ class App:
         memory_access: MemoryAccess,
         diagnostics: DiagnosticsSource,
         sessions: SessionControl,
-        listener: socket.socket,
+        listener: ListeningSocket,
         scheme: str,
     ) -> None:
         self._memory_access = memory_access
