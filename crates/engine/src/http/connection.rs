@@ -14,7 +14,7 @@ use hyper::body::{Body, Incoming};
 use hyper::header::EXPECT;
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
-use hyper::{Request, Response};
+use hyper::{Request, Response, Version};
 use tokio::net::TcpStream;
 use tokio::sync::watch;
 use tokio::time::{Sleep, sleep_until, timeout};
@@ -22,20 +22,23 @@ use tokio::time::{Sleep, sleep_until, timeout};
 use super::exchange::{Abandoned, Exchange, Order, Output, RequestHead, ResponseHead};
 use super::inbox::Event;
 use super::line::{SharedLine, Verdict, Wire};
-use super::refusal::Refusal;
+use super::refusal::{Refusal, RefusalBody};
 use super::server::Front;
 use crate::server::Peer;
 use crate::server::admission::Ticket;
 use crate::server::event::Kind;
-use crate::server::listener::{Admitted, drain, set_options};
+use crate::server::listener::{Admitted, drain_for, set_options};
 use crate::server::secure::secured;
 use crate::server::stream::Stream;
 
 /// The largest header of a request, in bytes.
 const MAX_HEADER: usize = 65_536;
 
-/// The largest rest of a body that is read although nobody wants it, so that the connection can go on.
-const MAX_UNWANTED: u64 = 1024 * 1024;
+/// How long a peer is read after its last response.
+const LINGER: Duration = Duration::from_secs(2);
+
+/// Bytes of a body that nobody wants, which are forgotten at once.
+const SKIPPED: usize = 65_536;
 
 /// The type of a TLS record that begins a handshake (RFC 8446, 5.1).
 const HANDSHAKE: u8 = 22;
@@ -67,13 +70,10 @@ pub(super) async fn serve(
         return;
     }
     let Some(line) = line.into_line() else { return };
-    if line.refused.is_some() {
-        front.ended(Kind::BrokenRequest, line.peer.clone());
-    }
     if line.has_unread() {
         line.ticket.set_answered();
         let mut stream = line.into_stream();
-        drain(&mut *stream, stop, |_| ()).await;
+        drain_for(LINGER, &mut *stream, stop, |_| ()).await;
     }
 }
 
@@ -125,7 +125,7 @@ async fn refuse_plain(
     let head = b"HTTP/1.1 400 Bad Request\r\nconnection: close\r\n";
     let response = [&head[..], &refusal.headers, b"\r\n", &refusal.body].concat();
     if stream.try_write(&response).is_ok() {
-        drain(&mut stream, stop, |_| ()).await;
+        drain_for(LINGER, &mut stream, stop, |_| ()).await;
     }
 }
 
@@ -223,11 +223,17 @@ async fn answered(
     let len = body.size_hint().exact();
     let exchange = front.exchange();
     let expects = parts.headers.contains_key(EXPECT);
-    let (is_here, peer) = {
+    let is_old = parts.version == Version::HTTP_10;
+    let (is_ambiguous, is_here, peer) = {
         let mut line = line.lock();
-        line.begin(Arc::clone(&exchange), len);
-        (!expects && len.is_some_and(|len| line.has(len)), line.peer.clone())
+        let is_ambiguous = line.begin(Arc::clone(&exchange), len);
+        let is_here = !expects && len.is_some_and(|len| line.has(len));
+        (is_ambiguous, is_here, line.peer.clone())
     };
+    if is_ambiguous {
+        front.ended(Kind::BrokenRequest, peer);
+        return Ok(refused(&front, exchange, line));
+    }
     let mut upload = Upload { line: line.clone(), body, received: BytesMut::new(), is_over: false };
     let mut handled = Handled { exchange: Arc::clone(&exchange), is_answered: false };
     let whole = match len {
@@ -243,8 +249,7 @@ async fn answered(
     let parts = (Arc::clone(&exchange), line.clone());
     let response = match upload.ordered(&front, &exchange).await {
         Answered::Whole { head, body, mut closes } => {
-            // In chunks, only hyper knows where a request ends: none follows.
-            closes |= len.is_none() || !upload.skipped(&exchange, closes || expects).await;
+            closes |= is_old || !upload.skipped(&front, &exchange, closes || expects).await;
             Output::whole(parts, head, body, closes)
         }
         Answered::Stream(head) => Output::stream(parts, head),
@@ -253,6 +258,18 @@ async fn answered(
     line.lock().note_answering();
     handled.is_answered = true;
     Ok(response)
+}
+
+/// Refuses a request that hyper accepts.
+fn refused(front: &Front, exchange: Arc<Exchange>, line: SharedLine) -> Response<Output> {
+    let RefusalBody { headers, body } = front.refusal(Refusal::NotHttp);
+    let headers = headers.split(|byte| *byte == b'\n').filter_map(|line| {
+        let colon = line.iter().position(|byte| *byte == b':')?;
+        Some((&line[..colon], line[colon + 1..].trim_ascii()))
+    });
+    let head = ResponseHead::new(400, headers).expect("the headers of a refusal are valid");
+    line.lock().note_answering();
+    Output::whole((exchange, line.clone()), head, Bytes::copy_from_slice(body), true)
 }
 
 /// Tells the handler that the client is gone if the connection ends before there is a response.
@@ -361,14 +378,9 @@ impl Upload {
     }
 
     /// Reads the rest of the request, so that the next one can follow. Returns whether it is read.
-    async fn skipped(&mut self, exchange: &Exchange, closes: bool) -> bool {
-        if self.is_over || closes {
-            return self.is_over;
-        }
-        if self.body.size_hint().exact().is_none_or(|left| left > MAX_UNWANTED) {
-            return false;
-        }
-        loop {
+    async fn skipped(&mut self, front: &Front, exchange: &Exchange, closes: bool) -> bool {
+        while !self.is_over && !closes {
+            self.received.clear();
             tokio::select! {
                 biased;
                 order = exchange.next() => {
@@ -376,9 +388,17 @@ impl Upload {
                         return false;
                     }
                 }
-                received = self.receive(usize::MAX) => return received.is_ok(),
+                received = self.receive(SKIPPED) => match received {
+                    Ok(_) | Err(NoBody::TooLarge) => {}
+                    Err(NoBody::Broken) => {
+                        front.ended(Kind::BrokenRequest, self.line.lock().peer.clone());
+                        return false;
+                    }
+                    Err(NoBody::Cut) => return false,
+                },
             }
         }
+        self.is_over
     }
 }
 

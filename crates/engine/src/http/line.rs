@@ -10,6 +10,7 @@ use hyper::rt::{Read, ReadBufCursor, Write};
 use socket2::SockRef;
 
 use super::exchange::{Exchange, Order};
+use super::portion::{ChunksEnd, HeadEnd, Portion};
 use super::refusal::{self, Refusal};
 use super::server::Front;
 use crate::server::Peer;
@@ -28,17 +29,6 @@ thread_local! {
         std::cell::RefCell::new(vec![0; CHUNK].into_boxed_slice());
 }
 
-/// What hyper may read next.
-#[derive(Debug)]
-enum Portion {
-    /// The header of a request, to its end.
-    Head(HeadEnd),
-    /// The rest of a body with a length: this many bytes.
-    Body(u64),
-    /// A body in chunks, whose end only hyper knows. No request follows on this connection.
-    Chunks,
-}
-
 /// How far the current request has been answered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Answer {
@@ -50,41 +40,6 @@ enum Answer {
     Begun,
     /// hyper has all of the response.
     Complete,
-}
-
-/// Finds the end of a header: an empty line.
-#[derive(Debug, Default)]
-struct HeadEnd {
-    /// Bytes that were searched.
-    searched: usize,
-    /// Whether the last byte that was searched ended a line, but for a CR.
-    is_line_begin: bool,
-    found: Option<usize>,
-}
-
-impl HeadEnd {
-    /// The length of the header, or of all bytes if its end is not among them. `bytes` are those of the
-    /// call before, and more.
-    fn find(&mut self, bytes: &[u8]) -> usize {
-        while self.found.is_none()
-            && let Some(byte) = bytes.get(self.searched)
-        {
-            self.searched += 1;
-            match byte {
-                b'\n' if self.is_line_begin => self.found = Some(self.searched),
-                b'\n' => self.is_line_begin = true,
-                b'\r' => {}
-                _ => self.is_line_begin = false,
-            }
-        }
-        self.found.unwrap_or(bytes.len())
-    }
-
-    /// Forgets bytes that were read. Empty lines before a request have no header: the search goes on.
-    fn skip(&mut self, len: usize) {
-        self.searched = self.searched.saturating_sub(len);
-        self.found = self.found.map(|found| found - len).filter(|left| *left > 0);
-    }
 }
 
 pub(super) struct Line {
@@ -176,14 +131,17 @@ impl SharedLine {
 
 impl Line {
     /// A request has begun: hyper has read its header. `None`: its body has no length.
-    pub(super) fn begin(&mut self, exchange: Arc<Exchange>, body: Option<u64>) {
-        self.portion = body.map_or(Portion::Chunks, Portion::Body);
+    /// Returns whether its header is ambiguous.
+    pub(super) fn begin(&mut self, exchange: Arc<Exchange>, body: Option<u64>) -> bool {
+        let is_ambiguous = matches!(&self.portion, Portion::Head(head) if head.is_ambiguous());
+        self.portion = body.map_or_else(|| Portion::Chunks(ChunksEnd::default()), Portion::Body);
         self.answer = Answer::Awaited;
         self.exchange = Some(exchange);
         if body == Some(0) {
             self.note_arrived();
         }
         self.note_waiting();
+        is_ambiguous
     }
 
     /// Whether this many bytes of a body have arrived.
@@ -220,7 +178,7 @@ impl Line {
         !self.is_ended
             && (self.refused.is_some()
                 || self.taken < self.held.len()
-                || !matches!(self.portion, Portion::Head(_) | Portion::Body(0)))
+                || !matches!(self.portion, Portion::Head(_)) && !self.portion.is_over())
     }
 
     pub(super) fn into_stream(self) -> Box<dyn Stream> {
@@ -247,7 +205,7 @@ impl Line {
     /// Tells the admission what the connection waits for.
     fn note_waiting(&mut self) {
         let is_taken = self.reply_due.is_none();
-        let has_arrived = matches!(self.portion, Portion::Body(0));
+        let has_arrived = self.portion.is_over();
         let waiting = if self.is_busy() && is_taken && (self.answer == Answer::Begun || has_arrived)
         {
             Waiting::ForHandler
@@ -261,12 +219,7 @@ impl Line {
 
     /// How many of the bytes that were received hyper may read.
     fn allowed(&mut self) -> usize {
-        let held = &self.held[self.taken..];
-        match &mut self.portion {
-            Portion::Head(end) => end.find(held),
-            Portion::Body(left) => held.len().min(usize::try_from(*left).unwrap_or(usize::MAX)),
-            Portion::Chunks => held.len(),
-        }
+        self.portion.len(&self.held[self.taken..])
     }
 
     /// hyper has read bytes.
@@ -276,15 +229,9 @@ impl Line {
             // Idle connections hold no memory.
             (self.held, self.taken) = (Vec::new(), 0);
         }
-        match &mut self.portion {
-            Portion::Head(end) => end.skip(len),
-            Portion::Body(left) => {
-                *left -= len as u64;
-                if *left == 0 {
-                    self.note_arrived();
-                }
-            }
-            Portion::Chunks => {}
+        self.portion.skip(len);
+        if self.portion.is_over() {
+            self.note_arrived();
         }
     }
 
@@ -339,7 +286,7 @@ impl Line {
     /// Returns whether the connection is broken.
     pub(super) fn poll_ahead(&mut self, context: &mut Context<'_>) -> bool {
         while self.is_busy()
-            && matches!(self.portion, Portion::Body(0))
+            && self.portion.is_over()
             && !self.is_ended
             && self.held.len() - self.taken < CHUNK
         {
@@ -428,7 +375,7 @@ impl Read for Wire {
         mut buffer: ReadBufCursor<'_>,
     ) -> Poll<io::Result<()>> {
         let line = &mut *self.0.lock();
-        if line.answer == Answer::Complete && matches!(line.portion, Portion::Body(0)) {
+        if line.answer == Answer::Complete && line.portion.is_over() {
             line.next_request();
         }
         loop {
@@ -439,7 +386,7 @@ impl Read for Wire {
                 line.is_wanted = false;
                 return Poll::Ready(Ok(()));
             }
-            if matches!(line.portion, Portion::Body(0)) {
+            if line.portion.is_over() {
                 // The next request has to wait. The task is polled when the response is complete.
                 return Poll::Pending;
             }
@@ -467,6 +414,7 @@ impl Write for Wire {
             // Nobody has a request, so this is hyper's response to what it can't parse.
             let refusal = refusal::of_response(bytes);
             line.refused = Some(refusal);
+            line.front.ended(Kind::BrokenRequest, line.peer.clone());
             let response = refusal::completed(bytes, line.front.refusal(refusal));
             line.stream.send(&response, &mut line.unsent).map_err(broken)?;
         } else {

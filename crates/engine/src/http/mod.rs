@@ -12,6 +12,7 @@ mod connection;
 mod exchange;
 mod inbox;
 mod line;
+mod portion;
 mod refusal;
 mod server;
 

@@ -329,14 +329,24 @@ pub(crate) fn set_options(stream: &TcpStream) {
 
 /// Shuts down the sending side, then reads until the peer closes, and passes the number of bytes on.
 /// Closing a socket with unread bytes resets the connection, and the peer may lose the last reply.
-pub(crate) async fn drain<S: Stream + ?Sized>(
+pub(crate) async fn drain<S: Stream>(
+    stream: &mut S,
+    stop: watch::Receiver<bool>,
+    drained: impl FnMut(usize),
+) {
+    drain_for(DRAIN, stream, stop, drained).await;
+}
+
+/// As `drain`, for at most this long.
+pub(crate) async fn drain_for<S: Stream + ?Sized>(
+    limit: Duration,
     stream: &mut S,
     mut stop: watch::Receiver<bool>,
     mut drained: impl FnMut(usize),
 ) {
     let _ = SockRef::from(stream.socket()).shutdown(Shutdown::Write);
     let mut unsent = Vec::new();
-    let deadline = Instant::now() + DRAIN;
+    let deadline = Instant::now() + limit;
     while Instant::now() < deadline {
         // On the stack, because many peers may be read at the same time: outside the closure, it would
         // be a part of every connection.
