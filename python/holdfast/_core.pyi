@@ -469,9 +469,9 @@ class HttpServer:
 
     `grace`, `request_timeout` and `idle_timeout` are seconds: how long a connection
     in the middle of a request is never closed for another, how long a request and taking its
-    response may take, and how long the pause between requests. With `leaving`, a client that sends no more is gone.
-    `refusals` are the headers and bodies for what reaches no handler, by name: `not_http`,
-    `header_too_large`, `not_tls`.
+    response may take, and how long the pause between requests. With `leaving`, a client that
+    sends no more is gone. `refusals` are the headers and bodies for what reaches no handler, by
+    name: `not_http`, `header_too_large`, `not_tls`.
     """
 
     def __init__(

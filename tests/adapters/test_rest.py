@@ -15,10 +15,9 @@ import pytest
 import holdfast
 from holdfast import logs
 from holdfast.adapters import Grant, MemoryAccess, Stop
-from holdfast.adapters.rest import openapi
+from holdfast.adapters.rest.operations import document as document_of
 from holdfast.audit import Audit
-from holdfast.web.host import ConnectionLimits
-from holdfast.web.host import Host
+from holdfast.web.host import ConnectionLimits, Host
 from holdfast.web.port import listen
 from support import web, wire
 from support.audits import writes
@@ -786,7 +785,7 @@ def test_mqtt_when_there_is_one(client: web.Client, service: web.Service) -> Non
 
 @pytest.fixture(scope="module")
 def document() -> dict[str, Any]:
-    return openapi.document("1.0", 8 * 2**20, secured=True)
+    return document_of("1.0", 8 * 2**20, secured=True)
 
 
 def resolve(document: dict[str, Any], reference: str) -> Any:
@@ -882,7 +881,7 @@ def test_every_reference_resolves_and_everything_is_used(document: dict[str, Any
 
 
 def test_tokens_are_in_the_document_when_there_are_some(document: dict[str, Any]) -> None:
-    open_to_all = openapi.document("1.0", 1024, secured=False)
+    open_to_all = document_of("1.0", 1024, secured=False)
     assert "securitySchemes" not in open_to_all["components"]
     assert not any(
         operation["security"]

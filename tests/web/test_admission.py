@@ -10,8 +10,8 @@ from ipaddress import ip_address, ip_network
 from typing import TYPE_CHECKING, Any
 
 import pytest
-
 from holdfast.web.admission import TIMEOUT, Admission, ConnectionLimits, Full, Waiting
+
 from holdfast.web.host import Host
 from holdfast.web.port import listen
 from holdfast.web.requests import Request, Response

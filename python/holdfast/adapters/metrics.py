@@ -22,15 +22,18 @@ from prometheus_client.registry import Collector
 from holdfast import __version__
 from holdfast.tags.text import plain
 from holdfast.web import health as probes
+from holdfast.web.application import Application
 from holdfast.web.host import ConnectionLimits, Host
-from holdfast.web.requests import SAFE, Response, rejection, response
+from holdfast.web.operations import Operation
+from holdfast.web.origin import Origins
+from holdfast.web.requests import BadRequest, Response, rejection, response
 
 if TYPE_CHECKING:
-    from holdfast._core import ListeningSocket
-    from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from prometheus_client.metrics_core import Metric
 
+    from holdfast._core import ListeningSocket
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.config import MetricsConfig
     from holdfast.stop import Stop
@@ -43,7 +46,7 @@ Result = TypeVar("Result")
 LIMITS = ConnectionLimits(32, when_full="evict")
 REQUEST_TIMEOUT = 10.0
 PATH = "/metrics"
-ALLOWED = (b"allow", b"GET, HEAD, OPTIONS")
+STATUSES = {"malformed": 400, "foreign_page": 403, "not_found": 404, "method_not_allowed": 405}
 STATES = ("running", "failed", "stopped")
 HEALTH = ("unknown", "ok", "error", "stale", "disabled", "standby")
 OUTCOMES = ("valid", "exceptions", "timeouts", "transport_errors")
@@ -101,18 +104,19 @@ class Metrics:
         *,
         https: Https | None = None,
     ) -> None:
-        self._health = health
-        self._registry = registry = CollectorRegistry()
+        registry = CollectorRegistry()
         registry.register(Figures(diagnostics))
         registry.register(Readiness(health))
         if settings.values:
             registry.register(TagFigures(diagnostics))
         ProcessCollector(registry=registry)
         GCCollector(registry=registry)
-        self._exporting = asyncio.Lock()
+        allowed = ": an IP address, localhost, or a name in metrics.hosts"
+        names = frozenset(settings.hosts)
+        origins = Origins(names=names, allowed=allowed, is_https=https is not None)
         self._host = Host(
             "metrics",
-            self._serve,
+            App(registry, health, origins),
             listener,
             sources=settings.sources,
             limits=LIMITS,
@@ -133,20 +137,36 @@ class Metrics:
             "tls_failures": self._host.tls_failures(),
         }
 
-    def _serve(self, request: Request) -> Response | Coroutine[Any, Any, Response]:
-        path = request.path
-        if path != PATH and path not in probes.PATHS:
-            detail = f"the metrics are at {PATH}, the health at {' and '.join(probes.PATHS)}"
-            return rejection(404, "not_found", detail)
-        if request.method == "OPTIONS":
-            return Response(204, headers=[ALLOWED, *SAFE])
-        if request.method not in ("GET", "HEAD"):
-            refusal = rejection(405, "method_not_allowed", "allowed: GET, HEAD, OPTIONS")
-            refusal.headers.append(ALLOWED)
-            return refusal
-        return self._export(request) if path == PATH else probes.answer(self._health, path)
 
-    async def _export(self, request: Request) -> Response:
+class App(Application):
+    """The application: the metrics, and the probes."""
+
+    def __init__(self, registry: CollectorRegistry, health: HealthSource, origins: Origins) -> None:
+        metrics = Operation("GET", PATH, "metrics", "", App.export)
+        live, ready = (
+            Operation("GET", path, "health", "", App.probe, is_open=True) for path in probes.PATHS
+        )
+        super().__init__((metrics, live, ready), origins)
+        self._registry = registry
+        self._health = health
+        self._exporting = asyncio.Lock()
+
+    def nowhere(self, _: str) -> str:
+        """Returns the error for another path."""
+        return f"the metrics are at {PATH}, the health at {' and '.join(probes.PATHS)}"
+
+    def refused(self, _: Request, error: Exception) -> Response:
+        """Returns the refusal of a request."""
+        if not isinstance(error, BadRequest):
+            raise error
+        return rejection(STATUSES[error.reason], error.reason, error.detail)
+
+    def probe(self, request: Request, _: object) -> Response:
+        """Answers a probe, whatever its Host. Only whom the metrics are for is shown details."""
+        details = self.origins.admits(request)
+        return probes.answer(self._health, request.path, details=details)
+
+    async def export(self, request: Request, _: object) -> Response:
         """Returns the metrics.
 
         They are made in a thread, one scrape at a time: thousands of devices must not hold up a

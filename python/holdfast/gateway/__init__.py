@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from holdfast import __version__
 from holdfast.gateway.app import App, rejection
+from holdfast.gateway.operations import document, operations
 from holdfast.gateway.pool import dial
 from holdfast.gateway.settings import GatewayLimits, Settings
 from holdfast.net.allow_list import AllowedNetwork
@@ -46,8 +48,15 @@ class Gateway:
         self.url = f"{scheme}://{self.address}"
         """The URL of its root."""
         self._app = App(
-            settings, self.url, resolve=resolve, dial=dial, poller=poller, health=health
+            operations(settings),
+            settings,
+            resolve=resolve,
+            dial=dial,
+            poller=poller,
+            health=health,
+            is_https=https is not None,
         )
+        self._app.describe(document(__version__, settings), self.url)
         self._host = Host(
             "gateway",
             self._app,

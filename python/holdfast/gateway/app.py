@@ -1,4 +1,4 @@
-"""The application of the gateway: routing, authorization, limits and responses.
+"""The application of the gateway: limits, and what each operation does.
 
 Only `device` communicates with devices. A request is cancelled when its client disconnects.
 """
@@ -9,97 +9,80 @@ import asyncio
 import contextlib
 import logging
 from collections import Counter
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
-
-import msgspec
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from holdfast import __version__, logs
 from holdfast.errors import ModbusException
-from holdfast.gateway import (
-    assets,
-    identifying,
-    listing,
-    openapi,
-    port_of_call,
-    reading,
-    surveying,
-    viewing,
-    watching,
-    writing,
-)
+from holdfast.gateway import assets, listing, port_of_call, surveying, viewing, watching
 from holdfast.gateway.broadcasting import NOTE
 from holdfast.gateway.device import Failed, RequestedDevice
 from holdfast.gateway.egress import Egress
-from holdfast.gateway.fields import from_json, from_query, malformed, timeout
 from holdfast.gateway.pool import Pool, dial
 from holdfast.gateway.refusals import FAILURE, REFUSALS
 from holdfast.gateway.sharing import Shared
 from holdfast.net.allow_list import AllowList
 from holdfast.net.resolver import Resolver
 from holdfast.web import health as probes
-from holdfast.web import openapi_page as page
+from holdfast.web.application import Application, json_response
 from holdfast.web.events import Stream
-from holdfast.web.openapi import DOCUMENT, PAGE
-from holdfast.web.refusals import UNREAD, headers_with
+from holdfast.web.origin import Origins, is_direct
 from holdfast.web.requests import (
-    JSON,
-    SAFE,
     BadRequest,
     BrokenBody,
     ClientDisconnected,
     Request,
     Response,
     response,
-    shown,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterator, Sequence
+    from collections.abc import Coroutine, Iterable, Iterator
 
     from holdfast._core import Poller
-    from holdfast.gateway.endpoint import Operation
-    from holdfast.gateway.fields import Field
+    from holdfast.gateway.endpoint import Endpoint, Given
     from holdfast.gateway.listing import Local
     from holdfast.gateway.pool import Dial
     from holdfast.gateway.settings import Settings
     from holdfast.net.resolver import Resolve
     from holdfast.web.health import HealthSource
-
-    Later: TypeAlias = Coroutine[Any, Any, Response | None]
-    Handler: TypeAlias = Callable[[Request], Response | Later]
+    from holdfast.web.operations import Operation
 
 Result = TypeVar("Result")
-
-ENDPOINTS: tuple[Operation, ...] = (*reading.ENDPOINTS, *writing.ENDPOINTS, *identifying.ENDPOINTS)
 
 REASON = b"holdfast-reason"
 FORM = b"application/x-www-form-urlencoded"
 """The default Content-Type of `curl -d`. The gateway treats it as JSON."""
-
-MAX_IGNORED = 4
-"""The most ignored keys of a request in the log."""
 
 STOPPING = "the gateway is stopping; a pending write may have been carried out"
 HOSTS = "--hosts, or hosts in the configuration"
 WRITES_ON = "enable them with --writes, or with access: read-write in the configuration"
 
 
-class App:
+class App(Application):
     """The application."""
 
     def __init__(
         self,
+        operations: Iterable[Operation[App]],
         settings: Settings,
-        url: str,
         *,
         resolve: Resolve | None = None,
         dial: Dial = dial,
         poller: Poller | None = None,
         health: HealthSource | None = None,
+        is_https: bool = False,
     ) -> None:
+        limits = self._limits = settings.limits
+        allowed = f" without tokens: an IP address, localhost, or a name in {HOSTS}"
+        names = None if settings.tokens else settings.hosts
+        super().__init__(
+            [each for each in operations if health is not None or each.path not in probes.PATHS],
+            Origins(names=names, allowed=allowed, is_https=is_https),
+            tokens=settings.tokens,
+            max_body=limits.body,
+        )
         self._health = health
         self._settings = settings
-        limits = self._limits = settings.limits
         # A lookup never needs more time than the longest request.
         self._egress = Egress(AllowList(settings.allow), resolve or Resolver(limits.timeout))
         self._pool = Pool(
@@ -119,28 +102,8 @@ class App:
         self._requests = self._failed = self._writes = 0
         self._refused: dict[str, int] = {}
         self._ending = asyncio.Event()
-        self._loop: asyncio.AbstractEventLoop | None = None
         self._lenient = port_of_call.PATHS if settings.compat == "port-of-call" else frozenset()
         """The paths of endpoints that take requests as Port of Call does."""
-        document = openapi.document(__version__, ENDPOINTS, settings)
-        if self._lenient:
-            port_of_call.describe(document)
-        self._document = msgspec.json.encode(document)
-        self._page = page.render(document, url)
-        self.routes: dict[str, tuple[str, Handler]] = {
-            **{each.path: ("POST", self._handler(each)) for each in ENDPOINTS},
-            surveying.PATH: ("POST", self._map),
-            watching.PATH: ("GET", self._watch),
-            viewing.PATH: ("POST", self._view),
-            **{each.path: ("POST", self._local(each)) for each in listing.ENDPOINTS},
-            listing.PROFILES: ("GET", self._profiles),
-            openapi.STATUS: ("GET", self._status),
-            DOCUMENT: ("GET", self._openapi),
-            PAGE: ("GET", self._docs),
-            **dict.fromkeys(assets.FILES, ("GET", self._asset)),
-        }
-        if health is not None:
-            self.routes |= dict.fromkeys(probes.PATHS, ("GET", self._probe))
 
     def counts(self) -> dict[str, object]:
         """Returns the counts of requests. Thread-safe.
@@ -158,63 +121,37 @@ class App:
 
     def end(self) -> None:
         """Ends all streams. Thread-safe."""
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # The loop is already closed.
-                self._loop.call_soon_threadsafe(self._ending.set)
+        self.call_soon(self._ending.set)
 
-    def __call__(self, request: Request) -> Response | Later:
-        """Answers one request."""
-        self._loop = asyncio.get_running_loop()
+    def __call__(self, request: Request) -> Response | Coroutine[Any, Any, Response | None]:
+        """Counts and answers one request."""
         self._requests += 1
-        try:
-            answer = self._answer(request)
-        except Exception as error:
-            return self._refusal(request, error)
-        return answer if isinstance(answer, Response) else self._finished(request, answer)
+        return super().__call__(request)
 
-    async def _finished(self, request: Request, answer: Later) -> Response | None:
-        try:
-            return await answer
-        except (BrokenBody, ClientDisconnected):
-            raise
-        except Exception as error:
-            return self._refusal(request, error)
-
-    def _answer(self, request: Request) -> Response | Later:
-        hosts = len(request.values(b"host"))
-        if hosts > 1 or (hosts == 0 and request.version == "1.1"):
-            raise malformed(f"{hosts} Host headers, HTTP/1.1 requires exactly one")
-        route = self.routes.get(request.path)
-        if route is None:
-            raise BadRequest("not_found", f"no resource at {shown(request.path)}")
-        allowed, handler = route
-        head = request.method == "HEAD" and allowed == "GET" and request.path != watching.PATH
-        if request.method == allowed or head:
-            return handler(request)
-        methods = f"{allowed}, OPTIONS"
-        if allowed == "GET" and request.path != watching.PATH:
-            methods = "GET, HEAD, OPTIONS"
-        if request.method == "OPTIONS":
-            answer = Response(204, headers=list(SAFE))
+    def check_type(self, request: Request) -> None:
+        """Raises `BadRequest` for a body that is not JSON by its type."""
+        if request.path in self._lenient:
+            port_of_call.check_type(request)
         else:
-            detail = port_of_call.METHOD_NOT_ALLOWED
-            if request.path not in self._lenient:
-                detail += f"; allowed: {methods}"
-            answer = self._refusal(request, BadRequest("method_not_allowed", detail))
-        answer.headers.append((b"allow", methods.encode()))
-        return answer
+            request.check_json(b"", FORM, parameters=True)
 
-    def _refusal(self, request: Request, error: Exception) -> Response:
-        """Returns the answer to a request that was refused or has failed."""
+    def not_allowed(self, operation: Operation[Any]) -> str:
+        """Returns the error for another method."""
+        if operation.path in self._lenient:
+            return port_of_call.METHOD_NOT_ALLOWED
+        return f"{port_of_call.METHOD_NOT_ALLOWED}; allowed: {operation.methods}"
+
+    def refused(self, request: Request, error: Exception) -> Response:
+        """Returns the response to a request that was refused or has failed."""
+        if isinstance(error, BrokenBody | ClientDisconnected):
+            raise error
         if isinstance(error, BadRequest):
             return self._refused_by(request, error)
-        reason, detail = "internal_error", "internal error, see the log"
         if isinstance(error, Failed):
             self._failed += 1
-            reason, detail = error.reason, error.detail
-        else:
-            logs.problem("request_failed", listener="gateway", peer=request.peer)
-        return rejection(FAILURE.status, reason, detail)
+            return rejection(FAILURE.status, error.reason, error.detail)
+        logs.problem("request_failed", listener="gateway", peer=request.peer)
+        return rejection(FAILURE.status, "internal_error", "internal error, see the log")
 
     def _refused_by(self, request: Request, unfit: BadRequest) -> Response:
         self._refused[unfit.reason] = self._refused.get(unfit.reason, 0) + 1
@@ -228,32 +165,12 @@ class App:
             # The detail may contain values to be written, which are never logged.
             detail="-" if unfit.reason == "malformed" else unfit.detail,
         )
-        status = REFUSALS.status(unfit.reason)
-        answer = rejection(status, unfit.reason, unfit.detail)
+        answer = rejection(REFUSALS.status(unfit.reason), unfit.reason, unfit.detail)
         if isinstance(unfit, port_of_call.Rejected):
             answer.body, answer.status = unfit.body, unfit.status
-        answer.headers += headers_with(answer.status)
-        answer.closes = status in UNREAD or request.header(b"expect") is not None
         return answer
 
-    # Authorization and limits.
-
-    def _admit(self, request: Request) -> None:
-        """Raises `BadRequest` for a request of another site's page or without a valid token."""
-        if request.is_foreign:
-            raise BadRequest("foreign_page", "the request is from a page of another site")
-        if self._settings.tokens:
-            request.who = request.owner(self._settings.tokens)
-        elif not request.is_direct(self._settings.hosts):
-            detail = "Host is a name, allowed without tokens: an IP address, localhost"
-            raise BadRequest("foreign_page", f"{detail}, or a name in {HOSTS}")
-        elif request.path == watching.PATH and not request.is_direct():
-            # The only GET that asks a device. Over HTTP and to a name, browsers send neither Origin
-            # nor Sec-Fetch-Site with the GET of a page.
-            detail = (
-                f"Host is a name, allowed without tokens for GET {watching.PATH}: an IP address"
-            )
-            raise BadRequest("foreign_page", f"{detail}, localhost; or use POST {viewing.PATH}")
+    # Limits.
 
     @contextlib.contextmanager
     def _place(self, kind: str, most: int) -> Iterator[None]:
@@ -312,50 +229,16 @@ class App:
 
     # Requests to devices.
 
-    def _handler(self, endpoint: Operation) -> Handler:
-        longest = round(1000 * self._limits.timeout)
-        fields = (*endpoint.fields, timeout(min(endpoint.timeout, longest), longest))
-
-        async def handle(request: Request) -> Response:
-            self._admit(request)
-            self._check_type(request)
-            with self._place("requests", self._limits.requests):
-                given = self._parsed(request, await request.body(self._limits.body), fields)
-                changes = endpoint.writes(given)
-                if changes and not self._settings.writes:
-                    raise BadRequest("writes_off", f"writes are disabled: {WRITES_ON}")
-                device = RequestedDevice(
-                    self._egress, self._pool, given, broadcast=endpoint.broadcast
-                )
-                with self._share(device):
-                    work = self._carry_out(request, endpoint, given, device, changes)
-                    return await self._while_there_or_told(request, work)
-
-        return handle
-
-    def _check_type(self, request: Request) -> None:
-        """Raises `BadRequest` for a body that is not JSON by its type."""
-        if request.path in self._lenient:
-            port_of_call.check_type(request)
-        else:
-            request.check_json(b"", FORM, parameters=True)
-
-    def _parsed(self, request: Request, body: bytes, fields: Sequence[Field]) -> dict[str, Any]:
-        """Returns the fields of a request with defaults. Raises `BadRequest`."""
-        if request.path not in self._lenient:
-            return from_json(body, fields)
-        given, ignored = port_of_call.parsed(request.path, body, fields)
-        if ignored:
-            logs.refused(
-                "keys_ignored",
-                kind="gateway",
-                listener="gateway",
-                peer=request.peer,
-                who=request.who,
-                path=request.path,
-                found=", ".join(map(shown, ignored[:MAX_IGNORED])),
-            )
-        return given
+    async def carry_out(self, request: Request, endpoint: Endpoint, given: Given) -> Response:
+        """Carries out one operation on a device."""
+        with self._place("requests", self._limits.requests):
+            changes = endpoint.writes(given)
+            if changes and not self._settings.writes:
+                raise BadRequest("writes_off", f"writes are disabled: {WRITES_ON}")
+            device = RequestedDevice(self._egress, self._pool, given, broadcast=endpoint.broadcast)
+            with self._share(device):
+                work = self._asked(request, endpoint, given, device, changes)
+                return await self._while_there_or_told(request, work)
 
     async def _while_there_or_told(
         self, request: Request, work: Coroutine[Any, Any, Result]
@@ -368,11 +251,11 @@ class App:
                 raise BadRequest("stopping", STOPPING) from None
             raise
 
-    async def _carry_out(
+    async def _asked(
         self,
         request: Request,
-        endpoint: Operation,
-        given: dict[str, Any],
+        endpoint: Endpoint,
+        given: Given,
         device: RequestedDevice,
         changes: bool,
     ) -> Response:
@@ -393,12 +276,12 @@ class App:
                 sent = device.asked and outcome != "refused"
                 told = outcome if sent or outcome == "refused" else "not sent"
                 self._note_write(request, given, device, told, sent=sent)
-        return response(JSON, msgspec.json.encode(answer))
+        return json_response(answer)
 
     def _note_write(
         self,
         request: Request,
-        given: dict[str, Any],
+        given: Given,
         device: RequestedDevice,
         outcome: str,
         *,
@@ -418,12 +301,11 @@ class App:
             outcome=outcome,
         )
 
-    async def _map(self, request: Request) -> None:
-        self._admit(request)
-        self._check_type(request)
+    # Streams.
+
+    async def map(self, request: Request, given: Given) -> None:
+        """Maps a device."""
         with self._stream(request):
-            body = await request.body(self._limits.body)
-            given = from_json(body, surveying.fields(self._limits))
             self._require_stream(request, given["maxStreams"])
             device = RequestedDevice(self._egress, self._pool, given)
             survey = surveying.planned(given)
@@ -433,20 +315,23 @@ class App:
             )
             await self._while_streaming(request, stream, work)
 
-    async def _watch(self, request: Request) -> None:
-        self._admit(request)
+    async def watch(self, request: Request, given: Given) -> None:
+        """Watches a range of a device."""
+        if not self._settings.tokens and not is_direct(request):
+            # The only GET that asks a device. Over HTTP and to a name, browsers send neither Origin
+            # nor Sec-Fetch-Site with the GET of a page.
+            detail = (
+                f"Host is a name, allowed without tokens for GET {watching.PATH}: an IP address"
+            )
+            raise BadRequest("foreign_page", f"{detail}, localhost; or use POST {viewing.PATH}")
         with self._stream(request):
-            given = from_query(request.query, watching.fields(self._limits))
             device = RequestedDevice(self._egress, self._pool, given)
             stream = Stream(request, self._limits.heartbeat)
             await self._while_streaming(request, stream, watching.watch(given, device, stream))
 
-    async def _view(self, request: Request) -> None:
-        self._admit(request)
-        self._check_type(request)
+    async def view(self, request: Request, given: Given) -> None:
+        """Follows several ranges and tag lists of a device."""
         with self._place("requests", self._limits.requests):
-            body = await request.body(self._limits.body)
-            given = from_json(body, viewing.fields(self._limits))
             parts = await viewing.parts_of(given, self._settings.profiles)
         device = RequestedDevice(self._egress, self._pool, given)
         streaming = not given["once"] and self._has_stream(request, given["maxStreams"])
@@ -481,23 +366,6 @@ class App:
         if most is not None and self._streams[host_of(request.peer)] > most:
             raise BadRequest("busy", f"streams of this address: {most}, which is maxStreams")
 
-    def _local(self, endpoint: Local) -> Handler:
-        """Returns the handler of an endpoint that asks no device."""
-
-        async def handle(request: Request) -> Response:
-            self._admit(request)
-            self._check_type(request)
-            with self._place("requests", self._limits.requests):
-                given = from_json(await request.body(self._limits.body), endpoint.fields)
-                answer = await endpoint.answer(given, self._settings.profiles)
-            return response(JSON, msgspec.json.encode(answer))
-
-        return handle
-
-    def _profiles(self, request: Request) -> Response:
-        self._admit(request)
-        return response(JSON, msgspec.json.encode(listing.profiles(self._settings.profiles)))
-
     async def _while_streaming(
         self, request: Request, stream: Stream, work: Coroutine[Any, Any, None]
     ) -> None:
@@ -509,36 +377,41 @@ class App:
             if self._ending.is_set():
                 await stream.end()
 
-    # Status, documents and console.
+    # Answers without a device.
 
-    def _status(self, request: Request) -> Response:
-        self._admit(request)
+    async def local(self, endpoint: Local, given: Given) -> Response:
+        """Answers a request for which no device is asked."""
+        with self._place("requests", self._limits.requests):
+            return json_response(await endpoint.answer(given, self._settings.profiles))
+
+    def profiles(self, _: Request, __: Given) -> Response:
+        """Lists the profiles."""
+        return json_response(listing.profiles(self._settings.profiles))
+
+    def status(self, _: Request, __: Given) -> Response:
+        """Returns the settings of the gateway."""
         limits = self._limits
-        status = {
-            "version": __version__,
-            "writes": self._settings.writes,
-            "tokens": bool(self._settings.tokens),
-            "allow": [str(entry) for entry in self._settings.allow],
-            "limits": {
-                "timeout": round(1000 * limits.timeout),
-                "interval": round(1000 * limits.interval),
-            },
-            "connections": len(self._pool),
-        }
-        return response(JSON, msgspec.json.encode(status))
+        return json_response(
+            {
+                "version": __version__,
+                "writes": self._settings.writes,
+                "tokens": bool(self._settings.tokens),
+                "allow": [str(entry) for entry in self._settings.allow],
+                "limits": {
+                    "timeout": round(1000 * limits.timeout),
+                    "interval": round(1000 * limits.interval),
+                },
+                "connections": len(self._pool),
+            }
+        )
 
-    def _probe(self, request: Request) -> Response:
+    def probe(self, request: Request, _: Given) -> Response:
         """Answers a probe. It needs no token, so the answer has no names."""
         assert self._health is not None, "there is a route"
         return probes.answer(self._health, request.path, details=False)
 
-    def _openapi(self, _: Request) -> Response:
-        return response(JSON, self._document)
-
-    def _docs(self, _: Request) -> Response:
-        return response(page.KIND, self._page, (b"content-security-policy", page.POLICY))
-
-    def _asset(self, request: Request) -> Response:
+    def asset(self, request: Request, _: Given) -> Response:
+        """Returns a file of the console."""
         kind, body = assets.read(request.path)
         return response(kind, body, *assets.HEADERS)
 
@@ -550,5 +423,5 @@ def host_of(peer: str) -> str:
 
 def rejection(status: int, reason: str, detail: str) -> Response:
     """Returns the response to a refused or failed request."""
-    body = msgspec.json.encode({"success": False, "error": detail})
-    return response(JSON, body, (REASON, reason.encode()), status=status)
+    said = {"success": False, "error": detail}
+    return json_response(said, (REASON, reason.encode()), status=status)

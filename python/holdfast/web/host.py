@@ -116,20 +116,24 @@ class Host:
         self._rejection = rejection
         self._https = https
         self._server: HttpServer | None = None
+        self._counts = dict.fromkeys(COUNTS, 0)
+        self._tls_failures: dict[str, int] = {}
         self._open: dict[int, _Exchanged] = {}
         """The requests whose handlers are coroutines, by number."""
         self._tasks: set[asyncio.Task[None]] = set()
 
     def counts(self) -> dict[str, int]:
         """Returns the counts of connections. Thread-safe. What is counted has been logged."""
-        if self._server is None:
-            return dict.fromkeys(COUNTS, 0)
-        self._log_events(self._server)
-        return self._server.counters()
+        server = self._server
+        if server is None:
+            return self._counts
+        self._log_events(server)
+        return server.counters()
 
     def tls_failures(self) -> dict[str, int]:
         """Returns the counts of failures of TLS, by reason. Thread-safe."""
-        return {} if self._server is None else self._server.tls_failures()
+        server = self._server
+        return self._tls_failures if server is None else server.tls_failures()
 
     def run(self, stop: Stop) -> None:
         """Serves in this thread until `stop` is set. Can be called again: the socket stays open."""
@@ -160,7 +164,8 @@ class Host:
             transport.close()
         finally:
             server.close()
-            self._log_events(server)
+            self._counts, self._tls_failures = self.counts(), server.tls_failures()
+            self._server = None
 
     def _started(self) -> HttpServer:
         limits, https = self._limits, self._https
@@ -346,15 +351,11 @@ class _Exchanged(Request):
                 self._gone.set_result(None)
             self._gone = True
 
-    async def body(self, most: int) -> bytes:
-        """Reads the body, at most `most` bytes."""
-        whole = self.arrived(most)
-        if whole is not None:
-            return whole
+    async def receive(self, most: int) -> bytes:
+        """Waits for the body."""
         self.exchange.receive(most)
         kind, value = await self._next()
         if kind == "body":
-            self.whole = value
             return bytes(value)
         if kind == "late":
             raise BadRequest("timeout", f"the body is incomplete: {value} bytes arrived in time")

@@ -6,7 +6,6 @@ its reason to a status code.
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import hmac
 import json
@@ -17,10 +16,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 
-from holdfast.net.addresses import address_in
-
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterable
+    from collections.abc import Iterable
 
 Headers: TypeAlias = list[tuple[bytes, bytes]]
 """Names in lower case, and values."""
@@ -128,15 +125,10 @@ class Request:
 
     # What a host provides.
 
-    @property
-    def is_late(self) -> bool:
-        """Whether the request did not arrive in time."""
-        return False
+    async def receive(self, most: int) -> bytes:
+        """Waits for a body that still arrives, at most `most` bytes.
 
-    async def piece(self) -> bytes | None:
-        """Returns the next piece of the body; `None` at its end; an empty one if it is late.
-
-        Raises `ClientDisconnected` and `BrokenBody`.
+        Raises `BadRequest`, `BrokenBody` and `ClientDisconnected`.
         """
         raise NotImplementedError
 
@@ -173,15 +165,8 @@ class Request:
         whole = self.arrived(most)
         if whole is not None:
             return whole
-        body = bytearray()
-        while (piece := await self.piece()) is not None:
-            body += piece
-            if len(body) > most:
-                raise BadRequest("too_large", f"the body has more than {most} bytes")
-            if self.is_late:
-                detail = f"the body is incomplete: {len(body)} bytes arrived in time"
-                raise BadRequest("timeout", detail)
-        return bytes(body)
+        self.whole = await self.receive(most)
+        return self.whole
 
     # The headers.
 
@@ -212,29 +197,6 @@ class Request:
         coding = self.header(b"content-encoding")
         if coding is not None and coding.lower() != b"identity":
             raise BadRequest("not_json", f"Content-Encoding is {_found(coding)}, allowed: none")
-
-    @property
-    def is_foreign(self) -> bool:
-        """Whether a browser sent the request from a page of another site."""
-        origin, host = self.header(b"origin"), self.header(b"host") or b""
-        if origin is not None and origin.partition(b"://")[2].lower() != host.lower():
-            return True
-        return self.header(b"sec-fetch-site") in (b"cross-site", b"same-site")
-
-    @property
-    def is_from_page(self) -> bool:
-        """Whether a web page sent the request, also one of this server."""
-        return any(self.values(name) for name in (b"origin", b"referer", b"sec-fetch-site"))
-
-    def is_direct(self, names: Container[str] = ()) -> bool:
-        """Whether Host is missing, an IP address, `localhost`, or one of `names` in lower case.
-
-        This prevents DNS rebinding: a web page can point its own name at this machine, but the
-        browser still sends that name as Host.
-        """
-        host = self.header(b"host")
-        name = None if host is None else _name_in(host)
-        return name is None or name in names
 
     def owner(self, tokens: Iterable[tuple[str, bytes]]) -> str:
         """Returns the name of the request's token. Raises `BadRequest` if there is none.
@@ -269,10 +231,3 @@ def shown(text: str) -> str:
 
 def _found(value: bytes | None) -> str:
     return "missing" if value is None else shown(value.decode("latin-1"))
-
-
-@functools.lru_cache(maxsize=64)
-def _name_in(host: bytes) -> str | None:
-    """Returns the name in a Host header; `None` for an IP address, `localhost` or nothing."""
-    name = re.sub(r":[0-9]*\Z", "", host.decode("latin-1")).lower()
-    return None if name in ("", "localhost") or address_in(name) is not None else name

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from holdfast import __version__
 from holdfast.adapters.rest.app import App
+from holdfast.adapters.rest.operations import OPERATIONS, document
 from holdfast.web.host import STOP_TIMEOUT, ConnectionLimits, Host
 
 if TYPE_CHECKING:
@@ -33,8 +35,7 @@ class Rest:
         https: Https | None = None,
         stop_timeout: float = STOP_TIMEOUT,
     ) -> None:
-        scheme = "http" if https is None else "https"
-        self._app = App(settings, memory_access, diagnostics, sessions, listener, scheme)
+        self._app = App(OPERATIONS, settings, memory_access, diagnostics, sessions)
         self._host = Host(
             "rest",
             self._app,
@@ -48,6 +49,11 @@ class Rest:
             request_timeout=settings.request_timeout,
             stop_timeout=stop_timeout,
             https=https,
+        )
+        scheme = "http" if https is None else "https"
+        self._app.describe(
+            document(__version__, settings.max_body, secured=settings.tokens != "none"),
+            f"{scheme}://{self._host.address}",
         )
         self.heartbeat = self._host.heartbeat
 
