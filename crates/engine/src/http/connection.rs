@@ -48,7 +48,7 @@ const NEVER: Duration = Duration::from_secs(3600);
 
 /// How a connection ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum End {
+pub(super) enum End {
     /// The peer may still send: it is read to its end, so that it gets the last response.
     Said,
     Dropped,
@@ -130,7 +130,11 @@ async fn refuse_plain(
 }
 
 /// Serves the requests of a connection.
-async fn converse(front: &Arc<Front>, line: &SharedLine, mut stop: watch::Receiver<bool>) -> End {
+pub(super) async fn converse(
+    front: &Arc<Front>,
+    line: &SharedLine,
+    mut stop: watch::Receiver<bool>,
+) -> End {
     let mut stopped = pin!(stop.wait_for(|stop| *stop));
     let mut alarm = pin!(sleep_until((Instant::now() + NEVER).into()));
     // hyper takes memory for each connection, so it begins with the first bytes.
@@ -213,28 +217,46 @@ impl super::line::Line {
     }
 }
 
-/// Hands a request to its handler, and returns the response.
-async fn answered(
+/// Hands a request to its handler, and returns the response. hyper reads on once this returns the future,
+/// so it notes what is read next before.
+fn answered(
     front: Arc<Front>,
     line: SharedLine,
+    request: Request<Incoming>,
+) -> impl Future<Output = Result<Response<Output>, Abandoned>> {
+    let exchange = front.exchange();
+    let len = request.body().size_hint().exact();
+    let is_ambiguous = line.lock().begin(Arc::clone(&exchange), len);
+    async move {
+        if is_ambiguous {
+            front.ended(Kind::BrokenRequest, line.lock().peer.clone());
+            return Ok(refused(&front, exchange, line));
+        }
+        handled(front, line, exchange, request).await
+    }
+}
+
+async fn handled(
+    front: Arc<Front>,
+    line: SharedLine,
+    exchange: Arc<Exchange>,
     request: Request<Incoming>,
 ) -> Result<Response<Output>, Abandoned> {
     let (parts, body) = request.into_parts();
     let len = body.size_hint().exact();
-    let exchange = front.exchange();
     let expects = parts.headers.contains_key(EXPECT);
     let is_old = parts.version == Version::HTTP_10;
-    let (is_ambiguous, is_here, peer) = {
-        let mut line = line.lock();
-        let is_ambiguous = line.begin(Arc::clone(&exchange), len);
-        let is_here = !expects && len.is_some_and(|len| line.has(len));
-        (is_ambiguous, is_here, line.peer.clone())
+    let (is_here, peer) = {
+        let line = line.lock();
+        (!expects && len.is_some_and(|len| line.has(len)), line.peer.clone())
     };
-    if is_ambiguous {
-        front.ended(Kind::BrokenRequest, peer);
-        return Ok(refused(&front, exchange, line));
-    }
-    let mut upload = Upload { line: line.clone(), body, received: BytesMut::new(), is_over: false };
+    let mut upload = Upload {
+        line: line.clone(),
+        body,
+        received: BytesMut::new(),
+        is_over: false,
+        is_cut: false,
+    };
     let mut handled = Handled { exchange: Arc::clone(&exchange), is_answered: false };
     let whole = match len {
         Some(0) => {
@@ -298,6 +320,7 @@ struct Upload {
     body: Incoming,
     received: BytesMut,
     is_over: bool,
+    is_cut: bool,
 }
 
 /// Why a body can't be had.
@@ -317,6 +340,10 @@ impl Upload {
 
     /// Receives until the end, at most `most` bytes.
     async fn receive(&mut self, most: usize) -> Result<Bytes, NoBody> {
+        if self.is_cut {
+            // hyper reports an error once, and then an end.
+            return Err(NoBody::Cut);
+        }
         while !self.is_over {
             match poll_fn(|context| Pin::new(&mut self.body).poll_frame(context)).await {
                 Some(Ok(frame)) => {
@@ -327,7 +354,10 @@ impl Upload {
                         return Err(NoBody::TooLarge);
                     }
                 }
-                Some(Err(error)) => return Err(no_body(&error)),
+                Some(Err(error)) => {
+                    self.is_cut = true;
+                    return Err(no_body(&error));
+                }
                 None => {
                     self.is_over = true;
                     self.line.lock().note_arrived();

@@ -9,6 +9,8 @@
 //!   for its next request to begin.
 
 mod connection;
+#[cfg(test)]
+mod cuts;
 mod exchange;
 mod inbox;
 mod line;

@@ -62,6 +62,7 @@ pub(super) struct HeadEnd {
     search: Search,
     /// The beginning of the line, in lower case, without CR.
     line: Vec<u8>,
+    has_lines: bool,
     has_length: bool,
     has_coding: bool,
 }
@@ -71,7 +72,7 @@ const CODING: &[u8] = b"transfer-encoding:";
 
 impl HeadEnd {
     fn find(&mut self, bytes: &[u8]) -> usize {
-        if self.search.found == Some(0) {
+        if self.search.found == Some(0) && !self.has_lines {
             // hyper ignores empty lines before a request: there was no header so far.
             *self = HeadEnd::default();
         }
@@ -91,6 +92,7 @@ impl HeadEnd {
     }
 
     fn end_line(&mut self) {
+        self.has_lines = true;
         self.has_length |= self.line.starts_with(LENGTH);
         self.has_coding |= self.line.starts_with(CODING);
         self.line.clear();

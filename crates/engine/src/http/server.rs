@@ -21,7 +21,7 @@ use crate::own_threads::OwnThreads;
 use crate::server::Peer;
 use crate::server::admission::ConnectionLimits;
 use crate::server::counters::ConnectionCounters;
-use crate::server::event::{self, Events, Kind, Verbosity};
+use crate::server::event::{self, Events, Kind, Reporter, Verbosity};
 use crate::server::listener::{Admitted, ListenerContext, Service, accept};
 use crate::server::live::Live;
 use crate::tls::server::ServerTls;
@@ -65,6 +65,27 @@ pub(super) struct Front {
 }
 
 impl Front {
+    /// Also returns the socket.
+    pub(super) fn new(
+        settings: HttpSettings,
+        inbox: Arc<Inbox>,
+        reporter: Reporter,
+    ) -> (Front, TcpListener) {
+        let context = ListenerContext::new(&settings.name, Some(settings.limits), reporter, None);
+        let front = Front {
+            context: Arc::new(context),
+            inbox,
+            sources: settings.sources,
+            request_timeout: settings.request_timeout,
+            idle_timeout: settings.idle_timeout,
+            leaving: settings.leaving,
+            tls: settings.tls.map(Live::from),
+            refusals: settings.refusals,
+            next: AtomicU64::new(0),
+        };
+        (front, settings.socket)
+    }
+
     pub(super) fn tls(&self) -> Option<Arc<ServerTls>> {
         self.tls.as_ref().map(Live::get)
     }
@@ -130,19 +151,9 @@ impl HttpServer {
         let (inbox, wakes) = Inbox::new()?;
         let (reporter, events) = event::channel(Verbosity::Refusals);
         settings.socket.set_nonblocking(true)?;
-        let context = ListenerContext::new(&settings.name, Some(settings.limits), reporter, None);
-        let front = Arc::new(Front {
-            context: Arc::new(context),
-            inbox: Arc::new(inbox),
-            sources: settings.sources,
-            request_timeout: settings.request_timeout,
-            idle_timeout: settings.idle_timeout,
-            leaving: settings.leaving,
-            tls: settings.tls.map(Live::from),
-            refusals: settings.refusals,
-            next: AtomicU64::new(0),
-        });
         let thread = format!("http-{}", settings.name);
+        let (front, socket) = Front::new(settings, Arc::new(inbox), reporter);
+        let front = Arc::new(front);
         let server = HttpServer {
             front,
             stop: watch::Sender::new(false),
@@ -153,7 +164,7 @@ impl HttpServer {
             wakes: Mutex::new(Some(wakes)),
         };
         let runtime = Builder::new_current_thread().enable_io().enable_time().build()?;
-        server.run(thread, runtime, settings.socket)?;
+        server.run(thread, runtime, socket)?;
         Ok(server)
     }
 
