@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from os import PathLike
-from typing import Any, Final, Literal, final
+from typing import Any, Final, Literal, Self, final
 
 from holdfast.errors import ModbusError
 from holdfast.types import (
@@ -45,8 +45,11 @@ __all__ = [
     "Engine",
     "Fence",
     "Follower",
+    "HttpExchange",
+    "HttpServer",
     "Link",
     "Listener",
+    "ListeningSocket",
     "Log",
     "LogError",
     "LogFollower",
@@ -448,6 +451,112 @@ class ServerTls:
     @property
     def warnings(self) -> list[str]:
         """What is doubtful about the files: dates, and revocation lists."""
+
+class ListeningSocket:
+    """A TCP socket that listens on `address:port`; `[::]` includes IPv4. Raises `OSError`."""
+
+    def __init__(self, bind_address: str) -> None: ...
+    def __enter__(self) -> Self: ...
+    def __exit__(self, *args: object) -> None: ...
+    def getsockname(self) -> tuple[str, int]:
+        """The address and the port."""
+
+    def close(self) -> None:
+        """Stops listening, when the servers of the socket have ended too."""
+
+class HttpServer:
+    """A server of HTTP/1.1 in a thread of its own.
+
+    `grace`, `request_timeout` and `idle_timeout` are seconds: how long a connection
+    in the middle of a request is never closed for another, how long a request and taking its
+    response may take, and how long the pause between requests. With `leaving`, a client that
+    sends no more is gone. `refusals` are the headers and bodies for what reaches no handler, by
+    name: `not_http`, `header_too_large`, `not_tls`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        socket: ListeningSocket,
+        *,
+        sources: Sequence[str],
+        max_connections: int,
+        max_connections_per_source: int | None = None,
+        when_full: WhenFull = "refuse",
+        grace: float,
+        request_timeout: float,
+        idle_timeout: float,
+        leaving: bool = False,
+        tls: ServerTls | None = None,
+        refusals: Sequence[tuple[str, Sequence[tuple[bytes, bytes]], bytes]],
+    ) -> None: ...
+    def detach(self) -> int:
+        """The handle of a socket that is readable when there is something to take."""
+
+    def take(self) -> tuple[list[tuple[Any, ...]], list[tuple[int, str, Any]]]:
+        """Takes new requests, and what has happened to others.
+
+        A request is its exchange, method, path, query, headers, peer, version, body, and the
+        subject, serial number and role of its client's certificate. The body is `None` while it
+        arrives. What has happened is a number, a word and a value: `body` (bytes), `late` (bytes
+        that have arrived), `too_large`, `broken`, `gone` or `room`.
+        """
+
+    def events(self) -> list[tuple[str, dict[str, Any]]]:
+        """Takes events of connections: a name, and fields for a log."""
+
+    def counters(self) -> dict[str, int]:
+        """Counts of connections."""
+
+    def tls_failures(self) -> dict[str, int]:
+        """Failures of TLS by reason."""
+
+    @property
+    def open(self) -> int:
+        """How many connections are open."""
+
+    def heartbeat(self) -> ThreadHeartbeat:
+        """The name of the thread, seconds since its last beat, and the system's number of it."""
+
+    def set_tls(self, tls: ServerTls) -> None:
+        """Uses other certificates for new connections."""
+
+    def end(self) -> None:
+        """Ends connections without a request now, and the others after their responses."""
+
+    def close(self) -> None:
+        """Ends all connections, and waits for the thread."""
+
+class HttpExchange:
+    """One request and its response. If it is dropped without a response, the connection ends."""
+
+    @property
+    def number(self) -> int:
+        """The number of the request."""
+
+    def receive(self, most: int) -> None:
+        """Asks for the body, at most `most` bytes. An event has it."""
+
+    def respond(
+        self, status: int, headers: Sequence[tuple[bytes, bytes]], body: bytes, closes: bool
+    ) -> None:
+        """Answers the request; with `closes`, the connection ends after it.
+
+        Raises `ValueError` for an invalid header or status.
+        """
+
+    def begin(self, status: int, headers: Sequence[tuple[bytes, bytes]]) -> None:
+        """Answers the request with a stream. Raises `ValueError`."""
+
+    def send(self, data: bytes) -> bool | None:
+        """Sends data of a stream.
+
+        Returns whether they were taken: otherwise the event `room` tells when to try again. `None`
+        if the client is gone.
+        """
+
+    def end(self, is_complete: bool) -> None:
+        """Ends a stream. One that is not complete is cut off."""
 
 def https_server_tls(
     *,

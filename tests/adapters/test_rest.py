@@ -15,10 +15,9 @@ import pytest
 import holdfast
 from holdfast import logs
 from holdfast.adapters import Grant, MemoryAccess, Stop
-from holdfast.adapters.rest import openapi
+from holdfast.adapters.rest.operations import document as document_of
 from holdfast.audit import Audit
-from holdfast.web.admission import ConnectionLimits
-from holdfast.web.host import Host
+from holdfast.web.host import ConnectionLimits, Host
 from holdfast.web.port import listen
 from support import web, wire
 from support.audits import writes
@@ -26,6 +25,8 @@ from support.audits import writes
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    from holdfast.web.requests import Request, Response
 
 ADMIN, READER, NARROW, OTHER = "secret-admin", "secret-reader", "secret-narrow", "secret-other"
 TOKENS = [
@@ -507,12 +508,14 @@ def test_every_answer_is_not_to_be_kept_and_names_no_server(client: web.Client, 
 
 
 def test_a_fault_is_answered_without_a_detail_and_logged(log: web.Records) -> None:
-    async def app(*_: object) -> None:
+    def fail(_: Request) -> Response:
         raise RuntimeError("the secret of the house")
 
     listener = listen("127.0.0.1", 0)
     loopback = [ip_network("127.0.0.0/8")]
-    host = Host("x", app, listener, sources=loopback, limits=ConnectionLimits(1), request_timeout=9)
+    host = Host(
+        "x", fail, listener, sources=loopback, limits=ConnectionLimits(1), request_timeout=9
+    )
     with (
         contextlib.closing(listener),
         web.in_a_thread(host),
@@ -782,7 +785,7 @@ def test_mqtt_when_there_is_one(client: web.Client, service: web.Service) -> Non
 
 @pytest.fixture(scope="module")
 def document() -> dict[str, Any]:
-    return openapi.document("1.0", 8 * 2**20, secured=True)
+    return document_of("1.0", 8 * 2**20, secured=True)
 
 
 def resolve(document: dict[str, Any], reference: str) -> Any:
@@ -860,7 +863,7 @@ def test_the_document_is_served_and_names_every_route(
         path: method.upper() for path, methods in served["paths"].items() for method in methods
     }
     assert named == ROUTES
-    app: Any = service.made()._host._app
+    app: Any = service.made()._app
     assert app.routes.keys() == named.keys()
     assert served["paths"].keys() == document["paths"].keys()
 
@@ -878,7 +881,7 @@ def test_every_reference_resolves_and_everything_is_used(document: dict[str, Any
 
 
 def test_tokens_are_in_the_document_when_there_are_some(document: dict[str, Any]) -> None:
-    open_to_all = openapi.document("1.0", 1024, secured=False)
+    open_to_all = document_of("1.0", 1024, secured=False)
     assert "securitySchemes" not in open_to_all["components"]
     assert not any(
         operation["security"]

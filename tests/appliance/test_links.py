@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from holdfast.adapters.rest import openapi
+from holdfast.adapters.rest.operations import document
 from support import web, wire
 from support.fake_device import Stream, exception
 from support.routed import await_count, configuration, counters
@@ -108,7 +108,7 @@ def test_rest_tells_the_counters_as_it_describes_them(device: Stream, run: Run) 
 
     with contextlib.closing(web.Client(endpoint(appliance, "rest"))) as client:
         told = client.get("/api/v1/diagnostics/stats").json["links"]
-    schemas = openapi.document("1.0", 1024, secured=False)["components"]["schemas"]
+    schemas = document("1.0", 1024, secured=False)["components"]["schemas"]
     described = schemas["Stats"]["properties"]["links"]["additionalProperties"]
     assert set(told["bus"]) == set(described["required"]) == set(described["properties"])
     assert told == {"bus": NONE | {"requests": 1, "replies": 1, "exceptions": 1}}

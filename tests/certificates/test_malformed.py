@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from holdfast.bounded_files import MAX_CERTIFICATES
 from holdfast.certificates import authority, expiry, inspection, own, pem
+from holdfast.web.https import Https, HttpsFiles
 from support.cases import examples
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def test_a_file_is_either_usable_or_named_as_unusable(tmp_path: Path, text: byte
         expiry.of_certificates,
         expiry.of_revocation_lists,
         own.nameless,
-        lambda file: own.check_own(file, file),
+        lambda file: Https(HttpsFiles(file, file)),
     ):
         with contextlib.suppress(pem.UnusableFile):
             use(file)

@@ -16,7 +16,8 @@ from schemathesis.specs.openapi.checks import positive_data_acceptance
 
 import holdfast
 from holdfast import __version__
-from holdfast.gateway import Settings, app, openapi, port_of_call
+from holdfast.gateway import Settings, port_of_call
+from holdfast.gateway.operations import document
 from support import gateways
 from support.cases import examples
 from support.gateways import Dialed
@@ -40,7 +41,7 @@ EXCLUDED: list[Any] = [
 
 ANY_TEXT = ("pattern", r"^[\s\S]*$")
 
-DOCUMENT = openapi.document(__version__, app.ENDPOINTS, Settings(()))
+DOCUMENT = document(__version__, Settings(()))
 OPERATIONS = [
     (path, method.upper(), mode)
     for path, methods in DOCUMENT["paths"].items()

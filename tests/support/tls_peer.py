@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import socket
 import ssl
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from support import web, wire
@@ -26,8 +25,6 @@ if TYPE_CHECKING:
 READ = bytes.fromhex("0300000001")
 ZERO = bytes.fromhex("03020000")
 HEALTH = web.head("GET", "/api/v1/health", "Connection: close")
-HTTPS_BY_CORE = find_spec("holdfast.web.tls") is None
-"""Whether the core serves HTTPS, instead of OpenSSL."""
 VERSIONS = {"1.2": ssl.TLSVersion.TLSv1_2, "1.3": ssl.TLSVersion.TLSv1_3}
 
 

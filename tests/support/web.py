@@ -10,7 +10,6 @@ import hashlib
 import http.client
 import json
 import logging
-import socket
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     import holdfast
-    from holdfast._core import Engine
+    from holdfast._core import Engine, ListeningSocket
     from holdfast.audit import Audit
     from holdfast.types import ThreadHeartbeat
     from holdfast.web.https import Https
@@ -206,7 +205,7 @@ class Service:
 
 
 @contextlib.contextmanager
-def supervised(supervisor: Supervisor, listener: socket.socket) -> Iterator[None]:
+def supervised(supervisor: Supervisor, listener: ListeningSocket) -> Iterator[None]:
     """Runs an adapter. At the end its thread must have stopped, without a failure."""
     supervisor.start()
     wire.until(lambda: supervisor.status()["state"] == "running", "it runs")

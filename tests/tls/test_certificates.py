@@ -27,7 +27,6 @@ from support.polled import Fake, data
 from support.running import endpoint as endpoint_of
 from support.secured import Relay, context
 from support.tls_peer import (
-    HTTPS_BY_CORE,
     configuration,
     reasons,
     rest_configuration,
@@ -324,41 +323,12 @@ def rest(own: Shown, trusted: Path) -> str:
     )
 
 
-OPENSSL_DIFFERS = {
-    "CA:TRUE",
-    "CA:TRUE without keyCertSign",
-    "RSA key of 1024 bits",
-    "below CA:FALSE",
-    "below CA:TRUE without keyCertSign",
-    "below an expired authority",
-    "below an expired intermediate",
-    "below too many",
-    "for any purpose",
-    "keyUsage keyCertSign",
-    "keyUsage keyEncipherment",
-    "keyUsage keyEncipherment, listed",
-    "keyUsage nonRepudiation",
-    "of X.509 version 1",
-    "of an impostor",
-    "outside the names of its authority",
-    "own, CA:TRUE and keyCertSign",
-    "own, CA:TRUE, not listed",
-    "signed by RSA-PSS with the longest salt",
-    "signed by a listed device",
-    "signed by a listed device, CA:TRUE without keyCertSign",
-    "signed with SHA-1",
-}
-"""Judged by other rules, or with other words, as long as OpenSSL serves HTTPS: then this goes."""
-
-
 @pytest.mark.parametrize(
     ("case", "version"), [each for version in ("1.2", "1.3") for each in listener_cases(version)]
 )
 def test_a_client_is_judged_alike_by_https(
     case: Case, version: str, mint: Mint, shown: dict[str, Shown], own: Shown, run: Run
 ) -> None:
-    if not HTTPS_BY_CORE and case.name in OPENSSL_DIFFERS:
-        pytest.skip("OpenSSL serves HTTPS, and differs")
     show = made(case, mint, shown)
     appliance = run(rest(own, show.trusted))
     trust = peer_context(own.trusted, Issued(show.chain, show.key), version, weak=True)

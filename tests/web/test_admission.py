@@ -7,18 +7,21 @@ import socket
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from ipaddress import ip_address, ip_network
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
-
 from holdfast.web.admission import TIMEOUT, Admission, ConnectionLimits, Full, Waiting
-from holdfast.web.host import Host, respond
+
+from holdfast.web.host import Host
 from holdfast.web.port import listen
+from holdfast.web.requests import Request, Response
 from support import web, wire
 
 if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
     from holdfast.types import WhenFull
-    from holdfast.web.host import Receive, Scope, Send
+
 
 ONE, TWO = ip_address("10.0.0.1"), ip_address("10.0.0.2")
 NOW = 100.0
@@ -108,19 +111,19 @@ def test_a_source_at_its_limit_evicts_only_its_own() -> None:
 
 
 def test_event_streams_are_never_evicted() -> None:
-    async def app(scope: Scope, _receive: Receive, send: Send) -> None:
-        if scope["path"] != "/stream":
-            await respond(send, 200, [(b"content-length", b"0")])
-            return
-        await send({"type": "http.response.start", "status": 200, "headers": []})
+    async def streamed(request: Request) -> None:
+        await request.begin(200, [])
         while True:
-            await send({"type": "http.response.body", "body": b"x", "more_body": True})
+            await request.send(b"x")
             await asyncio.sleep(0.01)
+
+    def answer(request: Request) -> Response | Coroutine[Any, Any, None]:
+        return streamed(request) if request.path == "/stream" else Response(200)
 
     listener = listen("127.0.0.1", 0)
     limits = ConnectionLimits(2, when_full="evict")
     sources = [ip_network("127.0.0.0/8")]
-    host = Host("x", app, listener, sources=sources, limits=limits, request_timeout=9)
+    host = Host("x", answer, listener, sources=sources, limits=limits, request_timeout=9)
     address: tuple[str, int] = listener.getsockname()
     with closing(listener), web.in_a_thread(host), ExitStack() as opened:
         streams = [opened.enter_context(wire.Connection(address)) for _ in range(2)]

@@ -15,8 +15,8 @@ import pytest
 
 import holdfast
 from holdfast.adapters.rest.app import App
-from holdfast.web.admission import ConnectionLimits
-from holdfast.web.host import Host
+from holdfast.adapters.rest.operations import OPERATIONS
+from holdfast.web.host import ConnectionLimits, Host
 from support import web, wire
 
 if TYPE_CHECKING:
@@ -68,10 +68,15 @@ class Rest:
 
     def __init__(self, service: web.Service, memory: holdfast.Memory) -> None:
         self.memory = memory
-        more = (service.diagnostics, web.NoSessions(), service.listener, "http")
         self.host = Host(
             "rest",
-            App(service.settings, service.memory_access, *more),
+            App(
+                OPERATIONS,
+                service.settings,
+                service.memory_access,
+                service.diagnostics,
+                web.NoSessions(),
+            ),
             service.listener,
             sources=service.settings.sources,
             limits=ConnectionLimits(9),

@@ -18,7 +18,7 @@ from holdfast.web.https import Https, HttpsFiles
 from support import web, wire
 from support.certificates import PAST, Certificates, Issued, named
 from support.secured import Authority
-from support.tls_peer import HTTPS_BY_CORE, VERSIONS, Peer, Refused, context
+from support.tls_peer import VERSIONS, Peer, Refused, context
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,10 +29,6 @@ SOON = 0.25
 """The request timeout of tests that wait for it."""
 SERVER = "DNS:localhost,IP:127.0.0.1"
 CLIENT = "DNS:panel"
-
-judged_by_core = pytest.mark.skipif(
-    not HTTPS_BY_CORE, reason="OpenSSL serves HTTPS, which lacks this"
-)
 
 
 class Files(NamedTuple):
@@ -363,7 +359,6 @@ def test_a_session_is_resumed_with_the_certificate_of_the_client(
         assert web.answers(peer.rest())[0].status == 200
 
 
-@judged_by_core
 def test_expired_revocation_lists_may_be_accepted(
     start: Start, files: Files, log: web.Records
 ) -> None:
@@ -376,7 +371,6 @@ def test_expired_revocation_lists_may_be_accepted(
     assert refusal(service, files.trust(files.client), log) == "expired_revocation_list"
 
 
-@judged_by_core
 def test_only_clients_with_an_allowed_role_are_served(
     start: Start, files: Files, log: web.Records
 ) -> None:

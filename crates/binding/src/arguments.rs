@@ -39,6 +39,14 @@ pub fn seconds(what: &str, seconds: f64) -> PyResult<Duration> {
         .ok_or_else(|| unknown(what, &seconds.to_string(), "0 to 31622400 seconds"))
 }
 
+pub fn time_to_wait(what: &str, time: f64) -> PyResult<Duration> {
+    let time = seconds(what, time)?;
+    if time.is_zero() {
+        return Err(PyValueError::new_err(format!("{what} is 0, it must be more than 0")));
+    }
+    Ok(time)
+}
+
 pub fn address(text: &str) -> PyResult<SocketAddr> {
     let form = "address:port as in 127.0.0.1:502 or [::1]:502";
     text.parse().map_err(|_| unknown("bind", text, form))

@@ -13,6 +13,7 @@ mod engine;
 mod fence;
 mod following;
 mod heartbeat;
+mod http;
 mod limits;
 mod link;
 mod listed;
@@ -47,6 +48,8 @@ mod _core {
     use super::fence::Fence;
     #[pymodule_export]
     use super::following::Follower;
+    #[pymodule_export]
+    use super::http::{HttpExchange, HttpServer, ListeningSocket};
     #[pymodule_export]
     use super::link::{Caller, Link, Passage, Route};
     #[pymodule_export]

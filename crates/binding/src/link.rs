@@ -3,9 +3,10 @@
 use std::net::IpAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use holdfast_engine::Wakes;
 use holdfast_engine::client::{ClientError, StrayCounters};
 use holdfast_engine::link::{
-    Caller as CoreCaller, InFlight, LinkSettings, Retry, Route as CoreRoute, SharedLink, Wakes,
+    Caller as CoreCaller, InFlight, LinkSettings, Retry, Route as CoreRoute, SharedLink,
 };
 use holdfast_engine::poller::{Passage as CorePassage, PassedRange};
 use holdfast_memory::Area;
@@ -182,12 +183,12 @@ impl Caller {
 }
 
 #[cfg(unix)]
-fn handle(wakes: Wakes) -> i64 {
+pub(crate) fn handle(wakes: Wakes) -> i64 {
     i64::from(std::os::fd::IntoRawFd::into_raw_fd(wakes))
 }
 
 #[cfg(windows)]
-fn handle(wakes: Wakes) -> i64 {
+pub(crate) fn handle(wakes: Wakes) -> i64 {
     std::os::windows::io::IntoRawSocket::into_raw_socket(wakes) as i64
 }
 

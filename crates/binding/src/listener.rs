@@ -20,7 +20,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyMapping;
 
-use crate::arguments::{address, byte, network, seconds, within, word};
+use crate::arguments::{address, byte, network, seconds, time_to_wait, within, word};
 use crate::client::line;
 use crate::link::{Passage, Route};
 use crate::memory::{Memory, named};
@@ -306,7 +306,7 @@ fn targets(mapping: &Bound<'_, PyMapping>) -> PyResult<Vec<(i128, Arc<CoreMemory
     Ok(targets)
 }
 
-fn limits(
+pub(crate) fn limits(
     max_connections: i128,
     max_connections_per_source: Option<i128>,
     when_full: &str,
@@ -320,6 +320,7 @@ fn limits(
         max_connections_per_source: of_source,
         when_full: word("when_full", when_full, &allowed)?,
         max_handshakes: None,
+        grace: Duration::ZERO,
     })
 }
 
@@ -331,12 +332,4 @@ fn secure_limits(
 ) -> PyResult<ConnectionLimits> {
     let most = within("max_handshakes", max_handshakes, 1..=65_535)?;
     Ok(ConnectionLimits { max_handshakes: has_tls.then_some(most), ..limits })
-}
-
-fn time_to_wait(what: &str, time: f64) -> PyResult<Duration> {
-    let time = seconds(what, time)?;
-    if time.is_zero() {
-        return Err(PyValueError::new_err(format!("{what} is 0, it must be more than 0")));
-    }
-    Ok(time)
 }

@@ -85,6 +85,17 @@ pub fn https_server_tls(
 }
 
 impl ServerTls {
+    /// The settings for a server of HTTP.
+    pub(crate) fn of_https(&self) -> PyResult<Arc<CoreServerTls>> {
+        match self.core.protocol() {
+            Protocol::Http => Ok(Arc::clone(&self.core)),
+            Protocol::Modbus => {
+                let message = "tls is that of a listener, allowed: https_server_tls(cert_file=…)";
+                Err(PyValueError::new_err(message))
+            }
+        }
+    }
+
     /// The settings for a listener of Modbus or Raw Ingest.
     pub(crate) fn of_listener(&self) -> PyResult<Arc<CoreServerTls>> {
         match self.core.protocol() {

@@ -18,6 +18,7 @@
 pub mod client;
 mod counter;
 mod heartbeat;
+pub mod http;
 pub mod items;
 pub mod link;
 mod lookup;
@@ -27,6 +28,8 @@ pub mod poller;
 mod serial_line;
 pub mod server;
 pub mod tls;
+mod wake;
 
 pub use heartbeat::Heartbeat;
 pub use serial_line::{LineDirection, LineMode, LineParity, SerialLine};
+pub use wake::Wakes;

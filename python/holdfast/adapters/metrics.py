@@ -4,43 +4,49 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gzip
 import threading
 import time
 from typing import TYPE_CHECKING, Any, TypeVar, cast
+from urllib.parse import parse_qs
 
-from prometheus_client import CollectorRegistry, GCCollector, ProcessCollector, make_asgi_app
+from prometheus_client import CollectorRegistry, GCCollector, ProcessCollector
 from prometheus_client.core import (
     CounterMetricFamily,
     GaugeMetricFamily,
     InfoMetricFamily,
 )
+from prometheus_client.exposition import choose_encoder, gzip_accepted
 from prometheus_client.registry import Collector
 
 from holdfast import __version__
 from holdfast.tags.text import plain
 from holdfast.web import health as probes
-from holdfast.web.admission import ConnectionLimits
-from holdfast.web.host import SAFE, Host, headers_of, rejection, respond
+from holdfast.web.application import Application
+from holdfast.web.host import ConnectionLimits, Host
+from holdfast.web.operations import Operation
+from holdfast.web.origin import Origins
+from holdfast.web.requests import BadRequest, Response, rejection, response
 
 if TYPE_CHECKING:
-    import socket
-    from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from prometheus_client.metrics_core import Metric
 
+    from holdfast._core import ListeningSocket
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.config import MetricsConfig
     from holdfast.stop import Stop
     from holdfast.web.health import HealthSource
-    from holdfast.web.host import Receive, Scope, Send
     from holdfast.web.https import Https
+    from holdfast.web.requests import Request
 
 Result = TypeVar("Result")
 
 LIMITS = ConnectionLimits(32, when_full="evict")
 REQUEST_TIMEOUT = 10.0
 PATH = "/metrics"
-ALLOWED = (b"allow", b"GET, HEAD, OPTIONS")
+STATUSES = {"malformed": 400, "foreign_page": 403, "not_found": 404, "method_not_allowed": 405}
 STATES = ("running", "failed", "stopped")
 HEALTH = ("unknown", "ok", "error", "stale", "disabled", "standby")
 OUTCOMES = ("valid", "exceptions", "timeouts", "transport_errors")
@@ -94,11 +100,10 @@ class Metrics:
         settings: MetricsConfig,
         diagnostics: DiagnosticsSource,
         health: HealthSource,
-        listener: socket.socket,
+        listener: ListeningSocket,
         *,
         https: Https | None = None,
     ) -> None:
-        self._health = health
         registry = CollectorRegistry()
         registry.register(Figures(diagnostics))
         registry.register(Readiness(health))
@@ -106,11 +111,12 @@ class Metrics:
             registry.register(TagFigures(diagnostics))
         ProcessCollector(registry=registry)
         GCCollector(registry=registry)
-        self._exporter = make_asgi_app(registry)
-        self._exporting = asyncio.Lock()
+        allowed = ": an IP address, localhost, or a name in metrics.hosts"
+        names = frozenset(settings.hosts)
+        origins = Origins(names=names, allowed=allowed, is_https=https is not None)
         self._host = Host(
             "metrics",
-            self._serve,
+            App(registry, health, origins),
             listener,
             sources=settings.sources,
             limits=LIMITS,
@@ -131,45 +137,58 @@ class Metrics:
             "tls_failures": self._host.tls_failures(),
         }
 
-    async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:  # noqa: ARG002
-        path = scope["path"]
-        if path != PATH and path not in probes.PATHS:
-            detail = f"the metrics are at {PATH}, the health at {' and '.join(probes.PATHS)}"
-            await respond(send, 404, *rejection("not_found", detail))
-        elif scope["method"] == "OPTIONS":
-            await respond(send, 204, [ALLOWED, *SAFE])
-        elif scope["method"] not in ("GET", "HEAD"):
-            headers, body = rejection("method_not_allowed", "allowed: GET, HEAD, OPTIONS")
-            await respond(send, 405, [*headers, ALLOWED], body)
-        elif path == PATH:
-            await self._export(scope, send)
-        else:
-            status, body = probes.answer(self._health, path)
-            await respond(send, status, headers_of(b"application/json", body), body)
 
-    async def _export(self, scope: Scope, send: Send) -> None:
-        """Sends the exporter's response with a length and the security headers.
+class App(Application):
+    """The application: the metrics, and the probes."""
 
-        It is made in a thread, one at a time: thousands of devices must not hold up a probe.
+    def __init__(self, registry: CollectorRegistry, health: HealthSource, origins: Origins) -> None:
+        metrics = Operation("GET", PATH, "metrics", "", App.export)
+        live, ready = (
+            Operation("GET", path, "health", "", App.probe, is_open=True) for path in probes.PATHS
+        )
+        super().__init__((metrics, live, ready), origins)
+        self._registry = registry
+        self._health = health
+        self._exporting = asyncio.Lock()
+
+    def nowhere(self, _: str) -> str:
+        """Returns the error for another path."""
+        return f"the metrics are at {PATH}, the health at {' and '.join(probes.PATHS)}"
+
+    def refused(self, _: Request, error: Exception) -> Response:
+        """Returns the refusal of a request."""
+        if not isinstance(error, BadRequest):
+            raise error
+        return rejection(STATUSES[error.reason], error.reason, error.detail)
+
+    def probe(self, request: Request, _: object) -> Response:
+        """Answers a probe, whatever its Host. Only whom the metrics are for is shown details."""
+        details = self.origins.admits(request)
+        return probes.answer(self._health, request.path, details=details)
+
+    async def export(self, request: Request, _: object) -> Response:
+        """Returns the metrics.
+
+        They are made in a thread, one scrape at a time: thousands of devices must not hold up a
+        probe.
         """
         async with self._exporting:
-            start, body = await _in_thread(lambda: asyncio.run(self._exported(scope)))
-        headers = [*start["headers"], (b"content-length", b"%d" % len(body)), *SAFE]
-        await respond(send, start["status"], headers, body)
+            return await _in_thread(lambda: self._exported(request))
 
-    async def _exported(self, scope: Scope) -> tuple[MutableMapping[str, Any], bytes]:
-        """The beginning and the body of the exporter's response."""
-        sent: list[MutableMapping[str, Any]] = []
+    def _exported(self, request: Request) -> Response:
+        """Returns the metrics in the format and coding that the client accepts."""
 
-        async def receive() -> MutableMapping[str, Any]:
-            return {"type": "http.request"}
+        def accepted(name: bytes) -> str:
+            return b",".join(request.values(name)).decode("latin-1")
 
-        async def send(message: MutableMapping[str, Any]) -> None:
-            sent.append(message)
-
-        await self._exporter(scope, receive, send)
-        start, body = sent
-        return start, body["body"]
+        encode, kind = choose_encoder(accepted(b"accept"))
+        names = parse_qs(request.query.decode("latin-1")).get("name[]")
+        registry = self._registry if names is None else self._registry.restricted_registry(names)
+        answer = response(kind.encode(), encode(cast("CollectorRegistry", registry)))
+        if gzip_accepted(accepted(b"accept-encoding")):
+            answer.body = gzip.compress(answer.body)
+            answer.headers.append((b"content-encoding", b"gzip"))
+        return answer
 
 
 async def _in_thread(work: Callable[[], Result]) -> Result:

@@ -5,33 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from cryptography import x509
-from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+from cryptography.hazmat.primitives.serialization import Encoding
 
 from holdfast.bounded_files import require_stored
 from holdfast.certificates.pem import (
     MALFORMED,
     UnusableFile,
     certificates,
-    key,
-    passphrase,
-    public_key,
     unlocked,
 )
 
 if TYPE_CHECKING:
-    from cryptography.hazmat.primitives.asymmetric.types import PublicKeyTypes
-
     from holdfast.certificates.pem import File
-
-
-def check_own(cert_file: File, key_file: File, passphrase_file: File | None = None) -> None:
-    """Checks that the files are readable and belong together. Raises `UnusableFile`."""
-    own = public_key(certificates(cert_file)[0])
-    secret = None if passphrase_file is None else passphrase(passphrase_file)
-    if own is None:
-        raise UnusableFile(cert_file, "the certificate has a key of an unknown kind")
-    if _spki(own) != _spki(key(key_file, secret).public_key()):
-        raise UnusableFile(key_file, f"it is not the key of the certificate in {cert_file}")
 
 
 def key_for_core(
@@ -68,7 +53,3 @@ def nameless(cert_file: File) -> str | None:
             return None
         found = "a subjectAltName without a DNS name or an IP address"
     return f"found {found}: clients ignore the common name, so they refuse this certificate"
-
-
-def _spki(public: PublicKeyTypes) -> bytes:
-    return public.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)

@@ -79,8 +79,6 @@ class ServiceChecks:
         self._tokens("gateway", gateway)
         self._tls(("gateway", "device_tls"), gateway.get("device_tls"))
         if gateway.get("tokens") != "none":
-            if gateway.get("hosts"):
-                self.report.doubt(("gateway", "hosts"), "has no effect with tokens")
             return
         for index, source in enumerate(entries(gateway.get("sources"))):
             network = parsed(parse_source, source)
@@ -91,6 +89,8 @@ class ServiceChecks:
     def _tokens(self, section: str, settings: dict[Any, Any]) -> None:
         """Tokens have unique names and hashes; `none` requires a loopback address."""
         bind, tokens = parsed(parse_bind, settings.get("bind")), settings.get("tokens")
+        if tokens != "none" and settings.get("hosts"):
+            self.report.doubt((section, "hosts"), "has no effect with tokens")
         if tokens == "none" and bind is not None and not bind.address.is_loopback:
             message = f"found 'none' with bind {bind}, allowed: none only on a loopback address"
             self.report.add((section, "tokens"), message)

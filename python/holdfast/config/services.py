@@ -122,6 +122,8 @@ class RestConfig(Model):
     """Seconds from the first byte of a request to its last."""
     tls: Annotated[HttpsConfig | None, NotNull()] = None
     """Certificates for HTTPS. Default: HTTP."""
+    hosts: Annotated[tuple[HostName, ...], Strict(False)] = ()
+    """With tokens none: the names under which REST may be reached."""
 
 
 class ClientTlsConfig(Model):
@@ -366,6 +368,8 @@ class MetricsConfig(Model):
     """Networks and addresses of the clients, IPv4 or IPv6."""
     tls: Annotated[HttpsConfig | None, NotNull()] = None
     """Certificates for HTTPS. Default: HTTP."""
+    hosts: Annotated[tuple[HostName, ...], Strict(False)] = ()
+    """The names under which the metrics may be reached."""
 
 
 class SyslogConfig(Model):

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from holdfast import __version__
 from holdfast.gateway.app import App, rejection
+from holdfast.gateway.operations import document, operations
 from holdfast.gateway.pool import dial
 from holdfast.gateway.settings import GatewayLimits, Settings
 from holdfast.net.allow_list import AllowedNetwork
-from holdfast.web.admission import ConnectionLimits
-from holdfast.web.host import Host, address_of
+from holdfast.web.host import ConnectionLimits, Host, address_of
 
 if TYPE_CHECKING:
-    import socket
-
-    from holdfast._core import Poller
+    from holdfast._core import ListeningSocket, Poller
     from holdfast.gateway.pool import Dial
     from holdfast.net.resolver import Resolve
     from holdfast.stop import Stop
@@ -34,7 +33,7 @@ class Gateway:
     def __init__(
         self,
         settings: Settings,
-        listener: socket.socket,
+        listener: ListeningSocket,
         *,
         resolve: Resolve | None = None,
         dial: Dial = dial,
@@ -49,8 +48,15 @@ class Gateway:
         self.url = f"{scheme}://{self.address}"
         """The URL of its root."""
         self._app = App(
-            settings, self.url, resolve=resolve, dial=dial, poller=poller, health=health
+            operations(settings),
+            settings,
+            resolve=resolve,
+            dial=dial,
+            poller=poller,
+            health=health,
+            is_https=https is not None,
         )
+        self._app.describe(document(__version__, settings), self.url)
         self._host = Host(
             "gateway",
             self._app,

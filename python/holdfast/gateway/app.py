@@ -1,4 +1,4 @@
-"""The ASGI application of the gateway: routing, authorization, limits and responses.
+"""The application of the gateway: limits, and what each operation does.
 
 Only `device` communicates with devices. A request is cancelled when its client disconnects.
 """
@@ -9,87 +9,80 @@ import asyncio
 import contextlib
 import logging
 from collections import Counter
-from typing import TYPE_CHECKING, Any, TypeAlias
-
-import msgspec
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from holdfast import __version__, logs
 from holdfast.errors import ModbusException
-from holdfast.gateway import (
-    assets,
-    identifying,
-    listing,
-    openapi,
-    port_of_call,
-    reading,
-    surveying,
-    viewing,
-    watching,
-    writing,
-)
+from holdfast.gateway import assets, listing, port_of_call, surveying, viewing, watching
 from holdfast.gateway.broadcasting import NOTE
 from holdfast.gateway.device import Failed, RequestedDevice
 from holdfast.gateway.egress import Egress
-from holdfast.gateway.fields import from_json, from_query, malformed, timeout
 from holdfast.gateway.pool import Pool, dial
 from holdfast.gateway.refusals import FAILURE, REFUSALS
 from holdfast.gateway.sharing import Shared
 from holdfast.net.allow_list import AllowList
 from holdfast.net.resolver import Resolver
 from holdfast.web import health as probes
-from holdfast.web import openapi_page as page
+from holdfast.web.application import Application, json_response
 from holdfast.web.events import Stream
-from holdfast.web.host import SAFE, BrokenBody, headers_of, respond
-from holdfast.web.openapi import DOCUMENT, PAGE
-from holdfast.web.refusals import UNREAD, headers_with
-from holdfast.web.requests import BadRequest, ClientDisconnected, Request, respond_to_its_end, shown
+from holdfast.web.origin import Origins, is_direct
+from holdfast.web.requests import (
+    BadRequest,
+    BrokenBody,
+    ClientDisconnected,
+    Request,
+    Response,
+    response,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
+    from collections.abc import Coroutine, Iterable, Iterator
 
     from holdfast._core import Poller
-    from holdfast.gateway.endpoint import Operation
-    from holdfast.gateway.fields import Field
+    from holdfast.gateway.endpoint import Endpoint, Given
     from holdfast.gateway.listing import Local
     from holdfast.gateway.pool import Dial
     from holdfast.gateway.settings import Settings
     from holdfast.net.resolver import Resolve
     from holdfast.web.health import HealthSource
-    from holdfast.web.host import Headers, Receive, Scope, Send
+    from holdfast.web.operations import Operation
 
-    Handler: TypeAlias = Callable[[Request, Send], Awaitable[None]]
+Result = TypeVar("Result")
 
-ENDPOINTS: tuple[Operation, ...] = (*reading.ENDPOINTS, *writing.ENDPOINTS, *identifying.ENDPOINTS)
-
-JSON = b"application/json"
 REASON = b"holdfast-reason"
 FORM = b"application/x-www-form-urlencoded"
 """The default Content-Type of `curl -d`. The gateway treats it as JSON."""
-
-MAX_IGNORED = 4
-"""The most ignored keys of a request in the log."""
 
 STOPPING = "the gateway is stopping; a pending write may have been carried out"
 HOSTS = "--hosts, or hosts in the configuration"
 WRITES_ON = "enable them with --writes, or with access: read-write in the configuration"
 
 
-class App:
-    """The ASGI application."""
+class App(Application):
+    """The application."""
 
     def __init__(
         self,
+        operations: Iterable[Operation[App]],
         settings: Settings,
-        url: str,
         *,
         resolve: Resolve | None = None,
         dial: Dial = dial,
         poller: Poller | None = None,
         health: HealthSource | None = None,
+        is_https: bool = False,
     ) -> None:
+        limits = self._limits = settings.limits
+        allowed = f" without tokens: an IP address, localhost, or a name in {HOSTS}"
+        names = None if settings.tokens else settings.hosts
+        super().__init__(
+            [each for each in operations if health is not None or each.path not in probes.PATHS],
+            Origins(names=names, allowed=allowed, is_https=is_https),
+            tokens=settings.tokens,
+            max_body=limits.body,
+        )
         self._health = health
         self._settings = settings
-        limits = self._limits = settings.limits
         # A lookup never needs more time than the longest request.
         self._egress = Egress(AllowList(settings.allow), resolve or Resolver(limits.timeout))
         self._pool = Pool(
@@ -109,28 +102,8 @@ class App:
         self._requests = self._failed = self._writes = 0
         self._refused: dict[str, int] = {}
         self._ending = asyncio.Event()
-        self._loop: asyncio.AbstractEventLoop | None = None
         self._lenient = port_of_call.PATHS if settings.compat == "port-of-call" else frozenset()
         """The paths of endpoints that take requests as Port of Call does."""
-        document = openapi.document(__version__, ENDPOINTS, settings)
-        if self._lenient:
-            port_of_call.describe(document)
-        self._document = msgspec.json.encode(document)
-        self._page = page.render(document, url)
-        self.routes: dict[str, tuple[str, Handler]] = {
-            **{each.path: ("POST", self._handler(each)) for each in ENDPOINTS},
-            surveying.PATH: ("POST", self._map),
-            watching.PATH: ("GET", self._watch),
-            viewing.PATH: ("POST", self._view),
-            **{each.path: ("POST", self._local(each)) for each in listing.ENDPOINTS},
-            listing.PROFILES: ("GET", self._profiles),
-            openapi.STATUS: ("GET", self._status),
-            DOCUMENT: ("GET", self._openapi),
-            PAGE: ("GET", self._docs),
-            **dict.fromkeys(assets.FILES, ("GET", self._asset)),
-        }
-        if health is not None:
-            self.routes |= dict.fromkeys(probes.PATHS, ("GET", self._probe))
 
     def counts(self) -> dict[str, object]:
         """Returns the counts of requests. Thread-safe.
@@ -148,62 +121,39 @@ class App:
 
     def end(self) -> None:
         """Ends all streams. Thread-safe."""
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # The loop is already closed.
-                self._loop.call_soon_threadsafe(self._ending.set)
+        self.call_soon(self._ending.set)
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answers one request."""
-        self._loop = asyncio.get_running_loop()
-        request = Request(scope, receive)
+    def __call__(self, request: Request) -> Response | Coroutine[Any, Any, Response | None]:
+        """Counts and answers one request."""
         self._requests += 1
-        try:
-            await self._answer(request, send)
-        except BadRequest as unfit:
-            await self._refuse(request, send, unfit)
-        except Failed as failed:
+        return super().__call__(request)
+
+    def check_type(self, request: Request) -> None:
+        """Raises `BadRequest` for a body that is not JSON by its type."""
+        if request.path in self._lenient:
+            port_of_call.check_type(request)
+        else:
+            request.check_json(b"", FORM, parameters=True)
+
+    def not_allowed(self, operation: Operation[Any]) -> str:
+        """Returns the error for another method."""
+        if operation.path in self._lenient:
+            return port_of_call.METHOD_NOT_ALLOWED
+        return f"{port_of_call.METHOD_NOT_ALLOWED}; allowed: {operation.methods}"
+
+    def refused(self, request: Request, error: Exception) -> Response:
+        """Returns the response to a request that was refused or has failed."""
+        if isinstance(error, BrokenBody | ClientDisconnected):
+            raise error
+        if isinstance(error, BadRequest):
+            return self._refused_by(request, error)
+        if isinstance(error, Failed):
             self._failed += 1
-            body = _error(failed.detail)
-            status = FAILURE.status
-            await self._reply(request, send, body, status=status, reason=failed.reason)
-        except ClientDisconnected:
-            pass
-        except BrokenBody:
-            raise
-        except Exception:
-            logs.problem("request_failed", listener="gateway", peer=request.peer)
-            with contextlib.suppress(RuntimeError):  # The response has begun and is cut off.
-                body = _error("internal error, see the log")
-                status = FAILURE.status
-                await self._reply(request, send, body, status=status, reason="internal_error")
+            return rejection(FAILURE.status, error.reason, error.detail)
+        logs.problem("request_failed", listener="gateway", peer=request.peer)
+        return rejection(FAILURE.status, "internal_error", "internal error, see the log")
 
-    async def _answer(self, request: Request, send: Send) -> None:
-        hosts = len(request.headers(b"host"))
-        if hosts > 1 or (hosts == 0 and request.scope["http_version"] == "1.1"):
-            raise malformed(f"{hosts} Host headers, HTTP/1.1 requires exactly one")
-        route = self.routes.get(request.path)
-        if route is None:
-            raise BadRequest("not_found", f"no resource at {shown(request.path)}")
-        allowed, handler = route
-        head = request.method == "HEAD" and allowed == "GET" and request.path != watching.PATH
-        if request.method == allowed or head:
-            await handler(request, send)
-            return
-        methods = f"{allowed}, OPTIONS"
-        if allowed == "GET" and request.path != watching.PATH:
-            methods = "GET, HEAD, OPTIONS"
-        request.more_headers.append((b"allow", methods.encode()))
-        if request.method != "OPTIONS":
-            detail = port_of_call.METHOD_NOT_ALLOWED
-            if request.path not in self._lenient:
-                detail += f"; allowed: {methods}"
-            raise BadRequest("method_not_allowed", detail)
-        await respond(send, 204, [*SAFE, *request.more_headers])
-
-    async def _refuse(self, request: Request, send: Send, unfit: BadRequest) -> None:
-        body, status = _error(unfit.detail), REFUSALS.status(unfit.reason)
-        if isinstance(unfit, port_of_call.Rejected):
-            body, status = unfit.body, unfit.status
+    def _refused_by(self, request: Request, unfit: BadRequest) -> Response:
         self._refused[unfit.reason] = self._refused.get(unfit.reason, 0) + 1
         logs.refused(
             "gateway_refused",
@@ -215,47 +165,12 @@ class App:
             # The detail may contain values to be written, which are never logged.
             detail="-" if unfit.reason == "malformed" else unfit.detail,
         )
-        request.more_headers += headers_with(status)
-        if status in UNREAD:
-            await respond_to_its_end(request, send, status, *rejection(unfit.reason, unfit.detail))
-            return
-        await self._reply(request, send, body, status=status, reason=unfit.reason)
+        answer = rejection(REFUSALS.status(unfit.reason), unfit.reason, unfit.detail)
+        if isinstance(unfit, port_of_call.Rejected):
+            answer.body, answer.status = unfit.body, unfit.status
+        return answer
 
-    async def _reply(
-        self,
-        request: Request,
-        send: Send,
-        body: bytes,
-        *,
-        kind: bytes = JSON,
-        status: int = 200,
-        reason: str | None = None,
-    ) -> None:
-        headers: Headers = headers_of(kind, body) + request.more_headers
-        if reason is not None:
-            headers.append((REASON, reason.encode()))
-        if request.header(b"expect") is not None:
-            headers.append((b"connection", b"close"))
-        await respond(send, status, headers, body)
-
-    # Authorization and limits.
-
-    def _admit(self, request: Request) -> None:
-        """Raises `BadRequest` for a request of another site's page or without a valid token."""
-        if request.is_foreign:
-            raise BadRequest("foreign_page", "the request is from a page of another site")
-        if self._settings.tokens:
-            request.who = request.owner(self._settings.tokens)
-        elif not request.is_direct(self._settings.hosts):
-            detail = "Host is a name, allowed without tokens: an IP address, localhost"
-            raise BadRequest("foreign_page", f"{detail}, or a name in {HOSTS}")
-        elif request.path == watching.PATH and not request.is_direct():
-            # The only GET that asks a device. Over HTTP and to a name, browsers send neither Origin
-            # nor Sec-Fetch-Site with the GET of a page.
-            detail = (
-                f"Host is a name, allowed without tokens for GET {watching.PATH}: an IP address"
-            )
-            raise BadRequest("foreign_page", f"{detail}, localhost; or use POST {viewing.PATH}")
+    # Limits.
 
     @contextlib.contextmanager
     def _place(self, kind: str, most: int) -> Iterator[None]:
@@ -291,8 +206,8 @@ class App:
         await asyncio.sleep(grace)
 
     async def _while_there(
-        self, request: Request, work: Coroutine[Any, Any, None], *, grace: float
-    ) -> None:
+        self, request: Request, work: Coroutine[Any, Any, Result], *, grace: float
+    ) -> Result:
         """Runs work. Cancels it when the client disconnects, or `grace` seconds after a stop.
 
         Raises `ClientDisconnected` in both cases.
@@ -306,7 +221,7 @@ class App:
             await asyncio.wait([task, *others], return_when=asyncio.FIRST_COMPLETED)
             if not task.done():
                 raise ClientDisconnected
-            task.result()
+            return task.result()
         finally:
             for each in (task, *others):
                 each.cancel()
@@ -314,69 +229,36 @@ class App:
 
     # Requests to devices.
 
-    def _handler(self, endpoint: Operation) -> Handler:
-        longest = round(1000 * self._limits.timeout)
-        fields = (*endpoint.fields, timeout(min(endpoint.timeout, longest), longest))
+    async def carry_out(self, request: Request, endpoint: Endpoint, given: Given) -> Response:
+        """Carries out one operation on a device."""
+        with self._place("requests", self._limits.requests):
+            changes = endpoint.writes(given)
+            if changes and not self._settings.writes:
+                raise BadRequest("writes_off", f"writes are disabled: {WRITES_ON}")
+            device = RequestedDevice(self._egress, self._pool, given, broadcast=endpoint.broadcast)
+            with self._share(device):
+                work = self._asked(request, endpoint, given, device, changes)
+                return await self._while_there_or_told(request, work)
 
-        async def handle(request: Request, send: Send) -> None:
-            self._admit(request)
-            self._check_type(request)
-            with self._place("requests", self._limits.requests):
-                given = self._parsed(request, await request.body(self._limits.body), fields)
-                changes = endpoint.writes(given)
-                if changes and not self._settings.writes:
-                    raise BadRequest("writes_off", f"writes are disabled: {WRITES_ON}")
-                device = RequestedDevice(
-                    self._egress, self._pool, given, broadcast=endpoint.broadcast
-                )
-                with self._share(device):
-                    work = self._carry_out(request, send, endpoint, given, device, changes)
-                    await self._while_there_or_told(request, work)
-
-        return handle
-
-    def _check_type(self, request: Request) -> None:
-        """Raises `BadRequest` for a body that is not JSON by its type."""
-        if request.path in self._lenient:
-            port_of_call.check_type(request)
-        else:
-            request.check_json(b"", FORM, parameters=True)
-
-    def _parsed(self, request: Request, body: bytes, fields: Sequence[Field]) -> dict[str, Any]:
-        """Returns the fields of a request with defaults. Raises `BadRequest`."""
-        if request.path not in self._lenient:
-            return from_json(body, fields)
-        given, ignored = port_of_call.parsed(request.path, body, fields)
-        if ignored:
-            logs.refused(
-                "keys_ignored",
-                kind="gateway",
-                listener="gateway",
-                peer=request.peer,
-                who=request.who,
-                path=request.path,
-                found=", ".join(map(shown, ignored[:MAX_IGNORED])),
-            )
-        return given
-
-    async def _while_there_or_told(self, request: Request, work: Coroutine[Any, Any, None]) -> None:
+    async def _while_there_or_told(
+        self, request: Request, work: Coroutine[Any, Any, Result]
+    ) -> Result:
         """As `_while_there`, but a request that a stop cancels is answered with `stopping`."""
         try:
-            await self._while_there(request, work, grace=self._limits.ending)
+            return await self._while_there(request, work, grace=self._limits.ending)
         except ClientDisconnected:
             if self._ending.is_set():
                 raise BadRequest("stopping", STOPPING) from None
             raise
 
-    async def _carry_out(
+    async def _asked(
         self,
         request: Request,
-        send: Send,
-        endpoint: Operation,
-        given: dict[str, Any],
+        endpoint: Endpoint,
+        given: Given,
         device: RequestedDevice,
         changes: bool,
-    ) -> None:
+    ) -> Response:
         outcome = "failed"
         try:
             answer = await endpoint.carry_out(given, device)
@@ -394,12 +276,12 @@ class App:
                 sent = device.asked and outcome != "refused"
                 told = outcome if sent or outcome == "refused" else "not sent"
                 self._note_write(request, given, device, told, sent=sent)
-        await self._reply(request, send, msgspec.json.encode(answer))
+        return json_response(answer)
 
     def _note_write(
         self,
         request: Request,
-        given: dict[str, Any],
+        given: Given,
         device: RequestedDevice,
         outcome: str,
         *,
@@ -419,41 +301,43 @@ class App:
             outcome=outcome,
         )
 
-    async def _map(self, request: Request, send: Send) -> None:
-        self._admit(request)
-        self._check_type(request)
+    # Streams.
+
+    async def map(self, request: Request, given: Given) -> None:
+        """Maps a device."""
         with self._stream(request):
-            body = await request.body(self._limits.body)
-            given = from_json(body, surveying.fields(self._limits))
             self._require_stream(request, given["maxStreams"])
             device = RequestedDevice(self._egress, self._pool, given)
             survey = surveying.planned(given)
-            stream = Stream(send, self._limits.heartbeat)
+            stream = Stream(request, self._limits.heartbeat)
             work = surveying.survey(
                 survey, device, stream, step=given["step"], longest=self._limits.discovery
             )
             await self._while_streaming(request, stream, work)
 
-    async def _watch(self, request: Request, send: Send) -> None:
-        self._admit(request)
+    async def watch(self, request: Request, given: Given) -> None:
+        """Watches a range of a device."""
+        if not self._settings.tokens and not is_direct(request):
+            # The only GET that asks a device. Over HTTP and to a name, browsers send neither Origin
+            # nor Sec-Fetch-Site with the GET of a page.
+            detail = (
+                f"Host is a name, allowed without tokens for GET {watching.PATH}: an IP address"
+            )
+            raise BadRequest("foreign_page", f"{detail}, localhost; or use POST {viewing.PATH}")
         with self._stream(request):
-            given = from_query(request.scope["query_string"], watching.fields(self._limits))
             device = RequestedDevice(self._egress, self._pool, given)
-            stream = Stream(send, self._limits.heartbeat)
+            stream = Stream(request, self._limits.heartbeat)
             await self._while_streaming(request, stream, watching.watch(given, device, stream))
 
-    async def _view(self, request: Request, send: Send) -> None:
-        self._admit(request)
-        self._check_type(request)
+    async def view(self, request: Request, given: Given) -> None:
+        """Follows several ranges and tag lists of a device."""
         with self._place("requests", self._limits.requests):
-            body = await request.body(self._limits.body)
-            given = from_json(body, viewing.fields(self._limits))
             parts = await viewing.parts_of(given, self._settings.profiles)
         device = RequestedDevice(self._egress, self._pool, given)
         streaming = not given["once"] and self._has_stream(request, given["maxStreams"])
         once = self._place("requests", self._limits.requests)
         with self._stream(request) if streaming else once:
-            stream = Stream(send, self._limits.heartbeat)
+            stream = Stream(request, self._limits.heartbeat)
             work = viewing.follow(given, viewing.View(parts, device), stream, streaming=streaming)
             await self._while_streaming(request, stream, work)
 
@@ -482,24 +366,6 @@ class App:
         if most is not None and self._streams[host_of(request.peer)] > most:
             raise BadRequest("busy", f"streams of this address: {most}, which is maxStreams")
 
-    def _local(self, endpoint: Local) -> Handler:
-        """Returns the handler of an endpoint that asks no device."""
-
-        async def handle(request: Request, send: Send) -> None:
-            self._admit(request)
-            self._check_type(request)
-            with self._place("requests", self._limits.requests):
-                given = from_json(await request.body(self._limits.body), endpoint.fields)
-                answer = await endpoint.answer(given, self._settings.profiles)
-            await self._reply(request, send, msgspec.json.encode(answer))
-
-        return handle
-
-    async def _profiles(self, request: Request, send: Send) -> None:
-        self._admit(request)
-        answer = listing.profiles(self._settings.profiles)
-        await self._reply(request, send, msgspec.json.encode(answer))
-
     async def _while_streaming(
         self, request: Request, stream: Stream, work: Coroutine[Any, Any, None]
     ) -> None:
@@ -511,41 +377,43 @@ class App:
             if self._ending.is_set():
                 await stream.end()
 
-    # Status, documents and console.
+    # Answers without a device.
 
-    async def _status(self, request: Request, send: Send) -> None:
-        self._admit(request)
+    async def local(self, endpoint: Local, given: Given) -> Response:
+        """Answers a request for which no device is asked."""
+        with self._place("requests", self._limits.requests):
+            return json_response(await endpoint.answer(given, self._settings.profiles))
+
+    def profiles(self, _: Request, __: Given) -> Response:
+        """Lists the profiles."""
+        return json_response(listing.profiles(self._settings.profiles))
+
+    def status(self, _: Request, __: Given) -> Response:
+        """Returns the settings of the gateway."""
         limits = self._limits
-        status = {
-            "version": __version__,
-            "writes": self._settings.writes,
-            "tokens": bool(self._settings.tokens),
-            "allow": [str(entry) for entry in self._settings.allow],
-            "limits": {
-                "timeout": round(1000 * limits.timeout),
-                "interval": round(1000 * limits.interval),
-            },
-            "connections": len(self._pool),
-        }
-        await self._reply(request, send, msgspec.json.encode(status))
+        return json_response(
+            {
+                "version": __version__,
+                "writes": self._settings.writes,
+                "tokens": bool(self._settings.tokens),
+                "allow": [str(entry) for entry in self._settings.allow],
+                "limits": {
+                    "timeout": round(1000 * limits.timeout),
+                    "interval": round(1000 * limits.interval),
+                },
+                "connections": len(self._pool),
+            }
+        )
 
-    async def _probe(self, request: Request, send: Send) -> None:
+    def probe(self, request: Request, _: Given) -> Response:
         """Answers a probe. It needs no token, so the answer has no names."""
         assert self._health is not None, "there is a route"
-        status, body = probes.answer(self._health, request.path, details=False)
-        await self._reply(request, send, body, status=status)
+        return probes.answer(self._health, request.path, details=False)
 
-    async def _openapi(self, request: Request, send: Send) -> None:
-        await self._reply(request, send, self._document)
-
-    async def _docs(self, request: Request, send: Send) -> None:
-        request.more_headers.append((b"content-security-policy", page.POLICY))
-        await self._reply(request, send, self._page, kind=page.KIND)
-
-    async def _asset(self, request: Request, send: Send) -> None:
+    def asset(self, request: Request, _: Given) -> Response:
+        """Returns a file of the console."""
         kind, body = assets.read(request.path)
-        request.more_headers += assets.HEADERS
-        await self._reply(request, send, body, kind=kind)
+        return response(kind, body, *assets.HEADERS)
 
 
 def host_of(peer: str) -> str:
@@ -553,11 +421,7 @@ def host_of(peer: str) -> str:
     return peer.rpartition(":")[0]
 
 
-def rejection(reason: str, detail: str) -> tuple[Headers, bytes]:
-    """Returns the headers and the JSON of a refusal."""
-    body = _error(detail)
-    return [*headers_of(JSON, body), (REASON, reason.encode())], body
-
-
-def _error(detail: str) -> bytes:
-    return msgspec.json.encode({"success": False, "error": detail})
+def rejection(status: int, reason: str, detail: str) -> Response:
+    """Returns the response to a refused or failed request."""
+    said = {"success": False, "error": detail}
+    return json_response(said, (REASON, reason.encode()), status=status)

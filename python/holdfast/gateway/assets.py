@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from holdfast.web.host import Headers
+    from holdfast.web.requests import Headers
 
 FOLDER = Path(__file__).parent / "console"
 

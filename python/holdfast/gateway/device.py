@@ -18,12 +18,12 @@ from holdfast.errors import (
 )
 from holdfast.gateway.broadcasting import broadcast
 from holdfast.gateway.egress import Refused
-from holdfast.gateway.fields import listed, malformed
 from holdfast.gateway.pool import Full, Unusable
 from holdfast.gateway.sharing import QueueFull, SharedClient
 from holdfast.net.resolver import NoSuchName
 from holdfast.protocol import BROADCAST_CODES, usual_port
 from holdfast.types import SERIAL_FRAMES
+from holdfast.web.fields import listed, malformed
 from holdfast.web.requests import BadRequest
 
 if TYPE_CHECKING:

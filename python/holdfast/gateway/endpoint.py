@@ -1,4 +1,4 @@
-"""The definition of an endpoint: its fields, its function and its description."""
+"""The definition of an endpoint on devices: its fields, its function and its description."""
 
 from __future__ import annotations
 
@@ -6,17 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.gateway.device import exception_text
-from holdfast.gateway.fields import (
-    HOST,
-    PORT,
-    REGISTER,
-    SERVER_NAME,
-    TRANSPORT,
-    UNIT,
-    Field,
-    Schema,
-)
-from holdfast.web.openapi import array_of
+from holdfast.gateway.fields import HOST, PORT, REGISTER, SERVER_NAME, TRANSPORT, UNIT
+from holdfast.web.fields import Field
+from holdfast.web.schemas import Schema, array_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -53,7 +45,7 @@ def never(_: Given) -> bool:
 
 
 @dataclass(frozen=True)
-class Operation:
+class Endpoint:
     """One operation on a device."""
 
     path: str

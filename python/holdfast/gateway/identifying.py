@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.client.requests import OBJECT_NAMES
-from holdfast.gateway.endpoint import EXAMPLE, MILLISECONDS, REGISTERS, TARGET, Operation
-from holdfast.gateway.fields import REGISTER, Field, array, integer
+from holdfast.gateway.endpoint import EXAMPLE, MILLISECONDS, REGISTERS, TARGET, Endpoint
+from holdfast.gateway.fields import REGISTER
 from holdfast.protocol import HARMLESS_DIAGNOSTICS, MAX_PDU
+from holdfast.web.fields import Field
+from holdfast.web.schemas import array, integer
 
 if TYPE_CHECKING:
     from holdfast.gateway.device import RequestedDevice
@@ -64,7 +66,7 @@ async def _identify(_: Given, device: RequestedDevice) -> Answer:
 
 
 ENDPOINTS = (
-    Operation(
+    Endpoint(
         "/api/modbus/diagnostics",
         "diagnostics",
         "Run diagnostics of a device on a serial line",
@@ -83,7 +85,7 @@ ENDPOINTS = (
         "that writes are enabled. Sub-function 4, Force Listen Only Mode, has no response.",
         writes=lambda given: given["subFunction"] not in HARMLESS_DIAGNOSTICS,
     ),
-    Operation(
+    Endpoint(
         "/api/modbus/server-id",
         "serverId",
         "Read the server id of a device",
@@ -107,7 +109,7 @@ ENDPOINTS = (
         },
         "Function 17. The layout depends on the device: `data` is the whole response, in hex.",
     ),
-    Operation(
+    Endpoint(
         "/api/modbus/identify",
         "identify",
         "Read vendor, product and revision of a device",

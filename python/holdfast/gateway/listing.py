@@ -7,25 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.gateway import tagging, typed
 from holdfast.gateway.endpoint import REGISTERS
-from holdfast.gateway.fields import (
-    BYTE_ORDER,
-    DATATYPE,
-    REQUIRED,
-    TYPED_SCHEMA,
-    Field,
-    array,
-)
+from holdfast.gateway.fields import BYTE_ORDER, DATATYPE, TYPED_SCHEMA
 from holdfast.gateway.reading import TYPED
 from holdfast.protocol import WRITE_REGISTERS
+from holdfast.web.fields import REQUIRED, Field
+from holdfast.web.schemas import array
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from holdfast.gateway.endpoint import Answer, Given
-    from holdfast.gateway.fields import Schema
     from holdfast.tags import TagList
-
-PROFILES = "/api/gateway/profiles"
+    from holdfast.web.schemas import Schema
 
 
 @dataclass(frozen=True)

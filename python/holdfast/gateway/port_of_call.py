@@ -11,18 +11,24 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast.gateway.fields import NotJson, decoded, filled
+from holdfast import logs
 from holdfast.gateway.reading import AREAS_READ, not_a_read_function
 from holdfast.net.addresses import LAST_PORT
 from holdfast.protocol import LAST_ADDRESS, MAX_WORD, READ_LIMITS, WRITE_REGISTERS
-from holdfast.web.requests import BadRequest
+from holdfast.web.fields import NotJson, decoded, filled, object_with
+from holdfast.web.operations import Body
+from holdfast.web.origin import is_from_page
+from holdfast.web.requests import BadRequest, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from holdfast.gateway.endpoint import Given
-    from holdfast.gateway.fields import Field
+    from holdfast.web.fields import Field
     from holdfast.web.requests import Request
+
+MAX_IGNORED = 4
+"""The most ignored keys of a request in the log."""
 
 METHOD_NOT_ALLOWED = "Method not allowed"
 EMPTY = "Unexpected end of JSON input"
@@ -124,13 +130,33 @@ PATHS = frozenset(_RULES)
 """The endpoints of Port of Call."""
 
 
+def body(path: str, fields: Sequence[Field], examples: Mapping[str, Any]) -> Body:
+    """Returns the body of a request for one of `PATHS`. Keys that are ignored are logged."""
+
+    def parse(request: Request, body: bytes) -> dict[str, Any]:
+        given, ignored = parsed(path, body, fields)
+        if ignored:
+            logs.refused(
+                "keys_ignored",
+                kind="gateway",
+                listener="gateway",
+                peer=request.peer,
+                who=request.who,
+                path=path,
+                found=", ".join(map(shown, ignored[:MAX_IGNORED])),
+            )
+        return given
+
+    return Body(object_with(fields), examples, parse)
+
+
 def check_type(request: Request) -> None:
     """Raises `BadRequest` unless the body is JSON by its type, or the request is of a program.
 
     Pages of other sites can send `text/plain` without permission, so a page can't send it here.
     """
     request.check_uncompressed()
-    if request.is_from_page:
+    if is_from_page(request):
         request.check_json(parameters=True)
 
 

@@ -6,19 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.errors import ModbusException
 from holdfast.gateway.device import exception_name, exception_text
-from holdfast.gateway.endpoint import EXAMPLE, TARGET, Operation
-from holdfast.gateway.fields import (
-    ADDRESS,
-    ADDRESS_SCHEMA,
-    BYTE_ORDER,
-    DATATYPE,
-    REGISTER,
-    Field,
-    Schema,
-    integer,
-    malformed,
-    told,
-)
+from holdfast.gateway.endpoint import EXAMPLE, TARGET, Endpoint
+from holdfast.gateway.fields import ADDRESS, ADDRESS_SCHEMA, BYTE_ORDER, DATATYPE, REGISTER
 from holdfast.gateway.typed import quantity_of, typed
 from holdfast.protocol import (
     ADDRESSES,
@@ -30,7 +19,8 @@ from holdfast.protocol import (
     READ_REGISTERS,
 )
 from holdfast.types import BIT_AREAS
-from holdfast.web.openapi import array_of
+from holdfast.web.fields import Field, malformed, told
+from holdfast.web.schemas import Schema, array_of, integer
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -58,6 +48,7 @@ FUNCTION = Field(
     {"type": "integer", "enum": list(FUNCTIONS)},
     ", ".join(f"{code} {area.replace('_', ' ')}" for area, (code, *_) in READ_FUNCTIONS.items()),
     refusal=not_a_read_function,
+    example=3,
 )
 QUANTITY = Field(
     "quantity",
@@ -66,6 +57,7 @@ QUANTITY = Field(
     "size of the datatype",
     None,
     allowed=f"an integer 1 to {READ_REGISTERS} for registers, 1 to {READ_BITS} for bits",
+    example=10,
 )
 
 
@@ -161,7 +153,7 @@ TYPED: dict[str, Schema] = {
 }
 
 ENDPOINTS = (
-    Operation(
+    Endpoint(
         "/api/modbus/connect",
         "connect",
         "Check whether a device responds",
@@ -177,7 +169,7 @@ ENDPOINTS = (
         "Reads holding register 0. A Modbus exception also shows that the device is reachable.",
         optional=("testRegister", "exception"),
     ),
-    Operation(
+    Endpoint(
         "/api/modbus/read",
         "read",
         "Read coils, discrete inputs, holding or input registers",

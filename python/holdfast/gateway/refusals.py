@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from holdfast.web.refusals import Refusal, Refusals
+from holdfast.web.refusals import (
+    LATE,
+    METHOD_NOT_ALLOWED,
+    TOO_LARGE,
+    UNAUTHORIZED,
+    Refusal,
+    Refusals,
+)
 
 REFUSALS = Refusals(
+    UNAUTHORIZED,
+    METHOD_NOT_ALLOWED,
+    LATE,
+    TOO_LARGE,
     Refusal(
         400,
         ("malformed",),
         "The request is malformed",
         "port is 0, allowed: an integer 1 to 65535",
-    ),
-    Refusal(
-        401,
-        ("unauthorized",),
-        "The token is missing or unknown",
-        "unknown token",
     ),
     Refusal(
         403,
@@ -25,24 +30,6 @@ REFUSALS = Refusals(
         "192.168.7.7, port 502, is not in the egress list of this gateway",
     ),
     Refusal(404, ("not_found",), "The resource does not exist", 'no resource at "/api"'),
-    Refusal(
-        405,
-        ("method_not_allowed",),
-        "The resource does not support this method",
-        "Method not allowed; allowed: POST, OPTIONS",
-    ),
-    Refusal(
-        408,
-        ("timeout",),
-        "The body did not arrive in time; the connection is closed",
-        "the body is incomplete: 1024 bytes arrived in time",
-    ),
-    Refusal(
-        413,
-        ("too_large",),
-        "The body is too large; the connection is closed",
-        "the body has more than 65536 bytes",
-    ),
     Refusal(
         415,
         ("not_json",),
@@ -74,13 +61,5 @@ FAILURE = Refusal(
 )
 """A failure: no connection or no valid response."""
 
-EVERYWHERE = ("method_not_allowed",)
-ASKING = ("foreign_page",)
-"""Reasons of all operations with access control; with tokens also `unauthorized`."""
-
-BODY = ("malformed", "timeout", "too_large", "not_json")
-QUERY = ("malformed",)
 DEVICE = ("refused_target", "busy", "stopping")
 """Reasons of all operations on devices, beside those of `FAILURE`."""
-
-WRITE = ("writes_off",)

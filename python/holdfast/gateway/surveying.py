@@ -9,19 +9,14 @@ from typing import TYPE_CHECKING, Any, cast
 from holdfast.errors import ConnectionLost, ModbusError, ModbusException
 from holdfast.gateway.device import Failed
 from holdfast.gateway.endpoint import TARGET
-from holdfast.gateway.fields import (
-    ADDRESS_SCHEMA,
-    AREA_LIST,
-    Field,
-    integer,
-    malformed,
-    timeout,
-)
+from holdfast.gateway.fields import ADDRESS_SCHEMA, AREA_LIST, timeout
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_BITS
 from holdfast.tools import discovery
 from holdfast.tools.discovery import Survey
 from holdfast.types import AREAS, BIT_AREAS
+from holdfast.web.fields import Field, malformed
 from holdfast.web.requests import BadRequest
+from holdfast.web.schemas import integer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

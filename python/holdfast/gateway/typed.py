@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from holdfast import values
-from holdfast.gateway.fields import malformed
 from holdfast.protocol import WRITE_REGISTERS
 from holdfast.values import ConversionError, WrongArea
 from holdfast.values.digits import shortest
+from holdfast.web.fields import malformed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,24 +11,16 @@ from typing import TYPE_CHECKING, Any, Protocol
 from holdfast.errors import ModbusError, ModbusException
 from holdfast.gateway.device import Failed, exception_text
 from holdfast.gateway.endpoint import TARGET
-from holdfast.gateway.fields import (
-    ADDRESS,
-    BYTE_ORDER,
-    DATATYPE,
-    Field,
-    Schema,
-    filled,
-    integer,
-    malformed,
-    timeout,
-)
+from holdfast.gateway.fields import ADDRESS, BYTE_ORDER, DATATYPE, timeout
 from holdfast.gateway.reading import FUNCTION, QUANTITY, Range
 from holdfast.gateway.tagging import LIST, MAX_TAGS, described, tags_of
 from holdfast.gateway.watching import TIMEOUT, interval_field
 from holdfast.tags.text import plain, text_of
 from holdfast.tools.tag_reading import TagReader, packed
 from holdfast.types import BIT_AREAS
+from holdfast.web.fields import Field, filled, malformed, object_with
 from holdfast.web.requests import BadRequest, shown
+from holdfast.web.schemas import Schema, integer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -58,18 +50,7 @@ ONLY = Field(
     None,
 )
 TAGS = (*LIST, ONLY)
-KINDS = (RANGE, TAGS)
-PART_SCHEMA: Schema = {
-    "oneOf": [
-        {
-            "type": "object",
-            "required": [field.name for field in fields if field.required],
-            "properties": {field.name: field.described for field in fields},
-            "additionalProperties": False,
-        }
-        for fields in KINDS
-    ]
-}
+PART_SCHEMA: Schema = {"oneOf": [object_with(RANGE), object_with(TAGS)]}
 PARTS = Field(
     "parts",
     {"type": "array", "minItems": 1, "maxItems": MAX_PARTS, "items": PART_SCHEMA},

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 from holdfast.errors import ModbusException
 from holdfast.gateway.device import Failed, exception_text
 from holdfast.gateway.endpoint import TARGET
-from holdfast.gateway.fields import ADDRESS, BYTE_ORDER, DATATYPE, Field, integer, timeout
+from holdfast.gateway.fields import ADDRESS, BYTE_ORDER, DATATYPE, timeout
 from holdfast.gateway.reading import FUNCTION, QUANTITY, Range
+from holdfast.web.fields import Field
 from holdfast.web.requests import BadRequest
+from holdfast.web.schemas import integer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -9,7 +9,7 @@ from holdfast.gateway.endpoint import (
     MILLISECONDS,
     REGISTERS,
     TARGET,
-    Operation,
+    Endpoint,
     always,
 )
 from holdfast.gateway.fields import (
@@ -20,10 +20,6 @@ from holdfast.gateway.fields import (
     DATATYPE,
     REGISTER,
     TYPED_SCHEMA,
-    Field,
-    array,
-    integer,
-    malformed,
 )
 from holdfast.gateway.typed import typed
 from holdfast.protocol import (
@@ -34,6 +30,8 @@ from holdfast.protocol import (
     WRITE_BITS,
     WRITE_REGISTERS,
 )
+from holdfast.web.fields import Field, malformed
+from holdfast.web.schemas import array, integer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -150,7 +148,7 @@ _WRITTEN = {
 }
 
 ENDPOINTS = (
-    Operation(
+    Endpoint(
         "/api/modbus/write/coil",
         "writeCoil",
         "Write one coil",
@@ -169,7 +167,7 @@ ENDPOINTS = (
         broadcast=True,
         timeout=TIMEOUT,
     ),
-    Operation(
+    Endpoint(
         "/api/modbus/write/registers",
         "writeRegisters",
         "Write holding registers",
@@ -203,7 +201,7 @@ ENDPOINTS = (
         broadcast=True,
         timeout=TIMEOUT,
     ),
-    Operation(
+    Endpoint(
         "/api/modbus/write/register",
         "writeRegister",
         "Write one holding register",
@@ -217,7 +215,7 @@ ENDPOINTS = (
         broadcast=True,
         timeout=TIMEOUT,
     ),
-    Operation(
+    Endpoint(
         "/api/modbus/write/coils",
         "writeCoils",
         "Write coils",
@@ -235,7 +233,7 @@ ENDPOINTS = (
         broadcast=True,
         timeout=TIMEOUT,
     ),
-    Operation(
+    Endpoint(
         "/api/modbus/write/mask",
         "writeMask",
         "Change bits of one holding register",
@@ -259,7 +257,7 @@ ENDPOINTS = (
         broadcast=True,
         timeout=TIMEOUT,
     ),
-    Operation(
+    Endpoint(
         "/api/modbus/readwrite",
         "readWrite",
         "Write holding registers, then read some, in one request",

@@ -1,1 +1,1 @@
-"""HTTP for ASGI applications: the host, requests, refusals, and the OpenAPI page."""
+"""HTTP: the host, requests, refusals, and the OpenAPI page."""

@@ -7,27 +7,24 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from holdfast.web.host import SAFE
+from holdfast.web.requests import SAFE
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Iterable
 
-    from holdfast.web.host import Headers, Send
+    from holdfast.web.requests import Headers, Request
 
 Result = TypeVar("Result")
-KIND = b"text/event-stream"
 
-
-def headers_of_stream() -> Headers:
-    """Returns the headers of a stream. `x-accel-buffering` keeps nginx from holding events back."""
-    return [(b"content-type", KIND), (b"x-accel-buffering", b"no"), *SAFE]
+HEADERS: Headers = [(b"content-type", b"text/event-stream"), (b"x-accel-buffering", b"no"), *SAFE]
+"""The headers of a stream. `x-accel-buffering` keeps nginx from holding events back."""
 
 
 class Stream:
     """Sends events, and comments as heartbeats so that both peers notice a lost connection."""
 
-    def __init__(self, send: Send, heartbeat: float) -> None:
-        self._send = send
+    def __init__(self, request: Request, heartbeat: float) -> None:
+        self._request = request
         self._heartbeat = heartbeat
         self._loop = asyncio.get_running_loop()
         self._last = self._loop.time()
@@ -36,9 +33,8 @@ class Stream:
 
     async def begin(self, more_headers: Iterable[tuple[bytes, bytes]] = ()) -> None:
         """Begins the response. The header is sent with the first event."""
-        start = [*headers_of_stream(), *more_headers]
         self.began = True
-        await self._send({"type": "http.response.start", "status": 200, "headers": start})
+        await self._request.begin(200, [*HEADERS, *more_headers])
 
     async def event(self, name: str, data: Any, number: int | None = None) -> None:
         """Sends one event with JSON data. `number` is its id."""
@@ -70,8 +66,8 @@ class Stream:
 
     async def end(self) -> None:
         """Ends the response."""
-        await self._send({"type": "http.response.body", "body": b""})
+        await self._request.end()
 
     async def _write(self, data: bytes) -> None:
         self._last = self._loop.time()
-        await self._send({"type": "http.response.body", "body": data, "more_body": True})
+        await self._request.send(data)

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import msgspec
 
+from holdfast.web.requests import JSON, Response, response
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -36,8 +38,8 @@ class HealthSource(Protocol):
         """Returns the checks that must all pass before clients are sent here."""
 
 
-def answer(health: HealthSource, path: str, *, details: bool = True) -> tuple[int, bytes]:
-    """Returns the status and the JSON for a path of `PATHS`.
+def answer(health: HealthSource, path: str, *, details: bool = True) -> Response:
+    """Returns the response for a path of `PATHS`.
 
     Without `details`, the body has only the name of each check and whether it has passed.
     """
@@ -48,4 +50,4 @@ def answer(health: HealthSource, path: str, *, details: bool = True) -> tuple[in
         for name, check in checks.items()
     }
     body = msgspec.json.encode({"ok": ok, "checks": shown})
-    return (200 if ok else 503), body
+    return response(JSON, body, status=200 if ok else 503)

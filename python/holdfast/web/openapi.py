@@ -1,49 +1,130 @@
-"""Building blocks of OpenAPI documents: schemas, responses and refusals."""
+"""Makes the OpenAPI document of an application from its table of operations."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeAlias
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from holdfast.web.refusals import HEADERS
+from holdfast.web.schemas import TEXT, Schema, object_of, ref
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable
 
-    from holdfast.web.refusals import Refusal
+    from holdfast.web.fields import Field
+    from holdfast.web.operations import Body, Operation
+    from holdfast.web.refusals import Refusal, Refusals
 
-Schema: TypeAlias = dict[str, Any]
-
-DOCUMENT = "/openapi.json"
-PAGE = "/docs"
-"""The paths of the OpenAPI document and of its page, in every application."""
-
-
-def integer(least: int, most: int) -> Schema:
-    """The schema of an integer from `least` to `most`."""
-    return {"type": "integer", "minimum": least, "maximum": most}
+OF_BODY = ("malformed", "timeout", "too_large", "not_json")
+"""The reasons of refusals that every operation with a body has."""
 
 
-def array_of(items: Schema) -> Schema:
-    """The schema of an array."""
-    return {"type": "array", "items": items}
+@dataclass(frozen=True)
+class Api:
+    """What a document has besides its operations."""
+
+    title: str
+    summary: str
+    description: str
+    schemas: dict[str, Schema]
+    refusals: Refusals
+    refused: Callable[[Refusal], dict[str, Any]]
+    """Returns the response of a refusal."""
 
 
-def object_of(properties: dict[str, Schema], *, optional: Sequence[str] = ()) -> Schema:
-    """The schema of an object with these properties and no others.
-
-    Properties are required, except those in `optional`.
-    """
+def document(
+    api: Api, version: str, operations: Iterable[Operation[Any]], *, secured: bool
+) -> dict[str, Any]:
+    """Returns the document. `secured`: tokens are required."""
+    told = [each for each in operations if each.answer is not None]
+    rows = {row.status: row for each in told for row in _rows(api, each, secured=secured)}
+    token = {
+        "type": "http",
+        "scheme": "bearer",
+        "description": "A token whose SHA-256 is in the configuration.",
+    }
     return {
-        "type": "object",
-        "required": [name for name in properties if name not in optional],
-        "properties": properties,
-        "additionalProperties": False,
+        "openapi": "3.1.0",
+        "info": {
+            "title": api.title,
+            "version": version,
+            "summary": api.summary,
+            "description": api.description,
+        },
+        "servers": [{"url": "/"}],
+        "paths": {
+            each.path: {each.method.lower(): _operation(api, each, secured=secured)}
+            for each in told
+        },
+        "components": {
+            "schemas": api.schemas,
+            "responses": {
+                _component(row): _with_headers(row, api.refused(row)) for row in rows.values()
+            },
+            **({"securitySchemes": {"token": token}} if secured else {}),
+        },
     }
 
 
-def ref(name: str, kind: str = "schemas") -> Schema:
-    """A reference to a component."""
-    return {"$ref": f"#/components/{kind}/{name}"}
+def _rows(api: Api, operation: Operation[Any], *, secured: bool) -> list[Refusal]:
+    """Returns the refusals and failures of an operation, sorted by status code."""
+    reasons = [*operation.refusals, "method_not_allowed"]
+    if not operation.is_open:
+        reasons += ["foreign_page", "unauthorized"] if secured else ["foreign_page"]
+    if operation.body is not None:
+        reasons += OF_BODY
+    elif operation.parameters:
+        reasons.append("malformed")
+    rows = [*api.refusals.of(reasons), *operation.failures]
+    return sorted(rows, key=lambda row: row.status)
+
+
+def _operation(api: Api, operation: Operation[Any], *, secured: bool) -> dict[str, Any]:
+    made: dict[str, Any] = {"operationId": operation.name, "summary": operation.summary}
+    if operation.description:
+        made["description"] = operation.description
+    made["security"] = [{"token": []}] if secured and not operation.is_open else []
+    if operation.body is not None:
+        made["requestBody"] = _body(operation.body)
+    if operation.parameters:
+        made["parameters"] = [_parameter(each) for each in operation.parameters]
+    rows = _rows(api, operation, secured=secured)
+    refused = {str(row.status): ref(_component(row), "responses") for row in rows}
+    return made | {"responses": {"200": operation.answer, **refused}}
+
+
+def _body(body: Body) -> dict[str, Any]:
+    examples = {
+        f"example{number}": {"summary": title, "value": value}
+        for number, (title, value) in enumerate(body.examples.items(), start=1)
+    }
+    content = {"application/json": {"schema": body.schema, "examples": examples}}
+    return {"required": True, "content": content}
+
+
+def _parameter(field: Field) -> dict[str, Any]:
+    return {
+        "name": field.name,
+        "in": "query",
+        "required": field.required,
+        "description": field.text,
+        "schema": field.typed,
+        "example": field.default if field.example is None else field.example,
+    }
+
+
+def _component(row: Refusal) -> str:
+    return f"Refused{row.status}"
+
+
+def _with_headers(row: Refusal, said: dict[str, Any]) -> dict[str, Any]:
+    headers: dict[str, Any] = dict(said.get("headers", {}))
+    if row.status in HEADERS:
+        name, value = HEADERS[row.status]
+        headers[name] = {"schema": {"const": value}}
+    if row.status == 405:
+        headers["Allow"] = {"schema": TEXT}
+    return {**said, "headers": headers} if headers else said
 
 
 def json_answer(description: str, schema: Schema, example: object = None) -> dict[str, Any]:
@@ -54,7 +135,7 @@ def json_answer(description: str, schema: Schema, example: object = None) -> dic
 
 def html_answer() -> dict[str, Any]:
     """An HTML response."""
-    return {"description": "HTML", "content": {"text/html": {"schema": {"type": "string"}}}}
+    return {"description": "HTML", "content": {"text/html": {"schema": TEXT}}}
 
 
 def stream_answer(**events: str) -> dict[str, Any]:
@@ -74,44 +155,3 @@ def stream_answer(**events: str) -> dict[str, Any]:
     ]
     content = {"text/event-stream": {"schema": {"oneOf": kinds}}}
     return {"description": "A stream of these server-sent events", "content": content}
-
-
-def parameter(
-    name: str, schema: Schema, example: object, description: str, *, default: object = None
-) -> dict[str, Any]:
-    """A query parameter, required unless it has a default."""
-    more = {} if default is None else {"default": default}
-    return {
-        "name": name,
-        "in": "query",
-        "required": default is None,
-        "description": description,
-        "schema": schema | more,
-        "example": example,
-    }
-
-
-def refused_by(rows: Iterable[Refusal]) -> dict[str, Any]:
-    """The responses of an operation for these refusals, as references to components."""
-    return {str(row.status): ref(_component(row), "responses") for row in rows}
-
-
-def refusal_components(
-    rows: Iterable[Refusal], said: Callable[[Refusal], dict[str, Any]]
-) -> dict[str, dict[str, Any]]:
-    """The components that `refused_by` refers to; `said` creates the response of a row."""
-    return {_component(row): _with_headers(row, said(row)) for row in rows}
-
-
-def _component(row: Refusal) -> str:
-    return f"Refused{row.status}"
-
-
-def _with_headers(row: Refusal, said: dict[str, Any]) -> dict[str, Any]:
-    headers: dict[str, Any] = dict(said.get("headers", {}))
-    if row.status in HEADERS:
-        name, value = HEADERS[row.status]
-        headers[name] = {"schema": {"const": value}}
-    if row.status == 405:
-        headers["Allow"] = {"schema": {"type": "string"}}
-    return {**said, "headers": headers} if headers else said

@@ -147,7 +147,7 @@ def _row(
 def _range(document: Mapping[str, Any], parameter: Mapping[str, Any]) -> str:
     schema = _resolved(document, parameter["schema"])
     if "enum" in schema:
-        return ", ".join(f"<code>{escape(word)}</code>" for word in schema["enum"])
+        return ", ".join(f"<code>{escape(str(word))}</code>" for word in schema["enum"])
     if "minimum" in schema:
         return f"{schema['minimum']} to {schema['maximum']}"
     return "text"

@@ -8,20 +8,16 @@ from __future__ import annotations
 
 import errno
 import logging
-import socket
-import sys
 import threading
 import time
 from typing import TYPE_CHECKING
 
 from holdfast import logs
-from holdfast.net.addresses import joined, parse_address
+from holdfast._core import ListeningSocket
+from holdfast.net.addresses import joined
 
 if TYPE_CHECKING:
     from holdfast.stop import Stop
-
-BACKLOG = 512
-"""Connections that the system queues before they are accepted."""
 
 FIRST_PAUSE = 1.0
 MAX_PAUSE = 10.0
@@ -33,27 +29,12 @@ LOG_INTERVAL = 60.0
 PRIVILEGE = "ports below 1024 require a privilege, on Linux CAP_NET_BIND_SERVICE"
 
 
-def listen(host: str, port: int) -> socket.socket:
+def listen(host: str, port: int) -> ListeningSocket:
     """Returns a socket that listens on an IP address; `::` includes IPv4. Raises `OSError`."""
-    flags = socket.AI_NUMERICHOST | socket.AI_PASSIVE
-    [(family, kind, number, _, address)] = socket.getaddrinfo(
-        host, port, type=socket.SOCK_STREAM, proto=socket.IPPROTO_TCP, flags=flags
-    )
-    listener = socket.socket(family, kind, number)
     try:
-        if sys.platform == "win32":
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
-        else:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if family == socket.AF_INET6:
-            any_address = parse_address(host).is_unspecified
-            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, not any_address)
-        listener.bind(address)
-        listener.listen(BACKLOG)
-    except OSError:
-        listener.close()
-        raise
-    return listener
+        return ListeningSocket(joined(host, port))
+    except ValueError as error:
+        raise OSError(str(error)) from None
 
 
 def explained(error: OSError) -> str:
@@ -73,7 +54,7 @@ class Port:
         """Why the port is not bound; `None` once it is."""
         self._host = host
         self._port = port
-        self._listener: socket.socket | None = None
+        self._listener: ListeningSocket | None = None
         self._bound: tuple[str, int] | None = None
         self._pause = FIRST_PAUSE
         self._logged: tuple[str, float] | None = None
@@ -91,7 +72,7 @@ class Port:
         return self._bound is not None
 
     @property
-    def listener(self) -> socket.socket:
+    def listener(self) -> ListeningSocket:
         """The listening socket. Raises `RuntimeError` if the port is not bound."""
         if self._listener is None:
             raise RuntimeError(f"{self.name}: {self.bind_address} is not bound")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.web.host import Headers
+    from holdfast.web.requests import Headers
 
 UNREAD = (408, 413)
 """Status codes of requests whose body is not fully read; the connection is closed after them."""
@@ -34,6 +34,27 @@ class Refusal:
     reasons: tuple[str, ...]
     means: str
     example: str
+
+
+UNAUTHORIZED = Refusal(401, ("unauthorized",), "The token is missing or unknown", "unknown token")
+METHOD_NOT_ALLOWED = Refusal(
+    405,
+    ("method_not_allowed",),
+    "The resource does not support this method",
+    "allowed: POST, OPTIONS",
+)
+LATE = Refusal(
+    408,
+    ("timeout",),
+    "The body did not arrive in time; the connection is closed",
+    "the body is incomplete: 1024 bytes arrived in time",
+)
+TOO_LARGE = Refusal(
+    413,
+    ("too_large",),
+    "The body is too large; the connection is closed",
+    "the body has more than 65536 bytes",
+)
 
 
 class Refusals:

@@ -1,4 +1,4 @@
-"""Requests of HTTP applications: bodies, tokens, and origins.
+"""The requests and responses of HTTP: what a handler gets from a host, and gives back.
 
 This module does not know routes. An invalid request raises `BadRequest`; the application converts
 its reason to a status code.
@@ -6,24 +6,26 @@ its reason to a status code.
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import functools
 import hashlib
 import hmac
 import json
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast.net.addresses import address_in
+import msgspec
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterable
+    from collections.abc import Iterable
 
-    from holdfast.web.host import Headers, Receive, Scope, Send
+Headers: TypeAlias = list[tuple[bytes, bytes]]
+"""Names in lower case, and values."""
 
-LINGER_TIMEOUT = 2.0
-"""Seconds to keep reading an oversized body, so that the client receives the response."""
+JSON = b"application/json"
+
+SAFE: Headers = [(b"cache-control", b"no-store"), (b"x-content-type-options", b"nosniff")]
+"""Headers of every response: no caching, no guessing of content types."""
 
 _JSON = re.compile(rb'application/json[ \t]*(;[ \t]*charset="?utf-?8"?[ \t]*)?', re.I)
 _JSON_WITH_PARAMETERS = re.compile(rb"application/json[ \t]*(;.*)?", re.I)
@@ -43,37 +45,139 @@ class ClientDisconnected(Exception):
     """The client closed the connection."""
 
 
+class BrokenBody(Exception):
+    """The body of a request is not valid HTTP. The host answers it, not the handler."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """The certificate of a client over mutual TLS."""
+
+    subject: str
+    serial: str
+    role: str | None = None
+
+
+@dataclass(slots=True)
+class Response:
+    """A whole response. The host adds `date`, and `content-length` where HTTP has one."""
+
+    status: int
+    body: bytes = b""
+    headers: Headers = field(default_factory=list)
+    closes: bool = False
+    """Whether the connection is closed after it, which the peer can still read."""
+
+
+def response(kind: bytes, body: bytes, *more: tuple[bytes, bytes], status: int = 200) -> Response:
+    """Returns a response with a body of this content type."""
+    return Response(status, body, [(b"content-type", kind), *SAFE, *more])
+
+
+def rejection(status: int, reason: str, detail: str, word: str = "rejected") -> Response:
+    """Returns the refusal of a request, in JSON."""
+    body = msgspec.json.encode({"status": word, "reason": reason, "detail": detail})
+    return response(JSON, body, status=status)
+
+
 class Request:
-    """An HTTP request."""
+    """One request. A host makes a subclass for a body that still arrives, and for streams."""
 
-    __slots__ = ("arrived", "method", "more_headers", "path", "peer", "receive", "scope", "who")
+    __slots__ = (
+        "headers",
+        "identity",
+        "method",
+        "path",
+        "peer",
+        "query",
+        "version",
+        "who",
+        "whole",
+    )
 
-    def __init__(self, scope: Scope, receive: Receive) -> None:
-        self.scope = scope
-        self.receive = receive
-        self.path: str = scope["path"]
-        self.method: str = scope["method"]
-        self.peer: str = scope["state"]["peer"]
+    def __init__(
+        self,
+        method: str,
+        path: str,
+        query: bytes,
+        headers: Headers,
+        peer: str,
+        *,
+        version: str = "1.1",
+        whole: bytes | None = b"",
+        identity: Identity | None = None,
+    ) -> None:
+        self.method = method
+        self.path = path
+        """The path, percent-decoded."""
+        self.query = query
+        """The part behind `?`, as it was sent."""
+        self.headers = headers
+        self.peer = peer
+        """The address of the client as text: `10.0.0.9:51200`."""
+        self.version = version
+        """The version of HTTP, `1.0` or `1.1`."""
+        self.whole = whole
+        """The body, if it has arrived together with the head; `None` while it still arrives."""
+        self.identity = identity
         self.who = "-"
         """The name of the token's owner; `-` until the token was checked."""
-        self.arrived = False
-        """Whether the body was received completely."""
-        self.more_headers: Headers = []
-        """Additional headers of the response."""
 
-    def headers(self, wanted: bytes) -> list[bytes]:
-        """Returns all headers of this name."""
-        return [value for name, value in self.scope["headers"] if name == wanted]
+    # What a host provides.
+
+    async def receive(self, most: int) -> bytes:
+        """Waits for a body that still arrives, at most `most` bytes.
+
+        Raises `BadRequest`, `BrokenBody` and `ClientDisconnected`.
+        """
+        raise NotImplementedError
+
+    async def gone(self) -> None:
+        """Returns when the client is gone. The body must have been read."""
+        raise NotImplementedError
+
+    async def begin(self, status: int, headers: Headers) -> None:
+        """Begins a stream. From here on, a half-close of the client means that it is gone."""
+        raise NotImplementedError
+
+    async def send(self, data: bytes) -> None:
+        """Sends a part of a stream when there is room for it. Raises `ClientDisconnected`."""
+        raise NotImplementedError
+
+    async def end(self) -> None:
+        """Ends a stream."""
+        raise NotImplementedError
+
+    # The body.
+
+    def arrived(self, most: int) -> bytes | None:
+        """Returns the body, at most `most` bytes; `None` if it still arrives. Raises `BadRequest`.
+
+        A body that is too large by its length is refused before it arrives.
+        """
+        told = self.header(b"content-length")
+        if len(self.whole or b"") > most or (told is not None and int(told) > most):
+            raise BadRequest("too_large", f"the body has more than {most} bytes")
+        return self.whole
+
+    async def body(self, most: int) -> bytes:
+        """Reads the body, at most `most` bytes. Raises `BadRequest` and `ClientDisconnected`."""
+        whole = self.arrived(most)
+        if whole is not None:
+            return whole
+        self.whole = await self.receive(most)
+        return self.whole
+
+    # The headers.
+
+    def values(self, wanted: bytes) -> list[bytes]:
+        """Returns the values of all headers of this name."""
+        return [value for name, value in self.headers if name == wanted]
 
     def header(self, wanted: bytes) -> bytes | None:
-        """Returns the last header of this name, if there is one."""
-        found = self.headers(wanted)
+        """Returns the value of the last header of this name, if there is one."""
+        found = self.values(wanted)
         return found[-1] if found else None
-
-    @property
-    def late(self) -> bool:
-        """Whether the request did not arrive in time."""
-        return "late" in self.scope["state"]
 
     def check_json(self, *also: bytes, parameters: bool = False) -> None:
         """Raises `BadRequest` unless Content-Type is JSON or in `also`, without compression.
@@ -94,65 +198,12 @@ class Request:
         if coding is not None and coding.lower() != b"identity":
             raise BadRequest("not_json", f"Content-Encoding is {_found(coding)}, allowed: none")
 
-    async def body(self, most: int) -> bytes:
-        """Reads the body, at most `most` bytes. Raises `BadRequest` and `ClientDisconnected`."""
-        told = self.header(b"content-length")
-        if told is not None and int(told) > most:
-            raise _too_large(most)
-        pieces: list[bytes] = []
-        size, more = 0, True
-        while more:
-            message = await self.receive()
-            if message["type"] == "http.disconnect":
-                raise ClientDisconnected
-            piece, more = message["body"], message["more_body"]
-            self.arrived = not more
-            pieces.append(piece)
-            size += len(piece)
-            if size > most:
-                raise _too_large(most)
-            if more and self.late:
-                raise BadRequest("timeout", f"the body is incomplete: {size} bytes arrived in time")
-        return b"".join(pieces)
-
-    async def gone(self) -> None:
-        """Returns when the client disconnects. The body must have been read."""
-        while (await self.receive())["type"] != "http.disconnect":
-            pass
-
-    def let_leave(self) -> None:
-        """Treats a half-close as a disconnect from now on: a stream has no other end."""
-        self.scope["state"]["leaving"] = True
-
-    @property
-    def is_foreign(self) -> bool:
-        """Whether a browser sent the request from a page of another site."""
-        origin, host = self.header(b"origin"), self.header(b"host") or b""
-        if origin is not None and origin.partition(b"://")[2].lower() != host.lower():
-            return True
-        return self.header(b"sec-fetch-site") in (b"cross-site", b"same-site")
-
-    @property
-    def is_from_page(self) -> bool:
-        """Whether a web page sent the request, also one of this server."""
-        return any(self.headers(name) for name in (b"origin", b"referer", b"sec-fetch-site"))
-
-    def is_direct(self, names: Container[str] = ()) -> bool:
-        """Whether Host is missing, an IP address, `localhost`, or one of `names` in lower case.
-
-        This prevents DNS rebinding: a web page can point its own name at this machine, but the
-        browser still sends that name as Host.
-        """
-        host = self.header(b"host")
-        name = None if host is None else _name_in(host)
-        return name is None or name in names
-
     def owner(self, tokens: Iterable[tuple[str, bytes]]) -> str:
         """Returns the name of the request's token. Raises `BadRequest` if there is none.
 
         `tokens` are names and SHA-256 hashes.
         """
-        given = self.headers(b"authorization")
+        given = self.values(b"authorization")
         if len(given) != 1:
             detail = "more than one Authorization header" if given else "no Authorization header"
             raise BadRequest("unauthorized", f"{detail}, required: Authorization: Bearer TOKEN")
@@ -169,25 +220,8 @@ class Request:
         return owner
 
 
-async def respond_to_its_end(
-    request: Request, send: Send, status: int, headers: Headers, body: bytes
-) -> None:
-    """Responds to a request whose body is not fully read, and closes the connection.
-
-    First it reads more of the body, for at most `LINGER_TIMEOUT`. Closing a connection while the
-    client still sends would reset it, and the client would lose the response.
-    """
-    closing = [*headers, (b"connection", b"close")]
-    await send({"type": "http.response.start", "status": status, "headers": closing})
-    if request.arrived or request.late or request.header(b"expect") is not None:
-        await send({"type": "http.response.body", "body": body})
-        return
-    await send({"type": "http.response.body", "body": body, "more_body": True})
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(LINGER_TIMEOUT):
-            while (await request.receive()).get("more_body", False) and not request.late:
-                pass
-    await send({"type": "http.response.body", "body": b""})
+Handler: TypeAlias = Callable[[Request], Response | Coroutine[Any, Any, Response | None]]
+"""Answers a request, at once or as a coroutine. `None`: it has sent a stream."""
 
 
 def shown(text: str) -> str:
@@ -197,14 +231,3 @@ def shown(text: str) -> str:
 
 def _found(value: bytes | None) -> str:
     return "missing" if value is None else shown(value.decode("latin-1"))
-
-
-def _too_large(most: int) -> BadRequest:
-    return BadRequest("too_large", f"the body has more than {most} bytes")
-
-
-@functools.lru_cache(maxsize=64)
-def _name_in(host: bytes) -> str | None:
-    """Returns the name in a Host header; `None` for an IP address, `localhost` or nothing."""
-    name = re.sub(r":[0-9]*\Z", "", host.decode("latin-1")).lower()
-    return None if name in ("", "localhost") or address_in(name) is not None else name

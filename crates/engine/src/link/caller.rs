@@ -13,11 +13,7 @@ use holdfast_protocol::pdu::EncodedRequest;
 
 use super::queue::source;
 use crate::client::{ClientError, Lost};
-
-#[cfg(not(unix))]
-pub use std::net::TcpStream as Wakes;
-#[cfg(unix)]
-pub use std::os::unix::net::UnixStream as Wakes;
+use crate::wake::{Wakes, pair};
 
 /// How long a link waits after a broadcast, which has no reply: the time to connect, if it is not
 /// connected, and for devices to carry it out (Modbus over Serial Line V1.02, 2.4.1).
@@ -74,8 +70,6 @@ impl Caller {
     /// The system has no sockets left.
     pub fn new() -> io::Result<(Arc<Caller>, Wakes)> {
         let (wake, wakes) = pair()?;
-        wake.set_nonblocking(true)?;
-        wakes.set_nonblocking(true)?;
         let caller = Caller { source: source(), state: Mutex::default(), wake };
         Ok((Arc::new(caller), wakes))
     }
@@ -164,27 +158,6 @@ impl Drop for Waiting {
             false => ClientError::Lost(Lost::Closed(Closed::BySelf)),
         };
         self.caller.end(self.ticket, Err(Arc::new(error)));
-    }
-}
-
-#[cfg(unix)]
-fn pair() -> io::Result<(Wakes, Wakes)> {
-    Wakes::pair()
-}
-
-/// Other systems have no pairs of sockets: a connection over the loopback interface.
-#[cfg(not(unix))]
-fn pair() -> io::Result<(Wakes, Wakes)> {
-    let listener = std::net::TcpListener::bind((std::net::Ipv4Addr::LOCALHOST, 0))?;
-    let wake = Wakes::connect(listener.local_addr()?)?;
-    let own = wake.local_addr()?;
-    loop {
-        // Another program may have connected first.
-        let (wakes, peer) = listener.accept()?;
-        if peer == own {
-            wake.set_nodelay(true)?;
-            return Ok((wake, wakes));
-        }
     }
 }
 

@@ -30,7 +30,7 @@ mod tcp;
 
 pub(crate) use access::Link;
 pub use backoff::Retry;
-pub use caller::{Called, Caller, Wakes};
+pub use caller::{Called, Caller};
 pub(crate) use coming::{Coming, Reply, ReplyTo, coming};
 pub(crate) use dialing::dial;
 pub use fault::Fault;

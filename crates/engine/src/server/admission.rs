@@ -37,6 +37,8 @@ pub struct ConnectionLimits {
     /// The most connections whose handshake is not complete. They are not among
     /// `max_connections`. `None`: connections begin without a handshake.
     pub max_handshakes: Option<usize>,
+    /// How long a connection in the middle of a request is never closed for another.
+    pub grace: Duration,
 }
 
 impl ConnectionLimits {
@@ -46,7 +48,19 @@ impl ConnectionLimits {
         max_connections_per_source: None,
         when_full: WhenFull::Refuse,
         max_handshakes: None,
+        grace: Duration::ZERO,
     };
+}
+
+/// What a connection of HTTP waits for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Waiting {
+    /// The peer may begin a request.
+    ForRequest,
+    /// The peer has begun a request, or has not taken a response.
+    ForRest,
+    /// The peer waits. Such a connection is never closed for another.
+    ForHandler,
 }
 
 #[derive(Debug)]
@@ -89,6 +103,8 @@ struct Activity {
     /// In microseconds since the epoch of the admission. Before any request, when it was admitted.
     last_request: AtomicU64,
     is_amid_packet: AtomicBool,
+    /// Whether the peer waits for a response that takes its time.
+    is_busy: AtomicBool,
     /// Whether the connection has had its last reply, and waits for its peer to close.
     is_answered: AtomicBool,
     /// Whether the connection must look up its rights again.
@@ -152,7 +168,7 @@ impl Admission {
         let mut table = self.table();
         let max_handshakes = table.limits.max_handshakes;
         let evicted = match max_handshakes {
-            None => table.clear_session(peer.ip())?,
+            None => table.clear_session(peer.ip(), self.since(Instant::now()))?,
             Some(most) => table.clear_handshake(peer.ip(), most)?,
         };
         let id = table.next_id;
@@ -161,6 +177,7 @@ impl Admission {
         let activity = Arc::new(Activity {
             last_request: AtomicU64::new(admitted),
             is_amid_packet: AtomicBool::new(false),
+            is_busy: AtomicBool::new(false),
             is_answered: AtomicBool::new(false),
             is_outdated: AtomicBool::new(false),
         });
@@ -225,14 +242,14 @@ impl Admission {
 
 impl Table {
     /// Makes sure that there is a place for a session.
-    fn clear_session(&mut self, source: IpAddr) -> Result<Option<Evicted>, Full> {
+    fn clear_session(&mut self, source: IpAddr, now: u64) -> Result<Option<Evicted>, Full> {
         let Some(of) = self.crowd(source.to_canonical()) else {
             return Ok(None);
         };
         if let Some(id) = self.answered(of) {
             return Ok(self.end(id).map(|held| Evicted::Answered(held.peer)));
         }
-        self.evict(of).map(Some)
+        self.evict(of, now).map(Some)
     }
 
     /// Whose sessions leave no place for one of `source`: those of the source itself, or `None` for
@@ -278,12 +295,14 @@ impl Table {
 
     /// Closes the session that has been idle longest, of one source or of all; first those that are
     /// not in the middle of a packet.
-    fn evict(&mut self, source: Option<IpAddr>) -> Result<Evicted, Full> {
+    fn evict(&mut self, source: Option<IpAddr>, now: u64) -> Result<Evicted, Full> {
         if self.limits.when_full == WhenFull::Refuse {
             return Err(Full);
         }
-        let candidates =
-            self.sessions.iter().filter(|(_, held)| held.task.is_some() && held.is_of(source));
+        let grace = self.limits.grace.as_micros() as u64;
+        let candidates = self.sessions.iter().filter(|(_, held)| {
+            held.task.is_some() && held.is_of(source) && held.may_go(now, grace)
+        });
         let id = candidates.min_by_key(|(id, held)| held.rank(**id)).map(|(id, _)| *id);
         let held = self.end(id.ok_or(Full)?).ok_or(Full)?;
         Ok(Evicted::Connection(held.peer))
@@ -352,6 +371,14 @@ impl Held {
         (is_amid_packet, i128::from(last_request) - silence as i128, id)
     }
 
+    /// Whether it may be closed for another connection now.
+    fn may_go(&self, now: u64, grace: u64) -> bool {
+        let Activity { last_request, is_amid_packet, is_busy, .. } = &*self.activity;
+        let is_amid = is_amid_packet.load(Ordering::Relaxed);
+        let waited = now.saturating_sub(last_request.load(Ordering::Relaxed));
+        !is_busy.load(Ordering::Relaxed) && (!is_amid || waited >= grace)
+    }
+
     fn source(&self) -> IpAddr {
         self.peer.ip().to_canonical()
     }
@@ -377,7 +404,7 @@ impl Ticket {
             // It has just been evicted, and ends at the next await.
             return Ok(None);
         };
-        let evicted = table.clear_session(source)?;
+        let evicted = table.clear_session(source, self.admission.since(Instant::now()))?;
         if let Some(held) = table.remove(self.id) {
             let now = self.admission.since(Instant::now());
             self.activity.last_request.store(now.max(held.admitted + 1), Ordering::Relaxed);
@@ -404,6 +431,13 @@ impl Ticket {
     pub(crate) fn take_outdated(&self) -> bool {
         self.activity.is_outdated.load(Ordering::Relaxed)
             && self.activity.is_outdated.swap(false, Ordering::Acquire)
+    }
+
+    /// Records what a connection of HTTP waits for, and since when.
+    pub(crate) fn wait(&self, waiting: Waiting, since: Instant) {
+        self.touch(since);
+        self.set_amid_packet(waiting == Waiting::ForRest);
+        self.activity.is_busy.store(waiting == Waiting::ForHandler, Ordering::Relaxed);
     }
 
     /// Records whether part of a packet has arrived.
@@ -460,6 +494,7 @@ mod tests {
             max_connections_per_source,
             when_full,
             max_handshakes: None,
+            grace: Duration::ZERO,
         }))
     }
 
@@ -475,6 +510,7 @@ mod tests {
             max_connections_per_source,
             when_full,
             max_handshakes: Some(max_handshakes),
+            grace: Duration::ZERO,
         }))
     }
 

@@ -91,6 +91,8 @@ pub struct ConnectionCounters {
     pub request_timeout: Counter,
     /// Closed because the peer did not read its replies within `request_timeout`.
     pub slow_reader: Counter,
+    /// What a peer sent is not HTTP.
+    pub broken_request: Counter,
     /// The system could not accept a connection.
     pub accept_errors: Counter,
 }

@@ -37,6 +37,8 @@ pub enum Kind {
     SlowReader,
     /// A frame had an invalid length, or began like a Raw Ingest packet.
     BrokenFrame,
+    /// What a peer sent is not HTTP.
+    BrokenRequest,
     /// Closed in favour of a new connection.
     Evicted,
     /// Closed during the handshake in favour of a new connection.
@@ -89,6 +91,7 @@ impl Kind {
             Kind::RequestTimeout => "request_timeout",
             Kind::SlowReader => "slow_reader",
             Kind::BrokenFrame => "broken_frame",
+            Kind::BrokenRequest => "broken_request",
             Kind::Evicted | Kind::EvictedHandshake => "evicted",
             Kind::RightsRevoked => "rights_revoked",
             Kind::Ended => "ended",

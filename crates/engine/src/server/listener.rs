@@ -35,7 +35,7 @@ const SYSTEM_BUFFER: usize = 256 * 1024;
 const KEEPALIVE: (Duration, u32, Duration) = (Duration::from_secs(60), 4, Duration::from_secs(15));
 
 /// The pause after a failed accept, usually for lack of file descriptors.
-const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+pub(crate) const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
 /// The longest time that a peer is read after its last reply, the bytes per read, and the most reads
 /// after that time.
@@ -113,6 +113,7 @@ impl ListenerContext {
             Kind::Ended => self.connections.ended.add(),
             Kind::RequestTimeout => self.connections.request_timeout.add(),
             Kind::SlowReader => self.connections.slow_reader.add(),
+            Kind::BrokenRequest => self.connections.broken_request.add(),
             Kind::TlsFailed(reason) => self.connections.tls_failed.add(reason),
             _ => {}
         }
@@ -282,7 +283,10 @@ fn admit<S: Service>(
 }
 
 /// Binds a listening socket that is not registered with a runtime.
-pub(crate) fn bind_tcp(address: SocketAddr) -> io::Result<std::net::TcpListener> {
+///
+/// # Errors
+/// The address can't be had.
+pub fn bind_tcp(address: SocketAddr) -> io::Result<std::net::TcpListener> {
     let socket = Socket::new(Domain::for_address(address), Type::STREAM, Some(Protocol::TCP))?;
     // On other systems, the option lets two programs bind the same port.
     #[cfg(unix)]
@@ -327,12 +331,22 @@ pub(crate) fn set_options(stream: &TcpStream) {
 /// Closing a socket with unread bytes resets the connection, and the peer may lose the last reply.
 pub(crate) async fn drain<S: Stream>(
     stream: &mut S,
+    stop: watch::Receiver<bool>,
+    drained: impl FnMut(usize),
+) {
+    drain_for(DRAIN, stream, stop, drained).await;
+}
+
+/// As `drain`, for at most this long.
+pub(crate) async fn drain_for<S: Stream + ?Sized>(
+    limit: Duration,
+    stream: &mut S,
     mut stop: watch::Receiver<bool>,
     mut drained: impl FnMut(usize),
 ) {
     let _ = SockRef::from(stream.socket()).shutdown(Shutdown::Write);
     let mut unsent = Vec::new();
-    let deadline = Instant::now() + DRAIN;
+    let deadline = Instant::now() + limit;
     while Instant::now() < deadline {
         // On the stack, because many peers may be read at the same time: outside the closure, it would
         // be a part of every connection.
@@ -353,7 +367,7 @@ pub(crate) async fn drain<S: Stream>(
 }
 
 /// Whether an error of `accept` concerns one peer, not the listener.
-fn is_of_one_peer(error: &io::Error) -> bool {
+pub(crate) fn is_of_one_peer(error: &io::Error) -> bool {
     use io::ErrorKind::{ConnectionAborted, ConnectionReset, Interrupted, WouldBlock};
     matches!(error.kind(), ConnectionAborted | ConnectionReset | Interrupted | WouldBlock)
 }

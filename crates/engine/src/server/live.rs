@@ -20,3 +20,9 @@ impl<T> Live<T> {
         std::mem::replace(&mut *self.0.write().unwrap_or_else(PoisonError::into_inner), value)
     }
 }
+
+impl<T> From<Arc<T>> for Live<T> {
+    fn from(value: Arc<T>) -> Live<T> {
+        Live(RwLock::new(value))
+    }
+}

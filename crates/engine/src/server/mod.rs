@@ -1,6 +1,6 @@
 //! Listeners: Modbus and Raw Ingest over memories, one file per transport.
 
-mod admission;
+pub(crate) mod admission;
 pub mod audit;
 mod connection;
 pub mod counters;
@@ -15,19 +15,19 @@ pub mod functions;
 pub mod identity;
 mod incoming;
 mod journal;
-mod listener;
-mod live;
+pub(crate) mod listener;
+pub(crate) mod live;
 mod memory_operations;
 mod peer;
 pub mod policy;
 pub mod ranges;
 mod raw_ingest;
 mod refused_request;
-mod secure;
+pub(crate) mod secure;
 mod serial;
-mod stream;
+pub(crate) mod stream;
 mod tcp;
-mod tls;
+pub(crate) mod tls;
 mod udp;
 pub mod unit_server;
 

@@ -368,17 +368,20 @@ mod tests {
     fn a_session_is_resumed_with_its_role_for_one_day_after_the_full_handshake() {
         let party = Party::new();
         for version in VERSIONS {
-            let clock = Clock::new();
-            let tls = ServerTls::with_clock(&party.files(), None, Arc::clone(&clock) as _).unwrap();
-            let client = party.client(version);
-            assert_eq!(shake(&tls, &client), Ok(FULL));
-            assert_eq!(shake(&tls, &client), Ok(RESUMED));
-            clock.pass(DAY / 2);
-            assert_eq!(shake(&tls, &client), Ok(RESUMED));
-            clock.pass(DAY / 2 + 1);
-            assert_eq!(shake(&tls, &client), Ok(FULL), "{version:?}");
-            assert_eq!(shake(&tls, &client), Ok(RESUMED));
+            resumes_for_one_day(&party.files(), &party.client(version));
         }
+    }
+
+    fn resumes_for_one_day(files: &ServerFiles, client: &Arc<ClientConfig>) {
+        let clock = Clock::new();
+        let tls = ServerTls::with_clock(files, None, Arc::clone(&clock) as _).unwrap();
+        assert_eq!(shake(&tls, client), Ok(FULL));
+        assert_eq!(shake(&tls, client), Ok(RESUMED));
+        clock.pass(DAY / 2);
+        assert_eq!(shake(&tls, client), Ok(RESUMED));
+        clock.pass(DAY / 2 + 1);
+        assert_eq!(shake(&tls, client), Ok(FULL));
+        assert_eq!(shake(&tls, client), Ok(RESUMED));
     }
 
     #[test]
@@ -538,17 +541,9 @@ mod tests {
     #[test]
     fn http_clients_need_no_certificate_without_authorities_and_resume_sessions() {
         let party = Party::new();
+        assert!(!ServerTls::load(&open(&party), None).unwrap().requires_certificate());
         for version in VERSIONS {
-            let clock = Clock::new();
-            let tls = ServerTls::with_clock(&open(&party), None, Arc::clone(&clock) as _).unwrap();
-            assert!(!tls.requires_certificate());
-            let client = party.anonymous(version);
-            assert_eq!(shake(&tls, &client), Ok(FULL));
-            assert_eq!(shake(&tls, &client), Ok(RESUMED));
-            clock.pass(DAY / 2);
-            assert_eq!(shake(&tls, &client), Ok(RESUMED));
-            clock.pass(DAY / 2 + 1);
-            assert_eq!(shake(&tls, &client), Ok(FULL), "{version:?}");
+            resumes_for_one_day(&open(&party), &party.anonymous(version));
         }
     }
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from holdfast import __version__
 from holdfast.adapters.rest.app import App
-from holdfast.web.admission import ConnectionLimits
-from holdfast.web.host import STOP_TIMEOUT, Host
+from holdfast.adapters.rest.operations import OPERATIONS, document
+from holdfast.web.host import STOP_TIMEOUT, ConnectionLimits, Host
 
 if TYPE_CHECKING:
-    import socket
-
+    from holdfast._core import ListeningSocket
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.sessions import SessionControl
     from holdfast.config import RestConfig
@@ -30,13 +30,12 @@ class Rest:
         memory_access: MemoryAccess,
         diagnostics: DiagnosticsSource,
         sessions: SessionControl,
-        listener: socket.socket,
+        listener: ListeningSocket,
         *,
         https: Https | None = None,
         stop_timeout: float = STOP_TIMEOUT,
     ) -> None:
-        scheme = "http" if https is None else "https"
-        self._app = App(settings, memory_access, diagnostics, sessions, listener, scheme)
+        self._app = App(OPERATIONS, settings, memory_access, diagnostics, sessions)
         self._host = Host(
             "rest",
             self._app,
@@ -50,6 +49,11 @@ class Rest:
             request_timeout=settings.request_timeout,
             stop_timeout=stop_timeout,
             https=https,
+        )
+        scheme = "http" if https is None else "https"
+        self._app.describe(
+            document(__version__, settings.max_body, secured=settings.tokens != "none"),
+            f"{scheme}://{self._host.address}",
         )
         self.heartbeat = self._host.heartbeat
 

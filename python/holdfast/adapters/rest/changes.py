@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from holdfast.ingest import Follower
-    from holdfast.web.host import Send
     from holdfast.web.requests import Request
 
 MAX_STREAMS = 32
@@ -59,7 +58,6 @@ class ChangeStreams:
         follower: Follower,
         ranges: Sequence[tuple[str, str]],
         min_interval: float,
-        send: Send,
     ) -> None:
         """Sends events until the peer leaves or the server stops.
 
@@ -71,9 +69,8 @@ class ChangeStreams:
             asyncio.create_task(self._ending.wait()),
         ]
         try:
-            request.let_leave()
-            stream = Stream(send, HEARTBEAT)
-            await stream.begin(request.more_headers)
+            stream = Stream(request, HEARTBEAT)
+            await stream.begin()
             await _follow(stream, follower, ranges, min_interval, ends)
             await stream.end()
         finally:

@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
-from holdfast.web.refusals import Refusal, Refusals
+from holdfast.web.refusals import (
+    LATE,
+    METHOD_NOT_ALLOWED,
+    TOO_LARGE,
+    UNAUTHORIZED,
+    Refusal,
+    Refusals,
+)
 
 REFUSALS = Refusals(
+    UNAUTHORIZED,
+    METHOD_NOT_ALLOWED,
+    LATE,
+    TOO_LARGE,
     Refusal(
         400,
         ("invalid_value", "malformed", "invalid_area", "out_of_range", "not_one_step"),
@@ -13,15 +24,10 @@ REFUSALS = Refusals(
         "values[2] is 70000, outside 0..65535",
     ),
     Refusal(
-        401,
-        ("unauthorized",),
-        "The token is missing or unknown",
-        "unknown token",
-    ),
-    Refusal(
         403,
-        ("not_granted",),
-        "The token does not grant this memory or area, writes, or the management of sessions",
+        ("not_granted", "foreign_page"),
+        "The token does not grant this memory or area, writes, or the management of sessions; or "
+        "the request is from a page of another site",
         "area coils is not granted to edge-gateway",
     ),
     Refusal(
@@ -31,28 +37,10 @@ REFUSALS = Refusals(
         'no memory "plant_z"',
     ),
     Refusal(
-        405,
-        ("method_not_allowed",),
-        "The resource does not support this method",
-        "allowed: POST, OPTIONS",
-    ),
-    Refusal(
-        408,
-        ("timeout",),
-        "The body did not arrive in time; the connection is closed",
-        "the body is incomplete: 1024 bytes arrived in time",
-    ),
-    Refusal(
         409,
         ("mirrored",),
         "The range mirrors a device, and only its poller writes it",
         "1 from address 40 of holding_registers overlap a range that mirrors a device",
-    ),
-    Refusal(
-        413,
-        ("too_large",),
-        "The body is too large; the connection is closed",
-        "the body has more than 8388608 bytes",
     ),
     Refusal(
         502,
@@ -82,13 +70,9 @@ REFUSALS = Refusals(
     ),
 )
 
-EVERYWHERE = ("method_not_allowed",)
-BODY = ("malformed", "timeout", "too_large", "not_json")
-QUERY = ("malformed",)
 MEMORY = ("unknown_memory", "not_granted", "invalid_area", "out_of_range")
 """Refusals of a range by the memory access."""
 
-STREAM = ("busy",)
 VALUES = (
     "invalid_value",
     "mirrored",

@@ -5,12 +5,22 @@ from __future__ import annotations
 from holdfast.adapters.rest.refusals import REFUSALS
 from holdfast.protocol import LAST_ADDRESS, MAX_WORD
 from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS
-from holdfast.web.openapi import Schema, array_of, integer, object_of, ref
+from holdfast.web.schemas import (
+    COUNT,
+    NUMBER,
+    TEXT,
+    Schema,
+    array_of,
+    count,
+    integer,
+    map_of,
+    object_of,
+    ref,
+)
 
-COUNTER: Schema = {"type": "integer", "minimum": 0}
 AT_LEAST_ONE: Schema = {"type": "integer", "minimum": 1}
-TEXT: Schema = {"type": "string"}
 TEXT_OR_NULL: Schema = {"type": ["string", "null"]}
+NUMBER_OR_NULL: Schema = {"type": ["number", "null"]}
 REGISTER = integer(0, MAX_WORD)
 ADDRESS = integer(0, LAST_ADDRESS)
 
@@ -30,7 +40,7 @@ def _command(areas: tuple[str, ...], key: str, item: Schema) -> Schema:
     )
 
 
-COMMANDS: dict[str, Schema] = {
+_COMMANDS: dict[str, Schema] = {
     "Area": {"type": "string", "enum": list(AREAS)},
     "Command": {"oneOf": [ref("RegisterCommand"), ref("BitCommand"), ref("BoolsCommand")]},
     "Batch": _values(ref("Command")),
@@ -41,7 +51,7 @@ COMMANDS: dict[str, Schema] = {
     "EndSession": object_of({"id": SESSION_ID}),
 }
 
-ANSWERS: dict[str, Schema] = {
+_ANSWERS: dict[str, Schema] = {
     "Accepted": object_of(
         {"status": {"const": "accepted"}, "memory": TEXT, "written": AT_LEAST_ONE}
     ),
@@ -61,235 +71,175 @@ ANSWERS: dict[str, Schema] = {
     ),
     "EndedSession": object_of({"status": {"const": "ended"}, "id": SESSION_ID}),
     "Health": object_of({"status": {"const": "ok"}}),
-    "Refusal": {
-        "type": "object",
-        "required": ["status", "reason", "detail"],
-        "properties": {
+    "Refusal": object_of(
+        {
             "status": {"const": "rejected"},
             "reason": {"enum": list(REFUSALS.reasons)},
-            "command": COUNTER | {"description": "The index of the command in the batch"},
-            "index": COUNTER | {"description": "The index of the value in the command"},
+            "command": count("The index of the command in the batch"),
+            "index": count("The index of the value in the command"),
             "detail": TEXT | {"description": "A message for people"},
         },
-        "additionalProperties": False,
-    },
+        optional=("command", "index"),
+    ),
 }
 
-DIAGNOSTICS: dict[str, Schema] = {
+_LINK = object_of(
+    {
+        "requests": COUNT,
+        "replies": count("With the exceptions of devices"),
+        "exceptions": COUNT,
+        "timeouts": COUNT,
+        "failures": count("Invalid replies, lost connections"),
+        "refused_full": COUNT,
+        "refused_down": COUNT,
+        "coalesced": count("Answered by an equal read"),
+        "cached": count("Answered by an earlier reply"),
+        "withdrawn": count("Not sent: the client had gone"),
+        "waiting": COUNT,
+        "unexpected_replies": count("Without a request"),
+        "stray_bytes": count("Not part of an expected reply"),
+        "late_replies": COUNT,
+        "raised_timeouts": count("Requests with more than their timeout"),
+        "floods": count("Pauses because of stray bytes"),
+    }
+)
+_ADAPTER = object_of(
+    {
+        "state": {"enum": ["running", "failed", "stopped"]},
+        "restarts": COUNT,
+        "last_error": TEXT_OR_NULL,
+    },
+    is_open=True,
+)
+_MEMORY_FILE = object_of(
+    {
+        "failing": TEXT_OR_NULL | {"description": "Why the file can't be written at present"},
+        "stored_at": NUMBER_OR_NULL | {"description": "Unix time of the last step on the disk"},
+        "commits": COUNT,
+        "pending": count("Writes that are not on the disk"),
+        "refused": count("Writes refused by the disk"),
+        "last_commit_seconds": NUMBER,
+        "bytes": count("Size of the file"),
+    }
+)
+_LOG = object_of(
+    {
+        "phase": {"enum": ["starting", "running", "returning", "failed", "stopped"]},
+        "connected": {"type": "boolean"},
+        "contact_age": NUMBER_OR_NULL
+        | {"description": "Seconds since the contents were current for sure"},
+        "sequence": count("Of the last message applied"),
+        "lag": count("Messages that are not applied yet"),
+        "steps": count("Writes of this node"),
+        "unavailable": count("Writes that were not sent"),
+        "not_confirmed": COUNT,
+        "refused": COUNT,
+        "ignored": count("Messages that no node has sent"),
+        "nodes": {"type": "array"},
+    },
+    optional=("contact_age", "unavailable", "not_confirmed", "refused", "ignored"),
+    is_open=True,
+)
+_COPIES = object_of(
+    {"sent": COUNT, "failed": count("Failed attempts"), "dropped": COUNT, "waiting": COUNT},
+    is_open=True,
+)
+_AUDIT = object_of(
+    {
+        "lines": count("Lines written"),
+        "failed": count("Lines that are missing in the file"),
+        "waiting": count("With fail: closed, lines that wait"),
+        "failing": {
+            "type": "boolean",
+            "description": "Whether the file could not be written last time",
+        },
+        "copies": map_of(_COPIES, "By name of the receiver: syslog, journald"),
+    },
+    is_open=True,
+) | {"type": ["object", "null"]}
+_THREAD = object_of(
+    {
+        "heartbeat_age": NUMBER | {"description": "Seconds since the last heartbeat"},
+        "cpu": NUMBER_OR_NULL
+        | {"description": "Processor time in seconds, if the system provides it"},
+    }
+)
+_HEALTH = ["unknown", "ok", "error", "stale", "disabled", "standby"]
+
+_DIAGNOSTICS: dict[str, Schema] = {
     "Sessions": object_of({"sessions": array_of(ref("Session"))}),
     "Session": object_of(
         {
             "listener": TEXT,
-            "id": COUNTER,
+            "id": COUNT,
             "peer": TEXT,
-            "opened": {"type": "number", "description": "Unix time"},
-            "idle": {"type": "number", "description": "Seconds since the last request"},
+            "opened": NUMBER | {"description": "Unix time"},
+            "idle": NUMBER | {"description": "Seconds since the last request"},
             "role": TEXT | {"description": "The role in the certificate of a TLS peer"},
             "subject": TEXT | {"description": "The subject of that certificate"},
             "serial": TEXT | {"description": "The serial number of that certificate"},
         },
         optional=("role", "subject", "serial"),
     ),
-    "Memories": object_of({"memories": {"type": "object", "additionalProperties": ref("Memory")}}),
+    "Memories": object_of({"memories": map_of(ref("Memory"))}),
     "Memory": object_of(
         {
-            "areas": {
-                "type": "object",
-                "propertyNames": ref("Area"),
-                "additionalProperties": object_of({"start": COUNTER, "size": AT_LEAST_ONE}),
-            },
+            "areas": map_of(object_of({"start": COUNT, "size": AT_LEAST_ONE}))
+            | {"propertyNames": ref("Area")},
             "sealed": {
                 "type": "boolean",
                 "description": "Whether the memory refuses Modbus clients",
             },
-            "opened": COUNTER | {"description": "How many times the seal opened"},
-            "closed": COUNTER | {"description": "How many times it closed again"},
+            "opened": count("How many times the seal opened"),
+            "closed": count("How many times it closed again"),
         }
     ),
     "Stats": object_of(
         {
-            "uptime": {"type": "number", "description": "Seconds"},
-            "listeners": {
-                "type": "object",
-                "description": "By name of the listener: requests by function code, "
-                "exceptions by code, connections, frames",
-                "additionalProperties": {"type": "object"},
-            },
-            "devices": {
-                "type": "object",
-                "description": "By name of the device: health, seconds since the last "
-                "valid response, requests by outcome, polls, reads, packets forwarded",
-                "additionalProperties": {
-                    "type": "object",
-                    "required": ["health"],
-                    "properties": {
-                        "health": {
-                            "enum": ["unknown", "ok", "error", "stale", "disabled", "standby"]
-                        },
-                    },
-                },
-            },
-            "links": {
-                "type": "object",
-                "description": "By name of the link, or of the first device behind it: requests of "
-                "listeners by outcome, and how many wait for a reply",
-                "additionalProperties": object_of(
-                    {
-                        "requests": COUNTER,
-                        "replies": COUNTER | {"description": "With the exceptions of devices"},
-                        "exceptions": COUNTER,
-                        "timeouts": COUNTER,
-                        "failures": COUNTER | {"description": "Invalid replies, lost connections"},
-                        "refused_full": COUNTER,
-                        "refused_down": COUNTER,
-                        "coalesced": COUNTER | {"description": "Answered by an equal read"},
-                        "cached": COUNTER | {"description": "Answered by an earlier reply"},
-                        "withdrawn": COUNTER | {"description": "Not sent: the client had gone"},
-                        "waiting": COUNTER,
-                        "unexpected_replies": COUNTER | {"description": "Without a request"},
-                        "stray_bytes": COUNTER | {"description": "Not part of an expected reply"},
-                        "late_replies": COUNTER,
-                        "raised_timeouts": COUNTER
-                        | {"description": "Requests with more than their timeout"},
-                        "floods": COUNTER | {"description": "Pauses because of stray bytes"},
-                    }
-                ),
-            },
-            "adapters": {
-                "type": "object",
-                "description": "By name of the adapter: messages accepted, values written, "
-                "reads, refusals by reason, and its own status",
-                "additionalProperties": {
-                    "type": "object",
-                    "required": ["state", "restarts", "last_error"],
-                    "properties": {
-                        "state": {"enum": ["running", "failed", "stopped"]},
-                        "restarts": COUNTER,
-                        "last_error": TEXT_OR_NULL,
-                    },
-                },
-            },
-            "events_lost": COUNTER,
-            "log_dropped": COUNTER,
-            "memory_files": {
-                "type": "object",
-                "description": "By path: the files that keep memories",
-                "additionalProperties": {
-                    "type": "object",
-                    "required": [
-                        "failing",
-                        "stored_at",
-                        "commits",
-                        "pending",
-                        "refused",
-                        "last_commit_seconds",
-                        "bytes",
-                    ],
-                    "properties": {
-                        "failing": TEXT_OR_NULL
-                        | {"description": "Why the file can't be written at present"},
-                        "stored_at": {
-                            "type": ["number", "null"],
-                            "description": "Unix time of the last step on the disk",
-                        },
-                        "commits": COUNTER,
-                        "pending": COUNTER | {"description": "Writes that are not on the disk"},
-                        "refused": COUNTER | {"description": "Writes refused by the disk"},
-                        "last_commit_seconds": {"type": "number"},
-                        "bytes": COUNTER | {"description": "Size of the file"},
-                    },
-                    "additionalProperties": False,
-                },
-            },
-            "logs": {
-                "type": "object",
-                "description": "By name: the logs that memories are replicated through",
-                "additionalProperties": {
-                    "type": "object",
-                    "required": ["phase", "connected", "sequence", "lag", "steps", "nodes"],
-                    "properties": {
-                        "phase": {
-                            "enum": ["starting", "running", "returning", "failed", "stopped"]
-                        },
-                        "connected": {"type": "boolean"},
-                        "contact_age": {
-                            "type": ["number", "null"],
-                            "description": "Seconds since the contents were current for sure",
-                        },
-                        "sequence": COUNTER | {"description": "Of the last message applied"},
-                        "lag": COUNTER | {"description": "Messages that are not applied yet"},
-                        "steps": COUNTER | {"description": "Writes of this node"},
-                        "unavailable": COUNTER | {"description": "Writes that were not sent"},
-                        "not_confirmed": COUNTER,
-                        "refused": COUNTER,
-                        "ignored": COUNTER | {"description": "Messages that no node has sent"},
-                    },
-                },
-            },
-            "audit": {
-                "type": ["object", "null"],
-                "required": ["lines", "failed", "waiting", "failing", "copies"],
-                "properties": {
-                    "lines": COUNTER | {"description": "Lines written"},
-                    "failed": COUNTER | {"description": "Lines that are missing in the file"},
-                    "waiting": COUNTER | {"description": "With fail: closed, lines that wait"},
-                    "failing": {
-                        "type": "boolean",
-                        "description": "Whether the file could not be written last time",
-                    },
-                    "copies": {
-                        "type": "object",
-                        "description": "By name of the receiver: syslog, journald",
-                        "additionalProperties": {
-                            "type": "object",
-                            "required": ["sent", "failed", "dropped", "waiting"],
-                            "properties": {
-                                "sent": COUNTER,
-                                "failed": COUNTER | {"description": "Failed attempts"},
-                                "dropped": COUNTER,
-                                "waiting": COUNTER,
-                            },
-                        },
-                    },
-                },
-            },
-            "threads": {
-                "type": "object",
-                "description": "By name of the thread",
-                "additionalProperties": object_of(
-                    {
-                        "heartbeat_age": {
-                            "type": "number",
-                            "description": "Seconds since the last heartbeat",
-                        },
-                        "cpu": {
-                            "type": ["number", "null"],
-                            "description": "Processor time in seconds, if the system provides it",
-                        },
-                    }
-                ),
-            },
-            "certificates": {
-                "type": "object",
-                "description": "For each configured file, when its first certificate expires, in "
-                "Unix time",
-                "additionalProperties": {"type": "number"},
-            },
-            "revocation_lists": {
-                "type": "object",
-                "description": "For each configured file, the first nextUpdate, in Unix time",
-                "additionalProperties": {"type": "number"},
-            },
+            "uptime": NUMBER | {"description": "Seconds"},
+            "listeners": map_of(
+                {"type": "object"},
+                "By name of the listener: requests by function code, exceptions by code, "
+                "connections, frames",
+            ),
+            "devices": map_of(
+                object_of({"health": {"enum": _HEALTH}}, is_open=True),
+                "By name of the device: health, seconds since the last valid response, requests "
+                "by outcome, polls, reads, packets forwarded",
+            ),
+            "links": map_of(
+                _LINK,
+                "By name of the link, or of the first device behind it: requests of listeners by "
+                "outcome, and how many wait for a reply",
+            ),
+            "adapters": map_of(
+                _ADAPTER,
+                "By name of the adapter: messages accepted, values written, reads, refusals by "
+                "reason, and its own status",
+            ),
+            "events_lost": COUNT,
+            "log_dropped": COUNT,
+            "memory_files": map_of(_MEMORY_FILE, "By path: the files that keep memories"),
+            "logs": map_of(_LOG, "By name: the logs that memories are replicated through"),
+            "audit": _AUDIT,
+            "threads": map_of(_THREAD, "By name of the thread"),
+            "certificates": map_of(
+                NUMBER, "For each configured file, when its first certificate expires, in Unix time"
+            ),
+            "revocation_lists": map_of(
+                NUMBER, "For each configured file, the first nextUpdate, in Unix time"
+            ),
         }
     ),
-    "Mqtt": {
-        "type": "object",
-        "required": ["connected", "broker", "topics", "last_error"],
-        "properties": {
+    "Mqtt": object_of(
+        {
             "connected": {"type": "boolean"},
             "broker": TEXT_OR_NULL,
             "topics": {"type": "array"},
             "last_error": TEXT_OR_NULL,
         },
-    },
+        is_open=True,
+    ),
 }
+
+SCHEMAS = _COMMANDS | _ANSWERS | _DIAGNOSTICS

@@ -1,0 +1,442 @@
+//! One connection: its requests one after the other, and its end.
+
+use std::error::Error as _;
+use std::future::poll_fn;
+use std::io;
+use std::net::SocketAddr;
+use std::pin::{Pin, pin};
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::{Duration, Instant};
+
+use bytes::{Bytes, BytesMut};
+use hyper::body::{Body, Incoming};
+use hyper::header::EXPECT;
+use hyper::server::conn::http1;
+use hyper::service::service_fn;
+use hyper::{Request, Response, Version};
+use tokio::net::TcpStream;
+use tokio::sync::watch;
+use tokio::time::{Sleep, sleep_until, timeout};
+
+use super::exchange::{Abandoned, Exchange, Order, Output, RequestHead, ResponseHead};
+use super::inbox::Event;
+use super::line::{SharedLine, Verdict, Wire};
+use super::refusal::{Refusal, RefusalBody};
+use super::server::Front;
+use crate::server::Peer;
+use crate::server::admission::Ticket;
+use crate::server::event::Kind;
+use crate::server::listener::{Admitted, drain_for, set_options};
+use crate::server::secure::secured;
+use crate::server::stream::Stream;
+
+/// The largest header of a request, in bytes.
+const MAX_HEADER: usize = 65_536;
+
+/// How long a peer is read after its last response.
+const LINGER: Duration = Duration::from_secs(2);
+
+/// Bytes of a body that nobody wants, which are forgotten at once.
+const SKIPPED: usize = 65_536;
+
+/// The type of a TLS record that begins a handshake (RFC 8446, 5.1).
+const HANDSHAKE: u8 = 22;
+
+/// The longest pause of the alarm for the deadlines.
+const NEVER: Duration = Duration::from_secs(3600);
+
+/// How a connection ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum End {
+    /// The peer may still send: it is read to its end, so that it gets the last response.
+    Said,
+    Dropped,
+}
+
+/// Serves a connection to its end.
+pub(super) async fn serve(
+    front: Arc<Front>,
+    connection: Admitted<()>,
+    stop: watch::Receiver<bool>,
+) {
+    let Admitted { stream, peer, ticket, .. } = connection;
+    set_options(&stream);
+    let Some((stream, peer)) = begin(&front, (stream, peer), &ticket, stop.clone()).await else {
+        return;
+    };
+    let line = SharedLine::new(Arc::clone(&front), (ticket, peer), stream);
+    if converse(&front, &line, stop.clone()).await == End::Dropped {
+        return;
+    }
+    let Some(line) = line.into_line() else { return };
+    if line.has_unread() {
+        line.ticket.set_answered();
+        let mut stream = line.into_stream();
+        drain_for(LINGER, &mut *stream, stop, |_| ()).await;
+    }
+}
+
+/// Begins TLS if the front has it. `None`: the connection has ended.
+async fn begin(
+    front: &Front,
+    (stream, peer): (TcpStream, SocketAddr),
+    ticket: &Ticket,
+    mut stop: watch::Receiver<bool>,
+) -> Option<(Box<dyn Stream>, Peer)> {
+    let Some(tls) = front.tls() else {
+        return Some((Box::new(stream), peer.into()));
+    };
+    let mut first = [0];
+    let peeked = tokio::select! {
+        biased;
+        _ = stop.wait_for(|stop| *stop) => return None,
+        peeked = timeout(front.request_timeout, stream.peek(&mut first)) => peeked,
+    };
+    match peeked {
+        Err(_) => front.ended(Kind::TlsFailed("timeout"), peer.into()),
+        Ok(Ok(1)) if first == [HANDSHAKE] => {
+            let context = &front.context;
+            let limit = front.request_timeout;
+            let (stream, peer) =
+                secured(&tls, context, (stream, peer), ticket, limit, stop).await?;
+            return Some((Box::new(stream), peer));
+        }
+        Ok(Ok(1)) => {
+            front.ended(Kind::TlsFailed("not_tls"), peer.into());
+            refuse_plain(front, stream, first[0], stop).await;
+        }
+        Ok(_) => {}
+    }
+    None
+}
+
+/// Answers an HTTP request without TLS; closes anything else.
+async fn refuse_plain(
+    front: &Front,
+    mut stream: TcpStream,
+    first: u8,
+    stop: watch::Receiver<bool>,
+) {
+    if !first.is_ascii_alphabetic() {
+        return;
+    }
+    let refusal = front.refusal(Refusal::NotTls);
+    let head = b"HTTP/1.1 400 Bad Request\r\nconnection: close\r\n";
+    let response = [&head[..], &refusal.headers, b"\r\n", &refusal.body].concat();
+    if stream.try_write(&response).is_ok() {
+        drain_for(LINGER, &mut stream, stop, |_| ()).await;
+    }
+}
+
+/// Serves the requests of a connection.
+pub(super) async fn converse(
+    front: &Arc<Front>,
+    line: &SharedLine,
+    mut stop: watch::Receiver<bool>,
+) -> End {
+    let mut stopped = pin!(stop.wait_for(|stop| *stop));
+    let mut alarm = pin!(sleep_until((Instant::now() + NEVER).into()));
+    // hyper takes memory for each connection, so it begins with the first bytes.
+    let begun = poll_fn(|context| {
+        if stopped.as_mut().poll(context).is_ready() {
+            return Poll::Ready(false);
+        }
+        let mut line = line.lock();
+        if let Poll::Ready(read) = line.poll_fill(context) {
+            return Poll::Ready(read.is_ok_and(|len| len > 0));
+        }
+        line.poll_deadlines(context, alarm.as_mut()).map(|()| false)
+    });
+    if !begun.await {
+        return End::Dropped;
+    }
+    let service = service_fn(|request| answered(Arc::clone(front), line.clone(), request));
+    let connection = http1::Builder::new()
+        .half_close(true)
+        .max_header_size(MAX_HEADER)
+        .max_buf_size(MAX_HEADER + 8192)
+        .header_read_timeout(None)
+        .serve_connection(Wire(line.clone()), service);
+    let mut connection = pin!(connection);
+    let mut is_stopping = false;
+    poll_fn(|context| {
+        if !is_stopping && stopped.as_mut().poll(context).is_ready() {
+            is_stopping = true;
+            if !line.lock().is_busy() {
+                return Poll::Ready(End::Dropped);
+            }
+            connection.as_mut().graceful_shutdown();
+        }
+        if let Poll::Ready(ended) = connection.as_mut().poll(context) {
+            let is_said = ended.is_ok() || line.lock().refused.is_some();
+            return Poll::Ready(if is_said { End::Said } else { End::Dropped });
+        }
+        let mut line = line.lock();
+        if line.poll_ahead(context) || line.is_left() {
+            return Poll::Ready(End::Dropped);
+        }
+        line.poll_deadlines(context, alarm.as_mut()).map(|()| End::Dropped)
+    })
+    .await
+}
+
+impl super::line::Line {
+    /// Whether the client is gone, although its connection is only half closed.
+    fn is_left(&self) -> bool {
+        let leaves = |exchange: &Arc<Exchange>| self.front.leaving || exchange.leaves();
+        self.is_ended && self.is_busy() && self.exchange.as_ref().is_some_and(leaves)
+    }
+
+    /// Ready when a deadline has passed: the connection ends.
+    fn poll_deadlines(
+        &mut self,
+        context: &mut Context<'_>,
+        mut alarm: Pin<&mut Sleep>,
+    ) -> Poll<()> {
+        loop {
+            let due = self.due().unwrap_or_else(|| Instant::now() + NEVER);
+            if alarm.deadline().into_std() > due {
+                alarm.as_mut().reset(due.into());
+            }
+            if alarm.as_mut().poll(context).is_pending() {
+                return Poll::Pending;
+            }
+            match self.look(Instant::now()) {
+                Verdict::Stay => {
+                    let next = self.due().unwrap_or_else(|| Instant::now() + NEVER);
+                    alarm.as_mut().reset(next.into());
+                }
+                Verdict::Drop(kind) => {
+                    self.front.ended(kind, self.peer.clone());
+                    return Poll::Ready(());
+                }
+                Verdict::DropAgain => return Poll::Ready(()),
+            }
+        }
+    }
+}
+
+/// Hands a request to its handler, and returns the response. hyper reads on once this returns the future,
+/// so it notes what is read next before.
+fn answered(
+    front: Arc<Front>,
+    line: SharedLine,
+    request: Request<Incoming>,
+) -> impl Future<Output = Result<Response<Output>, Abandoned>> {
+    let exchange = front.exchange();
+    let len = request.body().size_hint().exact();
+    let is_ambiguous = line.lock().begin(Arc::clone(&exchange), len);
+    async move {
+        if is_ambiguous {
+            front.ended(Kind::BrokenRequest, line.lock().peer.clone());
+            return Ok(refused(&front, exchange, line));
+        }
+        handled(front, line, exchange, request).await
+    }
+}
+
+async fn handled(
+    front: Arc<Front>,
+    line: SharedLine,
+    exchange: Arc<Exchange>,
+    request: Request<Incoming>,
+) -> Result<Response<Output>, Abandoned> {
+    let (parts, body) = request.into_parts();
+    let len = body.size_hint().exact();
+    let expects = parts.headers.contains_key(EXPECT);
+    let is_old = parts.version == Version::HTTP_10;
+    let (is_here, peer) = {
+        let line = line.lock();
+        (!expects && len.is_some_and(|len| line.has(len)), line.peer.clone())
+    };
+    let mut upload = Upload {
+        line: line.clone(),
+        body,
+        received: BytesMut::new(),
+        is_over: false,
+        is_cut: false,
+    };
+    let mut handled = Handled { exchange: Arc::clone(&exchange), is_answered: false };
+    let whole = match len {
+        Some(0) => {
+            upload.is_over = true;
+            Some(Bytes::new())
+        }
+        Some(_) if is_here => upload.whole().await,
+        _ => None,
+    };
+    let head = Box::new(RequestHead { parts, peer });
+    exchange.tell(Event::Request { exchange: Arc::clone(&exchange), head, body: whole });
+    let parts = (Arc::clone(&exchange), line.clone());
+    let response = match upload.ordered(&front, &exchange).await {
+        Answered::Whole { head, body, mut closes } => {
+            closes |= is_old || !upload.skipped(&front, &exchange, closes || expects).await;
+            Output::whole(parts, head, body, closes)
+        }
+        Answered::Stream(head) => Output::stream(parts, head),
+        Answered::Nothing => return Err(Abandoned),
+    };
+    line.lock().note_answering();
+    handled.is_answered = true;
+    Ok(response)
+}
+
+/// Refuses a request that hyper accepts.
+fn refused(front: &Front, exchange: Arc<Exchange>, line: SharedLine) -> Response<Output> {
+    let RefusalBody { headers, body } = front.refusal(Refusal::NotHttp);
+    let headers = headers.split(|byte| *byte == b'\n').filter_map(|line| {
+        let colon = line.iter().position(|byte| *byte == b':')?;
+        Some((&line[..colon], line[colon + 1..].trim_ascii()))
+    });
+    let head = ResponseHead::new(400, headers).expect("the headers of a refusal are valid");
+    line.lock().note_answering();
+    Output::whole((exchange, line.clone()), head, Bytes::copy_from_slice(body), true)
+}
+
+/// Tells the handler that the client is gone if the connection ends before there is a response.
+struct Handled {
+    exchange: Arc<Exchange>,
+    is_answered: bool,
+}
+
+impl Drop for Handled {
+    fn drop(&mut self) {
+        if !self.is_answered {
+            self.exchange.finish(false);
+        }
+    }
+}
+
+enum Answered {
+    Whole { head: ResponseHead, body: Bytes, closes: bool },
+    Stream(ResponseHead),
+    Nothing,
+}
+
+/// The body of a request, as far as the handler wants it.
+struct Upload {
+    line: SharedLine,
+    body: Incoming,
+    received: BytesMut,
+    is_over: bool,
+    is_cut: bool,
+}
+
+/// Why a body can't be had.
+enum NoBody {
+    TooLarge,
+    /// It is not HTTP.
+    Broken,
+    /// The connection has ended.
+    Cut,
+}
+
+impl Upload {
+    /// The body, which has arrived with the header. `None` if the connection breaks.
+    async fn whole(&mut self) -> Option<Bytes> {
+        self.receive(usize::MAX).await.ok()
+    }
+
+    /// Receives until the end, at most `most` bytes.
+    async fn receive(&mut self, most: usize) -> Result<Bytes, NoBody> {
+        if self.is_cut {
+            // hyper reports an error once, and then an end.
+            return Err(NoBody::Cut);
+        }
+        while !self.is_over {
+            match poll_fn(|context| Pin::new(&mut self.body).poll_frame(context)).await {
+                Some(Ok(frame)) => {
+                    if let Ok(data) = frame.into_data() {
+                        self.received.extend_from_slice(&data);
+                    }
+                    if self.received.len() > most {
+                        return Err(NoBody::TooLarge);
+                    }
+                }
+                Some(Err(error)) => {
+                    self.is_cut = true;
+                    return Err(no_body(&error));
+                }
+                None => {
+                    self.is_over = true;
+                    self.line.lock().note_arrived();
+                }
+            }
+        }
+        Ok(std::mem::take(&mut self.received).freeze())
+    }
+
+    /// Carries out what the handler wants, until it has the response.
+    async fn ordered(&mut self, front: &Front, exchange: &Exchange) -> Answered {
+        let number = exchange.number;
+        let mut wanted = None;
+        loop {
+            let order = match wanted {
+                None => exchange.next().await,
+                Some(most) => tokio::select! {
+                    biased;
+                    order = exchange.next() => order,
+                    received = self.receive(most) => {
+                        wanted = None;
+                        exchange.tell(match received {
+                            Ok(body) => Event::Body { number, body },
+                            Err(NoBody::TooLarge) => Event::TooLarge { number },
+                            Err(NoBody::Broken) => {
+                                front.ended(Kind::BrokenRequest, self.line.lock().peer.clone());
+                                Event::Broken { number }
+                            }
+                            Err(NoBody::Cut) => Event::Gone { number },
+                        });
+                        continue;
+                    }
+                },
+            };
+            match order {
+                Order::Receive(most) => wanted = Some(most),
+                Order::Late => {
+                    wanted = None;
+                    exchange.tell(Event::Late { number, received: self.received.len() });
+                }
+                Order::Respond { head, body, closes } => {
+                    return Answered::Whole { head, body, closes };
+                }
+                Order::Begin(head) => return Answered::Stream(head),
+                Order::Abandon => return Answered::Nothing,
+            }
+        }
+    }
+
+    /// Reads the rest of the request, so that the next one can follow. Returns whether it is read.
+    async fn skipped(&mut self, front: &Front, exchange: &Exchange, closes: bool) -> bool {
+        while !self.is_over && !closes {
+            self.received.clear();
+            tokio::select! {
+                biased;
+                order = exchange.next() => {
+                    if matches!(order, Order::Late) {
+                        return false;
+                    }
+                }
+                received = self.receive(SKIPPED) => match received {
+                    Ok(_) | Err(NoBody::TooLarge) => {}
+                    Err(NoBody::Broken) => {
+                        front.ended(Kind::BrokenRequest, self.line.lock().peer.clone());
+                        return false;
+                    }
+                    Err(NoBody::Cut) => return false,
+                },
+            }
+        }
+        self.is_over
+    }
+}
+
+/// Why hyper has no more of a body. The kinds of errors are those of its decoder.
+fn no_body(error: &hyper::Error) -> NoBody {
+    let cause = error.source().and_then(|cause| cause.downcast_ref::<io::Error>());
+    match cause.map(io::Error::kind) {
+        Some(io::ErrorKind::InvalidInput | io::ErrorKind::InvalidData) => NoBody::Broken,
+        _ => NoBody::Cut,
+    }
+}

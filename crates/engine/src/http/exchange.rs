@@ -1,0 +1,323 @@
+//! One request and its response, between the thread of its connection and the thread of its handler.
+
+use std::collections::VecDeque;
+use std::future::poll_fn;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll, Waker};
+
+use bytes::Bytes;
+use hyper::body::{Body, Frame, SizeHint};
+use hyper::header::{CONNECTION, CONTENT_LENGTH, HeaderName, HeaderValue};
+use hyper::http::request::Parts;
+use hyper::{HeaderMap, Response, StatusCode};
+
+use super::inbox::{Event, Inbox};
+use super::line::SharedLine;
+use crate::server::Peer;
+
+/// A request without its body.
+#[derive(Debug)]
+pub struct RequestHead {
+    pub parts: Parts,
+    pub peer: Peer,
+}
+
+/// A response without its body.
+#[derive(Debug)]
+pub struct ResponseHead {
+    pub status: StatusCode,
+    pub headers: HeaderMap,
+}
+
+impl ResponseHead {
+    /// # Errors
+    /// The name or value of a header, or the status, is invalid.
+    pub fn new<'a>(
+        status: u16,
+        headers: impl Iterator<Item = (&'a [u8], &'a [u8])>,
+    ) -> Result<ResponseHead, hyper::http::Error> {
+        let mut head =
+            ResponseHead { status: StatusCode::from_u16(status)?, headers: HeaderMap::new() };
+        for (name, value) in headers {
+            let name = HeaderName::from_bytes(name)?;
+            head.headers.append(name, HeaderValue::from_bytes(value)?);
+        }
+        Ok(head)
+    }
+
+    fn response(self, output: Output) -> Response<Output> {
+        let mut response = Response::new(output);
+        *response.status_mut() = self.status;
+        *response.headers_mut() = self.headers;
+        response
+    }
+}
+
+/// What a handler wants of the connection.
+#[derive(Debug)]
+pub(super) enum Order {
+    /// The body of the request, of at most this many bytes.
+    Receive(usize),
+    /// To answer with this response. The connection ends after it if `closes`.
+    Respond { head: ResponseHead, body: Bytes, closes: bool },
+    /// To answer with a stream.
+    Begin(ResponseHead),
+    /// Nothing more: there will be no response.
+    Abandon,
+    /// From the connection itself: the rest of the request did not arrive in time.
+    Late,
+}
+
+#[derive(Debug)]
+pub struct Exchange {
+    pub number: u64,
+    inbox: Arc<Inbox>,
+    state: Mutex<State>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    orders: VecDeque<Order>,
+    /// Data of a stream that hyper has not taken.
+    data: Option<Bytes>,
+    /// Whether hyper has taken data that the socket has not.
+    is_unsent: bool,
+    /// Whether the handler waits for room.
+    is_awaited: bool,
+    /// Whether the stream is complete, once it has ended.
+    end: Option<bool>,
+    /// Whether a peer that sends no more is gone.
+    leaves: bool,
+    /// Whether the connection has ended, or has sent the response.
+    is_over: bool,
+    waker: Option<Waker>,
+}
+
+/// What became of data for a stream.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sent {
+    Taken,
+    /// The data before are not sent: `Event::Room` tells when they are.
+    Full,
+    /// The client is gone.
+    Gone,
+}
+
+impl Exchange {
+    pub(super) fn new(number: u64, inbox: Arc<Inbox>) -> Arc<Exchange> {
+        Arc::new(Exchange { number, inbox, state: Mutex::default() })
+    }
+
+    /// Asks for the body of the request.
+    pub fn receive(&self, most: usize) {
+        self.order(Order::Receive(most));
+    }
+
+    /// Answers the request.
+    pub fn respond(&self, mut head: ResponseHead, body: Bytes, closes: bool) {
+        let has_body = !matches!(head.status, StatusCode::NO_CONTENT | StatusCode::NOT_MODIFIED);
+        if has_body && !head.headers.contains_key(CONTENT_LENGTH) {
+            head.headers.insert(CONTENT_LENGTH, HeaderValue::from(body.len()));
+        }
+        self.order(Order::Respond { head, body, closes });
+    }
+
+    /// Answers the request with a stream. A client that sends no more is gone from here on, because a
+    /// stream has no other end.
+    pub fn begin(&self, head: ResponseHead) {
+        self.state().leaves = true;
+        self.order(Order::Begin(head));
+    }
+
+    /// Sends data of a stream.
+    pub fn send(&self, data: Bytes) -> Sent {
+        let mut state = self.state();
+        if state.is_over {
+            return Sent::Gone;
+        }
+        if state.data.is_some() || state.is_unsent {
+            state.is_awaited = true;
+            return Sent::Full;
+        }
+        state.data = Some(data);
+        wake(state);
+        Sent::Taken
+    }
+
+    /// Ends a stream. One that is not complete is cut off, so that its client notices.
+    pub fn end(&self, is_complete: bool) {
+        let mut state = self.state();
+        state.end.get_or_insert(is_complete);
+        wake(state);
+    }
+
+    /// There will be no response: the connection is cut off, unless there has been one.
+    pub fn abandon(&self) {
+        self.order(Order::Abandon);
+    }
+
+    pub(super) fn leaves(&self) -> bool {
+        self.state().leaves
+    }
+
+    pub(super) fn order(&self, order: Order) {
+        let mut state = self.state();
+        state.orders.push_back(order);
+        wake(state);
+    }
+
+    /// The next order of the handler.
+    pub(super) async fn next(&self) -> Order {
+        poll_fn(|context| {
+            let mut state = self.state();
+            match state.orders.pop_front() {
+                Some(order) => Poll::Ready(order),
+                None => {
+                    state.waker = Some(context.waker().clone());
+                    Poll::Pending
+                }
+            }
+        })
+        .await
+    }
+
+    pub(super) fn tell(&self, event: Event) {
+        self.inbox.push(event);
+    }
+
+    /// The socket has taken all that hyper has.
+    pub(super) fn flushed(&self) {
+        let mut state = self.state();
+        state.is_unsent = false;
+        if state.is_awaited && state.data.is_none() {
+            state.is_awaited = false;
+            drop(state);
+            self.tell(Event::Room { number: self.number });
+        }
+    }
+
+    /// The connection is done with it. If the response is not complete, the client is gone.
+    pub(super) fn finish(&self, is_complete: bool) {
+        let mut state = self.state();
+        if !std::mem::replace(&mut state.is_over, true) && !is_complete {
+            drop(state);
+            self.tell(Event::Gone { number: self.number });
+        }
+    }
+
+    fn poll_data(&self, context: &Context<'_>) -> Poll<Option<Result<Bytes, Abandoned>>> {
+        let mut state = self.state();
+        if let Some(data) = state.data.take() {
+            state.is_unsent = true;
+            return Poll::Ready(Some(Ok(data)));
+        }
+        // The handler may be dropped without a word.
+        let is_abandoned = matches!(state.orders.front(), Some(Order::Abandon));
+        match state.end {
+            Some(true) => return Poll::Ready(None),
+            Some(false) => return Poll::Ready(Some(Err(Abandoned))),
+            None if is_abandoned => return Poll::Ready(Some(Err(Abandoned))),
+            None => {}
+        }
+        state.waker = Some(context.waker().clone());
+        Poll::Pending
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Wakes the task of the connection.
+fn wake(mut state: MutexGuard<'_, State>) {
+    let waker = state.waker.take();
+    drop(state);
+    if let Some(waker) = waker {
+        waker.wake();
+    }
+}
+
+/// The handler has left its request without a response, or with half of one.
+#[derive(Debug, thiserror::Error)]
+#[error("the response is cut off")]
+pub(super) struct Abandoned;
+
+/// The body of a response. When it is dropped, the response is complete, or the connection is broken.
+pub(super) struct Output {
+    exchange: Arc<Exchange>,
+    line: SharedLine,
+    content: Content,
+}
+
+enum Content {
+    Whole(Option<Bytes>),
+    Stream,
+    Ended,
+}
+
+impl Output {
+    pub(super) fn whole(
+        (exchange, line): (Arc<Exchange>, SharedLine),
+        mut head: ResponseHead,
+        body: Bytes,
+        closes: bool,
+    ) -> Response<Output> {
+        if closes {
+            head.headers.insert(CONNECTION, HeaderValue::from_static("close"));
+        }
+        let content = if body.is_empty() { Content::Ended } else { Content::Whole(Some(body)) };
+        head.response(Output { exchange, line, content })
+    }
+
+    pub(super) fn stream(
+        (exchange, line): (Arc<Exchange>, SharedLine),
+        head: ResponseHead,
+    ) -> Response<Output> {
+        head.response(Output { exchange, line, content: Content::Stream })
+    }
+}
+
+impl Body for Output {
+    type Data = Bytes;
+    type Error = Abandoned;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, Self::Error>>> {
+        let data = match &mut self.content {
+            Content::Whole(body) => body.take().map(Ok),
+            Content::Stream => match self.exchange.poll_data(context) {
+                Poll::Ready(data) => data,
+                Poll::Pending => return Poll::Pending,
+            },
+            Content::Ended => None,
+        };
+        if data.is_none() || matches!(self.content, Content::Whole(_)) {
+            self.content = Content::Ended;
+        }
+        Poll::Ready(data.map(|data| data.map(Frame::data)))
+    }
+
+    fn is_end_stream(&self) -> bool {
+        matches!(self.content, Content::Ended)
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        match &self.content {
+            Content::Whole(Some(body)) => SizeHint::with_exact(body.len() as u64),
+            Content::Whole(None) | Content::Ended => SizeHint::with_exact(0),
+            Content::Stream => SizeHint::default(),
+        }
+    }
+}
+
+impl Drop for Output {
+    fn drop(&mut self) {
+        // hyper drops a body without asking for it in the response to HEAD.
+        let is_complete = !matches!(self.content, Content::Stream);
+        self.exchange.finish(is_complete);
+        self.line.lock().note_answered();
+    }
+}

@@ -1,0 +1,24 @@
+//! HTTP/1.1 (RFC 9112): hyper parses requests and writes responses. This module admits peers, limits
+//! what they may take and how long, and hands requests to an event loop in another thread.
+//!
+//! * A request is handed over with its body if both have arrived together; otherwise the handler asks
+//!   for the body, after it has judged the rest.
+//! * hyper gets the bytes of one request at a time. So what becomes of bytes does not depend on how
+//!   the network has cut or joined them, and requests that were sent ahead wait as bytes.
+//! * A connection has three deadlines: for its request to arrive, for its response to be taken, and
+//!   for its next request to begin.
+
+mod connection;
+#[cfg(test)]
+mod cuts;
+mod exchange;
+mod inbox;
+mod line;
+mod portion;
+mod refusal;
+mod server;
+
+pub use exchange::{Exchange, RequestHead, ResponseHead, Sent};
+pub use inbox::Event;
+pub use refusal::{Refusal, RefusalBody};
+pub use server::{HttpServer, HttpSettings, bind};

@@ -1,0 +1,231 @@
+//! Which received bytes belong to the current request. hyper judges whether they are valid; here, only
+//! their end matters.
+
+/// What of a request is still to come.
+#[derive(Debug)]
+pub(super) enum Portion {
+    /// Its header.
+    Head(HeadEnd),
+    /// The rest of a body with a length: this many bytes.
+    Body(u64),
+    /// The rest of a body in chunks.
+    Chunks(ChunksEnd),
+}
+
+impl Portion {
+    /// How many of these bytes belong to the request. `bytes` are those of the call before that were not
+    /// [skipped](Portion::skip), and more.
+    pub(super) fn len(&mut self, bytes: &[u8]) -> usize {
+        match self {
+            Portion::Head(end) => end.find(bytes),
+            Portion::Body(left) => bytes.len().min(usize::try_from(*left).unwrap_or(usize::MAX)),
+            Portion::Chunks(end) => end.find(bytes),
+        }
+    }
+
+    /// Leaves out the first bytes, which hyper has read.
+    pub(super) fn skip(&mut self, len: usize) {
+        match self {
+            Portion::Head(end) => end.search.skip(len),
+            Portion::Body(left) => *left -= len as u64,
+            Portion::Chunks(end) => end.search.skip(len),
+        }
+    }
+
+    /// Whether all of the request has been read.
+    pub(super) fn is_over(&self) -> bool {
+        match self {
+            Portion::Head(_) => false,
+            Portion::Body(left) => *left == 0,
+            Portion::Chunks(end) => end.is_over && end.search.found == Some(0),
+        }
+    }
+}
+
+/// How far bytes were searched.
+#[derive(Debug, Default)]
+struct Search {
+    searched: usize,
+    found: Option<usize>,
+}
+
+impl Search {
+    fn skip(&mut self, len: usize) {
+        self.searched = self.searched.saturating_sub(len);
+        self.found = self.found.map(|found| found - len);
+    }
+}
+
+/// Finds the end of a header: an empty line. A CR before a line feed does not count.
+#[derive(Debug, Default)]
+pub(super) struct HeadEnd {
+    search: Search,
+    /// The beginning of the line, in lower case, without CR.
+    line: Vec<u8>,
+    has_lines: bool,
+    has_length: bool,
+    has_coding: bool,
+}
+
+const LENGTH: &[u8] = b"content-length:";
+const CODING: &[u8] = b"transfer-encoding:";
+
+impl HeadEnd {
+    fn find(&mut self, bytes: &[u8]) -> usize {
+        if self.search.found == Some(0) && !self.has_lines {
+            // hyper ignores empty lines before a request: there was no header so far.
+            *self = HeadEnd::default();
+        }
+        while self.search.found.is_none()
+            && let Some(byte) = bytes.get(self.search.searched)
+        {
+            self.search.searched += 1;
+            match byte {
+                b'\n' if self.line.is_empty() => self.search.found = Some(self.search.searched),
+                b'\n' => self.end_line(),
+                b'\r' => {}
+                _ if self.line.len() < CODING.len() => self.line.push(byte.to_ascii_lowercase()),
+                _ => {}
+            }
+        }
+        self.search.found.unwrap_or(bytes.len())
+    }
+
+    fn end_line(&mut self) {
+        self.has_lines = true;
+        self.has_length |= self.line.starts_with(LENGTH);
+        self.has_coding |= self.line.starts_with(CODING);
+        self.line.clear();
+    }
+
+    /// Whether the header has both Content-Length and Transfer-Encoding. hyper would accept it, but
+    /// proxies disagree about its end: request smuggling (RFC 9112, 6.1 and 11.2).
+    pub(super) fn is_ambiguous(&self) -> bool {
+        self.has_length && self.has_coding
+    }
+}
+
+/// Finds the end of a body in chunks (RFC 9112, 7.1).
+#[derive(Debug, Default)]
+pub(super) struct ChunksEnd {
+    search: Search,
+    part: Part,
+    is_over: bool,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Part {
+    /// The size of a chunk, so far.
+    Size(u64),
+    /// What follows the size in its line.
+    Extension(u64),
+    /// Data, and the line end behind them.
+    Data(u64),
+    /// A line of the trailer: its length so far.
+    Trailer(usize),
+}
+
+impl Default for Part {
+    fn default() -> Part {
+        Part::Size(0)
+    }
+}
+
+impl ChunksEnd {
+    fn find(&mut self, bytes: &[u8]) -> usize {
+        while self.search.found.is_none() && self.search.searched < bytes.len() {
+            let rest = &bytes[self.search.searched..];
+            self.search.searched += self.pass(rest);
+            if self.is_over {
+                self.search.found = Some(self.search.searched);
+            }
+        }
+        self.search.found.unwrap_or(bytes.len())
+    }
+
+    /// Passes at least one byte. Returns how many.
+    fn pass(&mut self, bytes: &[u8]) -> usize {
+        const LINE_END: u64 = 2;
+        let byte = bytes[0];
+        self.part = match self.part {
+            Part::Data(left) => {
+                let passed = bytes.len().min(usize::try_from(left).unwrap_or(usize::MAX));
+                let left = left - passed as u64;
+                self.part = if left == 0 { Part::Size(0) } else { Part::Data(left) };
+                return passed;
+            }
+            Part::Size(size) | Part::Extension(size) if byte == b'\n' => match size {
+                0 => Part::Trailer(0),
+                size => Part::Data(size.saturating_add(LINE_END)),
+            },
+            Part::Size(size) => match char::from(byte).to_digit(16) {
+                Some(digit) => Part::Size(size.saturating_mul(16).saturating_add(digit.into())),
+                None => Part::Extension(size),
+            },
+            Part::Extension(size) => Part::Extension(size),
+            Part::Trailer(len) => match byte {
+                b'\n' if len == 0 => {
+                    self.is_over = true;
+                    Part::Trailer(0)
+                }
+                b'\n' => Part::Trailer(0),
+                b'\r' => Part::Trailer(len),
+                _ => Part::Trailer(len + 1),
+            },
+        };
+        1
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Gives bytes in all ways to cut them in two, and returns what belongs to the request.
+    fn ends(portion: impl Fn() -> Portion, bytes: &[u8]) -> usize {
+        let mut lens = Vec::new();
+        for cut in 0..=bytes.len() {
+            let mut portion = portion();
+            let first = portion.len(&bytes[..cut]);
+            portion.skip(first);
+            lens.push(first + portion.len(&bytes[first..]));
+        }
+        assert!(lens.iter().all(|len| *len == lens[0]), "{lens:?}");
+        lens[0]
+    }
+
+    #[test]
+    fn a_header_ends_with_an_empty_line() {
+        for header in ["GET / HTTP/1.1\r\nHost: x\r\n\r\n", "GET / HTTP/1.1\nHost: x\n\n"] {
+            let bytes = format!("{header}GET /next");
+            let head = || Portion::Head(HeadEnd::default());
+            assert_eq!(ends(head, bytes.as_bytes()), header.len());
+        }
+    }
+
+    #[test]
+    fn a_body_in_chunks_ends_with_its_trailer() {
+        for body in [
+            "0\r\n\r\n",
+            "3\r\nabc\r\n0\r\n\r\n",
+            "3;x=\"1\"\r\n0\r\n\r\n1A\r\nabcdefghijklmnopqrstuvwxyz\r\n000\r\nX: y\r\n\r\n",
+        ] {
+            let bytes = format!("{body}GET / HTTP/1.1\r\n\r\n");
+            let chunks = || Portion::Chunks(ChunksEnd::default());
+            assert_eq!(ends(chunks, bytes.as_bytes()), body.len());
+        }
+    }
+
+    #[test]
+    fn a_length_beside_a_coding_is_noticed_wherever_it_is_cut() {
+        let header =
+            b"POST / HTTP/1.1\r\nTransfer-encoding: chunked\r\nX: y\r\nCONTENT-LENGTH: 5\r\n\r\n";
+        for cut in 0..header.len() {
+            let mut end = HeadEnd::default();
+            end.find(&header[..cut]);
+            end.search.skip(cut);
+            end.find(&header[cut..]);
+            assert!(end.is_ambiguous());
+        }
+    }
+}

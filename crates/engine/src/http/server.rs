@@ -1,0 +1,246 @@
+//! A server of HTTP: its listening socket, its thread, and its end.
+
+use std::io;
+use std::net::{IpAddr, TcpListener};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use ipnet::IpNet;
+use tokio::runtime::{Builder, Runtime};
+use tokio::sync::watch;
+use tokio::time::sleep;
+
+use super::connection::serve;
+use super::exchange::Exchange;
+use super::inbox::{Event, Inbox};
+use super::refusal::{Refusal, RefusalBody};
+use crate::heartbeat::Heartbeat;
+use crate::own_threads::OwnThreads;
+use crate::server::Peer;
+use crate::server::admission::ConnectionLimits;
+use crate::server::counters::ConnectionCounters;
+use crate::server::event::{self, Events, Kind, Reporter, Verbosity};
+use crate::server::listener::{Admitted, ListenerContext, Service, accept};
+use crate::server::live::Live;
+use crate::tls::server::ServerTls;
+use crate::wake::Wakes;
+
+pub use crate::server::listener::bind_tcp as bind;
+
+/// How often the end of the last connection is looked for when the server ends.
+const ENDING_PERIOD: Duration = Duration::from_millis(5);
+
+#[derive(Debug)]
+pub struct HttpSettings {
+    pub name: String,
+    /// A socket that listens.
+    pub socket: TcpListener,
+    /// The networks of the clients.
+    pub sources: Vec<IpNet>,
+    pub limits: ConnectionLimits,
+    /// For a request to arrive, and for a response to be taken.
+    pub request_timeout: Duration,
+    /// For the next request to begin.
+    pub idle_timeout: Duration,
+    /// Whether a client that sends no more is gone.
+    pub leaving: bool,
+    pub tls: Option<Arc<ServerTls>>,
+    /// In the order of [`Refusal::ALL`].
+    pub refusals: [RefusalBody; Refusal::ALL.len()],
+}
+
+/// What the connections of a server have in common.
+pub(super) struct Front {
+    pub(super) context: Arc<ListenerContext>,
+    inbox: Arc<Inbox>,
+    sources: Vec<IpNet>,
+    pub(super) request_timeout: Duration,
+    pub(super) idle_timeout: Duration,
+    pub(super) leaving: bool,
+    tls: Option<Live<ServerTls>>,
+    refusals: [RefusalBody; Refusal::ALL.len()],
+    next: AtomicU64,
+}
+
+impl Front {
+    /// Also returns the socket.
+    pub(super) fn new(
+        settings: HttpSettings,
+        inbox: Arc<Inbox>,
+        reporter: Reporter,
+    ) -> (Front, TcpListener) {
+        let context = ListenerContext::new(&settings.name, Some(settings.limits), reporter, None);
+        let front = Front {
+            context: Arc::new(context),
+            inbox,
+            sources: settings.sources,
+            request_timeout: settings.request_timeout,
+            idle_timeout: settings.idle_timeout,
+            leaving: settings.leaving,
+            tls: settings.tls.map(Live::from),
+            refusals: settings.refusals,
+            next: AtomicU64::new(0),
+        };
+        (front, settings.socket)
+    }
+
+    pub(super) fn tls(&self) -> Option<Arc<ServerTls>> {
+        self.tls.as_ref().map(Live::get)
+    }
+
+    pub(super) fn refusal(&self, refusal: Refusal) -> &RefusalBody {
+        &self.refusals[refusal as usize]
+    }
+
+    /// Counts and reports the end of a connection, or what is wrong with it.
+    pub(super) fn ended(&self, kind: Kind, peer: Peer) {
+        self.context.ended(kind, peer);
+        self.inbox.wake();
+    }
+
+    /// A new exchange.
+    pub(super) fn exchange(&self) -> Arc<Exchange> {
+        Exchange::new(self.next.fetch_add(1, Ordering::Relaxed), Arc::clone(&self.inbox))
+    }
+}
+
+impl Service for Front {
+    type PeerRights = ();
+
+    fn rights(&self, peer: IpAddr) -> Option<Arc<()>> {
+        let peer = peer.to_canonical();
+        self.sources.iter().any(|network| network.contains(&peer)).then(|| Arc::new(()))
+    }
+
+    fn ends(&self, _before: &Front, _peer: &Peer) -> Option<Kind> {
+        None
+    }
+
+    async fn serve(
+        self: Arc<Self>,
+        _live: Arc<Live<Front>>,
+        _context: Arc<ListenerContext>,
+        connection: Admitted<()>,
+        stop: watch::Receiver<bool>,
+    ) {
+        serve(self, connection, stop).await;
+    }
+}
+
+/// A server that runs until it is closed or dropped.
+pub struct HttpServer {
+    front: Arc<Front>,
+    stop: watch::Sender<bool>,
+    abort: watch::Sender<bool>,
+    threads: OwnThreads,
+    heartbeat: Arc<Heartbeat>,
+    events: Events,
+    wakes: Mutex<Option<Wakes>>,
+}
+
+impl HttpServer {
+    pub const HTTP_10: hyper::Version = hyper::Version::HTTP_10;
+
+    /// Serves in a thread of its own.
+    ///
+    /// # Errors
+    /// The system has no sockets or threads left.
+    pub fn start(settings: HttpSettings) -> io::Result<HttpServer> {
+        let (inbox, wakes) = Inbox::new()?;
+        let (reporter, events) = event::channel(Verbosity::Refusals);
+        settings.socket.set_nonblocking(true)?;
+        let thread = format!("http-{}", settings.name);
+        let (front, socket) = Front::new(settings, Arc::new(inbox), reporter);
+        let front = Arc::new(front);
+        let server = HttpServer {
+            front,
+            stop: watch::Sender::new(false),
+            abort: watch::Sender::new(false),
+            threads: OwnThreads::default(),
+            heartbeat: Arc::new(Heartbeat::new(thread.clone())),
+            events,
+            wakes: Mutex::new(Some(wakes)),
+        };
+        let runtime = Builder::new_current_thread().enable_io().enable_time().build()?;
+        server.run(thread, runtime, socket)?;
+        Ok(server)
+    }
+
+    fn run(&self, name: String, runtime: Runtime, socket: TcpListener) -> io::Result<()> {
+        let (front, heartbeat) = (Arc::clone(&self.front), Arc::clone(&self.heartbeat));
+        let (stop, mut abort) = (self.stop.subscribe(), self.abort.subscribe());
+        let worker = runtime.handle().clone();
+        let work = async move {
+            let context = Arc::clone(&front.context);
+            let live = Arc::new(Live::from(front));
+            accept(Arc::clone(&context), live, socket, vec![worker], stop).await;
+            while context.admission.open() > 0 {
+                tokio::select! {
+                    _ = abort.wait_for(|abort| *abort) => return,
+                    () = sleep(ENDING_PERIOD) => {}
+                }
+            }
+        };
+        let work = move || runtime.block_on(heartbeat.during(work));
+        self.threads.push(thread::Builder::new().name(name).spawn(work)?);
+        Ok(())
+    }
+
+    /// Takes what has happened to requests.
+    pub fn take(&self) -> Vec<Event> {
+        self.front.inbox.take()
+    }
+
+    /// Takes the next event of a connection.
+    pub fn event(&self) -> Option<event::Event> {
+        self.events.next(Duration::ZERO)
+    }
+
+    /// The socket that becomes readable when there is something to take. Only the first call has it.
+    pub fn wakes(&self) -> Option<Wakes> {
+        self.wakes.lock().unwrap_or_else(PoisonError::into_inner).take()
+    }
+
+    pub fn connections(&self) -> &ConnectionCounters {
+        &self.front.context.connections
+    }
+
+    pub fn open(&self) -> usize {
+        self.front.context.admission.open()
+    }
+
+    pub fn heartbeat(&self) -> &Arc<Heartbeat> {
+        &self.heartbeat
+    }
+
+    /// Uses these certificates for new connections.
+    pub fn set_tls(&self, tls: Arc<ServerTls>) {
+        if let Some(live) = &self.front.tls {
+            live.replace(tls);
+        }
+    }
+
+    /// Accepts no more connections, and ends those that have no request. The others end after their
+    /// responses.
+    pub fn end(&self) {
+        self.stop.send_replace(true);
+    }
+
+    /// Ends all connections, and waits for the thread.
+    pub fn close(&self) {
+        if self.threads.are_of_another_process() {
+            return;
+        }
+        self.stop.send_replace(true);
+        self.abort.send_replace(true);
+        self.threads.join();
+    }
+}
+
+impl Drop for HttpServer {
+    fn drop(&mut self) {
+        self.close();
+    }
+}

@@ -1,0 +1,188 @@
+"""The JSON schemas of the gateway's errors, of its status, and of the data of its events."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+from holdfast.gateway import listing
+from holdfast.gateway.fields import ADDRESS_SCHEMA, UNIT_SCHEMA
+from holdfast.gateway.reading import FUNCTION_SCHEMA, TYPED
+from holdfast.net.addresses import LAST_PORT
+from holdfast.protocol import READ_BITS
+from holdfast.tools.discovery import State
+from holdfast.types import AREAS
+from holdfast.web.schemas import (
+    BOOLEAN,
+    COUNT,
+    NUMBER,
+    TEXT,
+    Schema,
+    array_of,
+    count,
+    integer,
+    map_of,
+    object_of,
+)
+
+TARGET: dict[str, Schema] = {
+    "host": TEXT,
+    "port": integer(1, LAST_PORT),
+    "unitId": UNIT_SCHEMA,
+}
+"""The fields of a device in answers."""
+
+_QUANTITY = integer(1, READ_BITS)
+_VALUE: Schema = {"type": ["integer", "boolean"]}
+_AREA: Schema = {"enum": list(AREAS)}
+_FORMAT: Schema = {"enum": ["coils", "registers"]}
+_RANGES: Schema = {
+    **array_of({**array_of(ADDRESS_SCHEMA), "minItems": 2, "maxItems": 2}),
+    "description": "The first and the last address of each range",
+}
+_NOW: dict[str, Schema] = {"time": count("Milliseconds since 1970"), "rtt": COUNT}
+_ASKED = {"functionCode": FUNCTION_SCHEMA, "address": ADDRESS_SCHEMA, "quantity": _QUANTITY}
+
+_ERRORS: dict[str, Schema] = {
+    "Error": object_of({"success": {"const": False}, "error": TEXT}),
+    "ModbusException": object_of(
+        {
+            "success": {"const": False},
+            "error": {**TEXT, "examples": ["Modbus exception: Illegal Data Address (code 0x2)"]},
+            **TARGET,
+            **_ASKED,
+        },
+        optional=(*TARGET, *_ASKED),
+    ),
+}
+_STATUS = object_of(
+    {
+        "version": TEXT,
+        "writes": BOOLEAN,
+        "tokens": BOOLEAN,
+        "allow": array_of(TEXT),
+        "limits": object_of({"timeout": COUNT, "interval": COUNT}),
+        "connections": count("Open connections to devices"),
+    }
+)
+_TYPED_CHANGE = object_of({"index": COUNT, "value": {}, "text": TEXT})
+_WATCHES: dict[str, Schema] = {
+    "Values": object_of(
+        {
+            **_NOW,
+            "address": ADDRESS_SCHEMA,
+            "quantity": _QUANTITY,
+            "format": _FORMAT,
+            "values": array_of(_VALUE),
+            **TYPED,
+        },
+        optional=tuple(TYPED),
+    ),
+    "Change": object_of(
+        {
+            **_NOW,
+            "changes": array_of(object_of({"address": ADDRESS_SCHEMA, "value": _VALUE})),
+            "typed": array_of(_TYPED_CHANGE),
+        },
+        optional=("typed",),
+    ),
+    "Problem": object_of({**_NOW, "error": TEXT, "reason": TEXT}),
+}
+
+_PAIR: Schema = {"type": "array", "minItems": 2, "maxItems": 2, "prefixItems": [COUNT, {}]}
+_PROBLEM: dict[str, Schema] = {
+    "error": {"type": ["string", "null"], "description": "Why the last poll failed"},
+    "reason": TEXT,
+}
+_STATES: dict[str, Schema] = {
+    "values": {"type": "array", "description": "Registers or bits; the values of tags"},
+    "texts": array_of(TEXT),
+    "errors": map_of(TEXT),
+    **_PROBLEM,
+}
+_RANGE = object_of(
+    {"kind": {"const": "range"}, **_ASKED, "format": _FORMAT, **_STATES}, optional=tuple(_STATES)
+)
+_TAGS = object_of(
+    {"kind": {"const": "tags"}, "tags": array_of(listing.TAG), **_STATES},
+    optional=(*_STATES, "tags"),
+)
+_CHANGES = {name: array_of(_PAIR) for name in ("values", "texts", "errors")}
+_CHANGED_PART = object_of({"part": COUNT, **_CHANGES, **_PROBLEM}, optional=(*_CHANGES, *_PROBLEM))
+_VIEWS: dict[str, Schema] = {
+    "View": object_of(
+        {
+            **_NOW,
+            "stream": {**BOOLEAN, "description": "Whether more events follow"},
+            "parts": array_of({"oneOf": [_RANGE, _TAGS]}),
+        }
+    ),
+    "ViewChange": object_of({**_NOW, "parts": array_of(_CHANGED_PART)}),
+}
+
+_FOUND: dict[str, Schema] = {
+    "area": _AREA,
+    "addresses": COUNT,
+    "ranges": _RANGES,
+    "notSearchedFrom": {
+        "type": ["integer", "null"],
+        "description": "From where only usual start addresses were read; `null` after the search "
+        "of the area",
+    },
+}
+_MAPPED_AREA = object_of(
+    {
+        **_FOUND,
+        "state": {
+            "enum": list(get_args(State)),
+            "description": "`partly`: it ended early; `given_up`: the device can't read the area",
+        },
+        "absent": count("Addresses that do not exist"),
+        "absentRanges": _RANGES,
+        "notAsked": count("Addresses that were not read: unknown"),
+        "failures": map_of(
+            _RANGES,
+            "By exception code, or `timeout`, `connection`, `invalid`: addresses whose reads "
+            "failed, so that it is unknown whether they are valid",
+        ),
+        "givenUp": {"type": ["integer", "string", "null"]},
+        "largest": count("The largest quantity that one read returned"),
+        "requests": COUNT,
+    }
+)
+_MAPS: dict[str, Schema] = {
+    "Progress": object_of(
+        {
+            "at": count("Addresses done so far"),
+            "total": COUNT,
+            "requests": COUNT,
+            "found": {
+                **array_of(
+                    object_of({"area": _AREA, "first": ADDRESS_SCHEMA, "last": ADDRESS_SCHEMA})
+                ),
+                "description": "The ranges whose ends were found since the last event",
+            },
+            "areas": array_of(object_of(_FOUND, optional=("ranges",))),
+        }
+    ),
+    "Map": object_of(
+        {
+            "success": BOOLEAN,
+            "error": {**TEXT, "description": "Why it ended early"},
+            "reason": {**TEXT, "description": "The reason as a word"},
+            "requests": COUNT,
+            "seconds": NUMBER,
+            "exact": BOOLEAN,
+            "step": {
+                "type": ["integer", "null"],
+                "description": "The largest distance of two samples. Addresses where ranges often "
+                "begin were read too. `null` if every address was read",
+            },
+            "first": ADDRESS_SCHEMA,
+            "last": ADDRESS_SCHEMA,
+            "areas": array_of(_MAPPED_AREA),
+        },
+        optional=("error", "reason"),
+    ),
+}
+
+SCHEMAS: dict[str, Schema] = {**_ERRORS, "Status": _STATUS, **_WATCHES, **_VIEWS, **_MAPS}
