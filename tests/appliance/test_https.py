@@ -16,6 +16,7 @@ from holdfast.appliance import Appliance
 from holdfast.cli import main
 from holdfast.config import load
 from support import web, wire
+from support.certificate_cases import Mint
 from support.certificates import FUTURE, PAST, Certificates, Issued
 from support.cli import RunCommand
 from support.config_folder import written
@@ -48,7 +49,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     return Files(authority, authority.issue("server", NAMES, dates=long_lived), folder)
 
 
-def configured(tmp_path: Path, tls: dict[str, str], *services: str, port: int = 0) -> Path:
+def configured(tmp_path: Path, tls: dict[str, Any], *services: str, port: int = 0) -> Path:
     at: dict[str, Any] = {"bind": f"127.0.0.1:{port}", "sources": ["127.0.0.0/8"], "tls": tls}
     whole = {
         "rest": {**at, "tokens": "none"},
@@ -165,15 +166,18 @@ def test_dates_and_missing_names_are_warnings(files: Files, tmp_path: Path) -> N
         "nameless", "email:a@b.example", dates=("20200101000000Z", "20900101000000Z")
     )
     texts = {
-        late: "the certificate of CN=late expired on 2020-02-01",
-        early: "the certificate of CN=early is not valid before 2090-01-01 00:00 UTC",
-        soon: "the certificate of CN=soon expires in 1 day, on ",
-        nameless: "found a subjectAltName without a DNS name or an IP address: clients ignore",
+        late: ("", "certificate 1 (CN=late) expired "),
+        early: ("", "certificate 1 (CN=early) is not valid yet, its validity begins in "),
+        soon: (".cert_file", "the certificate of CN=soon expires in 1 day, on "),
+        nameless: (
+            ".cert_file",
+            "found a subjectAltName without a DNS name or an IP address: clients ignore",
+        ),
     }
-    for issued, text in texts.items():
+    for issued, (key, text) in texts.items():
         file = configured(tmp_path, files.tls(issued))
         code, [line] = checked(file)
-        start = f"warning: {file}:1: rest.tls.cert_file: {issued.certificate}: {text}"
+        start = f"warning: {file}:1: rest.tls{key}: {issued.certificate}: {text}"
         assert (code, line[: len(start)]) == (0, start)
 
 
@@ -181,17 +185,34 @@ def test_expired_revocation_lists_and_authorities_are_warnings(
     files: Files, tmp_path: Path
 ) -> None:
     revoked = files.authority.revoke(dates=tomorrow())
-    late = files.authority.issue("late", NAMES, dates=PAST).certificate
-    code, lines = checked(configured(tmp_path, files.tls(client_ca_file=late, crl_file=revoked)))
+    late = Mint(tmp_path).root(name="late", dates=PAST).certificate
+    both = tmp_path / "both.pem"
+    both.write_bytes(files.authority.ca.read_bytes() + late.read_bytes())
+    code, lines = checked(configured(tmp_path, files.tls(client_ca_file=both, crl_file=revoked)))
     assert code == 0
-    assert ["client_ca_file" in lines[0], "crl_file" in lines[1]] == [True, True]
-    assert "the revocation list of CN=authority expires in 1 day" in lines[1]
+    [old, unlisted, soon] = lines
+    assert f"rest.tls: {both}: certificate 2 (CN=late) expired " in old
+    assert old.endswith(": its clients are refused")
+    assert "found no list of certificate 2 of client_ca_file (CN=late)" in unlisted
+    assert "rest.tls.crl_file: " in soon
+    assert "the revocation list of CN=authority expires in 1 day" in soon
 
 
-def test_a_revocation_list_needs_authorities(files: Files, tmp_path: Path) -> None:
-    file = configured(tmp_path, files.tls(crl_file=files.authority.revoke()))
-    message = "rest.tls.crl_file: found without client_ca_file, allowed: only with it"
-    assert checked(file) == (2, [f"{file}:1: {message}", "1 problem"])
+def test_revocation_lists_and_roles_need_authorities(files: Files, tmp_path: Path) -> None:
+    for key, value in (("crl_file", files.authority.revoke()), ("roles", ["operator"])):
+        file = configured(tmp_path, files.tls() | {key: str(value) if key == "crl_file" else value})
+        message = f"rest.tls.{key}: found without client_ca_file, allowed: only with it"
+        assert checked(file) == (2, [f"{file}:1: {message}", "1 problem"])
+
+
+def test_the_settings_of_client_certificates_are_checked(files: Files, tmp_path: Path) -> None:
+    ca = {"client_ca_file": str(files.authority.ca)}
+    file = configured(tmp_path, {**files.tls(), **ca, "expired_crl": "accept"})
+    told = "rest.tls.expired_crl: has no effect without crl_file"
+    assert checked(file) == (0, [f"warning: {file}:1: {told}"])
+    file = configured(tmp_path, {**files.tls(), **ca, "roles": ["a", "b", "a"]})
+    code, [line, _] = checked(file)
+    assert (code, "rest.tls.roles" in line) == (2, True)
 
 
 @pytest.mark.parametrize("key", ["cert_file", "key_passphrase_file", "client_ca_file"])

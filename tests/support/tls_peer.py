@@ -1,13 +1,14 @@
-"""A Modbus client that controls its TLS records, and appliances for it."""
+"""A client of Modbus and HTTPS that controls its TLS records, and appliances for it."""
 
 from __future__ import annotations
 
 import contextlib
 import socket
 import ssl
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from support import wire
+from support import web, wire
 from support.config_folder import written
 from support.running import endpoint
 
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 
 READ = bytes.fromhex("0300000001")
 ZERO = bytes.fromhex("03020000")
+HEALTH = web.head("GET", "/api/v1/health", "Connection: close")
+HTTPS_BY_CORE = find_spec("holdfast.web.tls") is None
+"""Whether the core serves HTTPS, instead of OpenSSL."""
 VERSIONS = {"1.2": ssl.TLSVersion.TLSv1_2, "1.3": ssl.TLSVersion.TLSv1_3}
 
 
@@ -207,6 +211,17 @@ def configuration(tls: dict[str, Path], rules: list[dict[str, Any]], **listener:
     return written({"memories": memories, "listeners": {"secure": secure}})
 
 
+def rest_configuration(tls: dict[str, Any]) -> str:
+    """Builds a configuration with a REST service for the memory `plant`."""
+    rest = {
+        "bind": "127.0.0.1:0",
+        "sources": ["127.0.0.0/8"],
+        "tokens": "none",
+        "tls": {key: str(path) for key, path in tls.items()},
+    }
+    return written({"memories": {"plant": {"holding_registers": 8}}, "rest": rest})
+
+
 def connections(appliance: Appliance) -> dict[str, int]:
     """Returns the listener's counts of connections."""
     counted: dict[str, int] = appliance.diagnostics.stats()["listeners"]["secure"]["connections"]
@@ -228,6 +243,25 @@ def verdict(appliance: Appliance, trust: ssl.SSLContext) -> str:
             return verdicts.get(client.shake().ask(READ), "answered")
         except Refused as refused:
             return str(refused)
+
+
+def rest_verdict(appliance: Appliance, trust: ssl.SSLContext) -> str:
+    """Returns what the REST service says to a client: `served`, or the reason that it counts."""
+
+    def counted() -> dict[str, int]:
+        status: dict[str, Any] = appliance.diagnostics.stats()["adapters"]["rest"]
+        return dict(status.get("tls_failures", {}))  # A service that only starts has none.
+
+    before = counted()
+    with Peer(endpoint(appliance, "rest"), trust) as peer, contextlib.suppress(Refused):
+        peer.shake().send(HEALTH)
+        answers = web.answers(peer.rest())
+        if answers:
+            assert [answer.status for answer in answers] == [200]
+            return "served"
+    wire.until(lambda: counted() != before, "the failure is counted")
+    [reason] = [key for key, times in counted().items() if times != before.get(key, 0)]
+    return reason
 
 
 def secure_reply(to: tuple[str, int], trust: ssl.SSLContext, packet: bytes) -> bytes:

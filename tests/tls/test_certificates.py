@@ -1,8 +1,8 @@
 """One judgement of certificates: every face gives the same answer to every certificate.
 
 Devices show them to the blocking client, the asyncio client and the native poller; clients show
-them to the listener. So do receivers and senders of Raw Ingest packets. The right answers are in
-the table of `support/certificate_cases.py`.
+them to the listener, and to the HTTP services. So do receivers and senders of Raw Ingest packets.
+The right answers are in the table of `support/certificate_cases.py`.
 """
 
 from __future__ import annotations
@@ -26,10 +26,19 @@ from support.faces import FACES
 from support.polled import Fake, data
 from support.running import endpoint as endpoint_of
 from support.secured import Relay, context
-from support.tls_peer import configuration, reasons, secure_reply, verdict
+from support.tls_peer import (
+    HTTPS_BY_CORE,
+    configuration,
+    reasons,
+    rest_configuration,
+    rest_verdict,
+    secure_reply,
+    verdict,
+)
 from support.tls_peer import context as peer_context
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from support.certificate_cases import Case, Shown
@@ -308,12 +317,66 @@ def test_a_sender_is_judged_alike_by_the_listener_for_packets(
         assert reasons(appliance, caplog) == [case.client]
 
 
+def rest(own: Shown, trusted: Path) -> str:
+    """As `listener`, for the REST service."""
+    return rest_configuration(
+        {"cert_file": own.chain, "key_file": own.key, "client_ca_file": trusted}
+    )
+
+
+OPENSSL_DIFFERS = {
+    "CA:TRUE",
+    "CA:TRUE without keyCertSign",
+    "RSA key of 1024 bits",
+    "below CA:FALSE",
+    "below CA:TRUE without keyCertSign",
+    "below an expired authority",
+    "below an expired intermediate",
+    "below too many",
+    "for any purpose",
+    "keyUsage keyCertSign",
+    "keyUsage keyEncipherment",
+    "keyUsage keyEncipherment, listed",
+    "keyUsage nonRepudiation",
+    "of X.509 version 1",
+    "of an impostor",
+    "outside the names of its authority",
+    "own, CA:TRUE and keyCertSign",
+    "own, CA:TRUE, not listed",
+    "signed by RSA-PSS with the longest salt",
+    "signed by a listed device",
+    "signed by a listed device, CA:TRUE without keyCertSign",
+    "signed with SHA-1",
+}
+"""Judged by other rules, or with other words, as long as OpenSSL serves HTTPS: then this goes."""
+
+
+@pytest.mark.parametrize(
+    ("case", "version"), [each for version in ("1.2", "1.3") for each in listener_cases(version)]
+)
+def test_a_client_is_judged_alike_by_https(
+    case: Case, version: str, mint: Mint, shown: dict[str, Shown], own: Shown, run: Run
+) -> None:
+    if not HTTPS_BY_CORE and case.name in OPENSSL_DIFFERS:
+        pytest.skip("OpenSSL serves HTTPS, and differs")
+    show = made(case, mint, shown)
+    appliance = run(rest(own, show.trusted))
+    trust = peer_context(own.trusted, Issued(show.chain, show.key), version, weak=True)
+    assert rest_verdict(appliance, trust) == case.client
+
+
+@pytest.mark.parametrize("configured", [listener, rest])
 @pytest.mark.parametrize("case", [case for case in CASES if case.client is None], ids=str)
 def test_a_listener_refuses_a_file_with_certificates_that_others_vouch_for(
-    case: Case, mint: Mint, shown: dict[str, Shown], own: Shown, run: Run
+    case: Case,
+    configured: Callable[[Shown, Path], str],
+    mint: Mint,
+    shown: dict[str, Shown],
+    own: Shown,
+    run: Run,
 ) -> None:
-    with pytest.raises(ValueError, match="certificate 1: neither an authority"):
-        run(listener(own, made(case, mint, shown).trusted))
+    with pytest.raises((ValueError, OSError), match="certificate 1: neither an authority"):
+        run(configured(own, made(case, mint, shown).trusted))
 
 
 # What this side shows

@@ -15,11 +15,10 @@ from holdfast.certificates.inspection import describe
 from holdfast.cli import main
 from holdfast.cli.configuration import load_whole
 from holdfast.config import ConfigError
-from support import web, wire
+from support import wire
 from support.certificates import LISTS, PAST, Certificates, named
 from support.config_folder import written
-from support.running import endpoint
-from support.tls_peer import Peer, Refused, context, verdict
+from support.tls_peer import context, rest_verdict, verdict
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,8 +36,6 @@ FORMS: dict[str, tuple[Sequence[str], str | None]] = {
     "complete": (tuple(LISTS), None),
 }
 """What lists of each form have, and the reason of the entries."""
-
-HEALTH = web.head("GET", "/api/v1/health", "Connection: close")
 
 
 class Plant:
@@ -81,30 +78,16 @@ class Plant:
         """What the listener and the REST API say to a client: `served`, or the reason they log."""
         trust = context(self.authority.ca, client)
 
-        def failed(*path: str) -> dict[str, int]:
-            found: Any = appliance.diagnostics.stats()
-            for each in path:
-                found = found[each]
-            return dict(found.get("tls_failures", {}))
+        def failed() -> dict[str, int]:
+            counted: Any = appliance.diagnostics.stats()["listeners"]["secure"]
+            return dict(counted.get("tls_failures", {}))
 
-        def reason(before: dict[str, int], *path: str) -> str:
-            wire.until(lambda: failed(*path) != before, "the failure is counted")
-            [new] = [key for key, n in failed(*path).items() if n != before.get(key, 0)]
-            return new
-
-        places = (("listeners", "secure"), ("adapters", "rest"))
-        before = [failed(*each) for each in places]
+        before = failed()
         by_listener = verdict(appliance, trust)
         if by_listener != "served":
-            by_listener = reason(before[0], *places[0])
-        by_rest = "served"
-        with Peer(endpoint(appliance, "rest"), trust) as peer:
-            try:
-                peer.shake().send(HEALTH)
-                assert web.answers(peer.rest())[0].status == 200
-            except (Refused, IndexError):
-                by_rest = reason(before[1], *places[1])
-        return by_listener, by_rest
+            wire.until(lambda: failed() != before, "the failure is counted")
+            [by_listener] = [key for key, n in failed().items() if n != before.get(key, 0)]
+        return by_listener, rest_verdict(appliance, trust)
 
 
 @pytest.fixture(autouse=True)
@@ -177,7 +160,7 @@ def test_what_a_list_lacks_is_a_warning_with_the_name_of_the_file(
     lacks = f"has {MISSING[form]} (RFC 5280, 5.2): Holdfast uses it, other programs may refuse it"
     expected = [
         f"{file}:1: listeners.secure.tls: {crl}: revocation list 1 (CN=plant) {lacks}",
-        f"{file}:1: rest.tls.crl_file: {crl}: the revocation list of CN=plant {lacks}",
+        f"{file}:1: rest.tls: {crl}: revocation list 1 (CN=plant) {lacks}",
     ]
     assert [str(warning) for warning in load_whole(file).warnings] == expected
     result = CliRunner().invoke(main, ["check", str(file)])

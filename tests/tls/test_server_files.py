@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from click.testing import CliRunner
 
+from holdfast import _core
 from holdfast.cli import main
 from holdfast.cli.configuration import load_whole
 from holdfast.config import ConfigError
@@ -184,6 +185,13 @@ def test_certificates_in_the_wrong_order_are_an_error(plant: Plant, mint: Mint) 
     [problem] = refused.value.problems
     told = "certificate 2: found CN=authority, allowed: CN=between, the issuer of certificate 1"
     assert problem.message == f"{wrong}: {told}"
+
+
+def test_a_listener_takes_no_certificates_of_https(plant: Plant) -> None:
+    own = plant.files()
+    del own["ca_file"]
+    with pytest.raises(ValueError, match="tls is that of an HTTPS server, allowed: ServerTls"):
+        _core.Listener("secure", "127.0.0.1:0", [], tls=_core.https_server_tls(**own))
 
 
 def test_check_prints_warnings_and_succeeds(plant: Plant) -> None:

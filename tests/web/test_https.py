@@ -7,7 +7,6 @@ import shutil
 import ssl
 import warnings
 from contextlib import ExitStack
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import pytest
@@ -15,12 +14,11 @@ import pytest
 import holdfast
 from holdfast import logs
 from holdfast.certificates.pem import UnusableFile
-from holdfast.web import tls as web_tls
 from holdfast.web.https import Https, HttpsFiles
 from support import web, wire
-from support.certificates import PAST, Certificates, Issued
+from support.certificates import PAST, Certificates, Issued, named
 from support.secured import Authority
-from support.tls_peer import VERSIONS, Peer, Refused, context
+from support.tls_peer import HTTPS_BY_CORE, VERSIONS, Peer, Refused, context
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,6 +30,10 @@ SOON = 0.25
 SERVER = "DNS:localhost,IP:127.0.0.1"
 CLIENT = "DNS:panel"
 
+judged_by_core = pytest.mark.skipif(
+    not HTTPS_BY_CORE, reason="OpenSSL serves HTTPS, which lacks this"
+)
+
 
 class Files(NamedTuple):
     """An authority, and what it has issued."""
@@ -40,10 +42,10 @@ class Files(NamedTuple):
     server: Issued
     client: Issued
 
-    def https(self, **more: Path) -> Https:
+    def https(self, **more: Any) -> Https:
         return Https(HttpsFiles(self.server.certificate, self.server.key, **more))
 
-    def mutual(self, **more: Path) -> Https:
+    def mutual(self, **more: Any) -> Https:
         return self.https(client_ca_file=self.authority.ca, **more)
 
     def trust(self, issued: Issued | None = None, version: str | None = None) -> ssl.SSLContext:
@@ -133,6 +135,22 @@ def test_the_documentation_has_https_in_its_commands(start: Start, files: Files)
     host, port = service.address
     assert f"https://{host}:{port}/" in page
     assert "http://" not in page
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize(
+    ("offered", "chosen"), [(["h2", "http/1.1"], "http/1.1"), (["h2"], None), ([], None)]
+)
+def test_http_1_1_is_chosen_among_the_protocols_of_a_client(
+    start: Start, files: Files, version: str, offered: list[str], chosen: str | None
+) -> None:
+    trust = files.trust(version=version)
+    if offered:
+        trust.set_alpn_protocols(offered)
+    with Peer(start(files.https()).address, trust) as peer:
+        assert peer.shake().tls.selected_alpn_protocol() == chosen
+        peer.send(HEALTH)
+        assert web.answers(peer.rest())[0].status == 200
 
 
 def test_records_may_arrive_in_any_pieces(start: Start, files: Files) -> None:
@@ -239,7 +257,7 @@ def test_a_client_that_leaves_in_the_handshake_is_counted(
     with Peer(service.address, files.trust()) as peer:
         peer.wire.send(peer.hello()[:-1])
     service.until_counted("tls_failed")
-    assert log.of("tls_failed")[0]["reason"] == "closed"
+    assert log.of("tls_failed")[0]["reason"] == "closed_during_handshake"
 
 
 def test_peers_without_a_handshake_lock_nobody_out(start: Start, files: Files) -> None:
@@ -277,7 +295,7 @@ def test_a_client_that_does_not_trust_the_server_is_counted(
             peer.shake()
         peer.flush()
         service.until_counted("tls_failed")
-    assert log.of("tls_failed")[0]["reason"] == "peer_ended"
+    assert log.of("tls_failed")[0]["reason"] == "peer_refused_certificate"
 
 
 def test_an_altered_record_ends_the_connection(
@@ -332,8 +350,8 @@ def test_an_authority_needs_a_revocation_list(
     assert refusal(service, files.trust(files.client), log) == "unknown_revocation"
 
 
-def test_a_resumed_session_does_not_outlive_its_certificate(
-    start: Start, files: Files, log: web.Records, monkeypatch: pytest.MonkeyPatch
+def test_a_session_is_resumed_with_the_certificate_of_the_client(
+    start: Start, files: Files
 ) -> None:
     service, trust = start(files.mutual()), files.trust(files.client, "1.2")
     with Peer(service.address, trust) as peer:
@@ -343,12 +361,36 @@ def test_a_resumed_session_does_not_outlive_its_certificate(
         assert peer.shake().tls.session_reused
         peer.send(HEALTH)
         assert web.answers(peer.rest())[0].status == 200
-    monkeypatch.setattr(web_tls, "time", SimpleNamespace(time=lambda: 4e9))
-    with Peer(service.address, trust, session=session) as peer:
-        peer.shake()
-        assert peer.end() != "timeout"
-    service.until_counted("tls_failed")
-    assert log.of("tls_failed")[-1]["reason"] == "expired"
+
+
+@judged_by_core
+def test_expired_revocation_lists_may_be_accepted(
+    start: Start, files: Files, log: web.Records
+) -> None:
+    gone = files.authority.issue("gone", CLIENT)
+    lists = files.authority.revoke(gone, dates=PAST)
+    service = start(files.mutual(crl_file=lists, expired_crl="accept"))
+    assert is_served(service, files.trust(files.client))
+    assert refusal(service, files.trust(gone), log) == "revoked"
+    service = start(files.mutual(crl_file=lists))
+    assert refusal(service, files.trust(files.client), log) == "expired_revocation_list"
+
+
+@judged_by_core
+def test_only_clients_with_an_allowed_role_are_served(
+    start: Start, files: Files, log: web.Records
+) -> None:
+    operator, engineer = (
+        files.authority.issue(role, CLIENT, extensions=[named(role)])
+        for role in ("operator", "engineer")
+    )
+    service = start(files.mutual(roles=("operator", "viewer")))
+    assert is_served(service, files.trust(operator))
+    for other in (engineer, files.client):
+        assert refusal(service, files.trust(other), log) == "wrong_role"
+    service = start(files.mutual(roles=("",)))
+    assert is_served(service, files.trust(files.client))
+    assert refusal(service, files.trust(operator), log) == "wrong_role"
 
 
 # Renewed files.
@@ -418,8 +460,8 @@ def test_unusable_files_are_named(files: Files, tmp_path: Path) -> None:
     locked = Authority(tmp_path).locked(key, traditional=False)
     for name, text in {"wrong": "other\n", "two": "a\nb\n", "empty": ""}.items():
         (tmp_path / name).write_text(text)
-    both = tmp_path / "both.pem"
-    both.write_bytes(files.authority.revoke().read_bytes() + files.authority.ca.read_bytes())
+    stranger = Authority(tmp_path, "stranger")
+    crl = stranger.revoke()
     cases: dict[str, HttpsFiles] = {
         "none: No such file": HttpsFiles(tmp_path / "none", key),
         "empty: found no certificate": HttpsFiles(tmp_path / "empty", key),
@@ -435,7 +477,14 @@ def test_unusable_files_are_named(files: Files, tmp_path: Path) -> None:
         "empty: found no revocation list": HttpsFiles(
             cert, key, None, files.authority.ca, tmp_path / "empty"
         ),
-        "both.pem: found something else": HttpsFiles(cert, key, None, files.authority.ca, both),
+        "crl: crl_file requires an authority": HttpsFiles(
+            cert, key, None, stranger.self_signed("panel", CLIENT, ca=False)[0], crl
+        ),
+        "crl: found without client_ca_file": HttpsFiles(cert, key, crl_file=crl),
+        "found with roles and without client_ca_file": HttpsFiles(cert, key, roles=("operator",)),
+        "certificate 1: neither an authority": HttpsFiles(
+            cert, key, client_ca_file=files.client.certificate
+        ),
     }
     for message, given in cases.items():
         with pytest.raises(UnusableFile, match=message):

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, assert_never
 
 from holdfast import _core
-from holdfast.bounded_files import require_stored
 from holdfast.client.endpoint import endpoint, receiver_endpoint
 from holdfast.config import (
     ModbusAsciiListener,
@@ -268,20 +267,16 @@ def _shared_port(
 
 def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
     """Loads the certificates of a listener. Raises `ValueError` for an unusable file."""
-    from holdfast.certificates.pem import UnusableFile, unlocked
+    from holdfast.certificates.own import key_for_core
 
-    files = (settings.cert_file, settings.key_file, settings.ca_file, settings.crl_file)
-    try:
-        require_stored(*files)
-    except OSError as error:
-        raise UnusableFile(error.filename, error.strerror or str(error)) from error
+    others = (settings.cert_file, settings.ca_file, settings.crl_file)
     return _core.ServerTls(
         cert_file=settings.cert_file,
         key_file=settings.key_file,
         ca_file=settings.ca_file,
         crl_file=settings.crl_file,
         expired_crl=settings.expired_crl,
-        key=unlocked(settings.key_file, settings.key_passphrase_file),
+        key=key_for_core(settings.key_file, settings.key_passphrase_file, *others),
     )
 
 
@@ -386,6 +381,8 @@ def https(settings: HttpsConfig) -> Https:
             settings.key_passphrase_file,
             settings.client_ca_file,
             settings.crl_file,
+            settings.expired_crl,
+            settings.roles,
         )
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from holdfast.client.url import NetworkTarget
@@ -61,7 +61,6 @@ def doubts(config: Config) -> list[tuple[KeyPath, str]]:
     found: dict[str, tuple[KeyPath, str]] = {}
     for each in _named(config):
         from holdfast.certificates import expiry
-        from holdfast.certificates.inspection import incomplete_lists
         from holdfast.certificates.own import nameless
 
         lists = each.kind == "revocation lists"
@@ -70,8 +69,6 @@ def doubts(config: Config) -> list[tuple[KeyPath, str]]:
         texts = [one.doubt(now) for one in dates if one.is_valid(now) or not each.by_core]
         if each.kind == "server":
             texts.append(nameless(each.file))
-        if lists and not each.by_core:
-            texts += incomplete_lists(each.file)
         for text in texts:
             if text is not None:
                 told = f"{each.file}: {text}"
@@ -84,8 +81,7 @@ def _named(config: Config) -> Iterator[_Named]:
         tls = tls_of(listener)
         if tls is not None:
             place: KeyPath = ("listeners", name, "tls")
-            found = _of_server(place, tls.cert_file, tls.crl_file, "ca_file", tls.ca_file)
-            yield from (replace(each, by_core=True) for each in found)
+            yield from _of_server(place, tls.cert_file, tls.crl_file, "ca_file", tls.ca_file)
     for name in HTTP_SERVICES:
         service = getattr(config, name)
         if service is not None and service.tls is not None:
@@ -110,11 +106,11 @@ def _named(config: Config) -> Iterator[_Named]:
 def _of_server(
     place: KeyPath, cert_file: Path, crl_file: Path | None, ca_key: str, ca_file: Path | None
 ) -> Iterator[_Named]:
-    yield _Named((*place, "cert_file"), str(cert_file), "server")
+    yield _Named((*place, "cert_file"), str(cert_file), "server", by_core=True)
     if ca_file is not None:
-        yield _Named((*place, ca_key), str(ca_file), "certificates")
+        yield _Named((*place, ca_key), str(ca_file), "certificates", by_core=True)
     if crl_file is not None:
-        yield _Named((*place, "crl_file"), str(crl_file), "revocation lists")
+        yield _Named((*place, "crl_file"), str(crl_file), "revocation lists", by_core=True)
 
 
 def _of_url(place: KeyPath, target: Target) -> Iterator[_Named]:

@@ -23,7 +23,6 @@ from holdfast.certificates.pem import (
     is_locked,
     key,
     public_key,
-    revocation_lists,
 )
 
 if TYPE_CHECKING:
@@ -256,15 +255,6 @@ def _of_list(file: File, block: bytes) -> Described:
         if doubt is not None:
             (made.flaws if ends <= now() else made.advice).append(doubt)
     return made
-
-
-def incomplete_lists(file: File) -> list[str]:
-    """Returns which revocation lists of a file lack what; none if the file can't be read."""
-    try:
-        found = [(each.issuer.rfc4514_string(), _lacks(each)) for each in revocation_lists(file)]
-    except MALFORMED:
-        return []
-    return [f"the revocation list of {name} {lacks}" for name, lacks in found if lacks]
 
 
 def _lacks(read: x509.CertificateRevocationList) -> str | None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
+from holdfast.bounded_files import require_stored
 from holdfast.certificates.pem import (
     MALFORMED,
     UnusableFile,
@@ -14,6 +15,7 @@ from holdfast.certificates.pem import (
     key,
     passphrase,
     public_key,
+    unlocked,
 )
 
 if TYPE_CHECKING:
@@ -30,6 +32,21 @@ def check_own(cert_file: File, key_file: File, passphrase_file: File | None = No
         raise UnusableFile(cert_file, "the certificate has a key of an unknown kind")
     if _spki(own) != _spki(key(key_file, secret).public_key()):
         raise UnusableFile(key_file, f"it is not the key of the certificate in {cert_file}")
+
+
+def key_for_core(
+    key_file: File, passphrase_file: File | None, *others: File | None
+) -> bytes | None:
+    """Returns the key of a server if it is encrypted, without encryption; otherwise `None`.
+
+    The core reads the files itself, these and `others`: raises `UnusableFile` for one that could
+    block it.
+    """
+    try:
+        require_stored(key_file, *others)
+    except OSError as error:
+        raise UnusableFile(error.filename, error.strerror or str(error)) from error
+    return unlocked(key_file, passphrase_file)
 
 
 def own_der(cert_file: File) -> bytes:

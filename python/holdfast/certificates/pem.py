@@ -47,6 +47,11 @@ class UnusableFile(ValueError):
     def __init__(self, file: File, flaw: str) -> None:
         super().__init__(f"{file}: {flaw}")
 
+    @classmethod
+    def of(cls, error: ValueError) -> UnusableFile:
+        """Creates one from an error of the core, whose message has the same form."""
+        return cls.__new__(cls, str(error))
+
 
 def content(file: File) -> bytes:
     """Returns the content of a file. Raises `UnusableFile`."""

@@ -81,10 +81,13 @@ def _load_whole(path: Path | str) -> Config:
     for service in HTTP_SERVICES:
         settings = getattr(config, service)
         if settings is not None and settings.tls is not None:
+            place = (service, "tls")
             try:
-                assembly.https(settings.tls)
+                warnings = assembly.https(settings.tls).core.warnings
             except ValueError as error:
-                problems[service, "tls"] = str(error)
+                problems[place] = str(error)
+            else:
+                doubts += [(place, warning) for warning in warnings]
     if not problems:
         doubts += configured_certificates.doubts(config)
     if not problems and not doubts:

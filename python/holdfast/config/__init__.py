@@ -38,7 +38,6 @@ from holdfast.config.listeners import (
     SecureRawRuleConfig,
     SerialConfig,
     SerialRuleConfig,
-    ServerTlsConfig,
     TlsRuleConfig,
     UnitMemoryConfig,
     tls_of,
@@ -48,6 +47,7 @@ from holdfast.config.memories import MemoryConfig, Seal, Span
 from holdfast.config.model import Config, IdentityConfig, LogConfig, MappedTag
 from holdfast.config.problems import ConfigError, Problem
 from holdfast.config.schema import json_schema
+from holdfast.config.server_tls import HttpsConfig, ServerTlsConfig
 from holdfast.config.services import (
     HTTP_SERVICES,
     AdapterConfig,
@@ -56,7 +56,6 @@ from holdfast.config.services import (
     ClientTlsConfig,
     GatewayConfig,
     GatewayTokenConfig,
-    HttpsConfig,
     MappingConfig,
     MetricsConfig,
     MqttConfig,

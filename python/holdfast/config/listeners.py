@@ -25,17 +25,17 @@ from holdfast.config.scalars import (
     Duration,
     DurationOrZero,
     EightBits,
-    FilePath,
     MemoryNames,
     Name,
     NotNull,
     RawUnitId,
-    Role,
+    Roles,
     SerialUnitIds,
     Sources,
     StopBits,
     UnitIds,
 )
+from holdfast.config.server_tls import ServerTlsConfig
 from holdfast.types import Access
 
 FunctionList: TypeAlias = Annotated[Annotated[Codes, Field(min_length=1)] | None, NotNull()]
@@ -114,9 +114,7 @@ class RuleConfig(Model):
 class TlsRuleConfig(RuleConfig):
     """What the peers of these sources may do, if their certificates have one of these roles."""
 
-    roles: Annotated[
-        Annotated[tuple[Role, ...], Strict(False), Field(min_length=1)] | None, NotNull()
-    ] = None
+    roles: Roles = None
     """Roles of client certificates; "" is a certificate without a role. Default: any role."""
 
 
@@ -152,9 +150,7 @@ class RawRuleConfig(Model):
 class SecureRawRuleConfig(RawRuleConfig):
     """What the senders of these sources may write; with tls, those with one of these roles."""
 
-    roles: Annotated[
-        Annotated[tuple[Role, ...], Strict(False), Field(min_length=1)] | None, NotNull()
-    ] = None
+    roles: Roles = None
     """With tls: roles of certificates of senders; "" is a certificate without a role. Default: any
     role."""
 
@@ -243,26 +239,6 @@ class ModbusTcpListener(_ConnectionListener):
     """The protocol."""
     raw_ingest: Annotated[RawIngestConfig | None, NotNull()] = None
     """Raw ingest packets on the same port. Default: none."""
-
-
-class ServerTlsConfig(Model):
-    """PEM files of a TLS server; they are read at the start and at a reload."""
-
-    cert_file: FilePath
-    """The server's certificate, followed by its intermediate certificates."""
-    key_file: FilePath
-    """The key of that certificate."""
-    key_passphrase_file: Annotated[FilePath | None, NotNull()] = None
-    """A file that contains the passphrase of the key."""
-    ca_file: FilePath
-    """Authorities of client certificates, and self-signed certificates of clients."""
-    crl_file: Annotated[FilePath | None, NotNull()] = None
-    """Certificate revocation lists: one of each authority in the chain of a client."""
-    expired_crl: Literal["refuse", "accept"] = "refuse"
-    """Clients of an authority whose list is past its nextUpdate."""
-    review: DurationOrZero = 3600.0
-    """At most so many seconds pass until the certificates of open connections are judged again; 0:
-    only at a reload."""
 
 
 class ModbusTlsListener(_ConnectionListener):

@@ -320,6 +320,7 @@ Role = Annotated[
     PlainValidator(_text_of(MAX_ROLE, least=0)),
     WithJsonSchema({"type": "string", "maxLength": MAX_ROLE, "examples": ["operator"]}),
 ]
+Roles = Annotated[Annotated[tuple[Role, ...], Strict(False), Field(min_length=1)] | None, NotNull()]
 DeviceName = Annotated[
     str,
     PlainValidator(_text_of(MAX_DEVICE)),

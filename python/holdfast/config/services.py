@@ -57,6 +57,7 @@ from holdfast.config.scanning import (
     Publish,
     Writes,
 )
+from holdfast.config.server_tls import HttpsConfig
 from holdfast.config.syslog import Facility
 from holdfast.config.tags import TagConfig
 from holdfast.net.addresses import LOOPBACK
@@ -98,22 +99,6 @@ Tokens: TypeAlias = Annotated[
     | Annotated[Literal["none"], Tag("word")],
     Discriminator(_form),
 ]
-
-
-class HttpsConfig(Model):
-    """PEM files of an HTTPS server; they are read at the start."""
-
-    cert_file: FilePath
-    """The server's certificate, followed by its intermediate certificates."""
-    key_file: FilePath
-    """The key of that certificate."""
-    key_passphrase_file: Annotated[FilePath | None, NotNull()] = None
-    """A file that contains the passphrase of the key."""
-    client_ca_file: Annotated[FilePath | None, NotNull()] = None
-    """Authorities of client certificates. Default: clients need no certificate."""
-    crl_file: Annotated[FilePath | None, NotNull()] = None
-    """Certificate revocation lists: one of each authority above a client; requires client_ca_file.
-    """
 
 
 class RestConfig(Model):

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.files import check_readable
+from holdfast.config.lenient import entries
+from holdfast.config.unique import refuse_repeats
 from holdfast.net.tls import alone
 
 if TYPE_CHECKING:
@@ -46,6 +48,8 @@ def check_server_tls(path: KeyPath, tls: dict[Any, Any], folder: Path, report: R
 def check_https(path: KeyPath, tls: dict[Any, Any], folder: Path, report: Report) -> None:
     """Reports problems with the files of an HTTPS server."""
     check_server_tls(path, tls, folder, report)
-    if "crl_file" in tls and "client_ca_file" not in tls:
-        message = "found without client_ca_file, allowed: only with it"
-        report.add((*path, "crl_file"), message, of_key=True)
+    for key in ("crl_file", "roles"):
+        if key in tls and "client_ca_file" not in tls:
+            message = "found without client_ca_file, allowed: only with it"
+            report.add((*path, key), message, of_key=True)
+    refuse_repeats((*path, "roles"), entries(tls.get("roles")), report)

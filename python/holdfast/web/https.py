@@ -1,22 +1,17 @@
-"""The certificates of an HTTPS host, as a context of the `ssl` module."""
+"""The certificates of an HTTPS host, which the core reads and judges."""
 
 from __future__ import annotations
 
-import ssl
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from holdfast.certificates.own import check_own
-from holdfast.certificates.pem import (
-    UnusableFile,
-    blocks,
-    certificates,
-    content,
-    passphrase,
-    revocation_lists,
-)
+from holdfast import _core
+from holdfast.certificates.own import key_for_core
+from holdfast.certificates.pem import UnusableFile
+from holdfast.web.openssl_context import openssl_context
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
 
@@ -32,6 +27,10 @@ class HttpsFiles:
     """If given, clients need a certificate that these certificates vouch for."""
     crl_file: Path | None = None
     """If given, every authority above a client requires a list."""
+    expired_crl: Literal["refuse", "accept"] = "refuse"
+    """Clients of an authority whose list is past its `nextUpdate`."""
+    roles: Sequence[str] | None = None
+    """The allowed roles of clients, "" is a certificate without a role; `None` is any role."""
 
 
 class Https:
@@ -40,8 +39,22 @@ class Https:
     def __init__(self, files: HttpsFiles) -> None:
         """Loads the files. Raises `UnusableFile`."""
         self._files = files
-        self.context = _context(files)
-        """The context for new connections. Open connections keep theirs."""
+        self._core = _loaded(files)
+        # Only until the core serves HTTP: goes with web/tls.py and web/openssl_context.py.
+        if files.roles is not None:
+            raise UnusableFile(files.cert_file, "roles require HTTP that the core serves")
+        self.context = openssl_context(
+            files.cert_file,
+            files.key_file,
+            files.key_passphrase_file,
+            files.client_ca_file,
+            files.crl_file,
+        )
+
+    @property
+    def core(self) -> _core.ServerTls:
+        """The settings for new connections. Open connections keep theirs."""
+        return self._core
 
     def reload(self) -> None:
         """Loads the files again, for new connections. Thread-safe.
@@ -52,46 +65,23 @@ class Https:
 
     def adopt(self, other: Https) -> None:
         """Uses the files and certificates of another one for new connections. Thread-safe."""
-        # A whole context: in the old one, certificates and authorities could only be added.
-        self.context, self._files = other.context, other._files
+        self.context = other.context
+        self._core, self._files = other._core, other._files
 
 
-def _context(files: HttpsFiles) -> ssl.SSLContext:
-    """Returns a context for TLS 1.2 and 1.3. Raises `UnusableFile`."""
-    check_own(files.cert_file, files.key_file, files.key_passphrase_file)
-    made = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    made.minimum_version = ssl.TLSVersion.TLSv1_2
-    made.options |= ssl.OP_NO_RENEGOTIATION | ssl.OP_CIPHER_SERVER_PREFERENCE
-    made.set_alpn_protocols(["http/1.1"])
-    secret = files.key_passphrase_file
-    # Without a password, OpenSSL would ask for one on the terminal.
-    password = b"" if secret is None else passphrase(secret)
+def _loaded(files: HttpsFiles) -> _core.ServerTls:
+    """Loads the files. Raises `UnusableFile`."""
+    others = (files.cert_file, files.client_ca_file, files.crl_file)
+    key = key_for_core(files.key_file, files.key_passphrase_file, *others)
     try:
-        made.load_cert_chain(files.cert_file, files.key_file, password)
-    except (OSError, ValueError) as error:
-        raise UnusableFile(files.cert_file, f"OpenSSL can't use it: {error}") from error
-    if files.client_ca_file is not None:
-        _require_clients(made, files.client_ca_file, files.crl_file)
-    return made
-
-
-def _require_clients(made: ssl.SSLContext, ca_file: Path, crl_file: Path | None) -> None:
-    """Makes certificates of clients mandatory."""
-    certificates(ca_file)
-    made.verify_mode = ssl.CERT_REQUIRED
-    # A listed authority needs no authority above it.
-    made.verify_flags |= ssl.VerifyFlags.VERIFY_X509_PARTIAL_CHAIN
-    _load(made, ca_file)
-    if crl_file is not None:
-        revocation_lists(crl_file)
-        if any(label != "X509 CRL" for label, _ in blocks(content(crl_file))):
-            raise UnusableFile(crl_file, "found something else, allowed: revocation lists alone")
-        made.verify_flags |= ssl.VerifyFlags.VERIFY_CRL_CHECK_CHAIN
-        _load(made, crl_file)
-
-
-def _load(made: ssl.SSLContext, file: Path) -> None:
-    try:
-        made.load_verify_locations(file)
-    except (OSError, ValueError) as error:
-        raise UnusableFile(file, f"OpenSSL can't use it: {error}") from error
+        return _core.https_server_tls(
+            cert_file=files.cert_file,
+            key_file=files.key_file,
+            client_ca_file=files.client_ca_file,
+            crl_file=files.crl_file,
+            expired_crl=files.expired_crl,
+            roles=files.roles,
+            key=key,
+        )
+    except ValueError as error:
+        raise UnusableFile.of(error) from error
