@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -21,6 +22,10 @@ if TYPE_CHECKING:
     from holdfast.web.operations import Body, Given, Later
     from holdfast.web.origin import Origins
     from holdfast.web.requests import Request
+
+
+MAX_QUERIES = 64
+"""Parsed queries that are kept."""
 
 
 class Application:
@@ -46,6 +51,8 @@ class Application:
         self._anyone = anyone
         self.max_body = max_body
         self._document = self._page = b""
+        # Those who poll send the same query again and again.
+        self._parameters = functools.lru_cache(MAX_QUERIES)(self._parsed)
 
     def __call__(self, request: Request) -> Response | Later:
         """Answers one request; at once, unless its body still arrives or something must wait."""
@@ -100,14 +107,16 @@ class Application:
             self.origins.check(request)
             request.who = request.owner(self._tokens) if self._tokens else self._anyone
         if operation.body is None:
-            fields = operation.parameters
-            given = from_query(request.query, fields) if fields else {}
-            return operation.handler(self, request, given)
+            return operation.handler(self, request, self._parameters(operation.path, request.query))
         self.check_type(request)
         body = request.arrived(self.max_body)
         if body is None:
             return self._arriving(operation, operation.body, request)
         return operation.handler(self, request, operation.body.parse(request, body))
+
+    def _parsed(self, path: str, query: bytes) -> Given:
+        fields = self.routes[path].parameters
+        return from_query(query, fields) if fields else {}
 
     async def _arriving(
         self, operation: Operation[Any], body: Body, request: Request
