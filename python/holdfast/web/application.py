@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from holdfast.web.origin import Origins
     from holdfast.web.requests import Request
 
-
 MAX_QUERIES = 64
 """Parsed queries that are kept."""
 
@@ -107,7 +106,9 @@ class Application:
             self.origins.check(request)
             request.who = request.owner(self._tokens) if self._tokens else self._anyone
         if operation.body is None:
-            return operation.handler(self, request, self._parameters(operation.path, request.query))
+            fields = operation.parameters
+            given = self._parameters(request.path, request.query) if fields else {}
+            return operation.handler(self, request, given)
         self.check_type(request)
         body = request.arrived(self.max_body)
         if body is None:
@@ -115,8 +116,7 @@ class Application:
         return operation.handler(self, request, operation.body.parse(request, body))
 
     def _parsed(self, path: str, query: bytes) -> Given:
-        fields = self.routes[path].parameters
-        return from_query(query, fields) if fields else {}
+        return from_query(query, self.routes[path].parameters)
 
     async def _arriving(
         self, operation: Operation[Any], body: Body, request: Request
