@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Literal
 from holdfast import _core
 from holdfast.certificates.own import key_for_core
 from holdfast.certificates.pem import UnusableFile
-from holdfast.web.openssl_context import openssl_context
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
 
@@ -40,16 +39,7 @@ class Https:
         """Loads the files. Raises `UnusableFile`."""
         self._files = files
         self._core = _loaded(files)
-        # Only until the core serves HTTP: goes with web/tls.py and web/openssl_context.py.
-        if files.roles is not None:
-            raise UnusableFile(files.cert_file, "roles require HTTP that the core serves")
-        self.context = openssl_context(
-            files.cert_file,
-            files.key_file,
-            files.key_passphrase_file,
-            files.client_ca_file,
-            files.crl_file,
-        )
+        self._followers: list[Callable[[_core.ServerTls], None]] = []
 
     @property
     def core(self) -> _core.ServerTls:
@@ -65,8 +55,13 @@ class Https:
 
     def adopt(self, other: Https) -> None:
         """Uses the files and certificates of another one for new connections. Thread-safe."""
-        self.context = other.context
         self._core, self._files = other._core, other._files
+        for use in self._followers:
+            use(self._core)
+
+    def follow(self, use: Callable[[_core.ServerTls], None]) -> None:
+        """Calls a function with the settings whenever they change."""
+        self._followers.append(use)
 
 
 def _loaded(files: HttpsFiles) -> _core.ServerTls:
