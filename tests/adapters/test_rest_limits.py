@@ -387,7 +387,6 @@ GARBAGE = [
     b"GET / HTTP/9.9\r\n\r\n",
     b"GET / HTTP/2.0\r\n\r\n",
     b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n",
-    b"BREW /pot HTTP/1.1\r\n\r\n",
     b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(200)),
     bytes.fromhex("000100000006010300000001"),
     b"GET / HTTP/1.1\r\nNo colon\r\n\r\n",
@@ -395,7 +394,6 @@ GARBAGE = [
     b"GET / HTTP/1.1\r\nX: a\x00b\r\n\r\n",
     b"GET /\xff HTTP/1.1\r\n\r\n",
     b"GET http:// HTTP/1.1\r\n\r\n",
-    b"CONNECT plant:502 HTTP/1.1\r\n\r\n",
     web.head("POST", web.INGEST, "Content-Length: 1", "Content-Length: 2") + b"xx",
     web.head("POST", web.INGEST, "Content-Length: 5", "Transfer-Encoding: chunked") + b"0\r\n\r\n",
     web.head("POST", web.INGEST, "Transfer-Encoding: chunked", "Content-Length: 5") + b"0\r\n\r\n",
@@ -422,6 +420,16 @@ def test_what_is_not_http_is_refused(service: web.Service, connect: Connect, sen
     service.until_counted("broken_request")
     assert service.memories["plant_a"].read("coils", 0, 1000) == [0] * 1000
     wire.until(lambda: is_well(service), "it serves")
+
+
+@pytest.mark.parametrize("method", ["BREW", "CONNECT", "TRACE"])
+def test_a_method_that_no_resource_has_is_refused(
+    service: web.Service, connect: Connect, method: str
+) -> None:
+    [answer] = web.answers(connect(service, web.head(method, "/pot", CLOSE)).rest())
+    assert answer.status in (400, 404)
+    [answer] = web.answers(connect(service, web.head(method, web.INGEST, CLOSE)).rest())
+    assert answer.status in (400, 405)
 
 
 @settings(

@@ -98,7 +98,8 @@ def test_listeners_are_not_empty_text(folder: Folder) -> None:
          "7: request_timeout: found 0, allowed: a number from 0.001 to 31622400"),
         ("  tokens:", "  token: []\n  tokens:",
          "7: token: unknown key, allowed: bind, sources, tokens, max_body, max_connections, "
-         "max_connections_per_source, when_full, request_timeout, tls; did you mean 'tokens'?"),
+         "max_connections_per_source, when_full, request_timeout, tls, hosts; did you mean "
+         "'tokens'?"),
         ("name: edge", "name: ''", f"8: tokens[0].name: found '', allowed: {NAME}"),
         ("[plant]", "[]", f"10: tokens[0].memories: found an empty list, allowed: {SOME}"),
         ("[plant]", "[plan]", "10: tokens[0].memories[0]: found 'plan', allowed: plant, other; "
@@ -505,3 +506,21 @@ def test_a_seal_that_nothing_can_open_is_a_warning(folder: Folder, text: str) ->
 )
 def test_a_seal_that_something_can_open_is_no_warning(folder: Folder, text: str) -> None:
     assert folder.warnings(SEALED + text) == []
+
+
+def test_rest_and_metrics_have_names(folder: Folder) -> None:
+    rest = "rest: {bind: '127.0.0.1:80', sources: [127.0.0.1], tokens: none, hosts: [A.Example]}\n"
+    metrics = "metrics: {bind: '127.0.0.1:81', hosts: [holdfast, A.Example]}\n"
+    config = folder.config(MEMORIES + rest + metrics)
+    assert config.rest is not None
+    assert config.metrics is not None
+    assert config.rest.hosts == ("a.example",)
+    assert config.metrics.hosts == ("holdfast", "a.example")
+    [problem] = folder.problems(MEMORIES + rest + metrics.replace("holdfast", "'holdfast:9464'"))
+    assert problem.startswith("p.yaml:5: metrics.hosts[0]: found 'holdfast:9464', allowed: ")
+
+
+def test_with_tokens_names_of_rest_have_no_effect(folder: Folder) -> None:
+    assert folder.warnings(MEMORIES + REST + "  hosts: [gw]\n") == [
+        "p.yaml:13: rest.hosts: has no effect with tokens"
+    ]

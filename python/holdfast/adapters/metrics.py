@@ -114,9 +114,10 @@ class Metrics:
         allowed = ": an IP address, localhost, or a name in metrics.hosts"
         names = frozenset(settings.hosts)
         origins = Origins(names=names, allowed=allowed, is_https=https is not None)
+        self._app = App(registry, health, origins)
         self._host = Host(
             "metrics",
-            App(registry, health, origins),
+            self._app,
             listener,
             sources=settings.sources,
             limits=LIMITS,

@@ -50,6 +50,7 @@ REQUESTS = ("refused_function", "refused_unit", "refused_address", "refused_list
 DENIALS = {
     ("ingest_refused", "unauthorized"),
     ("ingest_refused", "not_granted"),
+    ("ingest_refused", "foreign_page"),
     ("gateway_refused", "unauthorized"),
     ("gateway_refused", "refused_target"),
     ("gateway_refused", "writes_off"),

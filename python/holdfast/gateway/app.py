@@ -9,11 +9,11 @@ import asyncio
 import contextlib
 import logging
 from collections import Counter
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from holdfast import __version__, logs
 from holdfast.errors import ModbusException
-from holdfast.gateway import assets, listing, port_of_call, surveying, viewing, watching
+from holdfast.gateway import assets, port_of_call, surveying, viewing, watching
 from holdfast.gateway.broadcasting import NOTE
 from holdfast.gateway.device import Failed, RequestedDevice
 from holdfast.gateway.egress import Egress
@@ -36,16 +36,18 @@ from holdfast.web.requests import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Iterable, Iterator
+    from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
 
     from holdfast._core import Poller
-    from holdfast.gateway.endpoint import Endpoint, Given
-    from holdfast.gateway.listing import Local
+    from holdfast.gateway.endpoint import Answer, Endpoint, Given
     from holdfast.gateway.pool import Dial
     from holdfast.gateway.settings import Settings
     from holdfast.net.resolver import Resolve
+    from holdfast.tags import TagList
     from holdfast.web.health import HealthSource
     from holdfast.web.operations import Operation
+
+    Check: TypeAlias = Callable[[Given, Mapping[str, TagList]], Awaitable[Answer]]
 
 Result = TypeVar("Result")
 
@@ -379,14 +381,17 @@ class App(Application):
 
     # Answers without a device.
 
-    async def local(self, endpoint: Local, given: Given) -> Response:
-        """Answers a request for which no device is asked."""
+    async def check(self, check: Check, given: Given) -> Response:
+        """Checks tags or values."""
         with self._place("requests", self._limits.requests):
-            return json_response(await endpoint.answer(given, self._settings.profiles))
+            return json_response(await check(given, self._settings.profiles))
 
-    def profiles(self, _: Request, __: Given) -> Response:
-        """Lists the profiles."""
-        return json_response(listing.profiles(self._settings.profiles))
+    def profiles(self) -> Response:
+        """Returns the names of the profiles, and how many tags they have."""
+        profiles = self._settings.profiles.items()
+        return json_response(
+            {"profiles": [{"name": name, "tags": len(tags)} for name, tags in profiles]}
+        )
 
     def status(self, _: Request, __: Given) -> Response:
         """Returns the settings of the gateway."""

@@ -1,8 +1,8 @@
-"""The endpoints for tag lists, and for values before they are written. They ask no device."""
+"""The operations for tag lists, and for values before they are written. They ask no device."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from holdfast.gateway import tagging, typed
@@ -11,47 +11,31 @@ from holdfast.gateway.fields import BYTE_ORDER, DATATYPE, TYPED_SCHEMA
 from holdfast.gateway.reading import TYPED
 from holdfast.protocol import WRITE_REGISTERS
 from holdfast.web.fields import REQUIRED, Field
-from holdfast.web.schemas import array
+from holdfast.web.openapi import json_answer
+from holdfast.web.operations import Operation, body_of
+from holdfast.web.schemas import (
+    BOOLEAN,
+    COUNT,
+    NUMBER,
+    TEXT,
+    Schema,
+    array,
+    array_of,
+    map_of,
+    object_of,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Sequence
 
-    from holdfast.gateway.endpoint import Answer, Given
-    from holdfast.tags import TagList
-    from holdfast.web.schemas import Schema
+    from holdfast.gateway.app import App
 
-
-@dataclass(frozen=True)
-class Local:
-    """An endpoint that asks no device."""
-
-    path: str
-    name: str
-    summary: str
-    description: str
-    fields: tuple[Field, ...]
-    answer: Callable[[Given, Mapping[str, TagList]], Awaitable[Answer]]
-    properties: dict[str, Schema]
-    """The schemas of the answer's fields, without `success`."""
-    example: str
-    """The name of an example of a request, and of its answer."""
-    request: dict[str, Any]
-    reply: dict[str, Any]
-    optional: tuple[str, ...] = ()
-    """The properties that an answer may not have."""
-
-
-def profiles(known: Mapping[str, TagList]) -> Answer:
-    """The names of the profiles, and how many tags they have."""
-    return {"profiles": [{"name": name, "tags": len(tags)} for name, tags in known.items()]}
-
-
-NUMBER = {"type": ["number", "null"]}
-TEXT = {"type": "string"}
-TAG: Schema = {
-    "type": "object",
-    "required": ["name", "area", "address", "count", "type", "order", "unit", "writable"],
-    "properties": {
+_NUMBER_OR_NULL: Schema = {"type": ["number", "null"]}
+_SCALE = object_of(
+    {"from": {"anyOf": [TEXT, {"type": "object"}]}, "as": {"enum": ["factor", "exponent"]}}
+) | {"description": "The register that contains the scale: a tag, or its place"}
+TAG = object_of(
+    {
         "name": TEXT,
         "area": TEXT,
         "address": {"type": "integer"},
@@ -59,30 +43,16 @@ TAG: Schema = {
         "type": TEXT,
         "order": TEXT,
         "unit": TEXT,
-        "scale": {
-            "anyOf": [
-                {"type": "number"},
-                {
-                    "type": "object",
-                    "description": "The register that contains the scale: a tag, or its place",
-                    "required": ["from", "as"],
-                    "properties": {
-                        "from": {"anyOf": [TEXT, {"type": "object"}]},
-                        "as": {"enum": ["factor", "exponent"]},
-                    },
-                    "additionalProperties": False,
-                },
-            ]
-        },
-        "offset": {"type": "number"},
-        "writable": {"type": "boolean"},
-        "min": NUMBER,
-        "max": NUMBER,
-        "states": {"type": "object", "additionalProperties": TEXT},
+        "scale": {"anyOf": [NUMBER, _SCALE]},
+        "offset": NUMBER,
+        "writable": BOOLEAN,
+        "min": _NUMBER_OR_NULL,
+        "max": _NUMBER_OR_NULL,
+        "states": map_of(TEXT),
         "description": TEXT,
     },
-    "additionalProperties": False,
-}
+    optional=("scale", "offset", "min", "max", "states", "description"),
+)
 _EXAMPLE = (
     "name,area,address,type,order,scale,offset,unit,writable\nsetpoint,hr,24,uint16,,0.1,,°C,true\n"
 )
@@ -104,68 +74,112 @@ _SETPOINT: dict[str, Any] = {
     "description": "",
 }
 
-ENDPOINTS = (
-    Local(
+
+def _valid(
+    properties: dict[str, Schema], reply: dict[str, Any], *, optional: Sequence[str] = ()
+) -> dict[str, Any]:
+    """The answer to a valid request."""
+    whole = object_of({"success": {"const": True}, **properties}, optional=optional)
+    return json_answer("The request is valid", whole, {"success": True, **reply})
+
+
+OPERATIONS: tuple[Operation[App], ...] = (
+    Operation(
+        "POST",
         "/api/gateway/tags",
         "tags",
         "Check a tag list",
+        lambda app, _, given: app.check(tagging.parse, given),
+        _valid({"tags": {"type": "array", "items": TAG}}, {"tags": [_SETPOINT]}),
+        ("busy",),
         "Parses a tag list as the command line does, and returns its tags. An error names the "
         "line, the tag and the key.",
-        tagging.LIST,
-        tagging.parse,
-        {"tags": {"type": "array", "items": TAG}},
-        "A list of one tag",
-        {"tags": _EXAMPLE, "format": "csv"},
-        {"tags": [_SETPOINT]},
+        body=body_of(tagging.LIST, {"A list of one tag": {"tags": _EXAMPLE, "format": "csv"}}),
     ),
-    Local(
+    Operation(
+        "POST",
         "/api/gateway/tags/value",
         "tagValue",
         "Check a value of a tag before it is written",
+        lambda app, _, given: app.check(tagging.encode, given),
+        _valid(
+            {
+                "tag": TAG,
+                "form": {
+                    "enum": ["coils", "registers", "mask"],
+                    "description": "What to write; for `mask`, `values` are the AND and the OR "
+                    "mask",
+                },
+                "values": array_of({"type": ["integer", "boolean"]}),
+                "value": {"description": "The value as it is then read"},
+                "text": TEXT,
+            },
+            {
+                "tag": _SETPOINT,
+                "form": "registers",
+                "values": [215],
+                "value": 21.5,
+                "text": "21.5",
+            },
+        ),
+        ("busy",),
         "Returns what a write has to send. Nothing is sent. A value that does not fit the type, "
         "the scale, `min` and `max` is refused, as are tags that are not `writable`.",
-        (*tagging.LIST, tagging.NAME, tagging.VALUE),
-        tagging.encode,
-        {
-            "tag": TAG,
-            "form": {
-                "enum": ["coils", "registers", "mask"],
-                "description": "What to write; for `mask`, `values` are the AND and the OR mask",
+        body=body_of(
+            (*tagging.LIST, tagging.NAME, tagging.VALUE),
+            {
+                "A list of one tag": {
+                    "tags": _EXAMPLE,
+                    "format": "csv",
+                    "name": "setpoint",
+                    "value": "21.5",
+                }
             },
-            "values": {"type": "array", "items": {"type": ["integer", "boolean"]}},
-            "value": {"description": "The value as it is then read"},
-            "text": TEXT,
-        },
-        "A list of one tag",
-        {"tags": _EXAMPLE, "format": "csv", "name": "setpoint", "value": "21.5"},
-        {
-            "tag": _SETPOINT,
-            "form": "registers",
-            "values": [215],
-            "value": 21.5,
-            "text": "21.5",
-        },
+        ),
     ),
-    Local(
+    Operation(
+        "POST",
         "/api/gateway/values",
         "values",
         "Check typed values before they are written",
+        lambda app, _, given: app.check(typed.encode, given),
+        _valid(
+            {"values": REGISTERS, **TYPED},
+            {"values": [0, 0x41AC], "typed": [21.5], "typedText": ["21.5"]},
+            optional=("typedErrors",),
+        ),
+        ("busy",),
         "Returns the registers that hold the values, and the values as they are then read. Nothing "
         "is sent. A value that does not fit the type is refused.",
-        (
-            Field(
-                "values",
-                array(TYPED_SCHEMA, WRITE_REGISTERS),
-                f"Values of the type, bytes in hex, for up to {WRITE_REGISTERS} registers",
+        body=body_of(
+            (
+                Field(
+                    "values",
+                    array(TYPED_SCHEMA, WRITE_REGISTERS),
+                    f"Values of the type, bytes in hex, for up to {WRITE_REGISTERS} registers",
+                ),
+                replace(DATATYPE, default=REQUIRED),
+                BYTE_ORDER,
             ),
-            replace(DATATYPE, default=REQUIRED),
-            BYTE_ORDER,
+            {
+                "A float, low word first": {
+                    "values": [21.5],
+                    "datatype": "float32",
+                    "byteOrder": "CDAB",
+                }
+            },
         ),
-        typed.encode,
-        {"values": REGISTERS, **TYPED},
-        "A float, low word first",
-        {"values": [21.5], "datatype": "float32", "byteOrder": "CDAB"},
-        {"values": [0, 0x41AC], "typed": [21.5], "typedText": ["21.5"]},
-        optional=("typedErrors",),
+    ),
+    Operation(
+        "GET",
+        "/api/gateway/profiles",
+        "profiles",
+        "List the profiles of the configuration",
+        lambda app, _, __: app.profiles(),
+        json_answer(
+            "The profiles",
+            object_of({"profiles": array_of(object_of({"name": TEXT, "tags": COUNT}))}),
+            {"profiles": [{"name": "sdm630", "tags": 24}]},
+        ),
     ),
 )

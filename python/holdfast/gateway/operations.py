@@ -26,11 +26,10 @@ from holdfast.web import health, openapi
 from holdfast.web.application import DOCUMENTS
 from holdfast.web.openapi import Api, html_answer, json_answer, stream_answer
 from holdfast.web.operations import Operation, body_of
-from holdfast.web.schemas import COUNT, TEXT, array_of, object_of, ref
+from holdfast.web.schemas import object_of, ref
 
 if TYPE_CHECKING:
     from holdfast.gateway.endpoint import Endpoint
-    from holdfast.gateway.listing import Local
     from holdfast.gateway.settings import GatewayLimits, Settings
     from holdfast.web.refusals import Refusal
 
@@ -43,8 +42,7 @@ def operations(settings: Settings) -> tuple[Operation[App], ...]:
         *(_of_device(each, settings) for each in ENDPOINTS),
         *_streams(settings.limits),
         _STATUS,
-        *(_local(each) for each in listing.ENDPOINTS),
-        _PROFILES,
+        *listing.OPERATIONS,
         *DOCUMENTS,
         *(_asset(path) for path in assets.FILES),
         *(Operation("GET", path, "health", "", App.probe, is_open=True) for path in health.PATHS),
@@ -153,39 +151,6 @@ _STATUS: Operation[App] = Operation(
         },
     ),
 )
-
-_PROFILES: Operation[App] = Operation(
-    "GET",
-    "/api/gateway/profiles",
-    "profiles",
-    "List the profiles of the configuration",
-    App.profiles,
-    json_answer(
-        "The profiles",
-        object_of({"profiles": array_of(object_of({"name": TEXT, "tags": COUNT}))}),
-        {"profiles": [{"name": "sdm630", "tags": 24}]},
-    ),
-)
-
-
-def _local(endpoint: Local) -> Operation[App]:
-    """Returns an operation that asks no device."""
-    properties = {"success": {"const": True}, **endpoint.properties}
-    return Operation(
-        "POST",
-        endpoint.path,
-        endpoint.name,
-        endpoint.summary,
-        lambda app, _, given: app.local(endpoint, given),
-        json_answer(
-            "The request is valid",
-            object_of(properties, optional=endpoint.optional),
-            {"success": True, **endpoint.reply},
-        ),
-        ("busy",),
-        endpoint.description,
-        body=body_of(endpoint.fields, {endpoint.example: endpoint.request}),
-    )
 
 
 def _asset(path: str) -> Operation[App]:

@@ -2,20 +2,10 @@
 
 from __future__ import annotations
 
-from holdfast.web.refusals import (
-    LATE,
-    METHOD_NOT_ALLOWED,
-    TOO_LARGE,
-    UNAUTHORIZED,
-    Refusal,
-    Refusals,
-)
+from holdfast.web.refusals import COMMON, Refusal, Refusals
 
 REFUSALS = Refusals(
-    UNAUTHORIZED,
-    METHOD_NOT_ALLOWED,
-    LATE,
-    TOO_LARGE,
+    *COMMON,
     Refusal(
         400,
         ("malformed",),

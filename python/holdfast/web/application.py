@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from holdfast.web.operations import Body, Given, Later
     from holdfast.web.origin import Origins
     from holdfast.web.requests import Request
+
+MAX_QUERIES = 64
+"""Parsed queries that are kept."""
 
 
 class Application:
@@ -46,6 +50,8 @@ class Application:
         self._anyone = anyone
         self.max_body = max_body
         self._document = self._page = b""
+        # Those who poll send the same query again and again.
+        self._parameters = functools.lru_cache(MAX_QUERIES)(self._parsed)
 
     def __call__(self, request: Request) -> Response | Later:
         """Answers one request; at once, unless its body still arrives or something must wait."""
@@ -101,13 +107,16 @@ class Application:
             request.who = request.owner(self._tokens) if self._tokens else self._anyone
         if operation.body is None:
             fields = operation.parameters
-            given = from_query(request.query, fields) if fields else {}
+            given = self._parameters(request.path, request.query) if fields else {}
             return operation.handler(self, request, given)
         self.check_type(request)
         body = request.arrived(self.max_body)
         if body is None:
             return self._arriving(operation, operation.body, request)
         return operation.handler(self, request, operation.body.parse(request, body))
+
+    def _parsed(self, path: str, query: bytes) -> Given:
+        return from_query(query, self.routes[path].parameters)
 
     async def _arriving(
         self, operation: Operation[Any], body: Body, request: Request

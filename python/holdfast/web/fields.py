@@ -107,11 +107,15 @@ def decoded(body: bytes) -> Any:
     """Parses JSON. Raises `NotJson`, and `BadRequest` for a duplicate name."""
     try:
         text = body.decode()
+        value = _DECODER.decode(text)
         if "\\u" in text:
-            msgspec.json.decode(body)  # Refuses half of a surrogate pair, which json lets through.
-        return _DECODER.decode(text)
-    except (msgspec.MsgspecError, RecursionError, ValueError) as error:
-        raise NotJson("malformed", f"the body is not JSON: {str(error)[:100]}") from None
+            msgspec.json.decode(body)  # `json` lets half of a surrogate pair through.
+        return value
+    except msgspec.MsgspecError:
+        detail = "a string has half of a surrogate pair"
+    except (RecursionError, ValueError) as error:
+        detail = str(error)[:100]
+    raise NotJson("malformed", f"the body is not JSON: {detail}")
 
 
 def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

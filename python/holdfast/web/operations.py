@@ -8,7 +8,7 @@ by the table, `web.openapi` makes the document from it.
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias, TypeVar
 
@@ -68,7 +68,7 @@ class Operation(Generic[App]):
     is_open: bool = False
     """Whether it has no secret: it requires no token, and pages of other sites may link to it."""
     has_head: bool = True
-    failures: Sequence[Refusal] = field(default=())
+    failures: Sequence[Refusal] = ()
     """Responses for failures that are no refusals."""
 
     @property

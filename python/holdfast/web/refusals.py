@@ -36,25 +36,28 @@ class Refusal:
     example: str
 
 
-UNAUTHORIZED = Refusal(401, ("unauthorized",), "The token is missing or unknown", "unknown token")
-METHOD_NOT_ALLOWED = Refusal(
-    405,
-    ("method_not_allowed",),
-    "The resource does not support this method",
-    "allowed: POST, OPTIONS",
+COMMON = (
+    Refusal(401, ("unauthorized",), "The token is missing or unknown", "unknown token"),
+    Refusal(
+        405,
+        ("method_not_allowed",),
+        "The resource does not support this method",
+        "allowed: POST, OPTIONS",
+    ),
+    Refusal(
+        408,
+        ("timeout",),
+        "The body did not arrive in time; the connection is closed",
+        "the body is incomplete: 1024 bytes arrived in time",
+    ),
+    Refusal(
+        413,
+        ("too_large",),
+        "The body is too large; the connection is closed",
+        "the body has more than 65536 bytes",
+    ),
 )
-LATE = Refusal(
-    408,
-    ("timeout",),
-    "The body did not arrive in time; the connection is closed",
-    "the body is incomplete: 1024 bytes arrived in time",
-)
-TOO_LARGE = Refusal(
-    413,
-    ("too_large",),
-    "The body is too large; the connection is closed",
-    "the body has more than 65536 bytes",
-)
+"""Refusals that applications have in common."""
 
 
 class Refusals:

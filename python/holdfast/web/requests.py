@@ -11,7 +11,7 @@ import hmac
 import json
 import re
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
@@ -66,7 +66,7 @@ class Response:
     body: bytes = b""
     headers: Headers = field(default_factory=list)
     closes: bool = False
-    """Whether the connection is closed after it, which the peer can still read."""
+    """Whether the host closes the connection then. It reads on until the peer has the response."""
 
 
 def response(kind: bytes, body: bytes, *more: tuple[bytes, bytes], status: int = 200) -> Response:
@@ -80,48 +80,26 @@ def rejection(status: int, reason: str, detail: str, word: str = "rejected") -> 
     return response(JSON, body, status=status)
 
 
+@dataclass(slots=True, eq=False)
 class Request:
     """One request. A host makes a subclass for a body that still arrives, and for streams."""
 
-    __slots__ = (
-        "headers",
-        "identity",
-        "method",
-        "path",
-        "peer",
-        "query",
-        "version",
-        "who",
-        "whole",
-    )
-
-    def __init__(
-        self,
-        method: str,
-        path: str,
-        query: bytes,
-        headers: Headers,
-        peer: str,
-        *,
-        version: str = "1.1",
-        whole: bytes | None = b"",
-        identity: Identity | None = None,
-    ) -> None:
-        self.method = method
-        self.path = path
-        """The path, percent-decoded."""
-        self.query = query
-        """The part behind `?`, as it was sent."""
-        self.headers = headers
-        self.peer = peer
-        """The address of the client as text: `10.0.0.9:51200`."""
-        self.version = version
-        """The version of HTTP, `1.0` or `1.1`."""
-        self.whole = whole
-        """The body, if it has arrived together with the head; `None` while it still arrives."""
-        self.identity = identity
-        self.who = "-"
-        """The name of the token's owner; `-` until the token was checked."""
+    method: str
+    path: str
+    """The path, percent-decoded."""
+    query: bytes
+    """The part behind `?`, as it was sent."""
+    headers: Headers
+    peer: str
+    """The address of the client as text: `10.0.0.9:51200`."""
+    _: KW_ONLY
+    version: str = "1.1"
+    """The version of HTTP, `1.0` or `1.1`."""
+    whole: bytes | None = b""
+    """The body, if it has arrived together with the head; `None` while it still arrives."""
+    identity: Identity | None = None
+    who: str = "-"
+    """The name of the token's owner; `-` until the token was checked."""
 
     # What a host provides.
 

@@ -549,6 +549,48 @@ mod tests {
         assert!(admission.admit(mapped).is_ok());
     }
 
+    /// Which of several connections of HTTP gives way, given what each waits for, and for how long.
+    fn http_evicts(waiting: &[(Waiting, Duration)]) -> Option<usize> {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let mut limits = admission(waiting.len(), None, WhenFull::Evict).table().limits;
+        limits.grace = Duration::from_secs(1);
+        let mut admission = Admission::new(limits);
+        admission.epoch -= Duration::from_secs(200);
+        let admission = Arc::new(admission);
+        let now = Instant::now();
+        let tickets: Vec<Ticket> = waiting
+            .iter()
+            .zip(0..)
+            .map(|((waiting, long), port)| {
+                let (ticket, _) = begin(&admission, &runtime, peer(1, port));
+                ticket.wait(*waiting, now - *long);
+                ticket
+            })
+            .collect();
+        let evicted = admission.admit(peer(2, 0)).ok()?.1;
+        assert_eq!(tickets.len(), waiting.len());
+        (0..waiting.len()).find(|port| evicted == Some(session(1, *port as u16)))
+    }
+
+    #[test]
+    fn connections_of_http_give_way_that_wait_longest_for_a_request_then_those_within_one() {
+        use Waiting::{ForHandler, ForRequest, ForRest};
+        let of = |seconds: u64| Duration::from_millis(seconds * 1000 + 500);
+        let cases: [(&[(Waiting, Duration)], Option<usize>); 8] = [
+            (&[(ForRequest, of(2)), (ForRequest, of(3)), (ForRequest, of(1))], Some(1)),
+            (&[(ForRequest, of(0)), (ForRest, of(99))], Some(0)),
+            (&[(ForRest, of(99)), (ForRequest, of(0))], Some(1)),
+            (&[(ForRest, of(91)), (ForRest, of(92)), (ForRest, of(0))], Some(1)),
+            (&[(ForHandler, of(99)), (ForRest, of(1))], Some(1)),
+            (&[(ForHandler, of(99)), (ForHandler, of(99))], None),
+            (&[(ForRest, of(0))], None),
+            (&[(ForHandler, of(99)), (ForRest, of(0))], None),
+        ];
+        for (waiting, evicted) in cases {
+            assert_eq!(http_evicts(waiting), evicted, "{waiting:?}");
+        }
+    }
+
     #[test]
     fn the_connection_that_has_been_idle_longest_is_evicted() {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();

@@ -35,7 +35,10 @@ class Rest:
         https: Https | None = None,
         stop_timeout: float = STOP_TIMEOUT,
     ) -> None:
-        self._app = App(OPERATIONS, settings, memory_access, diagnostics, sessions)
+        is_https = https is not None
+        self._app = App(
+            OPERATIONS, settings, memory_access, diagnostics, sessions, is_https=is_https
+        )
         self._host = Host(
             "rest",
             self._app,
@@ -50,10 +53,9 @@ class Rest:
             stop_timeout=stop_timeout,
             https=https,
         )
-        scheme = "http" if https is None else "https"
         self._app.describe(
             document(__version__, settings.max_body, secured=settings.tokens != "none"),
-            f"{scheme}://{self._host.address}",
+            f"{'https' if is_https else 'http'}://{self._host.address}",
         )
         self.heartbeat = self._host.heartbeat
 

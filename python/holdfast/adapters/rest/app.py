@@ -54,13 +54,15 @@ class App(Application):
         memory_access: MemoryAccess,
         diagnostics: DiagnosticsSource,
         sessions: SessionControl,
+        *,
+        is_https: bool = False,
     ) -> None:
         tokens = () if settings.tokens == "none" else settings.tokens
         allowed = " without tokens: an IP address, localhost, or a name in rest.hosts"
         names = None if tokens else frozenset(settings.hosts)
         super().__init__(
             operations,
-            Origins(names=names, allowed=allowed, is_https=settings.tls is not None),
+            Origins(names=names, allowed=allowed, is_https=is_https),
             tokens=[(token.name, bytes.fromhex(token.sha256)) for token in tokens],
             anyone=ANYONE,
             max_body=settings.max_body,
@@ -98,7 +100,8 @@ class App(Application):
         refused = error
         if isinstance(error, BadRequest):
             refused = Refused(error.reason, error.detail)
-            write = (request.path, request.method) == (INGEST, "POST")
+            # Nobody can fill the audit log with writes that are refused before a token was checked.
+            write = request.who != "-" and (request.method, request.path) == ("POST", INGEST)
             note = self._memory_access.refuse if write else self._memory_access.note
             note(refused, request.who, request.peer)
         if not isinstance(refused, Refused):

@@ -1,0 +1,206 @@
+"""Applications by the face that a host sees: a request in, a response or a stream out."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from holdfast.web.fields import NotJson, decoded
+from holdfast.web.requests import BadRequest, ClientDisconnected, Headers, Request, Response
+from support import web
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterator
+
+    from holdfast.adapters.rest.app import App
+
+HOST = (b"host", b"127.0.0.1")
+KIND = (b"content-type", b"application/json")
+COMMAND = json.dumps(web.command("coils", 0, [1])).encode()
+COIL = b"memory=plant_a&area=coils&address=0&count=1"
+
+
+class Arriving(Request):
+    """A request whose body comes in pieces, or that takes a stream."""
+
+    def __init__(
+        self, method: str, path: str, query: bytes = b"", pieces: tuple[bytes, ...] = ()
+    ) -> None:
+        super().__init__(method, path, query, [HOST, KIND], "127.0.0.1:50000", whole=None)
+        self._pieces = list(pieces)
+        self.late = asyncio.Event()
+        self.sent: list[bytes | int] = []
+        self.has_left = asyncio.Event()
+        self.got = asyncio.Event()
+
+    @property
+    def is_late(self) -> bool:
+        return self.late.is_set()
+
+    async def piece(self) -> bytes | None:
+        return self._pieces.pop(0) if self._pieces else None
+
+    async def gone(self) -> None:
+        await self.has_left.wait()
+
+    async def begin(self, status: int, headers: Headers) -> None:  # noqa: ARG002
+        self.sent.append(status)
+
+    async def send(self, data: bytes) -> None:
+        self.sent.append(data)
+        self.got.set()
+
+    async def end(self) -> None:
+        self.sent.append(b"")
+
+
+def whole(method: str, path: str, body: bytes = b"", query: bytes = b"") -> Request:
+    return Request(method, path, query, [HOST, KIND], "127.0.0.1:50000", whole=body)
+
+
+@pytest.fixture
+def memory() -> holdfast.Memory:
+    return holdfast.Memory(coils=8)
+
+
+@pytest.fixture
+def app(memory: holdfast.Memory) -> Iterator[App]:
+    service = web.Service({"plant_a": memory}, max_body=1024)
+    yield service.made()._app
+    service.listener.close()
+
+
+def run(test: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    asyncio.run(test())
+
+
+def test_what_needs_no_waiting_is_answered_without_a_coroutine(
+    app: App, memory: holdfast.Memory
+) -> None:
+    async def test() -> None:
+        for request, body in (
+            (whole("POST", web.INGEST, COMMAND), b'"accepted"'),
+            (whole("GET", web.READ, query=COIL), b'{"values":[1]}'),
+            (whole("GET", "/api/v1/health"), b'{"status":"ok"}'),
+            (whole("GET", "/nowhere"), b"not_found"),
+            (whole("POST", web.INGEST, b"{"), b"malformed"),
+        ):
+            answer = app(request)
+            assert isinstance(answer, Response), request.path
+            assert body in answer.body
+
+    run(test)
+    assert memory.read("coils", 0, 1) == [1]
+
+
+def test_a_body_that_still_arrives_is_answered_as_a_whole_one(
+    app: App, memory: holdfast.Memory
+) -> None:
+    async def test() -> None:
+        answer = app(Arriving("POST", web.INGEST, pieces=(COMMAND[:9], b"", COMMAND[9:])))
+        assert not isinstance(answer, Response)
+        assert await answer == app(whole("POST", web.INGEST, COMMAND))
+
+    run(test)
+    assert memory.read("coils", 0, 1) == [1]
+
+
+def test_a_body_that_is_too_large_or_late_closes_the_connection(app: App) -> None:
+    async def test() -> None:
+        large = app(Arriving("POST", web.INGEST, pieces=(b" " * 1000, b" " * 1000)))
+        late = Arriving("POST", web.INGEST, pieces=(b"{", b""))
+        late.late.set()
+        for answer in (large, app(late), app(whole("POST", web.INGEST, b" " * 1025))):
+            response = answer if isinstance(answer, Response) else await answer
+            assert response is not None
+            assert (response.status in (408, 413), response.closes) == (True, True)
+
+    run(test)
+
+
+def test_a_stream_begins_sends_and_ends_when_its_client_is_gone(app: App) -> None:
+    async def test() -> None:
+        request = Arriving("GET", "/api/v1/memory/changes", COIL)
+        answer = app(request)
+        assert not isinstance(answer, Response)
+        task = asyncio.ensure_future(answer)
+        await request.got.wait()
+        request.has_left.set()
+        assert await task is None
+        status, event, *_, end = request.sent
+        assert (status, end) == (200, b"")
+        assert isinstance(event, bytes)
+        assert event.startswith(b"id: 0\nevent: values\n")
+
+    run(test)
+    assert app.open_streams == 0
+
+
+def test_a_stream_whose_client_cannot_be_reached_frees_its_place(
+    app: App, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def fail(*_: object) -> None:
+        raise ClientDisconnected
+
+    async def test() -> None:
+        monkeypatch.setattr(Arriving, "send", fail)
+        answer = app(Arriving("GET", "/api/v1/memory/changes", COIL))
+        assert not isinstance(answer, Response)
+        with pytest.raises(ClientDisconnected):
+            await answer
+
+    run(test)
+    assert app.open_streams == 0
+
+
+def test_a_query_that_is_sent_again_is_answered_anew(app: App, memory: holdfast.Memory) -> None:
+    async def test() -> None:
+        for value in (0, 1):
+            memory.write("coils", 0, [value])
+            answer = app(whole("GET", web.READ, query=COIL))
+            assert isinstance(answer, Response)
+            assert answer.body == b'{"values":[%d]}' % value
+
+    run(test)
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        (b"", "line 1 column 1"),
+        (b"{\n1}", "line 2 column 1"),
+        (b'{"a":NaN}', "NaN is out of range"),
+        (b"[-Infinity]", "-Infinity is out of range"),
+        (b"[1e999]", "1e999 is out of range"),
+        (b"[" + b"9" * 5000 + b"]", "4300 digits"),
+        (b'["\\ud800"]', "surrogate"),
+        (b'["\xff"]', "can't decode byte 0xff"),
+        (b"\xff\xfe[\x00]\x00", "can't decode byte 0xff"),
+        (b'"\x01"', "control character"),
+        (b"[" * 60_000, "recursion"),
+        (b"[] []", "Extra data"),
+    ],
+)
+def test_what_is_not_json_is_told_by_its_place(body: bytes, says: str) -> None:
+    with pytest.raises(NotJson) as raised:
+        decoded(body)
+    assert raised.value.detail.startswith("the body is not JSON: ")
+    assert says in raised.value.detail
+    assert len(raised.value.detail) < 130
+
+
+@pytest.mark.parametrize("body", [b'{"a":1,"a":1}', b'[{"b":{"a":1,"c":2,"a":3}}]'])
+def test_a_name_that_is_given_twice_is_refused(body: bytes) -> None:
+    with pytest.raises(BadRequest, match='"a" is given more than once'):
+        decoded(body)
+
+
+def test_json_is_decoded_as_it_is_written() -> None:
+    text = '{"a": [1, 1.0, true, null, "\\u00e9\\ud83d\\ude00", 18446744073709551616]}'
+    found = decoded(text.encode())
+    assert found == {"a": [1, 1.0, True, None, "\u00e9\U0001f600", 2**64]}
+    assert [type(each) for each in found["a"][:3]] == [int, float, bool]
