@@ -519,7 +519,10 @@ class HttpServer:
         """The name of the thread, seconds since its last beat, and the system's number of it."""
 
     def set_tls(self, tls: ServerTls) -> None:
-        """Uses other certificates for new connections."""
+        """Uses other certificates for new connections, and judges open ones by them."""
+
+    def review(self) -> None:
+        """Judges the certificates of open connections again, and ends those that fail."""
 
     def end(self) -> None:
         """Ends connections without a request now, and the others after their responses."""

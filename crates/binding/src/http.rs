@@ -218,6 +218,11 @@ impl HttpServer {
         Ok(())
     }
 
+    /// Judges the certificates of open connections again.
+    fn review(&self) {
+        self.core.review();
+    }
+
     fn end(&self) {
         self.core.end();
     }

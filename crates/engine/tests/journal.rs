@@ -93,6 +93,7 @@ impl Setup {
             max_connections_per_source: None,
             when_full: WhenFull::Refuse,
             max_handshakes: None,
+            grace: std::time::Duration::ZERO,
         };
         let stream = StreamSettings {
             bind,

@@ -124,6 +124,7 @@ impl Setup {
                 max_connections_per_source: None,
                 when_full: WhenFull::Refuse,
                 max_handshakes: None,
+                grace: std::time::Duration::ZERO,
             },
             idle_timeout: None,
             request_timeout: TIMEOUT,

@@ -382,6 +382,7 @@ def https(settings: HttpsConfig) -> Https:
             settings.client_ca_file,
             settings.crl_file,
             settings.expired_crl,
+            settings.review,
             settings.roles,
         )
     )

@@ -115,6 +115,7 @@ class Host:
         self._leaving = leaving
         self._rejection = rejection
         self._https = https
+        self._reviewed = time.monotonic()
         self._server: HttpServer | None = None
         self._counts = dict.fromkeys(COUNTS, 0)
         self._tls_failures: dict[str, int] = {}
@@ -157,6 +158,7 @@ class Host:
             )
             while not stopped.is_set():
                 self.heartbeat.beat()
+                self._review(server)
                 self._log_events(server)
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stopped.wait(), PERIOD)
@@ -190,6 +192,13 @@ class Host:
         if https is not None:
             https.follow(server.set_tls)
         return server
+
+    def _review(self, server: HttpServer) -> None:
+        """Judges the certificates of open connections again when it is time to."""
+        review, now = 0.0 if self._https is None else self._https.review, time.monotonic()
+        if review and now - self._reviewed >= review:
+            self._reviewed = now
+            server.review()
 
     async def _end(self, server: HttpServer) -> None:
         """Ends connections; those with a pending request after at most `stop_timeout` seconds."""

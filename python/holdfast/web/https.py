@@ -28,6 +28,8 @@ class HttpsFiles:
     """If given, every authority above a client requires a list."""
     expired_crl: Literal["refuse", "accept"] = "refuse"
     """Clients of an authority whose list is past its `nextUpdate`."""
+    review: float = 3600.0
+    """Seconds after which the certificates of open connections are judged again; 0: never."""
     roles: Sequence[str] | None = None
     """The allowed roles of clients, "" is a certificate without a role; `None` is any role."""
 
@@ -50,6 +52,11 @@ class Https:
         """Calls `use` with the settings, now and when they change, instead of the one before."""
         self._use = use
         use(self._core)
+
+    @property
+    def review(self) -> float:
+        """Seconds after which the certificates of open connections are judged again; 0: never."""
+        return self._files.review
 
     def reload(self) -> None:
         """Loads the files again, for new connections. Thread-safe.

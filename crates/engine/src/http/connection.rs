@@ -49,8 +49,11 @@ const NEVER: Duration = Duration::from_secs(3600);
 /// How a connection ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum End {
-    /// The peer may still send: it is read to its end, so that it gets the last response.
-    Said,
+    /// After a response. The peer may still send: it is read to its end, so that it gets the response.
+    Answered,
+    /// Between requests: the end is announced, if the connection has a way to.
+    Idle,
+    /// At once: the peer is gone, or does not do its part.
     Dropped,
 }
 
@@ -66,10 +69,13 @@ pub(super) async fn serve(
         return;
     };
     let line = SharedLine::new(Arc::clone(&front), (ticket, peer), stream);
-    if converse(&front, &line, stop.clone()).await == End::Dropped {
-        return;
+    let end = converse(&front, &line, stop.clone()).await;
+    let Some(mut line) = line.into_line() else { return };
+    match end {
+        End::Dropped => return,
+        End::Idle => return line.announce_end(),
+        End::Answered => {}
     }
-    let Some(line) = line.into_line() else { return };
     if line.has_unread() {
         line.ticket.set_answered();
         let mut stream = line.into_stream();
@@ -140,16 +146,17 @@ pub(super) async fn converse(
     // hyper takes memory for each connection, so it begins with the first bytes.
     let begun = poll_fn(|context| {
         if stopped.as_mut().poll(context).is_ready() {
-            return Poll::Ready(false);
+            return Poll::Ready(Some(End::Idle));
         }
         let mut line = line.lock();
         if let Poll::Ready(read) = line.poll_fill(context) {
-            return Poll::Ready(read.is_ok_and(|len| len > 0));
+            let has_begun = read.is_ok_and(|len| len > 0);
+            return Poll::Ready((!has_begun).then_some(End::Dropped));
         }
-        line.poll_deadlines(context, alarm.as_mut()).map(|()| false)
+        line.poll_deadlines(context, alarm.as_mut()).map(Some)
     });
-    if !begun.await {
-        return End::Dropped;
+    if let Some(end) = begun.await {
+        return end;
     }
     let service = service_fn(|request| answered(Arc::clone(front), line.clone(), request));
     let connection = http1::Builder::new()
@@ -164,19 +171,19 @@ pub(super) async fn converse(
         if !is_stopping && stopped.as_mut().poll(context).is_ready() {
             is_stopping = true;
             if !line.lock().is_busy() {
-                return Poll::Ready(End::Dropped);
+                return Poll::Ready(End::Idle);
             }
             connection.as_mut().graceful_shutdown();
         }
         if let Poll::Ready(ended) = connection.as_mut().poll(context) {
             let is_said = ended.is_ok() || line.lock().refused.is_some();
-            return Poll::Ready(if is_said { End::Said } else { End::Dropped });
+            return Poll::Ready(if is_said { End::Answered } else { End::Dropped });
         }
         let mut line = line.lock();
         if line.poll_ahead(context) || line.is_left() {
             return Poll::Ready(End::Dropped);
         }
-        line.poll_deadlines(context, alarm.as_mut()).map(|()| End::Dropped)
+        line.poll_deadlines(context, alarm.as_mut())
     })
     .await
 }
@@ -193,7 +200,7 @@ impl super::line::Line {
         &mut self,
         context: &mut Context<'_>,
         mut alarm: Pin<&mut Sleep>,
-    ) -> Poll<()> {
+    ) -> Poll<End> {
         loop {
             let due = self.due().unwrap_or_else(|| Instant::now() + NEVER);
             if alarm.deadline().into_std() > due {
@@ -209,9 +216,10 @@ impl super::line::Line {
                 }
                 Verdict::Drop(kind) => {
                     self.front.ended(kind, self.peer.clone());
-                    return Poll::Ready(());
+                    let is_idle = kind == Kind::Idle;
+                    return Poll::Ready(if is_idle { End::Idle } else { End::Dropped });
                 }
-                Verdict::DropAgain => return Poll::Ready(()),
+                Verdict::DropAgain => return Poll::Ready(End::Dropped),
             }
         }
     }

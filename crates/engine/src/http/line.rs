@@ -14,9 +14,9 @@ use super::portion::{ChunksEnd, HeadEnd, Portion};
 use super::refusal::{self, Refusal};
 use super::server::Front;
 use crate::server::Peer;
-use crate::server::admission::{Ticket, Waiting};
+use crate::server::admission::{Ticket, WaitingFor};
 use crate::server::event::Kind;
-use crate::server::stream::{End, Stream};
+use crate::server::stream::{self, End, Stream};
 
 /// Bytes per read of the socket, and the most that a connection holds of requests that were sent ahead.
 const CHUNK: usize = 16 * 1024;
@@ -181,6 +181,12 @@ impl Line {
                 || !matches!(self.portion, Portion::Head(_)) && !self.portion.is_over())
     }
 
+    /// Announces the end of the connection, without waiting.
+    pub(super) fn announce_end(&mut self) {
+        self.stream.end(&mut self.unsent);
+        let _ = stream::write(self.stream.socket(), &mut self.unsent);
+    }
+
     pub(super) fn into_stream(self) -> Box<dyn Stream> {
         self.stream
     }
@@ -208,11 +214,11 @@ impl Line {
         let has_arrived = self.portion.is_over();
         let waiting = if self.is_busy() && is_taken && (self.answer == Answer::Begun || has_arrived)
         {
-            Waiting::ForHandler
+            WaitingFor::Handler
         } else if is_taken && (self.idle_due.is_some() || !self.is_used) {
-            Waiting::ForRequest
+            WaitingFor::Request
         } else {
-            Waiting::ForRest
+            WaitingFor::Rest
         };
         self.ticket.wait(waiting, self.since);
     }

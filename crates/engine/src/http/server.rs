@@ -215,10 +215,23 @@ impl HttpServer {
         &self.heartbeat
     }
 
-    /// Uses these certificates for new connections.
+    /// Uses these certificates for new connections, and judges open ones by them.
     pub fn set_tls(&self, tls: Arc<ServerTls>) {
         if let Some(live) = &self.front.tls {
             live.replace(tls);
+        }
+        self.review();
+    }
+
+    /// Judges the certificates of open connections again. Those that fail are ended.
+    pub fn review(&self) {
+        let Some(tls) = self.front.tls() else { return };
+        let fails = |peer: &Peer| {
+            let failure = tls.judge(peer.certificate.as_ref()?).err()?;
+            Some(Kind::TlsFailed(failure.reason()))
+        };
+        for (peer, kind) in self.front.context.admission.review(fails) {
+            self.front.ended(kind, peer);
         }
     }
 

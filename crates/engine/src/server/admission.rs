@@ -54,13 +54,13 @@ impl ConnectionLimits {
 
 /// What a connection of HTTP waits for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Waiting {
+pub(crate) enum WaitingFor {
     /// The peer may begin a request.
-    ForRequest,
+    Request,
     /// The peer has begun a request, or has not taken a response.
-    ForRest,
+    Rest,
     /// The peer waits. Such a connection is never closed for another.
-    ForHandler,
+    Handler,
 }
 
 #[derive(Debug)]
@@ -434,10 +434,10 @@ impl Ticket {
     }
 
     /// Records what a connection of HTTP waits for, and since when.
-    pub(crate) fn wait(&self, waiting: Waiting, since: Instant) {
+    pub(crate) fn wait(&self, waiting: WaitingFor, since: Instant) {
         self.touch(since);
-        self.set_amid_packet(waiting == Waiting::ForRest);
-        self.activity.is_busy.store(waiting == Waiting::ForHandler, Ordering::Relaxed);
+        self.set_amid_packet(waiting == WaitingFor::Rest);
+        self.activity.is_busy.store(waiting == WaitingFor::Handler, Ordering::Relaxed);
     }
 
     /// Records whether part of a packet has arrived.
@@ -550,7 +550,7 @@ mod tests {
     }
 
     /// Which of several connections of HTTP gives way, given what each waits for, and for how long.
-    fn http_evicts(waiting: &[(Waiting, Duration)]) -> Option<usize> {
+    fn http_evicts(waiting: &[(WaitingFor, Duration)]) -> Option<usize> {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
         let mut limits = admission(waiting.len(), None, WhenFull::Evict).table().limits;
         limits.grace = Duration::from_secs(1);
@@ -574,17 +574,18 @@ mod tests {
 
     #[test]
     fn connections_of_http_give_way_that_wait_longest_for_a_request_then_those_within_one() {
-        use Waiting::{ForHandler, ForRequest, ForRest};
+        use WaitingFor::{Handler, Request, Rest};
         let of = |seconds: u64| Duration::from_millis(seconds * 1000 + 500);
-        let cases: [(&[(Waiting, Duration)], Option<usize>); 8] = [
-            (&[(ForRequest, of(2)), (ForRequest, of(3)), (ForRequest, of(1))], Some(1)),
-            (&[(ForRequest, of(0)), (ForRest, of(99))], Some(0)),
-            (&[(ForRest, of(99)), (ForRequest, of(0))], Some(1)),
-            (&[(ForRest, of(91)), (ForRest, of(92)), (ForRest, of(0))], Some(1)),
-            (&[(ForHandler, of(99)), (ForRest, of(1))], Some(1)),
-            (&[(ForHandler, of(99)), (ForHandler, of(99))], None),
-            (&[(ForRest, of(0))], None),
-            (&[(ForHandler, of(99)), (ForRest, of(0))], None),
+        type Case<'a> = (&'a [(WaitingFor, Duration)], Option<usize>);
+        let cases: [Case<'_>; 8] = [
+            (&[(Request, of(2)), (Request, of(3)), (Request, of(1))], Some(1)),
+            (&[(Request, of(0)), (Rest, of(99))], Some(0)),
+            (&[(Rest, of(99)), (Request, of(0))], Some(1)),
+            (&[(Rest, of(91)), (Rest, of(92)), (Rest, of(0))], Some(1)),
+            (&[(Handler, of(99)), (Rest, of(1))], Some(1)),
+            (&[(Handler, of(99)), (Handler, of(99))], None),
+            (&[(Rest, of(0))], None),
+            (&[(Handler, of(99)), (Rest, of(0))], None),
         ];
         for (waiting, evicted) in cases {
             assert_eq!(http_evicts(waiting), evicted, "{waiting:?}");
