@@ -92,7 +92,7 @@ CASES: dict[str, bytes] = {
 def cuts(sent: bytes) -> Iterator[list[bytes]]:
     """The bytes cut in two at several places, and byte by byte at the beginning."""
     most = min(len(sent), 400)
-    for cut in range(1, most, most // 12):
+    for cut in range(1, most, most // 8):
         yield [sent[:cut], sent[cut:]]
     yield [*(sent[at : at + 1] for at in range(most)), sent[most:]]
 
@@ -109,6 +109,7 @@ def test_a_request_has_the_same_outcome_however_it_is_cut(rest: Rest, name: str)
 def test_joined_requests_have_the_same_outcome_as_those_that_are_sent_apart(
     rest: Rest, name: str
 ) -> None:
-    for other in CASES:
+    names = [*CASES, *CASES]
+    for other in names[names.index(name) :][:5]:
         sent = [CASES[name], CASES[other], HEALTH]
         assert rest.outcome([b"".join(sent)]) == rest.outcome(sent), other

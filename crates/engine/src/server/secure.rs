@@ -36,8 +36,13 @@ pub(crate) async fn secured(
     };
     let shaken = tokio::select! {
         biased;
-        _ = stop.wait_for(|stop| *stop) => return ended(Kind::Closed),
-        shaken = timeout(time_limit, stream.handshake(time_limit)) => shaken,
+        _ = stop.wait_for(|stop| *stop) => None,
+        shaken = timeout(time_limit, stream.handshake(time_limit)) => Some(shaken),
+    };
+    let Some(shaken) = shaken else {
+        // The peer may have completed its side.
+        stream.announce_end();
+        return ended(Kind::Closed);
     };
     let certificate = match shaken {
         Ok(Ok(())) => stream.peer_certificate(),

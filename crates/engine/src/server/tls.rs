@@ -89,11 +89,16 @@ impl ServerTlsStream {
         self.channel.presented_subject()
     }
 
-    /// Announces the end, and closes the connection.
-    pub(crate) async fn refuse(mut self, stop: watch::Receiver<bool>) {
+    /// Announces the end without waiting.
+    pub(crate) fn announce_end(&mut self) {
         let mut unsent = Vec::new();
         self.channel.end(&mut unsent);
         let _ = stream::write(&self.socket, &mut unsent);
+    }
+
+    /// Announces the end, and closes the connection.
+    pub(crate) async fn refuse(mut self, stop: watch::Receiver<bool>) {
+        self.announce_end();
         drain(&mut self.socket, stop, |_| ()).await;
     }
 
