@@ -80,9 +80,9 @@ class Field:
         whole: Schema = self.schema
         if self.most > 1:
             whole = {"type": "array", "minItems": 1, "items": self.schema}
-        return (
-            whole if self.required or self.default is None else {**whole, "default": self.default}
-        )
+        if self.required or self.default is None:
+            return whole
+        return {**whole, "default": self.default}
 
 
 def object_with(fields: Sequence[Field]) -> Schema:
@@ -155,15 +155,11 @@ def from_query(query: bytes, fields: Sequence[Field]) -> dict[str, Any]:
             times = "once" if limit == 1 else f"{limit} times"
             raise malformed(f"{name} is given more than {times}")
     _check_names(texts, fields)
-    given_values = {name: [known[name].read(text) for text in texts[name]] for name in texts}
-    return {
-        name: field.default
-        if name not in given_values
-        else given_values[name]
-        if field.most > 1
-        else given_values[name][0]
-        for name, field in known.items()
-    }
+    values: dict[str, Any] = {field.name: field.default for field in fields}
+    for name, given in texts.items():
+        read = [known[name].read(text) for text in given]
+        values[name] = read if known[name].most > 1 else read[0]
+    return values
 
 
 def malformed(detail: str) -> BadRequest:
