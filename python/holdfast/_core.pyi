@@ -561,6 +561,9 @@ class HttpExchange:
     def end(self, is_complete: bool) -> None:
         """Ends a stream. One that is not complete is cut off."""
 
+    def abandon(self) -> None:
+        """Ends the connection: there will be no response."""
+
 def https_server_tls(
     *,
     cert_file: str | PathLike[str],

@@ -271,6 +271,11 @@ impl HttpExchange {
     fn end(&self, is_complete: bool) {
         self.core.end(is_complete);
     }
+
+    /// There will be no response: the connection is cut off.
+    fn abandon(&self) {
+        self.core.abandon();
+    }
 }
 
 impl Drop for HttpExchange {

@@ -252,6 +252,8 @@ class Host:
             request.exchange.end(answer is None)
         elif answer is not None:
             self._respond(request, answer)
+        else:
+            request.exchange.abandon()
 
     def _failed(self, request: Request, error: Exception) -> Response:
         """The response to a request whose handler has failed. Errors are logged."""
