@@ -324,9 +324,10 @@ def test_a_connection_may_be_idle_between_requests(hasty: web.Service, connect: 
 
 @pytest.mark.parametrize("refused", [False, True])
 def test_a_connection_may_not_be_idle_for_ever(
-    service: web.Service, connect: Connect, monkeypatch: pytest.MonkeyPatch, refused: bool
+    start: Start, connect: Connect, monkeypatch: pytest.MonkeyPatch, refused: bool
 ) -> None:
     monkeypatch.setattr(http_host, "KEEP_ALIVE", 0.1)
+    service = start()
     sent = web.post(GOOD)
     connection = connect(service, sent.replace(b"/json", b"/x") if refused else sent)
     assert len(web.answers(connection.rest())) == 1

@@ -37,12 +37,15 @@ class Arriving(Request):
         self.has_left = asyncio.Event()
         self.got = asyncio.Event()
 
-    @property
-    def is_late(self) -> bool:
-        return self.late.is_set()
-
-    async def piece(self) -> bytes | None:
-        return self._pieces.pop(0) if self._pieces else None
+    async def receive(self, most: int) -> bytes:
+        body = b"".join(self._pieces)
+        if self.late.is_set():
+            raise BadRequest(
+                "timeout", f"the body is incomplete: {len(body)} bytes arrived in time"
+            )
+        if len(body) > most:
+            raise BadRequest("too_large", f"the body has more than {most} bytes")
+        return body
 
     async def gone(self) -> None:
         await self.has_left.wait()
