@@ -733,6 +733,7 @@ def test_a_write_that_is_left_alone_is_told_when_it_ends(opened: Opened) -> None
         view.page.get_by_role("spinbutton", name="Timeout").fill("1000")
         read_registers(view, mute.port)
         dialog = write_4711(view)
+        expect(dialog.get_by_text("Writing…")).to_be_visible()
         view.page.keyboard.press("Escape")
         expect(dialog).to_be_hidden()
         view.says("Unknown whether it was written. The table shows")

@@ -40,9 +40,7 @@ class Arriving(Request):
     async def receive(self, most: int) -> bytes:
         body = b"".join(self._pieces)
         if self.late.is_set():
-            raise BadRequest(
-                "timeout", f"the body is incomplete: {len(body)} bytes arrived in time"
-            )
+            raise BadRequest("timeout", "the body is incomplete")
         if len(body) > most:
             raise BadRequest("too_large", f"the body has more than {most} bytes")
         return body

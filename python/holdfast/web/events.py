@@ -32,7 +32,7 @@ class Stream:
         """Whether the response has begun."""
 
     async def begin(self, more_headers: Iterable[tuple[bytes, bytes]] = ()) -> None:
-        """Begins the response. The header is sent with the first event."""
+        """Begins the response."""
         self.began = True
         await self._request.begin(200, [*HEADERS, *more_headers])
 
