@@ -111,6 +111,16 @@ def test_everything_is_sent_in_order(output: Running) -> None:
     }
 
 
+def test_outputs_that_failed_together_do_not_try_again_together() -> None:
+    """Many of them share a broker."""
+    pauses = set()
+    for _ in range(20):
+        sending = Sending("out", Fake(), Buffer())
+        sending._failed(OSError("no route to host"))
+        pauses.add(sending._pause)
+    assert len(pauses) > 10
+
+
 @pytest.mark.parametrize("with_file", [False, True])
 def test_nothing_is_lost_in_an_outage(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, with_file: bool

@@ -15,6 +15,7 @@ from holdfast import logs
 from holdfast.nats_server import becoming
 from holdfast.nats_server.folder import Folder, ServerUnusable
 from holdfast.nats_server.program import MISSING, find_program
+from holdfast.runtime.backoff import Backoff
 from holdfast.stop import Stop
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ class NatsServer:
                 raise ServerUnusable(f"nats-server did not start within {STARTING:g} s")
 
     def _run(self) -> None:
-        pause = FIRST_PAUSE
+        backoff = Backoff(FIRST_PAUSE, MAX_PAUSE, jitter=False, proven_s=PROVEN)
         was_ready = False
         while not self._stop.is_set():
             began = time.monotonic()
@@ -127,13 +128,11 @@ class NatsServer:
             self._ready.clear()
             if self._stop.is_set() or not was_ready:
                 break
-            if time.monotonic() - began >= PROVEN:
-                pause = FIRST_PAUSE
+            pause = backoff.failed(time.monotonic() - began)
             logs.write(
                 logging.ERROR, "log_server_ended", log=self._name, error=self._reason, pause=pause
             )
             self._stop.wait(pause)
-            pause = min(2 * pause, MAX_PAUSE)
             self.restarts += 1
         self._over.set()
 
