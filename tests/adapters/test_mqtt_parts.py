@@ -11,7 +11,7 @@ from holdfast.adapters.mqtt.adapter import Mqtt
 from holdfast.adapters.mqtt.filters import Filters
 from holdfast.ingest import MemoryAccess
 from holdfast.mqtt.packets import parse_publish
-from holdfast.stop import Stop
+from holdfast.runtime.stop import Stop
 from support import mqtt_peer as mqtt
 from support.mqtt_rig import settings, subscription
 

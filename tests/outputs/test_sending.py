@@ -10,7 +10,7 @@ import pytest
 from holdfast.outputs import Buffer, Refused, Sending
 from holdfast.outputs import sending as module
 from holdfast.outputs.stored import Stored
-from holdfast.stop import Stop
+from holdfast.runtime.stop import Stop
 from support import wire
 from support.readings import numbered, numbers, tag
 

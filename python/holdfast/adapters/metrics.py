@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.config import MetricsConfig
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
     from holdfast.web.health import HealthSource
     from holdfast.web.host import Receive, Scope, Send
     from holdfast.web.https import Https

@@ -17,9 +17,9 @@ from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
 from holdfast import logs
-from holdfast.heartbeat import Heartbeat
 from holdfast.runtime.backoff import Backoff
-from holdfast.stop import Stop
+from holdfast.runtime.heartbeat import Heartbeat
+from holdfast.runtime.stop import Stop
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -51,6 +51,7 @@ from holdfast.config.scanning import (
 from holdfast.nats_server import HOST, ServerUnusable, TemporaryServer
 from holdfast.net import event_loop
 from holdfast.net.allow_list import AllowedNetwork
+from holdfast.runtime.standstill import WallClock
 from holdfast.scanner import (
     Defaults,
     FleetRefused,
@@ -66,7 +67,6 @@ from holdfast.scanner.configured import BUCKET
 from holdfast.scanner.hosts import PRIVATE
 from holdfast.scanner.schema import json_schema
 from holdfast.scanner.write_access import places
-from holdfast.standstill import WallClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

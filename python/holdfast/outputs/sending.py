@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from holdfast.outputs.buffer import Buffer
     from holdfast.outputs.stored import Stored
     from holdfast.polling import Reading
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
 
 FIRST_PAUSE = 1.0
 MAX_PAUSE = 10.0

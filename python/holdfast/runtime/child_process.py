@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from holdfast.runtime import exec_with_parent
-from holdfast.stop import Stop
+from holdfast.runtime.stop import Stop
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
     from holdfast.config.scanning import Dialect
     from holdfast.polling import Reading
+    from holdfast.runtime.stop import Stop
     from holdfast.scanner.broker import Servers
-    from holdfast.stop import Stop
 
 TIMEOUT = 5.0
 """Seconds for the server to confirm what was sent."""

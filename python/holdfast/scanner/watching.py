@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
-from holdfast import logs, tasks
+from holdfast import logs
+from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
 from holdfast.scanner.heartbeat import JETSTREAM_TIMEOUT, reason_of
 from holdfast.scanner.keeping import FETCHED, FIRST_RETRY, READING, RETRIED

@@ -24,9 +24,9 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.server import ServerState
 
 from holdfast import logs
-from holdfast.heartbeat import PERIOD, Heartbeat
 from holdfast.net.addresses import holds, joined, parse_address
 from holdfast.net.closing import close
+from holdfast.runtime.heartbeat import PERIOD, Heartbeat
 from holdfast.web.admission import Admission, Full, Waiting
 from holdfast.web.port import BACKLOG
 from holdfast.web.tls import TlsTransport
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
 
     from holdfast.net.addresses import Network
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
     from holdfast.web.admission import ConnectionLimits
     from holdfast.web.https import Https
 

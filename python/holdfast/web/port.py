@@ -19,7 +19,7 @@ from holdfast.net.addresses import joined, parse_address
 from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
 
 BACKLOG = 512
 """Connections that the system queues before they are accepted."""

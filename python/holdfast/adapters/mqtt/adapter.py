@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from holdfast.config import MappedTag, MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.ingest import MemoryAccess
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
 
 FIRST_PAUSE = 1.0
 MAX_PAUSE = 10.0

@@ -16,8 +16,8 @@ from holdfast.mqtt.waiting import Ended, Waiter
 from holdfast.net.tls import NO_FILES, broker_context
 from holdfast.outputs.mqtt.connection import Connection
 from holdfast.outputs.mqtt.messages import Delivery, Message
-from holdfast.standstill import LOOK, Standstill
-from holdfast.stop import Stop
+from holdfast.runtime.standstill import LOOK, Standstill
+from holdfast.runtime.stop import Stop
 
 if TYPE_CHECKING:
     import socket
