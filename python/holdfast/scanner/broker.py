@@ -22,6 +22,7 @@ from holdfast import logs
 from holdfast.config.scanning import PING_INTERVAL, PINGS_OUTSTANDING
 from holdfast.net.secret_file import read_secret
 from holdfast.net.tls import NO_FILES, Tls, broker_context
+from holdfast.net.tls_reasons import failure_text
 from holdfast.runtime.backoff import Backoff
 from holdfast.scanner.credentials import Credentials
 from holdfast.scanner.receiving import SafeClient, TlsClient
@@ -243,7 +244,7 @@ class Broker:
 
     def _note(self, client: Client, error: Exception) -> None:
         """Logs an error. Without a connection, the error is a failed attempt to connect."""
-        reason = str(error) or type(error).__name__
+        reason = failure_text(error)
         if self.client is not None:
             logs.refused("nats_error", kind="nats", reason=reason)
             return
@@ -290,10 +291,10 @@ async def connected_once(
                 )
         except (Error, OSError) as error:
             cause = failures[-1] if failures else error
-            reason = str(cause).removeprefix("nats: ")
+            reason = failure_text(cause).removeprefix("nats: ")
             if isinstance(cause, TimeoutError):
                 reason = "no answer in time"
-            message = f"no connection to NATS at {servers.shown}: {reason or type(cause).__name__}"
+            message = f"no connection to NATS at {servers.shown}: {reason}"
             raise ConnectionError(message) from error
         yield client
     finally:

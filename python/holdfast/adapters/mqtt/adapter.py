@@ -18,6 +18,7 @@ from holdfast.mqtt.password import read_password
 from holdfast.mqtt.waiting import Ended, Waiter
 from holdfast.net.addresses import joined
 from holdfast.net.tls import NO_FILES, broker_context
+from holdfast.net.tls_reasons import failure_text
 from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ class Mqtt:
                 link.disconnect()
             raise
         except (OSError, ValueError) as error:
-            self._ending = str(error)
+            self._ending = failure_text(error)
         except Exception as error:  # Nothing that a broker sends may end the adapter.
             logs.problem("mqtt_failed", broker=self._broker)
             self._ending = type(error).__name__
