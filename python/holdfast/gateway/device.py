@@ -18,12 +18,11 @@ from holdfast.errors import (
 )
 from holdfast.gateway.broadcasting import broadcast
 from holdfast.gateway.egress import Refused
-from holdfast.gateway.fields import malformed
+from holdfast.gateway.fields import listed, malformed
 from holdfast.gateway.pool import Full, Unusable
 from holdfast.gateway.sharing import QueueFull, SharedClient
 from holdfast.net.resolver import NoSuchName
 from holdfast.protocol import BROADCAST_CODES, usual_port
-from holdfast.runtime.text import all_of
 from holdfast.types import SERIAL_FRAMES
 from holdfast.web.requests import BadRequest
 
@@ -42,7 +41,7 @@ TOO_MANY_BEFORE = (
 )
 NO_BROADCAST = (
     "unitId 0 is the broadcast of a serial line, which has no response; with transport "
-    f"{all_of(SERIAL_FRAMES)} it allows only writes with functions {all_of(BROADCAST_CODES)}"
+    f"{listed(SERIAL_FRAMES)} it allows only writes with functions {listed(BROADCAST_CODES)}"
 )
 UNIT_0 = "unit id 0 is the broadcast of serial lines, which has no response"
 

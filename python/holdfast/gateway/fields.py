@@ -17,14 +17,13 @@ import msgspec
 from holdfast.net.addresses import LAST_PORT, address_in
 from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, MAX_WORD, TLS_PORT
 from holdfast.protocol import PORT as STANDARD_PORT
-from holdfast.runtime.text import all_of
 from holdfast.types import AREAS, TRANSPORTS
 from holdfast.web.openapi import Schema as Schema
 from holdfast.web.openapi import integer as integer
 from holdfast.web.requests import BadRequest, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
 REQUIRED: Any = object()
 """The default of a required field."""
@@ -228,7 +227,7 @@ def filled(given: Mapping[str, Any], fields: Sequence[Field]) -> dict[str, Any]:
     missing = [field.name for field in fields if field.required]
     missing = [name for name in missing if name not in given]
     if missing:
-        raise malformed(f"Missing required parameter{'s'[: len(missing) > 1]}: {all_of(missing)}")
+        raise malformed(f"Missing required parameter{'s'[: len(missing) > 1]}: {listed(missing)}")
     names = [field.name for field in fields]
     for name in given:
         if name not in names:
@@ -289,3 +288,9 @@ def told(value: Any) -> str:
 
 def _words(allowed: Sequence[Any]) -> str:
     return ", ".join(each if isinstance(each, str) else told(each) for each in allowed)
+
+
+def listed(entries: Iterable[object]) -> str:
+    """Joins entries: `5, 6 and 15`."""
+    *most, last = map(str, entries)
+    return f"{', '.join(most)} and {last}" if most else last
