@@ -31,7 +31,7 @@ from holdfast.outputs import Buffer, Sending
 from holdfast.outputs.mqtt import MqttOutput
 from holdfast.outputs.mqtt.payloads import Payloads
 from holdfast.polling import Reading
-from holdfast.stop import Stop
+from holdfast.runtime.stop import Stop
 from holdfast.tags import Tag
 
 DEVICES, TAGS = 100, 100

@@ -20,8 +20,8 @@ from typing import Any
 import common
 from nats.aio.client import Client
 
+from holdfast.nats_server import TemporaryServer
 from holdfast.scanner import wire
-from holdfast.scanner.embedded import Embedded
 from holdfast.scanner.groups import Group
 from holdfast.scanner.publishing import Publisher
 from holdfast.scanner.tags import Tag
@@ -217,7 +217,7 @@ def main() -> None:
     seconds = max(options.seconds, 2.0)
     results: dict[str, Any] = {"us_per_value": costs()}
     scan, change = results["us_per_value"]["scan"], results["us_per_value"]["change"]
-    with Embedded(0) as server:
+    with TemporaryServer(0) as server:
         handed = results["us_per_message"] = asyncio.run(publishing(server.url))
     print(f"\nBytes to messages: {scan:.2f} us per value, {change:.2f} us if unchanged.")
     print(f"To NATS: {handed['publish']:.2f} us each by publish, {handed['batch']:.2f} in batches.")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 
-from holdfast.scanner.embedded import Embedded
+from holdfast.nats_server import TemporaryServer
 
-with Embedded(0) as server:
+with TemporaryServer(0) as server:
     print(f"listening {server.url.removeprefix('nats://')}", flush=True)
     sys.stdin.read()

@@ -35,6 +35,7 @@ __all__ = [
     "MAX_PDU",
     "OTHER_READS",
     "SUB_FUNCTIONS",
+    "TLS_REASONS",
     "WRITE_FILE_RECORD",
     "Attempt",
     "BatchRefused",
@@ -109,6 +110,9 @@ EXCEPTIONS: Final[dict[int, str]]
 
 FAULTS: Final[dict[str, int]]
 """Why a device did not answer, as a word, with its code in status blocks and the poller."""
+
+TLS_REASONS: Final[tuple[str, ...]]
+"""Why TLS failed, as a word."""
 
 class OutOfRange(IndexError):
     """The range is not inside the area. Nothing was read or written."""

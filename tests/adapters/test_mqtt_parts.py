@@ -7,9 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from paho.mqtt.client import topic_matches_sub
 
-from holdfast.adapters.mqtt.backoff import Backoff
+from holdfast.adapters.mqtt.adapter import Mqtt
 from holdfast.adapters.mqtt.filters import Filters
+from holdfast.ingest import MemoryAccess
 from holdfast.mqtt.packets import parse_publish
+from holdfast.runtime.stop import Stop
 from support import mqtt_peer as mqtt
 from support.mqtt_rig import settings, subscription
 
@@ -141,12 +143,30 @@ def test_of_two_subscriptions_to_the_same_filter_the_first_gives_the_grant() -> 
 # Pauses
 
 
-def test_pauses_double_up_to_ten_seconds_and_begin_anew_after_a_connection_that_held() -> None:
-    backoff = Backoff()
-    expected = [1, 2, 4, 8, 10, 10]
+class Recorded(Stop):
+    """Notes the pauses instead of waiting. Is set after some of them."""
 
-    for _ in range(2):
-        for number, seconds in enumerate(expected):
-            held = 10.0 if number == 0 else 9.9
-            assert 0.75 * seconds <= backoff.pause(held) <= 1.25 * seconds
-    assert len({backoff.pause(0.0) for _ in range(10)}) > 1
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.pauses: list[float] = []
+        self._count = count
+
+    def wait(self, seconds: float | None = None) -> bool:
+        assert seconds is not None
+        self.pauses.append(seconds)
+        return len(self.pauses) == self._count
+
+
+def test_pauses_double_up_to_ten_seconds_and_begin_anew_after_a_connection_that_held(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    expected = [1, 2, 4, 8, 10, 10] * 2
+    held = iter([10.0, *[9.9] * 5] * 2)
+    monkeypatch.setattr(Mqtt, "_connection", lambda *_: next(held))
+    stop = Recorded(len(expected))
+
+    Mqtt(settings("mqtt://127.0.0.1:1883"), MemoryAccess("mqtt", {})).run(stop)
+
+    for pause, longest in zip(stop.pauses, expected, strict=True):
+        assert 0.75 * longest <= pause <= longest
+    assert len(set(stop.pauses)) == len(expected), "with jitter"

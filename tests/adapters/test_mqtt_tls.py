@@ -101,7 +101,7 @@ def test_another_authority_is_not_trusted(
 ) -> None:
     broker = secure(rig, authority, "IP:127.0.0.1")
 
-    assert "CERTIFICATE_VERIFY_FAILED" in error(connect(rig, broker, ca_file=stranger.ca))
+    assert error(connect(rig, broker, ca_file=stranger.ca)).startswith("unknown_issuer: ")
     assert "New client connected" not in broker.log
 
 

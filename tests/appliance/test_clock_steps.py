@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.appliance import running
-from holdfast.standstill import WallClock
+from holdfast.runtime.standstill import WallClock
 from support import wire
 from support.audits import lines
 from support.config_folder import written
@@ -66,7 +66,7 @@ def test_a_process_that_stood_still_between_two_clocks_is_not_a_step(
     clock = WallClock()
     steady = iter([0.0, 60.0])
     with monkeypatch.context() as patched:
-        patched.setattr("holdfast.standstill.now", lambda: next(steady))
+        patched.setattr("holdfast.runtime.standstill.now", lambda: next(steady))
         assert clock.look() is None
     assert clock.look() is None
     assert "clock_stepped" not in caplog.messages

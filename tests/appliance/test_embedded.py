@@ -10,7 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,7 @@ from support import wire
 from support.brokers import free_port
 from support.cli import RunCommand, answer, done, invoke
 from support.config_folder import Folder
-from support.machine import missing
+from support.machine import is_over, missing
 from support.running import endpoint
 
 if TYPE_CHECKING:
@@ -80,17 +80,6 @@ def start() -> Iterator[Callable[[Path], RunCommand]]:
 def server(folder: Path) -> int:
     """The process id of the server in this folder."""
     return int((folder / "log" / "nats-server.lock").read_text())
-
-
-def is_over(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return True
-    # A server that nobody waits for any more stays as an entry of the system.
-    with suppress(OSError):
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    return False
 
 
 def is_server(appliance: Appliance, status: dict[str, Any]) -> bool:

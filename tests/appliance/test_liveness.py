@@ -11,13 +11,13 @@ from holdfast import _core
 from holdfast.appliance import liveness
 from holdfast.appliance.liveness import STALLED, Liveness, cpu_time
 from holdfast.appliance.supervision import Supervisor
-from holdfast.heartbeat import Heartbeat
+from holdfast.runtime.heartbeat import Heartbeat
 from support import wire
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
     from holdfast.types import ThreadHeartbeat
     from support import web
     from support.running import Run

@@ -317,8 +317,9 @@ def test_it_ends_with_its_own_server(start: Start) -> None:
     process = start("--embedded", "--nats", "nats://127.0.0.1:0")
     greeting(process)
     connected(process)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    os.kill(int(children[0]), signal.SIGKILL)
+    lists = Path(f"/proc/{process.pid}/task").glob("*/children")
+    [child] = [child for children in lists for child in children.read_text().split()]
+    os.kill(int(child), signal.SIGKILL)
     _, log = process.communicate(timeout=wire.DEADLINE)
     assert process.returncode == 1
     assert "holdfast: nats-server ended: killed by signal 9" in log

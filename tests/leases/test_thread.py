@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast import tasks
 from holdfast.leases import Leases, LeaseThread, LeaseTimes, Relay
+from holdfast.runtime import tasks
 from holdfast.scanner.broker import Broker, Ping, Servers
 from support import wire
 from support.brokers import NatsServer

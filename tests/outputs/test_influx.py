@@ -15,7 +15,7 @@ from holdfast.outputs import Buffer, Refused, Sending
 from holdfast.outputs import sending as module
 from holdfast.outputs.influx import Influx
 from holdfast.outputs.stored import Stored
-from holdfast.stop import Stop
+from holdfast.runtime.stop import Stop
 from support import wire
 from support.brokers import free_port
 from support.line_protocol import Point, parsed

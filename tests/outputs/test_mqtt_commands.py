@@ -13,7 +13,7 @@ import pytest
 from holdfast.appliance import Appliance
 from holdfast.appliance.output_site import OutputSite
 from holdfast.outputs import sending
-from holdfast.standstill import LONG
+from holdfast.runtime.standstill import LONG
 from support import wire
 from support.mqtt_plant import TAGS, Client, Plant
 

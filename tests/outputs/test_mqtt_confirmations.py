@@ -12,7 +12,7 @@ from holdfast.config.outputs import MqttOutputConfig
 from holdfast.mqtt.packets import parse_publish
 from holdfast.outputs.mqtt import MqttOutput
 from holdfast.outputs.mqtt.packets import Packets
-from holdfast.stop import Stop
+from holdfast.runtime.stop import Stop
 from support.readings import numbered
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from holdfast.mqtt.packets import parse_publish
 from holdfast.mqtt.waiting import Waiter
 from holdfast.outputs.mqtt.messages import Delivery, Message, packed, packed_topic
 from holdfast.outputs.mqtt.packets import MAX_PACKET, Packets
-from holdfast.stop import Stop
+from holdfast.runtime.stop import Stop
 from support.config_folder import Folder
 
 if TYPE_CHECKING:

@@ -10,10 +10,10 @@ import pytest
 from holdfast.faults import NO_CONNECTION
 from holdfast.outputs import Buffer, Sending
 from holdfast.outputs import sending as module
+from holdfast.runtime.stop import Stop
 from holdfast.scanner import Servers
 from holdfast.scanner import output as output_module
 from holdfast.scanner.output import NatsOutput
-from holdfast.stop import Stop
 from support import wire
 from support.nats_bus import Caller
 from support.readings import TIME, numbered, reading, tag

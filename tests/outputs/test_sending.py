@@ -10,7 +10,7 @@ import pytest
 from holdfast.outputs import Buffer, Refused, Sending
 from holdfast.outputs import sending as module
 from holdfast.outputs.stored import Stored
-from holdfast.stop import Stop
+from holdfast.runtime.stop import Stop
 from support import wire
 from support.readings import numbered, numbers, tag
 
@@ -109,6 +109,16 @@ def test_everything_is_sent_in_order(output: Running) -> None:
         "last_error": None,
         "file_error": None,
     }
+
+
+def test_outputs_that_failed_together_do_not_try_again_together() -> None:
+    """Many of them share a broker."""
+    pauses = set()
+    for _ in range(20):
+        sending = Sending("out", Fake(), Buffer())
+        sending._failed(OSError("no route to host"))
+        pauses.add(sending._pause)
+    assert len(pauses) > 10
 
 
 @pytest.mark.parametrize("with_file", [False, True])

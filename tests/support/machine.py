@@ -24,6 +24,18 @@ def missing(what: str) -> None:
     pytest.skip(f"{what} is missing")
 
 
+def is_over(process: int) -> bool:
+    """Whether a process has ended."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    # A child that nobody waits for any more stays as an entry of the system.
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    return False
+
+
 def tool(name: str) -> str:
     """Returns the path of an external program."""
     path = shutil.which(name)

@@ -1,8 +1,10 @@
-//! Constants of the module: areas, functions and their limits, names of exceptions, device faults.
+//! Constants of the module: areas, functions and their limits, names of exceptions, device faults,
+//! reasons of TLS failures.
 //! Python takes them from here and keeps no list of its own.
 
 use holdfast_engine::link::Fault;
 use holdfast_engine::server::functions::{OTHER_READS, WRITE_FILE_RECORD};
+use holdfast_engine::tls::TlsFailure;
 use holdfast_memory::{Area, Span};
 use holdfast_protocol::pdu::{self, ExceptionCode, Function, SubFunction, limit};
 use pyo3::prelude::*;
@@ -49,7 +51,8 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
             faults.set_item(word, fault.code())?;
         }
     }
-    module.add("FAULTS", faults)
+    module.add("FAULTS", faults)?;
+    module.add("TLS_REASONS", PyTuple::new(py, TlsFailure::REASONS)?)
 }
 
 /// The name of a fault; `None` for an exception, which has a name in `EXCEPTIONS`.

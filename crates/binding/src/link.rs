@@ -6,12 +6,13 @@ use std::sync::{Arc, Mutex, PoisonError};
 use holdfast_engine::Wakes;
 use holdfast_engine::client::{ClientError, StrayCounters};
 use holdfast_engine::link::{
-    Caller as CoreCaller, InFlight, LinkSettings, Retry, Route as CoreRoute, SharedLink,
+    Caller as CoreCaller, InFlight, LinkSettings, Route as CoreRoute, SharedLink,
 };
 use holdfast_engine::poller::{Passage as CorePassage, PassedRange};
 use holdfast_memory::Area;
 use holdfast_protocol::client::InvalidResponse;
 use holdfast_protocol::pdu::{Bits, Registers, Request as CoreRequest, limit, pack_bits};
+use holdfast_runtime::Retry;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;

@@ -4,13 +4,14 @@ use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
 use holdfast_engine::client::Place as HostPlace;
-use holdfast_engine::link::{Fault, Retry};
+use holdfast_engine::link::Fault;
 use holdfast_engine::poller::plan::{self, Field, PlanLimits, Strategy, Stretch};
 use holdfast_engine::poller::{
     self, Batch, BlockSettings, Destination, DeviceSettings, DeviceState, ForwardSettings, Poll,
     Polled, Poller as Core, PollerError, ReadSettings, StatusSettings,
 };
 use holdfast_protocol::raw_ingest::Format;
+use holdfast_runtime::Retry;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};

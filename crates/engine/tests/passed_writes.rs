@@ -8,11 +8,12 @@ use std::thread;
 use std::time::Duration;
 
 use holdfast_engine::client::Place;
-use holdfast_engine::link::{InFlight, Retry};
+use holdfast_engine::link::InFlight;
 use holdfast_engine::poller::plan::{PlanLimits, Strategy};
 use holdfast_engine::poller::{DeviceSettings, Passage, PassedRange, Poller};
 use holdfast_memory::{Access, Area, Done, Journal, Layout, Memory, Read, Span, Step};
 use holdfast_protocol::pdu::Request;
+use holdfast_runtime::Retry;
 
 const AREA: Area = Area::HoldingRegisters;
 const TIMEOUT: Duration = Duration::from_secs(60);

@@ -10,7 +10,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use holdfast_engine::client::Place;
-use holdfast_engine::link::{InFlight, LinkSettings, Retry, Route, SharedLink};
+use holdfast_engine::link::{InFlight, LinkSettings, Route, SharedLink};
 use holdfast_engine::poller::Poller;
 use holdfast_engine::server::event::Verbosity;
 use holdfast_engine::server::functions::{AccessMode, Functions};
@@ -20,6 +20,7 @@ use holdfast_engine::server::{
     StreamSettings, WhenFull,
 };
 use holdfast_protocol::frame::{mbap, rtu};
+use holdfast_runtime::Retry;
 
 const MASTERS: usize = 50;
 const TIMEOUT: Duration = Duration::from_secs(60);

@@ -15,9 +15,9 @@ import warnings
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from holdfast.heartbeat import Heartbeat
 from holdfast.ingest import Counts, Grant, MemoryAccess, Refused, Written
-from holdfast.stop import Stop
+from holdfast.runtime.heartbeat import Heartbeat
+from holdfast.runtime.stop import Stop
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

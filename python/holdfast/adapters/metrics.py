@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from holdfast._core import ListeningSocket
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.config import MetricsConfig
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
     from holdfast.web.health import HealthSource
     from holdfast.web.https import Https
     from holdfast.web.requests import Request

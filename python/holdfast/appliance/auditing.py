@@ -12,8 +12,8 @@ from holdfast import logs
 from holdfast._core import __version__
 from holdfast.audit import Audit, Copies, Journal, Syslog
 from holdfast.config.syslog import parse_syslog
-from holdfast.heartbeat import PERIOD, Heartbeat
 from holdfast.protocol import OF_CODE
+from holdfast.runtime.heartbeat import PERIOD, Heartbeat
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping

@@ -38,8 +38,8 @@ from holdfast.config.route_checks import routed
 from holdfast.faults import fault_word
 from holdfast.ingest import MemoryAccess
 from holdfast.net.addresses import joined
+from holdfast.runtime.standstill import WallClock
 from holdfast.server.fork import close_in_children
-from holdfast.standstill import WallClock
 from holdfast.web.port import Port
 
 if TYPE_CHECKING:

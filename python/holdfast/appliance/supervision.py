@@ -17,8 +17,9 @@ from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
 from holdfast import logs
-from holdfast.heartbeat import Heartbeat
-from holdfast.stop import Stop
+from holdfast.runtime.backoff import Backoff
+from holdfast.runtime.heartbeat import Heartbeat
+from holdfast.runtime.stop import Stop
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -179,7 +180,7 @@ class Supervisor:
 
     def _run(self) -> None:
         _step_back()
-        pause = FIRST_PAUSE
+        backoff = Backoff(FIRST_PAUSE, MAX_PAUSE, jitter=False, proven_s=PROVEN)
         if self._port is not None:
             if self._port.error is not None:
                 self._state = "failed"
@@ -195,12 +196,9 @@ class Supervisor:
             if ended:
                 self._last_error = "the adapter returned before it was stopped"
                 logs.write(logging.ERROR, "adapter_ended", adapter=self.name)
-            if time.monotonic() - began >= PROVEN:
-                pause = FIRST_PAUSE
             self._state = "failed"
             self._restarts += 1
-            self._stop.wait(pause)
-            pause = min(2 * pause, MAX_PAUSE)
+            self._stop.wait(backoff.failed(time.monotonic() - began))
         if self._starter is not None:
             self._starter.close()
         self._state = "stopped"

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from holdfast import logs
-from holdfast.heartbeat import Heartbeat
 from holdfast.outputs import Buffer, Changes, Sending
 from holdfast.polling import Reading
 from holdfast.polling.reader import Reader
+from holdfast.runtime.heartbeat import Heartbeat
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable

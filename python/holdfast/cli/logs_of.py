@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.config.words import guess, listing
+from holdfast.runtime.text import guess, listing
 
 if TYPE_CHECKING:
     from holdfast.config import Config

@@ -13,7 +13,7 @@ from holdfast.cli.configuration import WRONG
 from holdfast.cli.suggesting import SuggestingGroup
 from holdfast.config import ConfigError
 from holdfast.config.initial import KINDS, parse, read
-from holdfast.config.words import guess, listing
+from holdfast.runtime.text import guess, listing
 from holdfast.tools import memory_file
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from holdfast.appliance.shared_logs import credentials, servers
 from holdfast.cli.configuration import load_or_exit
 from holdfast.cli.logs_of import chosen_log
 from holdfast.cli.signals import Signals
-from holdfast.config.words import listing
 from holdfast.nats_server import ServerUnusable
+from holdfast.runtime.text import listing
 from holdfast.scanner.broker import ANSWERING
 from holdfast.server import Server
 

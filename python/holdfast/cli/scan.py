@@ -48,8 +48,10 @@ from holdfast.config.scanning import (
     parse_prefix,
     parse_server,
 )
+from holdfast.nats_server import HOST, ServerUnusable, TemporaryServer
 from holdfast.net import event_loop
 from holdfast.net.allow_list import AllowedNetwork
+from holdfast.runtime.standstill import WallClock
 from holdfast.scanner import (
     Defaults,
     FleetRefused,
@@ -62,11 +64,9 @@ from holdfast.scanner import (
     device_tls,
 )
 from holdfast.scanner.configured import BUCKET
-from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
 from holdfast.scanner.hosts import PRIVATE
 from holdfast.scanner.schema import json_schema
 from holdfast.scanner.write_access import places
-from holdfast.standstill import WallClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -317,7 +317,7 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
         try:
             device_tls.check(trust)
             if embedded:
-                server = stack.enter_context(Embedded(_embedded_port(servers), store))
+                server = stack.enter_context(TemporaryServer(_embedded_port(servers), store))
                 servers, check = Servers((server.url,)), server.check
             settings = _settings(options, servers, allow, limits, trust)
             click.echo(_greeting(settings))
@@ -325,7 +325,7 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
         except FleetRefused as refused:
             click.echo(f"holdfast: fleet {options['fleet']}: {refused}", err=True)
             sys.exit(REFUSED)
-        except (EmbeddedFailed, OSError) as error:
+        except OSError as error:
             click.echo(f"holdfast: {error}", err=True)
             sys.exit(FAILED)
 
@@ -436,7 +436,7 @@ async def _scan(settings: Settings, check: Callable[[], None] | None, signals: S
         try:
             if check is not None:
                 check()
-        except EmbeddedFailed:
+        except ServerUnusable:
             scanner.end()
             await running
             raise

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from holdfast.runtime.text import either
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -30,4 +32,4 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
     if "://" in name:
         return f" Did you mean 'holdfast read {name}'?"
     close = difflib.get_close_matches(name.lower(), known, n=3, cutoff=0.6)
-    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
+    return f" Did you mean {either(map(repr, close))}?" if close else ""

@@ -15,8 +15,8 @@ from holdfast.cli import device, places
 from holdfast.cli.configuration import WRONG, load_or_exit, show_problems
 from holdfast.config import ConfigError
 from holdfast.config.tag_files import load_tags
-from holdfast.config.words import guess, listing
 from holdfast.protocol import LAST_ADDRESS
+from holdfast.runtime.text import guess, listing
 from holdfast.tags import Tag, TagError, TagList
 from holdfast.types import AREAS
 from holdfast.values.types import parsed

@@ -10,8 +10,8 @@ import click
 
 from holdfast.cli import device, showing
 from holdfast.cli.tagged_read import value_shown
-from holdfast.config.words import guess, listing
 from holdfast.errors import ModbusError, ModbusException
+from holdfast.runtime.text import guess, listing
 from holdfast.tools.tag_writing import prepared
 
 if TYPE_CHECKING:

@@ -10,14 +10,12 @@ import socket
 import time
 from typing import TYPE_CHECKING
 
-from holdfast.net.resolver import Resolver
+from holdfast.net.resolver import CONFIGURED
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from holdfast.net.resolver import SocketAddress
-
-_RESOLVER = Resolver()
 
 
 async def addresses(host: str, port: int) -> list[SocketAddress]:
@@ -25,7 +23,7 @@ async def addresses(host: str, port: int) -> list[SocketAddress]:
 
     A cancellation ends it at once, and no event loop waits for the lookup when it is closed.
     """
-    found = _RESOLVER.look_up(host, port)
+    found = CONFIGURED.look_up(host, port)
     # An address needs no lookup.
     return found.result() if found.done() else await asyncio.wrap_future(found)
 
@@ -55,7 +53,7 @@ async def connected(found: Sequence[SocketAddress], deadline: float) -> socket.s
 
 def connected_sync(host: str, port: int, deadline: float) -> socket.socket:
     """Like `addresses` and `connected`, without an event loop."""
-    found = _RESOLVER.wait_for(host, port, left(deadline))
+    found = CONFIGURED.wait_for(host, port, left(deadline))
     for others, (family, address) in _countdown(found):
         try:
             connection = socket.socket(family)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.config.lenient import entries, mapping
 from holdfast.config.schema import cached
-from holdfast.config.words import choice, listing
+from holdfast.runtime.text import either, listing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -22,7 +22,7 @@ Node: TypeAlias = dict[str, Any]
 def allowed(path: KeyPath, data: object) -> str:
     """Describes the values that are allowed at `path` of `data`."""
     nodes = _at(path, data)
-    return choice([_words(node) for node in nodes]) if nodes else "nothing"
+    return either([_words(node) for node in nodes]) if nodes else "nothing"
 
 
 def known_keys(path: KeyPath, data: object) -> list[str]:
@@ -84,12 +84,12 @@ def _resolved(node: Node) -> Node:
 def _words(node: Node) -> str:
     node = _resolved(node)
     if "discriminator" in node:
-        return f"a mapping with the type {choice(node['discriminator']['mapping'])}"
+        return f"a mapping with the type {either(node['discriminator']['mapping'])}"
     kinds = _kinds(node, None)
     if kinds:
-        return choice([_words(kind) for kind in kinds])
+        return either([_words(kind) for kind in kinds])
     if "enum" in node:
-        return choice(node["enum"])
+        return either(node["enum"])
     if "const" in node:
         return str(node["const"])
     return _WORDS[node["type"]](node)
@@ -105,7 +105,7 @@ def _range(kind: str, node: Node) -> str:
 
 def _text(node: Node) -> str:
     examples = node.get("examples", ())
-    return f"text, as in {choice(examples)}" if examples else "text"
+    return f"text, as in {either(examples)}" if examples else "text"
 
 
 def _list(node: Node) -> str:

@@ -12,9 +12,10 @@ from holdfast.config.lenient import entries, integer, mapping, parsed
 from holdfast.config.memory_checks import area_of
 from holdfast.config.range_checks import check_ranges, counted
 from holdfast.config.scalars import parse_receiver_url
-from holdfast.config.words import choice, show
+from holdfast.config.words import show
 from holdfast.net.addresses import joined
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD
+from holdfast.runtime.text import either
 from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS, Area
 
 if TYPE_CHECKING:
@@ -216,7 +217,7 @@ class DeviceChecks:
         if area not in AREAS or (of in AREAS and (area in BIT_AREAS) != (of in BIT_AREAS)):
             if area in AREAS:
                 kin = BIT_AREAS if of in BIT_AREAS else REGISTER_AREAS
-                message = f"found {show(area)}, allowed for {of}: {choice(kin)}"
+                message = f"found {show(area)}, allowed for {of}: {either(kin)}"
                 self.report.add((*path, "area"), message)
             return
         there = area_of(self.memories, path, into.get("memory"), area, self.report)

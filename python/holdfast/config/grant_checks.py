@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from holdfast.config.lenient import entries
 from holdfast.config.scalars import is_name
 from holdfast.config.unique import refuse_repeats
-from holdfast.config.words import guess, listing, show
+from holdfast.config.words import show
+from holdfast.runtime.text import guess, listing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from holdfast.config import source
 from holdfast.config.problems import ConfigError, Problem
-from holdfast.config.words import guess, listing, show
+from holdfast.config.words import show
 from holdfast.protocol import ADDRESSES, MAX_WORD
+from holdfast.runtime.text import guess, listing
 from holdfast.types import AREAS, BIT_AREAS, Area
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.embedded_checks import check_embedded, check_servers
 from holdfast.config.lenient import entries, mapping
 from holdfast.config.nats_checks import check_nats
-from holdfast.config.words import guess, listing, show
+from holdfast.config.words import show
+from holdfast.runtime.text import all_of, guess, listing
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -85,5 +86,5 @@ def _check_devices(data: dict[Any, Any], report: Report) -> None:
             and (log := mapping(mapping(memories.get(memory)).get("replicate")).get("log"))
         )
         if len(logs) > 1:
-            message = f"found memories of the logs {' and '.join(logs)}, allowed: those of one log"
+            message = f"found memories of the logs {all_of(logs)}, allowed: those of one log"
             report.add(("devices", name), message, of_key=True)

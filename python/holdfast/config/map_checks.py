@@ -11,7 +11,8 @@ from holdfast.config.memories import MemoryConfig
 from holdfast.config.tags import ProfileConfig, TagConfig
 from holdfast.config.topics import parse_topic_name
 from holdfast.config.unique import Owners
-from holdfast.config.words import guess, listing, show
+from holdfast.config.words import show
+from holdfast.runtime.text import guess, listing
 from holdfast.tags import Tag, TagError
 from holdfast.tags.register_scale import RegisterScale
 

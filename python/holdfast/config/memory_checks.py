@@ -14,8 +14,9 @@ from holdfast.config.lenient import fitting, integer, mapping
 from holdfast.config.memories import Extent, Span
 from holdfast.config.problems import ConfigError
 from holdfast.config.unique import Owners
-from holdfast.config.words import listing, show
+from holdfast.config.words import show
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD
+from holdfast.runtime.text import listing
 from holdfast.types import AREAS, BIT_AREAS, Area
 
 if TYPE_CHECKING:

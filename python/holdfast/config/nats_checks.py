@@ -8,7 +8,7 @@ from holdfast.config.files import check_readable
 from holdfast.config.lenient import entries, mapping, parsed
 from holdfast.config.scanning import check_dialect, parse_server
 from holdfast.config.tls_checks import check_client_tls
-from holdfast.config.words import listing
+from holdfast.runtime.text import listing
 
 if TYPE_CHECKING:
     from pathlib import Path

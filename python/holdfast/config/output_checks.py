@@ -13,7 +13,8 @@ from holdfast.config.lenient import entries, mapping, parsed
 from holdfast.config.nats_checks import check_nats
 from holdfast.config.tls_checks import check_client_tls
 from holdfast.config.topics import TAG, TopicNames, parse_topic_name, parse_topic_template
-from holdfast.config.words import guess, listing, show
+from holdfast.config.words import show
+from holdfast.runtime.text import guess, listing
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,7 +10,8 @@ from holdfast.config.lenient import entries, mapping
 from holdfast.config.problems import ConfigError
 from holdfast.config.scalars import NAME_FORM, is_name
 from holdfast.config.tag_files import KINDS, load_profile
-from holdfast.config.words import choice, show
+from holdfast.config.words import show
+from holdfast.runtime.text import either
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,7 +46,7 @@ class ProfileFiles:
 
     def _read(self, path: KeyPath, file: object, profiles: dict[str, Any]) -> None:
         if not isinstance(file, str) or not file.lower().endswith(KINDS) or "\0" in file:
-            self.report.add(path, f"found {show(file)}, allowed: a file {choice(KINDS)}")
+            self.report.add(path, f"found {show(file)}, allowed: a file {either(KINDS)}")
             return
         where = self.folder / file
         if not is_name(where.stem):

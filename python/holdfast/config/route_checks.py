@@ -12,8 +12,9 @@ from holdfast.config.listeners import RouteConfig
 from holdfast.config.scalars import is_name
 from holdfast.config.shared_connection_checks import target_of
 from holdfast.config.unit_keys import parse_unit_key, unit_ids
-from holdfast.config.words import guess, listing, show
+from holdfast.config.words import show
 from holdfast.protocol import MAX_SERIAL_UNIT, MAX_UNIT
+from holdfast.runtime.text import guess, listing
 
 if TYPE_CHECKING:
     from holdfast.client.url import Target

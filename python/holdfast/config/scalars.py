@@ -51,10 +51,11 @@ from holdfast.config.scanning import (
 from holdfast.config.syslog import parse_syslog
 from holdfast.config.topics import parse_topic_name, parse_topic_template
 from holdfast.config.unit_keys import EXAMPLE, UnitKey, parse_unit_key
-from holdfast.config.words import choice, shape, show
+from holdfast.config.words import shape, show
 from holdfast.net.addresses import Network
 from holdfast.net.allow_list import AllowedNetwork, AllowEntry
 from holdfast.protocol import MAX_CODE, MAX_SERIAL_UNIT, MAX_UNIT, MAX_WORD
+from holdfast.runtime.text import either
 from holdfast.types import Area
 
 MAX_BYTES = 244
@@ -103,7 +104,7 @@ def _id_of(what: str, least: int, most: int, note: str = "") -> Callable[[object
 
 def _adapter_name(value: object) -> str:
     if value in RESERVED:
-        raise ValueError(f"found {show(value)}, allowed: a name other than {choice(RESERVED)}")
+        raise ValueError(f"found {show(value)}, allowed: a name other than {either(RESERVED)}")
     return _name(value)
 
 

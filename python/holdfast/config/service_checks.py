@@ -19,7 +19,8 @@ from holdfast.config.scalars import parse_sha256
 from holdfast.config.services import HTTP_SERVICES, RestConfig
 from holdfast.config.tls_checks import check_client_tls, check_https
 from holdfast.config.unique import Owners
-from holdfast.config.words import choice, show
+from holdfast.config.words import show
+from holdfast.runtime.text import either
 
 if TYPE_CHECKING:
     from holdfast.config.grant_checks import GrantChecks
@@ -62,7 +63,7 @@ class ServiceChecks:
             none = "nats, gateway, routes and devices that are forwarded or have tags"
             self._empty("memories", data, f"when only {none} are configured")
         if data.get("listeners", {}) == {} and not data.keys() & {*_INSTEAD_OF_LISTENERS}:
-            self._empty("listeners", data, f"with {choice(_INSTEAD_OF_LISTENERS)}")
+            self._empty("listeners", data, f"with {either(_INSTEAD_OF_LISTENERS)}")
 
     def _empty(self, key: str, data: dict[Any, Any], unless: str) -> None:
         found = "found an empty mapping" if key in data else "missing"

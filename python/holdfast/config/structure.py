@@ -13,7 +13,8 @@ from holdfast.config.allowed import allowed, known_keys
 from holdfast.config.listeners import LISTENER_TYPES, UNIT_TAGS
 from holdfast.config.model import Config
 from holdfast.config.outputs import OUTPUT_TYPES
-from holdfast.config.words import choice, guess, listing, shape, show
+from holdfast.config.words import shape, show
+from holdfast.runtime.text import either, guess, listing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -75,7 +76,7 @@ def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
 
 def _add_kind(path: KeyPath, owner: dict[str, Any], report: Report) -> None:
     types = OUTPUT_TYPES if path[0] == "outputs" else LISTENER_TYPES
-    words = f"allowed: {choice(types)}"
+    words = f"allowed: {either(types)}"
     if "type" not in owner:
         report.add(path, f"missing, {words}", of_key=True)
     else:

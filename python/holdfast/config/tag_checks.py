@@ -10,8 +10,9 @@ from pydantic import TypeAdapter
 from holdfast.config.devices import RangeConfig
 from holdfast.config.lenient import entries, fitting, integer, mapping
 from holdfast.config.tags import TagConfig
-from holdfast.config.words import guess, listing, show
+from holdfast.config.words import show
 from holdfast.protocol import READ_REGISTERS
+from holdfast.runtime.text import guess, listing
 from holdfast.tags import Tag, TagError
 from holdfast.tags.register_scale import RegisterScale
 

@@ -14,7 +14,8 @@ from holdfast.config.report import Report
 from holdfast.config.scalars import is_name
 from holdfast.config.tag_checks import TagChecks
 from holdfast.config.tag_scale import FORMS, PLACE_KEYS
-from holdfast.config.words import guess, listing, show
+from holdfast.config.words import show
+from holdfast.runtime.text import guess, listing
 from holdfast.tags import TagList
 
 if TYPE_CHECKING:

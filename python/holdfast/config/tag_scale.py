@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
 from holdfast.config.scalars import is_name
-from holdfast.config.words import choice, guess, listing, show
+from holdfast.config.words import show
 from holdfast.protocol import LAST_ADDRESS
+from holdfast.runtime.text import either, guess, listing
 from holdfast.tags import Tag, TagError
 from holdfast.tags.register_scale import Form, RegisterScale
 from holdfast.types import AREAS, Area
@@ -91,7 +92,7 @@ def parse_scale(value: object) -> float | ScaleConfig:
     _keys(value, KEYS, KEYS, "")
     form = value["as"]
     if form not in FORMS:
-        raise ValueError(f"as: found {show(form)}, allowed: {choice(FORMS)}{guess(form, FORMS)}")
+        raise ValueError(f"as: found {show(form)}, allowed: {either(FORMS)}{guess(form, FORMS)}")
     source = value["from"]
     if isinstance(source, dict):
         return ScaleConfig(form, _place(source, TYPES[form]))
@@ -105,7 +106,7 @@ def _place(source: dict[Any, Any], kind: str) -> tuple[Area, int, str]:
     _keys(source, PLACE_KEYS, PLACE_KEYS[:2], "from: ")
     area, address, given = source["area"], source["address"], source.get("type", kind)
     if area not in AREAS:
-        raise ValueError(f"from: area: found {show(area)}, allowed: {choice(AREAS)}")
+        raise ValueError(f"from: area: found {show(area)}, allowed: {either(AREAS)}")
     if type(address) is not int or not 0 <= address <= LAST_ADDRESS:
         words = f"an integer from 0 to {LAST_ADDRESS}"
         raise ValueError(f"from: address: found {show(address)}, allowed: {words}")

@@ -10,8 +10,9 @@ from holdfast.config.lenient import entries, integer
 from holdfast.config.memory_checks import area_of
 from holdfast.config.range_checks import check_ranges
 from holdfast.config.unique import refuse_repeats
-from holdfast.config.words import choice, listing, show
+from holdfast.config.words import show
 from holdfast.protocol import CODES, MAX_CODE, OTHER_READS, WRITING_CODES
+from holdfast.runtime.text import either, listing
 from holdfast.types import AREAS, WRITABLE_AREAS
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ class RightsCheck:
     def _codes(self, path: KeyPath, codes: list[Any]) -> None:
         """Reports function codes that nothing there can have."""
         known = range(1, MAX_CODE + 1) if self.routed else CODES
-        words = f"a function code from 1 to {MAX_CODE}" if self.routed else choice(CODES)
+        words = f"a function code from 1 to {MAX_CODE}" if self.routed else either(CODES)
         for index, code in enumerate(codes):
             if type(code) is not int or code not in known:
                 self.report.settle((*path, index), f"found {show(code)}, allowed: {words}")
@@ -112,7 +113,7 @@ class UnitCheck:
                 continue
             if area not in areas:
                 message = f"found {area}, which Modbus clients can't write"
-                self.report.add((*path, "area"), f"{message}, allowed: {choice(areas)}")
+                self.report.add((*path, "area"), f"{message}, allowed: {either(areas)}")
                 continue
             there = area_of(self.memories, path, memory, area, self.report)
             if there is not None and (span[0] not in there or span[-1] not in there):

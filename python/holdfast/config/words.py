@@ -1,12 +1,8 @@
-"""Formats values for error messages: found values, and lists of allowed values."""
+"""Formats found values for error messages."""
 
 from __future__ import annotations
 
-import difflib
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
+from holdfast.runtime.text import clip
 
 MAX_SHOWN = 60
 
@@ -21,8 +17,7 @@ def show(value: object) -> str:
         return "a mapping" if value else "an empty mapping"
     if isinstance(value, list | tuple):
         return "a list" if value else "an empty list"
-    text = repr(value)
-    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"
+    return clip(repr(value), MAX_SHOWN)
 
 
 def shape(value: object) -> str:
@@ -30,20 +25,3 @@ def shape(value: object) -> str:
     if isinstance(value, str):
         return f"text of {len(value)} characters"
     return "a number" if type(value) in (int, float) else show(value)
-
-
-def choice(values: Iterable[object]) -> str:
-    """`a`, `a or b`, `a, b or c`; without duplicates."""
-    *most, last = dict.fromkeys(str(value) for value in values)
-    return f"{', '.join(most)} or {last}" if most else last
-
-
-def listing(values: Iterable[object]) -> str:
-    """`a, b, c`."""
-    return ", ".join(str(value) for value in values)
-
-
-def guess(word: object, known: Iterable[str]) -> str:
-    """`; did you mean 'x'?` if a known word is close, else ""."""
-    close = difflib.get_close_matches(str(word), list(known), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from holdfast._core import ListeningSocket, Poller
     from holdfast.gateway.pool import Dial
     from holdfast.net.resolver import Resolve
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
     from holdfast.web.health import HealthSource
     from holdfast.web.https import Https
 

@@ -10,7 +10,7 @@ from holdfast import values
 from holdfast.config import ConfigError
 from holdfast.config.tag_files import parse_tags
 from holdfast.config.tag_output import scale_as_data
-from holdfast.config.words import guess, listing
+from holdfast.runtime.text import guess, listing
 from holdfast.tags.register_scale import RegisterScale
 from holdfast.tags.text import plain, text_of, value_from
 from holdfast.types import BIT_AREAS

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.words import listing, show
+from holdfast.config.words import show
 from holdfast.protocol import CODES, FUNCTIONS, WRITING_CODES
+from holdfast.runtime.text import listing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.words import listing
 from holdfast.protocol import ADDRESSES
+from holdfast.runtime.text import listing
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.broker import parse_broker, parse_topic_filter
-from holdfast.config.words import listing, show
+from holdfast.config.words import show
 from holdfast.importing.draft import ADMISSION, INGESTED
 from holdfast.importing.filters import ALL
 from holdfast.importing.names import free_name, unique_names
@@ -16,6 +16,7 @@ from holdfast.importing.peers import Peers, written
 from holdfast.importing.sections import seconds, section
 from holdfast.net.addresses import LOOPBACK
 from holdfast.protocol import MAX_WORD
+from holdfast.runtime.text import all_of, listing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -323,7 +324,7 @@ class Adapters:
 
 
 def _areas(areas: Iterable[str]) -> str:
-    return " and ".join(area.replace("_", " ") for area in areas)
+    return all_of(area.replace("_", " ") for area in areas)
 
 
 def _written(adapter: str, granted: Sequence[Area]) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.scalars import MAX_CONNECTIONS
-from holdfast.config.words import guess, listing, show
+from holdfast.config.words import show
 from holdfast.importing import functions
 from holdfast.importing.draft import ADMISSION
 from holdfast.importing.filters import ALL, read_filter
@@ -15,6 +15,7 @@ from holdfast.importing.memories import check_gate, read_areas, read_id
 from holdfast.importing.names import unique_names
 from holdfast.importing.sections import Section, section
 from holdfast.protocol import LAST_ADDRESS, WRITING_CODES
+from holdfast.runtime.text import guess, listing
 
 if TYPE_CHECKING:
     from holdfast.config.ip_addresses import Bind

@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.words import choice, guess, show
+from holdfast.config.words import show
+from holdfast.runtime.text import either, guess
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -98,10 +99,10 @@ class Section:
 
     def word(self, key: str, allowed: Sequence[str], *, required: bool = False) -> str | None:
         """The word at a key, one of those allowed."""
-        value = self._present(key, choice(allowed), required)
+        value = self._present(key, either(allowed), required)
         if isinstance(value, str) and value in allowed:
             return value
-        self._wrong(key, value, choice(allowed))
+        self._wrong(key, value, either(allowed))
         return None
 
     def close(self, reasons: Mapping[str, str] | None = None) -> None:

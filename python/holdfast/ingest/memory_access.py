@@ -20,6 +20,7 @@ from holdfast import _core, logs
 from holdfast.audit import Unrecorded
 from holdfast.ingest.recording import Recording
 from holdfast.protocol import EXCEPTIONS
+from holdfast.runtime.text import clip
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
@@ -549,4 +550,4 @@ def _shown(value: object) -> str:
     if isinstance(value, dict | list):
         return "an object" if isinstance(value, dict) else "an array"
     text = msgspec.json.encode(value, enc_hook=repr).decode()
-    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"
+    return clip(text, MAX_SHOWN)

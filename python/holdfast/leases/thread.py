@@ -12,9 +12,10 @@ import threading
 from collections.abc import Callable, Coroutine, Iterable
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast import logs, tasks
-from holdfast.heartbeat import Heartbeat
+from holdfast import logs
 from holdfast.net.event_loop import EventLoop
+from holdfast.runtime import tasks
+from holdfast.runtime.heartbeat import Heartbeat
 
 if TYPE_CHECKING:
     from nats.aio.client import Client

@@ -10,7 +10,7 @@ import time
 from concurrent.futures import wait
 from typing import TYPE_CHECKING, Any
 
-from holdfast.net.resolver import Resolver
+from holdfast.net.resolver import CONFIGURED
 
 if TYPE_CHECKING:
     from holdfast.mqtt.waiting import Waiter
@@ -22,7 +22,6 @@ CONNECT_TIMEOUT = 10.0
 CHECK_INTERVAL = 0.1
 """Seconds between checks for a stop during a name lookup."""
 
-_RESOLVER = Resolver()
 _UNDER_WAY = {0, errno.EINPROGRESS, errno.EWOULDBLOCK}
 
 
@@ -41,7 +40,7 @@ def dial(host: str, port: int, context: ssl.SSLContext | None, waiter: Waiter) -
 
 
 def _addresses(host: str, port: int, waiter: Waiter) -> list[SocketAddress]:
-    asked = _RESOLVER.look_up(host, port)
+    asked = CONFIGURED.look_up(host, port)
     try:
         while not wait((asked,), CHECK_INTERVAL).done:
             waiter.check()

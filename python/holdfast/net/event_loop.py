@@ -11,7 +11,7 @@ import socket
 import sys
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from holdfast.net.resolver import Resolver
+from holdfast.net.resolver import CONFIGURED
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -22,8 +22,6 @@ else:
     _Usual = asyncio.SelectorEventLoop
 
 Result = TypeVar("Result")
-
-_RESOLVER = Resolver()
 
 
 class EventLoop(_Usual):
@@ -44,7 +42,7 @@ class EventLoop(_Usual):
             return await super().getaddrinfo(
                 host, port, family=family, type=type, proto=proto, flags=flags
             )
-        found = await asyncio.wrap_future(_RESOLVER.look_up(host, port))
+        found = await asyncio.wrap_future(CONFIGURED.look_up(host, port))
         kept = [each for each in found if family in (0, each[0])]
         if not kept:
             raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")

@@ -148,6 +148,11 @@ class Resolver:
             _end(asked, outcome)
 
 
+CONFIGURED = Resolver()
+"""For names that configurations and callers of the library give: brokers, devices, servers. Names
+that requests bring have a pool of their own, whose threads they can't take from these."""
+
+
 def _outcome(host: str, port: int | None) -> list[SocketAddress] | OSError:
     """What the system says of a name."""
     try:

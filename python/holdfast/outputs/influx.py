@@ -19,7 +19,7 @@ from holdfast.outputs.sending import Refused, soon_after
 if TYPE_CHECKING:
     from holdfast.config.outputs import InfluxConfig
     from holdfast.polling import Reading
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
 
 CONNECTING = 3.0
 """Seconds to connect, at most."""

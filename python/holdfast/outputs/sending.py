@@ -8,6 +8,7 @@ import time
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from holdfast import logs
+from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from holdfast.outputs.buffer import Buffer
     from holdfast.outputs.stored import Stored
     from holdfast.polling import Reading
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
 
 FIRST_PAUSE = 1.0
 MAX_PAUSE = 10.0
@@ -85,7 +86,9 @@ class Sending:
     ) -> None:
         self._name, self._receiver, self._buffer = name, receiver, buffer
         self._open_file = open_file
-        self._sent = self._refused = self._failures = 0
+        self._sent = self._refused = 0
+        self._backoff = Backoff(FIRST_PAUSE, MAX_PAUSE, jitter=True)
+        self._pause = 0.0
         self._last_error: str | None = None
         self._is_failing = False
         self._file_error: str | None = None
@@ -116,7 +119,7 @@ class Sending:
                 "dropped": self._buffer.dropped,
             },
             "waiting": len(self._buffer),
-            "failures": self._failures,
+            "failures": self._backoff.failures,
             "last_error": self._last_error,
             "file_error": self._file_error,
         }
@@ -149,7 +152,7 @@ class Sending:
                 waiting = len(self._buffer) - len(readings)
                 logs.write(logging.INFO, "output_back", output=self._name, waiting=waiting)
         self._is_failing = False
-        self._failures = 0
+        self._backoff.succeeded()
         try:
             self._buffer.done()
         except OSError as error:
@@ -158,7 +161,7 @@ class Sending:
 
     def _failed(self, error: OSError) -> bool:
         self._last_error = str(error) or type(error).__name__
-        self._failures += 1
+        self._pause = self._backoff.failed()
         if not self._is_failing:
             self._is_failing = True
             logs.write(logging.WARNING, "output_failed", output=self._name, error=self._last_error)
@@ -166,8 +169,7 @@ class Sending:
 
     def _wait(self, stop: Stop) -> None:
         """Waits for the next attempt, and keeps what comes meanwhile."""
-        pause = min(FIRST_PAUSE * 2.0 ** min(self._failures - 1, 10), MAX_PAUSE)
-        end = time.monotonic() + pause
+        end = time.monotonic() + self._pause
         while not stop.is_set() and (left := end - time.monotonic()) > 0:
             self._keep()
             stop.wait(min(TICK, left))

@@ -7,15 +7,15 @@ import contextlib
 import threading
 from typing import TYPE_CHECKING
 
-from holdfast.heartbeat import Heartbeat
 from holdfast.net import event_loop
+from holdfast.runtime.heartbeat import Heartbeat
 from holdfast.scanner.service import Scanner
 
 if TYPE_CHECKING:
     from holdfast._core import Poller
     from holdfast.leases import StartThread
+    from holdfast.runtime.stop import Stop
     from holdfast.scanner.service import Settings
-    from holdfast.stop import Stop
 
 
 class ScannerAdapter:

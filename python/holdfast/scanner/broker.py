@@ -22,6 +22,8 @@ from holdfast import logs
 from holdfast.config.scanning import PING_INTERVAL, PINGS_OUTSTANDING
 from holdfast.net.secret_file import read_secret
 from holdfast.net.tls import NO_FILES, Tls, broker_context
+from holdfast.net.tls_reasons import failure_text
+from holdfast.runtime.backoff import Backoff
 from holdfast.scanner.credentials import Credentials
 from holdfast.scanner.receiving import SafeClient, TlsClient
 
@@ -122,15 +124,14 @@ class Broker:
         Messages of `shared` subjects go to one of all members of `queue`. `max_pause_s` is between
         attempts to connect.
         """
-        self._max_pause_s = max_pause_s
-        self._first_pause_s = min(FIRST_PAUSE, max_pause_s)
+        self._backoff = Backoff(FIRST_PAUSE, max_pause_s, jitter=True)
+        self._first_pause_s = self._pause_s = min(FIRST_PAUSE, max_pause_s)
         self._shared, self._queue = shared, queue
         self._name = name
         self._ping = ping
         self._servers = servers
         self._handlers = handlers
         self._connected = connected
-        self._failures = 0
         self._told = ("", 0.0)
         self._worked = False
         self.client: SafeClient | None = None
@@ -160,7 +161,7 @@ class Broker:
                 self._subscribed = False
                 self._lost("stopped")
                 await _closed(client)
-            await asyncio.sleep(self._first_pause_s)
+            await asyncio.sleep(self._pause_s)
 
     async def _connect(self, client: SafeClient, ended: asyncio.Event) -> None:
         """Connects and subscribes; returns when nats-py gives up, which sets `ended`."""
@@ -188,7 +189,7 @@ class Broker:
                 reconnected_cb=again,
                 closed_cb=closed,
                 max_reconnect_attempts=-1,
-                reconnect_time_wait=self._first_pause_s,  # type: ignore[arg-type]
+                reconnect_time_wait=self._pause_s,  # type: ignore[arg-type]
                 ping_interval=self._ping.interval,  # type: ignore[arg-type]
                 max_outstanding_pings=self._ping.outstanding,
                 pending_size=PENDING,
@@ -225,10 +226,11 @@ class Broker:
             logging.INFO,
             "nats_connected",
             server="" if url is None else f"{url.hostname}:{url.port}",
-            attempts=self._failures + 1,
+            attempts=self._backoff.failures + 1,
         )
-        self._failures, self._told, self._worked = 0, ("", 0.0), True
-        client.options["reconnect_time_wait"] = self._first_pause_s
+        self._told, self._worked = ("", 0.0), True
+        self._backoff.succeeded()
+        self._pause_s = client.options["reconnect_time_wait"] = self._first_pause_s
         self.client = client
         self._connected(client)
 
@@ -242,18 +244,17 @@ class Broker:
 
     def _note(self, client: Client, error: Exception) -> None:
         """Logs an error. Without a connection, the error is a failed attempt to connect."""
-        reason = str(error) or type(error).__name__
+        reason = failure_text(error)
         if self.client is not None:
             logs.refused("nats_error", kind="nats", reason=reason)
             return
-        self._failures += 1
-        pause = min(FIRST_PAUSE * 2 ** min(self._failures, 10), self._max_pause_s)
-        client.options["reconnect_time_wait"] = pause
+        self._pause_s = client.options["reconnect_time_wait"] = self._backoff.failed()
         now = time.monotonic()
         if reason == self._told[0] and now - self._told[1] < SILENCE:
             return
         self._told = (reason, now)
-        logs.write(logging.WARNING, "nats_connect_failed", reason=reason, attempts=self._failures)
+        attempts = self._backoff.failures
+        logs.write(logging.WARNING, "nats_connect_failed", reason=reason, attempts=attempts)
 
 
 @asynccontextmanager
@@ -290,10 +291,10 @@ async def connected_once(
                 )
         except (Error, OSError) as error:
             cause = failures[-1] if failures else error
-            reason = str(cause).removeprefix("nats: ")
+            reason = failure_text(cause).removeprefix("nats: ")
             if isinstance(cause, TimeoutError):
                 reason = "no answer in time"
-            message = f"no connection to NATS at {servers.shown}: {reason or type(cause).__name__}"
+            message = f"no connection to NATS at {servers.shown}: {reason}"
             raise ConnectionError(message) from error
         yield client
     finally:

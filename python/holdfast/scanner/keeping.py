@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING
 from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
-from holdfast import logs, tasks
+from holdfast import logs
+from holdfast.runtime import tasks
+from holdfast.runtime.backoff import Backoff
 from holdfast.scanner.heartbeat import JETSTREAM_TIMEOUT, reason_of
 
 if TYPE_CHECKING:
@@ -78,7 +80,8 @@ class Keeper:
         self._stored: dict[Unit, dict[str, int]] = {}
         """The hashes of the stored entries, by key."""
         self._works: bool | None = None
-        self._failures = 0
+        self._backoff = Backoff(FIRST_RETRY, RETRIED, jitter=True)
+        self._pause_s = 0.0
         self._busy = asyncio.Lock()
         """Held while entries are read or written."""
         self.tried = asyncio.Event()
@@ -127,10 +130,10 @@ class Keeper:
             except Exception as error:  # Keeping is optional, no error may stop the scanner.
                 bucket = None
                 if self._client is client:  # Else the connection has ended, and not JetStream.
-                    self._failures += 1
+                    self._pause_s = self._backoff.failed()
                     self._tell(False, reason_of(error))
             else:
-                self._failures = 0
+                self._backoff.succeeded()
                 self._tell(True, "")
             self.tried.set()
             if not self._works:
@@ -140,9 +143,8 @@ class Keeper:
         """Waits for work; while JetStream fails, for the next attempt."""
         if self._works is False and self._client is not None:
             client = self._client
-            pause = min(FIRST_RETRY * 2 ** min(self._failures - 1, 10), RETRIED)
             try:
-                async with asyncio.timeout(pause):
+                async with asyncio.timeout(self._pause_s):
                     while self._client is client:
                         self._news.clear()
                         await self._news.wait()

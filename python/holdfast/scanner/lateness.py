@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 from nats.errors import Error
 
 from holdfast.faults import EXPIRES_AFTER
+from holdfast.runtime.standstill import Standstill, now
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.receiving import Received
-from holdfast.standstill import Standstill, now
 
 if TYPE_CHECKING:
     from collections.abc import Callable

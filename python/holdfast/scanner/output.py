@@ -14,6 +14,7 @@ from nats.errors import Error
 
 from holdfast.faults import fault_text, is_exception
 from holdfast.net.event_loop import EventLoop
+from holdfast.net.tls_reasons import failure_text
 from holdfast.outputs.sending import soon_after
 from holdfast.scanner.receiving import SafeClient, TlsClient
 from holdfast.scanner.subjects import data_subject, names
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
 
     from holdfast.config.scanning import Dialect
     from holdfast.polling import Reading
+    from holdfast.runtime.stop import Stop
     from holdfast.scanner.broker import Servers
-    from holdfast.stop import Stop
 
 TIMEOUT = 5.0
 """Seconds for the server to confirm what was sent."""
@@ -68,8 +69,7 @@ class NatsOutput:
         except (OSError, Error) as error:
             self._states.clear()  # What was published last is not certain.
             self._close_client()
-            told = str(error) or type(error).__name__
-            raise OSError(told.removeprefix("nats: ")) from error
+            raise OSError(failure_text(error).removeprefix("nats: ")) from error
 
     def idle(self) -> None:
         """Lets the client answer pings of the server."""

@@ -21,7 +21,7 @@ from nats.errors import Error, ProtocolError
 from nats.protocol.parser import AWAITING_CONTROL_LINE, AWAITING_MSG_PAYLOAD, Parser
 
 from holdfast import logs
-from holdfast.standstill import now
+from holdfast.runtime.standstill import now
 
 END = b"\r\n"
 MAX_LINE = 1024 * 1024

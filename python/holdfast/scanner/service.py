@@ -27,9 +27,11 @@ from weakref import WeakValueDictionary
 
 import msgspec
 
-from holdfast import _core, logs, tasks
+from holdfast import _core, logs
 from holdfast.config.scanning import written_pollable
 from holdfast.net.tls import NO_FILES, Tls
+from holdfast.runtime import tasks
+from holdfast.runtime.standstill import LONG
 from holdfast.scanner import (
     browsing,
     commands,
@@ -81,7 +83,6 @@ from holdfast.scanner.rivals import Rivals
 from holdfast.scanner.rules import Defaults, Rules
 from holdfast.scanner.variables import of_device, variables
 from holdfast.scanner.watching import WATCH_TIMES, WatchTimes
-from holdfast.standstill import LONG
 
 if TYPE_CHECKING:
     from nats.aio.client import Client

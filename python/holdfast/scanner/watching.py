@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
-from holdfast import logs, tasks
+from holdfast import logs
+from holdfast.runtime import tasks
+from holdfast.runtime.backoff import Backoff
 from holdfast.scanner.heartbeat import JETSTREAM_TIMEOUT, reason_of
 from holdfast.scanner.keeping import FETCHED, FIRST_RETRY, READING, RETRIED
 
@@ -88,7 +90,7 @@ class Watch:
         self._client: Client | None = None
         self._news = asyncio.Event()
         self._works: bool | None = None
-        self._failures = 0
+        self._backoff = Backoff(FIRST_RETRY, times.retry_s, jitter=True)
         self.tried = asyncio.Event()
         """Set after the first attempt to read the bucket."""
 
@@ -126,8 +128,7 @@ class Watch:
             except _Missed:
                 pass
             except Exception as error:  # JetStream may fail in any way; it is tried again.
-                pause = min(FIRST_RETRY * 2 ** min(self._failures, 10), self._times.retry_s)
-                self._failures += 1
+                pause = self._backoff.failed()
                 if self._client is client:  # Else the connection has ended, and not JetStream.
                     self._tell(False, reason_of(error))
                 self.tried.set()
@@ -145,7 +146,7 @@ class Watch:
             while (left := count - reader.received) > 0:
                 found |= await reader.fetch(min(left, FETCHED), JETSTREAM_TIMEOUT)
             await self._changed(found, True)
-            self._failures = 0
+            self._backoff.succeeded()
             self._tell(True, "")
             self.tried.set()
             while True:

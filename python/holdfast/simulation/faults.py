@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Self
 
 from holdfast.net.addresses import holds, parse_address
 from holdfast.net.closing import close
-from holdfast.tasks import end
+from holdfast.runtime.tasks import end
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from holdfast.runtime.text import quote
 from holdfast.tags.register_scale import RegisterScale, linear_of
 from holdfast.tags.writing import BOOLEANS, from_text
 from holdfast.values import DoesNotFit
@@ -92,19 +93,15 @@ def value_from(tag: Tag, text: str) -> Any:
         raise DoesNotFit(f"{text!r} has a decimal comma, allowed: a decimal point, as in {point}")
     if tag.states:
         return word
-    raise DoesNotFit(f"{_shown(text)} is not a number")
+    raise DoesNotFit(f"{quote(text)} is not a number")
 
 
 def _switched(tag: Tag, word: str) -> bool:
     found = (BOOLEANS | SWITCHED).get(word.lower())
     if found is None:
         names = "".join(f"{name}, " for name in tag.states.values())
-        raise DoesNotFit(f"{_shown(word)} is not {names}true, false, on, off, 1 or 0")
+        raise DoesNotFit(f"{quote(word)} is not {names}true, false, on, off, 1 or 0")
     return found
-
-
-def _shown(text: str) -> str:
-    return repr(text if len(text) <= 40 else f"{text[:40]}…")
 
 
 def _trimmed(tag: Tag, value: float) -> float:

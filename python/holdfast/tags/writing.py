@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.protocol import WRITE_LIMITS
+from holdfast.runtime.text import quote
 from holdfast.tags.markers import FLOATS
 from holdfast.types import BIT_AREAS
 
@@ -58,21 +59,21 @@ def _boolean(text: str, named: str) -> bool:
     # Not `True`: programs take other words for false than for true, and a guess can start a motor.
     found = BOOLEANS.get(text)
     if found is None:
-        raise ValueError(f"{_shown(text)} is not a valid {named}, allowed: true, false, 1 and 0")
+        raise ValueError(f"{quote(text)} is not a valid {named}, allowed: true, false, 1 and 0")
     return found
 
 
 def _number(text: str, named: str, is_float: bool) -> int | float:
     if _NUMBER.fullmatch(text) is None:
-        raise ValueError(f"{_shown(text)} is not a valid {named}, allowed: a JSON number")
+        raise ValueError(f"{quote(text)} is not a valid {named}, allowed: a JSON number")
     if is_float:
         number = float(text)
         if math.isinf(number):
-            raise ValueError(f"{_shown(text)} does not fit {named}")
+            raise ValueError(f"{quote(text)} does not fit {named}")
         return number
     exact = Decimal(text)
     if exact.adjusted() > 20 or exact != exact.to_integral_value():
-        raise ValueError(f"{_shown(text)} is not a valid {named}")
+        raise ValueError(f"{quote(text)} is not a valid {named}")
     return int(exact)
 
 
@@ -80,7 +81,7 @@ def _bytes(text: str, named: str) -> bytes:
     try:
         return base64.b64decode(text.strip(), validate=True)
     except (binascii.Error, ValueError):
-        raise ValueError(f"{_shown(text)} is not a valid {named}, allowed: base64") from None
+        raise ValueError(f"{quote(text)} is not a valid {named}, allowed: base64") from None
 
 
 def _array(text: str, type: Type, named: str) -> list[Any]:
@@ -89,11 +90,7 @@ def _array(text: str, type: Type, named: str) -> list[Any]:
     except (msgspec.DecodeError, RecursionError):
         items = None
     if not isinstance(items, list):
-        raise ValueError(f"{_shown(text)} is not a valid {named}, allowed: a JSON array")
+        raise ValueError(f"{quote(text)} is not a valid {named}, allowed: a JSON array")
     if type.base == "bytes":
         return [_bytes(item, named) if isinstance(item, str) else item for item in items]
     return items
-
-
-def _shown(text: str) -> str:
-    return repr(text if len(text) <= 40 else f"{text[:40]}…")

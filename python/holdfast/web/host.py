@@ -16,8 +16,8 @@ from urllib.parse import unquote
 
 from holdfast import logs
 from holdfast._core import HttpServer
-from holdfast.heartbeat import PERIOD, Heartbeat
 from holdfast.net.addresses import joined, parse_address
+from holdfast.runtime.heartbeat import PERIOD, Heartbeat
 from holdfast.web.requests import (
     BadRequest,
     BrokenBody,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from holdfast._core import HttpExchange, ListeningSocket
     from holdfast.net.addresses import Network
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
     from holdfast.types import WhenFull
     from holdfast.web.https import Https
     from holdfast.web.requests import Handler, Headers

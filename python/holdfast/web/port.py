@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 from holdfast import logs
 from holdfast._core import ListeningSocket
 from holdfast.net.addresses import joined
+from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
 
 FIRST_PAUSE = 1.0
 MAX_PAUSE = 10.0
@@ -48,18 +49,22 @@ class Port:
 
     def __init__(self, name: str, host: str, port: int) -> None:
         self.name = name
-        self.failures = 0
-        """Attempts that failed."""
         self.error: str | None = None
         """Why the port is not bound; `None` once it is."""
         self._host = host
         self._port = port
         self._listener: ListeningSocket | None = None
         self._bound: tuple[str, int] | None = None
-        self._pause = FIRST_PAUSE
+        self._backoff = Backoff(FIRST_PAUSE, MAX_PAUSE, jitter=False)
+        self._pause = 0.0
         self._logged: tuple[str, float] | None = None
         self._lock = threading.Lock()
         self._is_logged = False
+
+    @property
+    def failures(self) -> int:
+        """Attempts that failed."""
+        return self._backoff.failures
 
     @property
     def bind_address(self) -> str:
@@ -124,10 +129,8 @@ class Port:
         """Tries to bind the port until it succeeds. Returns `False` if `stop` was set."""
         while not stop.is_set():
             late = self.error is not None
-            if late:
-                if stop.wait(self._pause):
-                    break
-                self._pause = min(2 * self._pause, MAX_PAUSE)
+            if late and stop.wait(self._pause):
+                break
             if self.bind():
                 if late:
                     self.log_listening()
@@ -152,7 +155,7 @@ class Port:
     def _note(self, reason: str) -> None:
         """Logs a failure: the first one, another reason, and otherwise once in a while."""
         self.error = reason
-        self.failures += 1
+        self._pause = self._backoff.failed()
         now = time.monotonic()
         if self._logged and self._logged[0] == reason and now - self._logged[1] < LOG_INTERVAL:
             return

@@ -6,9 +6,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use holdfast_protocol::pdu::EncodedRequest;
+use holdfast_runtime::Retry;
 use tokio::time::Instant;
 
-use super::backoff::Retry;
 use super::blocking::BlockingLink;
 use super::fault::{Answer, Exchanged, Fault, fault};
 use super::pace::{Alone, InFlight, Pace, Place as Turn};

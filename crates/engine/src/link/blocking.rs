@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use holdfast_protocol::client::Closed;
 use holdfast_protocol::pdu::EncodedRequest;
+use holdfast_runtime::Retry;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
 
-use super::backoff::Retry;
 use super::fault::{Exchanged, FLOODED, Fault, fault};
 use super::fence::Pass;
 use super::flood::Flood;

@@ -9,7 +9,8 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use super::backoff::Retry;
+use holdfast_runtime::Retry;
+
 use crate::client::StrayCounters;
 
 /// The bytes that are tolerated at once.

@@ -9,7 +9,6 @@
 //! `holdfast_protocol`, decides when a connection ends. The next request opens a new one.
 
 mod access;
-mod backoff;
 mod blocking;
 mod caller;
 mod coming;
@@ -29,7 +28,6 @@ mod silence;
 mod tcp;
 
 pub(crate) use access::Link;
-pub use backoff::Retry;
 pub use caller::{Called, Caller};
 pub(crate) use coming::{Coming, Reply, ReplyTo, coming};
 pub(crate) use dialing::dial;

@@ -6,9 +6,9 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
+use holdfast_runtime::Retry;
 use tokio::sync::mpsc;
 
-use super::backoff::Retry;
 use super::caller::{Caller, Waiting};
 use super::coming::{Coming, ReplyTo, coming};
 use super::order::InOrder;

@@ -6,9 +6,9 @@ use std::collections::HashMap;
 use std::time::Duration;
 
 use holdfast_protocol::pdu::ExceptionCode;
+use holdfast_runtime::Retry;
 use tokio::time::Instant;
 
-use super::backoff::Retry;
 use super::fault::Fault;
 
 /// Timeouts in a row after which requests to a unit are refused for a while.

@@ -12,13 +12,13 @@ use holdfast_protocol::client::{
     Attempt, Closed, Connection, Done, Failure, Past, Ticket, Tolerance, Transport,
 };
 use holdfast_protocol::pdu::EncodedRequest;
+use holdfast_runtime::Retry;
 use tokio::net::TcpStream;
 use tokio::net::tcp::OwnedReadHalf;
 use tokio::sync::{Mutex, oneshot};
 use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
-use super::backoff::Retry;
 use super::dialing::dial;
 use super::fault::{Exchanged, FLOODED};
 use super::fence::Pass;

@@ -21,6 +21,7 @@ use std::time::{Duration, SystemTime};
 
 use holdfast_memory::{Access, Area, Memory, Operation, Outcome, Refusal, Write};
 use holdfast_protocol::pdu::{EncodedRequest, Range, Request};
+use holdfast_runtime::Retry;
 use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
@@ -36,7 +37,7 @@ use super::state::DeviceState;
 use super::status::StatusSettings;
 use super::turn::Turn;
 use crate::client::Endpoint;
-use crate::link::{Fault, Fence, InFlight, Link, Permit, Priority, Retry, Stage};
+use crate::link::{Fault, Fence, InFlight, Link, Permit, Priority, Stage};
 
 /// The longest interval between writes of the status block.
 const TELLING: Duration = Duration::from_secs(1);

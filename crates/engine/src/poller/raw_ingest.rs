@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use holdfast_memory::Area;
 use holdfast_protocol::raw_ingest::{DONE, Format, Header};
+use holdfast_runtime::Retry;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::Notify;
@@ -18,7 +19,7 @@ use tokio::time::{Instant, sleep, timeout_at};
 
 use super::status::{BlockSettings, STATUS_BLOCK_LEN, Status};
 use crate::counter::Counter;
-use crate::link::{Retry, agree, dial};
+use crate::link::{agree, dial};
 use crate::lookup;
 use crate::packet_area::in_packet;
 use crate::tls::TlsFailure;

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use holdfast_memory::Memory;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, limit};
+use holdfast_runtime::Retry;
 use thiserror::Error;
 use tokio::runtime::Builder;
 use tokio::sync::mpsc;
@@ -28,8 +29,7 @@ use super::write_through::{Passage, PassedRange, PassedWrite};
 use crate::client::{Endpoint, Place};
 use crate::heartbeat::Heartbeat;
 use crate::link::{
-    Call, Fault, Fence, InFlight, Link, LinkSettings, Permit, Priority, Retry, SharedLink, Stage,
-    serve,
+    Call, Fault, Fence, InFlight, Link, LinkSettings, Permit, Priority, SharedLink, Stage, serve,
 };
 use crate::own_threads::OwnThreads;
 use crate::tls::client::Identity;

@@ -131,10 +131,22 @@ pub enum TlsFailure {
     Other { text: String },
 }
 
+/// Makes the words of the causes, and the list of all words.
+macro_rules! reasons {
+    (match self { $($cause:pat => $word:literal,)+ }) => {
+        /// All words of [`reason`](TlsFailure::reason).
+        pub const REASONS: &[&str] = &[$($word),+];
+
+        /// The cause as a word for programs, for errors and log events. It does not change when
+        /// messages change.
+        pub const fn reason(&self) -> &'static str {
+            match self { $($cause => $word,)+ }
+        }
+    };
+}
+
 impl TlsFailure {
-    /// The cause as a word for programs, for errors and log events. It does not change when messages
-    /// change.
-    pub const fn reason(&self) -> &'static str {
+    reasons! {
         match self {
             TlsFailure::UnknownIssuer => "unknown_issuer",
             TlsFailure::Expired { .. } => "expired",
@@ -411,12 +423,14 @@ mod tests {
             TlsFailure::NotTls,
             TlsFailure::MalformedMessage { flaw },
             TlsFailure::ClosedDuringHandshake,
+            TlsFailure::ClosedBeforeReply,
             TlsFailure::BadRecord,
             TlsFailure::Other { text: "text".into() },
         ];
         let words: HashSet<&str> = causes.iter().map(TlsFailure::reason).collect();
         let texts: HashSet<String> = causes.iter().map(TlsFailure::to_string).collect();
         assert_eq!((words.len(), texts.len()), (causes.len(), causes.len()));
+        assert_eq!(words, TlsFailure::REASONS.iter().copied().collect());
         assert!(texts.contains("the certificate expired 59 s ago"));
         assert!(texts.contains("the certificate is not valid yet: its validity begins in 3 days"));
     }

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use async_nats::jetstream::{self, Context};
 use futures_util::StreamExt;
+use holdfast_runtime::Retry;
 use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 
@@ -23,9 +24,9 @@ use super::store::{DIGEST, POINTER, Store, subject};
 /// The most further messages that are applied before steps are sent.
 const TOGETHER_RECEIVED: usize = 255;
 
-/// Pauses between sessions. Each failure doubles the pause.
-const FIRST_PAUSE: Duration = Duration::from_millis(50);
-const MAX_PAUSE: Duration = Duration::from_secs(1);
+/// Pauses between sessions. Many nodes share the servers.
+const RETRY: Retry =
+    Retry { first: Duration::from_millis(50), most: Duration::from_secs(1), jitter: true };
 
 /// How long requests to JetStream may take.
 const REQUEST: Duration = Duration::from_secs(3);
@@ -33,7 +34,7 @@ const REQUEST: Duration = Duration::from_secs(3);
 impl Node {
     /// Runs sessions until the log is stopped, or can't go on.
     pub(super) fn run(mut self) {
-        let mut pause = FIRST_PAUSE;
+        let mut failures = 0_u32;
         while !self.shared.is_stopping() {
             let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
             let end = match runtime {
@@ -65,15 +66,16 @@ impl Node {
                 End::Lost(reason) => self.lost(reason),
             }
             if std::mem::take(&mut self.worked) {
-                pause = FIRST_PAUSE;
+                failures = 0;
             }
+            failures = failures.saturating_add(1);
+            let pause = RETRY.pause(failures);
             let until = Instant::now() + pause;
             while Instant::now() < until && !self.shared.is_stopping() {
                 std::thread::sleep(LOOK.min(pause));
                 self.sent.expire(Instant::now(), &self.shared.counters);
                 self.keep();
             }
-            pause = (pause * 2).min(MAX_PAUSE);
         }
         self.sent.expire(Instant::now() + self.settings.write_timeout, &self.shared.counters);
         self.shared.give_kept(self.kept(), true);

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from holdfast import logs
 from holdfast.adapters.mqtt.answers import Answers
-from holdfast.adapters.mqtt.backoff import FIRST_PAUSE, MAX_PAUSE, Backoff
 from holdfast.adapters.mqtt.filters import Filters
 from holdfast.adapters.mqtt.inbox import Inbox
 from holdfast.adapters.mqtt.link import MAX_UNSENT, BrokerConnection
@@ -19,6 +18,8 @@ from holdfast.mqtt.password import read_password
 from holdfast.mqtt.waiting import Ended, Waiter
 from holdfast.net.addresses import joined
 from holdfast.net.tls import NO_FILES, broker_context
+from holdfast.net.tls_reasons import failure_text
+from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
     import socket
@@ -30,7 +31,14 @@ if TYPE_CHECKING:
 
     from holdfast.config import MappedTag, MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.ingest import MemoryAccess
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
+
+FIRST_PAUSE = 1.0
+MAX_PAUSE = 10.0
+"""Seconds between attempts to connect. Each failure doubles the pause, up to the maximum."""
+
+PROVEN = 10.0
+"""After a connection of at least this many seconds, the pauses start from the first again."""
 
 WELCOME = 10.0
 """Seconds to wait for the broker's CONNACK."""
@@ -78,9 +86,9 @@ class Mqtt:
 
     def run(self, stop: Stop) -> None:
         """Stays connected until `stop` is set; reconnects when the connection ends."""
-        backoff = Backoff(*self._pauses)
+        backoff = Backoff(*self._pauses, jitter=True, proven_s=PROVEN)
         with Waiter(stop) as waiter, contextlib.suppress(Ended):
-            while not stop.wait(backoff.pause(self._connection(waiter))):
+            while not stop.wait(backoff.failed(self._connection(waiter))):
                 pass
 
     def status(self) -> dict[str, object]:
@@ -114,7 +122,7 @@ class Mqtt:
                 link.disconnect()
             raise
         except (OSError, ValueError) as error:
-            self._ending = str(error)
+            self._ending = failure_text(error)
         except Exception as error:  # Nothing that a broker sends may end the adapter.
             logs.problem("mqtt_failed", broker=self._broker)
             self._ending = type(error).__name__

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from holdfast.adapters.sessions import SessionControl
     from holdfast.config import RestConfig
     from holdfast.ingest import MemoryAccess
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
     from holdfast.web.https import Https
 
 __all__ = ["Rest"]

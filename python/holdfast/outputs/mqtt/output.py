@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from holdfast.outputs.mqtt.messages import Delivery
     from holdfast.outputs.site import Site
     from holdfast.polling import Reading
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
     from holdfast.tags import Tag
 
 ONLINE, OFFLINE = b"online", b"offline"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ssl
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -14,10 +15,11 @@ from holdfast.mqtt.dialing import dial
 from holdfast.mqtt.password import read_password
 from holdfast.mqtt.waiting import Ended, Waiter
 from holdfast.net.tls import NO_FILES, broker_context
+from holdfast.net.tls_reasons import failure_text
 from holdfast.outputs.mqtt.connection import Connection
 from holdfast.outputs.mqtt.messages import Delivery, Message
-from holdfast.standstill import LOOK, Standstill
-from holdfast.stop import Stop
+from holdfast.runtime.standstill import LOOK, Standstill
+from holdfast.runtime.stop import Stop
 
 if TYPE_CHECKING:
     import socket
@@ -178,6 +180,9 @@ class Session:
             except Ended:
                 connection.close()
                 raise ConnectionError("stopped") from None
+            except ssl.SSLError as error:  # That of a certificate is also a ValueError.
+                connection.close()
+                raise ConnectionError(failure_text(error)) from error
             except ValueError as error:
                 connection.close()
                 raise ConnectionError(f"the broker sent a malformed packet: {error}") from error
@@ -208,7 +213,7 @@ class Session:
             elif not self._is_cut:
                 connection.disconnect()
         except (OSError, ValueError) as error:
-            self._reason = str(error)
+            self._reason = failure_text(error)
         except Exception as error:  # Nothing that a broker sends may end the output.
             logs.problem("mqtt_failed", broker=self._settings.url)
             self._reason = type(error).__name__

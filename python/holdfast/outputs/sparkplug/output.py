@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from holdfast.outputs.mqtt.messages import Delivery, Message
     from holdfast.outputs.site import Site
     from holdfast.polling import Reading
-    from holdfast.stop import Stop
+    from holdfast.runtime.stop import Stop
 
 TIMEOUT = 2.0
 """Seconds to wait for the state of the primary host after connecting."""

@@ -17,10 +17,11 @@ from nats.errors import Error, NoRespondersError
 from nats.errors import TimeoutError as NoAnswer
 from nats.js.errors import NoStreamResponseError
 
-from holdfast import logs, tasks
+from holdfast import logs
 from holdfast.client.url import connection_of
-from holdfast.heartbeat import Heartbeat
 from holdfast.leases import Outdated
+from holdfast.runtime import tasks
+from holdfast.runtime.heartbeat import Heartbeat
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.fleet.exchange import About, Command, Executed, Told, subject
 from holdfast.scanner.fleet.fleet import Fleet

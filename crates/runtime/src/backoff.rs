@@ -3,15 +3,15 @@
 use std::hash::{BuildHasher, RandomState};
 use std::time::Duration;
 
-/// When a device that does not answer is tried again.
+/// When what failed is tried again: a device, a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Retry {
     /// The pause after the first failure.
     pub first: Duration,
     /// The longest pause.
     pub most: Duration,
-    /// Whether each pause is up to a quarter shorter at random, so that devices that failed together are
-    /// not retried together.
+    /// Whether each pause is up to a quarter shorter at random, so that what failed together is not
+    /// retried together.
     pub jitter: bool,
 }
 
@@ -23,12 +23,14 @@ impl Default for Retry {
 
 impl Retry {
     /// With no pause longer than this.
-    pub(crate) fn up_to(self, most: Duration) -> Retry {
+    #[must_use]
+    pub fn up_to(self, most: Duration) -> Retry {
         Retry { most: self.most.min(most), ..self }
     }
 
     /// The pause after `failures` consecutive failures, at least one.
-    pub(crate) fn pause(self, failures: u32) -> Duration {
+    #[must_use]
+    pub fn pause(self, failures: u32) -> Duration {
         let doubled = self.first.saturating_mul(1 << failures.saturating_sub(1).min(31));
         let pause = doubled.min(self.most);
         if !self.jitter {

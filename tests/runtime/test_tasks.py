@@ -7,7 +7,7 @@ import contextlib
 
 import pytest
 
-from holdfast import tasks
+from holdfast.runtime import tasks
 
 
 async def loses(cancellations: int) -> None:

@@ -1,0 +1,1 @@
+"""What running services share: pauses between attempts, child processes."""
