@@ -60,7 +60,7 @@ pub(super) enum MessageError {
 pub(super) const MAX_NODES: usize = 1024;
 
 /// The bytes before the steps, and those before each step, at most.
-pub(super) const OVERHEAD: usize = 128;
+pub(super) const OVERHEAD_BYTES: usize = 128;
 
 /// Encodes a message of steps that are encoded already.
 pub(super) fn encode<'a>(
@@ -69,7 +69,7 @@ pub(super) fn encode<'a>(
     steps: impl ExactSizeIterator<Item = &'a [u8]> + Clone,
 ) -> Bytes {
     let len: usize = steps.clone().map(|step| step.len() + 4).sum();
-    let mut out = Vec::with_capacity(len + OVERHEAD);
+    let mut out = Vec::with_capacity(len + OVERHEAD_BYTES);
     out.extend_from_slice(&MARK);
     out.push(VERSION);
     out.push(u8::from(compares));

@@ -310,8 +310,12 @@ impl Shared {
     }
 
     /// Changes what is known of a node. Nobody waits for that.
-    pub(super) fn update_node(&self, node: String, change: impl FnOnce(&mut NodeView)) {
-        change(lock(&self.progress).view.nodes.entry(node).or_default());
+    pub(super) fn update_node(&self, node: &str, change: impl FnOnce(&mut NodeView)) {
+        let nodes = &mut lock(&self.progress).view.nodes;
+        match nodes.get_mut(node) {
+            Some(known) => change(known),
+            None => change(nodes.entry(node.to_owned()).or_default()),
+        }
     }
 
     pub(super) fn view(&self) -> View {

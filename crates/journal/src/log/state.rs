@@ -76,9 +76,9 @@ impl State {
     }
 
     /// The last counter that was applied of this start of a node.
-    pub(super) fn last_counter(&self, origin: &Origin) -> u64 {
-        let last = self.origins.get(&origin.node);
-        last.filter(|(start, _)| *start == origin.start).map_or(0, |(_, counter)| *counter)
+    pub(super) fn last_counter(&self, node: &str, start: u64) -> u64 {
+        let last = self.origins.get(node);
+        last.filter(|(applied, _)| *applied == start).map_or(0, |(_, counter)| *counter)
     }
 
     /// Applies the next message. `age` tells how old the values of a device are in it, at most; `None` if

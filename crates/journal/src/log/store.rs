@@ -72,6 +72,20 @@ pub(super) struct Snapshot {
     pub(super) node: String,
 }
 
+impl Snapshot {
+    /// A snapshot of this state, which is not stored yet.
+    pub(super) fn of(state: &State, digest: String, node: &str) -> Snapshot {
+        Snapshot {
+            sequence: state.place.sequence,
+            stored: state.place.stored,
+            steps: state.steps,
+            object: format!("{:016x}", unique() as u64),
+            digest,
+            node: node.to_owned(),
+        }
+    }
+}
+
 pub(super) fn subject(log: &str) -> String {
     format!("holdfast.log.{log}.steps")
 }
