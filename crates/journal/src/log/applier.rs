@@ -10,7 +10,7 @@ use super::message::Origin;
 use super::note::Note;
 use super::raw_message::Received;
 use super::settings::Settings;
-use super::shared::{Kept, Shared};
+use super::shared::{Checkpoint, Shared};
 use super::state::{Applied, Place, State};
 use super::status::{Event, NodeView};
 
@@ -120,9 +120,9 @@ impl Applier {
         Ok(applied)
     }
 
-    /// Begins to load a snapshot. Nobody reads the contents until [`Applier::end_load`].
+    /// Begins to load a snapshot. Reads are refused until [`Applier::end_load`].
     pub(super) fn begin_load(&mut self) -> State {
-        self.shared.loading(true);
+        self.shared.set_loading(true);
         State::new(std::mem::take(&mut self.state.members))
     }
 
@@ -133,7 +133,7 @@ impl Applier {
         } else {
             self.state.members = state.members;
         }
-        self.shared.loading(false);
+        self.shared.set_loading(false);
         self.shared.counters.sequence.set(self.state.place.sequence);
     }
 
@@ -143,14 +143,14 @@ impl Applier {
     }
 
     /// What the file is to keep, unless the contents are not there yet.
-    pub(super) fn kept(&self) -> Option<Kept> {
+    pub(super) fn checkpoint(&self) -> Option<Checkpoint> {
         let stream = self.stream_id.as_deref().filter(|_| self.has_contents())?;
-        Note::with_contents(&self.state, &self.settings.name, stream)
+        Note::checkpoint(&self.state, &self.settings.name, stream)
     }
 
     /// The servers do not have what this node has applied. Says what to do.
     pub(super) fn replaced(&self, text: String) -> LogError {
-        let Some(file) = &self.settings.kept_file else { return LogError::Replaced(text) };
+        let Some(file) = &self.settings.memory_file else { return LogError::Replaced(text) };
         let place = self.state.place;
         LogError::Replaced(format!(
             "{text}. The contents of this node at {place} are kept in {file}. Stop all nodes and \

@@ -14,10 +14,10 @@ use super::settings::{Settings, is_word};
 use super::shared::Shared;
 use super::state::State;
 use super::status::{Digest, Event};
-use super::store::{DIGEST, Pointer};
+use super::store::{DIGEST_KEY_PREFIX, Pointer};
 
 /// The length of a digest as text.
-const DIGEST_LEN: usize = 64;
+const DIGEST_CHARS: usize = 64;
 
 /// Compares the digests of all nodes.
 pub(super) struct Comparer {
@@ -69,7 +69,7 @@ impl Comparer {
         let published = Published { sequence, digest: digest.to_owned() };
         if let Ok(value) = serde_json::to_vec(&published) {
             let keys = background.store().keys.clone();
-            let key = format!("{DIGEST}{}", self.settings.node);
+            let key = format!("{DIGEST_KEY_PREFIX}{}", self.settings.node);
             // If this fails, other nodes see the next digest.
             tokio::spawn(async move { keys.put(key, value.into()).await.map(drop) });
         }
@@ -85,9 +85,9 @@ impl Comparer {
         key: &str,
         value: &[u8],
     ) -> Option<(u64, Verdict)> {
-        let node = key.strip_prefix(DIGEST).unwrap_or_default();
+        let node = key.strip_prefix(DIGEST_KEY_PREFIX).unwrap_or_default();
         let Published { sequence, digest } = serde_json::from_slice(value).ok()?;
-        let is_digest = is_word(node) && digest.len() == DIGEST_LEN;
+        let is_digest = is_word(node) && digest.len() == DIGEST_CHARS;
         // Anyone may write the key. Only nodes that have sent a message have a vote.
         if !is_digest || node == self.settings.node || !state.knows(node) {
             return None;

@@ -13,14 +13,14 @@ use super::error::{End, LogError};
 use super::settings::{Login, Servers};
 
 /// The most commands that wait for the connection.
-const CAPACITY: usize = 4096;
+const MAX_WAITING_COMMANDS: usize = 4096;
 
 /// How often the connection is tried, and how long requests may take.
-const PING: Duration = Duration::from_secs(2);
-const REQUEST: Duration = Duration::from_secs(3);
+const PING_INTERVAL: Duration = Duration::from_secs(2);
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// After its end, a client waits for this time before it connects again. It is dropped before.
-const NEVER: Duration = Duration::from_secs(86_400);
+const NO_RECONNECT_DELAY: Duration = Duration::from_secs(86_400);
 
 pub(super) struct Connected {
     pub(super) client: Client,
@@ -69,12 +69,12 @@ pub(super) async fn connect(servers: &Servers, name: String) -> Result<Connected
     let options = options
         .name(name)
         .connection_timeout(servers.connect_timeout)
-        .request_timeout(Some(REQUEST))
-        .ping_interval(PING)
-        .client_capacity(CAPACITY)
+        .request_timeout(Some(REQUEST_TIMEOUT))
+        .ping_interval(PING_INTERVAL)
+        .client_capacity(MAX_WAITING_COMMANDS)
         .ignore_discovered_servers()
         .reconnect_delay_callback(move |_| {
-            if worked_before.load(Ordering::Acquire) { NEVER } else { Duration::ZERO }
+            if worked_before.load(Ordering::Acquire) { NO_RECONNECT_DELAY } else { Duration::ZERO }
         })
         .event_callback(move |event| {
             let reason = match event {

@@ -99,7 +99,7 @@ impl InFlight {
         Some(message.first_sent)
     }
 
-    /// The servers had nobody who takes the message, so nothing has stored it.
+    /// No server was there to store the message.
     pub(super) fn not_taken(&mut self, counter: u64, counters: &Counters) {
         self.answer(counter, Refusal::Unavailable, &counters.unavailable);
     }

@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_of_others_are_told_from_another_version() {
+    fn bytes_of_others_are_distinguished_from_another_version() {
         let of = |bytes: &[u8]| decode(bytes, &members());
         assert_eq!(of(b"hello"), Err(MessageError::Foreign));
         assert_eq!(of(b"HFL\x02whatever"), Err(MessageError::Version(2)));

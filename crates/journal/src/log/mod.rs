@@ -55,7 +55,7 @@ pub use error::LogError;
 pub use follower::{Follower, Next, Record, Until};
 pub use message::Origin;
 pub use settings::{Login, Servers, Settings, Tls, WhenBehind};
-pub use shared::Kept;
+pub use shared::Checkpoint;
 pub use status::{Digest, Event, Node, Phase, Status};
 
 use node::Node as Running;
@@ -75,7 +75,7 @@ pub struct Log {
 }
 
 /// How long the thread of a log may take to give what a file keeps.
-const KEEPING: Duration = Duration::from_secs(10);
+const CHECKPOINT_TIMEOUT: Duration = Duration::from_secs(10);
 
 impl Log {
     /// Makes the log the journal of these memories. Until it has caught up, writes are refused.
@@ -119,8 +119,8 @@ impl Log {
 
     /// The contents after one message, and a note for [`Log::resume`]. `None` while there are no contents
     /// that are right.
-    pub fn kept(&self) -> Option<Kept> {
-        self.shared.kept(KEEPING)
+    pub fn checkpoint(&self) -> Option<Checkpoint> {
+        self.shared.checkpoint(CHECKPOINT_TIMEOUT)
     }
 
     /// Starts the thread of the log. A second call does nothing.

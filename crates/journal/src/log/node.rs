@@ -3,7 +3,7 @@
 //! | part | decides |
 //! | --- | --- |
 //! | [`Applier`] | what a message of the stream does |
-//! | [`Sender`] | what is sent, and what writers are told |
+//! | [`Sender`] | what is sent, and the outcome that writers see |
 //! | [`Snapshotter`] | when a snapshot is taken and stored |
 //! | [`Comparer`] | whether digests of nodes agree |
 //! | [`Recovery`] | whether the contents are right |
@@ -24,7 +24,7 @@ use super::recovery::Recovery;
 use super::sender::Sender;
 use super::server_lag::ServerLag;
 use super::settings::Settings;
-use super::shared::{Kept, Shared};
+use super::shared::{Checkpoint, Shared};
 use super::snapshotter::Snapshotter;
 
 /// How often deadlines are checked.
@@ -57,7 +57,7 @@ impl Node {
             snapshotter: Snapshotter::new(&settings, &shared),
             comparer: Comparer::new(&settings, &shared),
             recovery: Recovery::new(&settings, &shared),
-            lag: ServerLag::new(settings.cut_off),
+            lag: ServerLag::new(settings.max_cut_off),
             fingerprint,
             settings,
             shared,
@@ -85,16 +85,16 @@ impl Node {
     }
 
     /// What the file is to keep, unless the contents are wrong or not there yet.
-    pub(super) fn kept(&self) -> Option<Kept> {
-        self.applier.kept().filter(|_| self.recovery.is_right())
+    pub(super) fn checkpoint(&self) -> Option<Checkpoint> {
+        self.applier.checkpoint().filter(|_| self.recovery.is_right())
     }
 
     /// What has to be done in time, whatever this node waits for: the file is given what it asks for, and
     /// writers learn that their steps were not confirmed.
     pub(super) fn keep_deadlines(&mut self, now: Instant) {
         // While a snapshot is loaded, the file waits.
-        if self.shared.is_kept_asked() && self.applier.has_contents() {
-            self.shared.give_kept(self.kept(), false);
+        if self.shared.is_checkpoint_requested() && self.applier.has_contents() {
+            self.shared.give_checkpoint(self.checkpoint());
         }
         self.sender.expire(now);
     }

@@ -6,7 +6,7 @@ use holdfast_memory::{Contents, Memory};
 use serde::{Deserialize, Serialize};
 
 use super::error::LogError;
-use super::shared::Kept;
+use super::shared::Checkpoint;
 use super::state::{Place, State, digest_of};
 
 const VERSION: u8 = 1;
@@ -45,7 +45,7 @@ impl Note {
     }
 
     /// The contents of this state, and the note about them. `None` if the note can't be encoded.
-    pub(super) fn with_contents(state: &State, log: &str, stream: &str) -> Option<Kept> {
+    pub(super) fn checkpoint(state: &State, log: &str, stream: &str) -> Option<Checkpoint> {
         let contents = Memory::contents(&state.members);
         let note = Note {
             version: VERSION,

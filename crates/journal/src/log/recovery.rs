@@ -50,7 +50,7 @@ impl Recovery {
     pub(super) fn may_rejoin(&self, error: &LogError) -> bool {
         let is_long_ago = |least: Duration| self.last.is_none_or(|last| last.elapsed() >= least);
         matches!(error, LogError::Differs { .. })
-            && self.settings.return_after.is_some_and(is_long_ago)
+            && self.settings.rejoin_after.is_some_and(is_long_ago)
     }
 
     /// The contents are wrong: the next session loads a snapshot.

@@ -1,4 +1,4 @@
-//! Sends the messages of this node, and tells the writers of its steps the outcome.
+//! Sends the messages of this node, and reports the outcome of its steps to their writers.
 //!
 //! A [`Sender`] lasts as long as the process: it numbers messages, and knows those whose outcome is
 //! open. A [`Publisher`] is its way to the stream in one session.
@@ -68,7 +68,7 @@ pub(super) struct Publisher {
 struct Batch {
     steps: Vec<Vec<u8>>,
     dones: Vec<Done>,
-    /// When their writers are told that they are not confirmed.
+    /// When they are answered as not confirmed.
     until: Instant,
 }
 

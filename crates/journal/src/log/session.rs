@@ -25,7 +25,7 @@ use super::raw_message::Received;
 use super::sender::Publisher;
 use super::state::{Applied, digest_of};
 use super::status::{Event, Phase};
-use super::store::{DIGEST, POINTER, Store, parsed};
+use super::store::{DIGEST_KEY_PREFIX, SNAPSHOT_KEY, Store, parsed};
 
 /// The most further messages that are applied before steps are sent.
 const MAX_FURTHER_MESSAGES: usize = 255;
@@ -92,7 +92,7 @@ impl<'n> Session<'n> {
         let messages = Messages::new(&store, from);
         let publisher = Publisher::new(connected.client.clone(), &settings);
         let acks = node.run_with_expiry(publisher.acknowledgements()).await??;
-        let watched = [POINTER.to_owned(), format!("{DIGEST}>")];
+        let watched = [SNAPSHOT_KEY.to_owned(), format!("{DIGEST_KEY_PREFIX}>")];
         let watch = node.run_with_expiry(store.keys.watch_many_with_history(watched)).await?;
         let watch = watch.map_err(|error| End::lost("subscribe", error))?;
         let info = store.stream.cached_info();
@@ -276,7 +276,7 @@ impl<'n> Session<'n> {
     /// A key of the log was written.
     fn watched(&mut self, entry: &kv::Entry) -> Result<(), End> {
         let Node { applier, snapshotter, comparer, .. } = &mut *self.node;
-        if entry.key == POINTER {
+        if entry.key == SNAPSHOT_KEY {
             snapshotter.learn(entry.revision, parsed(&entry.value)?);
             return Ok(());
         }

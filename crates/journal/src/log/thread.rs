@@ -39,7 +39,7 @@ pub(super) fn run(mut node: Node) {
         pause = (pause * 2).min(MAX_PAUSE);
     }
     node.sender.expire_all();
-    node.shared.give_kept(node.kept(), true);
+    node.shared.give_last_checkpoint(node.checkpoint());
     node.shared.update(|view| {
         view.phase = Phase::Stopped;
         view.server = None;
@@ -64,7 +64,7 @@ fn run_session(node: &mut Node) -> (End, bool) {
 fn fail(node: &Node, error: LogError) {
     // What the file is to keep has to be right. All other errors are about the log, not the contents.
     let is_right = !matches!(error, LogError::Differs { .. });
-    node.shared.give_kept(is_right.then(|| node.kept()).flatten(), true);
+    node.shared.give_last_checkpoint(node.checkpoint().filter(|_| is_right));
     node.shared.fail(error);
 }
 
