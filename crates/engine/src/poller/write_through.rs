@@ -55,7 +55,7 @@ pub(super) struct PassedWrite {
     _place: Place,
 }
 
-/// What a device has taken over or told, in its own addresses.
+/// Values that a device has accepted or returned, in its own addresses.
 pub(super) struct Change {
     pub(super) area: Area,
     pub(super) address: u16,
@@ -89,7 +89,7 @@ impl Passage {
     }
 
     /// Whether a request writes into one of the ranges.
-    pub(crate) fn takes(&self, pdu: &[u8]) -> bool {
+    pub(crate) fn accepts(&self, pdu: &[u8]) -> bool {
         let function = pdu.first().copied().and_then(Function::from_code);
         function.is_some_and(Function::is_write)
             && Request::parse(pdu).is_ok_and(|request| {

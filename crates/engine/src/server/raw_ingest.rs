@@ -146,7 +146,7 @@ pub(crate) struct RawIngest {
     pub(crate) packets: Arc<PacketCounters>,
     policy: Grants<RawGrant>,
     /// The rights of a peer that no rule names, by its role.
-    nobody: Arc<RawGrant>,
+    no_rights: Arc<RawGrant>,
     tls: Option<Arc<ServerTls>>,
     format: Format,
     flags: Flags,
@@ -253,7 +253,7 @@ impl RawIngest {
         RawIngest {
             packets,
             policy: Grants::new(rules),
-            nobody: Arc::new(RawGrant { targets: HashMap::new(), areas: Vec::new() }),
+            no_rights: Arc::new(RawGrant { targets: HashMap::new(), areas: Vec::new() }),
             tls: settings.tls.clone(),
             format: settings.format,
             flags: settings.flags,
@@ -321,12 +321,12 @@ impl RawIngest {
         let rights = live.get().granted(&peer).unwrap_or_else(|| {
             // Each packet is refused, which tells the sender more than the end of the connection.
             context.refuse_role(peer.clone());
-            Arc::clone(&self.nobody)
+            Arc::clone(&self.no_rights)
         });
         let by_role = peer.clone();
         let renewal = Box::new(move || {
             let service = live.get();
-            Some(service.granted(&by_role).unwrap_or_else(|| Arc::clone(&service.nobody)))
+            Some(service.granted(&by_role).unwrap_or_else(|| Arc::clone(&service.no_rights)))
         });
         let sending = self.begin((stream, peer), rights, &[], ticket);
         self.serve_packets(context, sending, renewal, stop).await;

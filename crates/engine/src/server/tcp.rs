@@ -64,7 +64,7 @@ pub(crate) struct ModbusStream {
     unit_server: Arc<UnitServer>,
     policy: Policy,
     /// The rights of a peer that no rule names, by its role.
-    nobody: Arc<PeerRights>,
+    no_rights: Arc<PeerRights>,
     timeouts: Timeouts,
     framing: StreamFraming,
     tls: Option<Arc<ServerTls>>,
@@ -87,7 +87,7 @@ impl ModbusStream {
                 .map(|raw| Arc::new(RawIngest::new(raw, packets.unwrap_or_default()))),
             unit_server,
             policy: Policy::of(&settings.rules),
-            nobody: Arc::new(PeerRights::none()),
+            no_rights: Arc::new(PeerRights::none()),
             timeouts: Timeouts {
                 idle: settings.idle_timeout,
                 request: settings.request_timeout,
@@ -156,7 +156,7 @@ impl ModbusStream {
         let rights = live.get().terms(&peer).map(|terms| terms.rights).unwrap_or_else(|| {
             // The session stays, and each request gets exception 01 (MB-TCP-Security, R-23, R-31).
             context.refuse_role(peer.clone());
-            Arc::clone(&self.nobody)
+            Arc::clone(&self.no_rights)
         });
         self.modbus::<F, _>(live, context, (stream, peer), (rights, Vec::new()), ticket, stop)
             .await;
@@ -245,9 +245,10 @@ impl ModbusStream {
 fn renewal(live: Arc<Live<ModbusStream>>, peer: Peer) -> Renewal {
     Box::new(move || {
         let service = live.get();
-        let nobody = || Terms { rights: Arc::clone(&service.nobody), timeouts: service.timeouts };
+        let no_rights =
+            || Terms { rights: Arc::clone(&service.no_rights), timeouts: service.timeouts };
         let terms = service.terms(&peer);
-        terms.or_else(|| peer.certificate.is_some().then(nobody))
+        terms.or_else(|| peer.certificate.is_some().then(no_rights))
     })
 }
 
@@ -258,7 +259,7 @@ impl Service for ModbusStream {
         let rights = self.policy.rights(peer);
         rights.or_else(|| {
             let raw = self.raw_ingest.as_ref()?;
-            raw.rights(peer).map(|_| Arc::clone(&self.nobody))
+            raw.rights(peer).map(|_| Arc::clone(&self.no_rights))
         })
     }
 

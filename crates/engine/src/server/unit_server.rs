@@ -107,12 +107,12 @@ impl UnitServer {
         request: &[u8],
     ) -> Option<&'r Elsewhere> {
         let places = rights.elsewhere(unit_id)?;
-        self.taker(places, unit_id, request)
+        self.find_destination(places, unit_id, request)
     }
 
-    /// The first place that takes a request.
+    /// The first place that accepts a request. Not inline: most units have no such places.
     #[inline(never)]
-    fn taker<'r>(
+    fn find_destination<'r>(
         &self,
         places: &'r [Elsewhere],
         unit_id: u8,
@@ -120,7 +120,7 @@ impl UnitServer {
     ) -> Option<&'r Elsewhere> {
         places.iter().find(|place| match place {
             Elsewhere::Device(_) => !self.refuses_silence(request),
-            Elsewhere::Mirror(passage) => !self.is_silent(unit_id) && passage.takes(request),
+            Elsewhere::Mirror(passage) => !self.is_silent(unit_id) && passage.accepts(request),
             Elsewhere::Journal(_) => !self.is_silent(unit_id) && is_write(request),
         })
     }
