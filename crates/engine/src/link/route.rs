@@ -10,9 +10,9 @@ use tokio::sync::mpsc;
 
 use super::backoff::Retry;
 use super::caller::{Caller, Waiting};
-use super::coming::{Coming, ReplyTo, coming};
 use super::order::InOrder;
 use super::pace::InFlight;
+use super::pending_reply::{PendingReply, ReplyTo, pending_reply};
 use super::queue::Priority;
 use crate::client::{ClientError, Endpoint, StrayCounters};
 use crate::counter::Counter;
@@ -210,13 +210,13 @@ impl Route {
         asker: &Asker,
         unit_id: u8,
         pdu: &[u8],
-    ) -> Result<Coming, ExceptionCode> {
+    ) -> Result<PendingReply, ExceptionCode> {
         let link = &self.link;
         link.counters.requests.add();
         let request = EncodedRequest::opaque(pdu).ok_or(ExceptionCode::IllegalFunction)?;
         let place = link.place(asker.waiting, false).ok_or(ExceptionCode::ServerDeviceBusy)?;
         let priority = link.priority(&request, asker.peer);
-        let (to, coming) = coming();
+        let (to, pending) = pending_reply();
         let call = Call {
             unit_id: self.unit_id.unwrap_or(unit_id),
             request,
@@ -229,7 +229,7 @@ impl Route {
             },
         };
         match link.calls.send(call) {
-            Ok(()) => Ok(coming),
+            Ok(()) => Ok(pending),
             Err(_) => Err(ExceptionCode::GatewayPathUnavailable),
         }
     }

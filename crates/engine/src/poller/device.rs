@@ -24,9 +24,9 @@ use holdfast_protocol::pdu::{EncodedRequest, Range, Request};
 use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
-use super::caught::{Panicked, caught};
 use super::cost::Samples;
 use super::learned::{Learned, Unreadable};
+use super::panic_guard::{Panicked, catch};
 use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
 use super::raw_ingest::{Forward, ForwardSettings};
 use super::results::{BlockResult, Poll, Results};
@@ -238,7 +238,7 @@ impl Device {
         self.state.begun();
         loop {
             self.publish_status();
-            let polled = caught(pin!(async {
+            let polled = catch(pin!(async {
                 tokio::select! {
                     successor = self.poll_until_replaced(&inbox) => successor,
                     never = self.publish_status_for_ever() => match never {},

@@ -16,8 +16,8 @@ use tokio::runtime::Builder;
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
-use super::caught::spawn_watched;
 use super::device::{Device, DeviceSettings, Inbox, Planned};
+use super::panic_guard::spawn_guarded;
 use super::plan::{PlanError, PlanLimits};
 use super::raw_ingest::{Forward, ForwardCounters, ForwardSettings};
 use super::results::{Receivers, Results, Written};
@@ -476,7 +476,7 @@ impl Running {
         let to = (Rc::clone(&link), Rc::clone(&turn));
         let state = Arc::clone(&polled.state);
         let (device, forwards) = made(planned, polled, to);
-        let device = spawn_watched(device.run(phase, Rc::clone(&inbox)), state);
+        let device = spawn_guarded(device.run(phase, Rc::clone(&inbox)), state);
         Running { link, turn, unit_id, timeout, release, fence, inbox, device, forwards }
     }
 
@@ -582,7 +582,7 @@ fn made(planned: Planned, polled: Polled, to: (Rc<Link>, Rc<Turn>)) -> (Device, 
         .collect();
     let tasks = forwards
         .iter()
-        .map(|forward| spawn_watched(Rc::clone(forward).run(), Arc::clone(&polled.state)));
+        .map(|forward| spawn_guarded(Rc::clone(forward).run(), Arc::clone(&polled.state)));
     let tasks = tasks.collect();
     (Device::new(planned, polled.state, to, forwards), tasks)
 }

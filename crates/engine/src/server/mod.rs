@@ -14,7 +14,7 @@ mod framing;
 pub mod functions;
 pub mod identity;
 mod incoming;
-mod journal;
+mod journaled_write;
 mod listener;
 mod live;
 mod memory_operations;

@@ -16,7 +16,7 @@ use tokio::sync::watch;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
 use super::audit::Forwarded;
-use super::deferred::come;
+use super::deferred::count_reply;
 use super::event::Kind;
 use super::framing::{Framing, Rtu};
 use super::listener::ListenerContext;
@@ -256,7 +256,9 @@ impl ModbusSerial {
                 self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted);
             self.note_refused(context, RefusedRequest::before_device(unit_id, request, &sent));
             let (route, answered) = match sent {
-                Ok((route, coming)) => (route, come(&self.unit_server, request, coming.await.ok())),
+                Ok((route, pending)) => {
+                    (route, count_reply(&self.unit_server, request, pending.await.ok()))
+                }
                 Err(code) => {
                     let pdu = exception(request, code.code());
                     (None, Reply { pdu, ..Reply::default() })

@@ -15,7 +15,7 @@ use tokio::sync::watch;
 use tokio::task::{JoinSet, yield_now};
 
 use super::audit::{Forwarded, Permit};
-use super::deferred::come;
+use super::deferred::count_reply;
 use super::framing::{Datagram, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
 use super::live::Live;
@@ -169,7 +169,7 @@ impl ModbusUdp {
         socket: &Datagrams,
         Completed { tag, unit_id, meta, route, request, reply, permit }: Completed,
     ) {
-        let reply = come(&self.unit_server, &request, reply);
+        let reply = count_reply(&self.unit_server, &request, reply);
         if let Some(auditor) = &context.auditor {
             let forwarded = Forwarded::new(route.as_ref(), &request, &reply);
             let peer = meta.addr.into();
@@ -222,19 +222,19 @@ impl ModbusUdp {
             let asker = Asker { source: later.source, peer: Some(peer.ip()), waiting };
             let permit = context.permit_forwarded(request);
             let permitted = permit.is_some();
-            let coming = if waiting < MAX_LATER {
+            let sent = if waiting < MAX_LATER {
                 self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted)
             } else {
                 Err(ExceptionCode::ServerDeviceBusy)
             };
-            if let Some(refused) = RefusedRequest::before_device(unit_id, request, &coming) {
+            if let Some(refused) = RefusedRequest::before_device(unit_id, request, &sent) {
                 context.refuse_request(refused, Some(peer.into()));
             }
-            return match coming {
-                Ok((route, coming)) => {
+            return match sent {
+                Ok((route, pending)) => {
                     let (meta, request) = (*meta, request.to_vec());
                     later.replies.spawn(async move {
-                        let reply = coming.await.ok();
+                        let reply = pending.await.ok();
                         Completed { tag, unit_id, meta, route, request, reply, permit }
                     });
                     0

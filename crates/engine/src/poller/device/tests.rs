@@ -11,8 +11,8 @@ use tokio::time::timeout;
 use super::*;
 use crate::client::Place;
 use crate::poller::BlockSettings;
-use crate::poller::caught::spawn_watched;
 use crate::poller::health::Health;
+use crate::poller::panic_guard::spawn_guarded;
 use crate::poller::results::Receivers;
 
 #[test]
@@ -246,7 +246,7 @@ fn a_task_that_panics_puts_its_device_in_error() {
     with_device(async |_| {
         let state = Arc::<DeviceState>::default();
         state.good();
-        spawn_watched(async { panic!("a fault in a forward") }, Arc::clone(&state));
+        spawn_guarded(async { panic!("a fault in a forward") }, Arc::clone(&state));
         until(|| state.health() == Health::Error).await;
         state.good();
         assert_eq!((state.health(), state.last_error()), (Health::Error, 0x8007));
