@@ -24,7 +24,7 @@ use super::admission::Ticket;
 use super::audit::Forwarded;
 use super::deferred::{Completed, Deferral, Deferred, MAX_WAITING};
 use super::event::Kind;
-use super::fair_share::{READ, Share};
+use super::fair_share::{Share, WORK_OF_READ};
 use super::framing::{Ascii, Framing, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
 use super::peer::Peer;
@@ -264,7 +264,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             let read = read?;
             self.renew()?;
             let answered = self.answering.answer(&input[..partial + read], output);
-            self.share.charge(READ);
+            self.share.charge(WORK_OF_READ);
             self.note_times(&answered);
             let output = &output[..answered.len];
             if !output.is_empty() {

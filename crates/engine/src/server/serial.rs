@@ -34,10 +34,10 @@ const BROADCAST: u8 = 0;
 const CHARACTER_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// The interval between attempts to open a lost device.
-const REOPEN: Duration = Duration::from_secs(1);
+const REOPEN_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A line that does not send a reply within this time counts as lost.
-const STUCK: Duration = Duration::from_secs(10);
+const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// A listener on a serial line.
 #[derive(Debug, Clone)]
@@ -96,7 +96,7 @@ impl ModbusSerial {
             port = loop {
                 tokio::select! {
                     _ = &mut stopping => return,
-                    () = sleep(REOPEN) => {}
+                    () = sleep(REOPEN_INTERVAL) => {}
                 }
                 if let Ok(port) = self.line.open() {
                     break port;
@@ -322,7 +322,7 @@ impl ModbusSerial {
 
 /// Sends a reply. An error means that the line is lost.
 async fn send(port: &SerialPort, reply: &[u8]) -> io::Result<()> {
-    timeout(STUCK, port.write_all(reply))
+    timeout(WRITE_TIMEOUT, port.write_all(reply))
         .await
         .map_err(|_| io::Error::from(io::ErrorKind::TimedOut))?
 }

@@ -17,14 +17,14 @@ use super::listener::{Admitted, ListenerContext, Service, set_options};
 use super::live::Live;
 use super::peer::Peer;
 use super::policy::{PeerRights, Policy, Rule};
-use super::raw_ingest::{Beginning, DECISIVE, RawIngest, RawSettings};
+use super::raw_ingest::{Beginning, DECISIVE_BYTES, RawIngest, RawSettings};
 use super::secure::secured;
 use super::stream::Stream;
 use super::unit_server::UnitServer;
 use crate::tls::server::ServerTls;
 
 /// The time that an unlimited wait lasts.
-const FOREVER: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
+const NO_DEADLINE: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
 
 /// The framing of Modbus on a TCP stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -215,14 +215,14 @@ impl ModbusStream {
             }
             let is_new = admitted.received.is_empty();
             let time_limit = if is_new { self.timeouts.idle } else { Some(self.timeouts.request) };
-            let deadline = begun + time_limit.unwrap_or(FOREVER);
+            let deadline = begun + time_limit.unwrap_or(NO_DEADLINE);
             let readable = tokio::select! {
                 readable = timeout_at(deadline, admitted.stream.readable()) => readable,
                 _ = stop.wait_for(|stop| *stop) => return context.ended(Kind::Closed, peer),
             };
             // No more than what decides: the rest is for whoever serves the connection.
-            let mut chunk = [0; DECISIVE];
-            let missing = DECISIVE - admitted.received.len();
+            let mut chunk = [0; DECISIVE_BYTES];
+            let missing = DECISIVE_BYTES - admitted.received.len();
             match readable {
                 Err(_) if is_new => return context.ended(Kind::Idle, peer),
                 Err(_) => return context.ended(Kind::RequestTimeout, peer),

@@ -94,6 +94,7 @@ impl MemoryFile {
         mut members: Vec<Member>,
         options: Options,
     ) -> Result<MemoryFile, FileError> {
+        // A memory has one journal, and that is the log.
         if options.sync.is_zero() {
             return Err(FileError::Memories("sync is 0, but the log confirms writes".to_owned()));
         }
@@ -192,6 +193,7 @@ impl MemoryFile {
         let State::Loaded(store) = &mut *state else { return Ok(()) };
         let memories: Vec<_> = self.members.iter().map(|m| Arc::clone(&m.memory)).collect();
         let mut ids = Vec::new();
+        // No step may come between the contents that are stored and the first that waits.
         self.queue.begin(|| {
             self.stored_writes.store(writes(&memories), Ordering::Relaxed);
             let (contents, note) = match &log {
@@ -360,6 +362,7 @@ fn first_changes(
         };
         let id = id_of(stored)?;
         ids.push(id);
+        // The same layout: only pages that differ are stored.
         if stored.is_some_and(|stored| stored.layout == layout) {
             changes.pages.extend(image.differing(id, &contents));
             continue;

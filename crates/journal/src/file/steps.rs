@@ -58,12 +58,14 @@ impl Steps {
         let mut outcomes: Vec<Outcome> = Vec::with_capacity(steps.len());
         for Waiting { step, .. } in &steps {
             let outcome = step.carry_out(&self.shadows);
+            // A refused step has changed nothing.
             if outcome.is_ok() {
                 self.touch(step, &mut touched);
             }
             outcomes.push(outcome);
         }
         let pages = touched.into_iter().filter_map(|place| self.changed(place)).collect();
+        // The memories have not changed yet: only the shadows are ahead.
         if self.store.store(Changes { pages, ..Changes::default() }).is_err() {
             self.restore_shadows();
             return self.queue.refuse(steps.into_iter().map(|each| each.done), Refusal::NotStored);

@@ -126,6 +126,7 @@ impl Comparer {
         if std::mem::replace(&mut self.is_replaying, true) {
             return false;
         }
+        // The memories themselves go on with the session.
         let members = copies(members);
         background.spawn(|store| async move {
             let digest = match members {

@@ -59,7 +59,7 @@ pub(super) enum MessageError {
 /// How many nodes a log may have had.
 pub(super) const MAX_NODES: usize = 1024;
 
-/// The bytes before the steps, and those before each step, at most.
+/// The most bytes before the steps, with those before one step.
 pub(super) const OVERHEAD_BYTES: usize = 128;
 
 /// Encodes a message of steps that are encoded already.

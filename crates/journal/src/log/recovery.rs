@@ -70,6 +70,7 @@ impl Recovery {
     /// The node has applied all that the log had. Returns whether it serves from now on.
     pub(super) fn caught_up(&mut self, sequence: u64) -> bool {
         let is_right = self.is_right();
+        // Each session compares anew: a digest from an earlier one proves nothing about what came since.
         if !is_right {
             self.contents = Contents::Comparing { sequence, since: Instant::now() };
         }

@@ -149,6 +149,7 @@ impl Sender {
         let Some(counter) = self.own_counter(origin) else { return Ok(None) };
         self.start = Start::Applied(origin.start);
         let sent = self.in_flight.applied(counter, outcomes, &self.shared.counters);
+        // All that the log had when it was sent comes before it, and was applied.
         if let Some(at) = sent {
             self.shared.contact(at);
         }
@@ -182,6 +183,7 @@ impl Sender {
         if self.shared.is_stopping() && self.in_flight.is_empty() {
             return Err(End::Stopped);
         }
+        // While many messages are in flight, steps gather in the queue: batches grow with the load.
         while self.in_flight.has_room() {
             let waiting = self.shared.take(MAX_BATCH_BYTES.min(publisher.max_steps_bytes()));
             let Some(until) = waiting.first().map(|first| first.until) else { break };

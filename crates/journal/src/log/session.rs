@@ -321,10 +321,12 @@ impl<'n> Session<'n> {
         let now = Instant::now();
         self.node.keep_deadlines(now);
         self.node.shared.expire(now);
+        // Steps that were sent are still answered before the end.
         if self.node.shared.is_stopping() && self.node.sender.is_idle() {
             return Err(End::Stopped);
         }
         let silent = now.saturating_duration_since(self.last_applied.max(self.began));
+        // A server that is cut off from the stream may keep the connection open for long.
         if silent > self.node.settings.silence() {
             let seconds = silent.as_secs_f64();
             return Err(End::Lost(format!("the log has confirmed nothing for {seconds:.1} s")));

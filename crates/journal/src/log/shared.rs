@@ -98,6 +98,7 @@ impl Journal for Shared {
     fn submit(&self, step: Step, done: Done) {
         let mut bytes = Vec::new();
         encoding::encode(&step, &mut bytes);
+        // The servers would end the connection: no later attempt could succeed either.
         if bytes.len() > self.max_step_bytes.load(Ordering::Relaxed) {
             self.counters.not_stored.add(1);
             return refuse(done, Refusal::NotStored);
@@ -224,6 +225,7 @@ impl Shared {
         let (mut count, mut len) = (0, 0);
         for waiting in &queue.steps {
             len += waiting.bytes.len() + 4;
+            // The first always: a step longer than `room` is sent alone.
             if count > 0 && len > room {
                 break;
             }

@@ -245,6 +245,7 @@ impl Store {
             _ => End::lost("reading a snapshot", error),
         };
         let object = self.objects.get(&snapshot.object).await.map_err(missing)?;
+        // Anyone may store an object of any size.
         let mut object = object.take(MAX_SNAPSHOT_BYTES);
         let mut bytes = Vec::new();
         loop {
@@ -285,6 +286,7 @@ impl Store {
         let object = ObjectMetadata { name: snapshot.object.clone(), ..ObjectMetadata::default() };
         let mut bytes = encoded;
         self.objects.put(object, &mut bytes).await.map_err(|error| error.to_string())?;
+        // The key is changed only if it is as it was seen: of two nodes, one fails.
         let (revision, previous) =
             seen.map(|(at, of)| (Some(at), Some(of.newest))).unwrap_or_default();
         let name = snapshot.object.clone();
@@ -309,6 +311,7 @@ impl Store {
     /// Removes messages and snapshots from before the snapshot before the last.
     pub(super) async fn tidy(&self, pointer: &Pointer) -> Result<(), String> {
         let Some(previous) = &pointer.previous else { return Ok(()) };
+        // The last snapshot may turn out to be damaged: the one before it can still be continued.
         if previous.sequence > 1 {
             let purge = self.stream.purge().sequence(previous.sequence);
             purge.await.map_err(|error| error.to_string())?;
