@@ -207,8 +207,7 @@ impl Memory {
         }
     }
 
-    /// Lets a journal carry out all writes from now on. Whoever writes waits for it; to not wait, use
-    /// [`Memory::submit`].
+    /// Lets a journal carry out all writes from now on. Writes wait for it; [`Memory::submit`] does not.
     ///
     /// # Panics
     /// The memory has a journal already.

@@ -282,7 +282,7 @@ impl BlockingClient {
         let (endpoint, epoch) = (self.endpoint.clone(), self.epoch);
         let (sender, opened) = mpsc::sync_channel(1);
         let work = move || {
-            // Whoever was interrupted does not receive it.
+            // Fails if the caller was interrupted.
             let _ = sender.send(Open::new(&endpoint, epoch, deadline, timeout));
         };
         let connecting = thread::Builder::new().name("holdfast-connect".into());

@@ -34,7 +34,7 @@ pub enum InFlight {
 pub(super) struct Pace {
     places: Rc<Places>,
     doubtful: Semaphore,
-    /// Shared by all requests in flight. Who has a place takes it for itself to be alone.
+    /// Shared by all requests in flight. A request that must be alone locks it for writing.
     in_flight: RwLock<()>,
     auto: Option<RefCell<Auto>>,
 }
@@ -144,13 +144,13 @@ impl Places {
         Some(Free(Some(Rc::clone(self))))
     }
 
-    /// Gives a place to whoever is next.
+    /// Gives a place to the next request.
     fn give(self: &Rc<Places>) {
         loop {
             let Some(next) = self.waiting.borrow_mut().pop() else { break };
             match next.send(Free(Some(Rc::clone(self)))) {
                 Ok(()) => return,
-                // Who waited was stopped. The place is not given back: it is still here.
+                // That request was cancelled. Its drop must not return the place a second time.
                 Err(mut place) => place.0 = None,
             }
         }

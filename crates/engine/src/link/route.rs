@@ -103,7 +103,7 @@ struct Place {
     is_called: bool,
 }
 
-/// Who asks.
+/// The source of a request.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Asker {
     /// A number of its own for each connection.
@@ -250,7 +250,7 @@ impl Reply {
         self.in_order = Some(in_order);
     }
 
-    /// Whether nobody waits for the reply any more.
+    /// Whether the caller has given up.
     pub(super) fn is_unwanted(&self) -> bool {
         match &self.to {
             Receiver::Listener(to, _) => to.is_unwanted(),

@@ -92,7 +92,7 @@ pub(super) struct Joining<'r> {
 }
 
 impl Joining<'_> {
-    /// It is sent now: whoever asks from now on gets a later reply.
+    /// It is sent now: equal reads from now on are answered by a later request.
     pub(super) fn leave(mut self) -> Vec<Reply> {
         let joined =
             self.read.take().and_then(|read| self.reads.waiting.borrow_mut().remove(&read));

@@ -71,7 +71,7 @@ pub struct DeviceSettings {
     pub status: Option<StatusSettings>,
     /// The first poll begins within this time. Devices are spread over it.
     pub start_within: Duration,
-    /// Who takes the polls too.
+    /// A queue that also receives the polls.
     pub report: Option<Arc<Results>>,
     /// Whether the connection is closed after each poll, for devices that accept only one.
     pub release: bool,

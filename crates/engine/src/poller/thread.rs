@@ -70,7 +70,7 @@ pub struct Polled {
     pub name: String,
     pub state: Arc<DeviceState>,
     pub forwards: Vec<Arc<ForwardCounters>>,
-    /// Who takes its polls.
+    /// The queue that receives its polls.
     pub report: Option<Arc<Results>>,
     address: Arc<Address>,
 }

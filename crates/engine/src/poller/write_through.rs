@@ -64,7 +64,7 @@ pub(super) struct Change {
     pub(super) bytes: Vec<u8>,
 }
 
-/// A place among those who wait.
+/// The place of a write that waits. It is free again when this is dropped.
 struct Place(Arc<AtomicUsize>);
 
 impl Drop for Place {

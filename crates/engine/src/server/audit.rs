@@ -98,9 +98,9 @@ struct Room {
 /// The receiving side.
 #[derive(Debug)]
 pub(crate) struct Records {
-    /// `None` only wakes whoever waits.
+    /// `None` only wakes the reader of the queue.
     receiver: Mutex<Receiver<Option<Record>>>,
-    /// Without listeners, nobody else can send: whoever waits must still wait.
+    /// Keeps the channel open without listeners: the reader of the queue must still wait then.
     sender: Sender<Option<Record>>,
     shared: Arc<Shared>,
 }
@@ -194,7 +194,7 @@ impl Auditor {
         let size = record.size();
         if let Some(mut room) = permit.and_then(|permit| permit.room) {
             debug_assert_eq!(room.size, size);
-            // Who takes the record releases its room.
+            // The room belongs to the record now, until the record is taken.
             room.size = 0;
         } else if self.shared.waiting.fetch_add(size, Ordering::Relaxed) > MAX_QUEUE_BYTES {
             self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
@@ -255,13 +255,13 @@ impl Records {
         records
     }
 
-    /// Ends the wait of whoever takes records.
+    /// Wakes the reader of the queue.
     pub(crate) fn wake(&self) {
         let _ = self.sender.send(None);
     }
 
     /// Whether the log can't be written, so that writes which must be recorded are refused. Wakes
-    /// whoever takes records: it has to try again.
+    /// the reader of the queue: it has to try again.
     pub(crate) fn set_failing(&self, failing: bool) {
         self.shared.failing.store(failing, Ordering::Relaxed);
         self.wake();

@@ -1,5 +1,5 @@
-//! Events of connections, for a log. Sending waits for nobody: when the queue is full, events are
-//! dropped and counted.
+//! Events of connections, for a log. Sending never waits: when the queue is full, events are dropped and
+//! counted.
 //!
 //! A source that causes many events must not displace those of others. If many of its events wait,
 //! further refusals that equal one of them, but for the port of the peer, are only counted there, and
@@ -203,8 +203,8 @@ impl Repeated {
 }
 
 impl Event {
-    /// Where it comes from: an address, or the network /64 of an IPv6 address, because a host has as
-    /// many addresses of it as it wants.
+    /// Where it comes from: an address, or the network /64 of an IPv6 address, because a host can
+    /// use any address of it.
     fn source(&self) -> Option<IpAddr> {
         Some(match self.peer.as_ref()?.ip().to_canonical() {
             IpAddr::V6(whole) => {

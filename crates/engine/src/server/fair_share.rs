@@ -1,7 +1,7 @@
 //! Fair shares of a worker thread among the sources of its connections: deficit round robin.
 //!
 //! A source that has used its share of a round waits until the next one, which begins as soon as all
-//! others that had something to do were served. There is no limit and no time: while nobody else waits,
+//! others that had something to do were served. There is no limit and no time: while no other source waits,
 //! rounds follow each other immediately, and a source that is alone has no rounds at all.
 //!
 //! A source is an address. All its connections on the worker share what it has, in the order in which
@@ -289,7 +289,7 @@ mod tests {
         IpAddr::from([192, 0, 2, last])
     }
 
-    /// Who has worked, in order: the last byte of the address.
+    /// The sources in the order in which they worked: the last byte of each address.
     type Log = Arc<Mutex<Vec<u8>>>;
 
     /// A connection that never waits for its peer.

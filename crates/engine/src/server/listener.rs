@@ -26,7 +26,7 @@ use super::stream::Stream;
 /// The most connections that wait in the system to be accepted.
 const MAX_BACKLOG: i32 = 1024;
 
-/// The most bytes that the system keeps of a connection and that nobody has read, in each direction.
+/// The most unread bytes of a connection that the system buffers, in each direction.
 /// Linux doubles it for its own bookkeeping. Without it, systems allow several megabytes.
 const SOCKET_BUFFER_BYTES: usize = 256 * 1024;
 

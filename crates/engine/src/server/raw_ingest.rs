@@ -895,7 +895,7 @@ mod tests {
         let mut sending = raw.sending(admitted(accepted, peer, Vec::new()));
         while (&*SockRef::from(&sending.stream)).write(&[DONE; CHUNK_BYTES]).is_ok() {}
         assert_eq!(runtime.block_on(raw.reply(&mut sending, DONE)), Err(Kind::SlowReader));
-        // Nobody can get a reply from a connection that is gone, but that is no reason to stop.
+        // A connection that is gone can't receive replies, but that is no reason to stop.
         drop(client);
         while (&*SockRef::from(&sending.stream)).write(&[DONE]).is_ok() {}
         assert_eq!(runtime.block_on(raw.reply(&mut sending, DONE)), Ok(()));

@@ -220,7 +220,7 @@ impl ModbusStream {
                 readable = timeout_at(deadline, admitted.stream.readable()) => readable,
                 _ = stop.wait_for(|stop| *stop) => return context.ended(Kind::Closed, peer),
             };
-            // No more than what decides: the rest is for whoever serves the connection.
+            // No more than what decides: the server of the protocol reads the rest.
             let mut chunk = [0; DECISIVE_BYTES];
             let missing = DECISIVE_BYTES - admitted.received.len();
             match readable {

@@ -278,7 +278,7 @@ impl Drop for MemoryFile {
             let state = self.state.get_mut().unwrap_or_else(PoisonError::into_inner);
             return mem::forget(mem::replace(state, State::Stopped));
         }
-        // Whoever wants to know whether the last contents are stored calls it before.
+        // A caller that needs the result calls it before.
         let _ = self.stop();
     }
 }

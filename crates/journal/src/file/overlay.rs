@@ -119,7 +119,7 @@ impl<B: StorageBackend> StorageBackend for Overlay<B> {
         self.below.close()
     }
 
-    // Whoever only reads shares the file with others who do.
+    // A reader shares the file with other readers.
     fn try_lock_range(&self, start: Bound<u64>, end: Bound<u64>) -> Result<bool, BackendError> {
         self.below.try_lock_shared_range(start, end)
     }

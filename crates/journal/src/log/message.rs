@@ -16,7 +16,7 @@ const MARK: [u8; 3] = *b"HFL";
 /// Of messages and snapshots, since both change together.
 pub(super) const VERSION: u8 = 1;
 
-/// Who sent a message, and which of its messages it is.
+/// The node that sent a message, and the number of the message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Origin {
     pub node: String,

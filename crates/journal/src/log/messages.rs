@@ -1,8 +1,8 @@
 //! The messages of the stream, in their order: from a consumer, or fetched one by one.
 //!
-//! The client library ends its connection at a message whose headers it can't parse, and takes one
-//! whose headers have a status for an answer of the server. Anyone who may publish can send such
-//! messages. A fetched message is JSON, with its headers as text, so it does no harm: a session begins
+//! The client library ends its connection at a message whose headers it can't parse, and takes
+//! a message whose headers have a status for an answer of the server. Any client that may publish can
+//! send such messages. A fetched message is JSON, with its headers as text, so it does no harm: a session begins
 //! with fetched messages, and changes to a consumer when those have no such headers.
 
 use std::ops::RangeInclusive;

@@ -125,8 +125,8 @@ impl<'n> Session<'n> {
             tokio::select! {
                 received = messages.next() => {
                     self.receive(&received?)?;
-                    // What has arrived together is answered before steps are sent: those who were
-                    // answered write again, and their steps travel together.
+                    // What has arrived together is answered before steps are sent: writers that
+                    // were answered write again, and their steps become one batch.
                     for _ in 0..MAX_FURTHER_MESSAGES {
                         let Some(received) = messages.next_now() else { break };
                         self.receive(&received?)?;

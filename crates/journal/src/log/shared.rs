@@ -1,4 +1,4 @@
-//! What the thread of a log shares with those who write, read and look at it.
+//! What the thread of a log shares with writers, readers and the status.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -46,7 +46,7 @@ pub(super) struct Shared {
     pub(super) counters: Counters,
     progress: Mutex<Progress>,
     changed: Condvar,
-    /// Held by who requests a checkpoint: an answer is for one only.
+    /// Held by the caller that requests a checkpoint: an answer is for one only.
     requesting: Mutex<()>,
     exchange: Mutex<Exchange>,
     answered: Condvar,
