@@ -79,8 +79,8 @@ impl Log {
         settings.snapshot_after = seconds("snapshot_seconds", snapshot_seconds)?;
         settings.digest_every = within("digest_steps", digest_steps, 1..=most)? as u64;
         settings.queue = within("queue", queue, 1..=1_000_000)?;
-        settings.cut_off = seconds("cut_off", cut_off)?;
-        settings.kept_file = kept_file;
+        settings.max_cut_off = seconds("cut_off", cut_off)?;
+        settings.memory_file = kept_file;
         settings.servers.connect_timeout = seconds("connect_timeout", connect_timeout)?;
         settings.servers.login = login(user, password_file, token_file, credentials_file)?;
         settings.servers.tls = tls.map(tls_of).transpose()?;

@@ -7,7 +7,7 @@ use std::time::UNIX_EPOCH;
 use holdfast_journal::file::{
     FileError, FileOnDisk, Member, MemoryFile as Core, Options, Source, read, release,
 };
-use holdfast_journal::log::{Kept, Log as CoreLog};
+use holdfast_journal::log::{Checkpoint, Log as CoreLog};
 use holdfast_memory::Area;
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
@@ -28,8 +28,8 @@ pub struct MemoryFile {
 struct OfLog(Arc<CoreLog>);
 
 impl Source for OfLog {
-    fn contents(&self) -> Option<Kept> {
-        self.0.kept()
+    fn contents(&self) -> Option<Checkpoint> {
+        self.0.checkpoint()
     }
 }
 

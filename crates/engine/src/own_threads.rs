@@ -28,7 +28,7 @@ impl OwnThreads {
         self.process != process::id()
     }
 
-    /// Whether there are threads that nobody has joined.
+    /// Whether there are threads that were not joined.
     pub(crate) fn are_running(&self) -> bool {
         match self.threads.try_lock() {
             Ok(threads) => !threads.is_empty(),

@@ -541,7 +541,7 @@ fn often(settings: &mut Settings) {
 /// As before, and a node whose contents are wrong does not return by itself.
 fn for_good(settings: &mut Settings) {
     often(settings);
-    settings.return_after = None;
+    settings.rejoin_after = None;
 }
 
 fn corrupt(node: &Node) {
@@ -659,7 +659,7 @@ fn of_two_nodes_the_one_that_the_log_does_not_lead_to_stops_serving() {
 fn wrong_contents_do_not_become_a_snapshot() {
     let server = Server::new();
     let soon = |settings: &mut Settings| {
-        settings.return_after = None;
+        settings.rejoin_after = None;
         settings.snapshot_steps = 5;
     };
     let (good, wrong) = (Node::started(&[&server], "a"), Node::new(&[&server], "b", soon));

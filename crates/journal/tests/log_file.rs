@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use holdfast_journal::file::{FileError, FileOnDisk, Member, MemoryFile, Options, Source, read};
-use holdfast_journal::log::{Kept, LogError, Settings};
+use holdfast_journal::log::{Checkpoint, LogError, Settings};
 use holdfast_memory::{Contents, Gate, GateMode, Layout, Memory, Refusal, Span};
 use nodes::{Folder, Node, Server, memory, memory_of, until};
 
@@ -26,8 +26,8 @@ impl std::fmt::Debug for OfNode {
 }
 
 impl Source for OfNode {
-    fn contents(&self) -> Option<Kept> {
-        self.0.log.kept()
+    fn contents(&self) -> Option<Checkpoint> {
+        self.0.log.checkpoint()
     }
 }
 
@@ -51,7 +51,7 @@ impl KeptNode {
     ) -> KeptNode {
         let file = opened(path, &memory).unwrap();
         let node = Node::with(memory, &[server], "a", |settings| {
-            settings.kept_file = Some(path.display().to_string());
+            settings.memory_file = Some(path.display().to_string());
             change(settings);
         });
         if let Some(note) = file.note() {
@@ -171,7 +171,7 @@ fn a_start_that_lasts_with_a_shorter_log_fails() {
     let (mut server, folder) = (Server::new(), Folder::new());
     let path = file_in(&folder);
     lose(&mut server, &path);
-    let node = KeptNode::new(&server, &path, |settings| settings.cut_off = Duration::ZERO);
+    let node = KeptNode::new(&server, &path, |settings| settings.max_cut_off = Duration::ZERO);
     let error = node.node.try_start().unwrap_err();
     assert_eq!(error.kind(), "replaced");
     says_what_to_do(&error.to_string(), &path);
@@ -200,7 +200,7 @@ fn a_log_that_went_on_elsewhere_is_not_that_of_the_file() {
 fn a_node_that_runs_keeps_what_the_servers_lose() {
     let (mut server, folder) = (Server::new(), Folder::new());
     let path = file_in(&folder);
-    let node = KeptNode::new(&server, &path, |settings| settings.cut_off = Duration::ZERO);
+    let node = KeptNode::new(&server, &path, |settings| settings.max_cut_off = Duration::ZERO);
     node.start();
     node.node.write(0, 111).unwrap();
     server.kill();
@@ -220,7 +220,7 @@ fn a_node_that_runs_keeps_what_the_servers_lose() {
     assert_eq!(node.node.read(0), Err(Refusal::Differs));
     node.stop();
     assert_eq!(kept_value(&path), 222);
-    let again = KeptNode::new(&server, &path, |settings| settings.cut_off = Duration::ZERO);
+    let again = KeptNode::new(&server, &path, |settings| settings.max_cut_off = Duration::ZERO);
     assert_eq!(again.node.try_start().unwrap_err().kind(), "replaced");
 }
 
@@ -267,7 +267,7 @@ fn all_who_ask_at_once_for_what_a_file_keeps_get_it() {
     node.node.write(0, 1).unwrap();
     std::thread::scope(|scope| {
         for _ in 0..4 {
-            scope.spawn(|| (0..100).for_each(|_| assert!(node.node.log.kept().is_some())));
+            scope.spawn(|| (0..100).for_each(|_| assert!(node.node.log.checkpoint().is_some())));
         }
     });
 }
@@ -278,7 +278,7 @@ fn a_note_that_does_not_fit_is_refused() {
     let path = file_in(&folder);
     let node = KeptNode::started(&server, &path);
     node.node.write(0, 1).unwrap();
-    let (_, note) = node.node.log.kept().unwrap();
+    let (_, note) = node.node.log.checkpoint().unwrap();
     node.stop();
     let fresh = |log: &str| Node::new(&[&server], "a", |settings| settings.name = log.to_owned());
     let error = fresh("other").log.resume(&note).unwrap_err();

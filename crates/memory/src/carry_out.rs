@@ -23,7 +23,7 @@ impl Step {
     }
 
     /// The same for a step whose values are that old: ranges that mirror a device are no newer then. If
-    /// nobody knows their age, such ranges stay as old as they were.
+    /// their age is unknown, such ranges stay as old as they were.
     ///
     /// # Errors
     /// As [`Step::carry_out`].

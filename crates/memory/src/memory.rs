@@ -72,8 +72,8 @@ pub struct Contents {
 #[derive(Debug)]
 struct Content {
     areas: [Box<[u8]>; 4],
-    /// Any of [`SEALED`], [`GUARDED`] and [`AGING`].
-    door: u8,
+    /// Any of [`SEALED`], [`GUARDED`] and [`AGING`]. With none of them, an access needs no further checks.
+    access_flags: u8,
     /// How many times the seal opened, and how many times it closed again.
     seal_changes: (u64, u64),
     /// How many writes were carried out, each in one step.
@@ -81,13 +81,13 @@ struct Content {
     observers: Observers,
 }
 
-/// Clients are refused.
+/// A flag of access: clients are refused.
 const SEALED: u8 = 1;
 
-/// The journal is asked before each access.
+/// A flag of access: the journal is asked before each.
 const GUARDED: u8 = 2;
 
-/// Mirrored ranges can be stale.
+/// A flag of access: mirrored ranges can be stale.
 const AGING: u8 = 4;
 
 /// The age of values that are written when they are known.
@@ -120,7 +120,7 @@ impl Memory {
             journal: OnceLock::new(),
             content: RwLock::new(Content {
                 areas,
-                door: if gate.is_some() { SEALED } else { 0 },
+                access_flags: if gate.is_some() { SEALED } else { 0 },
                 seal_changes: (0, 0),
                 writes: 0,
                 observers: Observers::default(),
@@ -151,7 +151,7 @@ impl Memory {
         // Accesses take the two locks in the other order, so they are not held together here.
         *self.mirrored.write().unwrap_or_else(PoisonError::into_inner) = ranges;
         let mut content = self.exclusive();
-        content.door = content.door & !AGING | if ages { AGING } else { 0 };
+        content.access_flags = content.access_flags & !AGING | if ages { AGING } else { 0 };
         Ok(())
     }
 
@@ -188,7 +188,7 @@ impl Memory {
         access: Access,
         (area, address, count): (Area, u16, usize),
     ) -> Result<(), Refusal> {
-        let ages = content.door & AGING != 0 && access != Access::Mirror;
+        let ages = content.access_flags & AGING != 0 && access != Access::Mirror;
         if ages && self.mirrored().touched(area, address, count).any(Mirrored::is_stale) {
             return Err(Refusal::Stale);
         }
@@ -207,8 +207,7 @@ impl Memory {
         }
     }
 
-    /// Lets a journal carry out all writes from now on. Whoever writes waits for it; to not wait, use
-    /// [`Memory::submit`].
+    /// Lets a journal carry out all writes from now on. Writes wait for it; [`Memory::submit`] does not.
     ///
     /// # Panics
     /// The memory has a journal already.
@@ -216,7 +215,7 @@ impl Memory {
         let guards = journal.guards();
         assert!(self.journal.set((journal, member)).is_ok(), "a memory has one journal");
         if guards {
-            self.exclusive().door |= GUARDED;
+            self.exclusive().access_flags |= GUARDED;
         }
     }
 
@@ -230,7 +229,7 @@ impl Memory {
     fn judge(&self, content: &Content, access: Access) -> Result<(), Refusal> {
         content.admit(access)?;
         match self.journal.get() {
-            Some((journal, _)) if content.door & GUARDED != 0 => journal.admit(),
+            Some((journal, _)) if content.access_flags & GUARDED != 0 => journal.admit(),
             _ => Ok(()),
         }
     }
@@ -626,7 +625,7 @@ impl Memory {
         }
         content.written(access, writes.clone());
         if access == Access::Mirror
-            && content.door & AGING != 0
+            && content.access_flags & AGING != 0
             && let Some(age) = age
         {
             self.renew(age, writes);
@@ -679,16 +678,16 @@ impl Memory {
 
 impl Content {
     const fn sealed(&self) -> bool {
-        self.door & SEALED != 0
+        self.access_flags & SEALED != 0
     }
 
     const fn seal(&mut self, sealed: bool) {
-        self.door = self.door & !SEALED | if sealed { SEALED } else { 0 };
+        self.access_flags = self.access_flags & !SEALED | if sealed { SEALED } else { 0 };
     }
 
     /// Whether an access needs no further judgement.
     const fn is_open_to(&self, access: Access) -> bool {
-        self.door == 0 && !matches!(access, Access::Restore)
+        self.access_flags == 0 && !matches!(access, Access::Restore)
     }
 
     /// Whether the seal admits an access. Called with the lock under which the write is carried out, so

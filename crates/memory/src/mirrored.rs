@@ -1,4 +1,4 @@
-//! Ranges that mirror a device: who may write them, and when nobody may use them.
+//! Ranges that mirror a device: which access may write them, and when they may not be used.
 
 use std::fmt;
 use std::sync::Arc;
@@ -14,7 +14,7 @@ pub trait Freshness: fmt::Debug + Send + Sync {
     /// this old. Those of before were older.
     fn renew(&self, age: Duration);
 
-    /// Whether nobody else may read or write the range now.
+    /// Whether only the mirror may read or write the range now.
     fn is_stale(&self) -> bool;
 }
 
@@ -24,13 +24,13 @@ pub struct Mirrored {
     pub area: Area,
     pub address: u16,
     pub count: usize,
-    /// Whether nobody else writes them.
+    /// Whether only the mirror writes them.
     pub is_reserved: bool,
     pub freshness: Option<Arc<dyn Freshness>>,
 }
 
 impl Mirrored {
-    /// Items that nobody else writes, and that never become stale.
+    /// Items that only the mirror writes, and that never become stale.
     pub const fn reserved(area: Area, address: u16, count: usize) -> Mirrored {
         Mirrored { area, address, count, is_reserved: true, freshness: None }
     }

@@ -1,4 +1,4 @@
-//! Observers: queues that receive every write to a memory, for who reacts to writes.
+//! Observers: queues that receive every write to a memory, for code that reacts to writes.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};

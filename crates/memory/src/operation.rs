@@ -1,8 +1,8 @@
-//! Read and write operations: a range and its bytes, and who asks for them.
+//! Read and write operations: a range and its bytes, and the kind of their source.
 
 use crate::area::Area;
 
-/// Who accesses the memory.
+/// The kind of a reader or writer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
     /// A reader or writer that a sealed memory refuses. It can never write the gate bit.

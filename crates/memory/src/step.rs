@@ -9,7 +9,7 @@ use crate::area::Area;
 use crate::error::{Refusal, Refused};
 use crate::operation::{Access, Write};
 
-/// A write of whoever has this access, to one memory or several.
+/// A write with this access, to one memory or several.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Step {
     pub access: Access,
@@ -46,7 +46,7 @@ pub struct CarriedOut {
     pub sequence: Option<u64>,
 }
 
-/// What became of a step. If it was refused, nothing was written.
+/// The result of a step. If it was refused, nothing was written.
 pub type Outcome = Result<CarriedOut, Refused>;
 
 /// Receives the outcome of a step. A step whose receiver is dropped counts as
@@ -101,7 +101,7 @@ impl StepWrite {
 pub(crate) fn wait(submit: impl FnOnce(Done) -> Result<(), Refused>) -> Outcome {
     let (sender, receiver) = std::sync::mpsc::sync_channel(1);
     submit(Box::new(move |outcome| {
-        // Whoever waits is still there: it waits without a limit.
+        // Never fails: the receiver below waits without a limit.
         let _ = sender.send(outcome);
     }))?;
     receiver.recv().unwrap_or(Err(Refused { index: 0, refusal: Refusal::NotConfirmed }))

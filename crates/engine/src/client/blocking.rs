@@ -16,18 +16,18 @@ use holdfast_protocol::pdu::{EncodedRequest, Response};
 
 use super::byte_stream::{ByteStream, StreamError};
 use super::connect::connect;
-use super::interrupt::{Interrupt, SLICE};
+use super::interrupt::{Interrupt, SIGNAL_CHECK_INTERVAL};
 use super::turns::Turns;
 use super::{ClientError, Endpoint, Lost, Place, StrayCounters};
 
 /// Bytes per read of a socket. No Modbus datagram is longer.
-const CHUNK: usize = 512;
+const CHUNK_BYTES: usize = 512;
 
 /// Reads before the time goes on: a flood does not end.
-const MAX_WAITING: usize = 64;
+const MAX_READS_AT_ONCE: usize = 64;
 
 /// A TCP connection that was unused for this time is checked before it is used again.
-const IDLE: Duration = Duration::from_millis(50);
+const CHECK_AFTER_IDLE: Duration = Duration::from_millis(50);
 
 /// A client of one endpoint. Any number of threads can call it; their calls take turns.
 pub struct BlockingClient {
@@ -282,7 +282,7 @@ impl BlockingClient {
         let (endpoint, epoch) = (self.endpoint.clone(), self.epoch);
         let (sender, opened) = mpsc::sync_channel(1);
         let work = move || {
-            // Whoever was interrupted does not receive it.
+            // Fails if the caller was interrupted.
             let _ = sender.send(Open::new(&endpoint, epoch, deadline, timeout));
         };
         let connecting = thread::Builder::new().name("holdfast-connect".into());
@@ -290,7 +290,7 @@ impl BlockingClient {
             return Some(Open::new(&self.endpoint, self.epoch, deadline, timeout));
         }
         loop {
-            match opened.recv_timeout(SLICE) {
+            match opened.recv_timeout(SIGNAL_CHECK_INTERVAL) {
                 Ok(opened) => return Some(opened),
                 Err(RecvTimeoutError::Timeout) if interrupt.is_hit() => return None,
                 Err(RecvTimeoutError::Timeout) => {}
@@ -384,10 +384,10 @@ impl Open {
     /// sent bytes without a request.
     fn is_usable(&mut self) -> bool {
         match self.transport {
-            Transport::Tcp => self.used.elapsed() <= IDLE || !self.stream.has_ended(),
+            Transport::Tcp => self.used.elapsed() <= CHECK_AFTER_IDLE || !self.stream.has_ended(),
             Transport::RtuOverTcp | Transport::AsciiOverTcp | Transport::RtuOverUdp => {
                 let is_quiet = self.stream.is_quiet();
-                let mut chunk = [0; CHUNK];
+                let mut chunk = [0; CHUNK_BYTES];
                 if !is_quiet && let Ok(Some(len)) = self.stream.receive_now(&mut chunk) {
                     self.connection.receive(&chunk[..len], self.epoch.elapsed(), |_| {});
                 }
@@ -407,7 +407,7 @@ impl Open {
         chunk: &mut [u8],
         sink: &mut impl FnMut(Done<'_>),
     ) -> Result<(), StreamError> {
-        for _ in 0..MAX_WAITING {
+        for _ in 0..MAX_READS_AT_ONCE {
             let Some(len) = self.stream.receive_now(chunk)? else { break };
             self.connection.receive(&chunk[..len], self.epoch.elapsed(), &mut *sink);
         }
@@ -436,7 +436,7 @@ impl Open {
         interrupt: &mut Interrupt<'_>,
         sink: &mut impl FnMut(Done<'_>),
     ) -> Result<(), StreamError> {
-        let mut chunk = [0; CHUNK];
+        let mut chunk = [0; CHUNK_BYTES];
         if matches!(self.transport, Transport::SerialRtu { .. } | Transport::SerialAscii { .. }) {
             // On a line that is never silent, the request times out.
             while Instant::now() < deadline

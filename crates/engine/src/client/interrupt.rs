@@ -4,9 +4,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 /// The longest wait between two looks at whether the caller is interrupted.
-pub(super) const SLICE: Duration = Duration::from_millis(100);
+pub(super) const SIGNAL_CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
-/// Asks the caller every [`SLICE`] whether it is interrupted. Once it is, it remains so.
+/// Asks the caller every [`SIGNAL_CHECK_INTERVAL`] whether it is interrupted. Once it is, it remains so.
 pub(super) struct Interrupt<'c> {
     check: Option<&'c mut dyn FnMut() -> bool>,
     next: Instant,
@@ -16,7 +16,7 @@ pub(super) struct Interrupt<'c> {
 impl<'c> Interrupt<'c> {
     /// `check` is asked; `None` never ends a call.
     pub(super) fn new(check: Option<&'c mut dyn FnMut() -> bool>) -> Interrupt<'c> {
-        Interrupt { check, next: Instant::now() + SLICE, hit: false }
+        Interrupt { check, next: Instant::now() + SIGNAL_CHECK_INTERVAL, hit: false }
     }
 
     pub(super) fn is_possible(&self) -> bool {
@@ -30,14 +30,18 @@ impl<'c> Interrupt<'c> {
             && Instant::now() >= self.next
         {
             self.hit = check();
-            self.next = Instant::now() + SLICE;
+            self.next = Instant::now() + SIGNAL_CHECK_INTERVAL;
         }
         self.hit
     }
 
     /// The end of the next wait that may last until `deadline`.
     pub(super) fn slice(&self, deadline: Instant) -> Instant {
-        if self.is_possible() { deadline.min(Instant::now() + SLICE) } else { deadline }
+        if self.is_possible() {
+            deadline.min(Instant::now() + SIGNAL_CHECK_INTERVAL)
+        } else {
+            deadline
+        }
     }
 
     /// Sleeps until then, or until the call ends.

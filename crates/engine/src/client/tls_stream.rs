@@ -4,15 +4,15 @@ use std::io::{ErrorKind, Write};
 use std::time::Instant;
 
 use super::byte_stream::{ByteStream, StreamError, TcpByteStream};
-use super::interrupt::SLICE;
+use super::interrupt::SIGNAL_CHECK_INTERVAL;
 use crate::tls::client::ClientTls;
 use crate::tls::{Channel, TlsFailure};
 
 /// Bytes per read of a socket.
-const CHUNK: usize = 4096;
+const CHUNK_BYTES: usize = 4096;
 
 /// The most reads of one check for available bytes.
-const READS: usize = 4;
+const MAX_READS_PER_CHECK: usize = 4;
 
 pub(super) struct TlsStream {
     stream: TcpByteStream,
@@ -55,8 +55,8 @@ impl TlsStream {
 
     /// Reads what is available, without waiting. Returns `true` if the connection has ended.
     fn look(&mut self) -> bool {
-        let mut chunk = [0; CHUNK];
-        for _ in 0..READS {
+        let mut chunk = [0; CHUNK_BYTES];
+        for _ in 0..MAX_READS_PER_CHECK {
             match self.stream.receive_now(&mut chunk) {
                 Ok(None) => return false,
                 Ok(Some(len)) => self.feed(&chunk[..len]),
@@ -68,12 +68,12 @@ impl TlsStream {
 
     /// Reads what arrives before the deadline.
     fn take(&mut self, deadline: Instant) -> Result<(), StreamError> {
-        let mut chunk = [0; CHUNK];
+        let mut chunk = [0; CHUNK_BYTES];
         let len = self.stream.receive(&mut chunk, deadline)?;
         self.feed(&chunk[..len]);
         // What the channel answers is sent even if the deadline was only the end of a slice.
         // A TLS failure takes precedence over a failure to send its alert.
-        self.flush(deadline.max(Instant::now() + SLICE))
+        self.flush(deadline.max(Instant::now() + SIGNAL_CHECK_INTERVAL))
             .or_else(|error| if self.broken.is_some() { Ok(()) } else { Err(error) })
     }
 

@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread::{self, Thread};
 
-use super::interrupt::{Interrupt, SLICE};
+use super::interrupt::{Interrupt, SIGNAL_CHECK_INTERVAL};
 
 #[derive(Default)]
 pub(super) struct Turns {
@@ -40,7 +40,7 @@ impl Turns {
         while tickets.current != mine {
             drop(tickets);
             if interrupt.is_possible() {
-                thread::park_timeout(SLICE);
+                thread::park_timeout(SIGNAL_CHECK_INTERVAL);
             } else {
                 thread::park();
             }

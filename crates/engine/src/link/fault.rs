@@ -31,7 +31,7 @@ pub enum Fault {
     Flooded,
     /// Another node uses the device. Nothing was sent.
     Standby,
-    /// A write that nobody expects any more, because it has waited too long. Nothing was sent.
+    /// A write that waited too long: its caller no longer expects it. Nothing was sent.
     Expired,
 }
 
@@ -104,7 +104,7 @@ pub(super) fn fault(error: &ClientError) -> Fault {
     }
 }
 
-/// Whether nobody has refused the connection, because it has reached nobody.
+/// Whether the connection failed on the way, so that no peer has refused it.
 fn is_unreachable(why: ErrorKind) -> bool {
     matches!(
         why,

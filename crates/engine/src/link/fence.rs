@@ -1,4 +1,4 @@
-//! Fences: until when devices may be used. Whoever holds the lease of a device moves the end of its fence;
+//! Fences: until when devices may be used. The holder of the lease of a device moves the end of its fence;
 //! when that passes without a renewal, nothing is sent to the device any more, not even by a process that
 //! was stopped in between.
 //!

@@ -1,4 +1,4 @@
-//! When a device that sends what nobody asked for is left alone for a while.
+//! Pauses for a device that floods its link with unsolicited data.
 //!
 //! A connection in a stream ends with the first bytes that belong to no request, so a device can cost one
 //! connection and one read of the socket for each poll. A flood is more than a faulty device sends.
@@ -13,18 +13,18 @@ use holdfast_runtime::Retry;
 
 use crate::client::StrayCounters;
 
-/// The bytes that are tolerated at once.
-const TOLERATED: u64 = 64 * 1024;
+/// Unsolicited bytes that are tolerated at once.
+const TOLERATED_BYTES: u64 = 64 * 1024;
 
-/// The time in which they are forgotten.
-const FORGOTTEN: Duration = Duration::from_secs(10);
+/// The time in which that many bytes no longer count.
+const DECAY_TIME: Duration = Duration::from_secs(10);
 
-/// What a link has received without a request.
+/// Unsolicited bytes of a link.
 #[derive(Debug)]
 pub(super) struct Flood {
     counters: Arc<StrayCounters>,
     retry: Retry,
-    /// Bytes that are not forgotten yet, and when that was.
+    /// Bytes that still counted, and when that was.
     level: Cell<(u64, Instant)>,
     /// The bytes that the counters had then.
     counted: Cell<u64>,
@@ -39,8 +39,8 @@ impl Flood {
         Flood { counters, retry, level, counted, floods: Cell::default() }
     }
 
-    /// Looks at what was counted since the last call. Returns when the device is asked again, if it has
-    /// sent too much.
+    /// Looks at what was counted since the last call. If the device has sent too much, returns when the
+    /// next request may be sent.
     pub(super) fn until(&self, now: Instant) -> Option<Instant> {
         let counted = self.counters.bytes.get();
         let new = counted - self.counted.replace(counted);
@@ -48,15 +48,15 @@ impl Flood {
             return None;
         }
         let (level, at) = self.level.get();
-        let forgotten = TOLERATED as f64 * (now - at).div_duration_f64(FORGOTTEN);
-        let level = level.saturating_sub(forgotten as u64) + new;
+        let decayed = TOLERATED_BYTES as f64 * (now - at).div_duration_f64(DECAY_TIME);
+        let level = level.saturating_sub(decayed as u64) + new;
         // The next flood after a pause is noticed early, and the pauses between floods are bounded.
-        self.level.set((level.min(TOLERATED), now));
-        if level <= TOLERATED {
+        self.level.set((level.min(TOLERATED_BYTES), now));
+        if level <= TOLERATED_BYTES {
             return None;
         }
         let (floods, last) = self.floods.get();
-        let is_again = last.is_some_and(|last| now - last <= 2 * self.retry.most + FORGOTTEN);
+        let is_again = last.is_some_and(|last| now - last <= 2 * self.retry.most + DECAY_TIME);
         let floods = if is_again { floods.saturating_add(1) } else { 1 };
         self.floods.set((floods, Some(now)));
         self.counters.floods.add();
@@ -106,7 +106,7 @@ mod tests {
         }
         assert_eq!(counters.floods.get(), 8);
         now += Duration::from_secs(600);
-        counters.bytes.add_many(TOLERATED + 1);
+        counters.bytes.add_many(TOLERATED_BYTES + 1);
         assert!(flood.until(now).unwrap() - now <= Duration::from_secs(1));
     }
 }

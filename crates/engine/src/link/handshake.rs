@@ -9,7 +9,7 @@ use crate::tls::client::ClientTls;
 use crate::tls::{Channel, TlsFailure};
 
 /// Bytes per read of a socket.
-const CHUNK: usize = 4096;
+const CHUNK_BYTES: usize = 4096;
 
 /// # Errors
 /// The handshake failed: close the connection. An alert has been sent.
@@ -17,7 +17,7 @@ pub(crate) async fn agree(stream: &mut TcpStream, tls: &ClientTls) -> io::Result
     let failed = |error| io::Error::other(TlsFailure::from(&error));
     let mut channel = tls.channel().map_err(failed)?;
     let (mut plain, mut out) = (Vec::new(), Vec::new());
-    let mut chunk = vec![0; CHUNK];
+    let mut chunk = vec![0; CHUNK_BYTES];
     channel.send(&[], &mut out);
     loop {
         stream.write_all(&out).await?;

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::{OwnedRwLockReadGuard, OwnedRwLockWriteGuard, RwLock};
 
-/// The connections that have requests. Their locks are fair: who comes first is first.
+/// The connections that have requests. Their locks are fair: first come, first served.
 #[derive(Debug, Default)]
 pub(super) struct Order {
     sources: Mutex<HashMap<u64, Arc<RwLock<()>>>>,

@@ -10,14 +10,14 @@ use tokio::time::Instant;
 use super::queue::{Priority, Queue};
 
 /// The most requests that `auto` has in flight.
-const MAX_AUTO: usize = 16;
+const MAX_AUTO_IN_FLIGHT: usize = 16;
 
 /// Answers after which `auto` judges how many are in flight.
-const ANSWERS: usize = 20;
+const ANSWERS_PER_DECISION: usize = 20;
 
 /// A round trip may take so much longer than that of a single request before the device is held to
 /// answer one request after the other.
-const FLAT: f64 = 1.25;
+const MAX_FLAT_RATIO: f64 = 1.25;
 
 /// `auto` tries more requests in flight again after this time.
 const RETRY_AFTER: Duration = Duration::from_secs(300);
@@ -34,7 +34,7 @@ pub enum InFlight {
 pub(super) struct Pace {
     places: Rc<Places>,
     doubtful: Semaphore,
-    /// Shared by all requests in flight. Who has a place takes it for itself to be alone.
+    /// Shared by all requests in flight. A request that must be alone locks it for writing.
     in_flight: RwLock<()>,
     auto: Option<RefCell<Auto>>,
 }
@@ -144,13 +144,13 @@ impl Places {
         Some(Free(Some(Rc::clone(self))))
     }
 
-    /// Gives a place to whoever is next.
+    /// Gives a place to the next request.
     fn give(self: &Rc<Places>) {
         loop {
             let Some(next) = self.waiting.borrow_mut().pop() else { break };
             match next.send(Free(Some(Rc::clone(self)))) {
                 Ok(()) => return,
-                // Who waited was stopped. The place is not given back: it is still here.
+                // That request was cancelled. Its drop must not return the place a second time.
                 Err(mut place) => place.0 = None,
             }
         }
@@ -177,7 +177,12 @@ enum Change {
 
 impl Auto {
     fn new() -> Auto {
-        Auto { limit: 1, answers: Vec::with_capacity(ANSWERS), alone: None, settled: None }
+        Auto {
+            limit: 1,
+            answers: Vec::with_capacity(ANSWERS_PER_DECISION),
+            alone: None,
+            settled: None,
+        }
     }
 
     fn answered(&mut self, took: Duration, was_full: bool, now: Instant) -> Change {
@@ -186,20 +191,20 @@ impl Auto {
             return Change::None;
         }
         self.answers.push(took);
-        if self.answers.len() < ANSWERS {
+        if self.answers.len() < ANSWERS_PER_DECISION {
             return Change::None;
         }
         // A few answers that were held up do not matter.
-        let (_, &mut median, _) = self.answers.select_nth_unstable(ANSWERS / 2);
+        let (_, &mut median, _) = self.answers.select_nth_unstable(ANSWERS_PER_DECISION / 2);
         self.answers.clear();
         if self.limit == 1 {
             self.alone = Some(median);
         }
         let alone = self.alone.unwrap_or(median);
-        if median > alone.mul_f64(FLAT) {
+        if median > alone.mul_f64(MAX_FLAT_RATIO) {
             return Change::Fewer(self.back_to(self.limit - 1, now));
         }
-        if self.limit == MAX_AUTO || self.settled.is_some_and(|until| now < until) {
+        if self.limit == MAX_AUTO_IN_FLIGHT || self.settled.is_some_and(|until| now < until) {
             return Change::None;
         }
         self.limit += 1;
@@ -223,7 +228,7 @@ mod tests {
 
     /// Answers that all take this long, while all places are taken.
     fn answer(auto: &mut Auto, took: Duration, now: Instant) -> Change {
-        for _ in 1..ANSWERS {
+        for _ in 1..ANSWERS_PER_DECISION {
             assert_eq!(auto.answered(took, true, now), Change::None);
         }
         auto.answered(took, true, now)
@@ -232,7 +237,7 @@ mod tests {
     #[test]
     fn there_are_more_while_round_trips_stay_short() {
         let (mut auto, now) = (Auto::new(), Instant::now());
-        for limit in 2..=MAX_AUTO {
+        for limit in 2..=MAX_AUTO_IN_FLIGHT {
             assert_eq!(answer(&mut auto, 10 * MS, now), Change::More);
             assert_eq!(auto.limit, limit);
         }
@@ -252,7 +257,7 @@ mod tests {
     fn an_answer_that_was_held_up_changes_nothing() {
         let (mut auto, now) = (Auto::new(), Instant::now());
         assert_eq!(auto.answered(1000 * MS, true, now), Change::None);
-        for _ in 2..ANSWERS {
+        for _ in 2..ANSWERS_PER_DECISION {
             assert_eq!(auto.answered(10 * MS, true, now), Change::None);
         }
         assert_eq!(auto.answered(10 * MS, true, now), Change::More);
@@ -262,7 +267,7 @@ mod tests {
     #[test]
     fn free_places_show_nothing() {
         let (mut auto, now) = (Auto::new(), Instant::now());
-        for _ in 0..3 * ANSWERS {
+        for _ in 0..3 * ANSWERS_PER_DECISION {
             assert_eq!(auto.answered(MS, false, now), Change::None);
         }
     }
@@ -272,7 +277,7 @@ mod tests {
         let (pace, now) = (Pace::new(InFlight::Auto), Instant::now());
         let mut taken = vec![pace.place(0, Priority::Usual).await];
         for _ in 0..3 {
-            for _ in 0..ANSWERS {
+            for _ in 0..ANSWERS_PER_DECISION {
                 pace.answered(10 * MS, now);
             }
             taken.push(pace.place(0, Priority::Usual).await);

@@ -13,7 +13,7 @@ use crate::client::ClientError;
 pub(crate) struct Permit {
     /// The fence of the device.
     pub fence: Option<Arc<Fence>>,
-    /// After this, whoever has requested a write no longer expects it.
+    /// After this, the caller no longer expects its write to be sent.
     pub until: Option<Instant>,
 }
 

@@ -1,11 +1,11 @@
-//! Who is next on a link: writes in the order of their arrival, then requests of preferred sources,
-//! then all others. Sources of the same rank take turns, however much one of them asks for. Who was
-//! passed over [`MAX_PASSED_OVER`] times goes first, so that no rank starves.
+//! Which request is next on a link: writes in the order of their arrival, then requests of preferred sources,
+//! then all others. Sources of the same rank take turns, however many requests one of them has. A
+//! rank that was skipped [`MAX_PASSED_OVER`] times is served next, so that no rank starves.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// How often a rank is passed over in favour of higher ones.
+/// How often a rank is skipped in favour of higher ones.
 const MAX_PASSED_OVER: u32 = 4;
 
 const RANKS: usize = 3;
@@ -26,7 +26,7 @@ pub(crate) enum Priority {
     Doubtful,
     /// A read of a preferred source.
     Preferred,
-    /// A write, or a request that somebody waits for.
+    /// A write, or a request with a person or program waiting for it.
     Urgent,
 }
 

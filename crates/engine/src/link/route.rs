@@ -10,9 +10,9 @@ use holdfast_runtime::Retry;
 use tokio::sync::mpsc;
 
 use super::caller::{Caller, Waiting};
-use super::coming::{Coming, ReplyTo, coming};
 use super::order::InOrder;
 use super::pace::InFlight;
+use super::pending_reply::{PendingReply, ReplyTo, pending_reply};
 use super::queue::Priority;
 use crate::client::{ClientError, Endpoint, StrayCounters};
 use crate::counter::Counter;
@@ -103,7 +103,7 @@ struct Place {
     is_called: bool,
 }
 
-/// Who asks.
+/// The source of a request.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Asker {
     /// A number of its own for each connection.
@@ -210,13 +210,13 @@ impl Route {
         asker: &Asker,
         unit_id: u8,
         pdu: &[u8],
-    ) -> Result<Coming, ExceptionCode> {
+    ) -> Result<PendingReply, ExceptionCode> {
         let link = &self.link;
         link.counters.requests.add();
         let request = EncodedRequest::opaque(pdu).ok_or(ExceptionCode::IllegalFunction)?;
         let place = link.place(asker.waiting, false).ok_or(ExceptionCode::ServerDeviceBusy)?;
         let priority = link.priority(&request, asker.peer);
-        let (to, coming) = coming();
+        let (to, pending) = pending_reply();
         let call = Call {
             unit_id: self.unit_id.unwrap_or(unit_id),
             request,
@@ -229,7 +229,7 @@ impl Route {
             },
         };
         match link.calls.send(call) {
-            Ok(()) => Ok(coming),
+            Ok(()) => Ok(pending),
             Err(_) => Err(ExceptionCode::GatewayPathUnavailable),
         }
     }
@@ -250,7 +250,7 @@ impl Reply {
         self.in_order = Some(in_order);
     }
 
-    /// Whether nobody waits for the reply any more.
+    /// Whether the caller has given up.
     pub(super) fn is_unwanted(&self) -> bool {
         match &self.to {
             Receiver::Listener(to, _) => to.is_unwanted(),

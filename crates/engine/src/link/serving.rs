@@ -10,12 +10,12 @@ use tokio::sync::mpsc;
 use tokio::task::spawn_local;
 
 use super::access::Link;
+use super::circuit_breaker::CircuitBreakers;
 use super::fault::{Exchanged, Fault, exception, fault};
 use super::order::Order;
 use super::permit::Permit;
 use super::route::{Call, LinkCounters, LinkSettings, Reply, SharedLink};
 use super::shared_reads::{SharedReads, shareable};
-use super::silence::Silence;
 use crate::client::ClientError;
 
 /// Carries out the requests to a link until all that could send some are dropped.
@@ -29,9 +29,9 @@ pub(crate) async fn serve(
         shared.connect_counters(link.strays());
     }
     let reads = SharedReads::new(settings.coalesce, settings.cache);
-    let silence = Silence::new(link.retry);
+    let breakers = CircuitBreakers::new(link.retry);
     let order = Arc::<Order>::default();
-    let serving = Rc::new(Serving { link, order, reads, silence, error: RefCell::default() });
+    let serving = Rc::new(Serving { link, order, reads, breakers, error: RefCell::default() });
     while let Some(call) = calls.recv().await {
         let Some(shared) = shared.upgrade() else { return };
         spawn_local(Rc::clone(&serving).carry_out(call, shared));
@@ -42,7 +42,7 @@ struct Serving {
     link: Rc<Link>,
     order: Arc<Order>,
     reads: SharedReads,
-    silence: Silence,
+    breakers: CircuitBreakers,
     /// Why the address could not be reached the last time.
     error: RefCell<Option<Arc<ClientError>>>,
 }
@@ -72,7 +72,7 @@ impl Serving {
         if replies.iter().all(Reply::is_unwanted) {
             return counters.withdrawn.add();
         }
-        // Others may have found out while this request waited.
+        // Requests before this one may have opened a breaker while it waited.
         let replies = self.admitted(unit_id, &request, replies, counters);
         let Some(timeout) = replies.iter().map(Reply::timeout).max() else { return };
         replies.iter().for_each(Reply::note_sent);
@@ -80,7 +80,7 @@ impl Serving {
         let answered =
             self.link.exchange(unit_id, &request, timeout, true, &Permit::default()).await;
         drop(turn);
-        self.learn(unit_id, &answered, replies.iter().any(Reply::is_of_listener));
+        self.record(unit_id, &answered, replies.iter().any(Reply::is_of_listener));
         let error = match answered {
             Ok(pdu) => {
                 counters.replies.add();
@@ -100,12 +100,12 @@ impl Serving {
             Fault::Timeout => counters.timeouts.add(),
             _ => counters.failures.add(),
         }
-        let pdu = exception(request.pdu(), fault.exception(self.silence.is_unreachable()));
+        let pdu = exception(request.pdu(), fault.exception(self.breakers.is_unreachable()));
         replies.into_iter().for_each(|reply| reply.send(Err((&error, &pdu))));
     }
 
-    /// Refuses what is not tried, and returns the others. Event loops choose their timeouts and look for
-    /// silent addresses: they are refused only if the address can't be reached.
+    /// Fails fast where a breaker is open, and returns the other callers. Event loops choose their timeouts
+    /// and look for silent addresses: they fail fast only if the address can't be reached.
     fn admitted(
         &self,
         unit_id: u8,
@@ -113,7 +113,7 @@ impl Serving {
         replies: Vec<Reply>,
         counters: &LinkCounters,
     ) -> Vec<Reply> {
-        let Err(code) = self.silence.refuse(unit_id) else { return replies };
+        let Err(code) = self.breakers.check(unit_id) else { return replies };
         let pdu = exception(request.pdu(), code.code());
         let error = self.error.borrow();
         let error = error.as_ref().filter(|_| code == ExceptionCode::GatewayPathUnavailable);
@@ -136,9 +136,9 @@ impl Serving {
         admitted
     }
 
-    /// Draws conclusions for the next requests. The timeouts of event loops alone say nothing of a unit:
-    /// they may be short.
-    fn learn(&self, unit_id: u8, answered: &Exchanged, from_listener: bool) {
+    /// Notes the outcome for the breakers. The timeouts of event loops alone say nothing about a unit: they
+    /// may be short.
+    fn record(&self, unit_id: u8, answered: &Exchanged, from_listener: bool) {
         let is_unreachable = self.link.retry_at().is_some();
         if let Err(error) = answered
             && is_unreachable
@@ -147,7 +147,7 @@ impl Serving {
         }
         let outcome = answered.as_ref().map(drop).map_err(|error| fault(error));
         if outcome != Err(Fault::Timeout) || from_listener || is_unreachable {
-            self.silence.learn(unit_id, outcome, is_unreachable);
+            self.breakers.record(unit_id, outcome, is_unreachable);
         }
     }
 }

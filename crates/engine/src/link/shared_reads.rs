@@ -11,7 +11,7 @@ use tokio::time::Instant;
 use super::route::Reply;
 
 /// The most replies that are kept for equal reads.
-const MAX_CACHED: usize = 1024;
+const MAX_CACHED_READS: usize = 1024;
 
 pub(super) struct SharedReads {
     /// Whether equal reads that wait at the same time share a reply.
@@ -75,10 +75,10 @@ impl SharedReads {
         }
         let now = Instant::now();
         let mut cached = self.cached.borrow_mut();
-        if cached.len() >= MAX_CACHED {
+        if cached.len() >= MAX_CACHED_READS {
             cached.retain(|_, kept| now < kept.until);
         }
-        if cached.len() < MAX_CACHED {
+        if cached.len() < MAX_CACHED_READS {
             cached.insert(read, Cached { pdu: pdu.to_vec(), until: now + self.keep, changes });
         }
     }
@@ -92,7 +92,7 @@ pub(super) struct Joining<'r> {
 }
 
 impl Joining<'_> {
-    /// It is sent now: whoever asks from now on gets a later reply.
+    /// It is sent now: equal reads from now on are answered by a later request.
     pub(super) fn leave(mut self) -> Vec<Reply> {
         let joined =
             self.read.take().and_then(|read| self.reads.waiting.borrow_mut().remove(&read));

@@ -35,7 +35,7 @@ use crate::tls::{Channel, TlsFailure};
 const LOST: Failure = Failure::Closed(Closed::ByPeer);
 
 /// Bytes that a socket may leave unsent before its connection is given up.
-const UNSENT: usize = 16 * 1024;
+const MAX_UNSENT_BYTES: usize = 16 * 1024;
 
 thread_local! {
     /// What is read from a socket at once. All connections of a thread share it: most are idle.
@@ -431,7 +431,9 @@ impl Open {
                 true
             }
             // If a device does not read, its requests time out. Their number is limited.
-            Err(error) => error.kind() == ErrorKind::WouldBlock && self.unsent.len() < UNSENT,
+            Err(error) => {
+                error.kind() == ErrorKind::WouldBlock && self.unsent.len() < MAX_UNSENT_BYTES
+            }
         }
     }
 }

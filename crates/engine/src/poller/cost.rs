@@ -1,7 +1,7 @@
 //! Estimates the time per request and per register of a device, from measured round trips.
 
 /// The number of answers that an estimate requires.
-const ENOUGH: u32 = 100;
+const MIN_SAMPLES: u32 = 100;
 
 /// Linear regression of round trip time by size: a constant per request, and a slope per 16 bits.
 #[derive(Debug, Clone, Copy, Default)]
@@ -26,7 +26,7 @@ impl Samples {
     /// Milliseconds per request and per register, once there are enough samples. Answers of one
     /// size do not show the cost of a register: `before` is used then.
     pub(super) fn cost(&self, before: f64) -> Option<(f64, f64)> {
-        if self.count < ENOUGH {
+        if self.count < MIN_SAMPLES {
             return None;
         }
         let count = f64::from(self.count);
@@ -45,7 +45,7 @@ mod tests {
     #[test]
     fn the_cost_is_estimated_from_the_answers() {
         let mut samples = Samples::default();
-        for index in 0..ENOUGH {
+        for index in 0..MIN_SAMPLES {
             assert_eq!(samples.cost(9.0), None);
             let size = f64::from(index % 10 + 1);
             samples.add(size, 5.0 + 0.25 * size);
@@ -57,7 +57,7 @@ mod tests {
     #[test]
     fn answers_of_one_size_do_not_change_the_cost_of_registers() {
         let mut samples = Samples::default();
-        for _ in 0..ENOUGH {
+        for _ in 0..MIN_SAMPLES {
             samples.add(10.0, 7.0);
         }
         assert_eq!(samples.cost(0.2), Some((5.0, 0.2)));
@@ -66,7 +66,7 @@ mod tests {
     #[test]
     fn a_cost_is_never_negative() {
         let mut samples = Samples::default();
-        for index in 0..ENOUGH {
+        for index in 0..MIN_SAMPLES {
             let size = f64::from(index % 2 * 100 + 1);
             samples.add(size, 10.0 - size / 20.0);
         }

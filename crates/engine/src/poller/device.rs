@@ -25,9 +25,9 @@ use holdfast_runtime::Retry;
 use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
-use super::caught::{Panicked, caught};
 use super::cost::Samples;
 use super::learned::{Learned, Unreadable};
+use super::panic_guard::{Panicked, catch};
 use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
 use super::raw_ingest::{Forward, ForwardSettings};
 use super::results::{BlockResult, Poll, Results};
@@ -40,10 +40,10 @@ use crate::client::Endpoint;
 use crate::link::{Fault, Fence, InFlight, Link, Permit, Priority, Stage};
 
 /// The longest interval between writes of the status block.
-const TELLING: Duration = Duration::from_secs(1);
+const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The number of consecutive polls without an answer after which a unit counts as dead.
-const DEAD_AFTER: u32 = 3;
+const DEAD_AFTER_POLLS: u32 = 3;
 
 /// The shortest interval between polls outside the schedule, unless the interval of the device is
 /// shorter.
@@ -72,7 +72,7 @@ pub struct DeviceSettings {
     pub status: Option<StatusSettings>,
     /// The first poll begins within this time. Devices are spread over it.
     pub start_within: Duration,
-    /// Who takes the polls too.
+    /// A queue that also receives the polls.
     pub report: Option<Arc<Results>>,
     /// Whether the connection is closed after each poll, for devices that accept only one.
     pub release: bool,
@@ -111,7 +111,8 @@ pub(super) struct Device {
     first: Cell<usize>,
     strategy: Cell<Strategy>,
     samples: Cell<Samples>,
-    silent: Cell<u32>,
+    /// Consecutive polls without an answer.
+    unanswered_polls: Cell<u32>,
     /// The due time of the next poll.
     due: Cell<Instant>,
     /// Whether the next poll is delayed because the device does not answer.
@@ -126,10 +127,11 @@ pub(super) struct Device {
 pub(super) struct Inbox {
     successor: RefCell<Option<Device>>,
     awake: Cell<bool>,
-    given: Notify,
+    arrived: Notify,
 }
 
-enum Told {
+/// What [`Inbox::next`] returns.
+enum Message {
     /// A new device replaces this one.
     Successor(Box<Device>),
     /// The device has answered a write.
@@ -139,23 +141,23 @@ enum Told {
 impl Inbox {
     pub(super) fn succeed(&self, successor: Device) {
         *self.successor.borrow_mut() = Some(successor);
-        self.given.notify_one();
+        self.arrived.notify_one();
     }
 
     pub(super) fn wake(&self) {
         self.awake.set(true);
-        self.given.notify_one();
+        self.arrived.notify_one();
     }
 
-    async fn next(&self) -> Told {
+    async fn next(&self) -> Message {
         loop {
             if let Some(successor) = self.successor.take() {
-                return Told::Successor(Box::new(successor));
+                return Message::Successor(Box::new(successor));
             }
             if self.awake.take() {
-                return Told::Awake;
+                return Message::Awake;
             }
-            self.given.notified().await;
+            self.arrived.notified().await;
         }
     }
 }
@@ -216,7 +218,7 @@ impl Device {
             first: Cell::new(0),
             strategy: Cell::new(settings.strategy),
             samples: Cell::default(),
-            silent: Cell::new(0),
+            unanswered_polls: Cell::new(0),
             due: Cell::new(Instant::now()),
             backing_off: Cell::new(false),
             off_schedule: Cell::new(None),
@@ -236,11 +238,11 @@ impl Device {
         self.due.set(Instant::now() + phase);
         self.state.begun();
         loop {
-            self.tell();
-            let polled = caught(pin!(async {
+            self.publish_status();
+            let polled = catch(pin!(async {
                 tokio::select! {
                     successor = self.poll_until_replaced(&inbox) => successor,
-                    never = self.tell_for_ever() => match never {},
+                    never = self.publish_status_for_ever() => match never {},
                 }
             }))
             .await;
@@ -259,12 +261,12 @@ impl Device {
     async fn wait_until_replaced(&self, inbox: &Inbox) -> Box<Device> {
         self.state.set_broken(true);
         loop {
-            self.tell();
+            self.publish_status();
             tokio::select! {
-                told = inbox.next() => if let Told::Successor(successor) = told {
+                message = inbox.next() => if let Message::Successor(successor) = message {
                     return successor;
                 },
-                () = sleep(TELLING) => {}
+                () = sleep(STATUS_INTERVAL) => {}
             }
         }
     }
@@ -279,9 +281,9 @@ impl Device {
             let at = off_schedule.map_or(due, |off_schedule| off_schedule.min(due));
             tokio::select! {
                 biased;
-                told = inbox.next() => match told {
-                    Told::Successor(successor) => return successor,
-                    Told::Awake => {
+                message = inbox.next() => match message {
+                    Message::Successor(successor) => return successor,
+                    Message::Awake => {
                         self.wake();
                         continue;
                     }
@@ -312,7 +314,7 @@ impl Device {
                 }
             }
             self.turn.polls(false);
-            self.tell();
+            self.publish_status();
             let (mut due, missed) = first_from(Instant::now(), due, interval);
             self.state.counters.missed.add_many(missed);
             let rest = self.rest();
@@ -337,11 +339,11 @@ impl Device {
         {
             self.link.release();
             self.state.set_standby(true);
-            self.tell();
+            self.publish_status();
             loop {
                 tokio::select! {
                     biased;
-                    told = inbox.next() => if let Told::Successor(successor) = told {
+                    message = inbox.next() => if let Message::Successor(successor) = message {
                         return Some(successor);
                     },
                     () = self.admitted(fence) => break,
@@ -351,7 +353,7 @@ impl Device {
         // The device before this one may have stood by, with another fence.
         if self.state.stands_by() {
             self.state.set_standby(false);
-            self.silent.set(0);
+            self.unanswered_polls.set(0);
             self.backing_off.set(false);
             self.off_schedule.set(None);
             self.due.set(Instant::now());
@@ -387,7 +389,7 @@ impl Device {
     /// Ends a backoff.
     fn wake(&self) {
         if self.backing_off.take() {
-            self.silent.set(0);
+            self.unanswered_polls.set(0);
             self.due.set(Instant::now());
         }
     }
@@ -411,7 +413,7 @@ impl Device {
         let wanted = self.off_schedule.get().or(before.off_schedule.get());
         self.off_schedule
             .set(wanted.map(|wanted| not_before.map_or(wanted, |time| time.max(wanted))));
-        self.silent.set(before.silent.get());
+        self.unanswered_polls.set(before.unanswered_polls.get());
         self.backing_off.set(before.backing_off.get());
         if before.backing_off.get() {
             self.off_schedule.set(None);
@@ -426,22 +428,24 @@ impl Device {
         }
     }
 
-    async fn tell_for_ever(&self) -> Infallible {
-        if self.settings.status.is_none() && !self.forwards.iter().any(|forward| forward.tells()) {
+    async fn publish_status_for_ever(&self) -> Infallible {
+        if self.settings.status.is_none()
+            && !self.forwards.iter().any(|forward| forward.has_status())
+        {
             pending::<()>().await;
         }
         loop {
-            sleep(TELLING).await;
-            self.tell();
+            sleep(STATUS_INTERVAL).await;
+            self.publish_status();
         }
     }
 
     /// The end of a backoff, if the address cannot be reached or the unit counts as dead.
     fn rest(&self) -> Option<Instant> {
-        let silent = self.silent.get();
+        let unanswered = self.unanswered_polls.get();
         self.link.retry_at().or_else(|| {
-            (silent >= DEAD_AFTER)
-                .then(|| Instant::now() + self.link.retry.pause(silent - DEAD_AFTER + 1))
+            (unanswered >= DEAD_AFTER_POLLS)
+                .then(|| Instant::now() + self.link.retry.pause(unanswered - DEAD_AFTER_POLLS + 1))
         })
     }
 
@@ -533,7 +537,11 @@ impl Device {
             self.link.release();
         }
         let silent = fault.is_some() && !answered;
-        self.silent.set(if silent { self.silent.get().saturating_add(1) } else { 0 });
+        self.unanswered_polls.set(if silent {
+            self.unanswered_polls.get().saturating_add(1)
+        } else {
+            0
+        });
         let unstored = self.state.take_unstored().then_some(Fault::Unstored);
         match fault.or(unstored) {
             None => self.state.good(),
@@ -629,7 +637,8 @@ impl Device {
         let counters = &self.state.counters;
         counters.requests.add();
         let began = Instant::now();
-        let priority = if self.silent.get() > 0 { Priority::Doubtful } else { Priority::Usual };
+        let priority =
+            if self.unanswered_polls.get() > 0 { Priority::Doubtful } else { Priority::Usual };
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
         let fence = self.settings.fence.as_ref();
         let permit = Permit { fence: fence.cloned(), until: None };
@@ -699,7 +708,7 @@ impl Device {
         }
     }
 
-    /// Writes what the device has told. This doesn't wait for the journal of a memory, because the other
+    /// Writes what was read from the device. This doesn't wait for the journal of a memory, because the other
     /// devices of the thread would wait too: what the journal refuses is counted later.
     fn store(&self, memory: &Memory, access: Access, write: Write<'_>) -> Result<(), Refusal> {
         if !memory.has_journal() {
@@ -714,7 +723,7 @@ impl Device {
         memory.submit(access, Operation::Write(write), done)
     }
 
-    fn tell(&self) {
+    fn publish_status(&self) {
         let status = self.state.status();
         if let Some(to) = &self.settings.status
             && !(self.state.stands_by() && to.memory.has_journal())
@@ -726,7 +735,7 @@ impl Device {
             return;
         }
         for forward in &self.forwards {
-            forward.tell(&status);
+            forward.offer_status(&status);
         }
     }
 }

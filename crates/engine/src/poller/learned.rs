@@ -10,10 +10,10 @@ use super::plan::{Block, Cut, Field, PlanLimits};
 use crate::link::Fault;
 
 /// How long the limits are remembered.
-const REMEMBERED: Duration = Duration::from_secs(600);
+const MEMORY_TIME: Duration = Duration::from_secs(600);
 
 /// The interval between attempts to read an unreadable range.
-const RETRY: Duration = Duration::from_secs(60);
+const RETRY_INTERVAL: Duration = Duration::from_secs(60);
 
 #[derive(Debug, Default)]
 pub(super) struct Learned {
@@ -88,7 +88,7 @@ impl Learned {
     pub(super) fn refused(&mut self, block: &Block, fault: Fault) {
         let Block { area, address, count, .. } = *block;
         debug_assert!(count > 0);
-        let retry_at = Instant::now() + RETRY;
+        let retry_at = Instant::now() + RETRY_INTERVAL;
         self.unreadable.push(Unreadable { area, address, count, fault, retry_at });
         self.remember();
     }
@@ -115,7 +115,7 @@ impl Learned {
         if range.retry_at > now && !in_any_case {
             return None;
         }
-        range.retry_at = now + RETRY;
+        range.retry_at = now + RETRY_INTERVAL;
         Some(range.clone())
     }
 
@@ -145,6 +145,6 @@ impl Learned {
     }
 
     fn remember(&mut self) {
-        self.until.get_or_insert_with(|| Instant::now() + REMEMBERED);
+        self.until.get_or_insert_with(|| Instant::now() + MEMORY_TIME);
     }
 }

@@ -1,5 +1,5 @@
-//! How old the values are that a device is read into. Whoever reads them compares the time, so values
-//! become old even if the poller hangs.
+//! The age of values that are read from a device. Each reader compares the time, so values become stale
+//! even if the poller hangs.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;

@@ -6,12 +6,12 @@
 //!
 //! All tasks of a poller run on one thread, so that they share state without locks.
 
-mod caught;
 mod cost;
 mod device;
 mod health;
 mod learned;
 mod mirror_age;
+mod panic_guard;
 pub mod plan;
 mod raw_ingest;
 mod results;

@@ -10,7 +10,7 @@ use holdfast_memory::Area;
 use thiserror::Error;
 
 /// Bits that count as one register.
-const BITS: f64 = 16.0;
+const BITS_PER_REGISTER: f64 = 16.0;
 
 /// A range that is read as a whole.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -186,7 +186,7 @@ pub fn plan(
             Strategy::Gap { max_gap } => by_gap(fields, of_area, limits, max_gap, &mut blocks),
             Strategy::Cost { request, item } => {
                 let bits = fields[of_area[0]].area.is_bits();
-                let item = if bits { item / BITS } else { item };
+                let item = if bits { item / BITS_PER_REGISTER } else { item };
                 by_cost(fields, of_area, limits, (request, item), &mut blocks);
             }
         }

@@ -29,7 +29,7 @@ use crate::tls::client::ClientTls;
 const MAX_PAUSE: Duration = Duration::from_secs(10);
 
 /// Bytes per read of a socket.
-const CHUNK: usize = 1024;
+const CHUNK_BYTES: usize = 1024;
 
 /// A receiver of Raw Ingest packets.
 #[derive(Debug, Clone)]
@@ -104,10 +104,10 @@ pub(super) struct Forward {
     settings: ForwardSettings,
     pub(super) counters: Arc<ForwardCounters>,
     waiting: RefCell<Waiting>,
-    news: Notify,
+    queued: Notify,
     failures: Cell<u32>,
     /// The status block that was offered last.
-    told: RefCell<Vec<u8>>,
+    last_status: RefCell<Vec<u8>>,
 }
 
 /// The newest unsent packet of each content, in the order of arrival.
@@ -151,9 +151,9 @@ impl Forward {
             settings,
             counters,
             waiting: RefCell::default(),
-            news: Notify::new(),
+            queued: Notify::new(),
             failures: Cell::new(0),
-            told: RefCell::default(),
+            last_status: RefCell::default(),
         })
     }
 
@@ -174,15 +174,15 @@ impl Forward {
     }
 
     /// Whether the receiver gets the status block.
-    pub(super) fn tells(&self) -> bool {
+    pub(super) fn has_status(&self) -> bool {
         self.settings.status.is_some()
     }
 
     /// Queues the status block, if the receiver gets it and it has changed. Never waits.
-    pub(super) fn tell(&self, status: &Status) {
+    pub(super) fn offer_status(&self, status: &Status) {
         let Some((target, block)) = &self.settings.status else { return };
         let bytes = status.bytes(block);
-        if *self.told.borrow() == bytes {
+        if *self.last_status.borrow() == bytes {
             return;
         }
         let header = Header {
@@ -192,7 +192,7 @@ impl Forward {
             count: const { NonZeroU16::new(STATUS_BLOCK_LEN).unwrap() },
         };
         self.queue(Content::Status, &header, &bytes);
-        self.told.replace(bytes);
+        self.last_status.replace(bytes);
     }
 
     fn queue(&self, of: Content, header: &Header, bytes: &[u8]) {
@@ -202,7 +202,7 @@ impl Forward {
         if self.waiting.borrow_mut().put(of, packet) {
             self.counters.replaced.add();
         }
-        self.news.notify_one();
+        self.queued.notify_one();
     }
 
     /// Sends the queued packets, one after another, forever.
@@ -210,7 +210,7 @@ impl Forward {
         loop {
             let next = self.waiting.borrow_mut().take();
             let Some((of, packet)) = next else {
-                self.news.notified().await;
+                self.queued.notified().await;
                 continue;
             };
             let deadline = Instant::now() + self.settings.timeout;
@@ -251,7 +251,7 @@ impl Forward {
 /// Sends a packet over TLS. Returns the reply.
 async fn send_over_tls(mut stream: TcpStream, tls: &ClientTls, packet: &[u8]) -> io::Result<u8> {
     let mut channel = agree(&mut stream, tls).await?;
-    let (mut plain, mut out, mut chunk) = (Vec::new(), Vec::new(), [0; CHUNK]);
+    let (mut plain, mut out, mut chunk) = (Vec::new(), Vec::new(), [0; CHUNK_BYTES]);
     channel.send(packet, &mut out);
     // A receiver that refuses the certificate closes the connection. Its alert says why.
     let sent = stream.write_all(&out).await;

@@ -14,7 +14,7 @@ use holdfast_memory::Area;
 use crate::link::Fault;
 
 /// The most polls in the queue.
-const CAPACITY: usize = 16_384;
+const MAX_POLLS: usize = 16_384;
 
 /// One poll of one device.
 #[derive(Debug, Clone)]
@@ -89,8 +89,8 @@ impl Results {
 
     pub(super) fn push(&self, poll: Poll) {
         self.put(|batch| {
-            debug_assert!(batch.polls.len() <= CAPACITY);
-            if batch.polls.len() == CAPACITY {
+            debug_assert!(batch.polls.len() <= MAX_POLLS);
+            if batch.polls.len() == MAX_POLLS {
                 batch.polls.pop_front();
                 self.dropped.fetch_add(1, Ordering::Relaxed);
             }

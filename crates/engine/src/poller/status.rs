@@ -10,7 +10,7 @@ use super::health::Health;
 pub const STATUS_BLOCK_LEN: u16 = 30;
 
 /// The size of the device name, in bytes.
-const NAME: usize = 16;
+const NAME_BYTES: usize = 16;
 
 /// Place and content of the block of a device: at `slot` × 30 of an area of registers.
 #[derive(Debug, Clone)]
@@ -82,7 +82,7 @@ impl Status {
             block[1] = self.last_error;
         }
         block[2] = self.seconds_in_error;
-        let mut text = [0; NAME];
+        let mut text = [0; NAME_BYTES];
         for (byte, character) in text.iter_mut().zip(settings.name.bytes()) {
             let is_shown = character.is_ascii_graphic() || character == b' ';
             *byte = if is_shown { character } else { b'?' };

@@ -17,8 +17,8 @@ use tokio::runtime::Builder;
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
-use super::caught::spawn_watched;
 use super::device::{Device, DeviceSettings, Inbox, Planned};
+use super::panic_guard::spawn_guarded;
 use super::plan::{PlanError, PlanLimits};
 use super::raw_ingest::{Forward, ForwardCounters, ForwardSettings};
 use super::results::{Receivers, Results, Written};
@@ -70,7 +70,7 @@ pub struct Polled {
     pub name: String,
     pub state: Arc<DeviceState>,
     pub forwards: Vec<Arc<ForwardCounters>>,
-    /// Who takes its polls.
+    /// The queue that receives its polls.
     pub report: Option<Arc<Results>>,
     address: Arc<Address>,
 }
@@ -93,7 +93,7 @@ impl Polled {
 /// A running poller, until it is stopped or dropped. Devices can be added and removed.
 pub struct Poller {
     polled: Mutex<Roster<Polled>>,
-    orders: mpsc::UnboundedSender<Order>,
+    commands: mpsc::UnboundedSender<Command>,
     receivers: Arc<Receivers>,
     tickets: AtomicU64,
     /// Writes of Modbus clients into what is read from devices.
@@ -104,8 +104,8 @@ pub struct Poller {
     heartbeat: Arc<Heartbeat>,
 }
 
-/// Orders to the thread of the poller. The thread ends when all senders are dropped.
-enum Order {
+/// Commands to the thread of the poller. The thread ends when all senders are dropped.
+enum Command {
     Add(Box<Planned>, Polled),
     /// Replaces the device of that name.
     Replace {
@@ -134,7 +134,7 @@ impl Poller {
     /// [`PollerError`]. Nothing is left running then.
     pub fn start(devices: Vec<DeviceSettings>) -> Result<Poller, PollerError> {
         let devices = devices.into_iter().map(checked).collect::<Result<Vec<_>, _>>()?;
-        let (orders, told) = mpsc::unbounded_channel();
+        let (commands, received) = mpsc::unbounded_channel();
         let (passed, writes) = mpsc::unbounded_channel();
         let receivers = Arc::new(Receivers::default());
         let runtime = Builder::new_current_thread()
@@ -145,7 +145,7 @@ impl Poller {
         let heartbeat = Arc::new(Heartbeat::new("holdfast-poller"));
         let (ended, own) = (Arc::clone(&receivers), Arc::clone(&heartbeat));
         let work = move || {
-            let work = own.during(obey(told, writes));
+            let work = own.during(run_commands(received, writes));
             LocalSet::new().block_on(&runtime, work);
             ended.end();
             // Does not wait for name resolution in progress.
@@ -159,7 +159,7 @@ impl Poller {
         threads.push(thread);
         let poller = Poller {
             polled: Mutex::default(),
-            orders,
+            commands,
             receivers,
             tickets: AtomicU64::default(),
             passed,
@@ -193,13 +193,13 @@ impl Poller {
             return Err(PollerError::Taken { device: settings.name.clone() });
         }
         let polled = Polled::new(settings, Arc::default());
-        self.order(Order::Add(Box::new(device), polled.clone()))?;
+        self.send(Command::Add(Box::new(device), polled.clone()))?;
         all.add(polled.name.clone(), polled);
         Ok(())
     }
 
-    fn order(&self, order: Order) -> Result<(), PollerError> {
-        self.orders.send(order).map_err(|_| PollerError::Stopped)
+    fn send(&self, command: Command) -> Result<(), PollerError> {
+        self.commands.send(command).map_err(|_| PollerError::Stopped)
     }
 
     /// Replaces the device called `name` after its current poll. The new device may have the same
@@ -225,8 +225,8 @@ impl Poller {
         };
         let polled = Polled::new(settings, Arc::clone(&before.state));
         let device = Box::new(device);
-        let ordered = polled.clone();
-        self.order(Order::Replace { name: name.to_owned(), device, polled: ordered, at_once })?;
+        let sent = polled.clone();
+        self.send(Command::Replace { name: name.to_owned(), device, polled: sent, at_once })?;
         all.replace(name, polled.name.clone(), polled);
         Ok(())
     }
@@ -245,14 +245,14 @@ impl Poller {
         }
         let (calls, called) = mpsc::unbounded_channel();
         let link = Arc::new(SharedLink::new(&settings, calls));
-        self.order(Order::Serve(Box::new(settings), Arc::downgrade(&link), called))?;
+        self.send(Command::Serve(Box::new(settings), Arc::downgrade(&link), called))?;
         all.retain(|(_, link)| link.strong_count() > 0);
         all.push((address, Arc::downgrade(&link)));
         Ok(link)
     }
 
-    /// The link to an address that a device or another user of a link already has; `None` if nobody
-    /// has it.
+    /// The link to an address that a device or another user of a link already has; `None` if there is
+    /// none.
     ///
     /// # Errors
     /// [`PollerError::Stopped`].
@@ -308,7 +308,7 @@ impl Poller {
         }
         let ticket = self.tickets.fetch_add(1, Ordering::Relaxed);
         let to = Arc::clone(to);
-        self.order(Order::Write { device: name.to_owned(), ticket, request, until, to })?;
+        self.send(Command::Write { device: name.to_owned(), ticket, request, until, to })?;
         Ok(ticket)
     }
 
@@ -319,7 +319,7 @@ impl Poller {
         let known = all.remove(name);
         if known {
             // A stopped poller polls nothing.
-            let _ = self.order(Order::Remove(name.to_owned()));
+            let _ = self.send(Command::Remove(name.to_owned()));
         }
         known
     }
@@ -344,7 +344,7 @@ impl Poller {
             return;
         }
         // The poller may already be stopped.
-        let _ = self.order(Order::Stop);
+        let _ = self.send(Command::Stop);
         self.thread.join();
     }
 }
@@ -375,13 +375,13 @@ impl Drop for Running {
     }
 }
 
-/// Orders are sent under the lock of the list of devices, so they arrive in the order of its
+/// Commands are sent under the lock of the list of devices, so they arrive in the order of its
 /// changes.
-const IN_ORDER: &str = "the running devices are those in the list";
+const SAME_AS_LIST: &str = "the running devices are those in the list";
 
-/// Starts and stops the tasks of devices, until `Order::Stop`.
-async fn obey(
-    mut orders: mpsc::UnboundedReceiver<Order>,
+/// Starts and stops the tasks of devices, until [`Command::Stop`].
+async fn run_commands(
+    mut commands: mpsc::UnboundedReceiver<Command>,
     mut passed: mpsc::UnboundedReceiver<PassedWrite>,
 ) {
     let mut links: HashMap<Address, rc::Weak<Link>> = HashMap::new();
@@ -389,9 +389,9 @@ async fn obey(
     let mut fences = Fences::default();
     let mut started = 0;
     loop {
-        let order = tokio::select! {
+        let command = tokio::select! {
             biased;
-            order = orders.recv() => order,
+            command = commands.recv() => command,
             Some(write) = passed.recv() => {
                 match running.get(write.device()) {
                     Some(device) => device.pass(write),
@@ -400,21 +400,21 @@ async fn obey(
                 continue;
             }
         };
-        let Some(order) = order else { return };
-        match order {
-            Order::Stop => return,
-            Order::Serve(settings, shared, calls) => {
+        let Some(command) = command else { return };
+        match command {
+            Command::Stop => return,
+            Command::Serve(settings, shared, calls) => {
                 let link =
                     link_to(&settings.endpoint, (settings.in_flight, settings.retry), &mut links);
                 spawn_local(serve(link, *settings, shared, calls));
             }
-            Order::Remove(name) => {
+            Command::Remove(name) => {
                 let removed = running.remove(&name);
-                debug_assert!(removed.is_some(), "{IN_ORDER}");
+                debug_assert!(removed.is_some(), "{SAME_AS_LIST}");
                 drop(removed);
                 links.retain(|_, link| link.strong_count() > 0);
             }
-            Order::Add(planned, polled) => {
+            Command::Add(planned, polled) => {
                 let phase = spread(planned.settings.start_within, started);
                 started += 1;
                 fences.watch(planned.settings.fence.as_ref());
@@ -423,13 +423,13 @@ async fn obey(
                 let link = link_to(endpoint, (*in_flight, *retry), &mut links);
                 let device = Running::start(*planned, polled, link, phase);
                 let before = running.insert(name, device);
-                debug_assert!(before.is_none(), "{IN_ORDER}");
+                debug_assert!(before.is_none(), "{SAME_AS_LIST}");
             }
-            Order::Replace { name, device: planned, polled, at_once } => {
+            Command::Replace { name, device: planned, polled, at_once } => {
                 let DeviceSettings { endpoint, in_flight, retry, .. } = &planned.settings;
                 let link = link_to(endpoint, (*in_flight, *retry), &mut links);
                 let before = running.remove(&name);
-                debug_assert!(before.is_some(), "{IN_ORDER}");
+                debug_assert!(before.is_some(), "{SAME_AS_LIST}");
                 fences.watch(planned.settings.fence.as_ref());
                 let name = planned.settings.name.clone();
                 let device = match before {
@@ -443,7 +443,7 @@ async fn obey(
                 running.insert(name, device);
                 links.retain(|_, link| link.strong_count() > 0);
             }
-            Order::Write { device, ticket, request, until, to } => match running.get(&device) {
+            Command::Write { device, ticket, request, until, to } => match running.get(&device) {
                 Some(device) => device.write(ticket, request, until, to),
                 None => to.push_write(Written { ticket, outcome: Err(Fault::Reset) }),
             },
@@ -451,7 +451,7 @@ async fn obey(
     }
 }
 
-/// The fences of devices, each with a task that tells when its end has passed.
+/// The fences of devices, each with a task that notices when its end has passed.
 #[derive(Default)]
 struct Fences(HashMap<*const Fence, Weak<Fence>>);
 
@@ -476,7 +476,7 @@ impl Running {
         let to = (Rc::clone(&link), Rc::clone(&turn));
         let state = Arc::clone(&polled.state);
         let (device, forwards) = made(planned, polled, to);
-        let device = spawn_watched(device.run(phase, Rc::clone(&inbox)), state);
+        let device = spawn_guarded(device.run(phase, Rc::clone(&inbox)), state);
         Running { link, turn, unit_id, timeout, release, fence, inbox, device, forwards }
     }
 
@@ -582,7 +582,7 @@ fn made(planned: Planned, polled: Polled, to: (Rc<Link>, Rc<Turn>)) -> (Device, 
         .collect();
     let tasks = forwards
         .iter()
-        .map(|forward| spawn_watched(Rc::clone(forward).run(), Arc::clone(&polled.state)));
+        .map(|forward| spawn_guarded(Rc::clone(forward).run(), Arc::clone(&polled.state)));
     let tasks = tasks.collect();
     (Device::new(planned, polled.state, to, forwards), tasks)
 }

@@ -15,7 +15,7 @@ use holdfast_protocol::pdu::{
 use tokio::sync::{mpsc, oneshot};
 
 use crate::items::{Items, touched};
-use crate::link::{Coming, Fault, Link, Permit, Priority, ReplyTo, coming, exception};
+use crate::link::{Fault, Link, PendingReply, Permit, Priority, ReplyTo, exception, pending_reply};
 
 /// The most writes into one memory that wait for devices.
 const MAX_WAITING: usize = 256;
@@ -55,7 +55,7 @@ pub(super) struct PassedWrite {
     _place: Place,
 }
 
-/// What a device has taken over or told, in its own addresses.
+/// Values that a device has accepted or returned, in its own addresses.
 pub(super) struct Change {
     pub(super) area: Area,
     pub(super) address: u16,
@@ -64,7 +64,7 @@ pub(super) struct Change {
     pub(super) bytes: Vec<u8>,
 }
 
-/// A place among those who wait.
+/// The place of a write that waits. It is free again when this is dropped.
 struct Place(Arc<AtomicUsize>);
 
 impl Drop for Place {
@@ -89,7 +89,7 @@ impl Passage {
     }
 
     /// Whether a request writes into one of the ranges.
-    pub(crate) fn takes(&self, pdu: &[u8]) -> bool {
+    pub(crate) fn accepts(&self, pdu: &[u8]) -> bool {
         let function = pdu.first().copied().and_then(Function::from_code);
         function.is_some_and(Function::is_write)
             && Request::parse(pdu).is_ok_and(|request| {
@@ -105,7 +105,7 @@ impl Passage {
     /// # Errors
     /// The exception to refuse it with: the memory is sealed, the request touches more than one range,
     /// too many wait, or the poller has stopped.
-    pub(crate) fn ask(&self, pdu: &[u8]) -> Result<(Arc<str>, Coming), ExceptionCode> {
+    pub(crate) fn ask(&self, pdu: &[u8]) -> Result<(Arc<str>, PendingReply), ExceptionCode> {
         Request::parse(pdu)?;
         if self.memory.sealed() {
             return Err(ExceptionCode::ServerDeviceBusy);
@@ -126,15 +126,15 @@ impl Passage {
     /// The code of the exception: of the device, or as for clients.
     pub fn write(&self, request: &Request<'_>) -> Result<(), u8> {
         let encoded = EncodedRequest::new(request);
-        let (_, coming) = self.pass(encoded.pdu()).map_err(ExceptionCode::code)?;
-        match coming.wait().as_ref().map(|reply| &reply.pdu[..]) {
+        let (_, pending) = self.pass(encoded.pdu()).map_err(ExceptionCode::code)?;
+        match pending.wait().as_ref().map(|reply| &reply.pdu[..]) {
             Ok([function, code]) if function & 0x80 != 0 => Err(*code),
             Ok(_) => Ok(()),
             Err(_) => Err(ExceptionCode::GatewayPathUnavailable.code()),
         }
     }
 
-    fn pass(&self, pdu: &[u8]) -> Result<(Arc<str>, Coming), ExceptionCode> {
+    fn pass(&self, pdu: &[u8]) -> Result<(Arc<str>, PendingReply), ExceptionCode> {
         let request = Request::parse(pdu)?;
         let (read, written) = touched(&request);
         let written = written.ok_or(ExceptionCode::IllegalFunction)?;
@@ -147,7 +147,7 @@ impl Passage {
         if self.waiting.fetch_add(1, Ordering::Relaxed) >= MAX_WAITING {
             return Err(ExceptionCode::GatewayPathUnavailable);
         }
-        let (reply, coming) = coming();
+        let (reply, pending) = pending_reply();
         let passed = PassedWrite {
             memory: Arc::clone(&self.memory),
             range: range.clone(),
@@ -158,7 +158,7 @@ impl Passage {
         };
         let sent = self.writes.send(passed);
         sent.or(Err(ExceptionCode::GatewayPathUnavailable))?;
-        Ok((Arc::clone(&range.device), coming))
+        Ok((Arc::clone(&range.device), pending))
     }
 }
 

@@ -15,10 +15,10 @@ use super::peer::Peer;
 use crate::link::Reply;
 
 /// The most bytes in the queue.
-const CAPACITY: usize = 32 << 20;
+const MAX_QUEUE_BYTES: usize = 32 << 20;
 
 /// Bytes of a record without its data.
-const OVERHEAD: usize = 128;
+const RECORD_OVERHEAD_BYTES: usize = 128;
 
 /// What happens to a write that can't be recorded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -98,9 +98,9 @@ struct Room {
 /// The receiving side.
 #[derive(Debug)]
 pub(crate) struct Records {
-    /// `None` only wakes whoever waits.
+    /// `None` only wakes the reader of the queue.
     receiver: Mutex<Receiver<Option<Record>>>,
-    /// Without listeners, nobody else can send: whoever waits must still wait.
+    /// Keeps the channel open without listeners: the reader of the queue must still wait then.
     sender: Sender<Option<Record>>,
     shared: Arc<Shared>,
 }
@@ -154,9 +154,9 @@ impl Auditor {
         if self.shared.failing.load(Ordering::Relaxed) {
             return None;
         }
-        let room = Room { shared: Arc::clone(&self.shared), size: OVERHEAD + len };
+        let room = Room { shared: Arc::clone(&self.shared), size: RECORD_OVERHEAD_BYTES + len };
         let waiting = self.shared.waiting.fetch_add(room.size, Ordering::Relaxed);
-        (waiting <= CAPACITY).then_some(Permit { room: Some(room) })
+        (waiting <= MAX_QUEUE_BYTES).then_some(Permit { room: Some(room) })
     }
 
     /// Records a Modbus request if it writes. `reply` is its reply; empty when there is none.
@@ -194,9 +194,9 @@ impl Auditor {
         let size = record.size();
         if let Some(mut room) = permit.and_then(|permit| permit.room) {
             debug_assert_eq!(room.size, size);
-            // Who takes the record releases its room.
+            // The room belongs to the record now, until the record is taken.
             room.size = 0;
-        } else if self.shared.waiting.fetch_add(size, Ordering::Relaxed) > CAPACITY {
+        } else if self.shared.waiting.fetch_add(size, Ordering::Relaxed) > MAX_QUEUE_BYTES {
             self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
             self.shared.lost.fetch_add(1, Ordering::Relaxed);
             return;
@@ -235,7 +235,7 @@ fn record(
 
 impl Record {
     fn size(&self) -> usize {
-        OVERHEAD
+        RECORD_OVERHEAD_BYTES
             + match &self.write {
                 Written::Modbus { pdu, .. } => pdu.len(),
                 Written::Packet { payload, .. } => payload.len(),
@@ -255,13 +255,13 @@ impl Records {
         records
     }
 
-    /// Ends the wait of whoever takes records.
+    /// Wakes the reader of the queue.
     pub(crate) fn wake(&self) {
         let _ = self.sender.send(None);
     }
 
     /// Whether the log can't be written, so that writes which must be recorded are refused. Wakes
-    /// whoever takes records: it has to try again.
+    /// the reader of the queue: it has to try again.
     pub(crate) fn set_failing(&self, failing: bool) {
         self.shared.failing.store(failing, Ordering::Relaxed);
         self.wake();
@@ -289,7 +289,7 @@ mod tests {
     #[test]
     fn a_write_that_must_be_recorded_takes_room_before_it_is_carried_out() {
         let (auditor, records) = auditing(Unrecordable::Refuse);
-        let most = CAPACITY / (OVERHEAD + WRITE.len()) + 1;
+        let most = MAX_QUEUE_BYTES / (RECORD_OVERHEAD_BYTES + WRITE.len()) + 1;
         let permits: Vec<Permit> = (0..most).map_while(|_| auditor.permit(WRITE)).collect();
         assert_eq!(permits.len(), most);
         assert!(auditor.permit(WRITE).is_none());
@@ -307,7 +307,7 @@ mod tests {
     fn room_that_is_not_used_is_released() {
         let (auditor, records) = auditing(Unrecordable::Refuse);
         let taken = |_| auditor.permit(WRITE).is_some();
-        assert!((0..2 * CAPACITY / OVERHEAD).all(taken));
+        assert!((0..2 * MAX_QUEUE_BYTES / RECORD_OVERHEAD_BYTES).all(taken));
         assert_eq!(records.shared.waiting.load(Ordering::Relaxed), 0);
     }
 
@@ -315,7 +315,7 @@ mod tests {
     fn without_room_that_was_taken_records_are_dropped_and_counted() {
         for unrecordable in [Unrecordable::Write, Unrecordable::Refuse] {
             let (auditor, records) = auditing(unrecordable);
-            let most = CAPACITY / (OVERHEAD + WRITE.len()) + 1;
+            let most = MAX_QUEUE_BYTES / (RECORD_OVERHEAD_BYTES + WRITE.len()) + 1;
             for _ in 0..most + 5 {
                 send(&auditor, None);
             }

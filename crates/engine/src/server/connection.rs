@@ -24,7 +24,7 @@ use super::admission::Ticket;
 use super::audit::Forwarded;
 use super::deferred::{Completed, Deferral, Deferred, MAX_WAITING};
 use super::event::Kind;
-use super::fair_share::{READ, Share};
+use super::fair_share::{Share, WORK_OF_READ};
 use super::framing::{Ascii, Framing, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
 use super::peer::Peer;
@@ -34,28 +34,28 @@ use super::stream::{self, Stream};
 use super::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};
 
 /// Bytes per read of a socket.
-const INPUT: usize = 4096;
+const INPUT_BYTES: usize = 4096;
 
 /// Room for the replies to all requests of one read, and for those that come later.
-const OUTPUT: usize =
+const OUTPUT_BYTES: usize =
     output::<Mbap>(output::<Rtu>(output::<Ascii>(0))) + MAX_WAITING * Ascii::MAX_LEN;
 
 const fn output<F: Framing>(least: usize) -> usize {
     // A read has room for at least one byte.
-    assert!(F::MAX_LEN < INPUT);
+    assert!(F::MAX_LEN < INPUT_BYTES);
     assert!(F::HEADER_LEN + pdu::MAX_LEN <= F::MAX_LEN);
-    let len = (INPUT / F::SHORTEST + 1) * F::MAX_LEN;
+    let len = (INPUT_BYTES / F::SHORTEST + 1) * F::MAX_LEN;
     if len > least { len } else { least }
 }
 
 /// The most reads of a connection before other tasks run.
-const TURNS: u32 = 4;
+const READS_PER_TURN: u32 = 4;
 
-/// The most reads of the remaining input before a connection ends.
-const LAST_READS: usize = 64;
+/// The most reads of the remaining input before a connection ends: a peer may go on sending.
+const MAX_LAST_READS: usize = 64;
 
-/// The deadline of a timer without a deadline.
-const FAR: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
+/// A timer without a deadline fires after this time.
+const NO_DEADLINE: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
 
 struct Scratch {
     input: Box<[u8]>,
@@ -64,8 +64,8 @@ struct Scratch {
 
 thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::new(Scratch {
-        input: vec![0; INPUT].into_boxed_slice(),
-        output: vec![0; OUTPUT].into_boxed_slice(),
+        input: vec![0; INPUT_BYTES].into_boxed_slice(),
+        output: vec![0; OUTPUT_BYTES].into_boxed_slice(),
     });
 }
 
@@ -99,13 +99,19 @@ pub(crate) struct Connection<F: Framing, S> {
     /// Bytes queued for the peer.
     unsent: Vec<u8>,
     last_request: Instant,
-    /// When the incomplete request began.
-    begun: Option<Instant>,
-    /// When bytes of the incomplete request were last read.
-    last_read: Instant,
-    /// Reads since the last pause.
-    turns: u32,
+    arrival: Arrival,
+    /// Reads since other tasks last ran.
+    reads_in_turn: u32,
     share: Share,
+}
+
+/// What has arrived of the next request.
+#[derive(Debug, Clone, Copy)]
+enum Arrival {
+    /// Nothing: the peer is idle.
+    Nothing,
+    /// The beginning of a request or of a TLS record, or bytes that are discarded until a silence.
+    Partial { begun: Instant, last_read: Instant },
 }
 
 /// The state that replies depend on.
@@ -159,9 +165,8 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             ticket,
             unsent: Vec::new(),
             last_request,
-            begun: None,
-            last_read: last_request,
-            turns: 0,
+            arrival: Arrival::Nothing,
+            reads_in_turn: 0,
             share,
         }
     }
@@ -170,7 +175,8 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     pub(crate) fn begin_with(&mut self, received: &[u8]) {
         if !received.is_empty() {
             self.answering.keep(received);
-            self.begun = Some(self.last_request);
+            let begun = self.last_request;
+            self.arrival = Arrival::Partial { begun, last_read: begun };
         }
     }
 
@@ -201,7 +207,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         // With a peer that never pauses, the branch for `stop` would never run.
         let flooded = stop.clone();
         let mut stopping = pin!(stop.wait_for(|stop| *stop));
-        let mut alarm = pin!(sleep_until(self.last_request + FAR));
+        let mut alarm = pin!(sleep_until(self.last_request + NO_DEADLINE));
         loop {
             if let Err(end) = self.send_unsent().await {
                 return Some(end);
@@ -209,18 +215,18 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             if flooded.has_changed().unwrap_or(true) {
                 return None;
             }
-            self.set(alarm.as_mut());
+            self.set_alarm(alarm.as_mut());
             let step = tokio::select! {
                 biased;
                 step = poll_fn(|context| self.poll(context)) => step,
-                () = &mut alarm => self.overdue(),
+                () = &mut alarm => self.on_alarm(),
                 _ = &mut stopping => return None,
             };
             if let Err(end) = step {
                 return Some(end);
             }
-            if self.turns == TURNS {
-                self.turns = 0;
+            if self.reads_in_turn == READS_PER_TURN {
+                self.reads_in_turn = 0;
                 yield_now().await;
             }
         }
@@ -237,7 +243,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             }
         }
         if self.share.poll(context).is_pending() {
-            self.turns = 0;
+            self.reads_in_turn = 0;
             return Poll::Pending;
         }
         let read = self.poll_read(context);
@@ -248,18 +254,18 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     /// Reads once, answers all complete requests, and writes once.
     fn poll_read(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
-            let kept = self.answering.restore(input);
-            let read = self.stream.poll_read(context, &mut input[kept..], &mut self.unsent);
+            let partial = self.answering.restore(input);
+            let read = self.stream.poll_read(context, &mut input[partial..], &mut self.unsent);
             let Poll::Ready(read) = read else {
-                self.turns = 0;
+                self.reads_in_turn = 0;
                 return Poll::Pending;
             };
-            self.turns += 1;
+            self.reads_in_turn += 1;
             let read = read?;
             self.renew()?;
-            let answered = self.answering.answer(&input[..kept + read], output);
-            self.share.charge(READ);
-            self.note(&answered);
+            let answered = self.answering.answer(&input[..partial + read], output);
+            self.share.charge(WORK_OF_READ);
+            self.note_times(&answered);
             let output = &output[..answered.len];
             if !output.is_empty() {
                 self.stream.send(output, &mut self.unsent)?;
@@ -272,18 +278,19 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     fn poll_deferred(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
             let Some(mut len) = self.answering.collect(context, output) else {
-                self.turns = 0;
+                self.reads_in_turn = 0;
                 return Poll::Pending;
             };
-            self.turns += 1;
+            self.reads_in_turn += 1;
             let mut broken = false;
+            // Requests that waited for the replies go on at once: no byte need arrive for them.
             let behind = self.answering.resume(input);
             if behind > 0 {
                 self.renew()?;
                 let answered = self.answering.answer(&input[..behind], &mut output[len..]);
                 len += answered.len;
                 broken = answered.broken;
-                self.note(&answered);
+                self.note_times(&answered);
             } else {
                 self.last_request = Instant::now();
             }
@@ -300,13 +307,14 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         if self.ticket.take_outdated() {
             let Terms { rights, timeouts } = (self.renewal)().ok_or(Kind::RightsRevoked)?;
             (self.answering.rights, self.timeouts) = (rights, timeouts);
+            // Other rights refuse other requests: each first one is reported again.
             self.answering.reported = Reported::default();
         }
         Ok(())
     }
 
     /// Updates the times that the deadlines depend on.
-    fn note(&mut self, answered: &Answered) {
+    fn note_times(&mut self, answered: &Answered) {
         let now = Instant::now();
         if answered.requests > 0 {
             self.last_request = now;
@@ -315,15 +323,16 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         self.share.charge((answered.requests + answered.discarded) as u32);
         let is_at_start = F::is_at_start(&self.answering.before);
         if self.answering.partial_len == 0 && is_at_start && !self.stream.is_amid_record() {
-            self.begun = None;
+            self.arrival = Arrival::Nothing;
             return;
         }
-        self.last_read = now;
         // Bytes that are discarded until a silence do not put off the end of the connection.
         let is_new = answered.requests > 0 || answered.consumed > 0 && is_at_start;
-        if self.begun.is_none() || is_new {
-            self.begun = Some(now);
-        }
+        let begun = match self.arrival {
+            Arrival::Partial { begun, .. } if !is_new => begun,
+            _ => now,
+        };
+        self.arrival = Arrival::Partial { begun, last_read: now };
     }
 
     /// Waits for the peer to read its replies.
@@ -342,26 +351,30 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         let is_amid_request = self.answering.partial_len > 0 || self.stream.is_amid_record();
         // Bytes that are discarded do not put off the end for want of requests.
         let idle = self.timeouts.idle.filter(|_| !is_amid_request && !self.answering.is_waiting());
-        let idle = (self.last_request + idle.unwrap_or(FAR), Kind::Idle);
-        match self.begun.map(|begun| begun + self.timeouts.request) {
-            Some(request) if is_amid_request || request < idle.0 => (request, Kind::RequestTimeout),
-            _ => idle,
-        }
+        let idle = (self.last_request + idle.unwrap_or(NO_DEADLINE), Kind::Idle);
+        let Arrival::Partial { begun, .. } = self.arrival else { return idle };
+        let request = (begun + self.timeouts.request, Kind::RequestTimeout);
+        if is_amid_request || request.0 < idle.0 { request } else { idle }
     }
 
-    /// When a silence ends a request.
-    fn silence(&self) -> Option<Instant> {
-        self.begun.and(self.timeouts.frame).map(|frame| self.last_read + frame)
+    /// When a silence ends a frame.
+    fn frame_end(&self) -> Option<Instant> {
+        match self.arrival {
+            Arrival::Nothing => None,
+            Arrival::Partial { last_read, .. } => {
+                self.timeouts.frame.map(|frame| last_read + frame)
+            }
+        }
     }
 
     fn deadline(&self) -> Instant {
         let (end, _) = self.end();
-        self.silence().map_or(end, |silence| silence.min(end))
+        self.frame_end().map_or(end, |frame_end| frame_end.min(end))
     }
 
     /// Moves the alarm to an earlier time. A later deadline is set when the alarm fires: requests
     /// are much more frequent than alarms.
-    fn set(&self, alarm: Pin<&mut Sleep>) {
+    fn set_alarm(&self, alarm: Pin<&mut Sleep>) {
         let deadline = self.deadline();
         if deadline < alarm.deadline() || alarm.is_elapsed() {
             alarm.reset(deadline);
@@ -369,20 +382,22 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     }
 
     /// Discards the beginning of a request that nothing followed, or ends the connection.
-    fn overdue(&mut self) -> Result<(), Kind> {
+    fn on_alarm(&mut self) -> Result<(), Kind> {
         let (now, (end, kind)) = (Instant::now(), self.end());
         if now < self.deadline() {
             return Ok(());
         }
         if self.share.is_waiting() {
             // What the peer has sent is not read yet: it is not to blame for silence.
-            (self.last_request, self.last_read) = (now, now);
-            self.begun = self.begun.map(|_| now);
+            self.last_request = now;
+            if let Arrival::Partial { .. } = self.arrival {
+                self.arrival = Arrival::Partial { begun: now, last_read: now };
+            }
             return Ok(());
         }
-        if self.silence().is_some_and(|silence| silence < end) {
-            self.answering.fall_silent();
-            self.begun = None;
+        if self.frame_end().is_some_and(|frame_end| frame_end < end) {
+            self.answering.discard_partial();
+            self.arrival = Arrival::Nothing;
             return Ok(());
         }
         Err(kind)
@@ -391,7 +406,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     /// Answers what the system has already received, then ends. The engine drops connections whose
     /// devices take too long.
     async fn finish(&mut self) {
-        // A peer that does not read loses these replies.
+        // An error: a peer that does not read loses these replies.
         if self.answering.drain(&mut self.stream, &mut self.unsent).is_err() {
             return;
         }
@@ -458,6 +473,7 @@ impl<F: Framing> Answering<F> {
                                 continue;
                             }
                             Deferral::Wait => {
+                                // It is framed again later, with what was known before it.
                                 deferred.leave(rest);
                                 self.before = before;
                                 rest = &[];
@@ -497,13 +513,13 @@ impl<F: Framing> Answering<F> {
     /// Keeps an incomplete frame, which is shorter than the longest one.
     fn keep(&mut self, rest: &[u8]) {
         let partial = self.partial.as_mut();
-        let kept = rest.len().min(partial.len());
-        partial[..kept].copy_from_slice(&rest[..kept]);
-        self.partial_len = kept;
+        let len = rest.len().min(partial.len());
+        partial[..len].copy_from_slice(&rest[..len]);
+        self.partial_len = len;
     }
 
     /// Discards the beginning of a request: the next byte starts a frame.
-    fn fall_silent(&mut self) {
+    fn discard_partial(&mut self) {
         if mem::take(&mut self.partial_len) > 0 {
             self.unit_server.counters.frames.damaged.add();
         }
@@ -544,7 +560,7 @@ impl<F: Framing> Answering<F> {
         len
     }
 
-    /// The peer has gone. What devices still answer is recorded.
+    /// The peer has disconnected. Replies of devices that still come are recorded.
     fn give_up(&mut self, running: watch::Receiver<bool>) {
         let Some(deferred) = self.deferred.take().filter(|deferred| !deferred.is_empty()) else {
             return;
@@ -610,14 +626,14 @@ impl<F: Framing> Answering<F> {
     fn drain(&mut self, stream: &mut impl Stream, unsent: &mut Vec<u8>) -> io::Result<()> {
         stream::write(stream.socket(), unsent)?;
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
-            for _ in 0..LAST_READS {
+            for _ in 0..MAX_LAST_READS {
                 // The replies of devices come first.
                 if self.is_waiting() {
                     break;
                 }
-                let kept = self.restore(input);
-                let Some(len) = stream.read_now(&mut input[kept..], unsent) else { break };
-                let answered = self.answer(&input[..kept + len], output);
+                let partial = self.restore(input);
+                let Some(len) = stream.read_now(&mut input[partial..], unsent) else { break };
+                let answered = self.answer(&input[..partial + len], output);
                 let output = &output[..answered.len];
                 if !output.is_empty() && stream.send(output, unsent).is_err() {
                     break;
@@ -730,7 +746,7 @@ mod tests {
     }
 
     fn allocates_nothing<F: Framing>(input: &[u8]) {
-        let (mut answering, mut output) = (answering::<F>(), vec![0; OUTPUT]);
+        let (mut answering, mut output) = (answering::<F>(), vec![0; OUTPUT_BYTES]);
         answering.answer(input, &mut output);
         let mut requests = 0;
         let allocations = allocation_counter::measure(|| {
@@ -747,12 +763,13 @@ mod tests {
         output: &mut [u8],
     ) -> (Vec<u8>, bool, String, Vec<Contents>) {
         let memory = memory();
-        let (mut answering, mut input) = (answering_with::<F>(Arc::clone(&memory)), vec![0; INPUT]);
+        let (mut answering, mut input) =
+            (answering_with::<F>(Arc::clone(&memory)), vec![0; INPUT_BYTES]);
         let (mut replies, mut broken) = (Vec::new(), false);
         for piece in pieces {
-            let kept = answering.restore(&mut input);
-            input[kept..kept + piece.len()].copy_from_slice(piece);
-            let answered = answering.answer(&input[..kept + piece.len()], output);
+            let partial = answering.restore(&mut input);
+            input[partial..partial + piece.len()].copy_from_slice(piece);
+            let answered = answering.answer(&input[..partial + piece.len()], output);
             replies.extend_from_slice(&output[..answered.len]);
             broken = answered.broken;
             if broken {
@@ -760,7 +777,7 @@ mod tests {
             }
         }
         if !broken {
-            answering.fall_silent();
+            answering.discard_partial();
         }
         let counters = &answering.unit_server.counters;
         let counted = format!("{:?} {:?}", counters.frames, counters.bus());
@@ -768,7 +785,7 @@ mod tests {
     }
 
     fn have_the_same_outcome<F: Framing>(cases: &[Vec<u8>]) {
-        let output = RefCell::new(vec![0; OUTPUT]);
+        let output = RefCell::new(vec![0; OUTPUT_BYTES]);
         assert_same_outcome(cases, |pieces| outcome::<F>(pieces, &mut output.borrow_mut()));
     }
 
@@ -821,7 +838,7 @@ mod tests {
 
     #[test]
     fn rtu_after_a_silence_is_never_part_of_what_came_before() {
-        let mut output = vec![0; OUTPUT];
+        let mut output = vec![0; OUTPUT_BYTES];
         let read = rtu_frame(1, &[3, 0, 0, 0, 1]);
         let answer = rtu_frame(1, &[3, 2, 0, 0]);
         let begun = [1, 16, 0, 0, 0, 0x7B, 0xF6].to_vec();
@@ -834,7 +851,7 @@ mod tests {
             let first = answering.answer(&before, &mut output);
             let replies = rtu_frame(1, &[99]) == before;
             assert_eq!(first.len > 0, replies, "{before:02x?}");
-            answering.fall_silent();
+            answering.discard_partial();
             assert_eq!(answering.partial_len, 0);
             let len = answering.answer(&read, &mut output).len;
             assert_eq!(output[..len], answer, "{before:02x?}");
@@ -866,31 +883,31 @@ mod tests {
         connection.share.charge(1_000_000);
         let mut context = Context::from_waker(std::task::Waker::noop());
         assert!(connection.poll(&mut context).is_pending());
-        assert_eq!(connection.overdue(), Ok(()));
+        assert_eq!(connection.on_alarm(), Ok(()));
         drop(other);
         assert!(connection.poll(&mut context).is_pending(), "nothing has arrived");
-        assert_eq!(connection.overdue(), Err(Kind::RequestTimeout));
+        assert_eq!(connection.on_alarm(), Err(Kind::RequestTimeout));
     }
 
     #[test]
     fn the_output_has_room_for_the_replies_to_any_input() {
         let shortest = frame(1, &[17]);
-        let input = shortest.repeat(INPUT / shortest.len());
-        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT]);
-        assert_eq!(answered.requests, INPUT / Mbap::SHORTEST);
-        assert!(answered.requests * mbap::MAX_LEN <= OUTPUT);
+        let input = shortest.repeat(INPUT_BYTES / shortest.len());
+        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        assert_eq!(answered.requests, INPUT_BYTES / Mbap::SHORTEST);
+        assert!(answered.requests * mbap::MAX_LEN <= OUTPUT_BYTES);
 
         let shortest = ascii_frame(1, &[17]);
-        let input = shortest.repeat(INPUT / shortest.len());
-        let answered = answering::<Ascii>().answer(&input, &mut vec![0; OUTPUT]);
-        assert_eq!(answered.requests, INPUT / Ascii::SHORTEST);
-        assert!(answered.requests * ascii::MAX_LEN <= OUTPUT);
+        let input = shortest.repeat(INPUT_BYTES / shortest.len());
+        let answered = answering::<Ascii>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        assert_eq!(answered.requests, INPUT_BYTES / Ascii::SHORTEST);
+        assert!(answered.requests * ascii::MAX_LEN <= OUTPUT_BYTES);
     }
 
     #[test]
     fn the_longest_ascii_reply_is_encoded_in_place() {
         let longest = [&[8, 0, 0][..], &[0xA5; 250]].concat();
-        let mut output = vec![0; OUTPUT];
+        let mut output = vec![0; OUTPUT_BYTES];
         let answered = answering::<Ascii>().answer(&ascii_frame(1, &longest), &mut output);
         assert_eq!(output[..answered.len], ascii_frame(1, &longest));
         assert_eq!(answered.len, ascii::MAX_LEN);
@@ -901,19 +918,19 @@ mod tests {
         let mut answering = answering::<Ascii>();
         let damaged =
             |answering: &Answering<Ascii>| answering.unit_server.counters.frames.damaged.get();
-        let line = [b":".to_vec(), vec![b'0'; INPUT - 1]].concat();
-        let answered = answering.answer(&line, &mut vec![0; OUTPUT]);
-        assert_eq!((answered.consumed, answering.partial_len), (INPUT, 0));
+        let line = [b":".to_vec(), vec![b'0'; INPUT_BYTES - 1]].concat();
+        let answered = answering.answer(&line, &mut vec![0; OUTPUT_BYTES]);
+        assert_eq!((answered.consumed, answering.partial_len), (INPUT_BYTES, 0));
         assert_eq!(damaged(&answering), 1);
 
-        answering.answer(&line[..ascii::MAX_LEN - 1], &mut vec![0; OUTPUT]);
+        answering.answer(&line[..ascii::MAX_LEN - 1], &mut vec![0; OUTPUT_BYTES]);
         assert_eq!((answering.partial_len, damaged(&answering)), (ascii::MAX_LEN - 1, 1));
     }
 
     #[test]
     fn requests_before_a_broken_frame_are_answered_and_none_after_it() {
         let input = [frame(1, &[17]), vec![0, 0, 0, 0, 1, 0, 1, 17], frame(1, &[17])].concat();
-        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT]);
+        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
         assert_eq!((answered.requests, answered.broken), (1, true));
     }
 
@@ -925,12 +942,12 @@ mod tests {
         let input = [frame(1, &[17]), packet].concat();
         for cut in 0..=input.len() {
             let mut shared = answering::<MbapBesidePackets>();
-            let (mut buffer, mut output) = (vec![0; INPUT], vec![0; OUTPUT]);
+            let (mut buffer, mut output) = (vec![0; INPUT_BYTES], vec![0; OUTPUT_BYTES]);
             let (mut requests, mut broken) = (0, false);
             for part in [&input[..cut], &input[cut..]] {
-                let kept = shared.restore(&mut buffer);
-                buffer[kept..kept + part.len()].copy_from_slice(part);
-                let answered = shared.answer(&buffer[..kept + part.len()], &mut output);
+                let partial = shared.restore(&mut buffer);
+                buffer[partial..partial + part.len()].copy_from_slice(part);
+                let answered = shared.answer(&buffer[..partial + part.len()], &mut output);
                 requests += answered.requests;
                 broken |= answered.broken;
                 if answered.broken {
@@ -943,17 +960,17 @@ mod tests {
         }
         // A version that is wrong makes no difference: its sender takes it for a packet too.
         let input = [&frame(1, &[17])[..], b"RI\x02\x03\x00\x02\x00\x00\x00\x06", &write].concat();
-        let answered = answering::<MbapBesidePackets>().answer(&input, &mut vec![0; OUTPUT]);
+        let answered = answering::<MbapBesidePackets>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
         assert_eq!((answered.requests, answered.broken), (1, true));
         // Frames of other protocols, and transaction ids like the start of a packet, are as before.
         let foreign = [0x52, 0x48, 2, 1, 0, 2, 1, 17];
         let mut harmless = frame(1, &[17]);
         harmless[..2].copy_from_slice(b"RI");
         let input = [&foreign[..], &harmless].concat();
-        let answered = answering::<MbapBesidePackets>().answer(&input, &mut vec![0; OUTPUT]);
+        let answered = answering::<MbapBesidePackets>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
         assert_eq!((answered.requests, answered.broken), (1, false));
         let input = [b"RI\x01\x09\x00\x02\x01\x11", &frame(1, &[17])[..]].concat();
-        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT]);
+        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
         assert_eq!((answered.requests, answered.broken), (1, false), "no packets at this port");
     }
 }

@@ -2,7 +2,7 @@
 //! only requests that are answered elsewhere overtake each other on their way.
 //!
 //! A request that can be answered here waits until all before it are answered: its client expects the
-//! effects of those. Who asks too much at once is not read for a while.
+//! effects of those. A connection with too many such requests is not read for a while.
 
 use std::collections::VecDeque;
 use std::net::IpAddr;
@@ -17,7 +17,7 @@ use super::listener::ListenerContext;
 use super::policy::{Elsewhere, PeerRights};
 use super::refused_request::RefusedRequest;
 use super::unit_server::UnitServer;
-use crate::link::{Asker, Coming, Reply, exception, source};
+use crate::link::{Asker, PendingReply, Reply, exception, source};
 
 /// The most requests of a connection that wait for replies.
 pub(super) const MAX_WAITING: usize = 16;
@@ -25,8 +25,8 @@ pub(super) const MAX_WAITING: usize = 16;
 pub(super) struct Deferred {
     source: u64,
     waiting: VecDeque<Waiting>,
-    /// Received bytes that are looked at when there is room again.
-    behind: Vec<u8>,
+    /// Received bytes that are read as requests when there is room again.
+    unread: Vec<u8>,
 }
 
 /// A request without its reply.
@@ -42,7 +42,7 @@ pub(super) struct Waiting {
 }
 
 enum Expected {
-    Coming(Coming),
+    Pending(PendingReply),
     Known(Reply),
 }
 
@@ -57,7 +57,7 @@ pub(super) struct Completed {
     pub(super) permit: Option<Permit>,
 }
 
-/// What becomes of a request.
+/// When a request is answered.
 pub(super) enum Deferral {
     /// Its reply comes later. It may already be refused.
     Later(Option<RefusedRequest>),
@@ -69,7 +69,7 @@ pub(super) enum Deferral {
 
 impl Default for Deferred {
     fn default() -> Deferred {
-        Deferred { source: source(), waiting: VecDeque::new(), behind: Vec::new() }
+        Deferred { source: source(), waiting: VecDeque::new(), unread: Vec::new() }
     }
 }
 
@@ -80,7 +80,7 @@ impl Deferred {
 
     /// Whether received bytes wait until there is room.
     pub(super) fn is_full(&self) -> bool {
-        !self.behind.is_empty()
+        !self.unread.is_empty()
     }
 
     /// Sends a request on its way, if its unit is elsewhere and there is room.
@@ -92,8 +92,10 @@ impl Deferred {
         (tag, unit_id, request): (u16, u8, &[u8]),
     ) -> Deferral {
         let place = match place {
+            // Without a request before it, nothing can reorder its effects.
             None if self.is_empty() => return Deferral::Now,
             Some(place @ Elsewhere::Device(_)) if self.waiting.len() < MAX_WAITING => place,
+            // A write to a mirror also changes the memory, which requests before it may read or write.
             Some(place @ Elsewhere::Mirror(_)) if self.is_empty() => place,
             Some(place @ Elsewhere::Journal(_))
                 if self.waiting.len() < MAX_WAITING
@@ -109,7 +111,7 @@ impl Deferred {
         let sent = unit_server.forward(rights, place, &asker, unit_id, request, permitted);
         let refused = RefusedRequest::before_device(unit_id, request, &sent);
         let (route, reply) = match sent {
-            Ok((route, coming)) => (route, Expected::Coming(coming)),
+            Ok((route, pending)) => (route, Expected::Pending(pending)),
             Err(code) => {
                 let pdu = exception(request, code.code());
                 (None, Expected::Known(Reply { pdu, ..Reply::default() }))
@@ -121,12 +123,12 @@ impl Deferred {
         Deferral::Later(refused)
     }
 
-    /// The client has gone. Requests that wait for their turn are not sent. Returns the others, whose
+    /// The client has disconnected. Requests that wait for their turn are not sent. Returns the others, whose
     /// replies still come.
     pub(super) fn give_up(self) -> VecDeque<Waiting> {
         for waiting in &self.waiting {
-            if let Expected::Coming(coming) = &waiting.reply {
-                coming.give_up();
+            if let Expected::Pending(pending) = &waiting.reply {
+                pending.give_up();
             }
         }
         self.waiting
@@ -134,15 +136,15 @@ impl Deferred {
 
     /// Keeps received bytes until there is room.
     pub(super) fn leave(&mut self, bytes: &[u8]) {
-        debug_assert!(self.behind.is_empty() && !bytes.is_empty());
-        self.behind.extend_from_slice(bytes);
+        debug_assert!(self.unread.is_empty() && !bytes.is_empty());
+        self.unread.extend_from_slice(bytes);
     }
 
     /// Moves those bytes to the start of `input`, and returns their length.
     pub(super) fn resume(&mut self, input: &mut [u8]) -> usize {
-        let behind = std::mem::take(&mut self.behind);
-        input[..behind.len()].copy_from_slice(&behind);
-        behind.len()
+        let unread = std::mem::take(&mut self.unread);
+        input[..unread.len()].copy_from_slice(&unread);
+        unread.len()
     }
 
     /// The next reply, once it is there.
@@ -152,9 +154,9 @@ impl Deferred {
         context: &mut Context<'_>,
     ) -> Poll<Completed> {
         let Some(first) = self.waiting.front_mut() else { return Poll::Pending };
-        if let Expected::Coming(coming) = &mut first.reply {
-            let Poll::Ready(reply) = Pin::new(coming).poll(context) else { return Poll::Pending };
-            first.reply = Expected::Known(come(unit_server, &first.request, reply.ok()));
+        if let Expected::Pending(pending) = &mut first.reply {
+            let Poll::Ready(reply) = Pin::new(pending).poll(context) else { return Poll::Pending };
+            first.reply = Expected::Known(count_reply(unit_server, &first.request, reply.ok()));
         }
         let Some(Waiting { tag, unit_id, route, request, reply, permit, .. }) =
             self.waiting.pop_front()
@@ -171,15 +173,17 @@ impl Waiting {
     pub(super) async fn complete(self, unit_server: &UnitServer) -> Option<Completed> {
         let Waiting { tag, unit_id, route, request, reply, permit, .. } = self;
         let reply = match reply {
-            Expected::Coming(coming) => come(unit_server, &request, Some(coming.await.ok()?)),
+            Expected::Pending(pending) => {
+                count_reply(unit_server, &request, Some(pending.await.ok()?))
+            }
             Expected::Known(reply) => reply,
         };
         Some(Completed { tag, unit_id, route, request, reply, permit })
     }
 }
 
-/// The reply that came, and counts it. `None` means that the link has ended.
-pub(super) fn come(unit_server: &UnitServer, request: &[u8], reply: Option<Reply>) -> Reply {
+/// Counts a reply, and returns it. `None` means that the link has ended.
+pub(super) fn count_reply(unit_server: &UnitServer, request: &[u8], reply: Option<Reply>) -> Reply {
     let ended = || exception(request, ExceptionCode::GatewayPathUnavailable.code());
     let reply = reply.unwrap_or_else(|| Reply { pdu: ended(), ..Reply::default() });
     unit_server.forwarded(request, &reply.pdu);

@@ -32,7 +32,7 @@ use crate::own_threads::OwnThreads;
 use crate::serial_line::SerialLine;
 
 /// The time that connections have to end when the engine stops.
-const GRACE: Duration = Duration::from_millis(500);
+const STOP_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Settings of an engine.
 #[derive(Debug, Clone)]
@@ -355,7 +355,7 @@ impl Engine {
                 let _ = stopping.wait_for(|stop| *stop).await;
                 drop(stopping);
                 // Each connection and listener holds a receiver.
-                let _ = tokio::time::timeout(GRACE, stop.closed()).await;
+                let _ = tokio::time::timeout(STOP_TIMEOUT, stop.closed()).await;
             }));
         };
         let thread = thread::Builder::new().name(name).spawn(body).map_err(StartError::Worker)?;

@@ -1,5 +1,5 @@
-//! Events of connections, for a log. Sending waits for nobody: when the queue is full, events are
-//! dropped and counted.
+//! Events of connections, for a log. Sending never waits: when the queue is full, events are dropped and
+//! counted.
 //!
 //! A source that causes many events must not displace those of others. If many of its events wait,
 //! further refusals that equal one of them, but for the port of the peer, are only counted there, and
@@ -17,10 +17,10 @@ use super::peer::Peer;
 use super::refused_request::RefusedRequest;
 
 /// The most events in the queue.
-const CAPACITY: usize = 1024;
+const MAX_EVENTS: usize = 1024;
 
 /// How many events of one source wait one by one, whatever it sends.
-const MAX_OF_SOURCE: usize = 32;
+const MAX_EVENTS_OF_SOURCE: usize = 32;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Kind {
@@ -206,8 +206,8 @@ impl Repeated {
 }
 
 impl Event {
-    /// Where it comes from: an address, or the network /64 of an IPv6 address, because a host has as
-    /// many addresses of it as it wants.
+    /// Where it comes from: an address, or the network /64 of an IPv6 address, because a host can
+    /// use any address of it.
     fn source(&self) -> Option<IpAddr> {
         Some(match self.peer.as_ref()?.ip().to_canonical() {
             IpAddr::V6(whole) => {
@@ -225,12 +225,12 @@ impl Queue {
         let of_source =
             source.map_or(0, |source| self.of_source.get(&source).copied().unwrap_or(0));
         let repeated = Repeated::of(&event);
-        if of_source >= MAX_OF_SOURCE || self.events.len() >= CAPACITY {
+        if of_source >= MAX_EVENTS_OF_SOURCE || self.events.len() >= MAX_EVENTS {
             if let Some(place) = repeated.as_ref().and_then(|each| self.refusals.get(each)) {
                 self.events[place - self.taken].count += 1;
                 return true;
             }
-            if self.events.len() >= if source.is_some() { CAPACITY / 2 } else { CAPACITY } {
+            if self.events.len() >= if source.is_some() { MAX_EVENTS / 2 } else { MAX_EVENTS } {
                 return false;
             }
         }
@@ -355,7 +355,7 @@ mod tests {
             refuse(&reporter, "10.0.0.7", 1, Kind::RefusedSource);
             let mut found = taken(&events);
             assert_eq!(found.pop(), Some(("10.0.0.7".into(), 1)));
-            assert_eq!(found.len(), MAX_OF_SOURCE);
+            assert_eq!(found.len(), MAX_EVENTS_OF_SOURCE);
             let counts: u64 = found.iter().map(|(_, count)| count).sum();
             assert_eq!((counts, events.lost()), (u64::from(u16::MAX), 0));
         }
@@ -364,14 +364,14 @@ mod tests {
     #[test]
     fn a_source_has_half_of_the_queue() {
         let (reporter, events) = channel(Verbosity::All);
-        for _ in 0..CAPACITY {
+        for _ in 0..MAX_EVENTS {
             refuse(&reporter, "10.0.0.9", 1, Kind::Opened);
         }
         refuse(&reporter, "10.0.0.7", 1, Kind::RefusedSource);
         let found = taken(&events);
-        assert_eq!(found.len(), CAPACITY / 2 + 1);
-        assert_eq!(found[CAPACITY / 2], ("10.0.0.7".into(), 1));
-        assert_eq!(events.lost(), (CAPACITY / 2) as u64);
+        assert_eq!(found.len(), MAX_EVENTS / 2 + 1);
+        assert_eq!(found[MAX_EVENTS / 2], ("10.0.0.7".into(), 1));
+        assert_eq!(events.lost(), (MAX_EVENTS / 2) as u64);
     }
 
     #[test]
@@ -382,7 +382,7 @@ mod tests {
             refuse(&reporter, &format!("2001:db8::{host:x}"), 1, kind);
         }
         refuse(&reporter, "2001:db8:0:1::1", 1, Kind::RefusedSource);
-        assert_eq!((taken(&events).len(), events.lost()), (MAX_OF_SOURCE + 1, 0));
+        assert_eq!((taken(&events).len(), events.lost()), (MAX_EVENTS_OF_SOURCE + 1, 0));
     }
 
     #[test]
@@ -402,17 +402,18 @@ mod tests {
             }
         }
         let all: Vec<Event> = std::iter::from_fn(|| events.next(Duration::ZERO)).collect();
-        let counts: Vec<u64> = all[MAX_OF_SOURCE..].iter().map(|event| event.count).collect();
+        let counts: Vec<u64> =
+            all[MAX_EVENTS_OF_SOURCE..].iter().map(|event| event.count).collect();
         assert_eq!(counts, [2; 12]);
     }
 
     #[test]
     fn events_of_more_sources_than_the_queue_has_room_for_are_lost_and_counted() {
         let (reporter, events) = channel(Verbosity::Refusals);
-        for number in 0..2 * CAPACITY {
+        for number in 0..2 * MAX_EVENTS {
             let source = format!("10.0.{}.{}", number / 256, number % 256);
             refuse(&reporter, &source, 1, Kind::RefusedSource);
         }
-        assert_eq!((taken(&events).len(), events.lost()), (CAPACITY, CAPACITY as u64));
+        assert_eq!((taken(&events).len(), events.lost()), (MAX_EVENTS, MAX_EVENTS as u64));
     }
 }

@@ -1,7 +1,7 @@
 //! Fair shares of a worker thread among the sources of its connections: deficit round robin.
 //!
 //! A source that has used its share of a round waits until the next one, which begins as soon as all
-//! others that had something to do were served. There is no limit and no time: while nobody else waits,
+//! others that had something to do were served. There is no limit and no time: while no other source waits,
 //! rounds follow each other immediately, and a source that is alone has no rounds at all.
 //!
 //! A source is an address. All its connections on the worker share what it has, in the order in which
@@ -17,18 +17,18 @@ use tokio::task::yield_now;
 
 /// The work of one source in a round. A read of a socket that brings one request is about a sixteenth of
 /// it: so much takes about 100 µs.
-const QUANTUM: i64 = 1024;
+const WORK_PER_ROUND: i64 = 1024;
 
 /// The work of one read of a socket, and of the write that answers it. It takes as long as answering so
 /// many requests that arrive together.
-pub(crate) const READ: u32 = 64;
+pub(crate) const WORK_OF_READ: u32 = 64;
 
 /// The bytes of a long packet that take as long as a request.
-const BYTES: usize = 256;
+const BYTES_PER_WORK: usize = 256;
 
 /// The most short packets of one source in a round.
 #[cfg(test)]
-pub(crate) const PACKETS: u16 = (QUANTUM / READ as i64) as u16;
+pub(crate) const PACKETS_PER_ROUND: u16 = (WORK_PER_ROUND / WORK_OF_READ as i64) as u16;
 
 thread_local! {
     static WORKER: RefCell<Worker> = RefCell::default();
@@ -36,7 +36,7 @@ thread_local! {
 
 /// The work of a read that brings a packet of this length.
 pub(crate) fn packet(len: usize) -> u32 {
-    READ + u32::try_from(len / BYTES).unwrap_or(u32::MAX)
+    WORK_OF_READ + u32::try_from(len / BYTES_PER_WORK).unwrap_or(u32::MAX)
 }
 
 /// The sources with connections on one worker thread.
@@ -132,7 +132,7 @@ impl Worker {
         let source = Source {
             address,
             connections: 1,
-            left: QUANTUM,
+            left: WORK_PER_ROUND,
             round: self.round,
             queue: VecDeque::new(),
             is_listed: false,
@@ -233,7 +233,8 @@ impl Source {
     /// Adds the work of the rounds that have begun. What is not used in a round is not kept.
     fn replenish(&mut self, round: u64) {
         let rounds = i64::try_from(round - self.round).unwrap_or(i64::MAX);
-        self.left = self.left.saturating_add(rounds.saturating_mul(QUANTUM)).min(QUANTUM);
+        self.left =
+            self.left.saturating_add(rounds.saturating_mul(WORK_PER_ROUND)).min(WORK_PER_ROUND);
         self.round = round;
     }
 
@@ -288,7 +289,7 @@ mod tests {
         IpAddr::from([192, 0, 2, last])
     }
 
-    /// Who has worked, in order: the last byte of the address.
+    /// The sources in the order in which they worked: the last byte of each address.
     type Log = Arc<Mutex<Vec<u8>>>;
 
     /// A connection that never waits for its peer.
@@ -311,7 +312,7 @@ mod tests {
                 yield_now().await;
                 share.come().await;
                 log.lock().unwrap().push(last);
-                share.charge(READ + 1);
+                share.charge(WORK_OF_READ + 1);
             }
         })
     }
@@ -339,7 +340,7 @@ mod tests {
     #[test]
     fn others_work_at_most_one_share_between_two_requests() {
         for connections in [1, 64] {
-            let work = READ + 16;
+            let work = WORK_OF_READ + 16;
             let log = run(|log| {
                 let mut tasks: Vec<_> =
                     (0..connections).map(|_| flood(1, 6400 / connections, work, log)).collect();
@@ -347,7 +348,7 @@ mod tests {
                 tasks
             });
             assert_eq!(log.len(), 6500, "everything is done");
-            let most = QUANTUM as usize / work as usize + 1;
+            let most = WORK_PER_ROUND as usize / work as usize + 1;
             let before = before_each(&log, 2);
             // A request that comes in the middle of a round may wait for the rest of it and, if its own
             // source has used its share, for the next.
@@ -358,13 +359,13 @@ mod tests {
     #[test]
     fn sources_that_never_pause_get_the_same_however_many_connections_they_have() {
         let log = run(|log| {
-            let mut tasks: Vec<_> = (0..32).map(|_| flood(1, 100, READ, log)).collect();
-            tasks.push(flood(2, 1000, READ, log));
+            let mut tasks: Vec<_> = (0..32).map(|_| flood(1, 100, WORK_OF_READ, log)).collect();
+            tasks.push(flood(2, 1000, WORK_OF_READ, log));
             tasks
         });
         let end = log.iter().rposition(|last| *last == 2).unwrap();
         let others = log[..end].iter().filter(|last| **last == 1).count();
-        assert!(others <= 1000 + 2 * QUANTUM as usize / READ as usize, "{others}");
+        assert!(others <= 1000 + 2 * WORK_PER_ROUND as usize / WORK_OF_READ as usize, "{others}");
     }
 
     #[test]
@@ -380,7 +381,7 @@ mod tests {
                     for _ in 0..10 {
                         share.come().await;
                         order.lock().unwrap().push(number);
-                        share.charge(QUANTUM as u32);
+                        share.charge(WORK_PER_ROUND as u32);
                     }
                 });
             }
@@ -401,7 +402,7 @@ mod tests {
             for share in &mut shares {
                 assert!(share.poll(&mut context).is_ready());
                 share.pass_on();
-                share.charge(QUANTUM as u32);
+                share.charge(WORK_PER_ROUND as u32);
             }
         }
         assert!(!WORKER.with_borrow(|worker| worker.has_rounds));
@@ -413,7 +414,7 @@ mod tests {
         runtime.block_on(async {
             let other = Share::of(address(2));
             let mut shares = [1; 3].map(|last| Share::of(address(last)));
-            shares[0].charge(100 * QUANTUM as u32);
+            shares[0].charge(100 * WORK_PER_ROUND as u32);
             let mut context = Context::from_waker(Waker::noop());
             assert!(shares.iter_mut().all(|share| share.poll(&mut context).is_pending()));
             drop(other);
@@ -426,8 +427,15 @@ mod tests {
         let mut worker = Worker::default();
         let place = worker.join(address(1));
         worker.join(address(2));
-        worker.charge(place, 3 * QUANTUM as u32 + 1);
-        for left in [-2 * QUANTUM - 1, -QUANTUM - 1, -1, QUANTUM - 1, QUANTUM, QUANTUM] {
+        worker.charge(place, 3 * WORK_PER_ROUND as u32 + 1);
+        for left in [
+            -2 * WORK_PER_ROUND - 1,
+            -WORK_PER_ROUND - 1,
+            -1,
+            WORK_PER_ROUND - 1,
+            WORK_PER_ROUND,
+            WORK_PER_ROUND,
+        ] {
             worker.sources[place].replenish(worker.round);
             assert_eq!(worker.sources[place].left, left);
             worker.begin_round();

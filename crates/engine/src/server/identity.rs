@@ -9,7 +9,7 @@ use holdfast_protocol::pdu::reply::MAX_SERVER_ID_LEN;
 const USER_APPLICATION_NAME: u8 = 0x06;
 
 /// Server id and run indicator take one byte each.
-const MAX_TEXT: usize = MAX_SERVER_ID_LEN - 2;
+const MAX_TEXT_BYTES: usize = MAX_SERVER_ID_LEN - 2;
 
 /// The identification of every unit.
 #[derive(Debug)]
@@ -57,7 +57,7 @@ impl Card {
         let objects = Objects::new(objects)?;
         let product = [0x00, 0x01, 0x02].map(|id| objects.get(id).unwrap_or_default()).join(&b' ');
         let mut text = name.unwrap_or(&product).to_vec();
-        text.truncate(MAX_TEXT);
+        text.truncate(MAX_TEXT_BYTES);
         Ok(Card { objects, text: text.into() })
     }
 }

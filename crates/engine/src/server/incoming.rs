@@ -16,26 +16,28 @@ use super::counters::PacketCounters;
 use super::stream::{End, Stream};
 
 /// The longest packet: a header of 12 bytes, 65,535 registers and a CRC.
-const MAX_PACKET: usize = 12 + 2 * 65_535 + 4;
+const MAX_PACKET_BYTES: usize = 12 + 2 * 65_535 + 4;
 
 /// The most bytes that a connection holds: a packet, and what arrives with its end.
-pub(crate) const ROOM: usize = 144 * 1024;
+pub(crate) const MAX_HELD_BYTES: usize = 144 * 1024;
 
 /// The most bytes that are kept without pages of their own.
-const SHORT: usize = 2048;
+const SHORT_BYTES: usize = 2048;
 
 /// The most unused pages that a worker keeps, for the next long packets: the system takes longer to
 /// provide pages than to copy a packet.
-const SPARE: usize = 16;
+const MAX_UNUSED_PAGES: usize = 16;
 
 /// Bytes per read while few bytes are held.
-const CHUNK: usize = 16 * 1024;
+const CHUNK_BYTES: usize = 16 * 1024;
 
-const _: () = assert!(MAX_PACKET + SHORT < ROOM && SHORT + CHUNK < ROOM);
+const _: () = assert!(
+    MAX_PACKET_BYTES + SHORT_BYTES < MAX_HELD_BYTES && SHORT_BYTES + CHUNK_BYTES < MAX_HELD_BYTES
+);
 
 thread_local! {
     /// Input of connections that hold few bytes, shared by all of a worker.
-    static SCRATCH: RefCell<Box<[u8]>> = RefCell::new(vec![0; CHUNK].into_boxed_slice());
+    static SCRATCH: RefCell<Box<[u8]>> = RefCell::new(vec![0; CHUNK_BYTES].into_boxed_slice());
     static UNUSED: RefCell<Vec<MmapMut>> = const { RefCell::new(Vec::new()) };
 }
 
@@ -80,7 +82,7 @@ impl Incoming {
                 read
             }
             _ => SCRATCH.with_borrow_mut(|scratch| {
-                let input = &mut scratch[..most.min(CHUNK)];
+                let input = &mut scratch[..most.min(CHUNK_BYTES)];
                 let read = stream.poll_read(context, input, unsent);
                 if let Poll::Ready(Ok(count)) = read {
                     self.extend(&input[..count]);
@@ -103,8 +105,8 @@ impl Incoming {
             pages[*len..total].copy_from_slice(bytes);
             return self.grow(bytes.len());
         }
-        if total > SHORT
-            && total <= ROOM
+        if total > SHORT_BYTES
+            && total <= MAX_HELD_BYTES
             && let Held::Few(few) = &self.held
             && let Some(mut pages) = pages()
         {
@@ -143,7 +145,7 @@ impl Incoming {
             // A thread that ends has no room for them any more.
             let _ = UNUSED.try_with(|unused| {
                 let mut unused = unused.borrow_mut();
-                if unused.len() < SPARE {
+                if unused.len() < MAX_UNUSED_PAGES {
                     unused.push(pages);
                 }
             });
@@ -179,7 +181,7 @@ impl Incoming {
         };
         if self.is_empty() && room > 0 {
             self.clear();
-        } else if self.len() <= SHORT && room > 2 * SHORT {
+        } else if self.len() <= SHORT_BYTES && room > 2 * SHORT_BYTES {
             self.replace(Held::Few(self.to_vec()));
         }
     }
@@ -188,7 +190,7 @@ impl Incoming {
 /// Pages for a long packet; `None` if the system has none.
 fn pages() -> Option<MmapMut> {
     let unused = UNUSED.with_borrow_mut(Vec::pop);
-    unused.or_else(|| MmapMut::map_anon(ROOM).ok())
+    unused.or_else(|| MmapMut::map_anon(MAX_HELD_BYTES).ok())
 }
 
 impl Deref for Incoming {
@@ -220,17 +222,17 @@ mod tests {
     #[test]
     fn bytes_keep_their_order_through_every_size() {
         let (mut incoming, counters) = incoming();
-        let sent: Vec<u8> = (0..MAX_PACKET).map(|at| (at % 251) as u8).collect();
+        let sent: Vec<u8> = (0..MAX_PACKET_BYTES).map(|at| (at % 251) as u8).collect();
         for piece in sent.chunks(777) {
             incoming.extend(piece);
-            assert!(counters.held_bytes.get() <= (incoming.len() + SHORT) as u64);
+            assert!(counters.held_bytes.get() <= (incoming.len() + SHORT_BYTES) as u64);
         }
         assert_eq!(*incoming, *sent);
-        incoming.consume(MAX_PACKET - 5);
-        assert_eq!(*incoming, sent[MAX_PACKET - 5..]);
+        incoming.consume(MAX_PACKET_BYTES - 5);
+        assert_eq!(*incoming, sent[MAX_PACKET_BYTES - 5..]);
         incoming.shrink();
-        assert_eq!(*incoming, sent[MAX_PACKET - 5..]);
-        assert!(counters.held_bytes.get() <= SHORT as u64);
+        assert_eq!(*incoming, sent[MAX_PACKET_BYTES - 5..]);
+        assert!(counters.held_bytes.get() <= SHORT_BYTES as u64);
         incoming.extend(&sent);
         assert_eq!(incoming[5..], *sent);
         drop(incoming);
@@ -240,12 +242,15 @@ mod tests {
     #[test]
     fn nothing_is_lost_beyond_the_room() {
         let (mut incoming, counters) = incoming();
-        incoming.extend(&[7; ROOM]);
+        incoming.extend(&[7; MAX_HELD_BYTES]);
         incoming.extend(&[8]);
-        assert_eq!((incoming.len(), incoming[ROOM - 1], incoming[ROOM]), (ROOM + 1, 7, 8));
-        incoming.consume(ROOM);
+        assert_eq!(
+            (incoming.len(), incoming[MAX_HELD_BYTES - 1], incoming[MAX_HELD_BYTES]),
+            (MAX_HELD_BYTES + 1, 7, 8)
+        );
+        incoming.consume(MAX_HELD_BYTES);
         incoming.shrink();
         assert_eq!(*incoming, [8]);
-        assert!(counters.held_bytes.get() <= SHORT as u64);
+        assert!(counters.held_bytes.get() <= SHORT_BYTES as u64);
     }
 }

@@ -24,11 +24,11 @@ use super::refused_request::RefusedRequest;
 use super::stream::Stream;
 
 /// The most connections that wait in the system to be accepted.
-const BACKLOG: i32 = 1024;
+const MAX_BACKLOG: i32 = 1024;
 
-/// The most bytes that the system keeps of a connection and that nobody has read, in each direction.
+/// The most unread bytes of a connection that the system buffers, in each direction.
 /// Linux doubles it for its own bookkeeping. Without it, systems allow several megabytes.
-const SYSTEM_BUFFER: usize = 256 * 1024;
+const SOCKET_BUFFER_BYTES: usize = 256 * 1024;
 
 /// TCP keepalive: the idle time before the first probe, the number of probes, the interval between
 /// them.
@@ -39,9 +39,9 @@ pub(crate) const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
 /// The longest time that a peer is read after its last reply, the bytes per read, and the most reads
 /// after that time.
-const DRAIN: Duration = Duration::from_secs(5);
-const DRAIN_CHUNK: usize = 16 * 1024;
-const LAST_READS: usize = 4;
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
+const DRAIN_CHUNK_BYTES: usize = 16 * 1024;
+const MAX_LAST_READS: usize = 4;
 
 /// The part of a listener that does not depend on its protocol.
 #[derive(Debug)]
@@ -292,10 +292,10 @@ pub fn bind_tcp(address: SocketAddr) -> io::Result<std::net::TcpListener> {
     #[cfg(unix)]
     socket.set_reuse_address(true)?;
     // Connections inherit both. The system may have lower limits.
-    let _ = socket.set_recv_buffer_size(SYSTEM_BUFFER);
-    let _ = socket.set_send_buffer_size(SYSTEM_BUFFER);
+    let _ = socket.set_recv_buffer_size(SOCKET_BUFFER_BYTES);
+    let _ = socket.set_send_buffer_size(SOCKET_BUFFER_BYTES);
     bind(&socket, address)?;
-    socket.listen(BACKLOG)?;
+    socket.listen(MAX_BACKLOG)?;
     Ok(socket.into())
 }
 
@@ -334,7 +334,7 @@ pub(crate) async fn drain<S: Stream>(
     stop: watch::Receiver<bool>,
     drained: impl FnMut(usize),
 ) {
-    drain_for(DRAIN, stream, stop, drained).await;
+    drain_for(DRAIN_TIMEOUT, stream, stop, drained).await;
 }
 
 /// As `drain`, for at most this long.
@@ -350,7 +350,8 @@ pub(crate) async fn drain_for<S: Stream + ?Sized>(
     while Instant::now() < deadline {
         // On the stack, because many peers may be read at the same time: outside the closure, it would
         // be a part of every connection.
-        let read = poll_fn(|context| stream.poll_read(context, &mut [0; DRAIN_CHUNK], &mut unsent));
+        let read =
+            poll_fn(|context| stream.poll_read(context, &mut [0; DRAIN_CHUNK_BYTES], &mut unsent));
         let read = tokio::select! {
             read = timeout_at(deadline, read) => read,
             _ = stop.wait_for(|stop| *stop) => break,
@@ -360,8 +361,8 @@ pub(crate) async fn drain_for<S: Stream + ?Sized>(
         // A peer that never pauses leaves time for other connections.
         yield_now().await;
     }
-    for _ in 0..LAST_READS {
-        let Some(len) = stream.read_now(&mut [0; DRAIN_CHUNK], &mut unsent) else { return };
+    for _ in 0..MAX_LAST_READS {
+        let Some(len) = stream.read_now(&mut [0; DRAIN_CHUNK_BYTES], &mut unsent) else { return };
         drained(len);
     }
 }

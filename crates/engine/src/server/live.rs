@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, PoisonError, RwLock};
 
-/// A value that is replaced as a whole. Whoever has taken the value before keeps it.
+/// A value that is replaced as a whole. Callers that took the value before keep it.
 #[derive(Debug)]
 pub(crate) struct Live<T>(RwLock<Arc<T>>);
 

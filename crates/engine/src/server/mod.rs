@@ -14,7 +14,7 @@ mod framing;
 pub mod functions;
 pub mod identity;
 mod incoming;
-mod journal;
+mod journaled_write;
 pub(crate) mod listener;
 pub(crate) mod live;
 mod memory_operations;

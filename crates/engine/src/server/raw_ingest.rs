@@ -32,7 +32,7 @@ use super::admission::{ConnectionLimits, Ticket};
 use super::audit::{Permit, Record, Written};
 use super::counters::PacketCounters;
 use super::event::Kind;
-use super::fair_share::{self, READ, Share};
+use super::fair_share::{self, Share, WORK_OF_READ};
 use super::incoming::Incoming;
 use super::listener::{Admitted, ListenerContext, Service, drain, set_options};
 use super::live::Live;
@@ -43,13 +43,13 @@ use super::stream::{self, End, Stream, send_all};
 use crate::tls::server::ServerTls;
 
 /// The most bytes that are needed to tell a packet from a Modbus frame.
-pub(crate) const DECISIVE: usize = 4;
+pub(crate) const DECISIVE_BYTES: usize = 4;
 
 /// Bytes per read of a new connection.
-const CHUNK: usize = 16 * 1024;
+const CHUNK_BYTES: usize = 16 * 1024;
 
 /// The most packets of one connection that are answered before other tasks run.
-const TURN: usize = 64;
+const PACKETS_PER_TURN: usize = 64;
 
 /// What peers from some networks can write.
 #[derive(Debug, Clone)]
@@ -127,7 +127,7 @@ impl Beginning {
             Beginning::SomethingElse
         } else if after.iter().take(2).any(|byte| *byte != 0) {
             Beginning::Packet
-        } else if bytes.len() >= DECISIVE {
+        } else if bytes.len() >= DECISIVE_BYTES {
             Beginning::SomethingElse
         } else {
             Beginning::Unknown
@@ -146,7 +146,7 @@ pub(crate) struct RawIngest {
     pub(crate) packets: Arc<PacketCounters>,
     policy: Grants<RawGrant>,
     /// The rights of a peer that no rule names, by its role.
-    nobody: Arc<RawGrant>,
+    no_rights: Arc<RawGrant>,
     tls: Option<Arc<ServerTls>>,
     format: Format,
     flags: Flags,
@@ -214,7 +214,7 @@ impl<S: Stream> Sending<S> {
             ready!(share.poll(context));
             let read = bytes.poll_read(context, (stream, unsent), most);
             if read.is_ready() {
-                share.charge(READ);
+                share.charge(WORK_OF_READ);
             }
             share.pass_on();
             read
@@ -253,7 +253,7 @@ impl RawIngest {
         RawIngest {
             packets,
             policy: Grants::new(rules),
-            nobody: Arc::new(RawGrant { targets: HashMap::new(), areas: Vec::new() }),
+            no_rights: Arc::new(RawGrant { targets: HashMap::new(), areas: Vec::new() }),
             tls: settings.tls.clone(),
             format: settings.format,
             flags: settings.flags,
@@ -321,12 +321,12 @@ impl RawIngest {
         let rights = live.get().granted(&peer).unwrap_or_else(|| {
             // Each packet is refused, which tells the sender more than the end of the connection.
             context.refuse_role(peer.clone());
-            Arc::clone(&self.nobody)
+            Arc::clone(&self.no_rights)
         });
         let by_role = peer.clone();
         let renewal = Box::new(move || {
             let service = live.get();
-            Some(service.granted(&by_role).unwrap_or_else(|| Arc::clone(&service.nobody)))
+            Some(service.granted(&by_role).unwrap_or_else(|| Arc::clone(&service.no_rights)))
         });
         let sending = self.begin((stream, peer), rights, &[], ticket);
         self.serve_packets(context, sending, renewal, stop).await;
@@ -552,7 +552,7 @@ impl RawIngest {
                     sending.share.come().await;
                     begun = Instant::now();
                     packets += 1;
-                    if packets.is_multiple_of(TURN) {
+                    if packets.is_multiple_of(PACKETS_PER_TURN) {
                         yield_now().await;
                     }
                     continue;
@@ -736,7 +736,7 @@ impl Service for RawIngest {
         if self.many.is_some() || self.tls.is_some() {
             return connection;
         }
-        let mut chunk = [0; CHUNK];
+        let mut chunk = [0; CHUNK_BYTES];
         let Ok(len) = (&*SockRef::from(&connection.stream)).read(&mut chunk) else {
             return connection;
         };
@@ -893,9 +893,9 @@ mod tests {
         let mut raw = listener(Format::V1, Flags::Strict);
         raw.request_timeout = Duration::from_millis(50);
         let mut sending = raw.sending(admitted(accepted, peer, Vec::new()));
-        while (&*SockRef::from(&sending.stream)).write(&[DONE; CHUNK]).is_ok() {}
+        while (&*SockRef::from(&sending.stream)).write(&[DONE; CHUNK_BYTES]).is_ok() {}
         assert_eq!(runtime.block_on(raw.reply(&mut sending, DONE)), Err(Kind::SlowReader));
-        // Nobody can get a reply from a connection that is gone, but that is no reason to stop.
+        // A connection that is gone can't receive replies, but that is no reason to stop.
         drop(client);
         while (&*SockRef::from(&sending.stream)).write(&[DONE]).is_ok() {}
         assert_eq!(runtime.block_on(raw.reply(&mut sending, DONE)), Ok(()));
@@ -903,7 +903,7 @@ mod tests {
 
     #[test]
     fn other_tasks_run_between_many_packets_that_arrive_together() {
-        const PACKETS: usize = 20 * TURN;
+        const PACKETS: usize = 20 * PACKETS_PER_TURN;
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let _guard = runtime.enter();
         let (client, accepted, peer) = connected();
@@ -924,13 +924,13 @@ mod tests {
             }
         });
         assert_eq!(raw.packets.accepted.get(), PACKETS as u64);
-        assert!(turns >= PACKETS / TURN, "{turns} turns");
+        assert!(turns >= PACKETS / PACKETS_PER_TURN, "{turns} turns");
     }
 
     #[test]
     fn a_packet_waits_for_one_share_of_another_source() {
         const CONNECTIONS: u16 = 16;
-        const PACKETS: usize = TURN - 1;
+        const PACKETS: usize = PACKETS_PER_TURN - 1;
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let packet = b"RI\x01\x03\x00\x01\x00\x00\x00\x01\x00\x07";
         let context = Arc::new(ListenerContext::for_tests());
@@ -955,7 +955,7 @@ mod tests {
                 .collect();
             let accepted = serve(([192, 0, 2, 2], 1).into(), 1).await.unwrap();
             // One share before the packet, and one before its sender is found to have left.
-            assert!(accepted <= 1 + 3 * u64::from(fair_share::PACKETS), "{accepted}");
+            assert!(accepted <= 1 + 3 * u64::from(fair_share::PACKETS_PER_ROUND), "{accepted}");
             for each in flood {
                 each.await.unwrap();
             }

@@ -16,7 +16,7 @@ use tokio::sync::watch;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
 use super::audit::Forwarded;
-use super::deferred::come;
+use super::deferred::count_reply;
 use super::event::Kind;
 use super::framing::{Framing, Rtu};
 use super::listener::ListenerContext;
@@ -34,10 +34,10 @@ const BROADCAST: u8 = 0;
 const CHARACTER_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// The interval between attempts to open a lost device.
-const REOPEN: Duration = Duration::from_secs(1);
+const REOPEN_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A line that does not send a reply within this time counts as lost.
-const STUCK: Duration = Duration::from_secs(10);
+const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// A listener on a serial line.
 #[derive(Debug, Clone)]
@@ -96,7 +96,7 @@ impl ModbusSerial {
             port = loop {
                 tokio::select! {
                     _ = &mut stopping => return,
-                    () = sleep(REOPEN) => {}
+                    () = sleep(REOPEN_INTERVAL) => {}
                 }
                 if let Ok(port) = self.line.open() {
                     break port;
@@ -256,7 +256,9 @@ impl ModbusSerial {
                 self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted);
             self.note_refused(context, RefusedRequest::before_device(unit_id, request, &sent));
             let (route, answered) = match sent {
-                Ok((route, coming)) => (route, come(&self.unit_server, request, coming.await.ok())),
+                Ok((route, pending)) => {
+                    (route, count_reply(&self.unit_server, request, pending.await.ok()))
+                }
                 Err(code) => {
                     let pdu = exception(request, code.code());
                     (None, Reply { pdu, ..Reply::default() })
@@ -320,7 +322,7 @@ impl ModbusSerial {
 
 /// Sends a reply. An error means that the line is lost.
 async fn send(port: &SerialPort, reply: &[u8]) -> io::Result<()> {
-    timeout(STUCK, port.write_all(reply))
+    timeout(WRITE_TIMEOUT, port.write_all(reply))
         .await
         .map_err(|_| io::Error::from(io::ErrorKind::TimedOut))?
 }

@@ -17,14 +17,14 @@ use super::listener::{Admitted, ListenerContext, Service, set_options};
 use super::live::Live;
 use super::peer::Peer;
 use super::policy::{PeerRights, Policy, Rule};
-use super::raw_ingest::{Beginning, DECISIVE, RawIngest, RawSettings};
+use super::raw_ingest::{Beginning, DECISIVE_BYTES, RawIngest, RawSettings};
 use super::secure::secured;
 use super::stream::Stream;
 use super::unit_server::UnitServer;
 use crate::tls::server::ServerTls;
 
 /// The time that an unlimited wait lasts.
-const FOREVER: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
+const NO_DEADLINE: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
 
 /// The framing of Modbus on a TCP stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -64,7 +64,7 @@ pub(crate) struct ModbusStream {
     unit_server: Arc<UnitServer>,
     policy: Policy,
     /// The rights of a peer that no rule names, by its role.
-    nobody: Arc<PeerRights>,
+    no_rights: Arc<PeerRights>,
     timeouts: Timeouts,
     framing: StreamFraming,
     tls: Option<Arc<ServerTls>>,
@@ -87,7 +87,7 @@ impl ModbusStream {
                 .map(|raw| Arc::new(RawIngest::new(raw, packets.unwrap_or_default()))),
             unit_server,
             policy: Policy::of(&settings.rules),
-            nobody: Arc::new(PeerRights::none()),
+            no_rights: Arc::new(PeerRights::none()),
             timeouts: Timeouts {
                 idle: settings.idle_timeout,
                 request: settings.request_timeout,
@@ -156,7 +156,7 @@ impl ModbusStream {
         let rights = live.get().terms(&peer).map(|terms| terms.rights).unwrap_or_else(|| {
             // The session stays, and each request gets exception 01 (MB-TCP-Security, R-23, R-31).
             context.refuse_role(peer.clone());
-            Arc::clone(&self.nobody)
+            Arc::clone(&self.no_rights)
         });
         self.modbus::<F, _>(live, context, (stream, peer), (rights, Vec::new()), ticket, stop)
             .await;
@@ -215,14 +215,14 @@ impl ModbusStream {
             }
             let is_new = admitted.received.is_empty();
             let time_limit = if is_new { self.timeouts.idle } else { Some(self.timeouts.request) };
-            let deadline = begun + time_limit.unwrap_or(FOREVER);
+            let deadline = begun + time_limit.unwrap_or(NO_DEADLINE);
             let readable = tokio::select! {
                 readable = timeout_at(deadline, admitted.stream.readable()) => readable,
                 _ = stop.wait_for(|stop| *stop) => return context.ended(Kind::Closed, peer),
             };
-            // No more than what decides: the rest is for whoever serves the connection.
-            let mut chunk = [0; DECISIVE];
-            let missing = DECISIVE - admitted.received.len();
+            // No more than what decides: the server of the protocol reads the rest.
+            let mut chunk = [0; DECISIVE_BYTES];
+            let missing = DECISIVE_BYTES - admitted.received.len();
             match readable {
                 Err(_) if is_new => return context.ended(Kind::Idle, peer),
                 Err(_) => return context.ended(Kind::RequestTimeout, peer),
@@ -245,9 +245,10 @@ impl ModbusStream {
 fn renewal(live: Arc<Live<ModbusStream>>, peer: Peer) -> Renewal {
     Box::new(move || {
         let service = live.get();
-        let nobody = || Terms { rights: Arc::clone(&service.nobody), timeouts: service.timeouts };
+        let no_rights =
+            || Terms { rights: Arc::clone(&service.no_rights), timeouts: service.timeouts };
         let terms = service.terms(&peer);
-        terms.or_else(|| peer.certificate.is_some().then(nobody))
+        terms.or_else(|| peer.certificate.is_some().then(no_rights))
     })
 }
 
@@ -258,7 +259,7 @@ impl Service for ModbusStream {
         let rights = self.policy.rights(peer);
         rights.or_else(|| {
             let raw = self.raw_ingest.as_ref()?;
-            raw.rights(peer).map(|_| Arc::clone(&self.nobody))
+            raw.rights(peer).map(|_| Arc::clone(&self.no_rights))
         })
     }
 

@@ -15,7 +15,7 @@ use tokio::sync::watch;
 use tokio::task::{JoinSet, yield_now};
 
 use super::audit::{Forwarded, Permit};
-use super::deferred::come;
+use super::deferred::count_reply;
 use super::framing::{Datagram, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
 use super::live::Live;
@@ -25,16 +25,16 @@ use super::unit_server::UnitServer;
 use crate::link::{Asker, Reply, source};
 
 /// Bytes per read of a socket. The system may deliver several datagrams of one peer at once.
-const INPUT: usize = 64 * 1024;
+const INPUT_BYTES: usize = 64 * 1024;
 
 /// The most reads before other tasks run.
-const TURNS: u32 = 16;
+const READS_PER_TURN: u32 = 16;
 
 /// The most reads of the remaining input when the listener stops.
-const LAST_READS: usize = 1024;
+const MAX_LAST_READS: usize = 1024;
 
 /// The most requests of a listener that wait for devices.
-const MAX_LATER: usize = 1024;
+const MAX_PENDING_REPLIES: usize = 1024;
 
 /// The longest frame of any framing of datagrams.
 const MAX_FRAME_LEN: usize = mbap::MAX_LEN;
@@ -98,12 +98,12 @@ impl ModbusUdp {
         let Ok(state) = UdpSocketState::new((&socket).into()) else { return };
         let Ok(socket) = UdpSocket::from_std(socket) else { return };
         let socket = Datagrams { socket, state };
-        let mut input = vec![0; INPUT].into_boxed_slice();
+        let mut input = vec![0; INPUT_BYTES].into_boxed_slice();
         let mut later = Later { source: source(), replies: JoinSet::new() };
         let mut turns = 0;
         loop {
             turns += 1;
-            if turns == TURNS {
+            if turns == READS_PER_TURN {
                 turns = 0;
                 // Datagrams that never pause leave time for connections, and for `stop`.
                 yield_now().await;
@@ -125,7 +125,7 @@ impl ModbusUdp {
                 self.take::<D>(context, &socket, &meta, &input, &mut later);
             }
         }
-        for _ in 0..LAST_READS {
+        for _ in 0..MAX_LAST_READS {
             match socket.receive(&mut input) {
                 Ok(meta) => self.take::<D>(context, &socket, &meta, &input, &mut later),
                 Err(error) if error.kind() == ErrorKind::WouldBlock => break,
@@ -169,7 +169,7 @@ impl ModbusUdp {
         socket: &Datagrams,
         Completed { tag, unit_id, meta, route, request, reply, permit }: Completed,
     ) {
-        let reply = come(&self.unit_server, &request, reply);
+        let reply = count_reply(&self.unit_server, &request, reply);
         if let Some(auditor) = &context.auditor {
             let forwarded = Forwarded::new(route.as_ref(), &request, &reply);
             let peer = meta.addr.into();
@@ -222,19 +222,19 @@ impl ModbusUdp {
             let asker = Asker { source: later.source, peer: Some(peer.ip()), waiting };
             let permit = context.permit_forwarded(request);
             let permitted = permit.is_some();
-            let coming = if waiting < MAX_LATER {
+            let sent = if waiting < MAX_PENDING_REPLIES {
                 self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted)
             } else {
                 Err(ExceptionCode::ServerDeviceBusy)
             };
-            if let Some(refused) = RefusedRequest::before_device(unit_id, request, &coming) {
+            if let Some(refused) = RefusedRequest::before_device(unit_id, request, &sent) {
                 context.refuse_request(refused, Some(peer.into()));
             }
-            return match coming {
-                Ok((route, coming)) => {
+            return match sent {
+                Ok((route, pending)) => {
                     let (meta, request) = (*meta, request.to_vec());
                     later.replies.spawn(async move {
-                        let reply = coming.await.ok();
+                        let reply = pending.await.ok();
                         Completed { tag, unit_id, meta, route, request, reply, permit }
                     });
                     0
@@ -374,6 +374,6 @@ mod tests {
             }
             most
         });
-        assert!(most <= u64::from(TURNS), "{most} without a pause");
+        assert!(most <= u64::from(READS_PER_TURN), "{most} without a pause");
     }
 }

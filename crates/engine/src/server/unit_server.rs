@@ -17,11 +17,11 @@ use holdfast_protocol::pdu::{
 use super::counters::{Bus, Counters};
 use super::functions::is_write;
 use super::identity::Identity;
-use super::journal;
+use super::journaled_write;
 use super::live::Live;
 use super::memory_operations::{exception_of, reading, writing};
 use super::policy::{Elsewhere, PeerRights};
-use crate::link::{Asker, Coming};
+use crate::link::{Asker, PendingReply};
 
 /// The units of one listener.
 #[derive(Debug)]
@@ -107,12 +107,12 @@ impl UnitServer {
         request: &[u8],
     ) -> Option<&'r Elsewhere> {
         let places = rights.elsewhere(unit_id)?;
-        self.taker(places, unit_id, request)
+        self.find_destination(places, unit_id, request)
     }
 
-    /// The first place that takes a request.
+    /// The first place that accepts a request. Not inline: most units have no such places.
     #[inline(never)]
-    fn taker<'r>(
+    fn find_destination<'r>(
         &self,
         places: &'r [Elsewhere],
         unit_id: u8,
@@ -120,7 +120,7 @@ impl UnitServer {
     ) -> Option<&'r Elsewhere> {
         places.iter().find(|place| match place {
             Elsewhere::Device(_) => !self.refuses_silence(request),
-            Elsewhere::Mirror(passage) => !self.is_silent(unit_id) && passage.takes(request),
+            Elsewhere::Mirror(passage) => !self.is_silent(unit_id) && passage.accepts(request),
             Elsewhere::Journal(_) => !self.is_silent(unit_id) && is_write(request),
         })
     }
@@ -137,7 +137,7 @@ impl UnitServer {
         unit_id: u8,
         request: &[u8],
         permitted: bool,
-    ) -> Result<(Option<Arc<str>>, Coming), ExceptionCode> {
+    ) -> Result<(Option<Arc<str>>, PendingReply), ExceptionCode> {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
         let sent = match place {
@@ -154,12 +154,12 @@ impl UnitServer {
             }
             Elsewhere::Device(route) => route
                 .ask(asker, unit_id, request)
-                .map(|coming| (Some(Arc::clone(&route.name)), coming)),
+                .map(|pending| (Some(Arc::clone(&route.name)), pending)),
             Elsewhere::Mirror(passage) => {
-                passage.ask(request).map(|(device, coming)| (Some(device), coming))
+                passage.ask(request).map(|(device, pending)| (Some(device), pending))
             }
             Elsewhere::Journal(memory) => {
-                journal::ask(memory, request).map(|coming| (None, coming))
+                journaled_write::submit(memory, request).map(|pending| (None, pending))
             }
         };
         sent.inspect_err(|code| self.counters.exception(*code))
@@ -204,7 +204,7 @@ impl UnitServer {
                 .memory(unit_id)
                 .filter(|memory| memory.has_journal() && permit.is_some() && may(unit_id));
             let (reply, log_sequence) = match journal {
-                Some(memory) => journal::carry_out(memory, request).await,
+                Some(memory) => journaled_write::carry_out(memory, request).await,
                 None => {
                     let (mut reply, asked) = ([0; pdu::MAX_LEN], (function_code, request));
                     let done = self.serve(rights, unit_id, asked, permit.is_some(), &mut reply);

@@ -69,8 +69,8 @@ impl FileOnDisk {
         FileOnDisk { path, beside: beside.into() }
     }
 
-    /// Removes what processes left beside the file that were killed while they created one. Whoever
-    /// creates one now does not have this file open, and fails.
+    /// Removes files beside this one, left by processes that were killed while they created them. A process
+    /// that creates one now does not have this file open, and fails.
     fn sweep(&self) {
         let (Some(folder), Some(name)) = (self.path.parent(), self.path.file_name()) else {
             return;

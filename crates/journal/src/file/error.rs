@@ -1,4 +1,4 @@
-//! Why a file can't be used. Whoever shows an error puts the name of the file in front.
+//! Why a file can't be used. The caller puts the name of the file in front.
 
 use std::io;
 

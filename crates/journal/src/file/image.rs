@@ -6,14 +6,14 @@ use super::error::FileError;
 
 /// The number of bytes of a page: 128 registers or 2048 bits. One register costs little to store, and a
 /// whole area has few pages.
-pub(super) const PAGE: usize = 256;
+pub(super) const PAGE_BYTES: usize = 256;
 
 /// Ends the name of a record with what was cut from a memory. Names of memories have no colon.
 pub(super) const SET_ASIDE: &str = ":set-aside";
 
 /// A memory as it is in the file, or what was cut from one.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Kept {
+pub struct StoredMemory {
     pub name: String,
     /// Its number in the file.
     pub(super) id: u16,
@@ -35,7 +35,7 @@ pub(super) struct Page {
 #[derive(Debug, Default)]
 pub(super) struct Changes {
     /// Memories that are new or have another layout; all their pages are stored.
-    pub memories: Vec<Kept>,
+    pub memories: Vec<StoredMemory>,
     pub pages: Vec<Page>,
     /// The names and numbers of what the file does not contain any more.
     pub removed: Vec<(String, u16)>,
@@ -55,20 +55,20 @@ impl Changes {
 /// All that a file contains.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Image {
-    memories: Vec<Kept>,
+    memories: Vec<StoredMemory>,
     note: Option<Vec<u8>>,
 }
 
-impl Kept {
+impl StoredMemory {
     /// A memory of zeros.
-    pub(super) fn new(name: &str, id: u16, layout: Layout) -> Kept {
+    pub(super) fn new(name: &str, id: u16, layout: Layout) -> StoredMemory {
         let areas = Area::ALL.map(|area| zeros(area, layout.span(area)));
-        Kept { name: name.to_owned(), id, layout, areas }
+        StoredMemory { name: name.to_owned(), id, layout, areas }
     }
 
     pub(super) fn pages(&self) -> impl Iterator<Item = (u8, u16, &[u8])> {
         (0..).zip(&self.areas).flat_map(|(area, bytes)| {
-            (0..).zip(bytes.chunks(PAGE)).map(move |(number, page)| (area, number, page))
+            (0..).zip(bytes.chunks(PAGE_BYTES)).map(move |(number, page)| (area, number, page))
         })
     }
 
@@ -92,7 +92,7 @@ impl Kept {
     }
 
     /// This memory, and around it what was cut from it. Addresses between the two have zeros.
-    pub(super) fn with(&self, set_aside: Option<&Kept>) -> Kept {
+    pub(super) fn with(&self, set_aside: Option<&StoredMemory>) -> StoredMemory {
         let Some(set_aside) = set_aside else { return self.clone() };
         let mut layout = self.layout;
         for area in Area::ALL {
@@ -103,12 +103,17 @@ impl Kept {
             let from = &self.areas[area as usize];
             copy_shared(area, from, self.layout.span(area), bytes, layout.span(area));
         }
-        Kept { name: self.name.clone(), id: self.id, layout, areas }
+        StoredMemory { name: self.name.clone(), id: self.id, layout, areas }
     }
 
     /// What is set aside when the memory has another layout; `None` if that lacks nothing. Addresses
     /// that it has are 0 in between.
-    pub(super) fn cut(&self, set_aside: Option<&Kept>, other: Layout, id: u16) -> Option<Kept> {
+    pub(super) fn cut(
+        &self,
+        set_aside: Option<&StoredMemory>,
+        other: Layout,
+        id: u16,
+    ) -> Option<StoredMemory> {
         let mut layout = Layout::default();
         for area in Area::ALL {
             layout = layout.with(area, self.lacking(set_aside, other, area));
@@ -121,20 +126,24 @@ impl Kept {
             let has = other.span(area);
             copy_shared(area, &zeros(area, has), has, bytes, layout.span(area));
         }
-        Some(Kept { name: format!("{}{SET_ASIDE}", self.name), id, layout, areas })
+        Some(StoredMemory { name: format!("{}{SET_ASIDE}", self.name), id, layout, areas })
     }
 
     /// The addresses that another layout lacks, of those that are known; perhaps with some of its own
     /// in between.
-    fn lacking(&self, set_aside: Option<&Kept>, other: Layout, area: Area) -> Span {
+    fn lacking(&self, set_aside: Option<&StoredMemory>, other: Layout, area: Area) -> Span {
         let known = [Some(self), set_aside].into_iter().flatten();
-        let lacking = known.flat_map(|kept| outside(kept.layout.span(area), other.span(area)));
+        let lacking = known.flat_map(|stored| outside(stored.layout.span(area), other.span(area)));
         lacking.fold(Span::default(), around)
     }
 
     /// What another layout makes of the contents, in words; one sentence for each area that differs,
     /// and one for all that is set aside afterwards.
-    pub(super) fn resizings(&self, set_aside: Option<&Kept>, layout: Layout) -> Vec<String> {
+    pub(super) fn resizings(
+        &self,
+        set_aside: Option<&StoredMemory>,
+        layout: Layout,
+    ) -> Vec<String> {
         let name = &self.name;
         let (mut sentences, mut lacking) = (Vec::new(), Vec::new());
         for area in Area::ALL {
@@ -150,7 +159,7 @@ impl Kept {
                 Some((first, end)) => format!("addresses {first}-{} are kept", end - 1),
                 None => "no address is kept".to_owned(),
             }];
-            let aside = set_aside.map_or(Span::default(), |kept| kept.layout.span(area));
+            let aside = set_aside.map_or(Span::default(), |stored| stored.layout.span(area));
             let back = outside(new, old).into_iter().filter_map(|new| overlap(new, aside));
             let back: Vec<_> = back.map(|(first, end)| span(first, end)).collect();
             for (spans, what) in [(back, "back"), (outside(old, new), "set aside")] {
@@ -174,7 +183,7 @@ impl Kept {
 }
 
 impl Image {
-    pub fn new(memories: Vec<Kept>, note: Option<Vec<u8>>) -> Image {
+    pub fn new(memories: Vec<StoredMemory>, note: Option<Vec<u8>>) -> Image {
         Image { memories, note }
     }
 
@@ -183,25 +192,25 @@ impl Image {
         self.note.as_ref()
     }
 
-    pub fn memories(&self) -> &[Kept] {
+    pub fn memories(&self) -> &[StoredMemory] {
         &self.memories
     }
 
-    pub fn into_memories(self) -> Vec<Kept> {
+    pub fn into_memories(self) -> Vec<StoredMemory> {
         self.memories
     }
 
-    pub fn named(&self, name: &str) -> Option<&Kept> {
-        self.memories.iter().find(|kept| kept.name == name)
+    pub fn named(&self, name: &str) -> Option<&StoredMemory> {
+        self.memories.iter().find(|stored| stored.name == name)
     }
 
     /// What was cut from a memory.
-    pub fn set_aside_of(&self, name: &str) -> Option<&Kept> {
-        self.memories.iter().find(|kept| kept.set_aside_of() == Some(name))
+    pub fn set_aside_of(&self, name: &str) -> Option<&StoredMemory> {
+        self.memories.iter().find(|stored| stored.set_aside_of() == Some(name))
     }
 
-    fn numbered(&self, id: u16) -> Option<&Kept> {
-        self.memories.iter().find(|kept| kept.id == id)
+    fn numbered(&self, id: u16) -> Option<&StoredMemory> {
+        self.memories.iter().find(|stored| stored.id == id)
     }
 
     /// The numbers that no memory has.
@@ -211,41 +220,42 @@ impl Image {
 
     /// Whether a page is in the file as it is.
     pub fn has(&self, page: &Page) -> bool {
-        let from = usize::from(page.number) * PAGE;
-        self.numbered(page.memory).is_some_and(|kept| {
-            kept.areas[usize::from(page.area)][from..from + page.bytes.len()] == *page.bytes
+        let from = usize::from(page.number) * PAGE_BYTES;
+        self.numbered(page.memory).is_some_and(|stored| {
+            stored.areas[usize::from(page.area)][from..from + page.bytes.len()] == *page.bytes
         })
     }
 
     pub fn apply(&mut self, changes: Changes) {
-        self.memories.retain(|kept| changes.removed.iter().all(|(name, _)| *name != kept.name));
+        self.memories.retain(|stored| changes.removed.iter().all(|(name, _)| *name != stored.name));
         if let Some(note) = changes.note {
             self.note = note;
         }
         for new in changes.memories {
-            match self.memories.iter_mut().find(|kept| kept.id == new.id) {
-                Some(kept) => *kept = new,
+            match self.memories.iter_mut().find(|stored| stored.id == new.id) {
+                Some(stored) => *stored = new,
                 None => self.memories.push(new),
             }
         }
         for page in changes.pages {
-            let kept = self.memories.iter_mut().find(|kept| kept.id == page.memory);
-            let Some(kept) = kept else { unreachable!("pages are of memories in the file") };
-            let from = usize::from(page.number) * PAGE;
-            let area = &mut kept.areas[usize::from(page.area)];
+            let stored = self.memories.iter_mut().find(|stored| stored.id == page.memory);
+            let Some(stored) = stored else { unreachable!("pages are of memories in the file") };
+            let from = usize::from(page.number) * PAGE_BYTES;
+            let area = &mut stored.areas[usize::from(page.area)];
             area[from..from + page.bytes.len()].copy_from_slice(&page.bytes);
         }
     }
 
     /// The pages in which contents differ from those in the file.
     pub fn differing(&self, id: u16, contents: &Contents) -> Vec<Page> {
-        let Some(kept) = self.numbered(id) else { return Vec::new() };
+        let Some(stored) = self.numbered(id) else { return Vec::new() };
         let mut pages = Vec::new();
-        for (area, (old, new)) in (0..).zip(kept.areas.iter().zip(&contents.areas)) {
+        for (area, (old, new)) in (0..).zip(stored.areas.iter().zip(&contents.areas)) {
             if old == new {
                 continue;
             }
-            for (number, (was, is)) in (0..).zip(old.chunks(PAGE).zip(new.chunks(PAGE))) {
+            for (number, (was, is)) in (0..).zip(old.chunks(PAGE_BYTES).zip(new.chunks(PAGE_BYTES)))
+            {
                 if was != is {
                     pages.push(Page { memory: id, area, number, bytes: is.to_vec() });
                 }
@@ -274,7 +284,7 @@ pub(super) fn encode(id: u16, layout: Layout) -> Vec<u8> {
 
 /// # Errors
 /// [`FileError::Damaged`]
-pub(super) fn decode(name: &str, record: &[u8]) -> Result<Kept, FileError> {
+pub(super) fn decode(name: &str, record: &[u8]) -> Result<StoredMemory, FileError> {
     let invalid = || FileError::damaged(format!("the layout of memory {name} is invalid"));
     let (id, mut spans) = record.split_first_chunk().ok_or_else(invalid)?;
     let mut layout = Layout::default();
@@ -286,7 +296,7 @@ pub(super) fn decode(name: &str, record: &[u8]) -> Result<Kept, FileError> {
         spans = rest;
     }
     if spans.is_empty() {
-        Ok(Kept::new(name, u16::from_be_bytes(*id), layout))
+        Ok(StoredMemory::new(name, u16::from_be_bytes(*id), layout))
     } else {
         Err(invalid())
     }

@@ -10,7 +10,7 @@
 //!   its own, until the layout has it again or it is released.
 //! * What a log changes comes from the log: contents at one of its messages, with a note of the log that
 //!   is stored with them. The file is never their journal.
-//! * Nobody knows what an I/O error leaves on the disk. So the next transaction writes a new file and
+//! * After an I/O error, the contents of the disk are unknown. So the next transaction writes a new file and
 //!   puts it in the place of the old one.
 //! * A file that is not entirely as it was stored is refused, and not changed. It is never replaced by
 //!   an empty one.
@@ -18,7 +18,7 @@
 mod disk;
 mod error;
 mod image;
-mod keeper;
+mod memory_file;
 mod overlay;
 mod periodic;
 mod queue;
@@ -31,19 +31,19 @@ use std::sync::Arc;
 
 pub use disk::{Disk, FileOnDisk};
 pub use error::FileError;
-pub use image::Kept;
-pub use keeper::{Member, MemoryFile, Options};
+pub use image::StoredMemory;
+pub use memory_file::{Member, MemoryFile, Options};
 pub use overlay::Overlay;
 pub use periodic::Source;
 pub use status::Status;
 pub use store::VERSION;
 
 /// Checks a file and returns what it contains, without changing it: memories, and what was cut from
-/// them ([`Kept::set_aside_of`]).
+/// them ([`StoredMemory::set_aside_of`]).
 ///
 /// # Errors
 /// As [`MemoryFile::open`], and [`FileError::Io`] for a file that does not exist.
-pub fn read(path: &Path) -> Result<Vec<Kept>, FileError> {
+pub fn read(path: &Path) -> Result<Vec<StoredMemory>, FileError> {
     read_from(&FileOnDisk::new(path))
 }
 
@@ -51,7 +51,7 @@ pub fn read(path: &Path) -> Result<Vec<Kept>, FileError> {
 ///
 /// # Errors
 /// As [`read`].
-pub fn read_from(disk: &dyn Disk) -> Result<Vec<Kept>, FileError> {
+pub fn read_from(disk: &dyn Disk) -> Result<Vec<StoredMemory>, FileError> {
     match disk.size()? {
         Some(len) => Ok(store::inspect(disk, len)?.into_memories()),
         None => Err(FileError::Io(std::io::ErrorKind::NotFound.into())),
@@ -68,7 +68,8 @@ pub fn release(disk: Arc<dyn Disk>, memory: &str) -> Result<bool, FileError> {
     }
     let mut store = store::Store::open(disk, Arc::default())?;
     let set_aside = store.image().set_aside_of(memory);
-    let removed: Vec<_> = set_aside.map(|kept| (kept.name.clone(), kept.id)).into_iter().collect();
+    let removed: Vec<_> =
+        set_aside.map(|stored| (stored.name.clone(), stored.id)).into_iter().collect();
     let was = !removed.is_empty();
     store.store(image::Changes { removed, ..image::Changes::default() })?;
     store.close()?;

@@ -8,7 +8,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use redb::{BackendError, StorageBackend};
 
-const BLOCK: u64 = 4096;
+/// The unit in which changed bytes are copied.
+const BLOCK_BYTES: u64 = 4096;
 
 /// A file that is only read, with changes in memory.
 #[derive(Debug)]
@@ -21,7 +22,7 @@ pub struct Overlay<B> {
 struct Changes {
     /// The length, and how much of the file is still visible; the file's length at first.
     len: Option<(u64, u64)>,
-    blocks: HashMap<u64, Box<[u8; BLOCK as usize]>>,
+    blocks: HashMap<u64, Box<[u8; BLOCK_BYTES as usize]>>,
 }
 
 impl<B: StorageBackend> Overlay<B> {
@@ -39,8 +40,8 @@ impl<B: StorageBackend> Overlay<B> {
 
     /// Reads a part of one block.
     fn read_part(&self, changes: &Changes, offset: u64, out: &mut [u8]) -> io::Result<()> {
-        if let Some(block) = changes.blocks.get(&(offset / BLOCK)) {
-            let from = (offset % BLOCK) as usize;
+        if let Some(block) = changes.blocks.get(&(offset / BLOCK_BYTES)) {
+            let from = (offset % BLOCK_BYTES) as usize;
             out.copy_from_slice(&block[from..from + out.len()]);
             return Ok(());
         }
@@ -58,7 +59,7 @@ fn parts(offset: u64, len: usize) -> impl Iterator<Item = (u64, usize, usize)> {
     let mut done = 0;
     std::iter::from_fn(move || {
         let at = offset + done as u64;
-        let part = ((BLOCK - at % BLOCK) as usize).min(len - done);
+        let part = ((BLOCK_BYTES - at % BLOCK_BYTES) as usize).min(len - done);
         let from = done;
         done += part;
         (part > 0).then_some((at, from, part))
@@ -85,9 +86,9 @@ impl<B: StorageBackend> StorageBackend for Overlay<B> {
     fn set_len(&self, len: u64) -> io::Result<()> {
         let mut changes = self.changes();
         let (_, visible) = self.lens(&changes)?;
-        changes.blocks.retain(|block, _| block * BLOCK < len);
-        let cut = (len % BLOCK) as usize;
-        if let Some(block) = changes.blocks.get_mut(&(len / BLOCK)) {
+        changes.blocks.retain(|block, _| block * BLOCK_BYTES < len);
+        let cut = (len % BLOCK_BYTES) as usize;
+        if let Some(block) = changes.blocks.get_mut(&(len / BLOCK_BYTES)) {
             block[cut..].fill(0);
         }
         changes.len = Some((len, visible.min(len)));
@@ -105,11 +106,11 @@ impl<B: StorageBackend> StorageBackend for Overlay<B> {
             return Err(io::ErrorKind::UnexpectedEof.into());
         }
         for (at, from, part) in parts(offset, data.len()) {
-            let mut block = Box::new([0; BLOCK as usize]);
-            self.read_part(&changes, at - at % BLOCK, &mut block[..])?;
-            let within = (at % BLOCK) as usize;
+            let mut block = Box::new([0; BLOCK_BYTES as usize]);
+            self.read_part(&changes, at - at % BLOCK_BYTES, &mut block[..])?;
+            let within = (at % BLOCK_BYTES) as usize;
             block[within..within + part].copy_from_slice(&data[from..from + part]);
-            changes.blocks.insert(at / BLOCK, block);
+            changes.blocks.insert(at / BLOCK_BYTES, block);
         }
         Ok(())
     }
@@ -118,7 +119,7 @@ impl<B: StorageBackend> StorageBackend for Overlay<B> {
         self.below.close()
     }
 
-    // Whoever only reads shares the file with others who do.
+    // A reader shares the file with other readers.
     fn try_lock_range(&self, start: Bound<u64>, end: Bound<u64>) -> Result<bool, BackendError> {
         self.below.try_lock_shared_range(start, end)
     }

@@ -28,7 +28,7 @@ pub(super) struct Periodic {
     pub queue: Arc<Queue>,
     pub sync: Duration,
     /// How many writes to the memories are in the file.
-    pub stored: Arc<AtomicU64>,
+    pub stored_writes: Arc<AtomicU64>,
     /// What changes the memories, if a log does.
     pub log: Option<Arc<dyn Source>>,
 }
@@ -46,7 +46,7 @@ impl Periodic {
     fn store_changes(&mut self) -> Result<(), FileError> {
         // Writes after this are in the contents, perhaps, and stored again.
         let written = writes(&self.memories);
-        if written == self.stored.load(Ordering::Relaxed) && !self.store.in_doubt() {
+        if written == self.stored_writes.load(Ordering::Relaxed) && !self.store.in_doubt() {
             return Ok(());
         }
         let (contents, note) = match &self.log {
@@ -61,7 +61,7 @@ impl Periodic {
         let pages = self.ids.iter().zip(&contents);
         let pages = pages.flat_map(|(id, contents)| image.differing(*id, contents)).collect();
         self.store.store(Changes { pages, note, ..Changes::default() })?;
-        self.stored.store(written, Ordering::Relaxed);
+        self.stored_writes.store(written, Ordering::Relaxed);
         Ok(())
     }
 }

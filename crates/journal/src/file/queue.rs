@@ -9,7 +9,7 @@ use holdfast_memory::{Action, Done, Journal, Memory, Refusal, Refused, Step};
 
 use super::status::Status;
 
-/// A step, who receives its outcome, and since when it waits.
+/// A step, the receiver of its outcome, and since when it waits.
 pub(super) struct Waiting {
     pub step: Step,
     pub done: Done,

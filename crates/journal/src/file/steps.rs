@@ -1,6 +1,6 @@
 //! Storing steps before they are answered.
 //!
-//! All steps that wait are carried out on shadows: memories that nobody else sees. That shows what they
+//! All steps that wait are carried out on shadows: memories that only this thread sees. That shows what they
 //! do and in which order. What differs then is stored in one transaction. After it, the same steps are
 //! carried out on the memories, and answered.
 
@@ -11,7 +11,7 @@ use std::time::Duration;
 use holdfast_memory::{Access, Action, Area, Memory, Outcome, Read, Refusal, Step};
 
 use super::error::FileError;
-use super::image::{Changes, PAGE, Page, layout_of};
+use super::image::{Changes, PAGE_BYTES, Page, layout_of};
 use super::queue::{Next, Queue, Waiting};
 use super::store::Store;
 
@@ -58,12 +58,14 @@ impl Steps {
         let mut outcomes: Vec<Outcome> = Vec::with_capacity(steps.len());
         for Waiting { step, .. } in &steps {
             let outcome = step.carry_out(&self.shadows);
+            // A refused step has changed nothing.
             if outcome.is_ok() {
                 self.touch(step, &mut touched);
             }
             outcomes.push(outcome);
         }
         let pages = touched.into_iter().filter_map(|place| self.changed(place)).collect();
+        // The memories have not changed yet: only the shadows are ahead.
         if self.store.store(Changes { pages, ..Changes::default() }).is_err() {
             self.restore_shadows();
             return self.queue.refuse(steps.into_iter().map(|each| each.done), Refusal::NotStored);
@@ -128,5 +130,5 @@ struct Place {
 }
 
 fn items_of_a_page(area: Area) -> usize {
-    if area.is_bits() { PAGE * 8 } else { PAGE / 2 }
+    if area.is_bits() { PAGE_BYTES * 8 } else { PAGE_BYTES / 2 }
 }

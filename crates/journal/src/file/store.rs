@@ -11,7 +11,7 @@ use redb::{
 
 use super::disk::Disk;
 use super::error::FileError;
-use super::image::{self, Changes, Image, Kept, Page};
+use super::image::{self, Changes, Image, Page, StoredMemory};
 use super::status::Status;
 
 /// The version of the format.
@@ -29,7 +29,7 @@ const LOG: TableDefinition<&str, &[u8]> = TableDefinition::new("log");
 const NOTE: &str = "note";
 
 /// redb keeps pages in memory, and the image is there already.
-const CACHE: usize = 1 << 20;
+const CACHE_BYTES: usize = 1 << 20;
 
 /// An open file.
 #[derive(Debug)]
@@ -38,7 +38,7 @@ pub(super) struct Store {
     database: Database,
     /// What the file contains, unless it is in doubt.
     image: Image,
-    /// The last transaction failed: nobody knows what the file contains.
+    /// The last transaction failed: what the file contains is unknown.
     in_doubt: bool,
     status: Arc<Mutex<Status>>,
 }
@@ -147,7 +147,7 @@ pub(super) fn inspect(disk: &dyn Disk, len: u64) -> Result<Image, FileError> {
 
 fn builder() -> Builder {
     let mut builder = Database::builder();
-    builder.set_cache_size(CACHE).set_check_integrity_on_open(true);
+    builder.set_cache_size(CACHE_BYTES).set_check_integrity_on_open(true);
     builder
 }
 
@@ -188,12 +188,12 @@ fn write(transaction: &WriteTransaction, changes: &Changes) -> Result<(), FileEr
         records.remove(&**name)?;
         pages.retain_in((*id, 0, 0)..=(*id, u8::MAX, u16::MAX), |_, _| false)?;
     }
-    for kept in &changes.memories {
-        let record = image::encode(kept.id, kept.layout);
-        records.insert(&*kept.name, &*with_checksum(kept.name.as_bytes(), &record))?;
-        pages.retain_in((kept.id, 0, 0)..=(kept.id, u8::MAX, u16::MAX), |_, _| false)?;
-        for (area, number, bytes) in kept.pages() {
-            let key = (kept.id, area, number);
+    for stored in &changes.memories {
+        let record = image::encode(stored.id, stored.layout);
+        records.insert(&*stored.name, &*with_checksum(stored.name.as_bytes(), &record))?;
+        pages.retain_in((stored.id, 0, 0)..=(stored.id, u8::MAX, u16::MAX), |_, _| false)?;
+        for (area, number, bytes) in stored.pages() {
+            let key = (stored.id, area, number);
             pages.insert(key, &*with_checksum(&place(key), bytes))?;
         }
     }
@@ -220,7 +220,7 @@ fn contents(database: &Database) -> Result<Image, FileError> {
         }
         _ => return Err(FileError::damaged("it has no format version")),
     }
-    let mut memories: Vec<Kept> = Vec::new();
+    let mut memories: Vec<StoredMemory> = Vec::new();
     for entry in transaction.open_table(MEMORIES)?.iter()? {
         let (name, record) = entry?;
         let name = name.value();
@@ -228,18 +228,18 @@ fn contents(database: &Database) -> Result<Image, FileError> {
             .ok_or_else(|| FileError::damaged(format!("wrong checksum of memory {name}")))?;
         memories.push(image::decode(name, record)?);
     }
-    memories.sort_by_key(|kept| kept.id);
+    memories.sort_by_key(|stored| stored.id);
     if memories.windows(2).any(|pair| pair[0].id == pair[1].id) {
         return Err(FileError::damaged("two memories have one number"));
     }
     let pages = transaction.open_table(PAGES)?;
     let mut entries = pages.iter()?;
-    for kept in &mut memories {
-        for (area, bytes) in (0..).zip(&mut kept.areas) {
-            for (number, page) in (0..).zip(bytes.chunks_mut(image::PAGE)) {
-                let key = (kept.id, area, number);
+    for stored in &mut memories {
+        for (area, bytes) in (0..).zip(&mut stored.areas) {
+            for (number, page) in (0..).zip(bytes.chunks_mut(image::PAGE_BYTES)) {
+                let key = (stored.id, area, number);
                 let damaged =
-                    |what| FileError::damaged(format!("{what} {number} of memory {}", kept.name));
+                    |what| FileError::damaged(format!("{what} {number} of memory {}", stored.name));
                 let Some(entry) = entries.next() else { return Err(damaged("there is no page")) };
                 let (found, stored) = entry?;
                 let stored = checked(&place(key), stored.value());

@@ -13,14 +13,14 @@ use super::error::{End, LogError};
 use super::settings::{Login, Servers};
 
 /// The most commands that wait for the connection.
-const CAPACITY: usize = 4096;
+const MAX_WAITING_COMMANDS: usize = 4096;
 
 /// How often the connection is tried, and how long requests may take.
-const PING: Duration = Duration::from_secs(2);
-const REQUEST: Duration = Duration::from_secs(3);
+const PING_INTERVAL: Duration = Duration::from_secs(2);
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// After its end, a client waits for this time before it connects again. It is dropped before.
-const NEVER: Duration = Duration::from_secs(86_400);
+const NO_RECONNECT_DELAY: Duration = Duration::from_secs(86_400);
 
 pub(super) struct Connected {
     pub(super) client: Client,
@@ -47,7 +47,7 @@ pub(super) async fn connect(servers: &Servers, name: String) -> Result<Connected
         addresses.push(address);
     }
     let (sender, ended) = watch::channel(None);
-    let worked = Arc::new(AtomicBool::new(false));
+    let was_connected = Arc::new(AtomicBool::new(false));
     let options = login(&servers.login).await?;
     let options = match &servers.tls {
         None => options,
@@ -65,20 +65,26 @@ pub(super) async fn connect(servers: &Servers, name: String) -> Result<Connected
             }
         }
     };
-    let worked_before = Arc::clone(&worked);
+    let connected_before = Arc::clone(&was_connected);
     let options = options
         .name(name)
         .connection_timeout(servers.connect_timeout)
-        .request_timeout(Some(REQUEST))
-        .ping_interval(PING)
-        .client_capacity(CAPACITY)
+        .request_timeout(Some(REQUEST_TIMEOUT))
+        .ping_interval(PING_INTERVAL)
+        .client_capacity(MAX_WAITING_COMMANDS)
         .ignore_discovered_servers()
+        // The client would send what it has not sent before: writes that were refused meanwhile.
         .reconnect_delay_callback(move |_| {
-            if worked_before.load(Ordering::Acquire) { NEVER } else { Duration::ZERO }
+            if connected_before.load(Ordering::Acquire) {
+                NO_RECONNECT_DELAY
+            } else {
+                Duration::ZERO
+            }
         })
         .event_callback(move |event| {
             let reason = match event {
                 Event::Disconnected | Event::Closed => Some("the connection was lost".to_owned()),
+                // The next session finds another server before this one ends.
                 Event::LameDuckMode => Some("the server is about to stop".to_owned()),
                 _ => None,
             };
@@ -88,7 +94,7 @@ pub(super) async fn connect(servers: &Servers, name: String) -> Result<Connected
             std::future::ready(())
         });
     let client = options.connect(addresses).await.map_err(|error| End::lost("connect", error))?;
-    worked.store(true, Ordering::Release);
+    was_connected.store(true, Ordering::Release);
     let info = client.server_info();
     let server = format!("{}:{}", info.host, info.port);
     Ok(Connected { client, server, ended })
@@ -117,6 +123,7 @@ fn secret(file: &Path) -> Result<String, LogError> {
 
 /// The path of a file that can be read.
 fn readable(file: &Path) -> Result<PathBuf, LogError> {
+    // The client names no file in its errors.
     std::fs::File::open(file).map_err(|error| LogError::file(file, &error))?;
     Ok(file.to_owned())
 }

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-/// Of how many sequences digests are kept: of those that this node has reached, and of others.
-const KEPT: usize = 16;
+/// The most sequences whose digests are remembered: of those that this node has reached, and of others.
+const MAX_SEQUENCES: usize = 16;
 
 #[derive(Debug)]
 pub(super) struct Digests {
@@ -13,7 +13,7 @@ pub(super) struct Digests {
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Verdict {
-    /// No other node has told a digest of this sequence, or this node has none.
+    /// No other node has published a digest of this sequence, or this node has none.
     Alone,
     Agrees,
     /// The majority has this other digest.
@@ -31,11 +31,12 @@ impl Digests {
         let digests = self.by_sequence.entry(sequence).or_default();
         digests.insert(node.to_owned(), digest.to_owned());
         let verdict = judge(digests, &self.node);
+        // Counted apart: other nodes can't displace what this node has reached, wherever they say they are.
         for is_own in [true, false] {
             let is_of = |digests: &BTreeMap<_, _>| digests.contains_key(&self.node) == is_own;
             let of = self.by_sequence.iter().filter(|(_, digests)| is_of(digests));
             let of: Vec<u64> = of.map(|(sequence, _)| *sequence).collect();
-            for sequence in &of[..of.len().saturating_sub(KEPT)] {
+            for sequence in &of[..of.len().saturating_sub(MAX_SEQUENCES)] {
                 self.by_sequence.remove(sequence);
             }
         }
@@ -54,6 +55,7 @@ fn judge(digests: &BTreeMap<String, String>, node: &str) -> Verdict {
     match other {
         None if digests.len() == 1 => Verdict::Alone,
         None => Verdict::Agrees,
+        // A tie is not a majority: of two nodes, each may be the wrong one.
         Some(_) if 2 * votes(own) > digests.len() => Verdict::Agrees,
         Some(other) if 2 * votes(other) > digests.len() => Verdict::Differs(other.clone()),
         Some(other) => Verdict::Unclear(other.clone()),
@@ -64,9 +66,9 @@ fn judge(digests: &BTreeMap<String, String>, node: &str) -> Verdict {
 mod tests {
     use super::*;
 
-    fn verdict(told: &[(&str, &str)]) -> Verdict {
+    fn verdict(published: &[(&str, &str)]) -> Verdict {
         let mut digests = Digests::new("a");
-        let verdicts = told.iter().map(|(node, digest)| digests.add(node, 10, digest));
+        let verdicts = published.iter().map(|(node, digest)| digests.add(node, 10, digest));
         verdicts.last().unwrap()
     }
 
@@ -96,7 +98,7 @@ mod tests {
             digests.add("b", 1_000_000 + sequence, "1");
             digests.add("a", sequence, "1");
         }
-        assert_eq!(digests.by_sequence.len(), 2 * KEPT);
+        assert_eq!(digests.by_sequence.len(), 2 * MAX_SEQUENCES);
         assert_eq!(digests.own(999), Some("1"));
         assert_eq!(digests.own(983), None);
     }

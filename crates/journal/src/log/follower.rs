@@ -180,6 +180,7 @@ impl Reading {
             if place.sequence < next {
                 continue;
             }
+            // Messages were removed behind a newer snapshot: what is missing can't be rebuilt.
             if place.sequence > next {
                 let text = format!("sequence {} came in place of {next}", place.sequence);
                 return Err(LogError::Snapshot(text).into());
@@ -187,6 +188,7 @@ impl Reading {
             if matches!(until, Until::Time(end) if place.stored > end) {
                 return Ok(None);
             }
+            // Also a message that was applied before is shown, with its steps.
             let decoded = message::decode(&payload, &self.state.members).ok();
             let applied = self.state.apply(place, &payload, |_| None)?;
             let fresh = matches!(applied, super::state::Applied::Fresh { .. });
@@ -228,6 +230,7 @@ async fn read_from(
     };
     let mut state = State::new(members);
     store.load(snapshot, &mut state).await?;
+    // Not a consumer: a message with malformed headers must not end it.
     let messages = fetched(store, state.place.sequence + 1);
     Ok(Reading { state, messages })
 }

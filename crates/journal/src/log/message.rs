@@ -16,7 +16,7 @@ const MARK: [u8; 3] = *b"HFL";
 /// Of messages and snapshots, since both change together.
 pub(super) const VERSION: u8 = 1;
 
-/// Who sent a message, and which of its messages it is.
+/// The node that sent a message, and the number of the message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Origin {
     pub node: String,
@@ -59,8 +59,8 @@ pub(super) enum MessageError {
 /// How many nodes a log may have had.
 pub(super) const MAX_NODES: usize = 1024;
 
-/// The bytes before the steps, and those before each step, at most.
-pub(super) const OVERHEAD: usize = 128;
+/// The most bytes before the steps, with those before one step.
+pub(super) const OVERHEAD_BYTES: usize = 128;
 
 /// Encodes a message of steps that are encoded already.
 pub(super) fn encode<'a>(
@@ -69,7 +69,7 @@ pub(super) fn encode<'a>(
     steps: impl ExactSizeIterator<Item = &'a [u8]> + Clone,
 ) -> Bytes {
     let len: usize = steps.clone().map(|step| step.len() + 4).sum();
-    let mut out = Vec::with_capacity(len + OVERHEAD);
+    let mut out = Vec::with_capacity(len + OVERHEAD_BYTES);
     out.extend_from_slice(&MARK);
     out.push(VERSION);
     out.push(u8::from(compares));
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_of_others_are_told_from_another_version() {
+    fn bytes_of_others_are_distinguished_from_another_version() {
         let of = |bytes: &[u8]| decode(bytes, &members());
         assert_eq!(of(b"hello"), Err(MessageError::Foreign));
         assert_eq!(of(b"HFL\x02whatever"), Err(MessageError::Version(2)));

@@ -1,8 +1,8 @@
 //! The messages of the stream, in their order: from a consumer, or fetched one by one.
 //!
-//! The client library ends its connection at a message whose headers it can't parse, and takes one
-//! whose headers have a status for an answer of the server. Anyone who may publish can send such
-//! messages. A fetched message is JSON, with its headers as text, so it does no harm: a session begins
+//! The client library ends its connection at a message whose headers it can't parse, and takes
+//! a message whose headers have a status for an answer of the server. Any client that may publish can
+//! send such messages. A fetched message is JSON, with its headers as text, so it does no harm: a session begins
 //! with fetched messages, and changes to a consumer when those have no such headers.
 
 use std::ops::RangeInclusive;
@@ -17,18 +17,18 @@ use super::raw_message::Received;
 use super::state::Place;
 use super::store::Store;
 
-/// How many requests for messages are on their way.
-const AHEAD: usize = 16;
+/// How many requests for messages are in flight.
+const MAX_FETCHES: usize = 16;
 
 /// How often to look for new messages.
-const POLL: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// A session fetches what was applied last, and the next message, which may have ended the session
 /// before.
-const AT_FIRST: u32 = 2;
+const FIRST_FETCHED_MESSAGES: u32 = 2;
 
 /// Fetching ends after so many messages in a row that a consumer can deliver.
-const CALM: u32 = 100;
+const CALM_AFTER_MESSAGES: u32 = 100;
 
 pub(super) struct Messages(Source);
 
@@ -43,11 +43,11 @@ impl Messages {
     /// Messages from this sequence on. Of those that the stream has already, the first are fetched.
     pub(super) fn new(store: &Store, from: u64) -> Messages {
         let there = (store.stream.cached_info().state.last_sequence + 1).saturating_sub(from);
-        let calm_after = u32::try_from(there).unwrap_or(u32::MAX).min(AT_FIRST);
+        let calm_after = u32::try_from(there).unwrap_or(u32::MAX).min(FIRST_FETCHED_MESSAGES);
         Messages(Source::Fetched { messages: fetched(store, from), calm_after })
     }
 
-    /// The next message. Nothing is lost if nobody waits for it any more.
+    /// The next message. Nothing is lost if the future is dropped.
     pub(super) async fn next(&mut self) -> Result<Received, End> {
         match &mut self.0 {
             Source::Consumer(messages) => match messages.next().await {
@@ -58,8 +58,11 @@ impl Messages {
             Source::Fetched { messages, calm_after } => {
                 let next = messages.next().await;
                 let received = next.unwrap_or_else(|| Err(End::Lost("no messages".to_owned())))?;
-                *calm_after =
-                    if received.is_readable { calm_after.saturating_sub(1) } else { CALM };
+                *calm_after = if received.is_readable {
+                    calm_after.saturating_sub(1)
+                } else {
+                    CALM_AFTER_MESSAGES
+                };
                 Ok(received)
             }
         }
@@ -93,7 +96,7 @@ pub(super) fn fetched(store: &Store, from: u64) -> Fetched {
     let ranges = stream::unfold((store.clone(), from), |(store, from)| async move {
         loop {
             match store.last().await {
-                Ok(last) if last < from => tokio::time::sleep(POLL).await,
+                Ok(last) if last < from => tokio::time::sleep(POLL_INTERVAL).await,
                 Ok(last) => return Some((Ok(from..=last), (store, last + 1))),
                 Err(end) => return Some((Err(end), (store, from))),
             }
@@ -117,5 +120,5 @@ fn of_range(store: Store, range: RangeInclusive<u64>) -> Fetched {
         }
     });
     // Those that are missing leave a gap in the sequences.
-    messages.buffered(AHEAD).filter_map(|message| async { message.transpose() }).boxed()
+    messages.buffered(MAX_FETCHES).filter_map(|message| async { message.transpose() }).boxed()
 }

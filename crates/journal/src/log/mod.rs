@@ -4,41 +4,44 @@
 //! that order. The node where a step comes from answers when it has applied it:
 //!
 //! ```text
-//! submit ─► shared.rs    waits, with other steps
-//!           sending.rs   publishes all that wait as one message
-//!                        the stream: one place in the order
-//!           state.rs     applies the message, on all nodes
-//! done   ◄─ sent.rs      the outcome of the step
+//! submit ─► shared.rs     waits, with other steps
+//!           sender.rs     publishes all that wait as one message
+//!                         the stream: one place in the order
+//!           applier.rs    applies the message, on all nodes
+//! done   ◄─ in_flight.rs  the outcome of the step
 //! ```
 //!
-//! `session.rs` runs the thread, and calls the other files: `joining.rs` before it reads the stream,
-//! `messages.rs` to read it, `applying.rs` for each message, `comparing.rs` for digests, `snapshots.rs` for snapshots.
-//! `returning.rs` is for a node whose contents were wrong, `note.rs` for one with a file.
+//! `thread.rs` runs sessions, and `session.rs` joins the parts of a node (`node.rs`): `applier.rs`, `sender.rs`,
+//! `snapshotter.rs`, `comparer.rs`, and `recovery.rs` for a node whose contents were wrong. `join.rs` is for the
+//! beginning of a session, `messages.rs` reads the stream, and `note.rs` is for a node with a file.
 
-mod applying;
+mod applier;
+mod background;
 mod clock;
-mod comparing;
+mod comparer;
 mod connection;
 mod digests;
 mod error;
 mod follower;
-mod joining;
+mod in_flight;
+mod join;
 mod layout;
 mod message;
 mod messages;
 mod node;
 mod note;
 mod raw_message;
-mod returning;
-mod sending;
-mod sent;
+mod recovery;
+mod sender;
+mod server_lag;
 mod session;
 mod settings;
 mod shared;
-mod snapshots;
+mod snapshotter;
 mod state;
 mod status;
 mod store;
+mod thread;
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -52,7 +55,7 @@ pub use error::LogError;
 pub use follower::{Follower, Next, Record, Until};
 pub use message::Origin;
 pub use settings::{Login, Servers, Settings, Tls, WhenBehind};
-pub use shared::Kept;
+pub use shared::Checkpoint;
 pub use status::{Digest, Event, Node, Phase, Status};
 
 use node::Node as Running;
@@ -72,7 +75,7 @@ pub struct Log {
 }
 
 /// How long the thread of a log may take to give what a file keeps.
-const KEEPING: Duration = Duration::from_secs(10);
+const CHECKPOINT_TIMEOUT: Duration = Duration::from_secs(10);
 
 impl Log {
     /// Makes the log the journal of these memories. Until it has caught up, writes are refused.
@@ -116,8 +119,8 @@ impl Log {
 
     /// The contents after one message, and a note for [`Log::resume`]. `None` while there are no contents
     /// that are right.
-    pub fn kept(&self) -> Option<Kept> {
-        self.shared.kept(KEEPING)
+    pub fn checkpoint(&self) -> Option<Checkpoint> {
+        self.shared.checkpoint(CHECKPOINT_TIMEOUT)
     }
 
     /// Starts the thread of the log. A second call does nothing.
@@ -137,7 +140,7 @@ impl Log {
             node.resume(note)?;
         }
         let name = format!("log {}", self.settings.name);
-        let started = std::thread::Builder::new().name(name).spawn(move || node.run());
+        let started = std::thread::Builder::new().name(name).spawn(move || thread::run(node));
         *thread = Some(started.map_err(|error| LogError::Thread(error.to_string()))?);
         Ok(())
     }

@@ -6,8 +6,7 @@ use holdfast_memory::{Contents, Memory};
 use serde::{Deserialize, Serialize};
 
 use super::error::LogError;
-use super::node::Node;
-use super::shared::Kept;
+use super::shared::Checkpoint;
 use super::state::{Place, State, digest_of};
 
 const VERSION: u8 = 1;
@@ -44,84 +43,47 @@ impl Note {
         }
         serde_json::from_slice(bytes).map_err(malformed)
     }
-}
 
-impl State {
-    fn kept(&self, log: &str, stream: &str) -> Option<Kept> {
-        let contents = Memory::contents(&self.members);
+    /// The contents of this state, and the note about them. `None` if the note can't be encoded.
+    pub(super) fn checkpoint(state: &State, log: &str, stream: &str) -> Option<Checkpoint> {
+        let contents = Memory::contents(&state.members);
         let note = Note {
             version: VERSION,
             log: log.to_owned(),
             stream: stream.to_owned(),
-            sequence: self.place.sequence,
-            stored: self.place.stored,
-            steps: self.steps,
-            origins: self.origins.clone(),
+            sequence: state.place.sequence,
+            stored: state.place.stored,
+            steps: state.steps,
+            origins: state.origins.clone(),
             sealed: contents.iter().map(|contents| contents.sealed).collect(),
-            digest: digest_of(&self.encode()),
+            digest: digest_of(&state.encode()),
         };
         Some((contents, serde_json::to_vec(&note).ok()?))
     }
 
-    /// Goes on from the contents that the memories have now.
-    fn resume(&mut self, note: &Note) -> Result<(), LogError> {
-        for (memory, sealed) in self.members.iter().zip(&note.sealed) {
+    /// Makes this note's state from the contents that the memories have now.
+    ///
+    /// # Errors
+    /// [`LogError::Snapshot`] if they are not those of the note.
+    pub(super) fn restore(&self, state: &mut State) -> Result<(), LogError> {
+        for (memory, sealed) in state.members.iter().zip(&self.sealed) {
             let contents = Memory::contents(std::slice::from_ref(memory));
             for Contents { areas, .. } in contents {
                 let sealed = *sealed && memory.gate().is_some();
                 memory.restore(&Contents { areas, sealed });
             }
         }
-        self.place = Place { sequence: note.sequence, stored: note.stored };
-        self.steps = note.steps;
-        self.origins = note.origins.clone();
-        let found = digest_of(&self.encode());
-        if found == note.digest {
+        state.place = Place { sequence: self.sequence, stored: self.stored };
+        state.steps = self.steps;
+        state.origins = self.origins.clone();
+        let found = digest_of(&state.encode());
+        if found == self.digest {
             return Ok(());
         }
-        let (place, expected) = (self.place, &note.digest);
+        let (place, expected) = (state.place, &self.digest);
         Err(LogError::Snapshot(format!(
             "the contents of {place} have digest {found}, expected is {expected}: something else has \
              changed the file. Move it away to start with the contents of the log"
         )))
-    }
-}
-
-impl Node {
-    /// Begins with the contents of the file.
-    ///
-    /// # Errors
-    /// [`LogError::Snapshot`] if they are not those of the note.
-    pub(super) fn resume(&mut self, note: Note) -> Result<(), LogError> {
-        self.state.resume(&note)?;
-        self.shared.counters.sequence.set(note.sequence);
-        self.id = Some(note.stream);
-        Ok(())
-    }
-
-    /// What the file is to keep, unless the contents are wrong or not there yet.
-    pub(super) fn kept(&self) -> Option<Kept> {
-        let is_right = self.doubt.is_none() && !self.state.members.is_empty();
-        let stream = self.id.as_deref().filter(|_| is_right)?;
-        self.state.kept(&self.settings.name, stream)
-    }
-
-    /// Gives the file what it asks for, unless contents are being loaded: then it waits.
-    pub(super) fn keep(&self) {
-        if self.shared.is_kept_asked() && !self.state.members.is_empty() {
-            self.shared.give_kept(self.kept(), false);
-        }
-    }
-
-    /// The servers have not what this node has applied. Says what to do.
-    pub(super) fn replaced(&self, text: String) -> LogError {
-        let Some(file) = &self.settings.kept_file else { return LogError::Replaced(text) };
-        let place = self.state.place;
-        LogError::Replaced(format!(
-            "{text}. The contents of this node at {place} are kept in {file}. Stop all nodes and \
-             decide which contents are right. Those of this node: 'holdfast memory export', then a \
-             new log, under another name, with these values as 'initial'. Those of the log: go on \
-             with it. In both cases move {file} away afterwards"
-        ))
     }
 }

@@ -51,6 +51,7 @@ impl Received {
         let is_plain = |headers: &String| headers.starts_with(WITHOUT_STATUS);
         // What is not UTF-8 in a subject is replaced in JSON.
         let breaks = |c: char| c.is_whitespace() || c == char::REPLACEMENT_CHARACTER;
+        // The client library refuses to convert a message whose headers it can't parse.
         let without_headers = RawMessage { headers: None, ..message.clone() };
         let is_readable = message.headers.as_ref().is_none_or(is_plain)
             && !message.subject.contains(breaks)

@@ -70,13 +70,13 @@ pub struct Settings {
     pub digest_every: u64,
     /// The most steps that wait to be sent.
     pub queue: usize,
-    /// A node whose contents differ returns by itself, unless it has done so within this time; with
+    /// A node whose contents differ rejoins by itself, unless it has done so within this time; with
     /// `None`, never.
-    pub return_after: Option<Duration>,
-    /// The file with what was applied, for messages.
-    pub kept_file: Option<String>,
-    /// For so long, a server may know less than this node: it may be cut off from the others.
-    pub cut_off: Duration,
+    pub rejoin_after: Option<Duration>,
+    /// The file that stores the memories, for messages of errors.
+    pub memory_file: Option<String>,
+    /// For so long, a server may know less than this node: it may be cut off from the other servers.
+    pub max_cut_off: Duration,
     /// Writes are answered when they are sent. Tests use it to show what then goes wrong.
     #[doc(hidden)]
     pub answers_early: bool,
@@ -101,9 +101,9 @@ impl Settings {
             snapshot_after: Duration::from_secs(600),
             digest_every: 10_000,
             queue: 4096,
-            return_after: Some(Duration::from_secs(24 * 3600)),
-            kept_file: None,
-            cut_off: Duration::from_secs(30),
+            rejoin_after: Some(Duration::from_secs(24 * 3600)),
+            memory_file: None,
+            max_cut_off: Duration::from_secs(30),
             answers_early: false,
         }
     }
@@ -115,7 +115,7 @@ impl Settings {
         for (what, name) in [("name", &self.name), ("node", &self.node)] {
             if !is_word(name) {
                 return refused(format!(
-                    "{what} is {name:?}, allowed: 1 to {MAX_NAME} letters, digits, - and _"
+                    "{what} is {name:?}, allowed: 1 to {MAX_NAME_CHARS} letters, digits, - and _"
                 ));
             }
         }
@@ -139,8 +139,8 @@ impl Settings {
             ("max_lag", self.max_lag),
             ("snapshot_seconds", self.snapshot_after),
         ] {
-            if found < SHORTEST {
-                let (found, least) = (found.as_secs_f64(), SHORTEST.as_secs_f64());
+            if found < MIN_TIMEOUT {
+                let (found, least) = (found.as_secs_f64(), MIN_TIMEOUT.as_secs_f64());
                 return refused(format!("{what} is {found} s, at least {least} s is required"));
             }
         }
@@ -158,12 +158,13 @@ impl Settings {
     }
 }
 
-const MAX_NAME: usize = 64;
+const MAX_NAME_CHARS: usize = 64;
 
-const SHORTEST: Duration = Duration::from_millis(50);
+/// No duration in the settings of a log is shorter.
+const MIN_TIMEOUT: Duration = Duration::from_millis(50);
 
 /// Whether a name can be part of a subject, of a stream's name and of a key.
 pub(super) fn is_word(name: &str) -> bool {
     let is_allowed = |byte: u8| byte.is_ascii_alphanumeric() || matches!(byte, b'-' | b'_');
-    (1..=MAX_NAME).contains(&name.len()) && name.bytes().all(is_allowed)
+    (1..=MAX_NAME_CHARS).contains(&name.len()) && name.bytes().all(is_allowed)
 }

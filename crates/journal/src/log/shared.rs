@@ -1,4 +1,4 @@
-//! What the thread of a log shares with those who write, read and look at it.
+//! What the thread of a log shares with writers, readers and the status.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -16,49 +16,56 @@ use super::status::{Counters, Event, NodeView, Phase, View};
 use crate::encoding;
 
 /// The most bytes of steps that wait to be sent.
-const QUEUE_BYTES: usize = 64 << 20;
+const MAX_QUEUE_BYTES: usize = 64 << 20;
 
-/// The most events that nobody has taken. Then the oldest are dropped.
-const EVENTS: usize = 1000;
+/// The most events that wait to be taken. Then the oldest are dropped.
+const MAX_EVENTS: usize = 1000;
 
-const OPEN: u8 = 0;
+/// What the contents can be used for, in [`Shared::usability`].
+const USABLE: u8 = 0;
+/// They are wrong.
 const DIFFERS: u8 = 1;
+/// A snapshot is being loaded.
 const LOADING: u8 = 2;
 
 pub(super) struct Shared {
     clock: Clock,
-    refuses: bool,
+    refuses_when_behind: bool,
     max_lag: Duration,
     write_timeout: Duration,
     capacity: usize,
-    /// What the contents are fit for: [`OPEN`], [`DIFFERS`] or [`LOADING`].
-    door: AtomicU8,
+    /// [`USABLE`], [`DIFFERS`] or [`LOADING`].
+    usability: AtomicU8,
     /// The contents have been current at this [`Moment`], in nanoseconds. 0 means never.
     contact: AtomicU64,
-    /// The longest encoded step that the servers accept.
-    longest: AtomicUsize,
+    /// The longest encoded step that the servers accept, in bytes.
+    max_step_bytes: AtomicUsize,
     stopping: AtomicBool,
     queue: Mutex<Queue>,
     pub(super) arrived: Notify,
     pub(super) counters: Counters,
     progress: Mutex<Progress>,
     changed: Condvar,
-    /// Held by who asks for what a file keeps: an answer is for one only.
-    asking: Mutex<()>,
-    keeping: Mutex<Keeping>,
-    given: Condvar,
+    /// Held by the caller that requests a checkpoint: an answer is for one only.
+    requesting: Mutex<()>,
+    exchange: Mutex<Exchange>,
+    answered: Condvar,
 }
 
-/// The contents of the memories in the order of their names, and a note about them.
-pub type Kept = (Vec<Contents>, Vec<u8>);
+/// The contents of the memories after one message, in the order of their names, and a note about them.
+pub type Checkpoint = (Vec<Contents>, Vec<u8>);
 
-/// What a file asks for.
+/// How the thread of the log hands a checkpoint to the file.
 #[derive(Default)]
-struct Keeping {
-    is_asked: bool,
-    given: Option<Kept>,
-    /// The log has ended: what was given last stays.
-    has_ended: bool,
+enum Exchange {
+    #[default]
+    Idle,
+    /// The file waits for it.
+    Requested,
+    /// `None` if the contents are not right.
+    Given(Option<Checkpoint>),
+    /// The log has ended: this stays the answer.
+    Ended(Option<Checkpoint>),
 }
 
 #[derive(Default)]
@@ -91,12 +98,14 @@ impl Journal for Shared {
     fn submit(&self, step: Step, done: Done) {
         let mut bytes = Vec::new();
         encoding::encode(&step, &mut bytes);
-        if bytes.len() > self.longest.load(Ordering::Relaxed) {
+        // The servers would end the connection: no later attempt could succeed either.
+        if bytes.len() > self.max_step_bytes.load(Ordering::Relaxed) {
             self.counters.not_stored.add(1);
             return refuse(done, Refusal::NotStored);
         }
         let mut queue = lock(&self.queue);
-        let fits = queue.steps.len() < self.capacity && queue.bytes + bytes.len() <= QUEUE_BYTES;
+        let fits =
+            queue.steps.len() < self.capacity && queue.bytes + bytes.len() <= MAX_QUEUE_BYTES;
         if !queue.open || !fits {
             drop(queue);
             self.counters.unavailable.add(1);
@@ -114,9 +123,9 @@ impl Journal for Shared {
     }
 
     fn admit(&self) -> Result<(), Refusal> {
-        match self.door.load(Ordering::Acquire) {
-            OPEN if self.refuses && self.is_behind() => Err(Refusal::Behind),
-            OPEN => Ok(()),
+        match self.usability.load(Ordering::Acquire) {
+            USABLE if self.refuses_when_behind && self.is_behind() => Err(Refusal::Behind),
+            USABLE => Ok(()),
             LOADING => Err(Refusal::Behind),
             _ => Err(Refusal::Differs),
         }
@@ -127,22 +136,22 @@ impl Shared {
     pub(super) fn new(settings: &Settings) -> Shared {
         Shared {
             clock: Clock::default(),
-            refuses: settings.when_behind == WhenBehind::Refuse,
+            refuses_when_behind: settings.when_behind == WhenBehind::Refuse,
             max_lag: settings.max_lag,
             write_timeout: settings.write_timeout,
             capacity: settings.queue,
-            door: AtomicU8::new(OPEN),
+            usability: AtomicU8::new(USABLE),
             contact: AtomicU64::new(0),
-            longest: AtomicUsize::new(usize::MAX),
+            max_step_bytes: AtomicUsize::new(usize::MAX),
             stopping: AtomicBool::new(false),
             queue: Mutex::default(),
             arrived: Notify::new(),
             counters: Counters::default(),
             progress: Mutex::default(),
             changed: Condvar::new(),
-            asking: Mutex::default(),
-            keeping: Mutex::default(),
-            given: Condvar::new(),
+            requesting: Mutex::default(),
+            exchange: Mutex::default(),
+            answered: Condvar::new(),
         }
     }
 
@@ -175,8 +184,8 @@ impl Shared {
     }
 
     /// Takes steps from now on.
-    pub(super) fn open(&self, longest: usize) {
-        self.longest.store(longest, Ordering::Relaxed);
+    pub(super) fn open(&self, max_step_bytes: usize) {
+        self.max_step_bytes.store(max_step_bytes, Ordering::Relaxed);
         lock(&self.queue).open = !self.is_stopping();
     }
 
@@ -216,6 +225,7 @@ impl Shared {
         let (mut count, mut len) = (0, 0);
         for waiting in &queue.steps {
             len += waiting.bytes.len() + 4;
+            // The first always: a step longer than `room` is sent alone.
             if count > 0 && len > room {
                 break;
             }
@@ -226,11 +236,11 @@ impl Shared {
         taken
     }
 
-    /// While contents are replaced, nobody reads.
-    pub(super) fn loading(&self, is: bool) {
-        let (from, to) = if is { (OPEN, LOADING) } else { (LOADING, OPEN) };
-        // If the contents differ, they stay unfit.
-        let _ = self.door.compare_exchange(from, to, Ordering::AcqRel, Ordering::Acquire);
+    /// While contents are replaced, reads are refused.
+    pub(super) fn set_loading(&self, is_loading: bool) {
+        let (from, to) = if is_loading { (USABLE, LOADING) } else { (LOADING, USABLE) };
+        // If the contents differ, they stay unusable until a comparison shows that they are right.
+        let _ = self.usability.compare_exchange(from, to, Ordering::AcqRel, Ordering::Acquire);
     }
 
     pub(super) fn stop(&self) {
@@ -245,7 +255,7 @@ impl Shared {
 
     /// The log can't go on. If it has served, its contents are not to be used any more.
     pub(super) fn fail(&self, error: LogError) {
-        self.door.store(DIFFERS, Ordering::Release);
+        self.usability.store(DIFFERS, Ordering::Release);
         self.event(Event::new(
             "log_failed",
             &[("kind", error.kind()), ("reason", &error.to_string())],
@@ -253,9 +263,9 @@ impl Shared {
         self.update(|view| view.phase = Phase::Failed(error));
     }
 
-    /// The contents are wrong. They are replaced, and nobody uses them before they are right.
+    /// The contents are wrong. They are replaced, and reads are refused until they are right.
     pub(super) fn drop_contents(&self, error: LogError) {
-        self.door.store(DIFFERS, Ordering::Release);
+        self.usability.store(DIFFERS, Ordering::Release);
         self.event(Event::new("log_contents_dropped", &[("reason", &error.to_string())]));
         self.update(|view| {
             (view.server, view.digest) = (None, None);
@@ -265,38 +275,54 @@ impl Shared {
 
     /// The contents in place of the wrong ones are right.
     pub(super) fn restored(&self) {
-        self.door.store(OPEN, Ordering::Release);
+        self.usability.store(USABLE, Ordering::Release);
         self.update(|view| {
             view.phase = Phase::Running;
             view.last_error = None;
         });
     }
 
-    /// Asks the thread of the log for what a file keeps, and waits for it, at most for this time.
-    pub(super) fn kept(&self, timeout: Duration) -> Option<Kept> {
-        let _alone = lock(&self.asking);
-        let mut keeping = lock(&self.keeping);
-        if keeping.has_ended {
-            return keeping.given.clone();
+    /// Requests a checkpoint from the thread of the log, and waits for it, at most for this time.
+    pub(super) fn checkpoint(&self, timeout: Duration) -> Option<Checkpoint> {
+        let _alone = lock(&self.requesting);
+        let mut exchange = lock(&self.exchange);
+        if !matches!(*exchange, Exchange::Ended(_)) {
+            *exchange = Exchange::Requested;
         }
-        keeping.is_asked = true;
-        let waited = self.given.wait_timeout_while(keeping, timeout, |keeping| keeping.is_asked);
-        let mut keeping = waited.unwrap_or_else(PoisonError::into_inner).0;
-        if keeping.has_ended { keeping.given.clone() } else { keeping.given.take() }
+        let is_open = |exchange: &mut Exchange| matches!(exchange, Exchange::Requested);
+        let waited = self.answered.wait_timeout_while(exchange, timeout, is_open);
+        let mut exchange = waited.unwrap_or_else(PoisonError::into_inner).0;
+        if let Exchange::Ended(last) = &*exchange {
+            return last.clone();
+        }
+        match std::mem::take(&mut *exchange) {
+            Exchange::Given(checkpoint) => checkpoint,
+            // The thread took too long. Its answer would be ignored.
+            _ => None,
+        }
     }
 
-    pub(super) fn is_kept_asked(&self) -> bool {
-        lock(&self.keeping).is_asked
+    pub(super) fn is_checkpoint_requested(&self) -> bool {
+        matches!(*lock(&self.exchange), Exchange::Requested)
     }
 
-    pub(super) fn give_kept(&self, given: Option<Kept>, has_ended: bool) {
-        *lock(&self.keeping) = Keeping { is_asked: false, given, has_ended };
-        self.given.notify_all();
+    pub(super) fn give_checkpoint(&self, checkpoint: Option<Checkpoint>) {
+        self.answer(Exchange::Given(checkpoint));
+    }
+
+    /// The thread of the log ends.
+    pub(super) fn give_last_checkpoint(&self, checkpoint: Option<Checkpoint>) {
+        self.answer(Exchange::Ended(checkpoint));
+    }
+
+    fn answer(&self, answer: Exchange) {
+        *lock(&self.exchange) = answer;
+        self.answered.notify_all();
     }
 
     pub(super) fn event(&self, event: Event) {
         let mut progress = lock(&self.progress);
-        if progress.events.len() == EVENTS {
+        if progress.events.len() == MAX_EVENTS {
             progress.events.pop_front();
         }
         progress.events.push_back(event);
@@ -309,9 +335,13 @@ impl Shared {
         self.changed.notify_all();
     }
 
-    /// Changes what is known of a node. Nobody waits for that.
-    pub(super) fn update_node(&self, node: String, change: impl FnOnce(&mut NodeView)) {
-        change(lock(&self.progress).view.nodes.entry(node).or_default());
+    /// Changes what is known of a node. No call waits for that, so none is woken.
+    pub(super) fn update_node(&self, node: &str, change: impl FnOnce(&mut NodeView)) {
+        let nodes = &mut lock(&self.progress).view.nodes;
+        match nodes.get_mut(node) {
+            Some(known) => change(known),
+            None => change(nodes.entry(node.to_owned()).or_default()),
+        }
     }
 
     pub(super) fn view(&self) -> View {

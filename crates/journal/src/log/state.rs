@@ -15,6 +15,7 @@ use super::error::LogError;
 use super::message::{self, MAX_NODES, Message, MessageError, Origin, VERSION};
 use super::settings::is_word;
 
+/// An encoded state begins with it.
 const MARK: [u8; 3] = *b"HFS";
 
 #[derive(Debug)]
@@ -45,7 +46,7 @@ impl fmt::Display for Place {
     }
 }
 
-/// What became of a message.
+/// What a message has done.
 #[derive(Debug)]
 pub(super) enum Applied {
     Fresh {
@@ -76,16 +77,16 @@ impl State {
     }
 
     /// The last counter that was applied of this start of a node.
-    pub(super) fn last_counter(&self, origin: &Origin) -> u64 {
-        let last = self.origins.get(&origin.node);
-        last.filter(|(start, _)| *start == origin.start).map_or(0, |(_, counter)| *counter)
+    pub(super) fn last_counter(&self, node: &str, start: u64) -> u64 {
+        let last = self.origins.get(node);
+        last.filter(|(applied, _)| *applied == start).map_or(0, |(_, counter)| *counter)
     }
 
-    /// Applies the next message. `age` tells how old the values of a device are in it, at most; `None` if
-    /// that is not known.
+    /// Applies the next message. `age` is how old the values of a device are in it, at most; `None` if that
+    /// is not known.
     ///
     /// # Errors
-    /// [`LogError::Version`]: nobody knows what the message does.
+    /// [`LogError::Version`]: this node can't know what the message does.
     pub(super) fn apply(
         &mut self,
         place: Place,
@@ -99,16 +100,19 @@ impl State {
                 let what = "a message of the log";
                 return Err(LogError::Version { what, found, supported: VERSION });
             }
+            // It has a place in the order all the same: all nodes ignore it there.
             Err(error) => {
                 self.place = place;
                 return Ok(Applied::Ignored(error));
             }
         };
         self.place = place;
+        // A message that was sent again, or one that a later start of its node has overtaken.
         let now = (origin.start, origin.counter);
         if self.origins.get(&origin.node).is_some_and(|last| *last >= now) {
             return Ok(Applied::Stale(origin));
         }
+        // The state of the log would grow for ever. All nodes have the same origins, so all ignore it.
         if self.origins.len() == MAX_NODES && !self.origins.contains_key(&origin.node) {
             return Ok(Applied::Ignored(MessageError::TooManyNodes));
         }

@@ -49,7 +49,7 @@ pub enum Phase {
     Stopped,
 }
 
-/// The part of the state that changes seldom.
+/// What the status shows, without the counters.
 #[derive(Debug, Clone, Default)]
 pub(super) struct View {
     pub(super) phase: Phase,
@@ -65,7 +65,7 @@ pub(super) struct View {
 pub struct Digest {
     pub sequence: u64,
     pub digest: String,
-    /// Whether another node has the same digest, or another one; `None` if no node has told one.
+    /// Whether another node has the same digest, or another one; `None` if no node has published one.
     pub agrees: Option<bool>,
 }
 

@@ -25,22 +25,24 @@ use super::settings::Settings;
 use super::state::{Place, State, digest_of};
 
 /// Within this time, the servers themselves notice a message that was sent twice.
-const DUPLICATES: Duration = Duration::from_secs(120);
+const DUPLICATE_WINDOW: Duration = Duration::from_secs(120);
 
-/// After this time without a pull, the server forgets a consumer.
-const FORGOTTEN: Duration = Duration::from_secs(30);
+/// After this time without a pull, the server deletes a consumer.
+const CONSUMER_TTL: Duration = Duration::from_secs(30);
 
-/// How long the lease of whoever takes a snapshot lasts.
-const LEASE: Duration = Duration::from_secs(30);
+/// How long the lease of the node that takes a snapshot lasts.
+const LEASE_TTL: Duration = Duration::from_secs(30);
 
-/// How long a part of a snapshot may take.
-const SILENCE: Duration = Duration::from_secs(10);
+/// How long one part of a snapshot may take to arrive.
+const SNAPSHOT_READ_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// No snapshot is longer than this.
-const MAX_SNAPSHOT: u64 = 1 << 30;
+const MAX_SNAPSHOT_BYTES: u64 = 1 << 30;
 
-pub(super) const POINTER: &str = "snapshot";
-pub(super) const DIGEST: &str = "digest.";
+/// The key that names the snapshots.
+pub(super) const SNAPSHOT_KEY: &str = "snapshot";
+/// The name of a node follows.
+pub(super) const DIGEST_KEY_PREFIX: &str = "digest.";
 
 const META_VERSION: &str = "holdfast-version";
 const META_LAYOUT: &str = "holdfast-layout";
@@ -70,6 +72,20 @@ pub(super) struct Snapshot {
     pub(super) object: String,
     pub(super) digest: String,
     pub(super) node: String,
+}
+
+impl Snapshot {
+    /// A snapshot of this state, which is not stored yet.
+    pub(super) fn of(state: &State, digest: String, node: &str) -> Snapshot {
+        Snapshot {
+            sequence: state.place.sequence,
+            stored: state.place.stored,
+            steps: state.steps,
+            object: format!("{:016x}", unique() as u64),
+            digest,
+            node: node.to_owned(),
+        }
+    }
 }
 
 pub(super) fn subject(log: &str) -> String {
@@ -102,6 +118,7 @@ impl Store {
                 }
                 match context.create_stream(config(settings, fingerprint)).await {
                     Ok(stream) => stream,
+                    // Another node was first: its fingerprint is checked below.
                     Err(error) if is_taken(&error.kind()) => {
                         context.get_stream(&name).await.map_err(|error| missing(&error))?
                     }
@@ -113,7 +130,7 @@ impl Store {
         check(stream.cached_info(), fingerprint)?;
         let bucket = |suffix: &str| format!("{name}{suffix}");
         let pointers = keys(context, settings, bucket(""), Duration::ZERO, create).await?;
-        let leases = keys(context, settings, bucket("-leases"), LEASE, create).await?;
+        let leases = keys(context, settings, bucket("-leases"), LEASE_TTL, create).await?;
         let objects = match context.get_object_store(bucket("")).await {
             Ok(objects) => objects,
             Err(error) if !create => return Err(End::lost("the snapshots of the log", error)),
@@ -123,7 +140,7 @@ impl Store {
                     num_replicas: settings.replicas,
                     ..object_store::Config::default()
                 };
-                // Another node may make it at the same time.
+                // Fails if another node makes it at the same time.
                 let _ = context.create_object_store(config).await;
                 context
                     .get_object_store(bucket(""))
@@ -147,8 +164,9 @@ impl Store {
     ) -> Result<pull::Stream, End> {
         let config = pull::Config {
             deliver_policy: DeliverPolicy::ByStartSequence { start_sequence: from },
+            // The node itself remembers what it has applied.
             ack_policy: AckPolicy::None,
-            inactive_threshold: FORGOTTEN,
+            inactive_threshold: CONSUMER_TTL,
             num_replicas: 1,
             memory_storage: true,
             ..pull::Config::default()
@@ -173,7 +191,7 @@ impl Store {
 
     /// Which snapshots there are, and the revision of that knowledge.
     pub(super) async fn pointer(&self) -> Result<Option<(u64, Pointer)>, End> {
-        let which = json!({"last_by_subj": format!("{}{POINTER}", self.keys.prefix)});
+        let which = json!({"last_by_subj": format!("{}{SNAPSHOT_KEY}", self.keys.prefix)});
         match fetch(&self.context, &self.keys.stream_name, which).await? {
             // A deleted key is empty.
             Some(entry) if !entry.payload.is_empty() => {
@@ -189,17 +207,17 @@ impl Store {
         let (stream, lost) = (&self.keys.stream_name, |error: &dyn std::fmt::Display| {
             End::lost("mending the keys", error)
         });
-        let which = json!({"last_by_subj": format!("{}{POINTER}", self.keys.prefix)});
+        let which = json!({"last_by_subj": format!("{}{SNAPSHOT_KEY}", self.keys.prefix)});
         let mut is_mended = false;
         if let Some(entry) = fetch(&self.context, stream, which).await?
             && !entry.is_readable
         {
             let value = serde_json::to_vec(pointer).map_err(|error| lost(&error))?;
-            let updated = self.keys.update(POINTER, value.into(), entry.place.sequence).await;
+            let updated = self.keys.update(SNAPSHOT_KEY, value.into(), entry.place.sequence).await;
             updated.map_err(|error| lost(&error))?;
             is_mended = true;
         }
-        let digests = format!("{}{DIGEST}>", self.keys.prefix);
+        let digests = format!("{}{DIGEST_KEY_PREFIX}>", self.keys.prefix);
         let (mut from, mut seen) = (1, 0);
         loop {
             let which = json!({"seq": from, "next_by_subj": digests});
@@ -227,10 +245,12 @@ impl Store {
             _ => End::lost("reading a snapshot", error),
         };
         let object = self.objects.get(&snapshot.object).await.map_err(missing)?;
-        let mut object = object.take(MAX_SNAPSHOT);
+        // Anyone may store an object of any size.
+        let mut object = object.take(MAX_SNAPSHOT_BYTES);
         let mut bytes = Vec::new();
         loop {
-            let read = tokio::time::timeout(SILENCE, object.read_buf(&mut bytes)).await;
+            let read =
+                tokio::time::timeout(SNAPSHOT_READ_TIMEOUT, object.read_buf(&mut bytes)).await;
             let read = read.map_err(|_| End::Lost("the snapshot does not arrive".to_owned()))?;
             if read.map_err(|error| End::lost("reading a snapshot", error))? == 0 {
                 break;
@@ -247,12 +267,12 @@ impl Store {
 
     /// Whether this node may take a snapshot now.
     pub(super) async fn lease(&self, node: &str) -> bool {
-        self.leases.create(POINTER, Bytes::copy_from_slice(node.as_bytes())).await.is_ok()
+        self.leases.create(SNAPSHOT_KEY, Bytes::copy_from_slice(node.as_bytes())).await.is_ok()
     }
 
     pub(super) async fn release(&self) {
         // Otherwise it expires.
-        let _ = self.leases.delete(POINTER).await;
+        let _ = self.leases.delete(SNAPSHOT_KEY).await;
     }
 
     /// Stores a snapshot and names it the newest, if the newest is still the one of `seen`.
@@ -266,15 +286,16 @@ impl Store {
         let object = ObjectMetadata { name: snapshot.object.clone(), ..ObjectMetadata::default() };
         let mut bytes = encoded;
         self.objects.put(object, &mut bytes).await.map_err(|error| error.to_string())?;
+        // The key is changed only if it is as it was seen: of two nodes, one fails.
         let (revision, previous) =
             seen.map(|(at, of)| (Some(at), Some(of.newest))).unwrap_or_default();
         let name = snapshot.object.clone();
         let pointer = Pointer { newest: snapshot, previous };
         let value = Bytes::from(serde_json::to_vec(&pointer).map_err(|error| error.to_string())?);
         let named = match revision {
-            None => self.keys.create(POINTER, value).await.map_err(|error| error.to_string()),
+            None => self.keys.create(SNAPSHOT_KEY, value).await.map_err(|error| error.to_string()),
             Some(at) => {
-                self.keys.update(POINTER, value, at).await.map_err(|error| error.to_string())
+                self.keys.update(SNAPSHOT_KEY, value, at).await.map_err(|error| error.to_string())
             }
         };
         match named {
@@ -290,6 +311,7 @@ impl Store {
     /// Removes messages and snapshots from before the snapshot before the last.
     pub(super) async fn tidy(&self, pointer: &Pointer) -> Result<(), String> {
         let Some(previous) = &pointer.previous else { return Ok(()) };
+        // The last snapshot may turn out to be damaged: the one before it can still be continued.
         if previous.sequence > 1 {
             let purge = self.stream.purge().sequence(previous.sequence);
             purge.await.map_err(|error| error.to_string())?;
@@ -320,13 +342,14 @@ fn config(settings: &Settings, fingerprint: &str) -> Config {
         subjects: vec![subject(&settings.name)],
         storage: StorageType::File,
         retention: RetentionPolicy::Limits,
-        // Without limits, and if there were any: a full stream refuses, it never forgets.
+        // Without limits. If a server sets one, a full stream refuses messages: it must not drop the oldest,
+        // which nodes have not applied yet.
         max_messages: -1,
         max_bytes: -1,
         max_messages_per_subject: -1,
         discard: DiscardPolicy::New,
         num_replicas: settings.replicas,
-        duplicate_window: DUPLICATES,
+        duplicate_window: DUPLICATE_WINDOW,
         deny_delete: true,
         metadata: metadata.map(|(key, value)| (key.to_owned(), value)).into(),
         ..Config::default()
@@ -386,7 +409,7 @@ async fn keys(
                 num_replicas: settings.replicas,
                 ..kv::Config::default()
             };
-            // Another node may make it at the same time.
+            // Fails if another node makes it at the same time.
             let _ = context.create_key_value(config).await;
             context.get_key_value(&bucket).await.map_err(|error| lost(&error))
         }

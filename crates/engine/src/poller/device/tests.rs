@@ -11,8 +11,8 @@ use tokio::time::timeout;
 use super::*;
 use crate::client::Place;
 use crate::poller::BlockSettings;
-use crate::poller::caught::spawn_watched;
 use crate::poller::health::Health;
+use crate::poller::panic_guard::spawn_guarded;
 use crate::poller::results::Receivers;
 
 #[test]
@@ -170,7 +170,7 @@ fn a_status_block_that_memory_refuses_is_counted_and_is_an_error() {
             let settings =
                 DeviceSettings { status: Some(status), ..settings(endpoint.clone(), &memory, 0) };
             let (device, state, _) = device(settings);
-            device.tell();
+            device.publish_status();
             assert_eq!(state.counters.unstored.get(), 1);
             device.poll(Instant::now()).await;
             assert_eq!((state.health(), state.last_error()), (Health::Error, 0x8006));
@@ -228,14 +228,14 @@ fn a_device_that_panics_writes_nothing_and_is_in_error_until_it_is_replaced() {
         let inbox = Rc::new(Inbox::default());
         let successor = made(settings, &state, &results);
         let running = spawn_local(device.run(Duration::ZERO, Rc::clone(&inbox)));
-        let told = || registers(&blocks)[..4].to_vec();
-        until(|| told() == [0, 2, 0x80, 7]).await;
+        let status = || registers(&blocks)[..4].to_vec();
+        until(|| status() == [0, 2, 0x80, 7]).await;
         assert_eq!((state.health(), state.last_error()), (Health::Error, 0x8007));
         assert_eq!((state.counters.reads.get(), registers(&memory)), (0, vec![0; 80]));
 
         state.set_broken(false);
         inbox.succeed(successor);
-        until(|| state.counters.polls.get() > 2 && told()[..2] == [0, 1]).await;
+        until(|| state.counters.polls.get() > 2 && status()[..2] == [0, 1]).await;
         assert_eq!(registers(&memory)[..8], [1, 2].repeat(4));
         running.abort();
     });
@@ -246,7 +246,7 @@ fn a_task_that_panics_puts_its_device_in_error() {
     with_device(async |_| {
         let state = Arc::<DeviceState>::default();
         state.good();
-        spawn_watched(async { panic!("a fault in a forward") }, Arc::clone(&state));
+        spawn_guarded(async { panic!("a fault in a forward") }, Arc::clone(&state));
         until(|| state.health() == Health::Error).await;
         state.good();
         assert_eq!((state.health(), state.last_error()), (Health::Error, 0x8007));
@@ -254,7 +254,7 @@ fn a_task_that_panics_puts_its_device_in_error() {
 }
 
 /// A place that refuses connections.
-fn nobody() -> Endpoint {
+fn closed_port() -> Endpoint {
     let gone = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let (host, port) = ("127.0.0.1".to_owned(), gone.local_addr().unwrap().port());
     Place::Tcp { host, port, tls: None }.into()
@@ -267,7 +267,7 @@ fn an_exact_pause_ends_when_it_ends_and_not_with_the_next_interval() {
         let most = Duration::from_millis(4);
         let retry = Retry { first: Duration::from_millis(1), most, jitter: false };
         let interval = Duration::from_secs(3600);
-        let settings = DeviceSettings { retry, interval, ..settings(nobody(), &memory, 0) };
+        let settings = DeviceSettings { retry, interval, ..settings(closed_port(), &memory, 0) };
         let (device, state, _) = device(settings);
         let running = spawn_local(device.run(Duration::ZERO, Rc::default()));
         until(|| state.failures() > 3).await;

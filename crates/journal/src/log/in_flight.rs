@@ -1,23 +1,24 @@
-//! Messages of this node that were sent, until they are applied.
+//! Messages of this node that were sent, until they are applied, and the writers who wait for them.
 
 use std::collections::VecDeque;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use bytes::Bytes;
 use holdfast_memory::{Done, Outcome, Refusal};
 
 use super::clock::Moment;
 use super::shared::refuse;
-use super::status::Counters;
+use super::status::{Counter, Counters};
 
-/// The most messages with steps that are on their way. Further steps wait, and travel together.
-const MAX_OPEN: usize = 16;
+/// The most messages with unanswered steps. Further steps wait, and are sent as one batch.
+const MAX_OPEN_MESSAGES: usize = 16;
 
-/// The most messages whose time is over, or that have no steps, that are remembered.
-const REMEMBERED: usize = 4096;
+/// The most messages that are remembered although their steps were answered, or they have none: the time
+/// when they were sent is needed when they are applied.
+const MAX_REMEMBERED_MESSAGES: usize = 4096;
 
 #[derive(Default)]
-pub(super) struct Sent {
+pub(super) struct InFlight {
     messages: VecDeque<Message>,
     /// How many messages have steps that were not answered.
     open: usize,
@@ -29,13 +30,13 @@ struct Message {
     /// Empty if there are no steps, and when they were answered.
     steps: Vec<Done>,
     first_sent: Moment,
-    times: u32,
+    attempts: u32,
     until: Instant,
 }
 
-impl Sent {
+impl InFlight {
     pub(super) fn has_room(&self) -> bool {
-        self.open < MAX_OPEN
+        self.open < MAX_OPEN_MESSAGES
     }
 
     pub(super) fn is_empty(&self) -> bool {
@@ -50,12 +51,20 @@ impl Sent {
         until: Instant,
     ) {
         debug_assert!(self.messages.back().is_none_or(|last| last.counter < counter));
-        if self.messages.len() >= REMEMBERED && self.messages.front().is_some_and(Message::is_told)
+        if self.messages.len() >= MAX_REMEMBERED_MESSAGES
+            && self.messages.front().is_some_and(Message::is_answered)
         {
             self.messages.pop_front();
         }
         self.open += usize::from(!steps.is_empty());
-        self.messages.push_back(Message { counter, payload, steps, first_sent, times: 1, until });
+        self.messages.push_back(Message {
+            counter,
+            payload,
+            steps,
+            first_sent,
+            attempts: 1,
+            until,
+        });
     }
 
     /// When a message was sent first, if it is remembered.
@@ -73,14 +82,14 @@ impl Sent {
     ) -> Option<Moment> {
         while self.messages.front().is_some_and(|first| first.counter < counter) {
             if let Some(message) = self.messages.pop_front() {
-                self.told(&message);
+                self.close(&message);
                 counters.unavailable.add(message.steps.len() as u64);
                 message.steps.into_iter().for_each(|done| refuse(done, Refusal::Unavailable));
             }
         }
         self.messages.front().filter(|first| first.counter == counter)?;
         let message = self.messages.pop_front()?;
-        self.told(&message);
+        self.close(&message);
         let refused = outcomes.iter().filter(|outcome| outcome.is_err()).count() as u64;
         counters.refused.add(refused);
         counters.steps.add(outcomes.len() as u64 - refused);
@@ -90,7 +99,7 @@ impl Sent {
         Some(message.first_sent)
     }
 
-    /// The servers had nobody who takes the message, so nothing has stored it.
+    /// No server was there to store the message.
     pub(super) fn not_taken(&mut self, counter: u64, counters: &Counters) {
         self.answer(counter, Refusal::Unavailable, &counters.unavailable);
     }
@@ -100,21 +109,22 @@ impl Sent {
         self.answer(counter, Refusal::NotConfirmed, &counters.not_confirmed);
     }
 
-    fn answer(&mut self, counter: u64, refusal: Refusal, counted: &super::status::Counter) {
+    fn answer(&mut self, counter: u64, refusal: Refusal, counted: &Counter) {
         let message = self.messages.iter_mut().find(|message| message.counter == counter);
         // A message that was sent twice may have been stored the other time.
-        let Some(message) = message.filter(|message| message.times == 1) else { return };
-        let steps = message.tell();
+        let Some(message) = message.filter(|message| message.attempts == 1) else { return };
+        let steps = message.take_steps();
         self.open -= usize::from(!steps.is_empty());
         counted.add(steps.len() as u64);
         steps.into_iter().for_each(|done| refuse(done, refusal));
     }
 
-    /// Messages up to this counter may have been applied where this node did not see it.
-    pub(super) fn unclear(&mut self, counter: u64, counters: &Counters) {
+    /// Messages up to this counter may have been applied where this node did not see it: a snapshot has
+    /// their results, but not their outcomes.
+    pub(super) fn give_up_until(&mut self, counter: u64, counters: &Counters) {
         while self.messages.front().is_some_and(|first| first.counter <= counter) {
             if let Some(message) = self.messages.pop_front() {
-                self.told(&message);
+                self.close(&message);
                 counters.not_confirmed.add(message.steps.len() as u64);
                 message.steps.into_iter().for_each(|done| refuse(done, Refusal::NotConfirmed));
             }
@@ -127,7 +137,7 @@ impl Sent {
             if message.until > now {
                 break;
             }
-            let steps = message.tell();
+            let steps = message.take_steps();
             self.open -= usize::from(!steps.is_empty());
             counters.not_confirmed.add(steps.len() as u64);
             steps.into_iter().for_each(|done| refuse(done, Refusal::NotConfirmed));
@@ -136,51 +146,50 @@ impl Sent {
 
     /// Messages whose outcome was not reported, to send them again in a new session. The others are
     /// forgotten: they are never sent again.
-    pub(super) fn again(&mut self) -> Vec<(u64, Bytes)> {
-        self.messages.retain(|message| !message.is_told());
+    pub(super) fn take_unanswered(&mut self) -> Vec<(u64, Bytes)> {
+        self.messages.retain(|message| !message.is_answered());
         self.messages
             .iter_mut()
             .map(|message| {
-                message.times += 1;
+                message.attempts += 1;
                 (message.counter, message.payload.clone())
             })
             .collect()
     }
 
-    fn told(&mut self, message: &Message) {
-        self.open -= usize::from(!message.is_told());
+    /// A message is no longer remembered.
+    fn close(&mut self, message: &Message) {
+        self.open -= usize::from(!message.is_answered());
     }
 }
 
 impl Message {
     /// The steps, to be answered now. The message is not sent again.
-    fn tell(&mut self) -> Vec<Done> {
+    fn take_steps(&mut self) -> Vec<Done> {
         self.payload = Bytes::new();
         std::mem::take(&mut self.steps)
     }
 
-    fn is_told(&self) -> bool {
+    fn is_answered(&self) -> bool {
         self.steps.is_empty()
     }
 }
 
-/// How often deadlines are looked at.
-pub(super) const LOOK: Duration = Duration::from_millis(20);
-
 #[cfg(test)]
 mod tests {
     use std::sync::mpsc::{Receiver, channel};
+    use std::time::Duration;
 
     use holdfast_memory::{CarriedOut, Refused};
 
     use super::super::clock::Clock;
     use super::*;
 
-    fn push(sent: &mut Sent, counter: u64, until: Instant) -> Receiver<Outcome> {
+    fn push(in_flight: &mut InFlight, counter: u64, until: Instant) -> Receiver<Outcome> {
         let (sender, receiver) = channel();
         let done: Done = Box::new(move |outcome| sender.send(outcome).unwrap());
         let message = (counter, Bytes::from_static(b"steps"));
-        sent.push(message, vec![done], Clock::default().now(), until);
+        in_flight.push(message, vec![done], Clock::default().now(), until);
         receiver
     }
 
@@ -194,52 +203,52 @@ mod tests {
 
     #[test]
     fn a_message_before_one_that_was_applied_never_will_be() {
-        let (mut sent, counters) = (Sent::default(), Counters::default());
-        let [one, two, three] = [1, 2, 3].map(|counter| push(&mut sent, counter, later()));
+        let (mut in_flight, counters) = (InFlight::default(), Counters::default());
+        let [one, two, three] = [1, 2, 3].map(|counter| push(&mut in_flight, counter, later()));
         let read = CarriedOut { read: vec![7], sequence: Some(3) };
-        assert!(sent.applied(2, vec![Ok(read.clone())], &counters).is_some());
+        assert!(in_flight.applied(2, vec![Ok(read.clone())], &counters).is_some());
         assert_eq!(one.try_recv(), Ok(refused(Refusal::Unavailable)));
         assert_eq!(two.try_recv(), Ok(Ok(read)));
         assert!(three.try_recv().is_err());
         assert_eq!((counters.steps.get(), counters.unavailable.get()), (1, 1));
-        assert!(!sent.is_empty());
+        assert!(!in_flight.is_empty());
     }
 
     #[test]
     fn a_message_that_a_snapshot_may_have_is_unclear() {
-        let (mut sent, counters) = (Sent::default(), Counters::default());
-        let [one, two] = [1, 2].map(|counter| push(&mut sent, counter, later()));
-        sent.unclear(1, &counters);
+        let (mut in_flight, counters) = (InFlight::default(), Counters::default());
+        let [one, two] = [1, 2].map(|counter| push(&mut in_flight, counter, later()));
+        in_flight.give_up_until(1, &counters);
         assert_eq!(one.try_recv(), Ok(refused(Refusal::NotConfirmed)));
         assert!(two.try_recv().is_err());
-        assert_eq!(sent.again().len(), 1);
+        assert_eq!(in_flight.take_unanswered().len(), 1);
     }
 
     #[test]
-    fn what_was_told_is_not_sent_again() {
-        let (mut sent, counters) = (Sent::default(), Counters::default());
+    fn a_message_whose_steps_were_answered_is_not_sent_again() {
+        let (mut in_flight, counters) = (InFlight::default(), Counters::default());
         let [late, open] = [Instant::now(), later()];
-        let (one, two) = (push(&mut sent, 1, late), push(&mut sent, 2, open));
-        sent.expire(Instant::now(), &counters);
+        let (one, two) = (push(&mut in_flight, 1, late), push(&mut in_flight, 2, open));
+        in_flight.expire(Instant::now(), &counters);
         assert_eq!(one.try_recv(), Ok(refused(Refusal::NotConfirmed)));
-        assert_eq!(sent.again(), [(2, Bytes::from_static(b"steps"))]);
+        assert_eq!(in_flight.take_unanswered(), [(2, Bytes::from_static(b"steps"))]);
         assert!(two.try_recv().is_err());
-        assert_eq!(sent.applied(1, vec![Ok(CarriedOut::default())], &counters), None);
+        assert_eq!(in_flight.applied(1, vec![Ok(CarriedOut::default())], &counters), None);
         assert_eq!(counters.not_confirmed.get(), 1);
     }
 
     #[test]
     fn only_a_message_that_was_sent_once_is_known_not_to_be_stored() {
-        let (mut sent, counters) = (Sent::default(), Counters::default());
-        let one = push(&mut sent, 1, later());
-        sent.again();
-        sent.not_taken(1, &counters);
+        let (mut in_flight, counters) = (InFlight::default(), Counters::default());
+        let one = push(&mut in_flight, 1, later());
+        in_flight.take_unanswered();
+        in_flight.not_taken(1, &counters);
         assert!(one.try_recv().is_err(), "the first time, it may have been stored");
-        let two = push(&mut sent, 2, later());
-        sent.not_taken(2, &counters);
+        let two = push(&mut in_flight, 2, later());
+        in_flight.not_taken(2, &counters);
         assert_eq!(two.try_recv(), Ok(refused(Refusal::Unavailable)));
-        let three = push(&mut sent, 3, later());
-        sent.not_stored(3, &counters);
+        let three = push(&mut in_flight, 3, later());
+        in_flight.not_stored(3, &counters);
         assert_eq!(three.try_recv(), Ok(refused(Refusal::NotConfirmed)));
     }
 }

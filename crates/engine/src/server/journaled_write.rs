@@ -5,7 +5,7 @@ use holdfast_memory::{Access, Area, Memory, Operation, Outcome, Write};
 use holdfast_protocol::pdu::{self, ExceptionCode, Request, reply};
 
 use super::memory_operations::{exception_of, writing};
-use crate::link::{Coming, Reply, ReplyTo, coming, exception};
+use crate::link::{PendingReply, Reply, ReplyTo, exception, pending_reply};
 
 /// Gives a write to the journal.
 ///
@@ -14,61 +14,61 @@ use crate::link::{Coming, Reply, ReplyTo, coming, exception};
 ///
 /// # Panics
 /// The memory has no journal, or the request is no write.
-pub(super) fn ask(memory: &Memory, pdu: &[u8]) -> Result<Coming, ExceptionCode> {
+pub(super) fn submit(memory: &Memory, pdu: &[u8]) -> Result<PendingReply, ExceptionCode> {
     let request = Request::parse(pdu)?;
-    let (to, coming) = coming();
-    let answer = Answer { request: pdu.to_vec(), to: Some(to) };
-    let submit = |operation| {
+    let (to, pending) = pending_reply();
+    let answer = PendingAnswer { request: pdu.to_vec(), to: Some(to) };
+    let give = |operation| {
         memory.submit(Access::Client, operation, Box::new(|outcome| answer.send(outcome)))
     };
     let registers = Area::HoldingRegisters;
     match request {
         Request::WriteSingleCoil { address, value } => {
-            submit(Operation::Write(writing(Area::Coils, address, 1, &[u8::from(value)])))
+            give(Operation::Write(writing(Area::Coils, address, 1, &[u8::from(value)])))
         }
         Request::WriteSingleRegister { address, value } => {
-            submit(Operation::Write(writing(registers, address, 1, &value.to_be_bytes())))
+            give(Operation::Write(writing(registers, address, 1, &value.to_be_bytes())))
         }
         Request::WriteMultipleCoils { address, bits } => {
             let write = writing(Area::Coils, address, bits.quantity(), bits.as_bytes());
-            submit(Operation::Write(write))
+            give(Operation::Write(write))
         }
         Request::WriteMultipleRegisters { address, registers: new } => {
-            submit(Operation::Write(writing(registers, address, new.quantity(), new.as_bytes())))
+            give(Operation::Write(writing(registers, address, new.quantity(), new.as_bytes())))
         }
         Request::MaskWriteRegister { address, and_mask, or_mask } => {
-            submit(Operation::Mask { area: registers, address, and_mask, or_mask })
+            give(Operation::Mask { area: registers, address, and_mask, or_mask })
         }
         Request::ReadWriteMultipleRegisters { read, write_address, registers: new } => {
             let write: Write = writing(registers, write_address, new.quantity(), new.as_bytes());
             let (address, count) = (read.address(), read.quantity().into());
-            submit(Operation::WriteThenRead { write, area: registers, address, count })
+            give(Operation::WriteThenRead { write, area: registers, address, count })
         }
         _ => unreachable!("only writes go to a journal"),
     }
     .map_err(exception_of)?;
-    Ok(coming)
+    Ok(pending)
 }
 
 /// Carries out a write, and waits for the journal. Returns the reply, and where a log has the write.
 pub(super) async fn carry_out(memory: &Memory, pdu: &[u8]) -> (Vec<u8>, Option<u64>) {
     let refused = |code: ExceptionCode| (exception(pdu, code.code()), None);
-    match ask(memory, pdu) {
+    match submit(memory, pdu) {
         Err(code) => refused(code),
-        Ok(coming) => match coming.await {
+        Ok(pending) => match pending.await {
             Ok(Reply { pdu, log_sequence }) => (pdu, log_sequence),
             Err(_) => refused(ExceptionCode::ServerDeviceFailure),
         },
     }
 }
 
-/// The answer to a write. If it is dropped, nobody knows what became of the write.
-struct Answer {
+/// The reply to a write. If it is dropped, the outcome of the write is unknown.
+struct PendingAnswer {
     request: Vec<u8>,
     to: Option<ReplyTo>,
 }
 
-impl Answer {
+impl PendingAnswer {
     fn send(mut self, outcome: Outcome) {
         let mut buffer = [0; pdu::MAX_LEN];
         let log_sequence = outcome.as_ref().ok().and_then(|done| done.sequence);
@@ -96,7 +96,7 @@ impl Answer {
     }
 }
 
-impl Drop for Answer {
+impl Drop for PendingAnswer {
     fn drop(&mut self) {
         if let Some(to) = self.to.take() {
             to.send(exception(&self.request, ExceptionCode::ServerDeviceFailure.code()));

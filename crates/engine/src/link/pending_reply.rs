@@ -1,4 +1,4 @@
-//! A reply that comes later, and whether somebody waits for it.
+//! A reply that comes later, and whether its client still waits for it.
 
 use std::future::Future;
 use std::pin::Pin;
@@ -10,13 +10,13 @@ use tokio::sync::oneshot;
 use tokio::sync::oneshot::error::RecvError;
 
 /// A request and its reply.
-pub(crate) fn coming() -> (ReplyTo, Coming) {
+pub(crate) fn pending_reply() -> (ReplyTo, PendingReply) {
     let (to, from) = oneshot::channel();
     let unwanted = Arc::new(AtomicBool::new(false));
-    (ReplyTo { to, unwanted: Arc::clone(&unwanted) }, Coming { from, unwanted })
+    (ReplyTo { to, unwanted: Arc::clone(&unwanted) }, PendingReply { from, unwanted })
 }
 
-/// What a request was answered with.
+/// The reply to a request.
 #[derive(Debug, Default)]
 pub(crate) struct Reply {
     /// Empty after a broadcast.
@@ -33,7 +33,7 @@ pub(crate) struct ReplyTo {
 
 /// A reply that comes later. An error means that the request was not sent, or that its link has ended.
 #[derive(Debug)]
-pub(crate) struct Coming {
+pub(crate) struct PendingReply {
     from: oneshot::Receiver<Reply>,
     unwanted: Arc<AtomicBool>,
 }
@@ -45,7 +45,7 @@ impl ReplyTo {
 
     /// Sends the reply to a write, which a log may have.
     pub(crate) fn send_written(self, pdu: Vec<u8>, log_sequence: Option<u64>) {
-        // The client may have gone.
+        // Fails if the client has disconnected.
         let _ = self.to.send(Reply { pdu, log_sequence });
     }
 
@@ -55,9 +55,9 @@ impl ReplyTo {
     }
 }
 
-impl Coming {
-    /// The client has gone: a request that waits for its turn is not sent. The reply to one that was
-    /// sent still comes.
+impl PendingReply {
+    /// The client has disconnected: a request that waits for its turn is not sent. The reply to one that
+    /// was sent still comes, because the audit log records it.
     pub(crate) fn give_up(&self) {
         self.unwanted.store(true, Ordering::Relaxed);
     }
@@ -68,7 +68,7 @@ impl Coming {
     }
 }
 
-impl Future for Coming {
+impl Future for PendingReply {
     type Output = Result<Reply, RecvError>;
 
     fn poll(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Self::Output> {

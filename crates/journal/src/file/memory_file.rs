@@ -13,7 +13,7 @@ use holdfast_memory::{Contents, GateMode, Memory};
 
 use super::disk::Disk;
 use super::error::FileError;
-use super::image::{Changes, Image, Kept, SET_ASIDE, layout_of};
+use super::image::{Changes, Image, SET_ASIDE, StoredMemory, layout_of};
 use super::periodic::{Periodic, Source, writes};
 use super::queue::{Queue, QueueLimits};
 use super::status::Status;
@@ -57,7 +57,7 @@ pub struct MemoryFile {
     queue: Arc<Queue>,
     status: Arc<Mutex<Status>>,
     /// How many writes to the memories are in the file, with a `sync` above 0.
-    stored: Arc<AtomicU64>,
+    stored_writes: Arc<AtomicU64>,
     /// The process that opened the file. A forked child must not touch it.
     process: u32,
     state: Mutex<State>,
@@ -94,6 +94,7 @@ impl MemoryFile {
         mut members: Vec<Member>,
         options: Options,
     ) -> Result<MemoryFile, FileError> {
+        // A memory has one journal, and that is the log.
         if options.sync.is_zero() {
             return Err(FileError::Memories("sync is 0, but the log confirms writes".to_owned()));
         }
@@ -113,20 +114,21 @@ impl MemoryFile {
         let note = if is_of_log { note_of(store.image(), &members)? } else { None };
         let (mut loaded, mut warnings) = (Vec::new(), Vec::new());
         for Member { name, memory } in &members {
-            let Some(kept) = store.image().named(name) else { continue };
+            let Some(stored) = store.image().named(name) else { continue };
             if is_of_log {
-                let areas = kept.areas.clone();
+                let areas = stored.areas.clone();
                 memory.restore(&Contents { areas, sealed: memory.sealed() });
             } else {
                 let set_aside = store.image().set_aside_of(name);
-                warnings.extend(kept.resizings(set_aside, layout_of(memory)));
-                memory.restore(&sealed_again(&kept.with(set_aside), memory));
+                warnings.extend(stored.resizings(set_aside, layout_of(memory)));
+                memory.restore(&sealed_again(&stored.with(set_aside), memory));
             }
             loaded.push(name.clone());
         }
-        for kept in store.image().memories() {
-            let name = &kept.name;
-            if kept.set_aside_of().is_none() && members.iter().all(|member| member.name != *name) {
+        for stored in store.image().memories() {
+            let name = &stored.name;
+            if stored.set_aside_of().is_none() && members.iter().all(|member| member.name != *name)
+            {
                 warnings
                     .push(format!("{name}: is in the file but not configured, and stays there"));
             }
@@ -140,7 +142,7 @@ impl MemoryFile {
             }
         }
         let state = Mutex::new(State::Loaded(Box::new(store)));
-        let (process, stored) = (process::id(), Arc::default());
+        let (process, stored_writes) = (process::id(), Arc::default());
         Ok(MemoryFile {
             members,
             options,
@@ -149,7 +151,7 @@ impl MemoryFile {
             note,
             queue,
             status,
-            stored,
+            stored_writes,
             process,
             state,
         })
@@ -191,8 +193,9 @@ impl MemoryFile {
         let State::Loaded(store) = &mut *state else { return Ok(()) };
         let memories: Vec<_> = self.members.iter().map(|m| Arc::clone(&m.memory)).collect();
         let mut ids = Vec::new();
+        // No step may come between the contents that are stored and the first that waits.
         self.queue.begin(|| {
-            self.stored.store(writes(&memories), Ordering::Relaxed);
+            self.stored_writes.store(writes(&memories), Ordering::Relaxed);
             let (contents, note) = match &log {
                 None => (Memory::contents(&memories), None),
                 Some(log) => {
@@ -215,8 +218,9 @@ impl MemoryFile {
                 let steps = Steps::new(*store, memories, ids, queue, retry);
                 Box::new(|| steps.run())
             } else {
-                let (sync, stored) = (self.options.sync, Arc::clone(&self.stored));
-                let periodic = Periodic { store: *store, memories, ids, queue, sync, stored, log };
+                let (sync, stored_writes) = (self.options.sync, Arc::clone(&self.stored_writes));
+                let periodic =
+                    Periodic { store: *store, memories, ids, queue, sync, stored_writes, log };
                 Box::new(|| periodic.run())
             };
         let (queue, status) = (Arc::clone(&self.queue), Arc::clone(&self.status));
@@ -257,7 +261,7 @@ impl MemoryFile {
             self.queue.waiting() as u64
         } else {
             let written: u64 = self.members.iter().map(|member| member.memory.writes()).sum();
-            written.saturating_sub(self.stored.load(Ordering::Relaxed))
+            written.saturating_sub(self.stored_writes.load(Ordering::Relaxed))
         };
         Status { pending, ..lock(&self.status).clone() }
     }
@@ -274,7 +278,7 @@ impl Drop for MemoryFile {
             let state = self.state.get_mut().unwrap_or_else(PoisonError::into_inner);
             return mem::forget(mem::replace(state, State::Stopped));
         }
-        // Whoever wants to know whether the last contents are stored calls it before.
+        // A caller that needs the result calls it before.
         let _ = self.stop();
     }
 }
@@ -303,10 +307,10 @@ fn check(members: &[Member]) -> Result<(), FileError> {
     Ok(())
 }
 
-/// The contents of a memory from the file. Nobody knows how old they are: a memory with a gate that
+/// The contents of a memory from the file. Their age is unknown: a memory with a gate that
 /// opens once is sealed again, and its gate bit is 0, because the next write would open it otherwise.
-fn sealed_again(kept: &Kept, memory: &Memory) -> Contents {
-    let mut areas = kept.resized(layout_of(memory));
+fn sealed_again(stored: &StoredMemory, memory: &Memory) -> Contents {
+    let mut areas = stored.resized(layout_of(memory));
     let Some(gate) = memory.gate() else { return Contents { areas, sealed: false } };
     let bit = usize::from(gate.address - memory.span(gate.area).start());
     let (byte, mask) = (&mut areas[gate.area as usize][bit / 8], 1 << (bit % 8));
@@ -323,7 +327,7 @@ fn sealed_again(kept: &Kept, memory: &Memory) -> Contents {
 /// The note of the log, if the file has the contents of its memories; `None` if it has none yet.
 fn note_of(image: &Image, members: &[Member]) -> Result<Option<Vec<u8>>, FileError> {
     let all = || members.iter().map(|member| (member, image.named(&member.name)));
-    if image.note().is_none() && all().all(|(_, kept)| kept.is_none()) {
+    if image.note().is_none() && all().all(|(_, stored)| stored.is_none()) {
         return Ok(None);
     }
     let advice = "move the file away to start with the contents of the log";
@@ -331,8 +335,8 @@ fn note_of(image: &Image, members: &[Member]) -> Result<Option<Vec<u8>>, FileErr
         let text = format!("the file has contents that are not of a log: {advice}");
         return Err(FileError::OfLog(text));
     };
-    for (Member { name, memory }, kept) in all() {
-        if kept.is_none_or(|kept| kept.layout != layout_of(memory)) {
+    for (Member { name, memory }, stored) in all() {
+        if stored.is_none_or(|stored| stored.layout != layout_of(memory)) {
             let text = format!("the file has other areas of memory {name}: {advice}");
             return Err(FileError::OfLog(text));
         }
@@ -349,28 +353,29 @@ fn first_changes(
     let (mut changes, mut ids) = (Changes::default(), Vec::new());
     let mut free = image.free_ids();
     for (Member { name, memory }, contents) in members.iter().zip(contents) {
-        let (kept, layout) = (image.named(name), layout_of(memory));
-        let mut id_of = |kept: Option<&Kept>| {
-            kept.map(|kept| kept.id).or_else(|| free.next()).ok_or_else(|| {
+        let (stored, layout) = (image.named(name), layout_of(memory));
+        let mut id_of = |stored: Option<&StoredMemory>| {
+            stored.map(|stored| stored.id).or_else(|| free.next()).ok_or_else(|| {
                 let text = format!("no place for memory {name}: the file has 65536 memories");
                 FileError::Memories(text)
             })
         };
-        let id = id_of(kept)?;
+        let id = id_of(stored)?;
         ids.push(id);
-        if kept.is_some_and(|kept| kept.layout == layout) {
+        // The same layout: only pages that differ are stored.
+        if stored.is_some_and(|stored| stored.layout == layout) {
             changes.pages.extend(image.differing(id, &contents));
             continue;
         }
-        if let Some(kept) = kept {
+        if let Some(stored) = stored {
             let set_aside = image.set_aside_of(name);
-            match kept.cut(set_aside, layout, 0) {
-                Some(cut) => changes.memories.push(Kept { id: id_of(set_aside)?, ..cut }),
+            match stored.cut(set_aside, layout, 0) {
+                Some(cut) => changes.memories.push(StoredMemory { id: id_of(set_aside)?, ..cut }),
                 None => changes.removed.extend(set_aside.map(|old| (old.name.clone(), old.id))),
             }
         }
         let areas = contents.areas;
-        changes.memories.push(Kept { name: name.clone(), id, layout, areas });
+        changes.memories.push(StoredMemory { name: name.clone(), id, layout, areas });
     }
     Ok((changes, ids))
 }

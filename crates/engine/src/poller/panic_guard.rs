@@ -16,7 +16,7 @@ pub(super) struct Panicked;
 /// Awaits a future and catches its panic.
 ///
 /// The future is pinned elsewhere: this one would have it twice, as an argument and in a pin.
-pub(super) async fn caught<F: Future>(mut future: Pin<&mut F>) -> Result<F::Output, Panicked> {
+pub(super) async fn catch<F: Future>(mut future: Pin<&mut F>) -> Result<F::Output, Panicked> {
     poll_fn(|context| match catch_unwind(AssertUnwindSafe(|| future.as_mut().poll(context))) {
         Ok(polled) => polled.map(Ok),
         Err(_) => Err(Panicked).into(),
@@ -25,15 +25,15 @@ pub(super) async fn caught<F: Future>(mut future: Pin<&mut F>) -> Result<F::Outp
 }
 
 /// Starts a task of a device. If the task panics, the device is in error until it is replaced.
-pub(super) fn spawn_watched(
+pub(super) fn spawn_guarded(
     task: impl Future<Output = ()> + 'static,
     state: Arc<DeviceState>,
 ) -> AbortHandle {
     let mut task = Box::pin(task);
-    let watched = async move {
-        if caught(task.as_mut()).await.is_err() {
+    let guarded = async move {
+        if catch(task.as_mut()).await.is_err() {
             state.set_broken(true);
         }
     };
-    spawn_local(watched).abort_handle()
+    spawn_local(guarded).abort_handle()
 }
