@@ -88,14 +88,9 @@ def body(commands: int) -> bytes:
 
 def measure(scenario: Scenario, file: Path, holdfast: Server, options: argparse.Namespace) -> None:
     """Measures the appliance and both loops once per round."""
-    post = common.bench(
-        "post",
-        *("--address", holdfast.address),
-        *("--path", "/api/v1/ingest"),
-        *("--token", TOKEN),
-        *("--body", file),
-        *("--connections", scenario.connections),
-    )
+    address, body = holdfast.address, file.read_bytes()
+    request = common.http_request(address, "/api/v1/ingest", token=TOKEN, body=body)
+    post = common.http_load(address, file.with_name("request"), request, scenario.connections)
     for index in range(options.rounds):
         results = {}
         for name in common.turns(["holdfast", "msgspec", "json"], index):
