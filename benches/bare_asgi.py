@@ -1,7 +1,8 @@
 """Runs a bare ASGI application on uvicorn: the peer of REST and the gateway.
 
-It parses the JSON of a request with msgspec into a type of its own, and answers with the JSON of
-its path; the file in the second argument has the answers. The first argument is the event loop.
+It parses the JSON of a request with msgspec into a type of its own. A write is answered with what
+it says, a read with the JSON of its path; the file in the second argument has these answers. The
+first argument is the event loop.
 """
 
 from __future__ import annotations
@@ -44,13 +45,17 @@ ENCODER = msgspec.json.Encoder()
 async def answer(scope: Any, receive: Any, send: Any) -> None:
     """Parses a request, and answers it."""
     path = scope["path"]
+    told = ANSWERS[path]
     if scope["method"] == "POST":
         body, more = b"", True
         while more:
             message = await receive()
             body, more = body + message["body"], message["more_body"]
-        DECODERS[path].decode(body)
-    reply = ENCODER.encode(ANSWERS[path])
+        asked = DECODERS[path].decode(body)
+        if type(asked) is Command:
+            written = len(asked.values)
+            told = {"status": "accepted", "memory": asked.memory, "written": written}
+    reply = ENCODER.encode(told)
     length = b"%d" % len(reply)
     headers = [(b"content-type", b"application/json"), (b"content-length", length)]
     await send({"type": "http.response.start", "status": 200, "headers": headers})
