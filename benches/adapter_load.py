@@ -88,9 +88,7 @@ class Bench:
     def __init__(self, options: argparse.Namespace, stack: ExitStack) -> None:
         self.options = options
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        self.body, self.message = folder / "body.json", folder / "message.json"
-        whole = command(REGISTERS)
-        self.body.write_text(f"[{','.join([whole] * ((MAX_BODY - 1) // (len(whole) + 1)))}]")
+        self.request, self.message = folder / "request", folder / "message.json"
         self.message.write_text(command(100))
         self.broker = stack.enter_context(self._broker(folder))
         self.server = stack.enter_context(
@@ -147,14 +145,10 @@ class Bench:
         return self.server.cpu() - before < QUIET / 10
 
     def _post(self, connections: int) -> list[str]:
-        return common.bench(
-            "post",
-            *("--address", self.rest),
-            *("--path", "/api/v1/ingest"),
-            *("--token", TOKEN),
-            *("--body", self.body),
-            *("--connections", connections),
-        )
+        whole = command(REGISTERS)
+        body = f"[{','.join([whole] * ((MAX_BODY - 1) // (len(whole) + 1)))}]".encode()
+        request = common.http_request(self.rest, "/api/v1/ingest", token=TOKEN, body=body)
+        return common.http_load(self.rest, self.request, request, connections)
 
     def _flood(self) -> contextlib.AbstractContextManager[object]:
         flood = common.bench(

@@ -38,9 +38,28 @@ def bench(*command: object) -> list[str]:
     return [str(TARGET / "holdfast-benches"), *map(str, command)]
 
 
-def python(script: str, *arguments: object) -> list[str]:
-    """The command line of a script in this folder."""
-    return [sys.executable, str(Path(__file__).parent / script), *map(str, arguments)]
+def python(script: str, *arguments: object, checkout: Path | None = None) -> list[str]:
+    """The command line of a script of `benches`, here or in another checkout with its packages."""
+    interpreter = checkout / ".venv" / "bin" / "python" if checkout else sys.executable
+    return [str(interpreter), str((checkout or ROOT) / "benches" / script), *map(str, arguments)]
+
+
+def http_load(address: str, file: Path, request: bytes, connections: int) -> list[str]:
+    """The command line of a load with an HTTP request, which is written into the file."""
+    file.write_bytes(request)
+    return bench("load", "--address", address, "--http", file, "--connections", connections)
+
+
+def http_request(
+    address: str, path: str, *, token: str | None = None, body: bytes | None = None
+) -> bytes:
+    """The bytes of a request: GET, or POST with a body of JSON."""
+    lines = [f"{'GET' if body is None else 'POST'} {path} HTTP/1.1", f"Host: {address}"]
+    if token is not None:
+        lines.append(f"Authorization: Bearer {token}")
+    if body is not None:
+        lines += ["Content-Type: application/json", f"Content-Length: {len(body)}"]
+    return "\r\n".join([*lines, "\r\n"]).encode() + (body or b"")
 
 
 def pinned(core: int, *, idle: bool = False) -> Callable[[], None]:
@@ -77,15 +96,18 @@ class Server:
         self.address = next(iter(self.addresses.values()))
 
     def _listening(self) -> tuple[str, str]:
-        """Reads a line `listening NAME ADDRESS`; the name is optional."""
+        """Reads until a line `listening NAME ADDRESS`; the name is optional."""
         assert self.process.stdout is not None
-        words = self.process.stdout.readline().split()
-        if words[:1] != ["listening"]:
-            self.process.kill()
-            self.process.wait()
-            self.log.seek(0)
-            raise RuntimeError(f"{self.name} did not start: {self.log.read()[-2000:]}")
-        return " ".join(words[1:-1]), words[-1]
+        for line in iter(self.process.stdout.readline, ""):
+            words = line.split()
+            if words[:1] == ["listening"]:
+                return " ".join(words[1:-1]), words[-1]
+            if line.startswith("  ") and line[2] != " ":  # A line of `holdfast run`.
+                return words[0], words[-1].rpartition("/")[2]
+        self.process.kill()
+        self.process.wait()
+        self.log.seek(0)
+        raise RuntimeError(f"{self.name} did not start: {self.log.read()[-2000:]}")
 
     def cpu(self) -> float:
         """Returns the processor time so far, in seconds."""
@@ -109,12 +131,18 @@ def started(name: str, command: Sequence[str], core: int, listeners: int = 1) ->
 
 
 @contextlib.contextmanager
-def appliance(configuration: str, core: int, listeners: int) -> Iterator[Server]:
-    """Runs an appliance with a configuration in YAML."""
+def appliance(
+    configuration: str,
+    core: int,
+    listeners: int,
+    loop: str = "asyncio",
+    checkout: Path | None = None,
+) -> Iterator[Server]:
+    """Runs `holdfast run` with a configuration in YAML; of another checkout, if one is given."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "holdfast.yaml"
         file.write_text(configuration)
-        command = python("holdfast_appliance.py", file)
+        command = python("holdfast_run.py", loop, file, checkout=checkout)
         with started("holdfast", command, core, listeners) as server:
             yield server
 

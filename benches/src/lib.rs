@@ -9,12 +9,12 @@
 mod bare;
 mod bare_once;
 mod flood;
+mod http;
 mod load;
 mod load_once;
 mod outcome;
 mod polite;
 mod poller;
-mod post;
 mod publish;
 
 use std::time::Duration;
@@ -25,7 +25,7 @@ use lexopt::ValueExt;
 pub type Failure = Box<dyn std::error::Error>;
 
 /// A run fails if the server does not answer within this time.
-const TIMEOUT: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Runs the load or the loop that the first argument names. The other arguments are its options.
 pub fn main() -> Result<(), Failure> {
@@ -37,7 +37,6 @@ pub fn main() -> Result<(), Failure> {
         "load" => load::main(arguments),
         "load-once" => load_once::main(arguments),
         "polite" => polite::main(arguments),
-        "post" => post::main(arguments),
         "publish" => publish::main(arguments),
         other => Err(format!("unknown load or loop {other}").into()),
     }

@@ -76,12 +76,6 @@ impl Outcome {
         self.busy = (cpu_seconds() - self.cpu_before) / self.began.elapsed().as_secs_f64();
     }
 
-    /// Adds the result of another connection in the same period.
-    pub(crate) fn merge(&mut self, other: &Outcome) -> Result<(), Failure> {
-        self.answered += other.answered;
-        Ok(self.latencies.add(&other.latencies)?)
-    }
-
     /// Prints the rate, latencies in microseconds and processor time as JSON.
     pub(crate) fn report(&self) {
         let micros = |nanos: u64| nanos as f64 / 1e3;

@@ -981,6 +981,17 @@ def test_a_client_is_in_use_in_one_event_loop_only(server: holdfast.Server) -> N
         other.run(plc.close())
 
 
+def test_a_client_runs_in_uvloop(server: holdfast.Server) -> None:
+    uvloop = pytest.importorskip("uvloop", reason="there is none for Windows")
+
+    async def main() -> None:
+        async with holdfast.Client(url_of(server), timeout=wire.DEADLINE) as plc:
+            assert await plc.read_holding_registers(0, 1) == [0]
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        runner.run(main())
+
+
 def test_the_event_loop_is_not_held_up_by_other_transports() -> None:
     async def main() -> None:
         with Stream("rtu+tcp", silent) as device:

@@ -407,6 +407,15 @@ def test_a_sender_over_tls_writes(plant: Appliance, party: Party, way: str) -> N
     assert counted(plant)["accepted"] == 2
 
 
+def test_a_sender_over_tls_writes_in_uvloop(plant: Appliance, party: Party) -> None:
+    uvloop = pytest.importorskip("uvloop", reason="there is none for Windows")
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        for packet in (PACKET, LONG):
+            to = address(plant)
+            runner.run(raw_ingest.send_packet(*to, packet, tls=party.tls(party.line)))
+    assert counted(plant)["accepted"] == 2
+
+
 @ways
 def test_a_sender_is_told_why_nothing_was_written(plant: Appliance, party: Party, way: str) -> None:
     to = address(plant)

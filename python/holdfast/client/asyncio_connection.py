@@ -14,7 +14,7 @@ import os
 import socket
 from collections import deque
 from math import inf
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from holdfast._core import Attempt, Connection
 from holdfast.client.connecting import addresses, connected
@@ -309,8 +309,7 @@ class _Protocol(asyncio.Protocol):
         self._settle(self.core.close())
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
+        self._transport = cast("asyncio.Transport", transport)  # Those of uvloop have no such base.
         self._settle([])
 
     def data_received(self, data: bytes) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import selectors
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from holdfast.client.connecting import left
 from holdfast.raw_ingest.outcome import TlsLost
@@ -49,8 +49,8 @@ class _Exchange(asyncio.Protocol):
         self.reply: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
+        # Those of uvloop have no such base.
+        self._transport = transport = cast("asyncio.Transport", transport)
         # Sending is paused whenever something is not sent.
         transport.set_write_buffer_limits(high=0)
         self._send()
