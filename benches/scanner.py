@@ -22,9 +22,9 @@ from nats.aio.client import Client
 
 from holdfast.scanner import wire
 from holdfast.scanner.embedded import Embedded
-from holdfast.scanner.groups import Group
-from holdfast.scanner.publishing import Publisher
-from holdfast.scanner.tags import Tag
+from holdfast.scanner.publish.publisher import Publisher
+from holdfast.scanner.subscriptions.groups import Group
+from holdfast.scanner.subscriptions.tag import Tag
 
 TAGS = 100
 TICKS = os.sysconf("SC_CLK_TCK")

@@ -14,7 +14,7 @@ import pytest
 from holdfast.appliance import control
 from holdfast.scanner import Servers
 from holdfast.scanner.broker import connected_once
-from holdfast.scanner.fleet.looking import FleetUnavailable, Looker
+from holdfast.scanner.fleet.observer import FleetUnavailable, Looker
 from support import wire
 from support.brokers import NatsServer, free_port
 from support.cli import failure

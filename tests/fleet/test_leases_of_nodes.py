@@ -12,7 +12,7 @@ import pytest
 
 from holdfast.leases import LEASE_TIMES, LeaseTimes
 from holdfast.scanner import FleetSettings
-from holdfast.scanner.fleet import part as parts
+from holdfast.scanner.fleet import member as parts
 from support import wire
 from support.fleet_nodes import FLEET, prepare
 from support.judges import Judges
@@ -22,7 +22,7 @@ from support.nats_bus import Caller, logged
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from holdfast.scanner.fleet.part import FleetPart
+    from holdfast.scanner.fleet.member import FleetPart
     from support.brokers import NatsServer
     from support.judges import Judge
     from support.nats_bus import Run, Running

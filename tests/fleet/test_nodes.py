@@ -16,7 +16,7 @@ from nats.errors import TimeoutError as NoAnswer
 from holdfast.config.scanning import parse_pollable
 from holdfast.leases import LEASE_TIMES, LeaseTimes
 from holdfast.scanner import FleetRefused, FleetSettings, Scanner, Servers, Settings, service
-from holdfast.scanner.keeping import Unit
+from holdfast.scanner.jetstream.store import Unit
 from support import wire
 from support.cli import invoke
 from support.fleet_nodes import FLEET, prepare
@@ -27,7 +27,7 @@ from support.nats_bus import Caller
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from holdfast.scanner.expiring import Expiring
+    from holdfast.scanner.subscriptions.ttl import Expiring
     from support.brokers import NatsServer
     from support.judges import Judge
     from support.nats_bus import Run, Running

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 
 from holdfast.scanner import wire
-from holdfast.scanner.fleet.terms import Terms
-from holdfast.scanner.outbox import Outbox
+from holdfast.scanner.fleet.agreement import Terms
+from holdfast.scanner.publish.outbox import Outbox
 
 
 def test_a_message_with_the_revision_of_its_lease_has_a_header() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from holdfast.scanner.fleet.placement import partition_of, placed
+from holdfast.scanner.fleet.assignment import partition_of, placed
 
 DEVICES = 100_000
 NODES = 50

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.scanner.expiring import Expiring
-from holdfast.scanner.keeping import BUCKET, Unit
+from holdfast.scanner.jetstream.store import BUCKET, Unit
+from holdfast.scanner.subscriptions.ttl import Expiring
 from support import wire
 from support.nats_bus import Caller, leaving, subscription, tag
 

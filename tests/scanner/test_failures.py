@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.scanner import devices
 from holdfast.scanner.broker import MAX_PAUSE
+from holdfast.scanner.subscriptions import device as devices
 from support import wire
 from support.brokers import NatsServer
 from support.fake_device import HANG_UP, FakeDevice, exception, registers

@@ -11,16 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.client.url import NetworkTarget
-from holdfast.scanner import outbox as outboxes
-from holdfast.scanner.browsing import browsed
-from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wanted
-from holdfast.scanner.groups import Group, grouped
-from holdfast.scanner.health import Health
-from holdfast.scanner.heartbeat import Heart
-from holdfast.scanner.messages import BrowseRequest, HeartbeatMetadata, ServiceReport
-from holdfast.scanner.outbox import Outbox
-from holdfast.scanner.publishing import Publisher
-from holdfast.scanner.tags import Tag
+from holdfast.scanner.jetstream.heartbeat import Heart
+from holdfast.scanner.messages.types import BrowseRequest, HeartbeatMetadata, ServiceReport
+from holdfast.scanner.publish import outbox as outboxes
+from holdfast.scanner.publish.outbox import Outbox
+from holdfast.scanner.publish.publisher import Publisher
+from holdfast.scanner.reports.devices import browsed
+from holdfast.scanner.subscriptions.device import Plan, ScannedDevice, Source, Subscriber, Wanted
+from holdfast.scanner.subscriptions.groups import Group, grouped
+from holdfast.scanner.subscriptions.health import Health
+from holdfast.scanner.subscriptions.tag import Tag
 from holdfast.tags.decoding import Places, decoder
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from nats.aio.msg import Msg
 
 import holdfast
 from holdfast.scanner import service as services
-from holdfast.scanner.registry import understood
+from holdfast.scanner.subscriptions.registry import understood
 from support import wire
 from support.nats_bus import leaving, subscription, tag
 

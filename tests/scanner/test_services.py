@@ -12,7 +12,8 @@ import pytest
 
 import holdfast
 from holdfast import logs
-from holdfast.scanner import Ping, heartbeat, service
+from holdfast.scanner import Ping, service
+from holdfast.scanner.jetstream import heartbeat
 from support import wire
 from support.brokers import NatsServer
 from support.fake_device import FakeDevice, exception, registers

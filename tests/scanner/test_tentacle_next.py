@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.scanner import Defaults, tentacle_next
+from holdfast.scanner import Defaults
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.keeping import BUCKET as KEPT
-from holdfast.scanner.watching import WATCH_TIMES, WatchTimes
+from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
+from holdfast.scanner.jetstream.store import BUCKET as KEPT
+from holdfast.scanner.messages import tentacle_next
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag

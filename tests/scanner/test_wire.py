@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from nats.errors import ProtocolError
 
 from holdfast.scanner import wire
-from holdfast.scanner.messages import Answer
-from holdfast.scanner.outbox import Outbox
+from holdfast.scanner.messages.types import Answer
+from holdfast.scanner.publish.outbox import Outbox
 from holdfast.scanner.receiving import SafeClient
 from support.nats_bus import Caller
 from support.wire import until as wire_until

@@ -19,7 +19,7 @@ from holdfast.cli.tls_options import tls_of, tls_options
 from holdfast.config.scanning import PREFIX
 from holdfast.net import event_loop
 from holdfast.scanner import Servers
-from holdfast.scanner.fleet.looking import FleetUnavailable, Looker
+from holdfast.scanner.fleet.observer import FleetUnavailable, Looker
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -61,10 +61,10 @@ from holdfast.scanner import (
     Settings,
     device_tls,
 )
-from holdfast.scanner.configured import BUCKET
+from holdfast.scanner.allowed_devices import PRIVATE
 from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
-from holdfast.scanner.hosts import PRIVATE
-from holdfast.scanner.schema import json_schema
+from holdfast.scanner.jetstream.entry_subscriptions import BUCKET
+from holdfast.scanner.messages.schema import json_schema
 from holdfast.scanner.write_access import places
 from holdfast.standstill import WallClock
 

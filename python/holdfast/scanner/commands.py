@@ -9,8 +9,8 @@ from holdfast import logs
 from holdfast.client.requests import write_typed
 from holdfast.faults import EXPIRED, STANDBY, fault_text
 from holdfast.scanner.errors import Moved, Refused
-from holdfast.scanner.health import is_unwritten
 from holdfast.scanner.lateness import AGAIN
+from holdfast.scanner.subscriptions.health import is_unwritten
 from holdfast.tags.text import value_from
 from holdfast.tags.writing import from_text
 from holdfast.values import ConversionError, encode
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from holdfast import tags
-    from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.polling import Polling
-    from holdfast.scanner.tags import Tag
+    from holdfast.scanner.subscriptions.device import ScannedDevice
+    from holdfast.scanner.subscriptions.tag import Tag
 
 
 def value(text: str, tag: Tag) -> Any:

@@ -20,7 +20,7 @@ from holdfast.scanner.errors import Refused
 from holdfast.types import PolledBlock
 
 if TYPE_CHECKING:
-    from holdfast.scanner.devices import ScannedDevice
+    from holdfast.scanner.subscriptions.device import ScannedDevice
 
 Poll: TypeAlias = tuple[str, float, list[PolledBlock]]
 """The device's name in the poller, the scheduled time in seconds, and the blocks."""

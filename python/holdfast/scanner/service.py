@@ -30,34 +30,23 @@ import msgspec
 from holdfast import _core, logs, tasks
 from holdfast.config.scanning import written_pollable
 from holdfast.net.tls import NO_FILES, Tls
-from holdfast.scanner import (
-    browsing,
-    commands,
-    device_tls,
-    kept_entries,
-    tentacle,
-    tentacle_next,
-    wire,
-    write_access,
-)
-from holdfast.scanner.adjusting import Adjustments, adjusted
+from holdfast.scanner import commands, device_tls, wire, write_access
+from holdfast.scanner.allowed_devices import Allowed
 from holdfast.scanner.broker import MAX_PAUSE, Broker, Ping, Servers
-from holdfast.scanner.browsing import browsed
-from holdfast.scanner.configured import Configured
-from holdfast.scanner.enabling import Enabling
 from holdfast.scanner.errors import Moved, Refused
-from holdfast.scanner.expiring import Expiring
+from holdfast.scanner.fleet.agreement import PROTOCOL, FleetSettings, Terms
 from holdfast.scanner.fleet.exchange import About, Command, Executed, subject
-from holdfast.scanner.fleet.part import FleetPart
-from holdfast.scanner.fleet.terms import PROTOCOL, FleetSettings, Terms
-from holdfast.scanner.groups import grouped
-from holdfast.scanner.health import Health
-from holdfast.scanner.heartbeat import EVERY, Heart
-from holdfast.scanner.hosts import Allowed
-from holdfast.scanner.kept import Kept
+from holdfast.scanner.fleet.member import FleetPart
+from holdfast.scanner.jetstream import entries as kept_entries
+from holdfast.scanner.jetstream.enabled_key import Enabling
+from holdfast.scanner.jetstream.entry_subscriptions import Configured
+from holdfast.scanner.jetstream.heartbeat import EVERY, Heart
+from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
+from holdfast.scanner.jetstream.restore import Kept
 from holdfast.scanner.lateness import Lateness
-from holdfast.scanner.limits import ScannerLimits
-from holdfast.scanner.messages import (
+from holdfast.scanner.messages import tentacle, tentacle_next
+from holdfast.scanner.messages.leniency import Adjustments, adjusted
+from holdfast.scanner.messages.types import (
     Announcement,
     Answer,
     BrowseRequest,
@@ -72,15 +61,20 @@ from holdfast.scanner.messages import (
     VariablesRequest,
     decode,
 )
-from holdfast.scanner.outbox import Outbox
+from holdfast.scanner.other_scanners import Rivals
 from holdfast.scanner.polling import Polling
-from holdfast.scanner.published_log import PublishedLog
-from holdfast.scanner.publishing import Publisher
-from holdfast.scanner.registry import Registry, understood
-from holdfast.scanner.rivals import Rivals
-from holdfast.scanner.rules import Defaults, Rules
-from holdfast.scanner.variables import of_device, variables
-from holdfast.scanner.watching import WATCH_TIMES, WatchTimes
+from holdfast.scanner.publish.log_mirror import PublishedLog
+from holdfast.scanner.publish.outbox import Outbox
+from holdfast.scanner.publish.publisher import Publisher
+from holdfast.scanner.reports import devices as browsing
+from holdfast.scanner.reports.devices import browsed
+from holdfast.scanner.reports.variables import of_device, variables
+from holdfast.scanner.subscriptions.groups import grouped
+from holdfast.scanner.subscriptions.health import Health
+from holdfast.scanner.subscriptions.limits import ScannerLimits
+from holdfast.scanner.subscriptions.registry import Registry, understood
+from holdfast.scanner.subscriptions.rules import Defaults, Rules
+from holdfast.scanner.subscriptions.ttl import Expiring
 from holdfast.standstill import LONG
 
 if TYPE_CHECKING:
@@ -92,12 +86,12 @@ if TYPE_CHECKING:
     from holdfast.config.scanning import Dialect, Writes
     from holdfast.leases import StartThread
     from holdfast.net.allow_list import AllowEntry
-    from holdfast.scanner.adjusting import Asked
-    from holdfast.scanner.devices import ScannedDevice
-    from holdfast.scanner.fleet.wants import Want
-    from holdfast.scanner.keeping import Unit
-    from holdfast.scanner.messages import BrowseAnswer
-    from holdfast.scanner.registry import Subscription
+    from holdfast.scanner.fleet.desired_state import Want
+    from holdfast.scanner.jetstream.store import Unit
+    from holdfast.scanner.messages.leniency import Asked
+    from holdfast.scanner.messages.types import BrowseAnswer
+    from holdfast.scanner.subscriptions.device import ScannedDevice
+    from holdfast.scanner.subscriptions.registry import Subscription
     from holdfast.tags import TagList
     from holdfast.types import PolledBlock
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast import logs
 from holdfast.leases import Leases, LeaseThread, Relay
-from holdfast.scanner.fleet.placement import partition_of, placed
-from holdfast.scanner.fleet.terms import FleetRefused, FleetSettings, Terms, digest
+from holdfast.scanner.fleet.agreement import FleetRefused, FleetSettings, Terms, digest
+from holdfast.scanner.fleet.assignment import partition_of, placed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -1,0 +1,1 @@
+"""What the scanner keeps in JetStream, and what it reads there."""

@@ -1,0 +1,263 @@
+"""Subscriptions from the entries of a JetStream bucket, as programs of tentacle-next write them.
+
+The key of an entry is `SUBSCRIBER.DEVICE`. Its value is the whole subscription, which ends when the
+entry is deleted. An entry that is refused ends the subscription of its former value, which nobody
+wants any more. It is logged once, shown to callers, and tried again: what refuses it, such as an
+unknown name or another subscriber, may end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from holdfast import logs
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.jetstream.key_watch import Watch
+from holdfast.scanner.jetstream.store import Unit
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Container, Iterable, Mapping
+
+    from nats.aio.client import Client
+
+    from holdfast.scanner.jetstream.key_watch import WatchTimes, Written
+    from holdfast.scanner.subscriptions.registry import Subscription
+
+BUCKET = "scanner_config_"
+"""The name of the bucket, before the prefix of all subjects."""
+
+MAX_ENTRIES = 50_000
+"""Limit of entries; further ones are ignored."""
+
+MAX_HELD = 64 * 1024 * 1024
+"""Limit in bytes of the values of refused entries that are kept to try them again."""
+
+
+@dataclass
+class Entry:
+    """An entry of the bucket."""
+
+    written: tuple[int, bytes] | None = None
+    """The revision and a digest of the value that was carried out or refused last."""
+    unit: Unit | None = None
+    """Its subscription; `None` if it is refused."""
+    refused: RefusedEntry | None = None
+
+
+@dataclass
+class RefusedEntry:
+    """Why an entry is refused, and what it is about, as far as its value can be read."""
+
+    key: str
+    reason: str
+    written: Written | None
+    """`None` if it is not kept to try it again."""
+    device: str | None = None
+    tags: list[str] = field(default_factory=list)
+
+
+class Configured:
+    """Carries out the entries of the bucket."""
+
+    def __init__(
+        self,
+        prefix: str,
+        understand: Callable[[str, bytes], Subscription],
+        subscribe: Callable[[Subscription], Awaitable[None]],
+        end: Callable[[Unit], Awaitable[None]],
+        times: WatchTimes,
+    ) -> None:
+        """`understand` checks the key and value of an entry, `subscribe` carries it out.
+
+        Both raise `Refused`. `end` ends a subscription.
+        """
+        self.bucket = BUCKET + prefix
+        self._understand = understand
+        self._subscribe = subscribe
+        self._end = end
+        self._retry_s = times.retry_s
+        self._watch = Watch(self.bucket, ">", self._changed, times)
+        self._entries: dict[str, Entry] = {}
+        self._keys: dict[Unit, str] = {}
+        self._lock = asyncio.Lock()
+        """Held while entries are carried out."""
+        self._held_bytes = 0
+        self._told_full = False
+
+    def connected(self, client: Client | None) -> None:
+        """Sets the client; `None` while there is no connection."""
+        self._watch.connected(client)
+
+    @property
+    def refused(self) -> list[RefusedEntry]:
+        """The refused entries, by key."""
+        found = (entry.refused for _, entry in sorted(self._entries.items()))
+        return [refused for refused in found if refused is not None]
+
+    def key_of(self, device: str, subscriber: str | None) -> str | None:
+        """Returns the key of the entry that a subscription is from; `None` if it is from none."""
+        return None if subscriber is None else self._keys.get(Unit(device, subscriber))
+
+    async def read(self) -> None:
+        """Waits until the entries are read for the first time, but not for long."""
+        await self._watch.read()
+
+    async def run(self) -> None:
+        """Carries out the entries, until it is cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._watch.run())
+            tasks.create_task(self._try_again())
+
+    async def _changed(self, found: Mapping[str, Written | None], is_all: bool) -> None:
+        """Carries out changed entries; with `is_all`, ends those that are not there any more."""
+        async with self._lock:
+            gone = [key for key in self._entries if key not in found] if is_all else []
+            gone += [key for key, written in found.items() if written is None]
+            for key in gone:
+                await self._forget(key)
+            wanted = []
+            for key, written in found.items():
+                if written is not None and self._is_wanted(key, written):
+                    wanted.append((key, written))
+            await self._carry_out(wanted)
+            if gone or wanted:
+                await self._carry_out(self._held(but={key for key, _ in wanted}))
+
+    def _is_wanted(self, key: str, written: Written) -> bool:
+        """Returns whether an entry is to be carried out; adds it if it is new.
+
+        An entry that is only read again, and not written again, is known.
+        """
+        entry = self._entries.get(key)
+        if entry is None:
+            if len(self._entries) >= MAX_ENTRIES:
+                if not self._told_full:
+                    self._told_full = True
+                    logs.write(logging.WARNING, "too_many_entries", bucket=self.bucket, key=key)
+                return False
+            self._entries[key] = Entry()
+            return True
+        return entry.written != _identity(written)
+
+    async def _forget(self, key: str) -> None:
+        entry = self._entries.pop(key, None)
+        if entry is not None:
+            self._set_refused(entry, None)
+            await self._release(entry)
+
+    async def _release(self, entry: Entry) -> None:
+        """Ends the subscription of an entry."""
+        unit, entry.unit = entry.unit, None
+        if unit is not None:
+            del self._keys[unit]
+            await self._end(unit)
+
+    async def _try_again(self) -> None:
+        while True:
+            await asyncio.sleep(self._retry_s)
+            async with self._lock:
+                await self._carry_out(self._held())
+
+    def _held(self, but: Container[str] = ()) -> list[tuple[str, Written]]:
+        """Returns the refused entries whose values are kept."""
+        refused = (entry.refused for entry in self._entries.values())
+        return [
+            (each.key, each.written)
+            for each in refused
+            if each is not None and each.written is not None and each.key not in but
+        ]
+
+    async def _carry_out(self, wanted: Iterable[tuple[str, Written]]) -> None:
+        """Carries out entries; those that others refuse are tried once more after these."""
+        refused = await self._each(wanted)
+        if any(released for _, _, released in refused):
+            await self._each((key, written) for key, written, _ in refused)
+
+    async def _each(self, wanted: Iterable[tuple[str, Written]]) -> list[tuple[str, Written, bool]]:
+        """Carries out entries concurrently. Returns the refused ones.
+
+        The third value is whether the entry had a subscription, which has ended.
+        """
+        pairs = list(wanted)
+        results = await asyncio.gather(*(self._one(key, written) for key, written in pairs))
+        return [
+            (key, written, released)
+            for (key, written), released in zip(pairs, results, strict=True)
+            if released is not None
+        ]
+
+    async def _one(self, key: str, written: Written) -> bool | None:
+        """Carries out an entry. If it is refused, returns whether it had a subscription."""
+        entry = self._entries[key]
+        had_subscription = entry.unit is not None
+        try:
+            asked = self._understand(key, written.value)
+            unit = Unit(asked.device, asked.subscriber)
+            if entry.unit not in (None, unit):
+                await self._release(entry)
+            entry.unit = unit
+            self._keys[unit] = key
+            await self._subscribe(asked)
+        except Refused as refused:
+            reason = str(refused)
+        except Exception as error:  # An error in one entry must not affect the others.
+            logs.problem("entry_failed", key=key)
+            reason = f"internal error: {type(error).__name__}"
+        else:
+            self._set_refused(entry, None)
+            entry.written = _identity(written)
+            return None
+        await self._refuse(key, written, reason, had_subscription=had_subscription)
+        return had_subscription
+
+    async def _refuse(
+        self, key: str, written: Written, reason: str, *, had_subscription: bool
+    ) -> None:
+        """Refuses an entry. A subscription of its subscriber by request goes on."""
+        entry = self._entries[key]
+        if had_subscription:
+            await self._release(entry)
+        elif entry.unit is not None:  # What was refused has changed nothing.
+            del self._keys[entry.unit]
+            entry.unit = None
+        before = entry.refused
+        self._set_refused(entry, None)
+        kept = written if self._held_bytes + len(written.value) <= MAX_HELD else None
+        self._set_refused(entry, RefusedEntry(key, reason, kept, *_about(written.value)))
+        entry.written = _identity(written)
+        if before is None or before.reason != reason:
+            logs.write(logging.WARNING, "entry_refused", bucket=self.bucket, key=key, reason=reason)
+
+    def _set_refused(self, entry: Entry, refused: RefusedEntry | None) -> None:
+        for each, sign in ((entry.refused, -1), (refused, 1)):
+            if each is not None and each.written is not None:
+                self._held_bytes += sign * len(each.written.value)
+        entry.refused = refused
+
+
+def _identity(written: Written) -> tuple[int, bytes]:
+    """Returns what tells a value from all others of its key, also when the bucket is replaced."""
+    return written.revision, blake2b(written.value, digest_size=16).digest()
+
+
+def _about(value: bytes) -> tuple[str | None, list[str]]:
+    """Returns the device and the tags of a refused value, as far as it can be read."""
+    try:
+        found = msgspec.json.decode(value)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None, []
+    device = _text(found, "deviceId")
+    tags = found.get("tags") if type(found) is dict else None
+    ids = [_text(tag, "id") for tag in tags] if type(tags) is list else []
+    return device, [] if device is None else list(dict.fromkeys(filter(None, ids)))
+
+
+def _text(found: Any, key: str) -> str | None:
+    value = found.get(key) if type(found) is dict else None
+    return value if type(value) is str else None

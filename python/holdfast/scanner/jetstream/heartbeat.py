@@ -1,0 +1,139 @@
+"""A heartbeat in a JetStream bucket, which shows other services that the scanner runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from typing import TYPE_CHECKING
+
+import msgspec
+from nats.errors import NoRespondersError, TimeoutError
+from nats.js.errors import APIError, KeyNotFoundError, NotFoundError, ServiceUnavailableError
+
+from holdfast import logs
+from holdfast.scanner.messages.types import Announcement, Heartbeat
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from nats.aio.client import Client
+    from nats.js.kv import KeyValue
+
+    from holdfast.scanner.messages.types import HeartbeatMetadata
+
+BUCKET = "service_heartbeats"
+EVERY = 10.0
+"""Seconds between heartbeats."""
+
+KEPT = 60.0
+"""Seconds after which a heartbeat expires if it is not renewed."""
+
+JETSTREAM_TIMEOUT = 2.0
+"""Seconds to wait for an answer of JetStream."""
+
+
+class Heart:
+    """Writes heartbeats to one key of the bucket."""
+
+    def __init__(
+        self, key: str, metadata: Callable[[], HeartbeatMetadata], rival: Callable[[int], object]
+    ) -> None:
+        """`rival` is called with the start time of another service that writes the same key."""
+        self._key = key
+        self._metadata = metadata
+        self._rival = rival
+        self.started = _now()
+        """Milliseconds since 1970."""
+        self._revision: int | None = None
+        """The revision of the own last heartbeat."""
+        self._works: bool | None = None
+        self._checked = False
+        self._stopped = False
+
+    async def beat(self, client: Client | None) -> None:
+        """Renews the heartbeat. Logs only the first of consecutive failures."""
+        if client is None:
+            return
+        sign = Heartbeat(
+            service_type="modbus",
+            module_id=self._key,
+            last_seen=_now(),
+            started_at=self.started,
+            metadata=self._metadata(),
+        )
+        try:
+            bucket = await _bucket(client)
+            if not self._works:
+                await self._check(bucket)
+            await self._look(bucket)
+            self._revision = await bucket.put(self._key, msgspec.json.encode(sign))
+        except Exception as error:  # Heartbeats are optional, so no error may stop the scanner.
+            self._told(False, reason_of(error))
+        else:
+            self._told(True, "")
+
+    async def _look(self, bucket: KeyValue) -> None:
+        """Reports another service that has written the key since the own last heartbeat."""
+        if self._revision is None:
+            return
+        try:
+            found = await bucket.get(self._key)
+            if found.revision == self._revision:
+                return
+            other = msgspec.json.decode(found.value or b"", type=Announcement)
+        except (KeyNotFoundError, msgspec.DecodeError):
+            return
+        if other.started_at != self.started:
+            self._rival(other.started_at)
+
+    async def _check(self, bucket: KeyValue) -> None:
+        """Logs once if heartbeats in the bucket never expire."""
+        if self._checked or (await bucket.status()).ttl:
+            return
+        self._checked = True
+        todo = f"delete the bucket, so that it is created again, or set max_age {KEPT:g} s"
+        logs.write(logging.WARNING, "heartbeat_has_no_end", bucket=BUCKET, todo=todo)
+
+    async def stop(self, client: Client | None) -> None:
+        """Deletes the heartbeat. A heartbeat that is still being renewed is not logged any more."""
+        self._stopped = True
+        if client is None or not self._works:
+            return
+        with contextlib.suppress(Exception):
+            async with asyncio.timeout(JETSTREAM_TIMEOUT):
+                await (await _bucket(client)).delete(self._key)
+
+    def _told(self, works: bool, reason: str) -> None:
+        if self._stopped or works is self._works:
+            return
+        if works:
+            logs.write(logging.INFO, "heartbeat", bucket=BUCKET, key=self._key)
+        else:
+            logs.write(logging.WARNING, "no_heartbeat", bucket=BUCKET, key=self._key, reason=reason)
+        self._works = works
+
+
+def reason_of(error: Exception) -> str:
+    """Returns why JetStream failed."""
+    if isinstance(error, APIError) and error.description:
+        return error.description
+    if isinstance(error, ServiceUnavailableError | NoRespondersError):
+        return "JetStream is not enabled on the server or for this account"
+    if isinstance(error, TimeoutError):
+        return f"JetStream did not answer within {JETSTREAM_TIMEOUT:g} s"
+    return str(error) or type(error).__name__
+
+
+async def _bucket(client: Client) -> KeyValue:
+    """Returns the bucket; creates it if it does not exist."""
+    jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT)
+    try:
+        return await jetstream.key_value(BUCKET)
+    except NotFoundError:
+        return await jetstream.create_key_value(bucket=BUCKET, history=1, ttl=KEPT)
+
+
+def _now() -> int:
+    return int(time.time() * 1000)

@@ -1,0 +1,248 @@
+"""Follows the keys of a JetStream bucket: reads all of them, then each change.
+
+It starts again with all keys after each connection, after an error of JetStream, and when it has
+missed a change. A missing bucket is created.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
+from nats.js.errors import NotFoundError
+
+from holdfast import logs, tasks
+from holdfast.scanner.jetstream.heartbeat import JETSTREAM_TIMEOUT, reason_of
+from holdfast.scanner.jetstream.store import FETCHED, FIRST_RETRY, READING, RETRIED
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping
+
+    from nats.aio.client import Client
+    from nats.aio.msg import Msg
+    from nats.js import JetStreamContext
+
+FIRST_READ = 2.0
+"""Seconds that requests wait until the bucket is read. Reading goes on after that."""
+
+MAX_SETTLING = 2.0
+"""Seconds after which changes are reported, even if further ones follow."""
+
+MARKER_HEADERS = ("KV-Operation", "Nats-Marker-Reason")
+"""The headers of messages that stand for deleted or expired keys."""
+
+
+@dataclass(frozen=True)
+class WatchTimes:
+    """When something is done about a bucket, in seconds."""
+
+    quiet_s: float = 5.0
+    """Without a change for so long, it is checked that the server still has the reader."""
+    settle_s: float = 0.2
+    """Without a further change for so long, changes are reported. Programs of tentacle-next delete
+    an entry before they write it again."""
+    retry_s: float = RETRIED
+    """Until what failed or was refused is tried again, at most."""
+
+
+WATCH_TIMES = WatchTimes()
+
+
+class Written(NamedTuple):
+    """A value of a key, and the number of the message that wrote it."""
+
+    value: bytes
+    revision: int
+
+
+class _Missed(Exception):
+    """A change was not received."""
+
+
+class Watch:
+    """Follows the keys of one bucket."""
+
+    def __init__(
+        self,
+        bucket: str,
+        keys: str,
+        changed: Callable[[Mapping[str, Written | None], bool], Awaitable[None]],
+        times: WatchTimes,
+    ) -> None:
+        """`keys` is a key, or `>` for all.
+
+        `changed` gets what changed keys have, `None` for a deleted one, and whether these are
+        all keys of the bucket.
+        """
+        self._bucket = bucket
+        self._stream = f"KV_{bucket}"
+        self._pre = f"$KV.{bucket}."
+        self._keys = keys
+        self._changed = changed
+        self._times = times
+        self._client: Client | None = None
+        self._news = asyncio.Event()
+        self._works: bool | None = None
+        self._failures = 0
+        self.tried = asyncio.Event()
+        """Set after the first attempt to read the bucket."""
+
+    def connected(self, client: Client | None) -> None:
+        """Sets the client; `None` while there is no connection."""
+        self._client = client
+        self._news.set()
+
+    async def read(self) -> None:
+        """Waits until the bucket is read for the first time, but not for long."""
+        if not self.tried.is_set():
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(FIRST_READ):
+                    await self.tried.wait()
+
+    async def run(self) -> None:
+        """Follows the bucket, until it is cancelled."""
+        while True:
+            await self._news.wait()
+            self._news.clear()
+            if self._client is None:
+                continue
+            works = (self._keep_following(self._client), self._news.wait())
+            running = [asyncio.create_task(work) for work in works]
+            try:
+                await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                await tasks.end(running)
+
+    async def _keep_following(self, client: Client) -> None:
+        while not client.is_closed:  # nats-py then replaces a cancellation by an error.
+            pause = FIRST_RETRY
+            try:
+                await self._follow(client)
+            except _Missed:
+                pass
+            except Exception as error:  # JetStream may fail in any way; it is tried again.
+                pause = min(FIRST_RETRY * 2 ** min(self._failures, 10), self._times.retry_s)
+                self._failures += 1
+                if self._client is client:  # Else the connection has ended, and not JetStream.
+                    self._tell(False, reason_of(error))
+                self.tried.set()
+            if not client.is_closed:
+                await asyncio.sleep(pause)
+
+    async def _follow(self, client: Client) -> None:
+        """Reads all keys, then reports changes. Raises `_Missed`, or an error of JetStream."""
+        jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT)
+        await self._open(jetstream)
+        reader = _Reader(self._stream, self._pre, self._times)
+        try:
+            count = await reader.begin(jetstream, self._keys)
+            found: dict[str, Written | None] = {}
+            while (left := count - reader.received) > 0:
+                found |= await reader.fetch(min(left, FETCHED), JETSTREAM_TIMEOUT)
+            await self._changed(found, True)
+            self._failures = 0
+            self._tell(True, "")
+            self.tried.set()
+            while True:
+                if changes := await reader.changes():
+                    await self._changed(changes, False)
+        except Exception:
+            await reader.delete()
+            raise
+        finally:
+            await reader.close()
+
+    async def _open(self, jetstream: JetStreamContext) -> None:
+        try:
+            await jetstream.stream_info(self._stream)
+        except NotFoundError:
+            await jetstream.create_key_value(bucket=self._bucket, history=1)
+
+    def _tell(self, works: bool, reason: str) -> None:
+        if works is self._works:
+            return
+        if works:
+            logs.write(logging.INFO, "bucket_watched", bucket=self._bucket)
+        else:
+            logs.write(logging.WARNING, "bucket_not_watched", bucket=self._bucket, reason=reason)
+        self._works = works
+
+
+class _Reader:
+    """A consumer of a bucket's messages.
+
+    A watcher of nats-py may report the end before the first key. The number of messages that a new
+    pull consumer has is certain.
+    """
+
+    def __init__(self, stream: str, pre: str, times: WatchTimes) -> None:
+        self._stream = stream
+        self._pre = pre
+        self._times = times
+        self.received = 0
+        """The number of the last message, counted by the server."""
+
+    async def begin(self, jetstream: JetStreamContext, keys: str) -> int:
+        """Creates the consumer. Returns the number of messages that it has for now."""
+        config = ConsumerConfig(
+            deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
+            ack_policy=AckPolicy.NONE,
+            inactive_threshold=READING,
+        )
+        self._jetstream = jetstream
+        self._subscription = await jetstream.pull_subscribe(
+            self._pre + keys, stream=self._stream, config=config
+        )
+        info = await self._subscription.consumer_info()
+        self._name = info.name
+        return info.num_pending or 0
+
+    async def changes(self) -> dict[str, Written | None]:
+        """Waits for changes. Returns them when no more follow, or nothing after a while."""
+        try:
+            found = await self.fetch(1, self._times.quiet_s)
+        except TimeoutError:
+            await self._check()
+            return {}
+        end = time.monotonic() + MAX_SETTLING
+        with contextlib.suppress(TimeoutError):
+            while time.monotonic() < end:
+                found |= await self.fetch(FETCHED, self._times.settle_s)
+        return found
+
+    async def fetch(self, most: int, timeout: float) -> dict[str, Written | None]:
+        """Returns the next messages, at least one. Raises `TimeoutError` if there are none."""
+        return dict(map(self._read, await self._subscription.fetch(most, timeout=timeout)))
+
+    def _read(self, message: Msg) -> tuple[str, Written | None]:
+        number = message.metadata.sequence.consumer
+        if number != self.received + 1:
+            raise _Missed
+        self.received = number
+        headers = message.headers or {}
+        is_marker = any(header in headers for header in MARKER_HEADERS)
+        key = message.subject.removeprefix(self._pre)
+        revision = message.metadata.sequence.stream
+        return key, None if is_marker else Written(message.data, revision)
+
+    async def _check(self) -> None:
+        """Checks that the server has the consumer, and delivered nothing that did not arrive."""
+        info = await self._subscription.consumer_info()
+        delivered = 0 if info.delivered is None else info.delivered.consumer_seq
+        if delivered != self.received and self._subscription.pending_msgs == 0:
+            raise _Missed
+
+    async def delete(self) -> None:
+        """Deletes the consumer, if the server can be reached. It expires anyway."""
+        with contextlib.suppress(Exception):
+            await self._jetstream.delete_consumer(self._stream, self._name)
+
+    async def close(self) -> None:
+        """Ends the subscription, which nats-py would repeat after each reconnect."""
+        with contextlib.suppress(Exception):
+            await self._subscription.unsubscribe()

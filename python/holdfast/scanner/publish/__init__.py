@@ -1,0 +1,1 @@
+"""From polls to messages for NATS."""

@@ -1,0 +1,511 @@
+"""The registry of all subscriptions. A request is carried out completely or not at all.
+
+All checks run before the first change, without an await in between. `understood` checks a request
+by itself. The registry checks it against the existing subscriptions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING
+from urllib.parse import parse_qsl, urlsplit
+
+from holdfast.client import url as urls
+from holdfast.client.tolerance import STRICT
+from holdfast.client.url import NetworkTarget, SerialTarget
+from holdfast.net.addresses import address_in, unbracketed
+from holdfast.protocol import usual_port
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.messages.leniency import Adjustments
+from holdfast.scanner.messages.subjects import next_name, subject_id
+from holdfast.scanner.subscriptions.device import (
+    USUALLY_WANTED,
+    Plan,
+    ScannedDevice,
+    Source,
+    Subscriber,
+    Wanted,
+)
+from holdfast.scanner.subscriptions.health import Health
+from holdfast.scanner.subscriptions.tag import ORDERS, profiled, tag
+from holdfast.types import SERIAL_FRAMES
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Mapping
+
+    from holdfast.client.url import Target
+    from holdfast.config.scanning import Dialect, Publish, Writes
+    from holdfast.scanner.messages.types import SubscribeRequest, TagRequest, UnsubscribeRequest
+    from holdfast.scanner.subscriptions.limits import ScannerLimits
+    from holdfast.scanner.subscriptions.rules import Rules
+    from holdfast.scanner.subscriptions.tag import Tag
+
+SETTINGS = ("timeout", "release", "plan")
+"""The settings of a device that a request may leave out, once another has set them."""
+
+LINE_SETTINGS = ("mode", "baud", "parity", "stop_bits", "data_bits", "silence")
+"""What all devices on one serial line have alike."""
+
+
+@dataclass(frozen=True)
+class Subscription:
+    """A subscribe request that is valid by itself."""
+
+    device: str
+    subscriber: str
+    source: Source
+    said: frozenset[str]
+    """The settings that the request contains. Others are those of the known device, or defaults."""
+    tags: Mapping[str, Tag]
+    wanted: Mapping[str, Wanted]
+    rate: int
+    publish: Publish
+    deadband: float
+    ttl: int | None
+    """Seconds."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """What a request has changed."""
+
+    device: ScannedDevice | None
+    """The device of the request, if it is known."""
+    polling: bool = False
+    """Whether its polling must change."""
+    former: ScannedDevice | None = None
+    """The device that `device` replaces, because its address or a setting is another."""
+
+
+def understood(
+    request: SubscribeRequest, rules: Rules, changes: Adjustments | None = None
+) -> Subscription:
+    """Checks a request by itself. Adds to `changes` what is adjusted. Raises `Refused`."""
+    changes = Adjustments() if changes is None else changes
+    limits, defaults = rules.limits, rules.defaults
+    _check_id(request.device_id)
+    publish = request.publish or defaults.publish
+    if request.deadband and publish != "change":
+        raise Refused('deadband requires "publish": "change"')
+    deadband = defaults.deadband if request.deadband is None else request.deadband
+    source = Source(
+        _target(request),
+        1 if request.unit_id is None else request.unit_id,
+        _within(
+            "timeout",
+            defaults.timeout if request.timeout is None else request.timeout,
+            limits.shortest_timeout,
+            limits.longest_timeout,
+        ),
+        bool(request.release),
+        Plan.of(request.plan),
+        request.url,
+    )
+    target = source.target
+    if source.unit == 0 and (isinstance(target, SerialTarget) or target.transport in SERIAL_FRAMES):
+        raise Refused("unitId is 0, which is the broadcast of a serial line")
+    order = ORDERS.get(request.byte_order or "big", request.byte_order or "")
+    tags: dict[str, Tag] = {}
+    of_profile = {} if request.profile is None else profiled(request.profile, rules)
+    replaced = dict(of_profile)
+    for entry in of_profile.values():
+        tags[entry.id] = tag(entry, order, f"profile {request.profile}", changes, rules)
+    for index, entry in enumerate(request.tags):
+        where = f"tags[{index}]"
+        made = tag(entry, order, where, changes, rules)
+        if replaced.pop(made.id, None) is None and made.id in tags:
+            if rules.strict:
+                raise Refused(f"{where}: duplicate id {made.id!r}")
+            if rules.dialect == "tentacle-next" and made != tags[made.id]:
+                # Its gateway sends tags in random order, so no definition is the last one.
+                raise Refused(f"{where}: {made.id!r} is {made}, and already {tags[made.id]}")
+            changes.add("tag_repeated", made.id)
+        tags[made.id] = made
+    source.plan.check(list(tags.values()))
+    said = {key for key in SETTINGS if getattr(request, key) is not None}
+    return Subscription(
+        request.device_id,
+        request.subscriber_id,
+        source,
+        frozenset(said),
+        tags,
+        {entry.id: _wanted(entry) for entry in (*of_profile.values(), *request.tags)},
+        _rate(request, rules, changes),
+        publish,
+        deadband if publish == "change" else 0.0,
+        request.ttl,
+    )
+
+
+def _wanted(entry: TagRequest) -> Wanted:
+    if entry.writable is None and entry.description is None:
+        return USUALLY_WANTED
+    return Wanted(entry.writable, entry.description)
+
+
+def _check_id(id: str) -> None:
+    """Checks a device id, which becomes a part of subjects. Raises `Refused`."""
+    if not id.isprintable():
+        raise Refused(f"deviceId is {id!r}, allowed: printable characters and blanks")
+
+
+def _rate(request: SubscribeRequest, rules: Rules, changes: Adjustments) -> int:
+    """Returns the scan rate; one that is too short is raised. Raises `Refused`."""
+    limits, rate = rules.limits, request.scan_rate
+    if rate is None:
+        return rules.defaults.scan_rate
+    if rate < limits.shortest_scan and not rules.strict:
+        changes.add("scan_rate_raised", f"{rate} to {limits.shortest_scan} ms")
+        return limits.shortest_scan
+    return _within("scanRate", rate, limits.shortest_scan, limits.longest_scan)
+
+
+def _target(request: SubscribeRequest) -> Target:
+    given = [key for key in ("host", "port", "transport") if getattr(request, key) is not None]
+    if request.url is not None:
+        if given:
+            raise Refused(f"both url and {given[0]} are given, allowed: only one")
+        try:
+            parts = urlsplit(request.url)
+            for key in dict(parse_qsl(parts.query, keep_blank_values=True)):
+                if parts.scheme == "tls" and key != "name" and key not in asdict(STRICT):
+                    allowed = "allowed: name and the tolerance options; files are the scanner's"
+                    raise Refused(f"url: {key} is given, {allowed}")
+            return urls.parse(request.url)
+        except ValueError as error:
+            raise Refused(f"url: {error}") from None
+    if request.host is None:
+        raise Refused("host is missing: give host or url")
+    transport = request.transport or "tcp"
+    port = usual_port(transport) if request.port is None else request.port
+    is_address = address_in(request.host) is not None
+    host = unbracketed(request.host) if is_address else request.host
+    return NetworkTarget(transport, host, port)
+
+
+def _within(key: str, value: int, least: int, most: int) -> int:
+    if not least <= value <= most:
+        raise Refused(f"{key} is {value}, allowed: {least} to {most} ms")
+    return value
+
+
+class Registry:
+    """The devices by id, with their subscribers."""
+
+    def __init__(
+        self, limits: ScannerLimits, writes: Writes = "tags", dialect: Dialect = "tentacle"
+    ) -> None:
+        self.devices: dict[str, ScannedDevice] = {}
+        self._limits = limits
+        self._writes = writes
+        self._dialect = dialect
+        self._tags = 0
+        self._holders: dict[str, set[str]] = {}
+        """The ids of the devices that have a tag id."""
+        self._spelled: dict[str, set[str]] = {}
+        """The tag ids, by their names in subjects; only with dialect `tentacle-next`."""
+        self._subjects: dict[str, str] = {}
+        """The ids of the devices, by their names in subjects."""
+        self._sharing: dict[str, list[str]] = {}
+        """The ids of the devices that share a connection, by its address or line."""
+
+    @property
+    def tags(self) -> int:
+        """The number of tags of all devices."""
+        return self._tags
+
+    def known(self, asked: Subscription) -> ScannedDevice | None:
+        """Returns the device of a request, if the request does not replace it.
+
+        Raises `Refused` if it would replace a device that others use.
+        """
+        device = self.devices.get(asked.device)
+        if device is None or not _replaces(device, asked):
+            return device
+        return None
+
+    def fresh(self, asked: Subscription) -> Collection[str]:
+        """Returns the tags of a request that its subscriber does not have yet, or not alike."""
+        device = self.devices.get(asked.device)
+        subscriber = None if device is None else device.subscribers.get(asked.subscriber)
+        if device is None or subscriber is None:
+            return asked.tags
+        return {
+            id
+            for id, tag in asked.tags.items()
+            if id not in subscriber.tags or device.tags[id] != tag
+        }
+
+    def subscribe(self, asked: Subscription, address: Target) -> Change:
+        """Adds a subscription. Returns what has changed.
+
+        A request without tags adds no subscriber, and no device. Raises `Refused`.
+        """
+        device = self.devices.get(asked.device)
+        new = [id for id in asked.tags if device is None or id not in device.tags]
+        self._check_limits(device, asked, len(new))
+        former = None
+        source = asked.source
+        if device is None:
+            self._check_subject(asked.device)
+            self._check_shared(asked)
+        else:
+            source = _merged(device.source, asked)
+            if _replaces(device, asked):
+                former = device
+                self._check_shared(asked)
+            _check_tags(device, asked)
+        if self._dialect == "tentacle-next":
+            _check_tag_names(() if device is None else device.tags, asked)
+        if device is not None:
+            source.plan.check(list((device.tags | dict(asked.tags)).values()))
+        if not asked.tags and (device is None or asked.subscriber not in device.subscribers):
+            return Change(device)
+        before = device.rate if device is not None and device.subscribers else None
+        if device is None or former is not None:
+            device = self._made(asked, source, address, former)
+        subscriber = device.subscribers.setdefault(
+            asked.subscriber, Subscriber(asked.rate, "scan", 0.0)
+        )
+        subscriber.rate = asked.rate
+        subscriber.publish = asked.publish
+        subscriber.deadband = asked.deadband
+        subscriber.ttl = asked.ttl
+        redefined = any(device.tags.get(id, tag) != tag for id, tag in asked.tags.items())
+        for kept in map(self._alike, asked.tags.values()):
+            device.tags[kept.id] = kept
+            subscriber.tags[kept.id] = asked.wanted[kept.id]
+        for id in new:
+            self._holders.setdefault(id, set()).add(device.id)
+            if self._dialect == "tentacle-next":
+                self._spelled.setdefault(next_name(id), set()).add(id)
+        self._tags += len(new)
+        return Change(device, bool(new) or redefined or device.rate != before, former)
+
+    def _alike(self, tag: Tag) -> Tag:
+        """Returns the same tag of another device, if there is one: many devices are of one kind."""
+        holder = next(iter(self._holders.get(tag.id, ())), None)
+        known = None if holder is None else self.devices[holder].tags.get(tag.id)
+        return known if known is not None and known == tag else tag
+
+    def _made(
+        self, asked: Subscription, source: Source, address: Target, former: ScannedDevice | None
+    ) -> ScannedDevice:
+        """Adds a device; with the subscribers and the tags of the one that it replaces, if any."""
+        device = ScannedDevice(asked.device, source, address, Health(), self._writes, self._dialect)
+        if former is not None:
+            device.subscribers, device.tags = dict(former.subscribers), dict(former.tags)
+            self._leave(former)
+        self.devices[device.id] = device
+        self._sharing.setdefault(_place(source.target), []).append(device.id)
+        self._subjects |= dict.fromkeys(_subjects(device), device.id)
+        return device
+
+    def unsubscribe(self, request: UnsubscribeRequest) -> tuple[ScannedDevice | None, bool]:
+        """Removes tags of a subscriber. Returns the device, and whether its polling must change.
+
+        Removes the device with its last subscriber. Unknown ids are ignored.
+        """
+        device = self.devices.get(request.device_id)
+        subscriber = None if device is None else device.subscribers.get(request.subscriber_id)
+        if device is None or subscriber is None:
+            return device, False
+        before = device.rate
+        ids = list(subscriber.tags) if request.ids is None else request.ids
+        for id in ids:
+            subscriber.tags.pop(id, None)
+        if not subscriber.tags:
+            del device.subscribers[request.subscriber_id]
+        unwanted = device.forget(ids)
+        for id in unwanted:
+            self._holders[id].discard(device.id)
+            if not self._holders[id]:
+                del self._holders[id]
+                self._forget_spelling(id)
+        self._tags -= len(unwanted)
+        if not device.subscribers:
+            del self.devices[device.id]
+            self._leave(device)
+            for name in _subjects(device):
+                del self._subjects[name]
+            return device, True
+        return device, bool(unwanted) or device.rate != before
+
+    def commanded(self, name: str) -> tuple[ScannedDevice, Tag]:
+        """Returns the tag of a command's name: an id, or device and id. Raises `Refused`."""
+        found = {(device, id) for id in self._ids(name) for device in self._holders.get(id, ())}
+        parts = name.split(".")
+        for at in range(1, len(parts)):
+            device = ".".join(parts[:at])
+            for id in self._ids(".".join(parts[at:])):
+                for named in {device, self._subjects.get(device, device)}:
+                    if named in self._holders.get(id, ()):
+                        found.add((named, id))
+        if not found:
+            raise Refused(f"no tag {name!r}")
+        if len(found) > 1:
+            known = ", ".join(f"{device}.{id}" for device, id in sorted(found))
+            raise Refused(f"{name!r} is ambiguous: {known}")
+        [(of, id)] = found
+        return self.devices[of], self.devices[of].tags[id]
+
+    def _ids(self, name: str) -> set[str]:
+        """Returns the tag ids that a command may mean by a name."""
+        if self._dialect == "tentacle-next":
+            return {name} | self._spelled.get(name, set())
+        return {name}
+
+    def _forget_spelling(self, id: str) -> None:
+        ids = self._spelled.get(next_name(id), set())
+        ids.discard(id)
+        if not ids:
+            self._spelled.pop(next_name(id), None)
+
+    def _check_subject(self, id: str) -> None:
+        """Checks that no other device has the same name in subjects. Raises `Refused`."""
+        name = subject_id(id)
+        other = self._subjects.get(name)
+        if other is not None:
+            raise Refused(
+                f"deviceId {id!r} has the same name in subjects as {other!r}, which is known: "
+                f"{name}; give one of them another id"
+            )
+
+    def _check_shared(self, asked: Subscription) -> None:
+        """Checks that a new device has the settings of the devices that share its connection."""
+        target = asked.source.target
+        place = _place(target)
+        others = (id for id in self._sharing.get(place, ()) if id != asked.device)
+        id = next(others, None)
+        if id is None:
+            return
+        settings = _settings(target)
+        # All others are like this one.
+        for key, known in _settings(self.devices[id].source.target).items():
+            if known != settings[key]:
+                at = "on one serial line" if isinstance(target, SerialTarget) else "at one address"
+                raise Refused(
+                    f"{key} of {place} is already {_shown(known)} for {id}, "
+                    f"not {_shown(settings[key])}; devices {at} have the same settings"
+                )
+
+    def _leave(self, device: ScannedDevice) -> None:
+        """Notes that a device does not use its connection any more."""
+        place = _place(device.source.target)
+        self._sharing[place].remove(device.id)
+        if not self._sharing[place]:
+            del self._sharing[place]
+
+    def _check_limits(self, device: ScannedDevice | None, asked: Subscription, new: int) -> None:
+        limits = self._limits
+        if device is None and len(self.devices) >= limits.devices:
+            raise Refused(f"there are already {limits.devices} devices, which is the limit")
+        subscribers = {} if device is None else device.subscribers
+        if asked.subscriber not in subscribers and len(subscribers) >= limits.subscribers:
+            raise Refused(
+                f"{asked.device} already has {limits.subscribers} subscribers, which is the limit"
+            )
+        tags = new + (0 if device is None else len(device.tags))
+        if tags > limits.device_tags:
+            raise Refused(f"{asked.device} would have {tags} tags, allowed: {limits.device_tags}")
+        if self._tags + new > limits.tags:
+            raise Refused(f"there would be {self._tags + new} tags, allowed: {limits.tags}")
+
+
+def _replaces(device: ScannedDevice, asked: Subscription) -> bool:
+    """Returns whether a request changes the address or a setting of a device.
+
+    Raises `Refused` if other subscribers use the device.
+    """
+    known, said = device.source, asked.source
+    found = ""
+    if (known.target, known.unit) != (said.target, said.unit):
+        found = f"{device.id} is known as {_told(known)}, not as {_told(said)}"
+    else:
+        for key in SETTINGS:
+            one, other = getattr(known, key), getattr(said, key)
+            if key in asked.said and one != other:
+                found = f"{key} of {device.id} is already different: {one}, not {other}"
+                break
+    if not found:
+        return False
+    _check_unused(found, [name for name in device.subscribers if name != asked.subscriber])
+    return True
+
+
+def _merged(known: Source, asked: Subscription) -> Source:
+    """Returns the source of a request, with the known settings in place of those left out."""
+    kept = {key: getattr(known, key) for key in SETTINGS if key not in asked.said}
+    return replace(asked.source, **kept)
+
+
+def _check_tags(device: ScannedDevice, asked: Subscription) -> None:
+    """Checks that no other subscriber uses another definition of a tag. Raises `Refused`."""
+    for id, wanted in asked.tags.items():
+        known = device.tags.get(id)
+        if known is not None and known != wanted:
+            difference = f"{known}, not {wanted}"
+            if str(known) == str(wanted):
+                difference = "another encoding or other null values"
+            found = f"tag {id!r} of {device.id} already has another definition: {difference}"
+            users = [name for name in device.users(id) if name != asked.subscriber]
+            _check_unused(found, users)
+
+
+def _check_tag_names(known: Iterable[str], asked: Subscription) -> None:
+    """Checks that each tag of a device has a subject of its own. Raises `Refused`."""
+    names = {next_name(id): id for id in known}
+    for id in asked.tags:
+        if not id.isprintable():
+            raise Refused(f"the tag id is {id!r}, allowed: printable characters and blanks")
+        other = names.setdefault(next_name(id), id)
+        if other != id:
+            raise Refused(
+                f"tag id {id!r} has the same name in subjects as {other!r}: {next_name(id)}; "
+                "give one of them another id"
+            )
+
+
+def _subjects(device: ScannedDevice) -> set[str]:
+    """Returns the names of a device in subjects and in kept entries."""
+    return {subject_id(device.id), *device.subjects}
+
+
+def _check_unused(found: str, users: list[str]) -> None:
+    """Raises `Refused` if there are other users of something that a request would replace."""
+    if users:
+        more = f" and {len(users) - 1} more" if len(users) > 1 else ""
+        raise Refused(f"{found}; {users[0]}{more} must unsubscribe first")
+
+
+def _place(target: Target) -> str:
+    """What devices share that have one connection."""
+    return target.device if isinstance(target, SerialTarget) else str(target)
+
+
+def _settings(target: Target) -> dict[str, object]:
+    """What devices of one connection have in common."""
+    line = LINE_SETTINGS if isinstance(target, SerialTarget) else ()
+    return {key: getattr(target, key) for key in line} | asdict(target.tolerance)
+
+
+def _told(source: Source) -> str:
+    """Formats the address of a device with everything that identifies it."""
+    target = source.target
+    usual: dict[str, object] = asdict(STRICT)
+    more = ""
+    if isinstance(target, SerialTarget):
+        usual["mode"] = target.mode
+    elif target.tls.name is not None:
+        more = f" with the name {target.tls.name}"
+    said = [
+        f"{key} {_shown(value)}"
+        for key, value in _settings(target).items()
+        if key not in usual or value != usual[key]
+    ]
+    more += f" ({', '.join(said)})" if said else ""
+    return f"{target}{more} unit {source.unit}"
+
+
+def _shown(setting: object) -> object:
+    return "the default" if setting is None else setting
