@@ -17,7 +17,13 @@ from holdfast.scanner.publish import outbox as outboxes
 from holdfast.scanner.publish.outbox import Outbox
 from holdfast.scanner.publish.publisher import Publisher
 from holdfast.scanner.reports.devices import browsed
-from holdfast.scanner.subscriptions.device import Plan, ScannedDevice, Source, Subscriber, Wanted
+from holdfast.scanner.subscriptions.device import (
+    Plan,
+    ScannedDevice,
+    Source,
+    Subscriber,
+    TagOptions,
+)
 from holdfast.scanner.subscriptions.groups import Group, grouped
 from holdfast.scanner.subscriptions.health import Health
 from holdfast.scanner.subscriptions.tag import Tag
@@ -45,7 +51,7 @@ def device(**subscribers: tuple[int, Publish, float, str]) -> ScannedDevice:
     found = ScannedDevice("plc", Source(TARGET, 1, 1000, False, Plan()), TARGET, Health())
     for name, (rate, publish, deadband, ids) in subscribers.items():
         found.subscribers[name] = Subscriber(
-            rate, publish, deadband, dict.fromkeys(ids, Wanted(False, None))
+            rate, publish, deadband, dict.fromkeys(ids, TagOptions(False, None))
         )
         found.tags |= {id: made(id, ord(id) - ord("a")) for id in ids}
     return found
@@ -208,7 +214,9 @@ def test_thousands_of_tags_far_apart_cost_no_more_each_than_a_few(
     tags = {f"t{at}": made(f"t{at}", 12 * at) for at in range(2000)}
     plc = device()
     plc.tags = tags
-    plc.subscribers["x"] = Subscriber(1000, "scan", 0.0, dict.fromkeys(tags, Wanted(False, None)))
+    plc.subscribers["x"] = Subscriber(
+        1000, "scan", 0.0, dict.fromkeys(tags, TagOptions(False, None))
+    )
     blocks: list[PolledBlock] = [
         ("holding_registers", 12 * at, 1, b"\0\1", 0, ANSWERED) for at in range(2000)
     ]

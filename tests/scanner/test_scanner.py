@@ -12,7 +12,7 @@ from nats.aio.msg import Msg
 
 import holdfast
 from holdfast.scanner import service as services
-from holdfast.scanner.subscriptions.registry import understood
+from holdfast.scanner.subscriptions.subscription import subscription_of
 from support import wire
 from support.nats_bus import leaving, subscription, tag
 
@@ -545,9 +545,9 @@ def test_between_two_large_requests_others_have_their_turn(
 
     def noted(*arguments: Any) -> Any:
         turns.append(turn)
-        return understood(*arguments)
+        return subscription_of(*arguments)
 
-    monkeypatch.setattr(services, "understood", noted)
+    monkeypatch.setattr(services, "subscription_of", noted)
     monkeypatch.setattr(services, "LARGE", 100)
 
     async def ask() -> None:

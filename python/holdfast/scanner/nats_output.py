@@ -15,7 +15,7 @@ from nats.errors import Error
 from holdfast.faults import fault_text, is_exception
 from holdfast.net.event_loop import EventLoop
 from holdfast.outputs.sending import soon_after
-from holdfast.scanner.messages.subjects import data_subject, names
+from holdfast.scanner.messages.dialects import DIALECTS
 from holdfast.scanner.receiving import SafeClient, TlsClient
 from holdfast.scanner.subscriptions.tag import datatype
 from holdfast.tags.text import plain
@@ -50,7 +50,7 @@ class NatsOutput:
     """One connection, on an event loop that runs in the thread of the output."""
 
     def __init__(self, servers: Servers, prefix: str, dialect: Dialect) -> None:
-        self._servers, self._prefix, self._dialect = servers, prefix, dialect
+        self._servers, self._prefix, self._dialect = servers, prefix, DIALECTS[dialect]
         self._runner = asyncio.Runner(loop_factory=EventLoop)
         self._client: SafeClient | None = None
         self._lost: asyncio.Event | None = None
@@ -170,7 +170,7 @@ class NatsOutput:
                 "datatype": datatype(tag.of_type),
                 "timestamp": stamp,
             }
-            subject = data_subject(self._prefix, device, tag.name, self._dialect)
+            subject = self._dialect.data_subject(self._prefix, device, tag.name)
             made.append((subject, _encode(message)))
         return made
 
@@ -185,7 +185,10 @@ class NatsOutput:
             message |= {"failures": 1, "error": fault_text(fault)}
         message["timestamp"] = stamp
         payload = _encode(message)
-        return [(f"{self._prefix}.status.{name}", payload) for name in names(device, self._dialect)]
+        return [
+            (f"{self._prefix}.status.{name}", payload)
+            for name in self._dialect.device_names(device)
+        ]
 
 
 async def _told_elsewhere(_: Exception) -> None:

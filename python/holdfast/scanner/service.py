@@ -39,13 +39,15 @@ from holdfast.scanner.fleet.exchange import About, Command, Executed, subject
 from holdfast.scanner.fleet.member import FleetPart
 from holdfast.scanner.jetstream import entries as kept_entries
 from holdfast.scanner.jetstream.enabled_key import Enabling
-from holdfast.scanner.jetstream.entry_subscriptions import Configured
+from holdfast.scanner.jetstream.entry_subscriptions import Configured, check_entry
 from holdfast.scanner.jetstream.heartbeat import EVERY, Heart
 from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
 from holdfast.scanner.jetstream.restore import Kept
 from holdfast.scanner.lateness import Lateness
-from holdfast.scanner.messages import tentacle, tentacle_next
-from holdfast.scanner.messages.leniency import Adjustments, adjusted
+from holdfast.scanner.messages.decoding import decode, decode_lenient
+from holdfast.scanner.messages.dialects import DIALECTS
+from holdfast.scanner.messages.leniency import Adjustments
+from holdfast.scanner.messages.tentacle import PAUSES_S
 from holdfast.scanner.messages.types import (
     Announcement,
     Answer,
@@ -59,7 +61,6 @@ from holdfast.scanner.messages.types import (
     SubscribeRequest,
     UnsubscribeRequest,
     VariablesRequest,
-    decode,
 )
 from holdfast.scanner.other_scanners import Rivals
 from holdfast.scanner.polling import Polling
@@ -72,8 +73,9 @@ from holdfast.scanner.reports.variables import of_device, variables
 from holdfast.scanner.subscriptions.groups import grouped
 from holdfast.scanner.subscriptions.health import Health
 from holdfast.scanner.subscriptions.limits import ScannerLimits
-from holdfast.scanner.subscriptions.registry import Registry, understood
+from holdfast.scanner.subscriptions.registry import Registry
 from holdfast.scanner.subscriptions.rules import Defaults, Rules
+from holdfast.scanner.subscriptions.subscription import subscription_of
 from holdfast.scanner.subscriptions.ttl import Expiring
 from holdfast.standstill import LONG
 
@@ -88,10 +90,9 @@ if TYPE_CHECKING:
     from holdfast.net.allow_list import AllowEntry
     from holdfast.scanner.fleet.desired_state import Want
     from holdfast.scanner.jetstream.store import Unit
-    from holdfast.scanner.messages.leniency import Asked
     from holdfast.scanner.messages.types import BrowseAnswer
     from holdfast.scanner.subscriptions.device import ScannedDevice
-    from holdfast.scanner.subscriptions.registry import Subscription
+    from holdfast.scanner.subscriptions.subscription import Subscription
     from holdfast.tags import TagList
     from holdfast.types import PolledBlock
 
@@ -161,7 +162,7 @@ class Settings:
     """The tags that requests can name by their profile."""
     fleet: FleetSettings | None = None
     """The fleet of scanners that it is a node of."""
-    exact_pauses_s: tuple[float, float] = tentacle.PAUSES_S
+    exact_pauses_s: tuple[float, float] = PAUSES_S
     """The first and the longest pause after failures of a device; only with dialect `tentacle`."""
     watch_times: WatchTimes = WATCH_TIMES
     """Those of the buckets of tentacle-next."""
@@ -171,7 +172,7 @@ class Settings:
     @property
     def write_access(self) -> dict[str, str]:
         """What may be written, where, by whom, and what narrows it, in words."""
-        return write_access.described(self.writes, self.allow, self.prefix, self.dialect)
+        return write_access.described(self.writes, self.allow, self.prefix, DIALECTS[self.dialect])
 
 
 class Scanner:
@@ -192,14 +193,15 @@ class Scanner:
         self._one_by_one = asyncio.Lock()
         """Held while a request is parsed and checked."""
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        self._dialect = DIALECTS[settings.dialect]
         self._rules = Rules(
             settings.limits,
             settings.defaults,
             settings.strict,
-            settings.dialect,
+            self._dialect,
             settings.profiles,
         )
-        self._registry = Registry(settings.limits, settings.writes, settings.dialect)
+        self._registry = Registry(settings.limits, settings.writes, self._dialect)
         self._adjusted: set[tuple[str, str]] = set()
         """The subscribers, and the kinds of adjustments, that are already logged."""
         self._publishers: dict[str, Publisher] = {}
@@ -354,12 +356,11 @@ class Scanner:
             f"{prefix}.scanner": self._announced,
             f"{prefix}.subscribe": self._answering("subscribe", self._subscribe),
             f"{prefix}.unsubscribe": self._answering("unsubscribe", self._unsubscribe),
-            f"{prefix}.command.>": self._answering("command", self._command),
             f"{prefix}.browse": self._answering("browse", self._browse),
             f"{prefix}.variables": self._answering("variables", self._variables),
         }
-        if self._is_next:  # Its PLC library sends commands here.
-            handlers[f"{prefix}.module.command.>"] = handlers[f"{prefix}.command.>"]
+        for each in self._dialect.command_subjects:
+            handlers[f"{prefix}.{each}"] = self._answering("command", self._command)
         if self._part is not None:
             for what, handle in (
                 ("command", self._forwarded),
@@ -516,8 +517,8 @@ class Scanner:
     async def _subscribe(self, message: Msg) -> Answer:
         async with self._in_order(message):
             changes = Adjustments()
-            request = self._decoded(message.data, SubscribeRequest, changes)
-            asked = understood(request, self._rules, changes)
+            request = self._subscribe_request(message.data, changes)
+            asked = subscription_of(request, self._rules, changes)
             self._check_not_configured(asked.device, asked.subscriber)
         async with self._turn(asked.device):
             fresh = self._registry.fresh(asked)
@@ -526,7 +527,7 @@ class Scanner:
                 await self._part.store(asked.device, change, asked.subscriber)
             else:
                 await self._add(asked)
-            if self._is_next:
+            if self._dialect.replaces_subscription:
                 self._remove_others(asked)
         await self._kept.settled(asked.device, asked.subscriber)
         self._log_adjustments(asked.subscriber, asked.device, changes)
@@ -558,9 +559,9 @@ class Scanner:
     def _understand(self, key: str, value: bytes) -> Subscription:
         """Checks the key and the value of an entry. Raises `Refused`."""
         changes = Adjustments()
-        request = self._decoded(value, SubscribeRequest, changes)
-        tentacle_next.check_entry(key, request)
-        asked = understood(request, self._rules, changes)
+        request = self._subscribe_request(value, changes)
+        check_entry(key, request)
+        asked = subscription_of(request, self._rules, changes)
         self._log_adjustments(asked.subscriber, asked.device, changes)
         return asked
 
@@ -610,7 +611,7 @@ class Scanner:
         if self._key_of(request.device_id, request.subscriber_id) is not None:
             return
         changes = Adjustments()
-        asked = understood(request, self._rules, changes)
+        asked = subscription_of(request, self._rules, changes)
         async with self._turn(asked.device):
             await self._add(asked, kept=True)
         self._log_warnings(asked, changes, asked.tags)
@@ -634,7 +635,7 @@ class Scanner:
         if change.former is not None:
             self._drop(change.former)
         device.endpoint = endpoint
-        if change.former is not None or self._is_next or asked.publish == "scan":
+        if change.former is not None or self._dialect.repeats_values or asked.publish == "scan":
             fresh = asked.tags
         self._begin_publishing(device, fresh)
         if not kept:
@@ -649,17 +650,13 @@ class Scanner:
         if self._is_own(device):
             self._polling.renew(device, at_once=at_once)
 
-    def _decoded(self, data: bytes, kind: type[Asked], changes: Adjustments) -> Asked:
-        most = self._settings.limits.request
-        if self._is_next and kind is SubscribeRequest:
-            data = tentacle_next.request(data, most)
-        if self._settings.strict:
-            return decode(data, kind, most)
-        return adjusted(data, kind, most, changes)
+    def _subscribe_request(self, data: bytes, changes: Adjustments) -> SubscribeRequest:
+        adjustments = None if self._settings.strict else changes
+        return self._dialect.subscribe_request(data, self._settings.limits.request, adjustments)
 
     def _log_adjustments(self, subscriber: str, device: str, changes: Adjustments) -> None:
         """Logs what was changed in a request: once for each subscriber and kind."""
-        for kind, what in changes:
+        for kind, what in changes.summary():
             if (subscriber, kind) in self._adjusted:
                 continue
             if len(self._adjusted) >= MAX_ADJUSTED:
@@ -671,7 +668,7 @@ class Scanner:
     def _log_warnings(asked: Subscription, changes: Adjustments, fresh: Collection[str]) -> None:
         """Logs what callers must know of the tags that they had not subscribed to before."""
         about = {"subscriber": asked.subscriber, "device": asked.device}
-        for tag, note in changes.warnings:
+        for tag, note in changes.byte_orders:
             if tag in fresh:
                 logs.write(logging.WARNING, "byte_order_differs", **about, tag=tag, note=note)
 
@@ -687,7 +684,7 @@ class Scanner:
 
     def _publisher(self, device: ScannedDevice) -> Publisher:
         settings, lease = self._settings, self._lease(device)
-        return Publisher(settings.prefix, device.id, settings.dialect, lease)
+        return Publisher(settings.prefix, device.id, self._dialect, lease)
 
     def _lease(self, device: ScannedDevice) -> int | None:
         """Returns the number that messages about a device have in a fleet."""
@@ -717,9 +714,13 @@ class Scanner:
     async def _unsubscribe(self, message: Msg) -> Answer:
         async with self._in_order(message):
             changes = Adjustments()
-            request = self._decoded(message.data, UnsubscribeRequest, changes)
-            if not self._is_next:
-                tentacle.check_unsubscribe(request)
+            request = decode_lenient(
+                message.data,
+                UnsubscribeRequest,
+                self._settings.limits.request,
+                None if self._settings.strict else changes,
+            )
+            self._dialect.check_unsubscribe(request)
             self._check_not_configured(request.device_id, request.subscriber_id)
         async with self._turn(request.device_id):
             await self._remove_wanted(request)
@@ -810,12 +811,7 @@ class Scanner:
         most = self._settings.limits.command
         if len(message.data) > most:
             raise Refused(f"the value has {len(message.data)} bytes, allowed: {most}")
-        try:
-            text = message.data.decode()
-        except UnicodeDecodeError:
-            raise Refused("the value is not UTF-8 text") from None
-        if self._is_next:
-            text = tentacle_next.command(message.data)
+        text = self._dialect.command_text(message.data)
         async with self._in_order(message):
             device, tag = self._registry.commanded(name)
         check = partial(self._lateness.check, message)
@@ -964,7 +960,7 @@ class Scanner:
         for subscriber, requests in wanted.items():
             tags: set[str] = set()
             for request in requests:
-                asked = understood(request, self._rules)
+                asked = subscription_of(request, self._rules)
                 await self._add(asked, kept=True, renewed=subscriber in renewed)
                 tags |= asked.tags.keys()
             known = self._registry.devices.get(device)

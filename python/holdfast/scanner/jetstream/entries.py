@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from holdfast.client.url import NetworkTarget
+from holdfast.scanner.messages.decoding import decode
 from holdfast.scanner.messages.subjects import subject_id
-from holdfast.scanner.messages.types import SubscribeRequest, TagRequest, decode
+from holdfast.scanner.messages.types import SubscribeRequest, TagRequest
 from holdfast.scanner.subscriptions.tag import CODE_OF_AREA
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
     from holdfast.scanner.messages.types import Marker
-    from holdfast.scanner.subscriptions.device import ScannedDevice, Wanted
+    from holdfast.scanner.subscriptions.device import ScannedDevice, TagOptions
     from holdfast.scanner.subscriptions.tag import Tag
 
 MAX_PART = 128 * 1024
@@ -109,7 +110,7 @@ def _place(device: ScannedDevice) -> dict[str, object]:
     return {"host": target.host, "port": target.port, "transport": target.transport}
 
 
-def _tag(tag: Tag, wanted: Wanted) -> bytes:
+def _tag(tag: Tag, wanted: TagOptions) -> bytes:
     """Returns a tag as JSON; without a description that would make it too long."""
     made = TagRequest(
         id=tag.id,

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast.scanner.jetstream.key_watch import WatchTimes, Written
-    from holdfast.scanner.subscriptions.registry import Subscription
+    from holdfast.scanner.messages.types import SubscribeRequest
+    from holdfast.scanner.subscriptions.subscription import Subscription
 
 BUCKET = "scanner_config_"
 """The name of the bucket, before the prefix of all subjects."""
@@ -239,6 +240,15 @@ class Configured:
             if each is not None and each.written is not None:
                 self._held_bytes += sign * len(each.written.value)
         entry.refused = refused
+
+
+def check_entry(key: str, request: SubscribeRequest) -> None:
+    """Checks what only entries of the bucket must fulfil. Raises `Refused`."""
+    named = f"{request.subscriber_id}.{request.device_id}"
+    if key != named:
+        raise Refused(f"the key is {key!r}, allowed: SUBSCRIBER.DEVICE of its value: {named!r}")
+    if request.ttl is not None:
+        raise Refused("ttl is given; an entry lasts until it is deleted")
 
 
 def _identity(written: Written) -> tuple[int, bytes]:

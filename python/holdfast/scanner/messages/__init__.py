@@ -1,1 +1,21 @@
 """The messages of the scanner, and what programs of each dialect send and expect. Does no I/O."""
+
+from __future__ import annotations
+
+from holdfast.scanner.messages.dialects import DIALECTS
+from holdfast.scanner.messages.types import (
+    Answer,
+    BrowseRequest,
+    FunctionCode,
+    HeartbeatMetadata,
+    ServiceReport,
+)
+
+__all__ = [
+    "DIALECTS",
+    "Answer",
+    "BrowseRequest",
+    "FunctionCode",
+    "HeartbeatMetadata",
+    "ServiceReport",
+]

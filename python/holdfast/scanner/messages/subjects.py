@@ -10,10 +10,6 @@ Programs of tentacle-next replace other characters, and listen to one subject fo
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from holdfast.config.scanning import Dialect
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
 _UNUSABLE = re.compile(r"[ .*>]")
@@ -40,16 +36,3 @@ def next_name(id: str) -> str:
     `id` must be printable.
     """
     return _REPLACED_BY_NEXT.sub("_", id)
-
-
-def names(device: str, dialect: Dialect) -> tuple[str, ...]:
-    """Returns the names of a device in the subjects of its messages."""
-    if dialect == "tentacle-next":
-        return (next_name(device),)
-    return tuple(filter(None, (subject_id(device), second_id(device))))
-
-
-def data_subject(prefix: str, device: str, tag: str, dialect: Dialect) -> str:
-    """Returns the subject of a tag's values."""
-    subject = f"{prefix}.data.{names(device, dialect)[0]}"
-    return f"{subject}.{next_name(tag)}" if dialect == "tentacle-next" else subject

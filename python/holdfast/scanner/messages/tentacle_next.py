@@ -1,19 +1,27 @@
-"""Reads messages of programs of tentacle-next, where their form differs. Does no I/O.
+"""The dialect of tentacle-next. Does no I/O.
 
-`request` and `command` return what the first generation would have sent, for the same checks.
+Its messages have another form. They are converted to what the first generation would have sent, for
+the same checks.
 """
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.messages.types import check_size
+from holdfast.scanner.messages.decoding import decode_lenient
+from holdfast.scanner.messages.subjects import next_name
+from holdfast.scanner.messages.types import SubscribeRequest
 
 if TYPE_CHECKING:
-    from holdfast.scanner.messages.types import SubscribeRequest
+    from collections.abc import Iterable, Mapping
+
+    from holdfast.config import scanning
+    from holdfast.scanner.messages.leniency import Adjustments
+    from holdfast.scanner.messages.types import UnsubscribeRequest
 
 FUNCTION_CODES = {1: "coil", 2: "discrete", 3: "holding", 4: "input"}
 """The numbers that its PLC library sends."""
@@ -33,25 +41,73 @@ class _Command(msgspec.Struct):
     value: msgspec.Raw
 
 
-def request(data: bytes, most: int) -> bytes:
-    """Returns a subscribe request of at most `most` bytes with the keys of `SubscribeRequest`.
+class TentacleNext:
+    """What programs of tentacle-next send and expect, see `Dialect`."""
 
-    A request that is not a JSON object is returned as it is. Raises `Refused` if it is too large.
-    """
-    check_size(data, most)
-    try:
-        found = msgspec.json.decode(data)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return data
-    if type(found) is not dict:
-        return data
+    name: scanning.Dialect = "tentacle-next"
+    # Its PLC library sends to the second.
+    command_subjects: tuple[str, ...] = ("command.>", "module.command.>")
+    byte_orders: Mapping[tuple[str, str], str] = MappingProxyType({})
+    replaces_subscription = True
+    last_definition_counts = False  # Its gateway sends tags in random order.
+    repeats_values = True
+
+    def device_names(self, device: str) -> tuple[str, ...]:
+        """Returns the only name."""
+        return (next_name(device),)
+
+    def tag_name(self, tag: str) -> str:
+        """Returns the last part of the subjects of a tag."""
+        return next_name(tag)
+
+    def data_subject(self, prefix: str, device: str, tag: str) -> str:
+        """Returns the subject that a tag has alone."""
+        return f"{prefix}.data.{next_name(device)}.{next_name(tag)}"
+
+    def subscribe_request(
+        self, data: bytes, max_bytes: int, adjustments: Adjustments | None
+    ) -> SubscribeRequest:
+        """Parses a request. Raises `Refused`."""
+        return decode_lenient(data, SubscribeRequest, max_bytes, adjustments, normalized)
+
+    def check_unsubscribe(self, request: UnsubscribeRequest) -> None:
+        """Allows all: without tags, the whole subscription is meant."""
+
+    def check_tag_ids(self, known: Iterable[str], new: Iterable[str]) -> None:
+        """Checks that each tag of a device has a subject of its own. Raises `Refused`."""
+        names = {next_name(id): id for id in known}
+        for id in new:
+            if not id.isprintable():
+                raise Refused(f"the tag id is {id!r}, allowed: printable characters and blanks")
+            other = names.setdefault(next_name(id), id)
+            if other != id:
+                raise Refused(
+                    f"tag id {id!r} has the same name in subjects as {other!r}: {next_name(id)}; "
+                    "give one of them another id"
+                )
+
+    def byte_order_notes(self, *_: object) -> Iterable[str]:
+        """Returns nothing: orders mean the same everywhere."""
+        return ()
+
+    def command_text(self, data: bytes) -> str:
+        """Returns the value of a JSON command as text. Raises `Refused`."""
+        try:
+            data.decode()
+        except UnicodeDecodeError:
+            raise Refused("the value is not UTF-8 text") from None
+        return _command_text(data)
+
+
+def normalized(found: dict[str, Any]) -> dict[str, Any]:
+    """Returns a subscribe request with the keys of `SubscribeRequest`."""
     if "tags" not in found and type(found.get("registers")) is list:
         found["tags"] = [_register(each) for each in found.pop("registers")]
     if "tags" in found and found["tags"] is None:  # Go's JSON of an empty list.
         found["tags"] = []
     if type(found.get("tags")) is list:
         found["tags"] = [_tag(each) for each in found["tags"]]
-    return msgspec.json.encode(found)
+    return found
 
 
 def _register(found: Any) -> Any:
@@ -70,8 +126,7 @@ def _tag(found: Any) -> Any:
     return found | {key: default for key, default in TAG_DEFAULTS.items() if not found.get(key)}
 
 
-def command(data: bytes) -> str:
-    """Returns the value of a command as text. Raises `Refused`."""
+def _command_text(data: bytes) -> str:
     try:
         value = msgspec.json.decode(data)
         raw = bytes(msgspec.json.decode(data, type=_Command).value) if type(value) is dict else data
@@ -84,12 +139,3 @@ def command(data: bytes) -> str:
         found = "null" if value is None else "an object"
         raise Refused(f"the value is {found}, allowed: numbers, booleans, texts and arrays")
     return value if type(value) is str else raw.decode()
-
-
-def check_entry(key: str, request: SubscribeRequest) -> None:
-    """Checks what only entries of the bucket must fulfil. Raises `Refused`."""
-    named = f"{request.subscriber_id}.{request.device_id}"
-    if key != named:
-        raise Refused(f"the key is {key!r}, allowed: SUBSCRIBER.DEVICE of its value: {named!r}")
-    if request.ttl is not None:
-        raise Refused("ttl is given; an entry lasts until it is deleted")

@@ -1,13 +1,12 @@
 """The messages of the service: requests, answers and published messages.
 
-`decode` checks requests strictly: an unknown key, a wrong type or a value out of range refuses the
-whole request. `null` for an optional value is the same as omitting it. `leniency` accepts more.
-Checks that need the state of the scanner are in other modules.
+A type has the checks of single keys. `decoding` applies them. Checks that need the state of the
+scanner are in other modules.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -15,8 +14,7 @@ from msgspec import Meta
 from holdfast.config.scanning import Publish
 from holdfast.net.addresses import LAST_PORT
 from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
-from holdfast.scanner.errors import Refused
-from holdfast.types import TRANSPORTS, Area, Transport
+from holdfast.types import Area, Transport
 
 FunctionCode = Literal["coil", "discrete", "holding", "input"]
 State = Literal["connecting", "online", "offline"]
@@ -32,26 +30,16 @@ Marker = bool | int | float | str
 MAX_TTL = 31_536_000
 """The longest `ttl` in seconds: a year."""
 
-EXACT = 2.0**53
-"""Floats below this represent every integer exactly."""
-
-CHOICES = {
-    "functionCode": get_args(FunctionCode),
-    "transport": TRANSPORTS,
-    "publish": get_args(Publish),
-    "tagIds": ("a list of tag ids", '"all"'),
-}
-
 
 class _Message(msgspec.Struct, rename="camel"):
     """A message with keys in camel case."""
 
 
-class _Request(_Message, forbid_unknown_fields=True):
+class Request(_Message, forbid_unknown_fields=True):
     """A request of a caller."""
 
 
-class TagRequest(_Request):
+class TagRequest(Request):
     """A tag: the address and the type of a value of a device."""
 
     id: Id
@@ -73,7 +61,7 @@ class TagRequest(_Request):
     """A profile of the configuration, whose tag of this id applies in place of all else."""
 
 
-class PlanRequest(_Request, rename=None):
+class PlanRequest(Request, rename=None):
     """How the tags of a device are combined into Modbus requests."""
 
     max_gap: Annotated[int, Meta(ge=0, le=LAST_ADDRESS)] | None = None
@@ -87,7 +75,7 @@ class PlanRequest(_Request, rename=None):
     """Ranges of addresses that are never read, in the same form."""
 
 
-class SubscribeRequest(_Request):
+class SubscribeRequest(Request):
     """Subscribes to tags of a device."""
 
     device_id: Annotated[str, Meta(min_length=1, max_length=128)]
@@ -121,7 +109,7 @@ class SubscribeRequest(_Request):
     """Seconds after which the subscription ends, unless a request renews it. Default: it stays."""
 
 
-class UnsubscribeRequest(_Request):
+class UnsubscribeRequest(Request):
     """Ends a subscription, or removes tags from it."""
 
     device_id: str
@@ -136,7 +124,7 @@ class UnsubscribeRequest(_Request):
         return None if self.tag_ids == "all" else self.tag_ids
 
 
-class BrowseRequest(_Request):
+class BrowseRequest(Request):
     """Requests a report of devices. An empty message requests all devices."""
 
     device_id: str | None = None
@@ -146,7 +134,7 @@ class BrowseRequest(_Request):
     """The number of tags of `deviceId` to skip."""
 
 
-class VariablesRequest(_Request):
+class VariablesRequest(Request):
     """Requests the latest values. An empty message requests those of all devices."""
 
     device_id: str | None = None
@@ -396,56 +384,3 @@ class BrowseAnswer(_Message, omit_defaults=True):
     next_tag: int | None = None
     """The `tagOffset` of the next request, if the device does not fit into this answer. The answer
     then has some of its tags, with their blocks and subscribers."""
-
-
-Asked = TypeVar("Asked", bound=_Request)
-
-
-def decode(data: bytes, kind: type[Asked], most: int) -> Asked:
-    """Parses a request of at most `most` bytes. Raises `Refused`."""
-    check_size(data, most)
-    try:
-        try:
-            return msgspec.json.decode(data, type=kind)
-        except msgspec.ValidationError as error:
-            if "got `float`" not in str(error):
-                raise
-            return msgspec.convert(with_integers(msgspec.json.decode(data)), type=kind)
-    except msgspec.ValidationError as error:
-        raise Refused(_explained(str(error))) from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise Refused(f"not JSON: {error}") from None
-
-
-def check_size(data: bytes, most: int) -> None:
-    """Raises `Refused` for a request of more than `most` bytes."""
-    if len(data) > most:
-        raise Refused(f"the request has {len(data)} bytes, allowed: {most}")
-
-
-def converted(value: object, kind: type[Asked]) -> Asked:
-    """Converts parsed JSON to a request. Raises `Refused`."""
-    try:
-        return msgspec.convert(value, type=kind)
-    except msgspec.ValidationError as error:
-        raise Refused(_explained(str(error))) from None
-
-
-def with_integers(value: Any) -> Any:
-    """Converts whole floats to integers. JavaScript callers do not distinguish them."""
-    if type(value) is dict:
-        return {key: with_integers(item) for key, item in value.items()}
-    if type(value) is list:
-        return [with_integers(item) for item in value]
-    if type(value) is float and value.is_integer() and abs(value) < EXACT:
-        return int(value)
-    return value
-
-
-def _explained(text: str) -> str:
-    """Returns an error message of msgspec; for an enumeration, with the allowed words."""
-    if "enum" in text:
-        for key, words in CHOICES.items():
-            if f".{key}`" in text:
-                return f"{text}, allowed: {', '.join(words)}"
-    return text

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import msgspec
 
 from holdfast.scanner import wire
-from holdfast.scanner.messages.subjects import data_subject
+from holdfast.scanner.messages.dialects import TENTACLE
 from holdfast.scanner.subscriptions.groups import Group
 from holdfast.scanner.subscriptions.tag import clean
 from holdfast.tags.changing import differs
@@ -23,7 +23,7 @@ from holdfast.tags.decoding import Places, Undecoded, decoder
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence, Set
 
-    from holdfast.config.scanning import Dialect
+    from holdfast.scanner.messages.dialect import Dialect
     from holdfast.scanner.subscriptions.tag import Tag
     from holdfast.tags.decoding import Decoder
     from holdfast.types import Area, PolledBlock
@@ -49,7 +49,7 @@ class Publisher:
     """Creates the messages of one device."""
 
     def __init__(
-        self, prefix: str, device: str, dialect: Dialect = "tentacle", lease: int | None = None
+        self, prefix: str, device: str, dialect: Dialect = TENTACLE, lease: int | None = None
     ) -> None:
         """In a fleet, messages have the revision of the `lease` of the device."""
         self._lease = lease
@@ -242,7 +242,7 @@ class Publisher:
         before = _encode(head)[:-1] + b',"value":'
         after = b',"datatype":"%b","timestamp":' % tag.datatype.encode()
         text = before.replace(b"%", b"%%") + b"%b" + after + b"%b}"
-        subject = data_subject(self._prefix, self._device, tag.id, self._dialect).encode()
+        subject = self._dialect.data_subject(self._prefix, self._device, tag.id).encode()
         size, header = len(before) + len(after) + 1, self._header
         escaped = subject.replace(b"%", b"%%")
         head_line = b"PUB %b %%d\r\n" % escaped

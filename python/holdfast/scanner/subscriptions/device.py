@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from holdfast._core import plan_blocks
 from holdfast.protocol import READ_BITS, READ_REGISTERS
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.messages.subjects import names
+from holdfast.scanner.messages.dialects import TENTACLE
 from holdfast.scanner.subscriptions.latest import LatestBlocks
 from holdfast.scanner.subscriptions.tag import AREA_OF_CODE, Tag
 
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
     from holdfast._core import Endpoint
     from holdfast.client.url import Target
-    from holdfast.config.scanning import Dialect, Publish, Writes
+    from holdfast.config.scanning import Publish, Writes
+    from holdfast.scanner.messages.dialect import Dialect
     from holdfast.scanner.messages.types import PlanRequest, Range
     from holdfast.scanner.subscriptions.health import Health
     from holdfast.types import Area
@@ -123,13 +124,13 @@ class Subscriber:
     """Milliseconds."""
     publish: Publish
     deadband: float
-    tags: dict[str, Wanted] = field(default_factory=dict)
+    tags: dict[str, TagOptions] = field(default_factory=dict)
     ttl: int | None = None
     """Seconds after which the subscription ends, unless a request renews it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class TagOptions:
     """The properties of a tag that each subscriber sets for itself."""
 
     writable: bool | None
@@ -137,7 +138,7 @@ class Wanted:
     description: str | None
 
 
-USUALLY_WANTED = Wanted(None, None)
+NO_OPTIONS = TagOptions(None, None)
 """One object for nearly all tags."""
 
 
@@ -151,10 +152,10 @@ class ScannedDevice:
         address: Target,
         health: Health,
         writes: Writes = "tags",
-        dialect: Dialect = "tentacle",
+        dialect: Dialect = TENTACLE,
     ) -> None:
         self.id = id
-        self.subjects = names(id, dialect)
+        self.subjects = dialect.device_names(id)
         """The names of the device in subjects; nearly always one."""
         self.source = source
         self.address = address

@@ -1,68 +1,36 @@
 """The registry of all subscriptions. A request is carried out completely or not at all.
 
-All checks run before the first change, without an await in between. `understood` checks a request
-by itself. The registry checks it against the existing subscriptions.
+All checks run before the first change, without an await in between. A `Subscription` is valid by
+itself; the registry checks it against those that it has.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
-from urllib.parse import parse_qsl, urlsplit
 
-from holdfast.client import url as urls
 from holdfast.client.tolerance import STRICT
-from holdfast.client.url import NetworkTarget, SerialTarget
-from holdfast.net.addresses import address_in, unbracketed
-from holdfast.protocol import usual_port
+from holdfast.client.url import SerialTarget
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.messages.leniency import Adjustments
-from holdfast.scanner.messages.subjects import next_name, subject_id
-from holdfast.scanner.subscriptions.device import (
-    USUALLY_WANTED,
-    Plan,
-    ScannedDevice,
-    Source,
-    Subscriber,
-    Wanted,
-)
+from holdfast.scanner.messages.dialects import TENTACLE
+from holdfast.scanner.messages.subjects import subject_id
+from holdfast.scanner.subscriptions.device import ScannedDevice, Source, Subscriber
 from holdfast.scanner.subscriptions.health import Health
-from holdfast.scanner.subscriptions.tag import ORDERS, profiled, tag
-from holdfast.types import SERIAL_FRAMES
+from holdfast.scanner.subscriptions.subscription import SETTINGS
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping
+    from collections.abc import Collection
 
     from holdfast.client.url import Target
-    from holdfast.config.scanning import Dialect, Publish, Writes
-    from holdfast.scanner.messages.types import SubscribeRequest, TagRequest, UnsubscribeRequest
+    from holdfast.config.scanning import Writes
+    from holdfast.scanner.messages.dialect import Dialect
+    from holdfast.scanner.messages.types import UnsubscribeRequest
     from holdfast.scanner.subscriptions.limits import ScannerLimits
-    from holdfast.scanner.subscriptions.rules import Rules
+    from holdfast.scanner.subscriptions.subscription import Subscription
     from holdfast.scanner.subscriptions.tag import Tag
-
-SETTINGS = ("timeout", "release", "plan")
-"""The settings of a device that a request may leave out, once another has set them."""
 
 LINE_SETTINGS = ("mode", "baud", "parity", "stop_bits", "data_bits", "silence")
 """What all devices on one serial line have alike."""
-
-
-@dataclass(frozen=True)
-class Subscription:
-    """A subscribe request that is valid by itself."""
-
-    device: str
-    subscriber: str
-    source: Source
-    said: frozenset[str]
-    """The settings that the request contains. Others are those of the known device, or defaults."""
-    tags: Mapping[str, Tag]
-    wanted: Mapping[str, Wanted]
-    rate: int
-    publish: Publish
-    deadband: float
-    ttl: int | None
-    """Seconds."""
 
 
 @dataclass(frozen=True)
@@ -77,123 +45,11 @@ class Change:
     """The device that `device` replaces, because its address or a setting is another."""
 
 
-def understood(
-    request: SubscribeRequest, rules: Rules, changes: Adjustments | None = None
-) -> Subscription:
-    """Checks a request by itself. Adds to `changes` what is adjusted. Raises `Refused`."""
-    changes = Adjustments() if changes is None else changes
-    limits, defaults = rules.limits, rules.defaults
-    _check_id(request.device_id)
-    publish = request.publish or defaults.publish
-    if request.deadband and publish != "change":
-        raise Refused('deadband requires "publish": "change"')
-    deadband = defaults.deadband if request.deadband is None else request.deadband
-    source = Source(
-        _target(request),
-        1 if request.unit_id is None else request.unit_id,
-        _within(
-            "timeout",
-            defaults.timeout if request.timeout is None else request.timeout,
-            limits.shortest_timeout,
-            limits.longest_timeout,
-        ),
-        bool(request.release),
-        Plan.of(request.plan),
-        request.url,
-    )
-    target = source.target
-    if source.unit == 0 and (isinstance(target, SerialTarget) or target.transport in SERIAL_FRAMES):
-        raise Refused("unitId is 0, which is the broadcast of a serial line")
-    order = ORDERS.get(request.byte_order or "big", request.byte_order or "")
-    tags: dict[str, Tag] = {}
-    of_profile = {} if request.profile is None else profiled(request.profile, rules)
-    replaced = dict(of_profile)
-    for entry in of_profile.values():
-        tags[entry.id] = tag(entry, order, f"profile {request.profile}", changes, rules)
-    for index, entry in enumerate(request.tags):
-        where = f"tags[{index}]"
-        made = tag(entry, order, where, changes, rules)
-        if replaced.pop(made.id, None) is None and made.id in tags:
-            if rules.strict:
-                raise Refused(f"{where}: duplicate id {made.id!r}")
-            if rules.dialect == "tentacle-next" and made != tags[made.id]:
-                # Its gateway sends tags in random order, so no definition is the last one.
-                raise Refused(f"{where}: {made.id!r} is {made}, and already {tags[made.id]}")
-            changes.add("tag_repeated", made.id)
-        tags[made.id] = made
-    source.plan.check(list(tags.values()))
-    said = {key for key in SETTINGS if getattr(request, key) is not None}
-    return Subscription(
-        request.device_id,
-        request.subscriber_id,
-        source,
-        frozenset(said),
-        tags,
-        {entry.id: _wanted(entry) for entry in (*of_profile.values(), *request.tags)},
-        _rate(request, rules, changes),
-        publish,
-        deadband if publish == "change" else 0.0,
-        request.ttl,
-    )
-
-
-def _wanted(entry: TagRequest) -> Wanted:
-    if entry.writable is None and entry.description is None:
-        return USUALLY_WANTED
-    return Wanted(entry.writable, entry.description)
-
-
-def _check_id(id: str) -> None:
-    """Checks a device id, which becomes a part of subjects. Raises `Refused`."""
-    if not id.isprintable():
-        raise Refused(f"deviceId is {id!r}, allowed: printable characters and blanks")
-
-
-def _rate(request: SubscribeRequest, rules: Rules, changes: Adjustments) -> int:
-    """Returns the scan rate; one that is too short is raised. Raises `Refused`."""
-    limits, rate = rules.limits, request.scan_rate
-    if rate is None:
-        return rules.defaults.scan_rate
-    if rate < limits.shortest_scan and not rules.strict:
-        changes.add("scan_rate_raised", f"{rate} to {limits.shortest_scan} ms")
-        return limits.shortest_scan
-    return _within("scanRate", rate, limits.shortest_scan, limits.longest_scan)
-
-
-def _target(request: SubscribeRequest) -> Target:
-    given = [key for key in ("host", "port", "transport") if getattr(request, key) is not None]
-    if request.url is not None:
-        if given:
-            raise Refused(f"both url and {given[0]} are given, allowed: only one")
-        try:
-            parts = urlsplit(request.url)
-            for key in dict(parse_qsl(parts.query, keep_blank_values=True)):
-                if parts.scheme == "tls" and key != "name" and key not in asdict(STRICT):
-                    allowed = "allowed: name and the tolerance options; files are the scanner's"
-                    raise Refused(f"url: {key} is given, {allowed}")
-            return urls.parse(request.url)
-        except ValueError as error:
-            raise Refused(f"url: {error}") from None
-    if request.host is None:
-        raise Refused("host is missing: give host or url")
-    transport = request.transport or "tcp"
-    port = usual_port(transport) if request.port is None else request.port
-    is_address = address_in(request.host) is not None
-    host = unbracketed(request.host) if is_address else request.host
-    return NetworkTarget(transport, host, port)
-
-
-def _within(key: str, value: int, least: int, most: int) -> int:
-    if not least <= value <= most:
-        raise Refused(f"{key} is {value}, allowed: {least} to {most} ms")
-    return value
-
-
 class Registry:
     """The devices by id, with their subscribers."""
 
     def __init__(
-        self, limits: ScannerLimits, writes: Writes = "tags", dialect: Dialect = "tentacle"
+        self, limits: ScannerLimits, writes: Writes = "tags", dialect: Dialect = TENTACLE
     ) -> None:
         self.devices: dict[str, ScannedDevice] = {}
         self._limits = limits
@@ -203,7 +59,7 @@ class Registry:
         self._holders: dict[str, set[str]] = {}
         """The ids of the devices that have a tag id."""
         self._spelled: dict[str, set[str]] = {}
-        """The tag ids, by their names in subjects; only with dialect `tentacle-next`."""
+        """The tag ids that have another name in subjects, by this name."""
         self._subjects: dict[str, str] = {}
         """The ids of the devices, by their names in subjects."""
         self._sharing: dict[str, list[str]] = {}
@@ -255,8 +111,7 @@ class Registry:
                 former = device
                 self._check_shared(asked)
             _check_tags(device, asked)
-        if self._dialect == "tentacle-next":
-            _check_tag_names(() if device is None else device.tags, asked)
+        self._dialect.check_tag_ids(() if device is None else device.tags, asked.tags)
         if device is not None:
             source.plan.check(list((device.tags | dict(asked.tags)).values()))
         if not asked.tags and (device is None or asked.subscriber not in device.subscribers):
@@ -274,11 +129,11 @@ class Registry:
         redefined = any(device.tags.get(id, tag) != tag for id, tag in asked.tags.items())
         for kept in map(self._alike, asked.tags.values()):
             device.tags[kept.id] = kept
-            subscriber.tags[kept.id] = asked.wanted[kept.id]
+            subscriber.tags[kept.id] = asked.options[kept.id]
         for id in new:
             self._holders.setdefault(id, set()).add(device.id)
-            if self._dialect == "tentacle-next":
-                self._spelled.setdefault(next_name(id), set()).add(id)
+            if (name := self._dialect.tag_name(id)) != id:
+                self._spelled.setdefault(name, set()).add(id)
         self._tags += len(new)
         return Change(device, bool(new) or redefined or device.rate != before, former)
 
@@ -351,15 +206,14 @@ class Registry:
 
     def _ids(self, name: str) -> set[str]:
         """Returns the tag ids that a command may mean by a name."""
-        if self._dialect == "tentacle-next":
-            return {name} | self._spelled.get(name, set())
-        return {name}
+        return {name} | self._spelled.get(name, set())
 
     def _forget_spelling(self, id: str) -> None:
-        ids = self._spelled.get(next_name(id), set())
+        name = self._dialect.tag_name(id)
+        ids = self._spelled.get(name, set())
         ids.discard(id)
         if not ids:
-            self._spelled.pop(next_name(id), None)
+            self._spelled.pop(name, None)
 
     def _check_subject(self, id: str) -> None:
         """Checks that no other device has the same name in subjects. Raises `Refused`."""
@@ -450,20 +304,6 @@ def _check_tags(device: ScannedDevice, asked: Subscription) -> None:
             found = f"tag {id!r} of {device.id} already has another definition: {difference}"
             users = [name for name in device.users(id) if name != asked.subscriber]
             _check_unused(found, users)
-
-
-def _check_tag_names(known: Iterable[str], asked: Subscription) -> None:
-    """Checks that each tag of a device has a subject of its own. Raises `Refused`."""
-    names = {next_name(id): id for id in known}
-    for id in asked.tags:
-        if not id.isprintable():
-            raise Refused(f"the tag id is {id!r}, allowed: printable characters and blanks")
-        other = names.setdefault(next_name(id), id)
-        if other != id:
-            raise Refused(
-                f"tag id {id!r} has the same name in subjects as {other!r}: {next_name(id)}; "
-                "give one of them another id"
-            )
 
 
 def _subjects(device: ScannedDevice) -> set[str]:

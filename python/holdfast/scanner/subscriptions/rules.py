@@ -6,12 +6,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from holdfast.config.scanning import SCAN_RATE, TIMEOUT
+from holdfast.scanner.messages.dialects import TENTACLE
 from holdfast.scanner.subscriptions.limits import ScannerLimits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from holdfast.config.scanning import Dialect, Publish
+    from holdfast.config.scanning import Publish
+    from holdfast.scanner.messages.dialect import Dialect
     from holdfast.tags import TagList
 
 
@@ -34,6 +36,6 @@ class Rules:
     defaults: Defaults = field(default_factory=Defaults)
     strict: bool = False
     """Whether a request is refused that would otherwise be adjusted, see `messages.leniency`."""
-    dialect: Dialect = "tentacle"
+    dialect: Dialect = TENTACLE
     profiles: Mapping[str, TagList] = field(default_factory=dict)
     """The tags that requests can name by their profile."""

@@ -6,22 +6,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
 from holdfast import tags
-from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS
-from holdfast.scanner.errors import Refused
-from holdfast.scanner.messages import tentacle
-from holdfast.scanner.messages.types import FunctionCode, TagRequest
+from holdfast.protocol import WRITE_LIMITS
+from holdfast.scanner.messages.types import FunctionCode
 from holdfast.tags.decoding import Undecoded
-from holdfast.tags.markers import as_decoded
 from holdfast.tags.register_scale import Scaled
 from holdfast.tags.writing import unwritable
 from holdfast.types import AREAS, BIT_AREAS
-from holdfast.values import ConversionError, WrongArea, codec_for
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
-    from holdfast.scanner.messages.leniency import Adjustments
     from holdfast.scanner.messages.types import DataType
-    from holdfast.scanner.subscriptions.rules import Rules
     from holdfast.tags.markers import Marker
     from holdfast.types import Area
     from holdfast.values.types import Type
@@ -29,15 +23,6 @@ if TYPE_CHECKING:
 AREA_OF_CODE: dict[FunctionCode, Area] = dict(zip(get_args(FunctionCode), AREAS, strict=True))
 CODE_OF_AREA = {area: code for code, area in AREA_OF_CODE.items()}
 """The names of the areas in messages."""
-
-ORDERS = {"big": "ABCD", "little": "DCBA"}
-"""Other names of byte orders, as callers of tentacle-modbus use them."""
-
-NUMERIC = ("bcd", "float", "int", "uint")
-"""What the names of numeric types begin with."""
-
-NO_MARKERS: frozenset[Marker] = frozenset()
-"""One object for nearly all tags."""
 
 KINDS: dict[str, DataType] = {
     "bool": "boolean",
@@ -136,90 +121,3 @@ def clean(value: Any, tag: Tag) -> Any:
 def datatype(type: Type) -> DataType:
     """Returns the `datatype` in messages."""
     return "array" if type.count is not None else KINDS.get(type.base, "number")
-
-
-def tag(request: TagRequest, order: str, where: str, changes: Adjustments, rules: Rules) -> Tag:
-    """Creates the tag of a request; `order` is the default byte order. Raises `Refused`.
-
-    Unless the rules are strict, a number in an area of bits becomes a boolean, and `writable` is
-    ignored in an area that can't be written. Adds this to `changes`.
-    """
-    if request.profile is not None:
-        return _of_profile(request.profile, request.id, where, rules)
-    area = AREA_OF_CODE[request.function_code]
-    name = request.datatype
-    if name == "boolean" or name.startswith("boolean["):
-        name = "bool" + name.removeprefix("boolean")
-    order = request.byte_order or order
-    order = ORDERS.get(order, order)
-    try:
-        type = parsed(name)
-        if _is_number(type) and area in BIT_AREAS and not rules.strict:
-            changes.add("datatype_ignored", f"{request.id} ({name} in {area})")
-            name, type = "bool", parsed("bool")
-        if type.base == "bool":
-            order = "ABCD"
-        elif rules.dialect == "tentacle" and area not in BIT_AREAS:
-            for note in tentacle.warnings(request, area, order):
-                changes.warn(request.id, note)
-            order = tentacle.order(name, order)
-        codec_for(area, name, order, request.encoding)
-    except WrongArea:
-        raise Refused(
-            f"{where}: datatype is {name}, functionCode {request.function_code} reads boolean"
-        ) from None
-    except ConversionError as error:
-        raise Refused(f"{where}: {error}") from None
-    if request.address + type.registers > ADDRESSES:
-        raise Refused(
-            f"{where}: {name} from address {request.address}: the last address is {LAST_ADDRESS}"
-        )
-    try:
-        null = NO_MARKERS
-        if request.null:
-            null = frozenset(as_decoded(each, type, request.encoding) for each in request.null)
-    except ValueError as error:
-        raise Refused(f"{where}.null: {error}") from None
-    made = Tag(request.id, area, request.address, name, order, null, request.encoding)
-    if request.writable and (flaw := made.unwritable) is not None:
-        if area in WRITE_LIMITS or rules.strict:
-            raise Refused(f"{where}: {flaw}")
-        changes.add("writable_ignored", f"{request.id} ({area})")
-    return made
-
-
-def _is_number(type: Type) -> bool:
-    return type.count is None and type.base.startswith(NUMERIC)
-
-
-def profiled(name: str, rules: Rules) -> dict[str, TagRequest]:
-    """The tags of a profile, as requests by id. Raises `Refused`."""
-    return {
-        tag.name: TagRequest(
-            id=tag.name,
-            address=tag.address,
-            function_code=CODE_OF_AREA[tag.area],
-            datatype=tag.type,
-            writable=tag.writable,
-            description=tag.description or None,
-            profile=name,
-        )
-        for tag in _profile(name, "profile", rules)
-    }
-
-
-def _of_profile(name: str, id: str, where: str, rules: Rules) -> Tag:
-    profile = _profile(name, f"{where}.profile", rules)
-    if id not in profile:
-        raise Refused(f"{where}: the profile {name} has no tag {id!r}")
-    tag = profile[id]
-    made = (tag.area, tag.address, tag.type, tag.order, tag.null, tag.encoding)
-    return Tag(id, *made, profile=name, meaning=tag)
-
-
-def _profile(name: str, where: str, rules: Rules) -> tags.TagList:
-    found = rules.profiles.get(name)
-    if found is None:
-        allowed = ", ".join(rules.profiles) or "none, the configuration has no profiles"
-        raise Refused(f"{where} is {name!r}, allowed: {allowed}")
-    return found
