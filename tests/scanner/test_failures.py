@@ -19,6 +19,7 @@ from support import wire
 from support.brokers import NatsServer
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
 from support.nats_bus import Caller, leaving, subscription, tag
+from support.scanner_parts import broker_of, client_of, presence_of, registry_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -94,7 +95,7 @@ def test_a_client_that_nats_throws_out_is_replaced(
 
 
 async def _nonsense(scanner: Any) -> None:
-    client = scanner._broker.client
+    client = client_of(scanner)
     await client._send_command(b"NONSENSE\r\n")
     await client._flush_pending()
 
@@ -161,7 +162,7 @@ def test_what_nats_took_before_it_died_is_published_anew(
 
     own_nats.freeze()
     memory.write("holding_registers", 0, [7])
-    device = scanner.scanner._registry.devices["plc1"]
+    device = registry_of(scanner.scanner).devices["plc1"]
     seen = device.health.scans + 3
     wire.until(lambda: device.health.scans > seen, "the change was handed to NATS")
 
@@ -183,7 +184,7 @@ def test_what_nats_took_before_it_died_is_published_anew(
 
 
 def test_nats_that_was_away_for_long_is_tried_every_other_second(run_scanner: Run) -> None:
-    broker = run_scanner(max_pause_s=MAX_PAUSE).scanner._broker
+    broker = broker_of(run_scanner(max_pause_s=MAX_PAUSE).scanner)
     client = broker.client
     assert client is not None
     broker._lost("tested")
@@ -389,7 +390,9 @@ def test_without_jetstream_it_says_so_once_and_goes_on(
             caller.request("modbus.subscribe", subscription(server, tag("a", 0)))
             data.next()
             for _ in range(3):
-                scanner.do(scanner.scanner._heart.beat(scanner.scanner._broker.client))
+                scanner.do(
+                    presence_of(scanner.scanner).heartbeat.beat(broker_of(scanner.scanner).client)
+                )
         [told] = [each for each in caplog.records if each.getMessage() == "no_heartbeat"]
         reason = "JetStream is not enabled on the server or for this account"
         assert told.__dict__["fields"]["reason"] == reason
@@ -407,7 +410,7 @@ def test_a_bucket_in_which_heartbeats_stay_for_ever_is_told_of_once(
     own_caller.do(_bucket_without_end(own_caller))
     scanner = run_scanner(own_nats)
     wire.until(lambda: "heartbeat" in events(caplog), "there is a heartbeat")
-    heart, broker = scanner.scanner._heart, scanner.scanner._broker
+    heart, broker = presence_of(scanner.scanner).heartbeat, broker_of(scanner.scanner)
     heart._works = None
     scanner.do(heart.beat(broker.client))
     [told] = [each for each in caplog.records if each.getMessage() == "heartbeat_has_no_end"]
@@ -514,12 +517,12 @@ def test_a_message_that_is_none_costs_no_other(
     run_scanner: Run, own_nats: NatsServer, own_caller: Caller, lines: bytes
 ) -> None:
     scanner = run_scanner(own_nats)
-    client = scanner.scanner._broker.client
+    client = client_of(scanner.scanner)
     _raw(own_nats, 3 * lines)
     assert own_caller.request("modbus.browse", b"")["success"]
     _raw(own_nats, lines)
     assert own_caller.request("modbus.browse", b"")["success"]
-    assert scanner.scanner._broker.client is client
+    assert client_of(scanner.scanner) is client
     assert client is not None
     assert client.stats["reconnects"] == 0
 

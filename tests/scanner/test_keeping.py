@@ -80,7 +80,7 @@ def test_a_state_that_is_being_stored_is_removed_when_the_scanner_stops(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     begun, stopping, put = threading.Event(), threading.Event(), KeyValue.put
-    purge, stop = JetStreamContext.purge_stream, store.Keeper.stop
+    purge, stop = JetStreamContext.purge_stream, store.EntryStore.stop
     sent: list[Future[int]] = []
     arrived: list[bool] = []
 
@@ -101,13 +101,13 @@ def test_a_state_that_is_being_stored_is_removed_when_the_scanner_stops(
         arrived.append(all(each.done() for each in sent))
         return await purge(jetstream, name, **more)
 
-    async def noted_stop(keeper: store.Keeper) -> None:
+    async def noted_stop(keeper: store.EntryStore) -> None:
         stopping.set()
         await stop(keeper)
 
     monkeypatch.setattr(KeyValue, "put", put_late)
     monkeypatch.setattr(JetStreamContext, "purge_stream", noted_purge)
-    monkeypatch.setattr(store.Keeper, "stop", noted_stop)
+    monkeypatch.setattr(store.EntryStore, "stop", noted_stop)
     running = run_scanner()
     caller.publish("modbus.subscribe", subscription(server, tag("a", 0)))
     assert begun.wait(wire.DEADLINE)
@@ -297,7 +297,7 @@ def test_jetstream_that_fails_holds_no_request_up_and_gets_everything_later(
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(store, "RETRIED", 0.1)
+    monkeypatch.setattr(store, "MAX_RETRY_S", 0.1)
     bare = NatsServer(tmp_path, jetstream=False)
     try:
         scanner = run_scanner(bare)

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.client.url import NetworkTarget
-from holdfast.scanner.jetstream.heartbeat import Heart
+from holdfast.scanner.jetstream.heartbeat import HeartbeatKey
 from holdfast.scanner.messages.types import BrowseRequest, HeartbeatMetadata, ServiceReport
 from holdfast.scanner.publish import outbox as outboxes
 from holdfast.scanner.publish.outbox import Outbox
 from holdfast.scanner.publish.publisher import Publisher
-from holdfast.scanner.reports.devices import browsed
+from holdfast.scanner.reports import browsed
 from holdfast.scanner.subscriptions.device import (
     Plan,
     ScannedDevice,
@@ -521,7 +521,7 @@ def test_a_heartbeat_that_fails_after_the_stop_is_not_logged(
 
     async def beaten(*, stopped: bool) -> list[str]:
         caplog.clear()
-        heart = Heart("plant", lambda: HeartbeatMetadata(0, 0, "1"), lambda _: None)
+        heart = HeartbeatKey("plant", lambda: HeartbeatMetadata(0, 0, "1"), lambda _: None)
         server = Jetstream()
         client = cast("Client", server)
         beating = asyncio.create_task(heart.beat(client))

@@ -17,6 +17,7 @@ from holdfast.scanner.messages import DIALECTS, tentacle_next
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag
+from support.scanner_parts import allowed_of
 from support.tentacle_next import (
     BUCKET,
     ENABLED,
@@ -418,15 +419,15 @@ def test_an_entry_whose_host_is_not_found_is_tried_again(
     run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = run_scanner(**NEXT)
-    address = running.scanner._allowed.address
+    address = allowed_of(running.scanner).address
 
     async def not_found(*_: Any, **__: Any) -> Any:
         raise Refused("host plc.example: no such name")
 
-    monkeypatch.setattr(running.scanner._allowed, "address", not_found)
+    monkeypatch.setattr(allowed_of(running.scanner), "address", not_found)
     caller.put(BUCKET, key(), gateway_entry(server, gateway_tag("a", 0)))
     wire.until(lambda: key() in refused(caller), "it is refused")
-    monkeypatch.setattr(running.scanner._allowed, "address", address)
+    monkeypatch.setattr(allowed_of(running.scanner), "address", address)
     wire.until(lambda: tags(caller) == {"a"}, "it is subscribed")
     assert refused(caller) == {}
     running.stop()

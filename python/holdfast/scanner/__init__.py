@@ -3,7 +3,9 @@
 It has no configuration of devices. It connects to a device at the first subscription to its tags,
 and disconnects after the last one ends. It keeps subscriptions over a restart in JetStream only.
 
-`service` starts and stops the parts. Each folder has one subject:
+`service` makes the parts, connects them and stops them. `requests` carries out subscriptions,
+`commands` writes, `reports` answers questions. `devices` polls and publishes what is subscribed to.
+`placement` is what differs between a scanner that is alone and a node of a fleet.
 
 * `messages`: the messages, and what the programs of each dialect send and expect
 * `subscriptions`: devices and tags, who has subscribed to them, and at what rate
@@ -17,7 +19,8 @@ from __future__ import annotations
 
 from holdfast.scanner.broker import Ping, Servers
 from holdfast.scanner.fleet.agreement import FleetRefused, FleetSettings
-from holdfast.scanner.service import Scanner, Settings
+from holdfast.scanner.service import Scanner
+from holdfast.scanner.settings import Settings
 from holdfast.scanner.subscriptions.limits import ScannerLimits
 from holdfast.scanner.subscriptions.rules import Defaults
 

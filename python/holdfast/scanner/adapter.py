@@ -14,7 +14,7 @@ from holdfast.scanner.service import Scanner
 if TYPE_CHECKING:
     from holdfast._core import Poller
     from holdfast.leases import StartThread
-    from holdfast.scanner.service import Settings
+    from holdfast.scanner.settings import Settings
     from holdfast.stop import Stop
 
 

@@ -35,7 +35,7 @@ PRIVATE = tuple(
 WHERE = "allow it with --allow, or in nats.devices of the configuration"
 
 
-class Allowed:
+class AllowedDevices:
     """The allowed devices; without entries, `PRIVATE`."""
 
     def __init__(self, entries: Iterable[AllowEntry] = ()) -> None:

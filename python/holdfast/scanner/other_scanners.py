@@ -12,28 +12,28 @@ import time
 from holdfast import logs
 from holdfast.scanner.messages.types import OtherScanner
 
-FORGOTTEN = 30.0
-"""Seconds after the last sign of another scanner until it is forgotten: three heartbeats."""
+FORGET_AFTER_S = 30.0
+"""Time after the last sign of another scanner until it is forgotten: three heartbeats."""
 
-MAX_RIVALS = 100
-"""Limit of other scanners."""
+MAX_SCANNERS = 100
+"""Limit of other scanners that are remembered."""
 
 
-class Rivals:
+class OtherScanners:
     """The other scanners, by the time of their start."""
 
     def __init__(self, started: int) -> None:
         self._started = started
         self._seen: dict[int, float] = {}
 
-    def seen(self, started: int) -> bool:
+    def saw(self, started: int) -> bool:
         """Records a sign of another scanner. Returns whether it is a new one, and then logs it."""
         if started == self._started:
             return False
         now = time.monotonic()
         self._expire(now)
         known = started in self._seen
-        if known or len(self._seen) < MAX_RIVALS:
+        if known or len(self._seen) < MAX_SCANNERS:
             self._seen[started] = now
         if not known:
             todo = "stop one of them, or give it another --prefix"
@@ -52,5 +52,5 @@ class Rivals:
 
     def _expire(self, now: float) -> None:
         self._seen = {
-            started: seen for started, seen in self._seen.items() if now - seen < FORGOTTEN
+            started: seen for started, seen in self._seen.items() if now - seen < FORGET_AFTER_S
         }

@@ -49,14 +49,10 @@ poll, and a caller may subscribe to a thousand tags one by one."""
 
 
 class Polling:
-    """Polls devices. Calls `take` in the event loop for each poll.
-
-    Its arguments are the device, the scheduled time in seconds, and the blocks.
-    """
+    """Polls devices, from `start` on."""
 
     def __init__(
         self,
-        take: Callable[[ScannedDevice, float, list[PolledBlock]], None],
         poller: _core.Poller | None = None,
         fence: Callable[[ScannedDevice], _core.Fence | None] = lambda _: None,
         exact_pauses_s: tuple[float, float] | None = None,
@@ -67,7 +63,6 @@ class Polling:
         """
         self._fence = fence
         self._exact_pauses_s = exact_pauses_s
-        self._take = take
         self._devices: dict[str, ScannedDevice] = {}
         """The devices by their name in the poller."""
         self._renewed: dict[ScannedDevice, float] = {}
@@ -78,13 +73,20 @@ class Polling:
         """Devices that must be polled immediately, because a new subscriber waits for values."""
         self._writes: dict[int, asyncio.Future[int]] = {}
         """Futures of the faults of pending writes, by the number from the poller."""
-        self._loop = asyncio.get_running_loop()
-        self._is_own = poller is None
-        self._poller = _core.Poller([]) if poller is None else poller
-        self._results = self._poller.receiver()
+        self._shared_poller = poller
         self._stopping = threading.Event()
         self._taken = threading.Semaphore(1)
         self._thread = threading.Thread(target=self._run, name="holdfast-scan", daemon=True)
+
+    def start(self, take: Callable[[ScannedDevice, float, list[PolledBlock]], None]) -> None:
+        """Calls `take` in the running event loop for each poll.
+
+        Its arguments are the device, the scheduled time in seconds, and the blocks.
+        """
+        self._take = take
+        self._loop = asyncio.get_running_loop()
+        self._poller = _core.Poller([]) if self._shared_poller is None else self._shared_poller
+        self._results = self._poller.receiver()
         self._thread.start()
 
     def renew(self, device: ScannedDevice, *, at_once: bool = True) -> None:
@@ -222,7 +224,7 @@ class Polling:
         await asyncio.to_thread(self._end)
 
     def _end(self) -> None:
-        if self._is_own:
+        if self._shared_poller is None:
             self._poller.stop()
         while self._thread.is_alive():
             # A wake-up that comes before the wait may have ended another one.

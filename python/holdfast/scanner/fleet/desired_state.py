@@ -1,4 +1,4 @@
-"""What the subscribers of a fleet want: a key for each device, in a bucket."""
+"""What the subscribers of a fleet desired: a key for each device, in a bucket."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from nats.js import JetStreamContext
     from nats.js.api import RawStreamMsg, StreamInfo
 
-TIMEOUT = 2.0
-"""Seconds to wait for an answer of JetStream."""
+TIMEOUT_S = 2.0
+"""Time to wait for an answer of JetStream."""
 
 TERMS = "terms"
 DEVICE = "device."
@@ -36,17 +36,17 @@ WRONG_SEQUENCE = (10071, 10164)
 """Error codes of JetStream: the key has another revision than expected."""
 
 
-SEEN = 1.0
-"""Seconds in which nodes that start at the same time see each other."""
+VISIBLE_AFTER_S = 1.0
+"""Time in which nodes that start at the same time see each other."""
 
-TOGETHER = 32
+MAX_CONCURRENT_WRITES = 32
 """Values of a lost bucket that are stored again at once."""
 
-FORMER = "Holdfast-Former"
+FORMER_HEADER = "Holdfast-Former"
 """The header of a value that is from a lost bucket: which one, and its revision there."""
 
 
-class Want(msgspec.Struct, kw_only=True):
+class DesiredDevice(msgspec.Struct, kw_only=True):
     """The value of a device: its subscriptions, as requests."""
 
     requests: list[msgspec.Raw]
@@ -71,22 +71,22 @@ class _Former:
         return bucket == self.bucket and revision.isdecimal() and int(revision) < self.revision
 
 
-class Wants:
-    """The bucket of wants, also if it gets lost: each node knows all of it, and stores it again."""
+class DesiredState:
+    """The bucket. Each node knows all of it, and stores it again if it gets lost."""
 
     def __init__(
-        self, fleet: str, changed: Callable[[str], None], replaced: Callable[[], None]
+        self, fleet: str, on_change: Callable[[str], None], on_loss: Callable[[], None]
     ) -> None:
-        """`changed` is called for each device that has a new value.
+        """`on_change` is called for each device that has a new value.
 
-        `replaced` is called when all revisions that are known have become void.
+        `on_loss` is called when all revisions that are known have become void.
         """
         self.bucket = f"holdfast_fleet_{fleet}_wants"
         self._stream = f"KV_{self.bucket}"
-        self._pre = f"$KV.{self.bucket}."
+        self._subject_prefix = f"$KV.{self.bucket}."
         self._fleet = fleet
-        self._changed = changed
-        self._replaced = replaced
+        self._on_change = on_change
+        self._on_loss = on_loss
         self._client: Client | None = None
         self._following: JetStreamContext.PushSubscription | None = None
         self._values: dict[str, tuple[int, bytes]] = {}
@@ -110,7 +110,7 @@ class Wants:
         Raises `FleetRefused` for terms in force that are others, and errors of nats-py.
         """
         self._client = client
-        found = await self._make(client.jetstream(timeout=TIMEOUT))
+        found = await self._make(client.jetstream(timeout=TIMEOUT_S))
         self._identify(str(found.created), found.state.last_seq)
         await self.agree(terms, is_in_force, may_replace=has_joined)
         await self._restore()
@@ -123,9 +123,12 @@ class Wants:
             mem_storage=True,
             inactive_threshold=30.0,
         )
-        context = client.jetstream(timeout=TIMEOUT)
+        context = client.jetstream(timeout=TIMEOUT_S)
         following = await context.subscribe(
-            f"{self._pre}{DEVICE}>", stream=self._stream, config=config, cb=self._saw
+            f"{self._subject_prefix}{DEVICE}>",
+            stream=self._stream,
+            config=config,
+            cb=self._on_message,
         )
         self._following = following
         info = await following.consumer_info()
@@ -138,7 +141,7 @@ class Wants:
         except NotFoundError:
             config = StreamConfig(
                 name=self._stream,
-                subjects=[f"{self._pre}>"],
+                subjects=[f"{self._subject_prefix}>"],
                 max_msgs_per_subject=1,
                 storage=StorageType.FILE,
                 deny_delete=True,
@@ -163,7 +166,7 @@ class Wants:
             for device, (revision, value) in self._values.items()
         }
         self._values = {}
-        self._replaced()
+        self._on_loss()
         known = sum(bool(former.value) for former in self._former.values())
         fields = {"fleet": self._fleet, "bucket": self.bucket, "devices": known}
         logs.write(logging.WARNING, "fleet_storage_lost", **fields)
@@ -174,8 +177,8 @@ class Wants:
             return
         stored, left = 0, list(self._former)
         while left:
-            together, left = left[:TOGETHER], left[TOGETHER:]
-            stored += sum(await asyncio.gather(*map(self._restore_one, together)))
+            batch, left = left[:MAX_CONCURRENT_WRITES], left[MAX_CONCURRENT_WRITES:]
+            stored += sum(await asyncio.gather(*map(self._restore_one, batch)))
         fields = {"fleet": self._fleet, "bucket": self.bucket, "devices": stored}
         logs.write(logging.INFO, "subscriptions_restored", **fields)
 
@@ -185,11 +188,11 @@ class Wants:
         is_stored, revision = False, 0
         while not is_stored:
             try:
-                await self._put(key, former.value, revision, {FORMER: former.header()})
+                await self._put(key, former.value, revision, {FORMER_HEADER: former.header()})
                 is_stored = True
             except Outdated:
                 found = await self._found(key)
-                header = "" if found is None else (found.headers or {}).get(FORMER, "")
+                header = "" if found is None else (found.headers or {}).get(FORMER_HEADER, "")
                 if found is None or not former.replaces(header):
                     break
                 revision = found.seq or 0
@@ -200,7 +203,7 @@ class Wants:
         """Whether changes of the bucket still come. Raises errors of nats-py."""
         if self._client is None or self._following is None:
             return False
-        info = await self._client.jetstream(timeout=TIMEOUT).stream_info(self._stream)
+        info = await self._client.jetstream(timeout=TIMEOUT_S).stream_info(self._stream)
         if str(info.created) != self._made_at or info.state.last_seq < self._latest:
             return False
         await self._following.consumer_info()  # Its server may have ended.
@@ -229,52 +232,52 @@ class Wants:
                 if not may_replace:
                     return
                 if not has_waited:
-                    await asyncio.sleep(SEEN)
+                    await asyncio.sleep(VISIBLE_AFTER_S)
                     has_waited = True
                     continue
             with contextlib.suppress(Outdated):
                 await self._put(TERMS, value, revision)
                 return
 
-    def value(self, device: str) -> tuple[int, Want | None]:
-        """The last known revision and value of a device; `None` if nobody wants it."""
+    def value(self, device: str) -> tuple[int, DesiredDevice | None]:
+        """The last known revision and value of a device; `None` without subscriptions."""
         revision, value = self._values.get(device, (0, b""))
-        return revision, msgspec.json.decode(value, type=Want) if value else None
+        return revision, msgspec.json.decode(value, type=DesiredDevice) if value else None
 
     @property
     def devices(self) -> list[str]:
-        """All devices that somebody wants."""
+        """All devices with subscriptions."""
         return [device for device, (_, value) in self._values.items() if value]
 
-    async def store(self, device: str, want: Want | None, revision: int) -> int:
+    async def store(self, device: str, desired: DesiredDevice | None, revision: int) -> int:
         """Replaces that revision of a device. Returns the new one.
 
         Raises `Outdated` and errors of nats-py.
         """
-        value, made_at = b"" if want is None else msgspec.json.encode(want), self._made_at
+        value, made_at = b"" if desired is None else msgspec.json.encode(desired), self._made_at
         stored = await self._put(DEVICE + _token(device), value, revision)
         if made_at != self._made_at:
             raise Outdated(device)
-        self._know(device, stored, value)
+        self._learn(device, stored, value)
         return stored
 
     async def read(self, device: str) -> None:
         """Reads the value of a device anew. Raises errors of nats-py."""
         revision, value = await self._get(DEVICE + _token(device))
-        self._know(device, revision, value)
+        self._learn(device, revision, value)
 
-    def _know(self, device: str, revision: int, value: bytes) -> bool:
+    def _learn(self, device: str, revision: int, value: bytes) -> bool:
         if revision <= self._values.get(device, (0, b""))[0]:
             return False
         self._values[device] = (revision, value)
         return True
 
-    async def _saw(self, message: Msg) -> None:
+    async def _on_message(self, message: Msg) -> None:
         metadata = message.metadata
         with contextlib.suppress(ValueError):
-            device = _text(message.subject.removeprefix(self._pre + DEVICE))
-            if self._know(device, metadata.sequence.stream, message.data):
-                self._changed(device)
+            device = _text(message.subject.removeprefix(self._subject_prefix + DEVICE))
+            if self._learn(device, metadata.sequence.stream, message.data):
+                self._on_change(device)
         if metadata.num_pending == 0:
             self.is_read.set()
 
@@ -284,9 +287,9 @@ class Wants:
 
     async def _found(self, key: str) -> RawStreamMsg | None:
         assert self._client is not None, "the bucket is open"
-        context = self._client.jetstream(timeout=TIMEOUT)
+        context = self._client.jetstream(timeout=TIMEOUT_S)
         try:
-            return await context.get_last_msg(self._stream, f"{self._pre}{key}")
+            return await context.get_last_msg(self._stream, f"{self._subject_prefix}{key}")
         except NotFoundError:
             return None
 
@@ -297,9 +300,9 @@ class Wants:
         headers = {"Nats-Expected-Last-Subject-Sequence": str(revision), **(more or {})}
         if not value:
             headers["KV-Operation"] = "DEL"
-        context = self._client.jetstream(timeout=TIMEOUT)
+        context = self._client.jetstream(timeout=TIMEOUT_S)
         try:
-            ack = await context.publish(f"{self._pre}{key}", value, headers=headers)
+            ack = await context.publish(f"{self._subject_prefix}{key}", value, headers=headers)
         except APIError as error:
             if error.err_code in WRONG_SEQUENCE:
                 raise Outdated(key) from None

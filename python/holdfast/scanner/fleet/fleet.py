@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 NODE = "node."
 PARTITION = "partition."
 
-TOGETHER = 4
+MAX_CONCURRENT_HANDOVERS = 4
 """Partitions that are handed over at once."""
 
-ENDING = 5.0
-"""Seconds to wait for polls and writes of a partition before it is given back."""
+DEVICE_STOP_TIMEOUT_S = 5.0
+"""Time to wait for polls and writes of a partition before it is given back."""
 
-SETTLED = 0.05
-"""Seconds in which changes are gathered before partitions are placed anew."""
+SETTLE_S = 0.05
+"""Time in which changes are gathered before partitions are placed anew."""
 
-LOOKED = 0.5
-"""The longest time in seconds between two looks at which leases have ended."""
+CHECK_INTERVAL_S = 0.5
+"""The longest time between two looks at which leases have ended."""
 
 
 def leases_of(fleet: str) -> str:
@@ -72,9 +72,9 @@ class Fleet:
         self._gained = gained
         self._lost = lost
         self._is_leaving = False
-        self._news = asyncio.Event()
+        self._has_changed = asyncio.Event()
         self._ending: dict[str, asyncio.Task[None]] = {}
-        self._may_end = asyncio.Semaphore(TOGETHER)
+        self._may_end = asyncio.Semaphore(MAX_CONCURRENT_HANDOVERS)
         self._started = int(time.time() * 1000)
         self._named_since = time.monotonic()
         """When this process was the node the last time, or nobody was."""
@@ -204,7 +204,7 @@ class Fleet:
         self._named_since = time.monotonic()
         while not self.leases.since(key):
             self._check_name()
-            await asyncio.sleep(SETTLED)
+            await asyncio.sleep(SETTLE_S)
         logs.write(
             logging.INFO,
             "fleet_joined",
@@ -233,10 +233,10 @@ class Fleet:
         known: list[str] = []
         while True:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(LOOKED):
-                    await self._news.wait()
-            await asyncio.sleep(SETTLED)
-            self._news.clear()
+                async with asyncio.timeout(CHECK_INTERVAL_S):
+                    await self._has_changed.wait()
+            await asyncio.sleep(SETTLE_S)
+            self._has_changed.clear()
             self._check_name()
             nodes = self.nodes
             if nodes != known:
@@ -269,7 +269,7 @@ class Fleet:
 
     async def _give_back(self, key: str, may_end: asyncio.Semaphore) -> None:
         async with may_end:
-            await self._thread.give_back(key, ENDING)
+            await self._thread.give_back(key, DEVICE_STOP_TIMEOUT_S)
         self._settle(key)
 
     async def leave(self) -> None:
@@ -306,18 +306,18 @@ class Fleet:
 
     def taken(self, key: str) -> None:
         """A lease was taken."""
-        self._news.set()
+        self._has_changed.set()
         self._settle(key)
 
     def lost(self, key: str, reason: str) -> None:
         """A lease is not held any more."""
-        self._news.set()
+        self._has_changed.set()
         logs.refused("lease_lost", kind="lease", fleet=self.settings.name, lease=key, reason=reason)
         self._settle(key)
 
     def changed(self) -> None:
         """Somebody else has taken or left a lease."""
-        self._news.set()
+        self._has_changed.set()
 
     def works(self, reason: str | None) -> None:
         """The bucket of leases works; or it does not, for this reason."""

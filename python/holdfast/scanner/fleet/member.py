@@ -1,4 +1,4 @@
-"""The part of a scanner that makes it a node of a fleet.
+"""A node of a fleet: its membership, its leases, and the desired state.
 
 All nodes know all subscriptions, so any of them answers any request. A device is polled by the node
 that has the lease of its partition.
@@ -10,11 +10,10 @@ import asyncio
 import contextlib
 import logging
 import time
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import msgspec
-from nats.errors import Error, NoRespondersError
-from nats.errors import TimeoutError as NoAnswer
+from nats.errors import Error
 from nats.js.errors import NoStreamResponseError
 
 from holdfast import logs, tasks
@@ -22,73 +21,48 @@ from holdfast.client.url import connection_of
 from holdfast.heartbeat import Heartbeat
 from holdfast.leases import Outdated
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.fleet.desired_state import Want, Wants
-from holdfast.scanner.fleet.exchange import About, Command, Executed, Told, subject
+from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
 from holdfast.scanner.fleet.fleet import Fleet
+from holdfast.scanner.jetstream.entries import requests as stored_requests
+from holdfast.scanner.jetstream.entries import restored
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Iterator
+    from collections.abc import Awaitable, Callable, Iterator
 
     from nats.aio.client import Client
-    from nats.aio.msg import Msg
 
     from holdfast import _core
-    from holdfast.leases import Connect, Holding, StartThread
+    from holdfast.leases import Connect, StartThread
     from holdfast.scanner.fleet.agreement import FleetSettings, Terms
+    from holdfast.scanner.messages.types import SubscribeRequest
+    from holdfast.scanner.placement import DeviceHost, SubscriptionHost
     from holdfast.scanner.subscriptions.device import ScannedDevice
+    from holdfast.scanner.subscriptions.registry import Registry
 
-Reply = TypeVar("Reply", bound=msgspec.Struct)
+OPEN_RETRY_S = 0.5
+"""Between attempts to open the buckets."""
 
-OPENED = 0.5
-"""Seconds between attempts to open the buckets."""
+ADOPT_RETRY_S = 10.0
+"""Between attempts to carry out a subscription of another node that is refused here."""
 
-RETRIED = 10.0
-"""Seconds between attempts to carry out a subscription of another node that is refused here."""
-
-CHANGES = 20
+MAX_STORE_ATTEMPTS = 20
 """Attempts to store a device that other nodes change at the same time."""
 
-ASKED = 2.0
-"""Seconds to wait for the answer of another node."""
+CONNECTION_CHECK_S = 0.1
+"""Between looks whether there is a connection."""
 
-AGAIN = 0.1
-"""Seconds between attempts to find the node that polls a device."""
-
-HANGING = 5.0
-"""Seconds without a sign of life of the event loop after which leases are not renewed."""
+HANG_AFTER_S = 5.0
+"""Time without a sign of life of the event loop after which leases are not renewed."""
 
 
-class Host(Protocol):
-    """What the scanner does for its fleet."""
-
-    async def adopt(self, device: str, want: Want | None, renewed: set[str]) -> None:
-        """Makes the subscriptions of a device those of the bucket. Raises `Refused`."""
-
-    def want(self, device: str) -> list[bytes]:
-        """The requests that make the subscriptions of a device."""
-
-    def timed(self, device: str) -> Iterable[str]:
-        """The subscribers of a device with a `ttl`."""
-
-    def turn(self, device: str) -> asyncio.Lock:
-        """The lock that serializes changes of a device."""
-
-    def begin(self, device: ScannedDevice) -> None:
-        """Polls a device from now on."""
-
-    def end(self, device: ScannedDevice) -> None:
-        """Polls a device no more."""
-
-
-class FleetPart:
-    """Joins the fleet, follows what is wanted, and knows who polls which device."""
+class FleetMember:
+    """Joins the fleet, follows the desired state, and knows which devices are its own."""
 
     def __init__(
         self,
         settings: FleetSettings,
         terms: Terms,
-        prefix: str,
-        host: Host,
+        registry: Registry,
         about: Callable[[], dict[str, Any]],
         connect: Connect,
         start_thread: StartThread,
@@ -105,15 +79,12 @@ class FleetPart:
             start_thread=start_thread,
         )
         self._heartbeat = Heartbeat()
-        self.wants = Wants(settings.name, self._changed, self._replaced)
-        self._moving_s = 2 * settings.lease_times.ttl_s
-        """How long a command waits for a node that polls its device: twice a takeover."""
+        self.desired = DesiredState(settings.name, self._on_change, self._on_loss)
         self._check_interval_s = settings.check_interval_s
-        self._prefix = prefix
-        self._host = host
+        self._registry = registry
         self._client: Client | None = None
-        self._is_new = asyncio.Event()
-        self._news = asyncio.Event()
+        self._has_new_client = asyncio.Event()
+        self._has_touched = asyncio.Event()
         self._touched: set[str] = set()
         self._failed: set[str] = set()
         self._renewed: dict[tuple[str, str], int] = {}
@@ -126,7 +97,7 @@ class FleetPart:
     def connected(self, client: Client | None) -> None:
         """Sets the client; `None` while there is no connection."""
         self._client = client
-        self._is_new.set()
+        self._has_new_client.set()
         if client is not None:
             self.fleet.connected()
 
@@ -134,21 +105,24 @@ class FleetPart:
         """Why this node can't publish values; then others should have its devices."""
         if self._client is None:
             return "the other connection to NATS was lost"
-        if self._heartbeat.age > HANGING:
-            return f"the event loop hangs for {HANGING:g} s"
+        if self._heartbeat.age > HANG_AFTER_S:
+            return f"the event loop hangs for {HANG_AFTER_S:g} s"
         return None
 
-    async def run(self, ready: asyncio.Event) -> None:
+    async def run(
+        self, devices: DeviceHost, subscriptions: SubscriptionHost, ready: asyncio.Event
+    ) -> None:
         """Is a node of the fleet until it is cancelled. Raises `FleetRefused`.
 
-        Sets `ready` when it knows what is wanted.
+        Sets `ready` when it knows the desired state.
         """
+        self._device_host, self._subscription_host = devices, subscriptions
         running: list[asyncio.Task[None]] = []
         self.fleet.start()
         try:
             async with self._heartbeat.kept():
                 await self._open(ready)
-                works = (self.fleet.run(), self._open_again(), self._follow())
+                works = (self.fleet.run(), self._follow_again(), self._adopt_changes())
                 running += [asyncio.create_task(work) for work in works]
                 done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
                 for task in done:
@@ -158,31 +132,31 @@ class FleetPart:
             await self.fleet.stop()
 
     async def _open(self, ready: asyncio.Event) -> None:
-        """Joins the fleet, and reads what is wanted."""
+        """Joins the fleet, and reads the desired state."""
         while not self.is_joined:
             client, leases = self._client, self.fleet.leases
             if client is None or leases.reason is not None or not leases.is_read:
-                await asyncio.sleep(AGAIN)
+                await asyncio.sleep(CONNECTION_CHECK_S)
                 continue
             try:
                 fleet = self.fleet
-                await self.wants.open(client, fleet.terms, fleet.has_terms, has_joined=False)
-                self._is_new.clear()
+                await self.desired.open(client, fleet.terms, fleet.has_terms, has_joined=False)
+                self._has_new_client.clear()
                 await fleet.join()
-                await self.wants.agree(fleet.terms, fleet.has_terms, may_replace=True)
+                await self.desired.agree(fleet.terms, fleet.has_terms, may_replace=True)
                 await self._read(ready)
                 self.is_joined = True
             except (Error, OSError) as error:
                 logs.refused("fleet_unavailable", kind="fleet", reason=str(error) or repr(error))
-                await asyncio.sleep(OPENED)
+                await asyncio.sleep(OPEN_RETRY_S)
 
     async def _read(self, ready: asyncio.Event) -> None:
-        await self.wants.is_read.wait()
-        for device in self.wants.devices:
+        await self.desired.is_read.wait()
+        for device in self.desired.devices:
             await self._adopt(device)
         ready.set()
 
-    async def _open_again(self) -> None:
+    async def _follow_again(self) -> None:
         """Follows the bucket anew after each reconnect, and whenever nothing comes from it.
 
         The server may have forgotten who follows it, or have lost the bucket.
@@ -190,54 +164,58 @@ class FleetPart:
         while True:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(self._check_interval_s):
-                    await self._is_new.wait()
+                    await self._has_new_client.wait()
             client = self._client
             if client is None:
-                await asyncio.sleep(AGAIN)
+                await asyncio.sleep(CONNECTION_CHECK_S)
                 continue
-            if not self._is_new.is_set():
+            if not self._has_new_client.is_set():
                 with contextlib.suppress(Error, OSError):
-                    if await self.wants.is_followed():
+                    if await self.desired.is_followed():
                         continue
-            self._is_new.clear()
+            self._has_new_client.clear()
             try:
-                await self.wants.open(client, self.fleet.terms, lambda _: True, has_joined=True)
+                await self.desired.open(client, self.fleet.terms, lambda _: True, has_joined=True)
             except (Error, OSError) as error:
                 logs.refused("fleet_unavailable", kind="fleet", reason=str(error) or repr(error))
-                await asyncio.sleep(OPENED)
-                self._is_new.set()
+                await asyncio.sleep(OPEN_RETRY_S)
+                self._has_new_client.set()
 
-    async def _follow(self) -> None:
+    async def _adopt_changes(self) -> None:
         """Carries out what other nodes have stored."""
         while True:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(RETRIED):
-                    await self._news.wait()
-                    self._news.clear()
+                async with asyncio.timeout(ADOPT_RETRY_S):
+                    await self._has_touched.wait()
+                    self._has_touched.clear()
             if not self._touched:
                 self._touched, self._failed = self._failed, set()
             touched, self._touched = self._touched, set()
             for device in touched:
                 await self._adopt(device)
 
-    def _replaced(self) -> None:
+    def _on_loss(self) -> None:
         self._applied.clear()
 
-    def _changed(self, device: str) -> None:
+    def _on_change(self, device: str) -> None:
         self._touched.add(device)
-        self._news.set()
+        self._has_touched.set()
 
     async def _adopt(self, device: str) -> None:
-        async with self._host.turn(device):
+        async with self._device_host.turn(device):
             await self._adopt_now(device)
 
     async def _adopt_now(self, device: str) -> Refused | None:
         """Returns why it is refused here."""
-        revision, want = self.wants.value(device)
-        times = {} if want is None else want.renewed
+        revision, desired = self.desired.value(device)
+        times = {} if desired is None else desired.renewed
         renewed = {each for each, at in times.items() if self._renewed.get((device, each)) != at}
         try:
-            await self._host.adopt(device, want, renewed)
+            wanted: dict[str, list[SubscribeRequest]] = {}
+            for text in () if desired is None else desired.requests:
+                request = restored(bytes(text))
+                wanted.setdefault(request.subscriber_id, []).append(request)
+            await self._subscription_host.adopt(device, wanted, renewed)
         except Refused as refused:
             logs.refused("not_restored", kind="fleet", device=device, reason=str(refused))
             self._failed.add(device)
@@ -254,22 +232,22 @@ class FleetPart:
         The lock of the device is held. `subscriber` has renewed its subscription. Raises `Refused`;
         then nothing has changed.
         """
-        for _ in range(CHANGES):
+        for _ in range(MAX_STORE_ATTEMPTS):
             await change()
             now = int(time.time() * 1000)
             renewed = {
                 each: now if each == subscriber else self._renewed.get((device, each), now)
-                for each in self._host.timed(device)
+                for each in self._subscribers_with_ttl(device)
             }
-            requests = [msgspec.Raw(each) for each in self._host.want(device)]
-            want = Want(requests=requests, renewed=renewed) if requests else None
+            requests = [msgspec.Raw(each) for each in self._requests(device)]
+            desired = DesiredDevice(requests=requests, renewed=renewed) if requests else None
             try:
-                self._check_size(device, want)
+                self._check_size(device, desired)
                 revision = self._applied.get(device, 0)
-                self._applied[device] = await self.wants.store(device, want, revision)
+                self._applied[device] = await self.desired.store(device, desired, revision)
             except Outdated:
                 with contextlib.suppress(Error, OSError):
-                    await self.wants.read(device)
+                    await self.desired.read(device)
                 if (refused := await self._adopt_now(device)) is not None:
                     raise Refused(f"the fleet's subscriptions of {device}: {refused}") from None
                 continue
@@ -277,21 +255,35 @@ class FleetPart:
                 await self._adopt_now(device)
                 raise
             except (Error, OSError) as error:
-                self._is_new.set()  # The bucket may be lost.
+                self._has_new_client.set()  # The bucket may be lost.
                 await self._adopt_now(device)
                 reason = str(error) or type(error).__name__
                 is_certain = isinstance(error, NoStreamResponseError)
                 said = "not stored in" if is_certain else "not confirmed by"
-                raise Refused(f"{said} {self.wants.bucket}: {reason}") from None
+                raise Refused(f"{said} {self.desired.bucket}: {reason}") from None
             self._renewed |= {(device, each): at for each, at in renewed.items()}
             return
-        raise Refused(f"{device} was changed by other nodes {CHANGES} times meanwhile: try again")
+        raise Refused(
+            f"{device} was changed by other nodes {MAX_STORE_ATTEMPTS} times meanwhile: try again"
+        )
 
-    def _check_size(self, device: str, want: Want | None) -> None:
+    def _requests(self, device_id: str) -> Iterator[bytes]:
+        """Yields the requests that make the subscriptions of a device."""
+        device = self._registry.devices.get(device_id)
+        for subscriber in () if device is None else device.subscribers:
+            assert device is not None, "it has subscribers"
+            yield from stored_requests(device, subscriber)
+
+    def _subscribers_with_ttl(self, device_id: str) -> list[str]:
+        device = self._registry.devices.get(device_id)
+        subscribers = {} if device is None else device.subscribers
+        return [name for name, each in subscribers.items() if each.ttl is not None]
+
+    def _check_size(self, device: str, desired: DesiredDevice | None) -> None:
         client = self._client
-        if want is None or client is None:
+        if desired is None or client is None:
             return
-        size, most = len(msgspec.json.encode(want)), client.max_payload - 1024
+        size, most = len(msgspec.json.encode(desired)), client.max_payload - 1024
         if size > most:
             raise Refused(
                 f"the subscriptions of {device} take {size} bytes, a fleet stores at most {most}: "
@@ -329,98 +321,11 @@ class FleetPart:
 
     def _gained(self, partition: int) -> None:
         for device in list(self._devices.get(partition, {}).values()):
-            self._host.begin(device)
+            self._device_host.begin(device)
 
     def _lost(self, partition: int) -> None:
         for device in list(self._devices.get(partition, {}).values()):
-            self._host.end(device)
-
-    async def command(
-        self,
-        device: ScannedDevice,
-        tag: str,
-        text: str,
-        own: Callable[[], Awaitable[bool]],
-        check: Callable[[], float],
-    ) -> None:
-        """Has a command carried out by whoever polls the device. Raises `Refused`.
-
-        `own` carries it out here. It returns false, and writes nothing, if the device has moved.
-        `check` refuses it if it is too late, and returns how many seconds it may wait.
-        """
-        end = time.monotonic() + self._moving_s
-        why = f"no node polls {device.id} now"
-        while True:
-            left = check()
-            owner = self.fleet.holder(device.partition)
-            if self.is_own(device):
-                if await own():
-                    return
-            elif owner is not None and self.fleet.is_other(owner):
-                sent = await self._send(owner, device, tag, text, left)
-                if sent is None:
-                    return
-                why = sent
-            if time.monotonic() > end:
-                raise Refused(f"not written: {why}")
-            await asyncio.sleep(AGAIN)
-
-    async def _send(
-        self, owner: Holding, device: ScannedDevice, tag: str, text: str, left: float
-    ) -> str | None:
-        """Returns why another node did not carry out a command. Raises `Refused` if it tried."""
-        holding = self.fleet.leases.seen.get(f"partition.{device.partition}")
-        command = Command(
-            device=device.id,
-            tag=tag,
-            text=text,
-            epoch=0 if holding is None else holding.revision,
-            within=min(left, self._moving_s),
-        )
-        # After this, it waits one timeout of the device for its turn, and one for the reply.
-        timeout = self._moving_s + 2 * device.source.timeout / 1000 + ASKED
-        try:
-            done = await self._ask(owner, "command", command, Executed, timeout)
-        except NoRespondersError:
-            return f"node {owner.node} is gone"
-        except (Error, OSError):
-            raise Refused(f"not confirmed: node {owner.node} did not answer") from None
-        if done.moved:
-            return f"{device.id} moves from node {owner.node} to another one"
-        if done.error is not None:
-            raise Refused(done.error)
-        return None
-
-    async def told(self, what: str, devices: list[ScannedDevice]) -> dict[str, Any]:
-        """What other nodes tell of their devices; nothing of nodes that don't answer."""
-        of_process: dict[str, tuple[Holding, list[str]]] = {}
-        for device in devices:
-            owner = self.fleet.holder(device.partition)
-            if owner is not None and self.fleet.is_other(owner):
-                of_process.setdefault(owner.process, (owner, []))[1].append(device.id)
-        found = await asyncio.gather(*(self._tell(what, *each) for each in of_process.values()))
-        return {device: report for each in found for device, report in each.items()}
-
-    async def _tell(self, what: str, node: Holding, devices: list[str]) -> dict[str, Any]:
-        try:
-            return (await self._ask(node, what, About(devices=devices), Told, ASKED)).devices
-        except (Error, OSError) as error:
-            reason = str(error) or type(error).__name__
-            logs.refused("node_silent", kind="fleet", node=node.node, reason=reason)
-            return {}
-
-    async def _ask(
-        self, node: Holding, what: str, request: msgspec.Struct, kind: type[Reply], seconds: float
-    ) -> Reply:
-        client = self._client
-        if client is None:
-            raise NoAnswer
-        where = subject(self._prefix, node.node, what, node.process)
-        answer: Msg = await client.request(where, msgspec.json.encode(request), timeout=seconds)
-        try:
-            return msgspec.json.decode(answer.data, type=kind)
-        except msgspec.DecodeError as error:
-            raise OSError(f"node {node.node} sent a malformed answer: {error}") from None
+            self._device_host.end(device)
 
     async def leave(self) -> None:
         """Hands everything over."""

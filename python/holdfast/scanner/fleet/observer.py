@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from holdfast.leases import Entry
     from holdfast.scanner.broker import Servers
 
-LOOKED = 0.05
-"""Seconds between two looks at a node that leaves."""
+CHECK_INTERVAL_S = 0.05
+"""Time between two looks at a node that leaves."""
 
-LEAVING = 30.0
-"""Seconds in which a node must hand its devices over."""
+LEAVE_TIMEOUT_S = 30.0
+"""Time in which a node must hand its devices over."""
 
 
 class FleetUnavailable(Exception):
@@ -74,7 +74,7 @@ class Seen:
         }
 
 
-class Looker:
+class FleetObserver:
     """A connection that reads the bucket of leases."""
 
     def __init__(self, fleet: str, servers: Servers, within_s: float = ANSWERING) -> None:
@@ -153,11 +153,11 @@ class Looker:
             raise FleetUnavailable(f"there is no node {node} at {prefix}.fleet") from None
         except (Error, OSError, msgspec.DecodeError) as error:
             raise FleetUnavailable(f"node {node} does not answer: {_reason(error)}") from None
-        end = time.monotonic() + LEAVING
+        end = time.monotonic() + LEAVE_TIMEOUT_S
         while node in (await self.look()).nodes:
-            await asyncio.sleep(LOOKED)
+            await asyncio.sleep(CHECK_INTERVAL_S)
             if time.monotonic() > end:
-                raise FleetUnavailable(f"node {node} has not left within {LEAVING:g} s")
+                raise FleetUnavailable(f"node {node} has not left within {LEAVE_TIMEOUT_S:g} s")
 
 
 def _reason(error: Exception) -> str:

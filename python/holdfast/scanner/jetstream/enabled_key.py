@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from holdfast import logs
-from holdfast.scanner.jetstream.key_watch import Watch
+from holdfast.scanner.jetstream.key_watch import KeyWatch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -28,15 +28,13 @@ class _State(msgspec.Struct):
     enabled: bool
 
 
-class Enabling:
+class EnabledKey:
     """Follows the key of the scanner."""
 
-    def __init__(self, key: str, enable: Callable[[bool], None], times: WatchTimes) -> None:
-        """`enable` is called with the first state and each new one."""
+    def __init__(self, key: str, times: WatchTimes) -> None:
         self._key = key
-        self._enable = enable
-        self._watch = Watch(BUCKET, key, self._changed, times)
-        self._told: bool | None = None
+        self._watch = KeyWatch(BUCKET, key, self._on_change, times)
+        self._last_reported: bool | None = None
         self.enabled = True
 
     def connected(self, client: Client | None) -> None:
@@ -47,18 +45,19 @@ class Enabling:
         """Waits until the key is read for the first time, but not for long."""
         await self._watch.read()
 
-    async def run(self) -> None:
-        """Follows the key, until it is cancelled."""
+    async def run(self, enable: Callable[[bool], None]) -> None:
+        """Calls `enable` with the first state and each new one, until it is cancelled."""
+        self._enable = enable
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._watch.run())
-            tasks.create_task(self._begin())
+            tasks.create_task(self._report_first())
 
-    async def _begin(self) -> None:
+    async def _report_first(self) -> None:
         """Enables the scanner if the key can't be read."""
         await self._watch.tried.wait()
-        self._tell()
+        self._report()
 
-    async def _changed(self, found: Mapping[str, Written | None], is_all: bool) -> None:
+    async def _on_change(self, found: Mapping[str, Written | None], is_all: bool) -> None:
         """Takes the state; a malformed one changes nothing."""
         if self._key not in found and not is_all:
             return
@@ -74,9 +73,9 @@ class Enabling:
             self.enabled = enabled
             level = logging.INFO if enabled else logging.WARNING
             logs.write(level, "scanner_enabled" if enabled else "scanner_disabled", key=self._key)
-        self._tell()
+        self._report()
 
-    def _tell(self) -> None:
-        if self._told is not self.enabled:
-            self._told = self.enabled
+    def _report(self) -> None:
+        if self._last_reported is not self.enabled:
+            self._last_reported = self.enabled
             self._enable(self.enabled)

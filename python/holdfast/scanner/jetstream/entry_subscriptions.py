@@ -12,17 +12,17 @@ import asyncio
 import logging
 from dataclasses import dataclass, field
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
 from holdfast import logs
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.jetstream.key_watch import Watch
-from holdfast.scanner.jetstream.store import Unit
+from holdfast.scanner.jetstream.key_watch import KeyWatch
+from holdfast.scanner.subscriptions.key import SubscriptionKey
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Container, Iterable, Mapping
+    from collections.abc import Container, Iterable, Mapping
 
     from nats.aio.client import Client
 
@@ -36,8 +36,8 @@ BUCKET = "scanner_config_"
 MAX_ENTRIES = 50_000
 """Limit of entries; further ones are ignored."""
 
-MAX_HELD = 64 * 1024 * 1024
-"""Limit in bytes of the values of refused entries that are kept to try them again."""
+MAX_HELD_BYTES = 64 * 1024 * 1024
+"""Limit of the values of refused entries that are kept to try them again."""
 
 
 @dataclass
@@ -46,7 +46,7 @@ class Entry:
 
     written: tuple[int, bytes] | None = None
     """The revision and a digest of the value that was carried out or refused last."""
-    unit: Unit | None = None
+    subscription: SubscriptionKey | None = None
     """Its subscription; `None` if it is refused."""
     refused: RefusedEntry | None = None
 
@@ -63,33 +63,32 @@ class RefusedEntry:
     tags: list[str] = field(default_factory=list)
 
 
-class Configured:
+class EntryHost(Protocol):
     """Carries out the entries of the bucket."""
 
-    def __init__(
-        self,
-        prefix: str,
-        understand: Callable[[str, bytes], Subscription],
-        subscribe: Callable[[Subscription], Awaitable[None]],
-        end: Callable[[Unit], Awaitable[None]],
-        times: WatchTimes,
-    ) -> None:
-        """`understand` checks the key and value of an entry, `subscribe` carries it out.
+    def check_entry(self, key: str, value: bytes) -> Subscription:
+        """Returns the subscription of an entry. Raises `Refused`."""
 
-        Both raise `Refused`. `end` ends a subscription.
-        """
+    async def carry_out_entry(self, asked: Subscription) -> None:
+        """Makes a subscription that of the entry. Raises `Refused`."""
+
+    async def end_entry(self, key: SubscriptionKey) -> None:
+        """Ends the subscription of an entry."""
+
+
+class EntrySubscriptions:
+    """Carries out the entries of the bucket."""
+
+    def __init__(self, prefix: str, times: WatchTimes) -> None:
         self.bucket = BUCKET + prefix
-        self._understand = understand
-        self._subscribe = subscribe
-        self._end = end
         self._retry_s = times.retry_s
-        self._watch = Watch(self.bucket, ">", self._changed, times)
+        self._watch = KeyWatch(self.bucket, ">", self._on_change, times)
         self._entries: dict[str, Entry] = {}
-        self._keys: dict[Unit, str] = {}
+        self._keys: dict[SubscriptionKey, str] = {}
         self._lock = asyncio.Lock()
         """Held while entries are carried out."""
         self._held_bytes = 0
-        self._told_full = False
+        self._has_logged_limit = False
 
     def connected(self, client: Client | None) -> None:
         """Sets the client; `None` while there is no connection."""
@@ -103,19 +102,20 @@ class Configured:
 
     def key_of(self, device: str, subscriber: str | None) -> str | None:
         """Returns the key of the entry that a subscription is from; `None` if it is from none."""
-        return None if subscriber is None else self._keys.get(Unit(device, subscriber))
+        return None if subscriber is None else self._keys.get(SubscriptionKey(device, subscriber))
 
     async def read(self) -> None:
         """Waits until the entries are read for the first time, but not for long."""
         await self._watch.read()
 
-    async def run(self) -> None:
-        """Carries out the entries, until it is cancelled."""
+    async def run(self, host: EntryHost) -> None:
+        """Has `host` carry out the entries, until it is cancelled."""
+        self._host = host
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._watch.run())
             tasks.create_task(self._try_again())
 
-    async def _changed(self, found: Mapping[str, Written | None], is_all: bool) -> None:
+    async def _on_change(self, found: Mapping[str, Written | None], is_all: bool) -> None:
         """Carries out changed entries; with `is_all`, ends those that are not there any more."""
         async with self._lock:
             gone = [key for key in self._entries if key not in found] if is_all else []
@@ -138,8 +138,8 @@ class Configured:
         entry = self._entries.get(key)
         if entry is None:
             if len(self._entries) >= MAX_ENTRIES:
-                if not self._told_full:
-                    self._told_full = True
+                if not self._has_logged_limit:
+                    self._has_logged_limit = True
                     logs.write(logging.WARNING, "too_many_entries", bucket=self.bucket, key=key)
                 return False
             self._entries[key] = Entry()
@@ -154,10 +154,10 @@ class Configured:
 
     async def _release(self, entry: Entry) -> None:
         """Ends the subscription of an entry."""
-        unit, entry.unit = entry.unit, None
-        if unit is not None:
-            del self._keys[unit]
-            await self._end(unit)
+        subscription, entry.subscription = entry.subscription, None
+        if subscription is not None:
+            del self._keys[subscription]
+            await self._host.end_entry(subscription)
 
     async def _try_again(self) -> None:
         while True:
@@ -196,15 +196,15 @@ class Configured:
     async def _one(self, key: str, written: Written) -> bool | None:
         """Carries out an entry. If it is refused, returns whether it had a subscription."""
         entry = self._entries[key]
-        had_subscription = entry.unit is not None
+        had_subscription = entry.subscription is not None
         try:
-            asked = self._understand(key, written.value)
-            unit = Unit(asked.device, asked.subscriber)
-            if entry.unit not in (None, unit):
+            asked = self._host.check_entry(key, written.value)
+            subscription = SubscriptionKey(asked.device, asked.subscriber)
+            if entry.subscription not in (None, subscription):
                 await self._release(entry)
-            entry.unit = unit
-            self._keys[unit] = key
-            await self._subscribe(asked)
+            entry.subscription = subscription
+            self._keys[subscription] = key
+            await self._host.carry_out_entry(asked)
         except Refused as refused:
             reason = str(refused)
         except Exception as error:  # An error in one entry must not affect the others.
@@ -224,12 +224,12 @@ class Configured:
         entry = self._entries[key]
         if had_subscription:
             await self._release(entry)
-        elif entry.unit is not None:  # What was refused has changed nothing.
-            del self._keys[entry.unit]
-            entry.unit = None
+        elif entry.subscription is not None:  # What was refused has changed nothing.
+            del self._keys[entry.subscription]
+            entry.subscription = None
         before = entry.refused
         self._set_refused(entry, None)
-        kept = written if self._held_bytes + len(written.value) <= MAX_HELD else None
+        kept = written if self._held_bytes + len(written.value) <= MAX_HELD_BYTES else None
         self._set_refused(entry, RefusedEntry(key, reason, kept, *_about(written.value)))
         entry.written = _identity(written)
         if before is None or before.reason != reason:

@@ -24,39 +24,37 @@ if TYPE_CHECKING:
     from holdfast.scanner.messages.types import HeartbeatMetadata
 
 BUCKET = "service_heartbeats"
-EVERY = 10.0
-"""Seconds between heartbeats."""
 
-KEPT = 60.0
-"""Seconds after which a heartbeat expires if it is not renewed."""
+EXPIRES_AFTER_S = 60.0
+"""Time after which a heartbeat expires if it is not renewed."""
 
-JETSTREAM_TIMEOUT = 2.0
-"""Seconds to wait for an answer of JetStream."""
+JETSTREAM_TIMEOUT_S = 2.0
+"""Time to wait for an answer of JetStream."""
 
 
-class Heart:
+class HeartbeatKey:
     """Writes heartbeats to one key of the bucket."""
 
     def __init__(
-        self, key: str, metadata: Callable[[], HeartbeatMetadata], rival: Callable[[int], object]
+        self, key: str, metadata: Callable[[], HeartbeatMetadata], on_other: Callable[[int], object]
     ) -> None:
-        """`rival` is called with the start time of another service that writes the same key."""
+        """`on_other` is called with the start time of another service that writes the same key."""
         self._key = key
         self._metadata = metadata
-        self._rival = rival
+        self._on_other = on_other
         self.started = _now()
         """Milliseconds since 1970."""
         self._revision: int | None = None
         """The revision of the own last heartbeat."""
         self._works: bool | None = None
-        self._checked = False
+        self._has_checked_ttl = False
         self._stopped = False
 
     async def beat(self, client: Client | None) -> None:
         """Renews the heartbeat. Logs only the first of consecutive failures."""
         if client is None:
             return
-        sign = Heartbeat(
+        content = Heartbeat(
             service_type="modbus",
             module_id=self._key,
             last_seen=_now(),
@@ -66,15 +64,15 @@ class Heart:
         try:
             bucket = await _bucket(client)
             if not self._works:
-                await self._check(bucket)
-            await self._look(bucket)
-            self._revision = await bucket.put(self._key, msgspec.json.encode(sign))
+                await self._check_ttl(bucket)
+            await self._look_for_others(bucket)
+            self._revision = await bucket.put(self._key, msgspec.json.encode(content))
         except Exception as error:  # Heartbeats are optional, so no error may stop the scanner.
-            self._told(False, reason_of(error))
+            self._log_state(False, reason_of(error))
         else:
-            self._told(True, "")
+            self._log_state(True, "")
 
-    async def _look(self, bucket: KeyValue) -> None:
+    async def _look_for_others(self, bucket: KeyValue) -> None:
         """Reports another service that has written the key since the own last heartbeat."""
         if self._revision is None:
             return
@@ -86,14 +84,16 @@ class Heart:
         except (KeyNotFoundError, msgspec.DecodeError):
             return
         if other.started_at != self.started:
-            self._rival(other.started_at)
+            self._on_other(other.started_at)
 
-    async def _check(self, bucket: KeyValue) -> None:
+    async def _check_ttl(self, bucket: KeyValue) -> None:
         """Logs once if heartbeats in the bucket never expire."""
-        if self._checked or (await bucket.status()).ttl:
+        if self._has_checked_ttl or (await bucket.status()).ttl:
             return
-        self._checked = True
-        todo = f"delete the bucket, so that it is created again, or set max_age {KEPT:g} s"
+        self._has_checked_ttl = True
+        todo = (
+            f"delete the bucket, so that it is created again, or set max_age {EXPIRES_AFTER_S:g} s"
+        )
         logs.write(logging.WARNING, "heartbeat_has_no_end", bucket=BUCKET, todo=todo)
 
     async def stop(self, client: Client | None) -> None:
@@ -102,10 +102,10 @@ class Heart:
         if client is None or not self._works:
             return
         with contextlib.suppress(Exception):
-            async with asyncio.timeout(JETSTREAM_TIMEOUT):
+            async with asyncio.timeout(JETSTREAM_TIMEOUT_S):
                 await (await _bucket(client)).delete(self._key)
 
-    def _told(self, works: bool, reason: str) -> None:
+    def _log_state(self, works: bool, reason: str) -> None:
         if self._stopped or works is self._works:
             return
         if works:
@@ -122,17 +122,17 @@ def reason_of(error: Exception) -> str:
     if isinstance(error, ServiceUnavailableError | NoRespondersError):
         return "JetStream is not enabled on the server or for this account"
     if isinstance(error, TimeoutError):
-        return f"JetStream did not answer within {JETSTREAM_TIMEOUT:g} s"
+        return f"JetStream did not answer within {JETSTREAM_TIMEOUT_S:g} s"
     return str(error) or type(error).__name__
 
 
 async def _bucket(client: Client) -> KeyValue:
     """Returns the bucket; creates it if it does not exist."""
-    jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT)
+    jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
     try:
         return await jetstream.key_value(BUCKET)
     except NotFoundError:
-        return await jetstream.create_key_value(bucket=BUCKET, history=1, ttl=KEPT)
+        return await jetstream.create_key_value(bucket=BUCKET, history=1, ttl=EXPIRES_AFTER_S)
 
 
 def _now() -> int:

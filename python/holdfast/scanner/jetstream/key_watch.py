@@ -17,8 +17,13 @@ from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
 from holdfast import logs, tasks
-from holdfast.scanner.jetstream.heartbeat import JETSTREAM_TIMEOUT, reason_of
-from holdfast.scanner.jetstream.store import FETCHED, FIRST_RETRY, READING, RETRIED
+from holdfast.scanner.jetstream.heartbeat import JETSTREAM_TIMEOUT_S, reason_of
+from holdfast.scanner.jetstream.store import (
+    FETCH_BATCH,
+    FIRST_RETRY_S,
+    MAX_RETRY_S,
+    READER_EXPIRES_S,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -27,11 +32,11 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
     from nats.js import JetStreamContext
 
-FIRST_READ = 2.0
-"""Seconds that requests wait until the bucket is read. Reading goes on after that."""
+MAX_FIRST_READ_WAIT_S = 2.0
+"""How long requests wait until the bucket is read. Reading goes on after that."""
 
-MAX_SETTLING = 2.0
-"""Seconds after which changes are reported, even if further ones follow."""
+MAX_SETTLE_S = 2.0
+"""Time after which changes are reported, even if further ones follow."""
 
 MARKER_HEADERS = ("KV-Operation", "Nats-Marker-Reason")
 """The headers of messages that stand for deleted or expired keys."""
@@ -46,7 +51,7 @@ class WatchTimes:
     settle_s: float = 0.2
     """Without a further change for so long, changes are reported. Programs of tentacle-next delete
     an entry before they write it again."""
-    retry_s: float = RETRIED
+    retry_s: float = MAX_RETRY_S
     """Until what failed or was refused is tried again, at most."""
 
 
@@ -64,29 +69,29 @@ class _Missed(Exception):
     """A change was not received."""
 
 
-class Watch:
+class KeyWatch:
     """Follows the keys of one bucket."""
 
     def __init__(
         self,
         bucket: str,
         keys: str,
-        changed: Callable[[Mapping[str, Written | None], bool], Awaitable[None]],
+        on_change: Callable[[Mapping[str, Written | None], bool], Awaitable[None]],
         times: WatchTimes,
     ) -> None:
         """`keys` is a key, or `>` for all.
 
-        `changed` gets what changed keys have, `None` for a deleted one, and whether these are
+        `on_change` gets what changed keys have, `None` for a deleted one, and whether these are
         all keys of the bucket.
         """
         self._bucket = bucket
         self._stream = f"KV_{bucket}"
-        self._pre = f"$KV.{bucket}."
+        self._subject_prefix = f"$KV.{bucket}."
         self._keys = keys
-        self._changed = changed
+        self._on_change = on_change
         self._times = times
         self._client: Client | None = None
-        self._news = asyncio.Event()
+        self._has_new_client = asyncio.Event()
         self._works: bool | None = None
         self._failures = 0
         self.tried = asyncio.Event()
@@ -95,23 +100,23 @@ class Watch:
     def connected(self, client: Client | None) -> None:
         """Sets the client; `None` while there is no connection."""
         self._client = client
-        self._news.set()
+        self._has_new_client.set()
 
     async def read(self) -> None:
         """Waits until the bucket is read for the first time, but not for long."""
         if not self.tried.is_set():
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(FIRST_READ):
+                async with asyncio.timeout(MAX_FIRST_READ_WAIT_S):
                     await self.tried.wait()
 
     async def run(self) -> None:
         """Follows the bucket, until it is cancelled."""
         while True:
-            await self._news.wait()
-            self._news.clear()
+            await self._has_new_client.wait()
+            self._has_new_client.clear()
             if self._client is None:
                 continue
-            works = (self._keep_following(self._client), self._news.wait())
+            works = (self._keep_following(self._client), self._has_new_client.wait())
             running = [asyncio.create_task(work) for work in works]
             try:
                 await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
@@ -120,37 +125,37 @@ class Watch:
 
     async def _keep_following(self, client: Client) -> None:
         while not client.is_closed:  # nats-py then replaces a cancellation by an error.
-            pause = FIRST_RETRY
+            pause = FIRST_RETRY_S
             try:
                 await self._follow(client)
             except _Missed:
                 pass
             except Exception as error:  # JetStream may fail in any way; it is tried again.
-                pause = min(FIRST_RETRY * 2 ** min(self._failures, 10), self._times.retry_s)
+                pause = min(FIRST_RETRY_S * 2 ** min(self._failures, 10), self._times.retry_s)
                 self._failures += 1
                 if self._client is client:  # Else the connection has ended, and not JetStream.
-                    self._tell(False, reason_of(error))
+                    self._log_state(False, reason_of(error))
                 self.tried.set()
             if not client.is_closed:
                 await asyncio.sleep(pause)
 
     async def _follow(self, client: Client) -> None:
         """Reads all keys, then reports changes. Raises `_Missed`, or an error of JetStream."""
-        jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT)
+        jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
         await self._open(jetstream)
-        reader = _Reader(self._stream, self._pre, self._times)
+        reader = _Reader(self._stream, self._subject_prefix, self._times)
         try:
             count = await reader.begin(jetstream, self._keys)
             found: dict[str, Written | None] = {}
             while (left := count - reader.received) > 0:
-                found |= await reader.fetch(min(left, FETCHED), JETSTREAM_TIMEOUT)
-            await self._changed(found, True)
+                found |= await reader.fetch(min(left, FETCH_BATCH), JETSTREAM_TIMEOUT_S)
+            await self._on_change(found, True)
             self._failures = 0
-            self._tell(True, "")
+            self._log_state(True, "")
             self.tried.set()
             while True:
                 if changes := await reader.changes():
-                    await self._changed(changes, False)
+                    await self._on_change(changes, False)
         except Exception:
             await reader.delete()
             raise
@@ -163,7 +168,7 @@ class Watch:
         except NotFoundError:
             await jetstream.create_key_value(bucket=self._bucket, history=1)
 
-    def _tell(self, works: bool, reason: str) -> None:
+    def _log_state(self, works: bool, reason: str) -> None:
         if works is self._works:
             return
         if works:
@@ -180,9 +185,9 @@ class _Reader:
     pull consumer has is certain.
     """
 
-    def __init__(self, stream: str, pre: str, times: WatchTimes) -> None:
+    def __init__(self, stream: str, subject_prefix: str, times: WatchTimes) -> None:
         self._stream = stream
-        self._pre = pre
+        self._subject_prefix = subject_prefix
         self._times = times
         self.received = 0
         """The number of the last message, counted by the server."""
@@ -192,11 +197,11 @@ class _Reader:
         config = ConsumerConfig(
             deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
             ack_policy=AckPolicy.NONE,
-            inactive_threshold=READING,
+            inactive_threshold=READER_EXPIRES_S,
         )
         self._jetstream = jetstream
         self._subscription = await jetstream.pull_subscribe(
-            self._pre + keys, stream=self._stream, config=config
+            self._subject_prefix + keys, stream=self._stream, config=config
         )
         info = await self._subscription.consumer_info()
         self._name = info.name
@@ -209,10 +214,10 @@ class _Reader:
         except TimeoutError:
             await self._check()
             return {}
-        end = time.monotonic() + MAX_SETTLING
+        end = time.monotonic() + MAX_SETTLE_S
         with contextlib.suppress(TimeoutError):
             while time.monotonic() < end:
-                found |= await self.fetch(FETCHED, self._times.settle_s)
+                found |= await self.fetch(FETCH_BATCH, self._times.settle_s)
         return found
 
     async def fetch(self, most: int, timeout: float) -> dict[str, Written | None]:
@@ -226,7 +231,7 @@ class _Reader:
         self.received = number
         headers = message.headers or {}
         is_marker = any(header in headers for header in MARKER_HEADERS)
-        key = message.subject.removeprefix(self._pre)
+        key = message.subject.removeprefix(self._subject_prefix)
         revision = message.metadata.sequence.stream
         return key, None if is_marker else Written(message.data, revision)
 

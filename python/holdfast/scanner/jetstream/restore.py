@@ -18,168 +18,178 @@ from holdfast.scanner.jetstream.entries import (
     status_key,
     without,
 )
-from holdfast.scanner.jetstream.store import RETRIED, Keeper, Unit
+from holdfast.scanner.jetstream.store import MAX_RETRY_S, EntryStore
 from holdfast.scanner.messages.types import Status
+from holdfast.scanner.subscriptions.key import SubscriptionKey
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Mapping
+
+    from nats.aio.client import Client
 
     from holdfast.scanner.messages.types import SubscribeRequest, UnsubscribeRequest
+    from holdfast.scanner.placement import SubscriptionHost
     from holdfast.scanner.subscriptions.registry import Registry
 
-RESTORING = 2.0
-"""Seconds that requests wait for the restoration. It goes on after that."""
+MAX_RESTORE_WAIT_S = 2.0
+"""How long requests wait for stored subscriptions. Restoring them goes on after that."""
 
 
-class Kept:
-    """Connects the registry with the keeper."""
+class StoredSubscriptions:
+    """Stores the subscriptions and states of the registry, and restores them after a start."""
 
-    def __init__(
-        self,
-        prefix: str,
-        registry: Registry,
-        subscribe: Callable[[SubscribeRequest], Awaitable[None]],
-        is_kept_elsewhere: Callable[[Unit], bool],
-    ) -> None:
-        """`subscribe` carries out a kept request, or raises `Refused`.
-
-        A unit that is kept elsewhere is not stored.
-        """
+    def __init__(self, prefix: str, registry: Registry) -> None:
         self._prefix = prefix
         self._registry = registry
-        self._subscribe = subscribe
-        self._is_kept_elsewhere = is_kept_elsewhere
-        self._pending: dict[Unit, list[SubscribeRequest]] = {}
-        """Kept requests that are not carried out yet."""
-        self._logged: set[Unit] = set()
-        """Pending units whose refusal is logged."""
-        self._read = False
+        self._host: SubscriptionHost | None = None
+        self._pending: dict[SubscriptionKey, list[SubscribeRequest]] = {}
+        """Stored requests that are not carried out yet."""
+        self._logged: set[SubscriptionKey] = set()
+        """Pending subscriptions whose refusal is logged."""
+        self._has_read = False
         self._found_pending = asyncio.Event()
-        self.keeper = Keeper(prefix, self._entries, self._found)
+        self._store = EntryStore(prefix, self._entries, self._on_read)
+
+    def connected(self, client: Client | None) -> None:
+        """Sets the client; `None` while there is no connection."""
+        self._store.connected(client)
+
+    async def run(self, host: SubscriptionHost, ready: asyncio.Event) -> None:
+        """Restores and stores, until it is cancelled.
+
+        `host` carries out stored requests. Subscriptions from entries of another bucket are not
+        stored. Sets `ready` after the first attempt to restore, or when it takes too long.
+        """
+        self._host = host
+        async with asyncio.TaskGroup() as running:
+            running.create_task(self._store.run())
+            running.create_task(self._restore(host, ready))
+
+    async def close(self) -> None:
+        """Removes the states of devices, which nobody updates any more. Then stores nothing."""
+        await self._store.stop()
 
     def changed(self, device: str, subscriber: str) -> None:
         """Stores a subscription that has changed, instead of what is pending."""
-        self._touch(Unit(device, subscriber))
+        self._touch(SubscriptionKey(device, subscriber))
 
     def state_changed(self, device: str) -> None:
         """Stores the state of a device; removes it if the device is gone."""
-        self.keeper.touch(Unit(device))
+        self._store.touch(SubscriptionKey(device))
 
     def unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Removes tags of a subscription, also of a pending one."""
-        unit = Unit(request.device_id, request.subscriber_id)
+        owner = SubscriptionKey(request.device_id, request.subscriber_id)
         ids = request.ids
-        left = [] if ids is None else without(self._pending.get(unit, []), set(ids))
-        self._touch(unit)
+        left = [] if ids is None else without(self._pending.get(owner, []), set(ids))
+        self._touch(owner)
         if left:
-            self._pending[unit] = left
+            self._pending[owner] = left
 
     async def settled(self, device: str, subscriber: str) -> None:
         """Waits until a changed subscription is stored; not while JetStream fails."""
-        await self.keeper.settled(Unit(device, subscriber))
+        await self._store.settled(SubscriptionKey(device, subscriber))
 
-    def _touch(self, unit: Unit) -> None:
-        self._pending.pop(unit, None)
-        self._logged.discard(unit)
-        self.keeper.touch(unit)
+    def _touch(self, owner: SubscriptionKey) -> None:
+        self._pending.pop(owner, None)
+        self._logged.discard(owner)
+        self._store.touch(owner)
 
-    def _entries(self, unit: Unit) -> Mapping[str, bytes]:
-        """Returns what is to be stored for a unit."""
-        if self._is_kept_elsewhere(unit):
+    def _entries(self, owner: SubscriptionKey) -> Mapping[str, bytes]:
+        """Returns the entries of an owner: nothing, if it is gone."""
+        assert self._host is not None, "the store runs"
+        if self._host.is_entry(owner.device, owner.subscriber):
             return {}
-        if unit in self._pending:
-            assert unit.subscriber is not None
-            pending = map(msgspec.json.encode, self._pending[unit])
-            return numbered(self._prefix, unit.device, unit.subscriber, pending)
-        device = self._registry.devices.get(unit.device)
+        if owner in self._pending:
+            assert owner.subscriber is not None
+            pending = map(msgspec.json.encode, self._pending[owner])
+            return numbered(self._prefix, owner.device, owner.subscriber, pending)
+        device = self._registry.devices.get(owner.device)
         if device is None:
             return {}
-        if unit.subscriber is None:
+        if owner.subscriber is None:
             return {status_key(self._prefix, device.id): device.status}
-        if unit.subscriber not in device.subscribers:
+        if owner.subscriber not in device.subscribers:
             return {}
-        values = requests(device, unit.subscriber)
-        return numbered(self._prefix, device.id, unit.subscriber, values)
+        values = requests(device, owner.subscriber)
+        return numbered(self._prefix, device.id, owner.subscriber, values)
 
-    def _found(self, entries: list[tuple[str, bytes]]) -> Mapping[str, Unit]:
+    def _on_read(self, entries: list[tuple[str, bytes]]) -> Mapping[str, SubscriptionKey]:
         """Takes the stored entries. At the first time, their subscriptions become pending.
 
         Everything known is compared with them again: the bucket may have been lost.
         Later, subscriptions that are not known here are left alone: another scanner may have stored
         them.
         """
-        units: dict[str, Unit] = {}
+        owners: dict[str, SubscriptionKey] = {}
         for key, value in sorted(entries, key=lambda entry: number(entry[0])):
             try:
                 if key.startswith(f"{self._prefix}.status."):
-                    units[key] = Unit(msgspec.json.decode(value, type=Status).device_id)
+                    owners[key] = SubscriptionKey(msgspec.json.decode(value, type=Status).device_id)
                     continue
                 request = restored(value)
             except (Refused, msgspec.DecodeError) as error:
                 logs.refused("kept_entry_malformed", kind="kept", key=key, reason=str(error))
                 continue
-            unit = Unit(request.device_id, request.subscriber_id)
-            is_ours = unit in self.keeper.touched or self._is_known(unit)
-            if not self._read and not is_ours:
-                self._pending.setdefault(unit, []).append(request)
-            if is_ours or unit in self._pending:
-                units[key] = unit
-        self._read = True
+            owner = SubscriptionKey(request.device_id, request.subscriber_id)
+            is_ours = owner in self._store.touched or self._is_known(owner)
+            if not self._has_read and not is_ours:
+                self._pending.setdefault(owner, []).append(request)
+            if is_ours or owner in self._pending:
+                owners[key] = owner
+        self._has_read = True
         for device in self._registry.devices.values():
             for name in (None, *device.subscribers):
-                self.keeper.touch(Unit(device.id, name))
+                self._store.touch(SubscriptionKey(device.id, name))
         if self._pending:
             self._found_pending.set()
-        return units
+        return owners
 
-    def _is_known(self, unit: Unit) -> bool:
-        device = self._registry.devices.get(unit.device)
-        return device is not None and unit.subscriber in device.subscribers
+    def _is_known(self, owner: SubscriptionKey) -> bool:
+        device = self._registry.devices.get(owner.device)
+        return device is not None and owner.subscriber in device.subscribers
 
-    async def restore(self, ready: asyncio.Event) -> None:
-        """Carries out pending requests, until it is cancelled.
-
-        Sets `ready` after the first attempt, or when it takes too long.
-        """
-        await self.keeper.tried.wait()
+    async def _restore(self, host: SubscriptionHost, ready: asyncio.Event) -> None:
+        """Carries out pending requests, until it is cancelled."""
+        await self._store.tried.wait()
         while True:
-            work = asyncio.create_task(self._restore_all())
+            work = asyncio.create_task(self._restore_all(host))
             try:
-                await asyncio.wait([work], timeout=None if ready.is_set() else RESTORING)
+                await asyncio.wait([work], timeout=None if ready.is_set() else MAX_RESTORE_WAIT_S)
                 ready.set()
                 await work
             finally:
                 work.cancel()
             if self._pending:
-                await asyncio.sleep(RETRIED)
+                await asyncio.sleep(MAX_RETRY_S)
             else:
                 self._found_pending.clear()
                 await self._found_pending.wait()
 
-    async def _restore_all(self) -> None:
-        devices: dict[str, list[Unit]] = {}
-        for unit in self._pending:
-            devices.setdefault(unit.device, []).append(unit)
-        await asyncio.gather(*map(self._restore_device, devices.values()))
+    async def _restore_all(self, host: SubscriptionHost) -> None:
+        devices: dict[str, list[SubscriptionKey]] = {}
+        for owner in self._pending:
+            devices.setdefault(owner.device, []).append(owner)
+        await asyncio.gather(*(self._restore_device(host, each) for each in devices.values()))
 
-    async def _restore_device(self, units: list[Unit]) -> None:
-        for unit in units:
-            found = self._pending.get(unit, [])
+    async def _restore_device(self, host: SubscriptionHost, owners: list[SubscriptionKey]) -> None:
+        for owner in owners:
+            found = self._pending.get(owner, [])
             try:
                 for request in found:
-                    if self._pending.get(unit) is not found:
+                    if self._pending.get(owner) is not found:
                         break  # A caller has changed it.
-                    await self._subscribe(request)
+                    await host.restore(request)
             except Refused as refused:
-                if unit not in self._logged:
-                    self._logged.add(unit)
-                    self._log(logging.WARNING, "not_restored", unit, reason=str(refused))
+                if owner not in self._logged:
+                    self._logged.add(owner)
+                    self._log(logging.WARNING, "not_restored", owner, reason=str(refused))
                 continue
-            if found and self._pending.get(unit) is found:
-                self._touch(unit)
+            if found and self._pending.get(owner) is found:
+                self._touch(owner)
                 tags = sum(len(request.tags) for request in found)
-                self._log(logging.INFO, "restored", unit, tags=tags)
+                self._log(logging.INFO, "restored", owner, tags=tags)
 
     @staticmethod
-    def _log(level: int, event: str, unit: Unit, **more: object) -> None:
-        logs.write(level, event, device=unit.device, subscriber=unit.subscriber, **more)
+    def _log(level: int, event: str, owner: SubscriptionKey, **more: object) -> None:
+        logs.write(level, event, device=owner.device, subscriber=owner.subscriber, **more)

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
 from holdfast import logs, tasks
-from holdfast.scanner.jetstream.heartbeat import JETSTREAM_TIMEOUT, reason_of
+from holdfast.scanner.jetstream.heartbeat import JETSTREAM_TIMEOUT_S, reason_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Set
@@ -26,56 +25,52 @@ if TYPE_CHECKING:
     from nats.js import JetStreamContext
     from nats.js.kv import KeyValue
 
+    from holdfast.scanner.subscriptions.key import SubscriptionKey
+
 BUCKET = "holdfast_scanner"
 STREAM = f"KV_{BUCKET}"
-PRE = f"$KV.{BUCKET}."
+KEY_SUBJECTS = f"$KV.{BUCKET}."
 
-READING = 30.0
-"""Seconds after which the server removes a reader that was left behind."""
+READER_EXPIRES_S = 30.0
+"""Time after which the server removes a reader that was left behind."""
 
-FETCHED = 256
+FETCH_BATCH = 256
 """Entries that are read at once."""
 
-FIRST_RETRY = 0.5
-RETRIED = 10.0
-"""Seconds between attempts while JetStream fails. Each failure doubles them, up to the second."""
+FIRST_RETRY_S = 0.5
+MAX_RETRY_S = 10.0
+"""Between attempts while JetStream fails. Each failure doubles the pause, up to the second."""
 
-TOGETHER = 16
-"""Units that are written concurrently."""
-
-
-@dataclass(frozen=True)
-class Unit:
-    """Keys that are written together: those of a subscriber of a device, or of its status."""
-
-    device: str
-    subscriber: str | None = None
-    """`None` for the status."""
+MAX_CONCURRENT_WRITES = 16
+"""Subscriptions that are written at once."""
 
 
-class Keeper:
-    """Writes the wanted entries of units to the bucket, as soon as they are touched."""
+class EntryStore:
+    """Writes entries to the bucket, as soon as their owner is touched.
+
+    An owner of entries is a subscription, or the status of a device.
+    """
 
     def __init__(
         self,
         prefix: str,
-        entries: Callable[[Unit], Mapping[str, bytes]],
-        found: Callable[[list[tuple[str, bytes]]], Mapping[str, Unit]],
+        entries: Callable[[SubscriptionKey], Mapping[str, bytes]],
+        on_read: Callable[[list[tuple[str, bytes]]], Mapping[str, SubscriptionKey]],
     ) -> None:
-        """`entries` returns what is to be stored for a unit: nothing, if it is gone.
+        """`entries` returns what is to be stored for an owner: nothing, if it is gone.
 
-        `found` gets the stored entries after each connection. It returns the units of those that
-        are to be replaced or removed when their unit does not want them.
+        `on_read` gets the stored entries after each connection. It returns the owners of those that
+        are to be replaced or removed when their owner does not want them.
         """
         self._prefix = prefix
         self._entries = entries
-        self._found = found
+        self._on_read = on_read
         self._client: Client | None = None
-        self._news = asyncio.Event()
-        self._touched: set[Unit] = set()
-        self._writing: set[Unit] = set()
-        self._waiting: dict[Unit, asyncio.Event] = {}
-        self._stored: dict[Unit, dict[str, int]] = {}
+        self._has_work = asyncio.Event()
+        self._touched: set[SubscriptionKey] = set()
+        self._writing: set[SubscriptionKey] = set()
+        self._waiting: dict[SubscriptionKey, asyncio.Event] = {}
+        self._stored: dict[SubscriptionKey, dict[str, int]] = {}
         """The hashes of the stored entries, by key."""
         self._works: bool | None = None
         self._failures = 0
@@ -85,30 +80,30 @@ class Keeper:
         """Set after the first attempt to read the stored entries."""
 
     @property
-    def touched(self) -> Set[Unit]:
-        """The units that are not stored yet."""
+    def touched(self) -> Set[SubscriptionKey]:
+        """The owners that are not stored yet."""
         return self._touched | self._writing
 
     def connected(self, client: Client | None) -> None:
         """Sets the client; `None` while there is no connection."""
         self._client = client
-        self._news.set()
+        self._has_work.set()
 
-    def touch(self, unit: Unit) -> None:
-        """Writes a unit soon."""
-        self._touched.add(unit)
-        self._news.set()
+    def touch(self, owner: SubscriptionKey) -> None:
+        """Writes the entries of an owner soon."""
+        self._touched.add(owner)
+        self._has_work.set()
 
-    async def settled(self, unit: Unit) -> None:
-        """Waits until a touched unit is stored; not while JetStream fails."""
+    async def settled(self, owner: SubscriptionKey) -> None:
+        """Waits until the entries of a touched owner are stored; not while JetStream fails."""
         if not self._works or self._client is None:
             return
-        if unit in self._touched or unit in self._writing:
-            stored = self._waiting.setdefault(unit, asyncio.Event())
+        if owner in self._touched or owner in self._writing:
+            stored = self._waiting.setdefault(owner, asyncio.Event())
             await stored.wait()
 
     async def run(self) -> None:
-        """Reads the entries after each connection, and writes units, until it is cancelled."""
+        """Reads the entries after each connection, and writes changes, until it is cancelled."""
         bucket: KeyValue | None = None
         client: Client | None = None
         while True:
@@ -123,15 +118,15 @@ class Keeper:
                 async with self._busy:
                     if bucket is None:
                         bucket = await self._read(client)
-                    await self._write(client.jetstream(timeout=JETSTREAM_TIMEOUT), bucket)
+                    await self._write(client.jetstream(timeout=JETSTREAM_TIMEOUT_S), bucket)
             except Exception as error:  # Keeping is optional, no error may stop the scanner.
                 bucket = None
                 if self._client is client:  # Else the connection has ended, and not JetStream.
                     self._failures += 1
-                    self._tell(False, reason_of(error))
+                    self._log_state(False, reason_of(error))
             else:
                 self._failures = 0
-                self._tell(True, "")
+                self._log_state(True, "")
             self.tried.set()
             if not self._works:
                 self._release()
@@ -140,21 +135,21 @@ class Keeper:
         """Waits for work; while JetStream fails, for the next attempt."""
         if self._works is False and self._client is not None:
             client = self._client
-            pause = min(FIRST_RETRY * 2 ** min(self._failures - 1, 10), RETRIED)
+            pause = min(FIRST_RETRY_S * 2 ** min(self._failures - 1, 10), MAX_RETRY_S)
             try:
                 async with asyncio.timeout(pause):
                     while self._client is client:
-                        self._news.clear()
-                        await self._news.wait()
+                        self._has_work.clear()
+                        await self._has_work.wait()
             except TimeoutError:
                 pass
             return
-        await self._news.wait()
-        self._news.clear()
+        await self._has_work.wait()
+        self._has_work.clear()
 
     async def _read(self, client: Client) -> KeyValue:
         """Opens the bucket and reports its entries."""
-        jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT)
+        jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
         try:
             bucket = await jetstream.key_value(BUCKET)
         except NotFoundError:
@@ -162,44 +157,48 @@ class Keeper:
         entries = []
         for kind in ("subscription.*.*.*", "status.*"):
             entries += await _entries(jetstream, f"{self._prefix}.{kind}")
-        units = self._found(entries)
+        owners = self._on_read(entries)
         self._stored = {}
         for key, value in entries:
-            if key in units:
-                self._stored.setdefault(units[key], {})[key] = hash(value)
-        self._touched.update(units.values())
+            if key in owners:
+                self._stored.setdefault(owners[key], {})[key] = hash(value)
+        self._touched.update(owners.values())
         return bucket
 
     async def _write(self, jetstream: JetStreamContext, bucket: KeyValue) -> None:
-        """Writes all touched units. After an error, those that failed are still touched."""
+        """Writes the entries of all touched owners. Those that failed are still touched then."""
         while self._touched:
-            self._writing = {self._touched.pop() for _ in range(min(TOGETHER, len(self._touched)))}
-            units = list(self._writing)
-            work = (self._write_unit(jetstream, bucket, unit) for unit in units)
+            count = min(MAX_CONCURRENT_WRITES, len(self._touched))
+            self._writing = {self._touched.pop() for _ in range(count)}
+            owners = list(self._writing)
+            work = (self._write_owner(jetstream, bucket, owner) for owner in owners)
             results = await asyncio.gather(*work, return_exceptions=True)
             self._writing = set()
             errors = []
-            for unit, result in zip(units, results, strict=True):
+            for owner, result in zip(owners, results, strict=True):
                 if isinstance(result, BaseException):
-                    self._touched.add(unit)
+                    self._touched.add(owner)
                     errors.append(result)
-                elif unit not in self._touched and unit in self._waiting:
-                    self._waiting.pop(unit).set()
+                elif owner not in self._touched and owner in self._waiting:
+                    self._waiting.pop(owner).set()
             if errors:
                 raise errors[0]
 
-    async def _write_unit(self, jetstream: JetStreamContext, bucket: KeyValue, unit: Unit) -> None:
-        wanted = self._entries(unit)
-        stored = self._stored.setdefault(unit, {})
+    async def _write_owner(
+        self, jetstream: JetStreamContext, bucket: KeyValue, owner: SubscriptionKey
+    ) -> None:
+        wanted = self._entries(owner)
+        stored = self._stored.setdefault(owner, {})
         for key, value in wanted.items():
             if stored.get(key) != hash(value):
                 await bucket.put(key, value)
                 stored[key] = hash(value)
         for key in [key for key in stored if key not in wanted]:
-            await jetstream.purge_stream(STREAM, subject=PRE + key)  # Leaves no marker behind.
+            # Unlike a deletion, a purge leaves no marker behind.
+            await jetstream.purge_stream(STREAM, subject=KEY_SUBJECTS + key)
             del stored[key]
         if not stored:
-            del self._stored[unit]
+            del self._stored[owner]
 
     def _release(self) -> None:
         """Lets requests go on that wait for JetStream."""
@@ -210,13 +209,15 @@ class Keeper:
     async def stop(self) -> None:
         """Removes the states of devices, which nobody updates any more. Then writes nothing."""
         client, self._client = self._client, None
-        self._news.set()
+        self._has_work.set()
         if client is not None and self._works:
-            jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT)
+            jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
             async with self._busy:  # What is on its way to the server comes before the removal.
-                await jetstream.purge_stream(STREAM, subject=f"{PRE}{self._prefix}.status.*")
+                await jetstream.purge_stream(
+                    STREAM, subject=f"{KEY_SUBJECTS}{self._prefix}.status.*"
+                )
 
-    def _tell(self, works: bool, reason: str) -> None:
+    def _log_state(self, works: bool, reason: str) -> None:
         if works is self._works:
             return
         if works:
@@ -235,18 +236,18 @@ async def _entries(jetstream: JetStreamContext, keys: str) -> list[tuple[str, by
     config = ConsumerConfig(
         deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
         ack_policy=AckPolicy.NONE,
-        inactive_threshold=READING,
+        inactive_threshold=READER_EXPIRES_S,
     )
-    reader = await jetstream.pull_subscribe(PRE + keys, stream=STREAM, config=config)
+    reader = await jetstream.pull_subscribe(KEY_SUBJECTS + keys, stream=STREAM, config=config)
     try:
         info = await reader.consumer_info()
         left = info.num_pending or 0
         found = []
         while left > 0:
-            messages = await reader.fetch(min(left, FETCHED), timeout=JETSTREAM_TIMEOUT)
+            messages = await reader.fetch(min(left, FETCH_BATCH), timeout=JETSTREAM_TIMEOUT_S)
             left -= len(messages)
             found += [
-                (message.subject.removeprefix(PRE), message.data)
+                (message.subject.removeprefix(KEY_SUBJECTS), message.data)
                 for message in messages
                 if not message.headers  # Only markers of deleted keys have headers.
             ]

@@ -21,6 +21,8 @@ class Dialect(Protocol):
     """The subjects of commands, after the prefix."""
     byte_orders: Mapping[tuple[str, str], str]
     """The byte order that a type is read with, where that of its request means another one."""
+    has_exact_pauses: bool
+    """Whether a device is connected to again after the pauses of `tentacle`, without jitter."""
     replaces_subscription: bool
     """Whether a subscribe request is the whole subscription: it ends that of all other tags."""
     last_definition_counts: bool

@@ -37,6 +37,7 @@ class Tentacle:
     name: scanning.Dialect = "tentacle"
     command_subjects: tuple[str, ...] = ("command.>",)
     byte_orders: Mapping[tuple[str, str], str] = BYTE_ORDERS
+    has_exact_pauses = True
     replaces_subscription = False
     last_definition_counts = True
     repeats_values = False

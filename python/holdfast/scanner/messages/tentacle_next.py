@@ -48,6 +48,7 @@ class TentacleNext:
     # Its PLC library sends to the second.
     command_subjects: tuple[str, ...] = ("command.>", "module.command.>")
     byte_orders: Mapping[tuple[str, str], str] = MappingProxyType({})
+    has_exact_pauses = False
     replaces_subscription = True
     last_definition_counts = False  # Its gateway sends tags in random order.
     repeats_values = True

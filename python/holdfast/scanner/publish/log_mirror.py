@@ -25,7 +25,7 @@ MAX_MESSAGE = 4096
 """The most characters of a published message."""
 
 
-class PublishedLog(logging.Handler):
+class LogMirror(logging.Handler):
     """Passes the records of the thread that creates it to `publish`, as text for NATS."""
 
     def __init__(self, prefix: str, publish: Callable[[object, bytes], None]) -> None:

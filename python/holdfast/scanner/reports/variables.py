@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _encode = msgspec.json.Encoder().encode
 
-ENVELOPE = 2
+ENVELOPE_BYTES = 2
 """Bytes of an answer without variables."""
 
 
@@ -28,15 +28,15 @@ def variables(
     devices: Mapping[str, tuple[ScannedDevice, Mapping[str, str]]],
     refused: Iterable[RefusedEntry],
     module: str,
-    most: int,
+    max_bytes: int,
 ) -> bytes:
-    """Returns the answer as JSON, with as many tags as fit into `most` bytes.
+    """Returns the answer as JSON, with as many tags as fit into `max_bytes`.
 
     `devices` holds each device with the errors of tags that could not be decoded. The tags are
     sorted by device; `offset` of the request skips the first ones. The tags of `refused` follow.
     """
     texts: list[bytes] = []
-    room = most - ENVELOPE
+    room = max_bytes - ENVELOPE_BYTES
     known = sum(
         len(device.tags) for id, (device, _) in devices.items() if request.device_id in (None, id)
     )
@@ -53,7 +53,7 @@ def variables(
     return b"[" + b",".join(texts) + b"]"
 
 
-def of_device(
+def device_variables(
     device: ScannedDevice, undecoded: Mapping[str, str], module: str
 ) -> Iterator[Variable]:
     """Yields the latest value of each tag of a device."""

@@ -43,6 +43,10 @@ class Change:
     """Whether its polling must change."""
     former: ScannedDevice | None = None
     """The device that `device` replaces, because its address or a setting is another."""
+    fresh: Collection[str] = ()
+    """The tags whose next values must be published in any case: the subscriber waits for them."""
+    only_adds_tags: bool = False
+    """Whether a known subscriber has requested only tags that are new."""
 
 
 class Registry:
@@ -117,6 +121,10 @@ class Registry:
         if not asked.tags and (device is None or asked.subscriber not in device.subscribers):
             return Change(device)
         before = device.rate if device is not None and device.subscribers else None
+        fresh = self.fresh(asked)
+        if former is not None or asked.publish == "scan" or self._dialect.repeats_values:
+            fresh = asked.tags
+        only_adds_tags = device is not None and device.is_extended_by(asked.subscriber, asked.tags)
         if device is None or former is not None:
             device = self._made(asked, source, address, former)
         subscriber = device.subscribers.setdefault(
@@ -135,7 +143,8 @@ class Registry:
             if (name := self._dialect.tag_name(id)) != id:
                 self._spelled.setdefault(name, set()).add(id)
         self._tags += len(new)
-        return Change(device, bool(new) or redefined or device.rate != before, former)
+        polling = bool(new) or redefined or device.rate != before
+        return Change(device, polling, former, fresh, only_adds_tags)
 
     def _alike(self, tag: Tag) -> Tag:
         """Returns the same tag of another device, if there is one: many devices are of one kind."""

@@ -44,29 +44,27 @@ def requested_tags(
     replaceable = {entry.id for entry in of_profile}
     entries = [(f"profile {request.profile}", entry) for entry in of_profile]
     entries += ((f"tags[{index}]", entry) for index, entry in enumerate(request.tags))
+    options = {entry.id: _options(entry) for _, entry in entries}
     found: dict[str, Tag] = {}
     for where, entry in entries:
         made = _tag(entry, order, where, rules, adjustments)
-        if made.id in found and made.id in replaceable:
-            replaceable.discard(made.id)  # A second one in the request would be a repetition.
-        elif made.id in found:
-            _check_repeated(where, made, found[made.id], rules)
+        before = found.get(made.id)
+        if before is not None and made.id in replaceable:
+            replaceable -= {made.id}  # A second one in the request would be a repetition.
+        elif before is not None:
+            if rules.strict:
+                raise Refused(f"{where}: duplicate id {made.id!r}")
+            if made != before and not rules.dialect.last_definition_counts:
+                raise Refused(f"{where}: {made.id!r} is {made}, and already {before}")
             adjustments.changes.append(("tag_repeated", made.id))
         found[made.id] = made
-    return found, {entry.id: _options(entry) for _, entry in entries}
+    return found, options
 
 
 def _options(entry: TagRequest) -> TagOptions:
     if entry.writable is None and entry.description is None:
         return NO_OPTIONS
     return TagOptions(entry.writable, entry.description)
-
-
-def _check_repeated(where: str, tag: Tag, before: Tag, rules: Rules) -> None:
-    if rules.strict:
-        raise Refused(f"{where}: duplicate id {tag.id!r}")
-    if tag != before and not rules.dialect.last_definition_counts:
-        raise Refused(f"{where}: {tag.id!r} is {tag}, and already {before}")
 
 
 def _tag(

@@ -10,57 +10,57 @@ import contextlib
 import time
 from typing import TYPE_CHECKING
 
-from holdfast.scanner.jetstream.store import Unit
+from holdfast.scanner.subscriptions.key import SubscriptionKey
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
 
-class Expiring:
+class SubscriptionTtls:
     """The subscriptions with a `ttl`, and when each ends."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._ttls: dict[Unit, int] = {}
-        self._ends: dict[Unit, float] = {}
-        self._runs = False
-        self._news = asyncio.Event()
+        self._ttls: dict[SubscriptionKey, int] = {}
+        self._ends: dict[SubscriptionKey, float] = {}
+        self._is_running = False
+        self._changed = asyncio.Event()
 
     def renew(self, device: str, subscriber: str, ttl: int | None) -> None:
         """Starts the time of a subscription again; without `ttl`, it does not end."""
-        unit = Unit(device, subscriber)
+        key = SubscriptionKey(device, subscriber)
         if ttl is None:
-            self._ttls.pop(unit, None)
-            self._ends.pop(unit, None)
+            self._ttls.pop(key, None)
+            self._ends.pop(key, None)
             return
-        self._ttls[unit] = ttl
-        self._ends[unit] = self._clock() + ttl
-        self._news.set()
+        self._ttls[key] = ttl
+        self._ends[key] = self._clock() + ttl
+        self._changed.set()
 
     def connected(self, is_connected: bool) -> None:
         """Stops the time of all subscriptions, or starts it again."""
-        self._runs = is_connected
+        self._is_running = is_connected
         if is_connected:
             now = self._clock()
-            self._ends = {unit: now + ttl for unit, ttl in self._ttls.items()}
-        self._news.set()
+            self._ends = {key: now + ttl for key, ttl in self._ttls.items()}
+        self._changed.set()
 
-    def is_due(self, unit: Unit) -> bool:
+    def is_due(self, key: SubscriptionKey) -> bool:
         """Returns whether a subscription ends now."""
-        return self._runs and unit in self._ends and self._ends[unit] <= self._clock()
+        return self._is_running and key in self._ends and self._ends[key] <= self._clock()
 
-    async def run(self, end: Callable[[Unit], Awaitable[None]]) -> None:
+    async def run(self, end: Callable[[SubscriptionKey], Awaitable[None]]) -> None:
         """Calls `end` for each subscription that is due, until it is cancelled.
 
         After `end`, it must not be due any more.
         """
         while True:
-            for unit in list(filter(self.is_due, self._ends)):
-                await end(unit)
-            self._news.clear()
+            for key in list(filter(self.is_due, self._ends)):
+                await end(key)
+            self._changed.clear()
             left = None
-            if self._runs and self._ends:
+            if self._is_running and self._ends:
                 left = max(min(self._ends.values()) - self._clock(), 0.0)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(left):
-                    await self._news.wait()
+                    await self._changed.wait()

@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 
 _encode = msgspec.json.Encoder().encode
 
-ENVELOPE = 300
+ENVELOPE_BYTES = 300
 """Bytes of an answer without devices."""
 
-SMALLEST_TAG = 100
+MIN_TAG_BYTES = 100
 """The fewest bytes of a tag in an answer. It limits how many tags can fit."""
 
-SMALLEST_ID = 4
+MIN_ID_BYTES = 4
 """The fewest bytes of a tag id in the list of a subscriber."""
 
 
@@ -44,19 +44,19 @@ def browsed(
     devices: Mapping[str, tuple[ScannedDevice, Mapping[str, str]]],
     counters: Mapping[str, Mapping[str, Any]],
     service: ServiceReport,
-    most: int,
+    max_bytes: int,
 ) -> BrowseAnswer:
-    """Returns the answer, with at most `most` bytes.
+    """Returns the answer, with at most `max_bytes` bytes.
 
     `devices` holds each device with the errors of tags that could not be decoded. Raises `Refused`
     for `tagOffset` without `deviceId`.
     """
     answer = BrowseAnswer(True, len(devices), service, [])
-    room = most - ENVELOPE
+    room = max_bytes - ENVELOPE_BYTES
     if request.device_id is not None:
         if request.device_id in devices:
             device, undecoded = devices[request.device_id]
-            report = _Report(device, undecoded, counters.get(device.polled_as, {}))
+            report = _DeviceReport(device, undecoded, counters.get(device.polled_as, {}))
             page, answer.next_tag = report.page(request.tag_offset or 0, room)
             answer.devices.append(page)
         return answer
@@ -64,7 +64,9 @@ def browsed(
         raise Refused("tagOffset requires deviceId")
     for at, id in enumerate(sorted(devices)[request.offset or 0 :], request.offset or 0):
         device, undecoded = devices[id]
-        whole = _Report(device, undecoded, counters.get(device.polled_as, {})).whole(most)
+        whole = _DeviceReport(device, undecoded, counters.get(device.polled_as, {})).whole(
+            max_bytes
+        )
         size = len(_encode(whole)) + 1
         if size > room:
             answer.next = at
@@ -74,17 +76,17 @@ def browsed(
     return answer
 
 
-def report(
+def device_report(
     device: ScannedDevice,
     undecoded: Mapping[str, str],
     counters: Mapping[str, Mapping[str, Any]],
-    most: int,
+    max_bytes: int,
 ) -> DeviceReport:
     """Returns the report of one device; without tags, blocks and subscribers if it is too large."""
-    return _Report(device, undecoded, counters.get(device.polled_as, {})).whole(most)
+    return _DeviceReport(device, undecoded, counters.get(device.polled_as, {})).whole(max_bytes)
 
 
-class _Report:
+class _DeviceReport:
     """Creates the reports of one device."""
 
     def __init__(
@@ -95,20 +97,20 @@ class _Report:
         self._counters = counters
         self._tags = list(device.tags.values())
         self._places = Places(self._tags)
-        self._least = SMALLEST_TAG + SMALLEST_ID * len(device.subscribers)
+        self._min_tag_bytes = MIN_TAG_BYTES + MIN_ID_BYTES * len(device.subscribers)
 
-    def whole(self, most: int) -> DeviceReport:
+    def whole(self, max_bytes: int) -> DeviceReport:
         """Returns the whole report; without tags, blocks and subscribers if it is too large."""
-        if len(self._tags) * SMALLEST_TAG <= most:
+        if len(self._tags) * MIN_TAG_BYTES <= max_bytes:
             report = self._with(self._tags)
-            if len(_encode(report)) < most - ENVELOPE:
+            if len(_encode(report)) < max_bytes - ENVELOPE_BYTES:
                 return report
         return self._head()
 
     def page(self, offset: int, room: int) -> tuple[DeviceReport, int | None]:
         """Returns a report with as many tags as fit, and the offset of the next tag, if any."""
         left = self._tags[offset:]
-        count = min(len(left), max(room // self._least, 1))
+        count = min(len(left), max(room // self._min_tag_bytes, 1))
         while True:
             report = self._with(left[:count])
             size = len(_encode(report)) + 1
