@@ -27,7 +27,7 @@ def test_a_node_that_was_stopped_for_too_long_drops_what_waits() -> None:
 
     async def work() -> None:
         lost = asyncio.Event()
-        outbox = Outbox(may_send=lambda: False, lost=lost.set)
+        outbox = Outbox(may_send=lambda: False, on_drop=lost.set)
         outbox.connected(Connected())  # type: ignore[arg-type]
         outbox.put([(("d", "t"), b"PUB")])
         running = asyncio.create_task(outbox.run())

@@ -14,6 +14,7 @@ import pytest
 
 import holdfast
 from holdfast.scanner.broker import MAX_PAUSE
+from holdfast.scanner.jetstream import State
 from holdfast.scanner.subscriptions import device as devices
 from support import wire
 from support.brokers import NatsServer
@@ -333,7 +334,7 @@ def test_a_device_that_hangs_up_is_asked_again(
 def test_a_name_is_looked_up_again_when_the_device_does_not_answer(
     run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(devices, "LOOK_UP", 0.0)
+    monkeypatch.setattr(devices, "LOOKUP_INTERVAL_S", 0.0)
     port = server.address[1]
     known = [(socket.AF_INET, 1, 6, "", (host, port)) for host in ("127.0.0.2", "127.0.0.1")]
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: known)
@@ -411,7 +412,7 @@ def test_a_bucket_in_which_heartbeats_stay_for_ever_is_told_of_once(
     scanner = run_scanner(own_nats)
     wire.until(lambda: "heartbeat" in events(caplog), "there is a heartbeat")
     heart, broker = presence_of(scanner.scanner).heartbeat, broker_of(scanner.scanner)
-    heart._works = None
+    heart._availability.state = State.UNKNOWN
     scanner.do(heart.beat(broker.client))
     [told] = [each for each in caplog.records if each.getMessage() == "heartbeat_has_no_end"]
     assert told.__dict__["fields"]["bucket"] == "service_heartbeats"

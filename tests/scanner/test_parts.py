@@ -379,8 +379,8 @@ def test_messages_flow_in_order_while_they_are_taken() -> None:
 
 
 def test_each_has_its_turn_while_more_comes_than_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outboxes, "CHECK_INTERVAL", 0.001)
-    monkeypatch.setattr(outboxes, "PIECE", 20)
+    monkeypatch.setattr(outboxes, "CHECK_INTERVAL_S", 0.001)
+    monkeypatch.setattr(outboxes, "MAX_BATCH_BYTES", 20)
     keys = range(100)
 
     async def flow() -> list[bytes]:
@@ -403,12 +403,12 @@ def test_each_has_its_turn_while_more_comes_than_is_taken(monkeypatch: pytest.Mo
 def test_the_newest_of_each_is_kept_while_they_are_not_taken(
     how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(outboxes, "CHECK_INTERVAL", 0.001)
+    monkeypatch.setattr(outboxes, "CHECK_INTERVAL_S", 0.001)
 
     async def flow() -> tuple[Outbox, list[bytes]]:
-        wire, outbox = Wire(), Outbox(most=3)
+        wire, outbox = Wire(), Outbox(max_kept=3)
         if how == "slow":
-            wire.pending_data_size = outboxes.BACKLOG
+            wire.pending_data_size = outboxes.MAX_BACKLOG_BYTES
             outbox.connected(cast("Client", wire))
         for text in (b"a1", b"b1", b"a2", b"c1", b"b2", b"d1"):
             outbox.put([(text[:1], text)])

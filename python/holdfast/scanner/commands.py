@@ -10,7 +10,7 @@ from holdfast import logs
 from holdfast.client.requests import write_typed
 from holdfast.faults import EXPIRED, STANDBY, fault_text
 from holdfast.scanner.errors import Moved, Refused
-from holdfast.scanner.lateness import AGAIN, Lateness
+from holdfast.scanner.lateness import SEND_AGAIN, Lateness
 from holdfast.scanner.messages.types import Answer
 from holdfast.scanner.subscriptions.health import is_unwritten
 from holdfast.tags.text import value_from
@@ -137,7 +137,7 @@ async def write_tag(
     if fault == STANDBY:
         raise Moved(f"not written: {fault_text(fault)}")
     if fault:
-        said = "not written" if is_unwritten(fault) else "not confirmed"
-        again = f"; {AGAIN}" if fault == EXPIRED else ""
-        raise Refused(f"{said}: {fault_text(fault)}{again}")
+        outcome = "not written" if is_unwritten(fault) else "not confirmed"
+        again = f"; {SEND_AGAIN}" if fault == EXPIRED else ""
+        raise Refused(f"{outcome}: {fault_text(fault)}{again}")
     logs.write(logging.INFO, "tag_written", device=device.id, tag=tag.id)

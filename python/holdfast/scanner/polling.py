@@ -25,17 +25,17 @@ if TYPE_CHECKING:
 Poll: TypeAlias = tuple[str, float, list[PolledBlock]]
 """The device's name in the poller, the scheduled time in seconds, and the blocks."""
 
-RESULTS_TIMEOUT = 60.0
-"""Seconds of one wait for results. Stopping the poller ends the wait."""
+RESULTS_TIMEOUT_S = 60.0
+"""Time of one wait for results. Stopping the poller ends the wait."""
 
-WAKE_INTERVAL = 0.1
-"""Seconds between wake-ups of a thread that has to end."""
+WAKE_INTERVAL_S = 0.1
+"""Time between wake-ups of a thread that has to end."""
 
-GATHERED = 0.005
-"""The shortest time in seconds between two batches, so that batches have a useful size."""
+MIN_BATCH_INTERVAL_S = 0.005
+"""The shortest time between two batches, so that batches have a useful size."""
 
-FIRST_WITHIN = 1.0
-"""Seconds over which the first polls of new devices are spread."""
+FIRST_POLL_SPREAD_S = 1.0
+"""Time over which the first polls of new devices are spread."""
 
 PREFIX = "nats/"
 """The beginning of the names of devices in the poller. Names in a configuration have no slash."""
@@ -43,8 +43,8 @@ PREFIX = "nats/"
 NUMBERS = itertools.count()
 """A restarted scanner continues with the next number."""
 
-RENEWED = 0.1
-"""The shortest time in seconds between two changes of a device in the poller. Each change starts a
+MIN_CHANGE_INTERVAL_S = 0.1
+"""The shortest time between two changes of a device in the poller. Each change starts a
 poll, and a caller may subscribe to a thousand tags one by one."""
 
 
@@ -65,8 +65,8 @@ class Polling:
         self._exact_pauses_s = exact_pauses_s
         self._devices: dict[str, ScannedDevice] = {}
         """The devices by their name in the poller."""
-        self._renewed: dict[ScannedDevice, float] = {}
-        self._waiting: dict[ScannedDevice, asyncio.TimerHandle] = {}
+        self._changed_at: dict[ScannedDevice, float] = {}
+        self._pending_changes: dict[ScannedDevice, asyncio.TimerHandle] = {}
         self._paused: set[ScannedDevice] | None = None
         """The devices to poll when polling is resumed; `None` while it is not paused."""
         self._urgent: set[ScannedDevice] = set()
@@ -75,7 +75,7 @@ class Polling:
         """Futures of the faults of pending writes, by the number from the poller."""
         self._shared_poller = poller
         self._stopping = threading.Event()
-        self._taken = threading.Semaphore(1)
+        self._may_take = threading.Semaphore(1)
         self._thread = threading.Thread(target=self._run, name="holdfast-scan", daemon=True)
 
     def start(self, take: Callable[[ScannedDevice, float, list[PolledBlock]], None]) -> None:
@@ -90,7 +90,7 @@ class Polling:
         self._thread.start()
 
     def renew(self, device: ScannedDevice, *, at_once: bool = True) -> None:
-        """Updates a device in the poller, at most every `RENEWED` seconds.
+        """Updates a device in the poller, at most every `MIN_CHANGE_INTERVAL_S` seconds.
 
         With `at_once`, it is then polled immediately, otherwise at its next scheduled time. While
         polling is paused, it is polled when that ends. Raises `Refused` after `stop`.
@@ -102,11 +102,11 @@ class Polling:
             return
         if at_once:
             self._urgent.add(device)
-        if device in self._waiting:
+        if device in self._pending_changes:
             return
-        left = self._renewed.get(device, 0.0) + RENEWED - self._loop.time()
-        if device in self._renewed and left > 0:
-            self._waiting[device] = self._loop.call_later(left, self._renew, device)
+        left = self._changed_at.get(device, 0.0) + MIN_CHANGE_INTERVAL_S - self._loop.time()
+        if device in self._changed_at and left > 0:
+            self._pending_changes[device] = self._loop.call_later(left, self._renew, device)
         else:
             self._renew(device)
 
@@ -115,31 +115,31 @@ class Polling:
 
         Each change gives the device a new name, so that results of the old tags are discarded.
         """
-        self._waiting.pop(device, None)
+        self._pending_changes.pop(device, None)
         at_once = device in self._urgent
         self._urgent.discard(device)
         old, name = device.polled_as, f"{PREFIX}{next(NUMBERS)}"
         if old:
-            self._poller.replace(old, self._made(device, name), at_once=at_once)
+            self._poller.replace(old, self._native(device, name), at_once=at_once)
             del self._devices[old]
         else:
-            self._poller.add(self._made(device, name))
+            self._poller.add(self._native(device, name))
         device.polled_as = name
         self._devices[name] = device
-        self._renewed[device] = self._loop.time()
+        self._changed_at[device] = self._loop.time()
 
     def drop(self, device: ScannedDevice) -> None:
         """Stops polling a device and closes its connection."""
         if self._paused is not None:
             self._paused.discard(device)
             return
-        waiting = self._waiting.pop(device, None)
+        waiting = self._pending_changes.pop(device, None)
         if waiting is not None:
             waiting.cancel()
         self._urgent.discard(device)
         self._poller.remove(device.polled_as)
         del self._devices[device.polled_as]
-        del self._renewed[device]
+        del self._changed_at[device]
 
     def pause(self) -> None:
         """Stops polling all devices and closes their connections, until `resume`."""
@@ -175,7 +175,7 @@ class Polling:
         finally:
             del self._writes[number]
 
-    def _made(self, device: ScannedDevice, name: str) -> _core.PolledDevice:
+    def _native(self, device: ScannedDevice, name: str) -> _core.PolledDevice:
         source, plan = device.source, device.source.plan
         assert device.endpoint is not None
         interval = device.rate / 1000
@@ -196,7 +196,7 @@ class Polling:
             readable=plan.readable,
             forbidden=plan.forbidden,
             # A device that was taken over has waited already.
-            start_within=min(interval if fence is None else interval / 2, FIRST_WITHIN),
+            start_within=min(interval if fence is None else interval / 2, FIRST_POLL_SPREAD_S),
             report=self._results,
             release=source.release,
             retry=self._exact_pauses_s,
@@ -216,8 +216,8 @@ class Polling:
     async def stop(self) -> None:
         """Stops polling its devices, and closes the connections that nobody else uses."""
         self._stopping.set()
-        self._taken.release()
-        for waiting in self._waiting.values():
+        self._may_take.release()
+        for waiting in self._pending_changes.values():
             waiting.cancel()
         for name in self._devices:
             self._poller.remove(name)
@@ -229,19 +229,19 @@ class Polling:
         while self._thread.is_alive():
             # A wake-up that comes before the wait may have ended another one.
             self._results.wake()
-            self._thread.join(WAKE_INTERVAL)
+            self._thread.join(WAKE_INTERVAL_S)
 
     def _run(self) -> None:
-        while (taken := self._results.take(RESULTS_TIMEOUT)) is not None:
+        while (taken := self._results.take(RESULTS_TIMEOUT_S)) is not None:
             if not any(taken):
                 if self._stopping.is_set():
                     return
                 continue
-            self._taken.acquire()
+            self._may_take.acquire()
             if self._stopping.is_set():
                 return
             self._loop.call_soon_threadsafe(self._hand_over, *taken)
-            self._stopping.wait(GATHERED)
+            self._stopping.wait(MIN_BATCH_INTERVAL_S)
 
     def _hand_over(self, polls: Sequence[Poll], writes: Sequence[tuple[int, int]]) -> None:
         try:
@@ -254,4 +254,4 @@ class Polling:
                 if device is not None:
                     self._take(device, due, blocks)
         finally:
-            self._taken.release()
+            self._may_take.release()

@@ -84,7 +84,7 @@ class FleetPlacement:
         """Returns a queue that sends nothing while other nodes may poll the same devices."""
         self._outbox = Outbox(
             may_send=lambda: not self.member.is_joined or self._fleet.may_publish,
-            lost=repeat_values,
+            on_drop=repeat_values,
             at_once=True,
         )
         return self._outbox

@@ -9,10 +9,10 @@ import time
 from typing import TYPE_CHECKING
 
 import msgspec
-from nats.errors import NoRespondersError, TimeoutError
-from nats.js.errors import APIError, KeyNotFoundError, NotFoundError, ServiceUnavailableError
+from nats.js.errors import KeyNotFoundError, NotFoundError
 
 from holdfast import logs
+from holdfast.scanner.jetstream.availability import JETSTREAM_TIMEOUT_S, Availability
 from holdfast.scanner.messages.types import Announcement, Heartbeat
 
 if TYPE_CHECKING:
@@ -27,9 +27,6 @@ BUCKET = "service_heartbeats"
 
 EXPIRES_AFTER_S = 60.0
 """Time after which a heartbeat expires if it is not renewed."""
-
-JETSTREAM_TIMEOUT_S = 2.0
-"""Time to wait for an answer of JetStream."""
 
 
 class HeartbeatKey:
@@ -46,7 +43,7 @@ class HeartbeatKey:
         """Milliseconds since 1970."""
         self._revision: int | None = None
         """The revision of the own last heartbeat."""
-        self._works: bool | None = None
+        self._availability = Availability("heartbeat", "no_heartbeat", bucket=BUCKET, key=key)
         self._has_checked_ttl = False
         self._stopped = False
 
@@ -63,14 +60,16 @@ class HeartbeatKey:
         )
         try:
             bucket = await _bucket(client)
-            if not self._works:
+            if not self._availability.is_available:
                 await self._check_ttl(bucket)
             await self._look_for_others(bucket)
             self._revision = await bucket.put(self._key, msgspec.json.encode(content))
         except Exception as error:  # Heartbeats are optional, so no error may stop the scanner.
-            self._log_state(False, reason_of(error))
+            if not self._stopped:
+                self._availability.failed(error)
         else:
-            self._log_state(True, "")
+            if not self._stopped:
+                self._availability.succeeded()
 
     async def _look_for_others(self, bucket: KeyValue) -> None:
         """Reports another service that has written the key since the own last heartbeat."""
@@ -99,31 +98,11 @@ class HeartbeatKey:
     async def stop(self, client: Client | None) -> None:
         """Deletes the heartbeat. A heartbeat that is still being renewed is not logged any more."""
         self._stopped = True
-        if client is None or not self._works:
+        if client is None or not self._availability.is_available:
             return
         with contextlib.suppress(Exception):
             async with asyncio.timeout(JETSTREAM_TIMEOUT_S):
                 await (await _bucket(client)).delete(self._key)
-
-    def _log_state(self, works: bool, reason: str) -> None:
-        if self._stopped or works is self._works:
-            return
-        if works:
-            logs.write(logging.INFO, "heartbeat", bucket=BUCKET, key=self._key)
-        else:
-            logs.write(logging.WARNING, "no_heartbeat", bucket=BUCKET, key=self._key, reason=reason)
-        self._works = works
-
-
-def reason_of(error: Exception) -> str:
-    """Returns why JetStream failed."""
-    if isinstance(error, APIError) and error.description:
-        return error.description
-    if isinstance(error, ServiceUnavailableError | NoRespondersError):
-        return "JetStream is not enabled on the server or for this account"
-    if isinstance(error, TimeoutError):
-        return f"JetStream did not answer within {JETSTREAM_TIMEOUT_S:g} s"
-    return str(error) or type(error).__name__
 
 
 async def _bucket(client: Client) -> KeyValue:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
-from holdfast import logs, tasks
-from holdfast.scanner.jetstream.heartbeat import JETSTREAM_TIMEOUT_S, reason_of
+from holdfast import tasks
+from holdfast.scanner.jetstream.availability import JETSTREAM_TIMEOUT_S, Availability
 from holdfast.scanner.jetstream.store import (
     FETCH_BATCH,
     FIRST_RETRY_S,
@@ -92,7 +91,8 @@ class KeyWatch:
         self._times = times
         self._client: Client | None = None
         self._has_new_client = asyncio.Event()
-        self._works: bool | None = None
+        events = "bucket_watched", "bucket_not_watched"
+        self._availability = Availability(*events, bucket=bucket)
         self._failures = 0
         self.tried = asyncio.Event()
         """Set after the first attempt to read the bucket."""
@@ -134,7 +134,7 @@ class KeyWatch:
                 pause = min(FIRST_RETRY_S * 2 ** min(self._failures, 10), self._times.retry_s)
                 self._failures += 1
                 if self._client is client:  # Else the connection has ended, and not JetStream.
-                    self._log_state(False, reason_of(error))
+                    self._availability.failed(error)
                 self.tried.set()
             if not client.is_closed:
                 await asyncio.sleep(pause)
@@ -151,7 +151,7 @@ class KeyWatch:
                 found |= await reader.fetch(min(left, FETCH_BATCH), JETSTREAM_TIMEOUT_S)
             await self._on_change(found, True)
             self._failures = 0
-            self._log_state(True, "")
+            self._availability.succeeded()
             self.tried.set()
             while True:
                 if changes := await reader.changes():
@@ -167,15 +167,6 @@ class KeyWatch:
             await jetstream.stream_info(self._stream)
         except NotFoundError:
             await jetstream.create_key_value(bucket=self._bucket, history=1)
-
-    def _log_state(self, works: bool, reason: str) -> None:
-        if works is self._works:
-            return
-        if works:
-            logs.write(logging.INFO, "bucket_watched", bucket=self._bucket)
-        else:
-            logs.write(logging.WARNING, "bucket_not_watched", bucket=self._bucket, reason=reason)
-        self._works = works
 
 
 class _Reader:

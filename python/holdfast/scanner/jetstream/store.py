@@ -9,14 +9,13 @@ is optional: without it, nothing is kept, and nothing waits for it.
 from __future__ import annotations
 
 import asyncio
-import logging
 from typing import TYPE_CHECKING
 
 from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
-from holdfast import logs, tasks
-from holdfast.scanner.jetstream.heartbeat import JETSTREAM_TIMEOUT_S, reason_of
+from holdfast import tasks
+from holdfast.scanner.jetstream.availability import JETSTREAM_TIMEOUT_S, Availability
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Set
@@ -72,7 +71,8 @@ class EntryStore:
         self._waiting: dict[SubscriptionKey, asyncio.Event] = {}
         self._stored: dict[SubscriptionKey, dict[str, int]] = {}
         """The hashes of the stored entries, by key."""
-        self._works: bool | None = None
+        events = "subscriptions_kept", "subscriptions_not_kept"
+        self._availability = Availability(*events, bucket=BUCKET)
         self._failures = 0
         self._busy = asyncio.Lock()
         """Held while entries are read or written."""
@@ -96,7 +96,7 @@ class EntryStore:
 
     async def settled(self, owner: SubscriptionKey) -> None:
         """Waits until the entries of a touched owner are stored; not while JetStream fails."""
-        if not self._works or self._client is None:
+        if not self._availability.is_available or self._client is None:
             return
         if owner in self._touched or owner in self._writing:
             stored = self._waiting.setdefault(owner, asyncio.Event())
@@ -123,17 +123,17 @@ class EntryStore:
                 bucket = None
                 if self._client is client:  # Else the connection has ended, and not JetStream.
                     self._failures += 1
-                    self._log_state(False, reason_of(error))
+                    self._availability.failed(error)
             else:
                 self._failures = 0
-                self._log_state(True, "")
+                self._availability.succeeded()
             self.tried.set()
-            if not self._works:
+            if not self._availability.is_available:
                 self._release()
 
     async def _wait(self) -> None:
         """Waits for work; while JetStream fails, for the next attempt."""
-        if self._works is False and self._client is not None:
+        if self._availability.is_unavailable and self._client is not None:
             client = self._client
             pause = min(FIRST_RETRY_S * 2 ** min(self._failures - 1, 10), MAX_RETRY_S)
             try:
@@ -210,21 +210,12 @@ class EntryStore:
         """Removes the states of devices, which nobody updates any more. Then writes nothing."""
         client, self._client = self._client, None
         self._has_work.set()
-        if client is not None and self._works:
+        if client is not None and self._availability.is_available:
             jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
             async with self._busy:  # What is on its way to the server comes before the removal.
                 await jetstream.purge_stream(
                     STREAM, subject=f"{KEY_SUBJECTS}{self._prefix}.status.*"
                 )
-
-    def _log_state(self, works: bool, reason: str) -> None:
-        if works is self._works:
-            return
-        if works:
-            logs.write(logging.INFO, "subscriptions_kept", bucket=BUCKET)
-        else:
-            logs.write(logging.WARNING, "subscriptions_not_kept", bucket=BUCKET, reason=reason)
-        self._works = works
 
 
 async def _entries(jetstream: JetStreamContext, keys: str) -> list[tuple[str, bytes]]:

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 MAX_GAP = 10
 
-LOOK_UP = 10.0
-"""Seconds between lookups of the name of a device that does not respond."""
+LOOKUP_INTERVAL_S = 10.0
+"""Time between lookups of the name of a device that does not respond."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Plan:
     def of(request: PlanRequest | None) -> Plan:
         """Creates the plan of a request. Raises `Refused`."""
         if request is None:
-            return USUAL_PLAN
+            return DEFAULT_PLAN
         return Plan(
             MAX_GAP if request.max_gap is None else request.max_gap,
             request.max_registers or READ_REGISTERS,
@@ -83,7 +83,7 @@ class Plan:
                     raise Refused(f"tag {tag.id!r} from address {tag.address}: {found}")
 
 
-USUAL_PLAN = Plan()
+DEFAULT_PLAN = Plan()
 """One object for nearly all devices."""
 
 
@@ -182,11 +182,11 @@ class ScannedDevice:
         return min(subscriber.rate for subscriber in self.subscribers.values())
 
     def may_have_moved(self) -> bool:
-        """Returns whether its name must be looked up again, at most every `LOOK_UP` seconds."""
+        """Returns whether its name must be looked up again, at most every `LOOKUP_INTERVAL_S`."""
         now = time.monotonic()
         if self.address == self.source.target or self.health.state != "offline":
             return False
-        if now - self._looked_up < LOOK_UP:
+        if now - self._looked_up < LOOKUP_INTERVAL_S:
             return False
         self._looked_up = now
         return True

@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     from holdfast.scanner.messages.types import State
     from holdfast.types import PolledBlock
 
-Found = TypeVar("Found", bound=tuple[Any, ...])
+Block = TypeVar("Block", bound=tuple[Any, ...])
 """A tuple that begins with area, address and count."""
 
-UNREACHED = (PATH_UNAVAILABLE, TARGET_SILENT)
+GATEWAY_FAILURES = (PATH_UNAVAILABLE, TARGET_SILENT)
 """Exceptions of a gateway that does not reach the device."""
 
-FORGIVEN = 1
+TOLERATED_FAILURES = 1
 """Consecutive scans without a response before a device is offline."""
 
-UNWRITTEN = (
+NOT_WRITTEN_FAULTS = (
     ILLEGAL_FUNCTION,
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
@@ -55,7 +55,7 @@ UNWRITTEN = (
 
 def is_unwritten(fault: int) -> bool:
     """Returns whether a failed write has certainly changed nothing."""
-    return fault in UNWRITTEN
+    return fault in NOT_WRITTEN_FAULTS
 
 
 @dataclass(slots=True)
@@ -97,7 +97,7 @@ class Health:
         else:
             self.failures += 1
             unreached = any(fault in (NO_CONNECTION, UNREACHABLE) for fault, _ in faults)
-            if self.state != "online" or self.failures > FORGIVEN or unreached:
+            if self.state != "online" or self.failures > TOLERATED_FAILURES or unreached:
                 self.state = "offline"
         if self.state != before[0]:
             self.since = blocks[-1][5]
@@ -110,11 +110,11 @@ class Health:
         return before != (self.state, self.error if self.state == "online" else None)
 
 
-def without_overlap(blocks: Iterable[Found], others: Iterable[PolledBlock]) -> list[Found]:
+def without_overlap(blocks: Iterable[Block], others: Iterable[PolledBlock]) -> list[Block]:
     """Returns the blocks that overlap none of `others`, which must not overlap each other."""
     places = sorted(block[:3] for block in others)
 
-    def is_apart(block: Found) -> bool:
+    def is_apart(block: Block) -> bool:
         area, address, count = block[:3]
         at = bisect_left(places, (area, address + count, 0)) - 1
         before = places[at] if at >= 0 else None
@@ -124,4 +124,4 @@ def without_overlap(blocks: Iterable[Found], others: Iterable[PolledBlock]) -> l
 
 
 def _answered(fault: int) -> bool:
-    return is_exception(fault) and fault not in UNREACHED
+    return is_exception(fault) and fault not in GATEWAY_FAILURES
