@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from holdfast.scanner.fleet.assignment import partition_of, placed
+from holdfast.scanner.fleet.assignment import assigned, partition_of
 
 DEVICES = 100_000
 NODES = 50
@@ -29,7 +29,7 @@ def test_100_000_devices_move_hardly_more_than_they_must(partitions: int, most: 
     links = (f"tcp://10.{n >> 16}.{n >> 8 & 255}.{n & 255}:502" for n in range(DEVICES))
     devices = Counter(partition_of(link, partitions) for link in links)
     nodes = [f"node-{number}" for number in range(NODES)]
-    by = placed(partitions, nodes, {})
+    by = assigned(partitions, nodes, {})
     ratios, imbalances = [], []
     for step in range(40):
         before, largest = by, len(nodes)
@@ -38,7 +38,7 @@ def test_100_000_devices_move_hardly_more_than_they_must(partitions: int, most: 
         else:
             nodes.append(f"new-{step}")
             largest = len(nodes)
-        by = placed(partitions, nodes, before)
+        by = assigned(partitions, nodes, before)
         moved = sum(devices[each] for each in by if by[each] != before[each])
         ratios.append(moved / (DEVICES / largest))
         imbalances.append(max(loads(by, devices).values()) / (DEVICES / len(nodes)) - 1)
@@ -56,7 +56,7 @@ def test_100_000_devices_move_hardly_more_than_they_must(partitions: int, most: 
 def test_every_partition_has_a_live_node_and_none_moves_in_vain(
     partitions: int, nodes: set[str], held: dict[int, str]
 ) -> None:
-    by = placed(partitions, nodes, held)
+    by = assigned(partitions, nodes, held)
     assert set(by) == set(range(partitions))
     counts = Counter(dict.fromkeys(nodes, 0)) + Counter()
     counts.update(by.values())
@@ -67,18 +67,18 @@ def test_every_partition_has_a_live_node_and_none_moves_in_vain(
     for partition, node in held.items():
         if partition < partitions and node in nodes and by[partition] != node:
             assert counts[node] >= partitions // len(nodes)
-    assert placed(partitions, nodes, by) == by
+    assert assigned(partitions, nodes, by) == by
 
 
 def test_a_node_that_joins_takes_its_share_and_moves_nothing_else() -> None:
-    before = placed(256, ["a", "b", "c"], {})
-    after = placed(256, ["a", "b", "c", "d"], before)
+    before = assigned(256, ["a", "b", "c"], {})
+    after = assigned(256, ["a", "b", "c", "d"], before)
     moved = [partition for partition in after if after[partition] != before[partition]]
     assert len(moved) == 64
     assert {after[partition] for partition in moved} == {"d"}
 
 
 def test_a_node_that_leaves_gives_only_its_own_away() -> None:
-    before = placed(256, ["a", "b", "c", "d"], {})
-    after = placed(256, ["a", "b", "c"], before)
+    before = assigned(256, ["a", "b", "c", "d"], {})
+    after = assigned(256, ["a", "b", "c"], before)
     assert {before[each] for each in after if after[each] != before[each]} == {"d"}

@@ -130,7 +130,7 @@ def test_a_frozen_server_does_not_hold_up_a_stop(
     own_nats: NatsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "LAST", 0.05)
-    monkeypatch.setattr(output_module, "TIMEOUT", 3600.0)
+    monkeypatch.setattr(output_module, "CONFIRM_TIMEOUT_S", 3600.0)
     output = NatsOutput(Servers((own_nats.url,)), "modbus", "tentacle")
     buffer, stop = Buffer(), Stop()
     sending = Sending("nats", output, buffer)

@@ -11,12 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.client.url import NetworkTarget
-from holdfast.scanner.jetstream.heartbeat import HeartbeatKey
-from holdfast.scanner.messages.types import BrowseRequest, HeartbeatMetadata, ServiceReport
+from holdfast.scanner import ScannerLimits
+from holdfast.scanner.alone import Alone
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.jetstream import HeartbeatKey
+from holdfast.scanner.messages import BrowseRequest, HeartbeatMetadata, ServiceReport
 from holdfast.scanner.publish import outbox as outboxes
 from holdfast.scanner.publish.outbox import Outbox
 from holdfast.scanner.publish.publisher import Publisher
 from holdfast.scanner.reports import browsed
+from holdfast.scanner.subscriptions import Group, Registry, Tag, grouped
 from holdfast.scanner.subscriptions.device import (
     Plan,
     ScannedDevice,
@@ -24,9 +28,7 @@ from holdfast.scanner.subscriptions.device import (
     Subscriber,
     TagOptions,
 )
-from holdfast.scanner.subscriptions.groups import Group, grouped
 from holdfast.scanner.subscriptions.health import Health
-from holdfast.scanner.subscriptions.tag import Tag
 from holdfast.tags.decoding import Places, decoder
 
 if TYPE_CHECKING:
@@ -177,10 +179,10 @@ def test_everything_is_published_anew_when_that_is_asked_for(change: bool) -> No
     tags = tuple(made(id, ord(id) - ord("a")) for id in "abc")
     seldom = Group(60_000, change, tags[:2], (0.0, 0.0))
     often = Group(1000, False, tags[2:], (0.0,))
-    line.publisher.want(lambda: [often, seldom])
+    line.publisher.update(lambda: [often, seldom])
     assert line.at(0, 1, 2, 3) == {"a": 1, "b": 2, "c": 3}
     assert line.at(1, 1, 2, 3) == {"c": 3}
-    line.publisher.renew()
+    line.publisher.repeat_all()
     assert line.at(1.5, 1, 2, 3) == {"a": 1, "b": 2, "c": 3}
     assert line.at(2.5, 1, 2, 3) == {"c": 3}
 
@@ -188,13 +190,13 @@ def test_everything_is_published_anew_when_that_is_asked_for(change: bool) -> No
 def test_who_comes_to_known_tags_gets_their_next_values() -> None:
     line = Line()
     tags = tuple(made(id, ord(id) - ord("a")) for id in "ab")
-    line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))])
+    line.publisher.update(lambda: [Group(60_000, False, tags, (0.0, 0.0))])
     assert line.at(0, 1, 2) == {"a": 1, "b": 2}
     for newcomers in (["a"], ["b"]):
-        line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))], newcomers)
-    line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))])
+        line.publisher.update(lambda: [Group(60_000, False, tags, (0.0, 0.0))], newcomers)
+    line.publisher.update(lambda: [Group(60_000, False, tags, (0.0, 0.0))])
     assert line.at(10, 1, 2) == {"a": 1, "b": 2}
-    line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))], ["b", "gone"])
+    line.publisher.update(lambda: [Group(60_000, False, tags, (0.0, 0.0))], ["b", "gone"])
     assert line.at(20, 1, 2) == {"b": 2}
     assert line.at(30, 1, 2) == {}
 
@@ -221,7 +223,7 @@ def test_thousands_of_tags_far_apart_cost_no_more_each_than_a_few(
         ("holding_registers", 12 * at, 1, b"\0\1", 0, ANSWERED) for at in range(2000)
     ]
     line = Line()
-    line.publisher.want(lambda: grouped(plc))
+    line.publisher.update(lambda: grouped(plc))
     assert len(line.publisher.messages(0, blocks)) == 2000
     assert count <= 2 * 2000
     plc.health.judge([(*block[:3], None, 2, ANSWERED) for block in blocks])
@@ -534,3 +536,12 @@ def test_a_heartbeat_that_fails_after_the_stop_is_not_logged(
 
     assert asyncio.run(beaten(stopped=False)) == ["no_heartbeat"]
     assert asyncio.run(beaten(stopped=True)) == []
+
+
+def test_a_command_that_was_not_written_is_not_confirmed() -> None:
+    async def has_moved() -> bool:
+        return False
+
+    alone = Alone("modbus", Registry(ScannerLimits()), keeps_subscriptions=False)
+    with pytest.raises(Refused, match="not written: another node uses the device"):
+        asyncio.run(alone.write(device(), made("a"), "1", has_moved, lambda: 1.0))

@@ -67,7 +67,7 @@ class AllowedDevices:
         except NoSuchName as error:
             raise Refused(f"host {host}: {error.why}") from None
         except NotAllowed as error:
-            told = f" ({', '.join(error.found)})" if error.found else ""
+            resolved = f" ({', '.join(error.found)})" if error.found else ""
             networks = ", ".join(str(each.network) for each in self._list.networks)
             allowed = networks or "serial devices only"
-            raise Refused(f"{host}{told} is not allowed, allowed: {allowed}") from None
+            raise Refused(f"{host}{resolved} is not allowed, allowed: {allowed}") from None

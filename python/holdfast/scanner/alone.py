@@ -61,19 +61,19 @@ class Alone:
             await asyncio.Event().wait()
 
     async def leave(self) -> None:
-        """Has nobody to hand devices over to."""
+        """Does nothing: there are no other nodes."""
 
     async def close(self) -> None:
-        """Removes the states of devices, which nobody updates any more."""
+        """Removes the states of devices, which would be out of date."""
         if self._keeps_subscriptions:
             with contextlib.suppress(Exception):  # JetStream is optional, and may fail in any way.
                 await self._stored.close()
 
     def added(self, device: ScannedDevice) -> None:
-        """Has nothing to note."""
+        """Does nothing: all devices are polled here."""
 
     def dropped(self, device: ScannedDevice) -> None:
-        """Has nothing to note."""
+        """Does nothing: all devices are polled here."""
 
     def is_own(self, _device: ScannedDevice, /) -> bool:
         """Whether this scanner polls a device: it polls all."""
@@ -84,7 +84,7 @@ class Alone:
         return True
 
     def fence(self, _device: ScannedDevice, /) -> None:
-        """Returns nothing: nobody else may poll a device."""
+        """Returns nothing: no other scanner may poll a device."""
         return
 
     def lease(self, _device: ScannedDevice, /) -> None:

@@ -28,19 +28,17 @@ if TYPE_CHECKING:
     from holdfast.scanner.broker import Servers
     from holdfast.stop import Stop
 
-TIMEOUT = 5.0
-"""Seconds for the server to confirm what was sent."""
+CONFIRM_TIMEOUT_S = 5.0
+"""Time for the server to confirm what was sent."""
 
-CONNECTING = 3.0
-"""Seconds to connect."""
+CONNECT_TIMEOUT_S = 3.0
 
-CHECK_INTERVAL = 0.05
-"""Seconds between checks whether the connection has ended."""
+CHECK_INTERVAL_S = 0.05
+"""Time between checks whether the connection has ended."""
 
-CLOSING = 1.0
-"""Seconds to close a connection."""
+CLOSE_TIMEOUT_S = 1.0
 
-PENDING = 64 * 2**20
+MAX_PENDING_BYTES = 64 * 2**20
 """The limit of nats-py's send buffer in bytes, far above one step."""
 
 _encode = msgspec.json.Encoder().encode
@@ -102,7 +100,7 @@ class NatsOutput:
     async def _confirmed(self, client: SafeClient) -> None:
         """Waits until the server has everything. A connection that ends is an error at once."""
         assert self._lost is not None, "set with the client"
-        flushing = asyncio.ensure_future(client.flush(timeout=int(TIMEOUT)))
+        flushing = asyncio.ensure_future(client.flush(timeout=int(CONFIRM_TIMEOUT_S)))
         losing = asyncio.ensure_future(self._lost.wait())
         try:
             while not flushing.done():
@@ -111,7 +109,7 @@ class NatsOutput:
                     raise ConnectionError("the connection was lost")
                 await asyncio.wait(
                     {flushing, losing},
-                    timeout=CHECK_INTERVAL,
+                    timeout=CHECK_INTERVAL_S,
                     return_when=asyncio.FIRST_COMPLETED,
                 )
             flushing.result()
@@ -128,7 +126,7 @@ class NatsOutput:
 
             client = TlsClient() if self._servers.secure else SafeClient()
             try:
-                await asyncio.wait_for(self._connect(client, is_lost), CONNECTING)
+                await asyncio.wait_for(self._connect(client, is_lost), CONNECT_TIMEOUT_S)
             except BaseException:
                 await client.close()
                 raise
@@ -141,11 +139,11 @@ class NatsOutput:
         await client.connect(
             **options,
             allow_reconnect=False,
-            connect_timeout=int(CONNECTING),
+            connect_timeout=int(CONNECT_TIMEOUT_S),
             max_reconnect_attempts=1,
             reconnect_time_wait=0,
-            pending_size=PENDING,
-            error_cb=_told_elsewhere,
+            pending_size=MAX_PENDING_BYTES,
+            error_cb=_ignore_error,
             disconnected_cb=lost,
         )
 
@@ -153,7 +151,7 @@ class NatsOutput:
         client, self._client = self._client, None
         if client is not None:
             try:
-                self._runner.run(asyncio.wait_for(client.close(), CLOSING))
+                self._runner.run(asyncio.wait_for(client.close(), CLOSE_TIMEOUT_S))
             except (TimeoutError, OSError, Error):
                 return
 
@@ -191,5 +189,5 @@ class NatsOutput:
         ]
 
 
-async def _told_elsewhere(_: Exception) -> None:
-    """Errors end `send`, which tells them."""
+async def _ignore_error(_: Exception) -> None:
+    """Ignores an error: it also ends `send`, which reports it."""

@@ -140,7 +140,7 @@ class Placement(Protocol):
         """Hands all devices over to other nodes, if there are any."""
 
     async def close(self) -> None:
-        """Removes the states of devices, which nobody updates any more."""
+        """Removes the states of devices, which would be out of date."""
 
     def added(self, device: ScannedDevice) -> None:
         """Notes that a device is known from now on."""
@@ -158,7 +158,7 @@ class Placement(Protocol):
         """Returns what closes when another node may poll a device; `None` if none ever may."""
 
     def lease(self, device: ScannedDevice, /) -> int | None:
-        """Returns the number that messages about a device bear; `None` if they bear none."""
+        """Returns the number for the header of messages about a device; `None` without a fleet."""
 
     async def store(
         self,

@@ -1,4 +1,4 @@
-"""What callers may write, in words for the log: a scanner writes to devices for whoever asks.
+"""What callers may write, in words for the log: by default, every NATS client may.
 
 Does no I/O.
 """

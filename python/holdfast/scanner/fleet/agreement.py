@@ -11,7 +11,7 @@ from holdfast.config.scanning import PARTITIONS
 from holdfast.leases import LEASE_TIMES, LeaseTimes
 
 PROTOCOL = 1
-"""The version of what nodes tell each other, in buckets and messages."""
+"""The version of the buckets and messages that nodes share."""
 
 
 class FleetRefused(Exception):

@@ -19,7 +19,7 @@ def partition_of(link: str, partitions: int) -> int:
     return _hash(link) % partitions
 
 
-def placed(partitions: int, nodes: Collection[str], held: Mapping[int, str]) -> dict[int, str]:
+def assigned(partitions: int, nodes: Collection[str], held: Mapping[int, str]) -> dict[int, str]:
     """Who should hold each partition; `held` is who does now.
 
     All nodes have the same number of partitions, or one more. No other assignment of that kind

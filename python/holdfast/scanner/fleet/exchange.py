@@ -14,7 +14,7 @@ class Command(msgspec.Struct, kw_only=True):
     tag: str
     text: str
     epoch: int
-    """The revision of the lease that the sender knows: whoever has an older one is not meant."""
+    """The revision of the lease that the sender knows. A node with an older one must not write."""
     within: float = 0.0
     """Seconds that it may wait for the device, but for one timeout of that."""
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast import logs
 from holdfast.leases import Leases, LeaseThread, Relay
 from holdfast.scanner.fleet.agreement import FleetRefused, FleetSettings, Terms, digest
-from holdfast.scanner.fleet.assignment import partition_of, placed
+from holdfast.scanner.fleet.assignment import assigned, partition_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -77,7 +77,7 @@ class Fleet:
         self._may_end = asyncio.Semaphore(MAX_CONCURRENT_HANDOVERS)
         self._started = int(time.time() * 1000)
         self._named_since = time.monotonic()
-        """When this process was the node the last time, or nobody was."""
+        """When no other process had the name of this node, the last time."""
         self._begun: dict[int, int] = {}
         """The partitions whose devices are used, with the revision of the lease."""
         self._epochs: dict[int, int] = {}
@@ -243,11 +243,11 @@ class Fleet:
                 fields = {"fleet": self.settings.name, "nodes": ",".join(nodes)}
                 logs.write(logging.INFO, "fleet_changed", **fields)
                 known = nodes
-            self._place(nodes)
+            self._assign(nodes)
             if time.monotonic() > self._shown_at + self.leases.times.renewal_s:
                 self._show()
 
-    def _place(self, nodes: list[str]) -> None:
+    def _assign(self, nodes: list[str]) -> None:
         if self._is_leaving:
             return
         held = {
@@ -255,7 +255,7 @@ class Fleet:
             for partition in range(self.settings.partitions)
             if (holder := self.holder(partition)) is not None
         }
-        target = placed(self.settings.partitions, nodes, held)
+        target = assigned(self.settings.partitions, nodes, held)
         mine = {f"{PARTITION}{each}" for each, node in target.items() if node == self.node}
         self._thread.want([f"{NODE}{self.node}", *mine])
         for key in self.leases.held:

@@ -259,8 +259,8 @@ class FleetMember:
                 await self._adopt_now(device)
                 reason = str(error) or type(error).__name__
                 is_certain = isinstance(error, NoStreamResponseError)
-                said = "not stored in" if is_certain else "not confirmed by"
-                raise Refused(f"{said} {self.desired.bucket}: {reason}") from None
+                outcome = "not stored in" if is_certain else "not confirmed by"
+                raise Refused(f"{outcome} {self.desired.bucket}: {reason}") from None
             self._renewed |= {(device, each): at for each, at in renewed.items()}
             return
         raise Refused(

@@ -131,7 +131,7 @@ class FleetPlacement:
         return self.member.fence(device)
 
     def lease(self, device: ScannedDevice) -> int:
-        """Returns the number that messages about a device bear: a later node has a greater one."""
+        """Returns the number in the header of messages: that of a later node is greater."""
         return self._fleet.epoch(device.partition)
 
     async def store(

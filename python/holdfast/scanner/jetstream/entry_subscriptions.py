@@ -1,8 +1,8 @@
 """Subscriptions from the entries of a JetStream bucket, as programs of tentacle-next write them.
 
 The key of an entry is `SUBSCRIBER.DEVICE`. Its value is the whole subscription, which ends when the
-entry is deleted. An entry that is refused ends the subscription of its former value, which nobody
-wants any more. It is logged once, shown to callers, and tried again: what refuses it, such as an
+entry is deleted. An entry that is refused ends the subscription of its former value, which is out
+of date. It is logged once, shown to callers, and tried again: what refuses it, such as an
 unknown name or another subscriber, may end.
 """
 
@@ -124,13 +124,13 @@ class EntrySubscriptions:
                 await self._forget(key)
             wanted = []
             for key, written in found.items():
-                if written is not None and self._is_wanted(key, written):
+                if written is not None and self._is_new(key, written):
                     wanted.append((key, written))
             await self._carry_out(wanted)
             if gone or wanted:
-                await self._carry_out(self._held(but={key for key, _ in wanted}))
+                await self._carry_out(self._refused_entries(but={key for key, _ in wanted}))
 
-    def _is_wanted(self, key: str, written: Written) -> bool:
+    def _is_new(self, key: str, written: Written) -> bool:
         """Returns whether an entry is to be carried out; adds it if it is new.
 
         An entry that is only read again, and not written again, is known.
@@ -163,9 +163,9 @@ class EntrySubscriptions:
         while True:
             await asyncio.sleep(self._retry_s)
             async with self._lock:
-                await self._carry_out(self._held())
+                await self._carry_out(self._refused_entries())
 
-    def _held(self, but: Container[str] = ()) -> list[tuple[str, Written]]:
+    def _refused_entries(self, but: Container[str] = ()) -> list[tuple[str, Written]]:
         """Returns the refused entries whose values are kept."""
         refused = (entry.refused for entry in self._entries.values())
         return [
@@ -176,24 +176,28 @@ class EntrySubscriptions:
 
     async def _carry_out(self, wanted: Iterable[tuple[str, Written]]) -> None:
         """Carries out entries; those that others refuse are tried once more after these."""
-        refused = await self._each(wanted)
+        refused = await self._carry_out_once(wanted)
         if any(released for _, _, released in refused):
-            await self._each((key, written) for key, written, _ in refused)
+            await self._carry_out_once((key, written) for key, written, _ in refused)
 
-    async def _each(self, wanted: Iterable[tuple[str, Written]]) -> list[tuple[str, Written, bool]]:
+    async def _carry_out_once(
+        self, wanted: Iterable[tuple[str, Written]]
+    ) -> list[tuple[str, Written, bool]]:
         """Carries out entries concurrently. Returns the refused ones.
 
         The third value is whether the entry had a subscription, which has ended.
         """
         pairs = list(wanted)
-        results = await asyncio.gather(*(self._one(key, written) for key, written in pairs))
+        results = await asyncio.gather(
+            *(self._carry_out_one(key, written) for key, written in pairs)
+        )
         return [
             (key, written, released)
             for (key, written), released in zip(pairs, results, strict=True)
             if released is not None
         ]
 
-    async def _one(self, key: str, written: Written) -> bool | None:
+    async def _carry_out_one(self, key: str, written: Written) -> bool | None:
         """Carries out an entry. If it is refused, returns whether it had a subscription."""
         entry = self._entries[key]
         had_subscription = entry.subscription is not None
@@ -230,7 +234,7 @@ class EntrySubscriptions:
         before = entry.refused
         self._set_refused(entry, None)
         kept = written if self._held_bytes + len(written.value) <= MAX_HELD_BYTES else None
-        self._set_refused(entry, RefusedEntry(key, reason, kept, *_about(written.value)))
+        self._set_refused(entry, RefusedEntry(key, reason, kept, *_subject_of(written.value)))
         entry.written = _identity(written)
         if before is None or before.reason != reason:
             logs.write(logging.WARNING, "entry_refused", bucket=self.bucket, key=key, reason=reason)
@@ -252,22 +256,22 @@ def check_entry(key: str, request: SubscribeRequest) -> None:
 
 
 def _identity(written: Written) -> tuple[int, bytes]:
-    """Returns what tells a value from all others of its key, also when the bucket is replaced."""
+    """Returns what identifies a value of a key, also when the bucket is replaced."""
     return written.revision, blake2b(written.value, digest_size=16).digest()
 
 
-def _about(value: bytes) -> tuple[str | None, list[str]]:
+def _subject_of(value: bytes) -> tuple[str | None, list[str]]:
     """Returns the device and the tags of a refused value, as far as it can be read."""
     try:
         found = msgspec.json.decode(value)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None, []
-    device = _text(found, "deviceId")
+    device = _text_value(found, "deviceId")
     tags = found.get("tags") if type(found) is dict else None
-    ids = [_text(tag, "id") for tag in tags] if type(tags) is list else []
+    ids = [_text_value(tag, "id") for tag in tags] if type(tags) is list else []
     return device, [] if device is None else list(dict.fromkeys(filter(None, ids)))
 
 
-def _text(found: Any, key: str) -> str | None:
+def _text_value(found: Any, key: str) -> str | None:
     value = found.get(key) if type(found) is dict else None
     return value if type(value) is str else None

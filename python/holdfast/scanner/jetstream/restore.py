@@ -66,7 +66,7 @@ class StoredSubscriptions:
             running.create_task(self._restore(host, ready))
 
     async def close(self) -> None:
-        """Removes the states of devices, which nobody updates any more. Then stores nothing."""
+        """Removes the states of devices, which would be out of date. Then stores nothing."""
         await self._store.stop()
 
     def changed(self, device: str, subscriber: str) -> None:

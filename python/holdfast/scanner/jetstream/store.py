@@ -207,7 +207,7 @@ class EntryStore:
         self._waiting.clear()
 
     async def stop(self) -> None:
-        """Removes the states of devices, which nobody updates any more. Then writes nothing."""
+        """Removes the states of devices, which would be out of date. Then writes nothing."""
         client, self._client = self._client, None
         self._has_work.set()
         if client is not None and self._availability.is_available:

@@ -185,7 +185,7 @@ class Heartbeat(_Message):
 
 
 class HeartbeatMetadata(_Message, omit_defaults=True):
-    """What a heartbeat tells about the service."""
+    """What a heartbeat reports of the service."""
 
     device_count: int
     tag_count: int

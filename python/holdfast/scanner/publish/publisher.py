@@ -35,11 +35,11 @@ Shape: TypeAlias = tuple[Place, ...]
 Message: TypeAlias = tuple[str, bytes]
 """The id of a tag, and the text that publishes its value."""
 
-SHAPES = 64
+MAX_SHAPES = 64
 """Limit of cached shapes. A device that refuses some blocks has more than one shape."""
 
-SLACK = 0.0005
-"""Tolerance in seconds when scheduled times are compared, because they are rounded."""
+SLACK_S = 0.0005
+"""Tolerance when scheduled times are compared, because they are rounded."""
 
 _UNKNOWN = object()
 _encode = msgspec.json.Encoder().encode
@@ -57,12 +57,12 @@ class Publisher:
         self._prefix = prefix
         self._device = device
         self._dialect = dialect
-        self._wanted: Callable[[], Sequence[Group]] | None = None
+        self._new_groups: Callable[[], Sequence[Group]] | None = None
         """Returns the groups from the next poll on; `None` if they have not changed."""
-        self._newcomers: set[str] = set()
-        self._anew = False
-        self._groups: list[_Due] = []
-        self._shapes: dict[Shape, list[tuple[_Due, list[_Placed]]]] = {}
+        self._new_tags: set[str] = set()
+        self._repeat_all = False
+        self._groups: list[_ScheduledGroup] = []
+        self._shapes: dict[Shape, list[tuple[_ScheduledGroup, list[_Placed]]]] = {}
         self._fresh: set[str] = set()
         """Tags whose next value is published even if it is not due."""
         self._last: dict[str, Any] = {}
@@ -70,17 +70,17 @@ class Publisher:
         self.undecoded: dict[str, str] = {}
         """The errors of tags whose registers were read but can't be decoded."""
 
-    def want(self, groups: Callable[[], Sequence[Group]], newcomers: Iterable[str] = ()) -> None:
+    def update(self, groups: Callable[[], Sequence[Group]], new_tags: Iterable[str] = ()) -> None:
         """Changes the groups from the next poll on. Combines all changes before that poll."""
-        self._wanted = groups
-        self._newcomers.update(newcomers)
+        self._new_groups = groups
+        self._new_tags.update(new_tags)
 
-    def renew(self, lease: int | None = None) -> None:
+    def repeat_all(self, lease: int | None = None) -> None:
         """Publishes the next values of all tags, even if they are unchanged or not due.
 
         In a fleet, messages have the revision `lease` from now on.
         """
-        self._anew = True
+        self._repeat_all = True
         if lease is None or lease == self._lease:
             return
         self._lease, self._header = lease, wire.lease_header(lease)
@@ -88,12 +88,16 @@ class Publisher:
         for due in self._groups:
             due.parts.clear()
 
-    def regroup(self, groups: Sequence[Group], newcomers: Collection[str]) -> None:
-        """Changes the groups now. The next value of newcomers is published even if unchanged."""
-        before = {(due.group.change, due.group.rate): due for due in self._groups if not due.once}
+    def regroup(self, groups: Sequence[Group], new_tags: Collection[str]) -> None:
+        """Changes the groups now. The next value of `new_tags` is published even if unchanged."""
+        # A group with the same rate and mode goes on in its rhythm, with the times of its last
+        # publication: a new subscriber must not shift the times of the others.
+        before = {
+            (due.group.change, due.group.rate): due for due in self._groups if not due.is_once
+        }
         tags = {tag.id: tag for group in groups for tag in group.tags}
         known = {tag.id for due in before.values() for tag in due.group.tags} - self._fresh
-        self._fresh = (tags.keys() - known) | (tags.keys() & newcomers)
+        self._fresh = (tags.keys() - known) | (tags.keys() & new_tags)
         ids = {tag.id for group in groups for tag in group.tags if group.change}
         same = ids == self._last.keys()
         self._last = {id: self._last.get(id, _UNKNOWN) for id in ids}
@@ -102,27 +106,30 @@ class Publisher:
         for group in groups:
             due = before.get((group.change, group.rate))
             is_same = same and due is not None and due.group == group
-            self._groups.append(due if is_same and due is not None else _Due(group, due))
-        hurried = {id for due in self._groups for id in due.hurried(self._fresh)}
-        self._await_firsts(self._fresh - hurried)
+            self._groups.append(due if is_same and due is not None else _ScheduledGroup(group, due))
+        publish_now = {id for due in self._groups for id in due.publish_now(self._fresh)}
+        self._schedule_first_values(self._fresh - publish_now)
+        # Tags that are not published any more have no error any more.
         self.undecoded = {id: why for id, why in self.undecoded.items() if id in tags}
 
-    def _settle(self) -> None:
+    def _apply_updates(self) -> None:
         """Applies the changes that were requested since the last poll."""
-        groups = None if self._wanted is None else self._wanted()
-        if groups is None and self._anew:
-            groups = [due.group for due in self._groups if not due.once]
+        # The groups are computed here, and not with each request: a caller may subscribe to a
+        # thousand tags one by one.
+        groups = None if self._new_groups is None else self._new_groups()
+        if groups is None and self._repeat_all:
+            groups = [due.group for due in self._groups if not due.is_once]
         if groups is None:
             return
-        newcomers = self._newcomers
-        if self._anew:
-            newcomers = {tag.id for group in groups for tag in group.tags}
-        self.regroup(groups, newcomers)
-        self._wanted, self._newcomers, self._anew = None, set(), False
+        new_tags = self._new_tags
+        if self._repeat_all:
+            new_tags = {tag.id for group in groups for tag in group.tags}
+        self.regroup(groups, new_tags)
+        self._new_groups, self._new_tags, self._repeat_all = None, set(), False
 
     def messages(self, due: float, blocks: Sequence[PolledBlock]) -> list[Message]:
         """Returns the messages after a poll. `due` is its scheduled time in seconds."""
-        self._settle()
+        self._apply_updates()
         shape = tuple(block[:3] for block in blocks if block[3] is not None)
         parts = self._shapes.get(shape)
         if parts is None:
@@ -136,46 +143,46 @@ class Publisher:
             if not compiled or not group.now(due):
                 continue
             for block, part in compiled:
-                found = self._made(part, *answered[block])
-                if first and not group.once:
+                found = self._messages_of(part, *answered[block])
+                if first and not group.is_once:
                     found = (message for message in found if message[0] not in first)
                 made += found
-            if group.once:
+            if group.is_once:
                 first = {id for id, _ in made}
         if self._fresh and any(id in self._fresh for id, _ in made):
             self._fresh.difference_update(id for id, _ in made)
-            self._await_firsts(self._fresh)
+            self._schedule_first_values(self._fresh)
         return made
 
-    def _await_firsts(self, ids: Set[str]) -> None:
+    def _schedule_first_values(self, ids: Set[str]) -> None:
         """Publishes the next values of these tags even if their groups are not due."""
-        groups = [due for due in self._groups if not due.once]
+        groups = [due for due in self._groups if not due.is_once]
         tags = {tag.id: tag for due in groups for tag in due.group.tags if tag.id in ids}
         if tags:
             first = Group(0, False, tuple(tags.values()), (0.0,) * len(tags))
-            groups.insert(0, _Due(first, None, once=True))
+            groups.insert(0, _ScheduledGroup(first, None, is_once=True))
         self._groups = groups
         self._shapes.clear()
 
-    def _made(self, part: _Part, data: bytes, timestamp: bytes) -> Iterable[Message]:
+    def _messages_of(self, part: _Part, data: bytes, timestamp: bytes) -> Iterable[Message]:
         """Returns the messages of the tags of one group in one block."""
         values = part.decoder(data)
-        if part.special:
+        if part.needs_cleaning:
             values = [clean(value, tag) for value, tag in zip(values, part.tags, strict=True)]
-        if part.plain:
+        if part.is_plain_json:  # One call for all values, instead of one for each.
             texts = _encode(values)[1:-1].split(b",")
         else:
             texts = [b"null" if type(value) is Undecoded else _encode(value) for value in values]
         rows: Iterator[Any] = zip(part.ids, part.lengths, part.templates, texts, strict=True)
-        if part.picky:
-            rows = compress(rows, self._picked(part, values))
+        if part.needs_filter:
+            rows = compress(rows, self._filtered(part, values))
         digits = len(timestamp)
         return (
             (id, template % (length + digits + len(text), text, timestamp))
             for id, length, template, text in rows
         )
 
-    def _picked(self, part: _Part, values: Sequence[Any]) -> list[bool]:
+    def _filtered(self, part: _Part, values: Sequence[Any]) -> list[bool]:
         """Returns which values to publish; in a group that publishes changes, the changed ones.
 
         Records errors of decoding. An undecoded value counts as no value.
@@ -194,15 +201,15 @@ class Publisher:
             picked.append(wanted)
         return picked
 
-    def _compiled(self, shape: Shape) -> list[tuple[_Due, list[_Placed]]]:
+    def _compiled(self, shape: Shape) -> list[tuple[_ScheduledGroup, list[_Placed]]]:
         """Compiles the parts of all groups for a shape. Each tag is read from its first block."""
-        if len(self._shapes) >= SHAPES:
+        if len(self._shapes) >= MAX_SHAPES:
             self._shapes.clear()
         parts = [(due, list(self._parts(due, shape))) for due in self._groups]
         self._shapes[shape] = parts
         return parts
 
-    def _parts(self, due: _Due, shape: Shape) -> Iterator[_Placed]:
+    def _parts(self, due: _ScheduledGroup, shape: Shape) -> Iterator[_Placed]:
         taken: set[str] = set()
         for index, block in enumerate(shape):
             part = due.parts.get(block)
@@ -217,11 +224,11 @@ class Publisher:
             taken.update(part.ids)
             yield index, part
 
-    def _part(self, due: _Due, tags: list[Tag], block: Place) -> _Part:
+    def _part(self, due: _ScheduledGroup, tags: list[Tag], block: Place) -> _Part:
         _, address, count = block
         group = due.group
         texts = [self._template(tag) for tag in tags]
-        infallible = all(tag.type in _INFALLIBLE and tag.source is None for tag in tags)
+        is_infallible = all(tag.type in _INFALLIBLE_TYPES and tag.source is None for tag in tags)
         remembered = group.change or any(tag.id in self._last for tag in tags)
         return _Part(
             decoder(tags, address, count),
@@ -230,10 +237,10 @@ class Publisher:
             [text for text, _ in texts],
             [length for _, length in texts],
             [due.deadbands[tag.id] for tag in tags],
-            plain=infallible,
-            special=remembered or any(tag.null or tag.meaning is not None for tag in tags),
+            is_plain_json=is_infallible,
+            needs_cleaning=remembered or any(tag.null or tag.meaning is not None for tag in tags),
             change=group.change,
-            picky=remembered or not infallible,
+            needs_filter=remembered or not is_infallible,
         )
 
     def _template(self, tag: Tag) -> tuple[bytes, int]:
@@ -251,7 +258,7 @@ class Publisher:
         return head_line + text + b"\r\n", size + len(header)
 
 
-_INFALLIBLE = {
+_INFALLIBLE_TYPES = {
     "bool",
     *(f"bit:{bit}" for bit in range(16)),
     *(f"{sign}int{bits}" for sign in ("", "u") for bits in (16, 32, 64)),
@@ -271,12 +278,12 @@ class _Part(NamedTuple):
     lengths: Sequence[int]
     """The lengths of the payloads without values and times."""
     deadbands: Sequence[float]
-    plain: bool
+    is_plain_json: bool
     """Whether all values can be encoded as one JSON array and split at the commas."""
-    special: bool
+    needs_cleaning: bool
     """Whether some values must be converted, such as NaN or a marker to `null`."""
     change: bool
-    picky: bool
+    needs_filter: bool
     """Whether some values may be omitted, or must be remembered."""
 
 
@@ -284,12 +291,14 @@ _Placed: TypeAlias = tuple[int, _Part]
 """The index of a block, and the part in it."""
 
 
-class _Due:
+class _ScheduledGroup:
     """A group, and the time of its last publication."""
 
-    def __init__(self, group: Group, before: _Due | None, *, once: bool = False) -> None:
+    def __init__(
+        self, group: Group, before: _ScheduledGroup | None, *, is_once: bool = False
+    ) -> None:
         self.group = group
-        self.once = once
+        self.is_once = is_once
         self._last: float = -math.inf if before is None else before._last
         self.places = Places(group.tags)
         self.deadbands = {
@@ -298,7 +307,7 @@ class _Due:
         self.parts: dict[Place, _Part] = {}
         """The compiled parts of blocks, shared by all shapes."""
 
-    def hurried(self, fresh: Collection[str]) -> Iterable[str]:
+    def publish_now(self, fresh: Collection[str]) -> Iterable[str]:
         """Makes the group due if all of its tags are fresh. Returns its tags if it is due then."""
         if all(id in fresh for id in self.deadbands):
             self._last = -math.inf
@@ -306,13 +315,13 @@ class _Due:
 
     def keep(self, place: Place, part: _Part) -> None:
         """Caches a part. The cache is limited, because blocks may differ at every poll."""
-        if len(self.parts) >= SHAPES + 2 * len(self.group.tags):
+        if len(self.parts) >= MAX_SHAPES + 2 * len(self.group.tags):
             self.parts.clear()
         self.parts[place] = part
 
     def now(self, due: float) -> bool:
         """Returns whether the group is due at this scan, and records the publication if so."""
-        if due < self._last + self.group.rate / 1000 - SLACK:
+        if due < self._last + self.group.rate / 1000 - SLACK_S:
             return False
         self._last = due
         return True

@@ -42,14 +42,14 @@ class Publishers:
         if publisher is None:
             publisher = self._publishers[device.id] = self._publisher(device)
         # Where another node polls the device, `restart` makes all of its tags fresh.
-        publisher.want(lambda: grouped(device), fresh if self._placement.is_own(device) else ())
+        publisher.update(lambda: grouped(device), fresh if self._placement.is_own(device) else ())
         if with_state:
             self.publish_state(device)
 
     def restart(self, device: ScannedDevice) -> None:
         """Publishes a device that another node has published until now."""
         publisher = self._publishers[device.id] = self._publisher(device)
-        publisher.want(lambda: grouped(device), device.tags)
+        publisher.update(lambda: grouped(device), device.tags)
 
     def remove(self, device: ScannedDevice) -> None:
         """Publishes a device no more."""
@@ -62,14 +62,14 @@ class Publishers:
     def repeat_values(self) -> None:
         """Publishes the next value of every tag, even if it is unchanged."""
         for publisher in self._publishers.values():
-            publisher.renew()
+            publisher.repeat_all()
 
     def repeat(self, device: ScannedDevice) -> None:
         """Publishes the state and all values of a device again, over a new connection.
 
         Messages that were sent before a disconnect may be lost.
         """
-        self._publishers[device.id].renew(self._placement.lease(device))
+        self._publishers[device.id].repeat_all(self._placement.lease(device))
         self.publish_state(device)
 
     def publish_values(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from holdfast.scanner.subscriptions.groups import Group, grouped
 from holdfast.scanner.subscriptions.key import SubscriptionKey
+from holdfast.scanner.subscriptions.registry import Registry
 from holdfast.scanner.subscriptions.tag import AREA_OF_CODE, Tag
 from holdfast.scanner.subscriptions.ttl import SubscriptionTtls
 
-__all__ = ["AREA_OF_CODE", "Group", "SubscriptionKey", "SubscriptionTtls", "Tag", "grouped"]
+__all__ = [
+    "AREA_OF_CODE",
+    "Group",
+    "Registry",
+    "SubscriptionKey",
+    "SubscriptionTtls",
+    "Tag",
+    "grouped",
+]

@@ -213,13 +213,16 @@ class ScannedDevice:
             return flaw
         if self._writes == "none":
             return "this scanner writes nothing (nats.writes is none)"
-        said = {user: self.subscribers[user].tags[tag.id].writable for user in self.users(tag.id)}
-        if True in said.values():
+        choices = {
+            user: self.subscribers[user].tags[tag.id].writable for user in self.users(tag.id)
+        }
+        if True in choices.values():
             return None
         if self._writes == "explicit":
             return 'no subscriber set "writable": true, which nats.writes: explicit requires'
         return next(
-            (f'{user} set "writable": false' for user, each in said.items() if each is False), None
+            (f'{user} set "writable": false' for user, each in choices.items() if each is False),
+            None,
         )
 
     def forget(self, ids: Collection[str]) -> list[str]:

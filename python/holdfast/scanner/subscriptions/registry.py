@@ -60,13 +60,13 @@ class Registry:
         self._writes = writes
         self._dialect = dialect
         self._tags = 0
-        self._holders: dict[str, set[str]] = {}
+        self._devices_of_tag: dict[str, set[str]] = {}
         """The ids of the devices that have a tag id."""
-        self._spelled: dict[str, set[str]] = {}
+        self._tags_by_name: dict[str, set[str]] = {}
         """The tag ids that have another name in subjects, by this name."""
         self._subjects: dict[str, str] = {}
         """The ids of the devices, by their names in subjects."""
-        self._sharing: dict[str, list[str]] = {}
+        self._devices_by_connection: dict[str, list[str]] = {}
         """The ids of the devices that share a connection, by its address or line."""
 
     @property
@@ -103,21 +103,7 @@ class Registry:
         """
         device = self.devices.get(asked.device)
         new = [id for id in asked.tags if device is None or id not in device.tags]
-        self._check_limits(device, asked, len(new))
-        former = None
-        source = asked.source
-        if device is None:
-            self._check_subject(asked.device)
-            self._check_shared(asked)
-        else:
-            source = _merged(device.source, asked)
-            if _replaces(device, asked):
-                former = device
-                self._check_shared(asked)
-            _check_tags(device, asked)
-        self._dialect.check_tag_ids(() if device is None else device.tags, asked.tags)
-        if device is not None:
-            source.plan.check(list((device.tags | dict(asked.tags)).values()))
+        source, former = self._check(device, asked, len(new))
         if not asked.tags and (device is None or asked.subscriber not in device.subscribers):
             return Change(device)
         before = device.rate if device is not None and device.subscribers else None
@@ -126,7 +112,7 @@ class Registry:
             fresh = asked.tags
         only_adds_tags = device is not None and device.is_extended_by(asked.subscriber, asked.tags)
         if device is None or former is not None:
-            device = self._made(asked, source, address, former)
+            device = self._new_device(asked, source, address, former)
         subscriber = device.subscribers.setdefault(
             asked.subscriber, Subscriber(asked.rate, "scan", 0.0)
         )
@@ -135,33 +121,55 @@ class Registry:
         subscriber.deadband = asked.deadband
         subscriber.ttl = asked.ttl
         redefined = any(device.tags.get(id, tag) != tag for id, tag in asked.tags.items())
-        for kept in map(self._alike, asked.tags.values()):
+        for kept in map(self._shared_tag, asked.tags.values()):
             device.tags[kept.id] = kept
             subscriber.tags[kept.id] = asked.options[kept.id]
         for id in new:
-            self._holders.setdefault(id, set()).add(device.id)
+            self._devices_of_tag.setdefault(id, set()).add(device.id)
             if (name := self._dialect.tag_name(id)) != id:
-                self._spelled.setdefault(name, set()).add(id)
+                self._tags_by_name.setdefault(name, set()).add(id)
         self._tags += len(new)
         polling = bool(new) or redefined or device.rate != before
         return Change(device, polling, former, fresh, only_adds_tags)
 
-    def _alike(self, tag: Tag) -> Tag:
+    def _check(
+        self, device: ScannedDevice | None, asked: Subscription, new_tags: int
+    ) -> tuple[Source, ScannedDevice | None]:
+        """Checks a subscription against all others. Raises `Refused`.
+
+        Returns the source of its device, and the device that it replaces, if any.
+        """
+        self._check_limits(device, asked, new_tags)
+        if device is None:
+            self._check_subject(asked.device)
+            self._check_shared(asked)
+            self._dialect.check_tag_ids((), asked.tags)
+            return asked.source, None
+        source, former = _merged(device.source, asked), None
+        if _replaces(device, asked):
+            former = device
+            self._check_shared(asked)
+        _check_tags(device, asked)
+        self._dialect.check_tag_ids(device.tags, asked.tags)
+        source.plan.check(list((device.tags | dict(asked.tags)).values()))
+        return source, former
+
+    def _shared_tag(self, tag: Tag) -> Tag:
         """Returns the same tag of another device, if there is one: many devices are of one kind."""
-        holder = next(iter(self._holders.get(tag.id, ())), None)
+        holder = next(iter(self._devices_of_tag.get(tag.id, ())), None)
         known = None if holder is None else self.devices[holder].tags.get(tag.id)
         return known if known is not None and known == tag else tag
 
-    def _made(
+    def _new_device(
         self, asked: Subscription, source: Source, address: Target, former: ScannedDevice | None
     ) -> ScannedDevice:
         """Adds a device; with the subscribers and the tags of the one that it replaces, if any."""
         device = ScannedDevice(asked.device, source, address, Health(), self._writes, self._dialect)
         if former is not None:
             device.subscribers, device.tags = dict(former.subscribers), dict(former.tags)
-            self._leave(former)
+            self._release_connection(former)
         self.devices[device.id] = device
-        self._sharing.setdefault(_place(source.target), []).append(device.id)
+        self._devices_by_connection.setdefault(_connection(source.target), []).append(device.id)
         self._subjects |= dict.fromkeys(_subjects(device), device.id)
         return device
 
@@ -182,14 +190,14 @@ class Registry:
             del device.subscribers[request.subscriber_id]
         unwanted = device.forget(ids)
         for id in unwanted:
-            self._holders[id].discard(device.id)
-            if not self._holders[id]:
-                del self._holders[id]
-                self._forget_spelling(id)
+            self._devices_of_tag[id].discard(device.id)
+            if not self._devices_of_tag[id]:
+                del self._devices_of_tag[id]
+                self._forget_name(id)
         self._tags -= len(unwanted)
         if not device.subscribers:
             del self.devices[device.id]
-            self._leave(device)
+            self._release_connection(device)
             for name in _subjects(device):
                 del self._subjects[name]
             return device, True
@@ -197,13 +205,15 @@ class Registry:
 
     def commanded(self, name: str) -> tuple[ScannedDevice, Tag]:
         """Returns the tag of a command's name: an id, or device and id. Raises `Refused`."""
-        found = {(device, id) for id in self._ids(name) for device in self._holders.get(id, ())}
+        found = {
+            (device, id) for id in self._ids(name) for device in self._devices_of_tag.get(id, ())
+        }
         parts = name.split(".")
         for at in range(1, len(parts)):
             device = ".".join(parts[:at])
             for id in self._ids(".".join(parts[at:])):
                 for named in {device, self._subjects.get(device, device)}:
-                    if named in self._holders.get(id, ()):
+                    if named in self._devices_of_tag.get(id, ()):
                         found.add((named, id))
         if not found:
             raise Refused(f"no tag {name!r}")
@@ -215,14 +225,14 @@ class Registry:
 
     def _ids(self, name: str) -> set[str]:
         """Returns the tag ids that a command may mean by a name."""
-        return {name} | self._spelled.get(name, set())
+        return {name} | self._tags_by_name.get(name, set())
 
-    def _forget_spelling(self, id: str) -> None:
+    def _forget_name(self, id: str) -> None:
         name = self._dialect.tag_name(id)
-        ids = self._spelled.get(name, set())
+        ids = self._tags_by_name.get(name, set())
         ids.discard(id)
         if not ids:
-            self._spelled.pop(name, None)
+            self._tags_by_name.pop(name, None)
 
     def _check_subject(self, id: str) -> None:
         """Checks that no other device has the same name in subjects. Raises `Refused`."""
@@ -237,8 +247,8 @@ class Registry:
     def _check_shared(self, asked: Subscription) -> None:
         """Checks that a new device has the settings of the devices that share its connection."""
         target = asked.source.target
-        place = _place(target)
-        others = (id for id in self._sharing.get(place, ()) if id != asked.device)
+        place = _connection(target)
+        others = (id for id in self._devices_by_connection.get(place, ()) if id != asked.device)
         id = next(others, None)
         if id is None:
             return
@@ -248,16 +258,16 @@ class Registry:
             if known != settings[key]:
                 at = "on one serial line" if isinstance(target, SerialTarget) else "at one address"
                 raise Refused(
-                    f"{key} of {place} is already {_shown(known)} for {id}, "
-                    f"not {_shown(settings[key])}; devices {at} have the same settings"
+                    f"{key} of {place} is already {_setting_text(known)} for {id}, "
+                    f"not {_setting_text(settings[key])}; devices {at} have the same settings"
                 )
 
-    def _leave(self, device: ScannedDevice) -> None:
+    def _release_connection(self, device: ScannedDevice) -> None:
         """Notes that a device does not use its connection any more."""
-        place = _place(device.source.target)
-        self._sharing[place].remove(device.id)
-        if not self._sharing[place]:
-            del self._sharing[place]
+        place = _connection(device.source.target)
+        self._devices_by_connection[place].remove(device.id)
+        if not self._devices_by_connection[place]:
+            del self._devices_by_connection[place]
 
     def _check_limits(self, device: ScannedDevice | None, asked: Subscription, new: int) -> None:
         limits = self._limits
@@ -280,14 +290,14 @@ def _replaces(device: ScannedDevice, asked: Subscription) -> bool:
 
     Raises `Refused` if other subscribers use the device.
     """
-    known, said = device.source, asked.source
+    known, requested = device.source, asked.source
     found = ""
-    if (known.target, known.unit) != (said.target, said.unit):
-        found = f"{device.id} is known as {_told(known)}, not as {_told(said)}"
+    if (known.target, known.unit) != (requested.target, requested.unit):
+        found = f"{device.id} is known as {_described(known)}, not as {_described(requested)}"
     else:
         for key in SETTINGS:
-            one, other = getattr(known, key), getattr(said, key)
-            if key in asked.said and one != other:
+            one, other = getattr(known, key), getattr(requested, key)
+            if key in asked.given_settings and one != other:
                 found = f"{key} of {device.id} is already different: {one}, not {other}"
                 break
     if not found:
@@ -298,7 +308,7 @@ def _replaces(device: ScannedDevice, asked: Subscription) -> bool:
 
 def _merged(known: Source, asked: Subscription) -> Source:
     """Returns the source of a request, with the known settings in place of those left out."""
-    kept = {key: getattr(known, key) for key in SETTINGS if key not in asked.said}
+    kept = {key: getattr(known, key) for key in SETTINGS if key not in asked.given_settings}
     return replace(asked.source, **kept)
 
 
@@ -327,7 +337,7 @@ def _check_unused(found: str, users: list[str]) -> None:
         raise Refused(f"{found}; {users[0]}{more} must unsubscribe first")
 
 
-def _place(target: Target) -> str:
+def _connection(target: Target) -> str:
     """What devices share that have one connection."""
     return target.device if isinstance(target, SerialTarget) else str(target)
 
@@ -338,7 +348,7 @@ def _settings(target: Target) -> dict[str, object]:
     return {key: getattr(target, key) for key in line} | asdict(target.tolerance)
 
 
-def _told(source: Source) -> str:
+def _described(source: Source) -> str:
     """Formats the address of a device with everything that identifies it."""
     target = source.target
     usual: dict[str, object] = asdict(STRICT)
@@ -347,14 +357,14 @@ def _told(source: Source) -> str:
         usual["mode"] = target.mode
     elif target.tls.name is not None:
         more = f" with the name {target.tls.name}"
-    said = [
-        f"{key} {_shown(value)}"
+    settings = [
+        f"{key} {_setting_text(value)}"
         for key, value in _settings(target).items()
         if key not in usual or value != usual[key]
     ]
-    more += f" ({', '.join(said)})" if said else ""
+    more += f" ({', '.join(settings)})" if settings else ""
     return f"{target}{more} unit {source.unit}"
 
 
-def _shown(setting: object) -> object:
+def _setting_text(setting: object) -> object:
     return "the default" if setting is None else setting

@@ -89,7 +89,7 @@ def _tag(
             adjustments.changes.append(("datatype_ignored", f"{request.id} ({name} in {area})"))
             name, type = "bool", parsed("bool")
         if type.base == "bool":
-            order = "ABCD"
+            order = "ABCD"  # It has none: then equal tags are equal, whatever a request says.
         elif area not in BIT_AREAS:
             for note in rules.dialect.byte_order_notes(request, area, order):
                 adjustments.byte_orders.append((request.id, note))
@@ -105,18 +105,22 @@ def _tag(
         raise Refused(
             f"{where}: {name} from address {request.address}: the last address is {LAST_ADDRESS}"
         )
-    try:
-        null = NO_MARKERS
-        if request.null:
-            null = frozenset(as_decoded(each, type, request.encoding) for each in request.null)
-    except ValueError as error:
-        raise Refused(f"{where}.null: {error}") from None
+    null = _null_markers(request, type, where)
     made = Tag(request.id, area, request.address, name, order, null, request.encoding)
     if request.writable and (flaw := made.unwritable) is not None:
         if area in WRITE_LIMITS or rules.strict:
             raise Refused(f"{where}: {flaw}")
         adjustments.changes.append(("writable_ignored", f"{request.id} ({area})"))
     return made
+
+
+def _null_markers(request: TagRequest, type: Type, where: str) -> frozenset[Marker]:
+    if not request.null:
+        return NO_MARKERS
+    try:
+        return frozenset(as_decoded(each, type, request.encoding) for each in request.null)
+    except ValueError as error:
+        raise Refused(f"{where}.null: {error}") from None
 
 
 def _is_number(type: Type) -> bool:

@@ -38,7 +38,7 @@ class Subscription:
     device: str
     subscriber: str
     source: Source
-    said: frozenset[str]
+    given_settings: frozenset[str]
     """The settings that the request contains. Others are those of the known device, or defaults."""
     tags: Mapping[str, Tag]
     options: Mapping[str, TagOptions]
