@@ -11,8 +11,8 @@ from holdfast.faults import NO_CONNECTION
 from holdfast.outputs import Buffer, Sending
 from holdfast.outputs import sending as module
 from holdfast.scanner import Servers
-from holdfast.scanner import nats_output as output_module
-from holdfast.scanner.nats_output import NatsOutput
+from holdfast.scanner.publish import nats_output as output_module
+from holdfast.scanner.publish.nats_output import NatsOutput
 from holdfast.stop import Stop
 from support import wire
 from support.nats_bus import Caller

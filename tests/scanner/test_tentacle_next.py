@@ -13,7 +13,12 @@ from holdfast.scanner import Defaults
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
 from holdfast.scanner.jetstream.store import BUCKET as KEPT
-from holdfast.scanner.messages import DIALECTS, tentacle_next
+from holdfast.scanner.messages import (
+    DIALECTS,
+    SubscribeRequest,
+    decode_lenient,
+    tentacle_next,
+)
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag
@@ -696,7 +701,7 @@ def test_an_unknown_number_of_a_function_is_not_guessed() -> None:
 
 def test_a_request_that_is_too_large_is_refused() -> None:
     with pytest.raises(Refused, match="has 13 bytes, allowed: 12"):
-        DIALECTS["tentacle-next"].subscribe_request(b'{"tags":null}', 12, None)
+        decode_lenient(b'{"tags":null}', SubscribeRequest, 12, None, tentacle_next.normalized)
 
 
 @pytest.mark.parametrize(

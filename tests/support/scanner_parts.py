@@ -10,10 +10,10 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast.scanner import Scanner
-    from holdfast.scanner.allowed_devices import AllowedDevices
     from holdfast.scanner.broker import Broker
     from holdfast.scanner.fleet.member import FleetMember
-    from holdfast.scanner.polling import Polling
+    from holdfast.scanner.polling.allowed_devices import AllowedDevices
+    from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.presence import Presence
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.ttl import SubscriptionTtls

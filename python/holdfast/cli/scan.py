@@ -59,12 +59,12 @@ from holdfast.scanner import (
     ScannerLimits,
     Servers,
     Settings,
-    device_tls,
 )
-from holdfast.scanner.allowed_devices import PRIVATE
 from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
 from holdfast.scanner.jetstream.entry_subscriptions import BUCKET
 from holdfast.scanner.messages.schema import json_schema
+from holdfast.scanner.polling import device_tls
+from holdfast.scanner.polling.allowed_devices import PRIVATE
 from holdfast.scanner.write_access import places
 from holdfast.standstill import WallClock
 

@@ -4,11 +4,12 @@ It has no configuration of devices. It connects to a device at the first subscri
 and disconnects after the last one ends. It keeps subscriptions over a restart in JetStream only.
 
 `service` makes the parts, connects them and stops them. `requests` carries out subscriptions,
-`commands` writes, `reports` answers questions. `devices` polls and publishes what is subscribed to.
-`placement` is what differs between a scanner that is alone and a node of a fleet.
+`commands` writes, `reports` answers questions. `placement` is what differs between a scanner that
+is alone and a node of a fleet.
 
 * `messages`: the messages, and what the programs of each dialect send and expect
 * `subscriptions`: devices and tags, who has subscribed to them, and at what rate
+* `polling`: the devices in use: their addresses, and how polls and writes reach them
 * `publish`: from polls to messages
 * `jetstream`: what is kept in JetStream, and what is read there
 * `reports`: the answers to `browse` and `variables`

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from holdfast import tags
     from holdfast.scanner.messages.dialect import Dialect
     from holdfast.scanner.placement import Placement
-    from holdfast.scanner.polling import Polling
+    from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.responder import Responder
     from holdfast.scanner.settings import Settings
     from holdfast.scanner.subscriptions.device import ScannedDevice

@@ -11,7 +11,7 @@ from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.entry_subscriptions import check_entry
 from holdfast.scanner.messages.decoding import decode_lenient
 from holdfast.scanner.messages.leniency import Adjustments
-from holdfast.scanner.messages.types import Answer, UnsubscribeRequest
+from holdfast.scanner.messages.types import Answer, SubscribeRequest, UnsubscribeRequest
 from holdfast.scanner.request_log import RequestLog
 from holdfast.scanner.subscriptions.subscription import subscription_of
 
@@ -20,10 +20,9 @@ if TYPE_CHECKING:
 
     from nats.aio.msg import Msg
 
-    from holdfast.scanner.devices import Devices
     from holdfast.scanner.jetstream.buckets import Buckets
-    from holdfast.scanner.messages.types import SubscribeRequest
     from holdfast.scanner.placement import Placement
+    from holdfast.scanner.polling.devices import Devices
     from holdfast.scanner.responder import Responder
     from holdfast.scanner.subscriptions.key import SubscriptionKey
     from holdfast.scanner.subscriptions.registry import Registry
@@ -61,8 +60,12 @@ class Requests:
         """Adds the subscription of a request. Raises `Refused`."""
         async with self._responder.in_order(message):
             rules, adjustments = self._rules, Adjustments()
-            request = rules.dialect.subscribe_request(
-                message.data, rules.limits.request, None if rules.strict else adjustments
+            request = decode_lenient(
+                message.data,
+                SubscribeRequest,
+                rules.limits.request,
+                None if rules.strict else adjustments,
+                rules.dialect.normalize,
             )
             asked = subscription_of(request, rules, adjustments)
             self._buckets.check_not_entry(asked.device, asked.subscriber)
@@ -137,8 +140,12 @@ class Requests:
     def check_entry(self, key: str, value: bytes) -> Subscription:
         """Returns the subscription of an entry. Raises `Refused`."""
         rules, adjustments = self._rules, Adjustments()
-        request = rules.dialect.subscribe_request(
-            value, rules.limits.request, None if rules.strict else adjustments
+        request = decode_lenient(
+            value,
+            SubscribeRequest,
+            rules.limits.request,
+            None if rules.strict else adjustments,
+            rules.dialect.normalize,
         )
         check_entry(key, request)
         asked = subscription_of(request, rules, adjustments)

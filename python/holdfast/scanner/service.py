@@ -9,17 +9,17 @@ import threading
 from typing import TYPE_CHECKING
 
 from holdfast import logs, tasks
-from holdfast.scanner import device_tls
-from holdfast.scanner.allowed_devices import AllowedDevices
 from holdfast.scanner.alone import Alone
 from holdfast.scanner.broker import Broker
 from holdfast.scanner.commands import Commands
-from holdfast.scanner.device_address import DeviceAddresses
-from holdfast.scanner.devices import Devices
 from holdfast.scanner.fleet.placement import FleetPlacement
 from holdfast.scanner.jetstream.buckets import NoBuckets, TentacleNextBuckets
 from holdfast.scanner.messages.dialects import DIALECTS
-from holdfast.scanner.polling import Polling
+from holdfast.scanner.polling import device_tls
+from holdfast.scanner.polling.allowed_devices import AllowedDevices
+from holdfast.scanner.polling.device_address import DeviceAddresses
+from holdfast.scanner.polling.devices import Devices
+from holdfast.scanner.polling.poller import Polling
 from holdfast.scanner.presence import Presence
 from holdfast.scanner.publish.log_mirror import LogMirror
 from holdfast.scanner.publish.publishers import Publishers

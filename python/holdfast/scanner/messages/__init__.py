@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from holdfast.scanner.messages.decoding import decode_lenient
 from holdfast.scanner.messages.dialects import DIALECTS
 from holdfast.scanner.messages.types import (
     Answer,
@@ -9,6 +10,7 @@ from holdfast.scanner.messages.types import (
     FunctionCode,
     HeartbeatMetadata,
     ServiceReport,
+    SubscribeRequest,
 )
 
 __all__ = [
@@ -18,4 +20,6 @@ __all__ = [
     "FunctionCode",
     "HeartbeatMetadata",
     "ServiceReport",
+    "SubscribeRequest",
+    "decode_lenient",
 ]

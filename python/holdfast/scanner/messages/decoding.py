@@ -18,8 +18,7 @@ from holdfast.scanner.messages.types import FunctionCode, Request
 from holdfast.types import TRANSPORTS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
+    from holdfast.scanner.messages.dialect import Normalize
     from holdfast.scanner.messages.leniency import Adjustments
 
 Decoded = TypeVar("Decoded", bound=Request)
@@ -48,7 +47,7 @@ def decode_lenient(
     kind: type[Lenient],
     max_bytes: int,
     adjustments: Adjustments | None,
-    normalize: Callable[[dict[str, Any]], object] | None = None,
+    normalize: Normalize | None = None,
 ) -> Lenient:
     """Parses a request, and adds what was adjusted; without `adjustments`, nothing may be.
 
@@ -60,7 +59,8 @@ def decode_lenient(
     try:
         if normalize is None or found is None:
             return _exact(data, kind)
-        return _converted(normalize(found), kind)
+        found = normalize(found)
+        return _converted(found, kind)
     except Refused:
         if adjustments is None:
             raise

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from holdfast.config import scanning
-    from holdfast.scanner.messages.leniency import Adjustments
-    from holdfast.scanner.messages.types import SubscribeRequest, TagRequest, UnsubscribeRequest
+    from holdfast.scanner.messages.types import TagRequest, UnsubscribeRequest
     from holdfast.types import Area
+
+
+Normalize: TypeAlias = "Callable[[dict[str, Any]], dict[str, Any]]"
+"""Returns the JSON object of a request with other keys. It may change the one that it gets."""
 
 
 class Dialect(Protocol):
@@ -25,6 +28,8 @@ class Dialect(Protocol):
     """Whether a device is connected to again after the pauses of `tentacle`, without jitter."""
     replaces_subscription: bool
     """Whether a subscribe request is the whole subscription: it ends that of all other tags."""
+    normalize: Normalize | None
+    """What makes the keys of a `SubscribeRequest` from those that its programs send, if needed."""
     last_definition_counts: bool
     """Whether a request may define a tag twice, and means the last definition then."""
     repeats_values: bool
@@ -38,14 +43,6 @@ class Dialect(Protocol):
 
     def data_subject(self, prefix: str, device: str, tag: str, /) -> str:
         """Returns the subject of a tag's values."""
-
-    def subscribe_request(
-        self, data: bytes, max_bytes: int, adjustments: Adjustments | None
-    ) -> SubscribeRequest:
-        """Parses a request, and adds what was adjusted; without `adjustments`, nothing may be.
-
-        Raises `Refused`.
-        """
 
     def check_unsubscribe(self, request: UnsubscribeRequest) -> None:
         """Raises `Refused` for a request that may mean something else than it says."""

@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING
 
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.messages.decoding import decode_lenient
 from holdfast.scanner.messages.subjects import second_id, subject_id
-from holdfast.scanner.messages.types import SubscribeRequest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from holdfast.config import scanning
-    from holdfast.scanner.messages.leniency import Adjustments
+    from holdfast.scanner.messages.dialect import Normalize
     from holdfast.scanner.messages.types import TagRequest, UnsubscribeRequest
     from holdfast.types import Area
 
@@ -39,6 +37,7 @@ class Tentacle:
     byte_orders: Mapping[tuple[str, str], str] = BYTE_ORDERS
     has_exact_pauses = True
     replaces_subscription = False
+    normalize: Normalize | None = None
     last_definition_counts = True
     repeats_values = False
 
@@ -53,12 +52,6 @@ class Tentacle:
     def data_subject(self, prefix: str, device: str, _tag: str, /) -> str:
         """Returns the subject that all tags of a device share."""
         return f"{prefix}.data.{subject_id(device)}"
-
-    def subscribe_request(
-        self, data: bytes, max_bytes: int, adjustments: Adjustments | None
-    ) -> SubscribeRequest:
-        """Parses a request. Raises `Refused`."""
-        return decode_lenient(data, SubscribeRequest, max_bytes, adjustments)
 
     def check_unsubscribe(self, request: UnsubscribeRequest) -> None:
         """Raises `Refused` for a request that may have lost its tags, and would end everything."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from holdfast.scanner.jetstream.buckets import Buckets
     from holdfast.scanner.messages.types import BrowseAnswer, DeviceReport, Variable
-    from holdfast.scanner.polling import Polling
+    from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.publish.outbox import Outbox
     from holdfast.scanner.publish.publishers import Publishers
     from holdfast.scanner.reports.service_status import ServiceStatus

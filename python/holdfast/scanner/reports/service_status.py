@@ -9,7 +9,7 @@ from holdfast.scanner.messages.types import EntryReport, ServiceReport
 if TYPE_CHECKING:
     from holdfast.scanner.jetstream.buckets import Buckets
     from holdfast.scanner.placement import Placement
-    from holdfast.scanner.polling import Polling
+    from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.presence import Presence
     from holdfast.scanner.publish.outbox import Outbox
 

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Coroutine
     from typing import Any
 
-    from holdfast.scanner.device_address import DeviceAddresses
     from holdfast.scanner.placement import Placement
-    from holdfast.scanner.polling import Polling
+    from holdfast.scanner.polling.device_address import DeviceAddresses
+    from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.publish.publishers import Publishers
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.scanner.device_tls import endpoint_of
+from holdfast.scanner.polling.device_tls import endpoint_of
 
 if TYPE_CHECKING:
     from holdfast._core import Endpoint, Poller
     from holdfast.client.url import Target
     from holdfast.net.tls import Tls
-    from holdfast.scanner.allowed_devices import AllowedDevices
+    from holdfast.scanner.polling.allowed_devices import AllowedDevices
 
 
 class DeviceAddresses:
