@@ -20,11 +20,10 @@ from typing import Any
 import common
 from nats.aio.client import Client
 
-from holdfast.scanner import wire
 from holdfast.scanner.embedded import Embedded
-from holdfast.scanner.publish.publisher import Publisher
-from holdfast.scanner.subscriptions.groups import Group
-from holdfast.scanner.subscriptions.tag import Tag
+from holdfast.scanner.nats import wire
+from holdfast.scanner.publish import Publisher
+from holdfast.scanner.subscriptions import Group, Tag
 
 TAGS = 100
 TICKS = os.sysconf("SC_CLK_TCK")

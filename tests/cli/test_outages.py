@@ -13,8 +13,8 @@ import pytest
 
 from holdfast.appliance import control
 from holdfast.scanner import Servers
-from holdfast.scanner.broker import connected_once
 from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
+from holdfast.scanner.nats import connected_once
 from support import wire
 from support.brokers import NatsServer, free_port
 from support.cli import failure

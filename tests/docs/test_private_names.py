@@ -38,8 +38,8 @@ VARIABLES = {
         "state": "uvicorn.server.ServerState",
         "server_state": "uvicorn.server.ServerState",
     },
-    "scanner/receiving.py": {"nc": "nats.aio.client.Client"},
-    "scanner/wire.py": {
+    "scanner/nats/tolerant_client.py": {"nc": "nats.aio.client.Client"},
+    "scanner/nats/wire.py": {
         "client": "nats.aio.client.Client",
         "transport": "nats.aio.transport.TcpTransport",
     },

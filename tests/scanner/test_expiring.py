@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.scanner.jetstream.store import BUCKET
+from holdfast.scanner.jetstream import BUCKET
 from holdfast.scanner.subscriptions import SubscriptionKey, SubscriptionTtls
 from support import wire
 from support.nats_bus import Caller, leaving, subscription, tag

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.scanner.broker import MAX_PAUSE
 from holdfast.scanner.jetstream import State
+from holdfast.scanner.nats import MAX_PAUSE
 from holdfast.scanner.subscriptions import device as devices
 from support import wire
 from support.brokers import NatsServer

@@ -14,8 +14,7 @@ import pytest
 from nats.js import JetStreamContext
 from nats.js.kv import KeyValue
 
-from holdfast.scanner.jetstream import entries, store
-from holdfast.scanner.jetstream.store import BUCKET
+from holdfast.scanner.jetstream import BUCKET, entries, store
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag

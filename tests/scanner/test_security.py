@@ -13,7 +13,8 @@ import pytest
 from nats.errors import NoRespondersError
 
 from holdfast.net.tls import Tls
-from holdfast.scanner import Scanner, Servers, Settings, broker
+from holdfast.scanner import Scanner, Servers, Settings
+from holdfast.scanner.nats import connection as broker
 from support import wire
 from support.brokers import NatsServer
 from support.certificates import Certificates

@@ -11,8 +11,8 @@ import pytest
 import holdfast
 from holdfast.scanner import Defaults
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
-from holdfast.scanner.jetstream.store import BUCKET as KEPT
+from holdfast.scanner.jetstream import BUCKET as KEPT
+from holdfast.scanner.jetstream import WATCH_TIMES, WatchTimes
 from holdfast.scanner.messages import (
     DIALECTS,
     SubscribeRequest,

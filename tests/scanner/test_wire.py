@@ -11,10 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nats.errors import ProtocolError
 
-from holdfast.scanner import wire
-from holdfast.scanner.messages.types import Answer
-from holdfast.scanner.publish.outbox import Outbox
-from holdfast.scanner.receiving import SafeClient
+from holdfast.scanner.messages import Answer
+from holdfast.scanner.nats import SafeClient, wire
+from holdfast.scanner.publish import Outbox
 from support.nats_bus import Caller
 from support.wire import until as wire_until
 

@@ -21,7 +21,7 @@ from nats.js.errors import NotFoundError
 
 from holdfast.config.scanning import parse_pollable
 from holdfast.scanner import Scanner, Servers, Settings
-from holdfast.scanner.jetstream.store import BUCKET
+from holdfast.scanner.jetstream import BUCKET
 from support import wire
 from support.brokers import NatsServer
 

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast.scanner import Scanner
-    from holdfast.scanner.broker import Broker
     from holdfast.scanner.fleet.member import FleetMember
+    from holdfast.scanner.nats import Broker
     from holdfast.scanner.polling.allowed_devices import AllowedDevices
     from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.presence import Presence

@@ -18,8 +18,8 @@ is alone and a node of a fleet.
 
 from __future__ import annotations
 
-from holdfast.scanner.broker import Ping, Servers
 from holdfast.scanner.fleet.agreement import FleetRefused, FleetSettings
+from holdfast.scanner.nats.connection import Ping, Servers
 from holdfast.scanner.service import Scanner
 from holdfast.scanner.settings import Settings
 from holdfast.scanner.subscriptions.limits import ScannerLimits

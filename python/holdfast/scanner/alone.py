@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from nats.aio.client import Client
 
-    from holdfast.scanner.broker import Handler
     from holdfast.scanner.messages.types import UnsubscribeRequest
+    from holdfast.scanner.nats.connection import Handler
     from holdfast.scanner.placement import (
         DeviceHost,
         ReportHandlers,

@@ -14,7 +14,7 @@ from nats.errors import Error
 
 from holdfast.faults import EXPIRES_AFTER
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.receiving import Received
+from holdfast.scanner.nats.tolerant_client import Received
 from holdfast.standstill import Standstill, now
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from nats.aio.msg import Msg
 
-    from holdfast.scanner.receiving import SafeClient
+    from holdfast.scanner.nats.tolerant_client import SafeClient
 
 MAX_WAIT_S = EXPIRES_AFTER
 """How long a command may wait between the socket and the device, besides one timeout of the device.

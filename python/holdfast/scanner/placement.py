@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast import _core
-    from holdfast.scanner.broker import Handler
     from holdfast.scanner.messages.types import (
         BrowseAnswer,
         BrowseRequest,
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
         Variable,
         VariablesRequest,
     )
+    from holdfast.scanner.nats.connection import Handler
     from holdfast.scanner.publish.outbox import Outbox
     from holdfast.scanner.responder import Handle
     from holdfast.scanner.subscriptions.device import ScannedDevice

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from holdfast import _core, tasks
-from holdfast.scanner import wire
 from holdfast.scanner.jetstream.heartbeat import HeartbeatKey
 from holdfast.scanner.messages.types import Announcement, HeartbeatMetadata
+from holdfast.scanner.nats import wire
 from holdfast.scanner.other_scanners import OtherScanners
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, TypeAlias
 import msgspec
 
 from holdfast import logs
-from holdfast.scanner import wire
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.types import Answer, BrowseAnswer
+from holdfast.scanner.nats import wire
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 from holdfast import logs, tasks
 from holdfast.scanner.alone import Alone
-from holdfast.scanner.broker import Broker
 from holdfast.scanner.commands import Commands
 from holdfast.scanner.fleet.placement import FleetPlacement
 from holdfast.scanner.jetstream.buckets import NoBuckets, TentacleNextBuckets
 from holdfast.scanner.messages.dialects import DIALECTS
+from holdfast.scanner.nats.connection import Broker
 from holdfast.scanner.polling import device_tls
 from holdfast.scanner.polling.allowed_devices import AllowedDevices
 from holdfast.scanner.polling.device_address import DeviceAddresses
@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 
     from holdfast._core import Poller
     from holdfast.leases import StartThread
-    from holdfast.scanner.broker import Handler
     from holdfast.scanner.jetstream.buckets import Buckets
     from holdfast.scanner.messages.dialect import Dialect
+    from holdfast.scanner.nats.connection import Handler
     from holdfast.scanner.placement import Placement
     from holdfast.scanner.settings import Settings
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from holdfast.net.tls import NO_FILES, Tls
 from holdfast.scanner import write_access
-from holdfast.scanner.broker import MAX_PAUSE, Ping, Servers
 from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
 from holdfast.scanner.messages.dialects import DIALECTS
 from holdfast.scanner.messages.tentacle import PAUSES_S
+from holdfast.scanner.nats.connection import MAX_PAUSE, Ping, Servers
 from holdfast.scanner.subscriptions.limits import ScannerLimits
 from holdfast.scanner.subscriptions.rules import Defaults
 from holdfast.standstill import LONG

@@ -13,16 +13,16 @@ from nats.errors import Error, NoRespondersError
 from nats.js.errors import NotFoundError
 
 from holdfast.leases import LEASE_TIMES, Holding, LeaseBucket
-from holdfast.scanner.broker import ANSWERING, connected_once
 from holdfast.scanner.fleet.exchange import subject
 from holdfast.scanner.fleet.fleet import NODE, PARTITION, leases_of
+from holdfast.scanner.nats.connection import ANSWERING, connected_once
 
 if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
     from holdfast.leases import Entry
-    from holdfast.scanner.broker import Servers
+    from holdfast.scanner.nats.connection import Servers
 
 CHECK_INTERVAL_S = 0.05
 """Time between two looks at a node that leaves."""

@@ -11,8 +11,6 @@ import msgspec
 
 from holdfast import _core, logs
 from holdfast.config.scanning import written_pollable
-from holdfast.scanner import wire
-from holdfast.scanner.broker import Broker
 from holdfast.scanner.fleet.agreement import PROTOCOL, Terms
 from holdfast.scanner.fleet.answers import NodeAnswers
 from holdfast.scanner.fleet.exchange import subject
@@ -20,6 +18,8 @@ from holdfast.scanner.fleet.member import FleetMember
 from holdfast.scanner.fleet.nodes import OtherNodes
 from holdfast.scanner.fleet.reports import FleetReports
 from holdfast.scanner.messages.types import Answer, FleetReport
+from holdfast.scanner.nats import wire
+from holdfast.scanner.nats.connection import Broker
 from holdfast.scanner.publish.outbox import Outbox
 
 if TYPE_CHECKING:
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast.leases import StartThread
-    from holdfast.scanner.broker import Handler
     from holdfast.scanner.fleet.agreement import FleetSettings
     from holdfast.scanner.messages.types import UnsubscribeRequest
+    from holdfast.scanner.nats.connection import Handler
     from holdfast.scanner.placement import (
         CommandHost,
         DeviceHost,

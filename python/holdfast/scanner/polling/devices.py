@@ -70,6 +70,7 @@ class Devices:
         live runs on.
         """
         known = self._registry.known(asked)
+        # A known device keeps its address: a lookup could give another one of its name.
         address, endpoint = (
             await self._addresses.find(asked.source.target)
             if known is None
@@ -90,7 +91,9 @@ class Devices:
         # A caller that subscribes to tags one by one knows the state already.
         with_state = change.former is not None or not change.only_adds_tags
         self._publishers.update(device, change.fresh, with_state=with_state)
-        if change.polling or change.former or (change.fresh and device.rate > PROMPT_POLL_MAX_MS):
+        # At a short interval, the next regular scan comes soon enough for a new subscriber.
+        waits_long = bool(change.fresh) and device.rate > PROMPT_POLL_MAX_MS
+        if change.polling or change.former or waits_long:
             self._poll(device)
 
     def keep_only(self, device_id: str, subscriber_id: str, tags: Collection[str]) -> None:
@@ -113,7 +116,7 @@ class Devices:
             self._publishers.update(device)
             if changed:
                 self._poll(device, at_once=False)
-        elif changed:
+        elif changed:  # It was the last subscriber.
             self._drop(device)
             self._placement.state_changed(device.id)
 

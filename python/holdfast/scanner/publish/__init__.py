@@ -1,1 +1,8 @@
 """From polls to messages for NATS."""
+
+from __future__ import annotations
+
+from holdfast.scanner.publish.outbox import Outbox
+from holdfast.scanner.publish.publisher import Publisher
+
+__all__ = ["Outbox", "Publisher"]

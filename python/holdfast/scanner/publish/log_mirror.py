@@ -12,8 +12,8 @@ import threading
 from typing import TYPE_CHECKING
 
 from holdfast import logs
-from holdfast.scanner import wire
 from holdfast.scanner.messages.types import LogEntry
+from holdfast.scanner.nats import wire
 
 if TYPE_CHECKING:
     from collections.abc import Callable

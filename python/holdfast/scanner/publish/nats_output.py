@@ -16,7 +16,7 @@ from holdfast.faults import fault_text, is_exception
 from holdfast.net.event_loop import EventLoop
 from holdfast.outputs.sending import soon_after
 from holdfast.scanner.messages.dialects import DIALECTS
-from holdfast.scanner.receiving import SafeClient, TlsClient
+from holdfast.scanner.nats.tolerant_client import SafeClient, TlsClient
 from holdfast.scanner.subscriptions.tag import datatype
 from holdfast.tags.text import plain
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from holdfast.config.scanning import Dialect
     from holdfast.polling import Reading
-    from holdfast.scanner.broker import Servers
+    from holdfast.scanner.nats.connection import Servers
     from holdfast.stop import Stop
 
 CONFIRM_TIMEOUT_S = 5.0

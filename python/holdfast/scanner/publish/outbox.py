@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from nats.errors import Error
 
-from holdfast.scanner import wire
+from holdfast.scanner.nats import wire
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

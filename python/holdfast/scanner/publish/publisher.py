@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
 
-from holdfast.scanner import wire
 from holdfast.scanner.messages.dialects import TENTACLE
+from holdfast.scanner.nats import wire
 from holdfast.scanner.subscriptions.groups import Group
 from holdfast.scanner.subscriptions.tag import clean
 from holdfast.tags.changing import differs

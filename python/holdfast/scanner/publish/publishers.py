@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from holdfast.scanner import wire
 from holdfast.scanner.messages.types import Status
+from holdfast.scanner.nats import wire
 from holdfast.scanner.publish.publisher import Publisher
 from holdfast.scanner.subscriptions.groups import grouped
 

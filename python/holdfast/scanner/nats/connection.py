@@ -22,8 +22,8 @@ from holdfast import logs
 from holdfast.config.scanning import PING_INTERVAL, PINGS_OUTSTANDING
 from holdfast.net.secret_file import read_secret
 from holdfast.net.tls import NO_FILES, Tls, broker_context
-from holdfast.scanner.credentials import Credentials
-from holdfast.scanner.receiving import SafeClient, TlsClient
+from holdfast.scanner.nats.credentials import Credentials
+from holdfast.scanner.nats.tolerant_client import SafeClient, TlsClient
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
