@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from holdfast.scanner.fleet.agreement import Terms
-from holdfast.scanner.nats import wire
-from holdfast.scanner.publish import Outbox
+from holdfast.scanner.nats import Outbox, wire
 
 
 def test_a_message_with_the_revision_of_its_lease_has_a_header() -> None:

@@ -16,8 +16,9 @@ from holdfast.scanner.alone import Alone
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream import HeartbeatKey
 from holdfast.scanner.messages import BrowseRequest, HeartbeatMetadata, ServiceReport
-from holdfast.scanner.publish import Outbox, Publisher
-from holdfast.scanner.publish import outbox as outboxes
+from holdfast.scanner.nats import Outbox
+from holdfast.scanner.nats import outbox as outboxes
+from holdfast.scanner.publish import Publisher
 from holdfast.scanner.reports import browsed
 from holdfast.scanner.subscriptions import Group, Registry, Tag, grouped
 from holdfast.scanner.subscriptions.device import (

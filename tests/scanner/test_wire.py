@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from nats.errors import ProtocolError
 
 from holdfast.scanner.messages import Answer
-from holdfast.scanner.nats import SafeClient, wire
-from holdfast.scanner.publish import Outbox
+from holdfast.scanner.nats import Outbox, SafeClient, wire
 from support.nats_bus import Caller
 from support.wire import until as wire_until
 

@@ -18,10 +18,10 @@ is alone and a node of a fleet.
 
 from __future__ import annotations
 
-from holdfast.scanner.fleet.agreement import FleetRefused, FleetSettings
+from holdfast.scanner.fleet.agreement import FleetRefused
 from holdfast.scanner.nats.connection import Ping, Servers
 from holdfast.scanner.service import Scanner
-from holdfast.scanner.settings import Settings
+from holdfast.scanner.settings import FleetSettings, Settings
 from holdfast.scanner.subscriptions.limits import ScannerLimits
 from holdfast.scanner.subscriptions.rules import Defaults
 

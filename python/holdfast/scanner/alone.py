@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from holdfast.faults import STANDBY, fault_text
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.restore import StoredSubscriptions
-from holdfast.scanner.publish.outbox import Outbox
+from holdfast.scanner.nats.outbox import Outbox
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         VariablesRequest,
     )
     from holdfast.scanner.nats.connection import Handler
-    from holdfast.scanner.publish.outbox import Outbox
+    from holdfast.scanner.nats.outbox import Outbox
     from holdfast.scanner.responder import Handle
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.tag import Tag

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast.scanner.jetstream.buckets import Buckets
+    from holdfast.scanner.nats.outbox import Outbox
     from holdfast.scanner.placement import Placement
-    from holdfast.scanner.publish.outbox import Outbox
     from holdfast.scanner.subscriptions.registry import Registry
 
 HEARTBEAT_INTERVAL_S = 10.0

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from nats.aio.msg import Msg
 
-    from holdfast.scanner.publish.outbox import Outbox
+    from holdfast.scanner.nats.outbox import Outbox
 
 Handle: TypeAlias = "Callable[[Msg], Awaitable[Answer | BrowseAnswer | bytes]]"
 """Carries out a message. Returns the answer, or its JSON."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from holdfast.config.scanning import PARTITIONS
+from holdfast.leases import LEASE_TIMES, LeaseTimes
 from holdfast.net.tls import NO_FILES, Tls
 from holdfast.scanner import write_access
 from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
@@ -20,8 +22,21 @@ if TYPE_CHECKING:
 
     from holdfast.config import scanning
     from holdfast.net.allow_list import AllowEntry
-    from holdfast.scanner.fleet.agreement import FleetSettings
     from holdfast.tags import TagList
+
+
+@dataclass(frozen=True)
+class FleetSettings:
+    """The fleet that a scanner is a part of."""
+
+    name: str
+    node: str
+    """The name of this scanner in the fleet; unique."""
+    partitions: int = PARTITIONS
+    lease_times: LeaseTimes = LEASE_TIMES
+    """The same for all nodes, or two of them use a device."""
+    check_interval_s: float = 5.0
+    """Between looks whether changes of subscriptions still come."""
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 
 import msgspec
-
-from holdfast.config.scanning import PARTITIONS
-from holdfast.leases import LEASE_TIMES, LeaseTimes
 
 PROTOCOL = 1
 """The version of the buckets and messages that nodes share."""
@@ -16,20 +12,6 @@ PROTOCOL = 1
 
 class FleetRefused(Exception):
     """The node can't be a part of the fleet with these settings."""
-
-
-@dataclass(frozen=True)
-class FleetSettings:
-    """The fleet that a scanner is a part of."""
-
-    name: str
-    node: str
-    """The name of this scanner in the fleet; unique."""
-    partitions: int = PARTITIONS
-    lease_times: LeaseTimes = LEASE_TIMES
-    """The same for all nodes, or two of them use a device."""
-    check_interval_s: float = 5.0
-    """Between looks whether changes of subscriptions still come."""
 
 
 def digest(terms: bytes) -> str:

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast import logs
 from holdfast.leases import Leases, LeaseThread, Relay
-from holdfast.scanner.fleet.agreement import FleetRefused, FleetSettings, Terms, digest
+from holdfast.scanner.fleet.agreement import FleetRefused, Terms, digest
 from holdfast.scanner.fleet.assignment import assigned, partition_of
+from holdfast.scanner.settings import FleetSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -33,9 +33,10 @@ if TYPE_CHECKING:
 
     from holdfast import _core
     from holdfast.leases import Connect, StartThread
-    from holdfast.scanner.fleet.agreement import FleetSettings, Terms
+    from holdfast.scanner.fleet.agreement import Terms
     from holdfast.scanner.messages.types import SubscribeRequest
     from holdfast.scanner.placement import DeviceHost, SubscriptionHost
+    from holdfast.scanner.settings import FleetSettings
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
 

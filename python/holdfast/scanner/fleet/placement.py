@@ -20,7 +20,7 @@ from holdfast.scanner.fleet.reports import FleetReports
 from holdfast.scanner.messages.types import Answer, FleetReport
 from holdfast.scanner.nats import wire
 from holdfast.scanner.nats.connection import Broker
-from holdfast.scanner.publish.outbox import Outbox
+from holdfast.scanner.nats.outbox import Outbox
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast.leases import StartThread
-    from holdfast.scanner.fleet.agreement import FleetSettings
     from holdfast.scanner.messages.types import UnsubscribeRequest
     from holdfast.scanner.nats.connection import Handler
     from holdfast.scanner.placement import (
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
         SubscriptionHost,
     )
     from holdfast.scanner.responder import Handle
-    from holdfast.scanner.settings import Settings
+    from holdfast.scanner.settings import FleetSettings, Settings
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.tag import Tag

@@ -10,12 +10,14 @@ from holdfast.scanner.nats.connection import (
     Servers,
     connected_once,
 )
+from holdfast.scanner.nats.outbox import Outbox
 from holdfast.scanner.nats.tolerant_client import SafeClient
 
 __all__ = [
     "ANSWERING",
     "MAX_PAUSE",
     "Broker",
+    "Outbox",
     "Ping",
     "SafeClient",
     "Servers",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from holdfast.scanner.publish.outbox import Outbox
 from holdfast.scanner.publish.publisher import Publisher
 
-__all__ = ["Outbox", "Publisher"]
+__all__ = ["Publisher"]

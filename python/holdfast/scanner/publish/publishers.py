@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from holdfast.scanner.messages.dialect import Dialect
+    from holdfast.scanner.nats.outbox import Outbox
     from holdfast.scanner.placement import Placement
-    from holdfast.scanner.publish.outbox import Outbox
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.types import PolledBlock
 

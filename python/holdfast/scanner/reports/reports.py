@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from holdfast.scanner.jetstream.buckets import Buckets
     from holdfast.scanner.messages.types import BrowseAnswer, DeviceReport, Variable
+    from holdfast.scanner.nats.outbox import Outbox
     from holdfast.scanner.polling.poller import Polling
-    from holdfast.scanner.publish.outbox import Outbox
     from holdfast.scanner.publish.publishers import Publishers
     from holdfast.scanner.reports.service_status import ServiceStatus
     from holdfast.scanner.responder import Responder

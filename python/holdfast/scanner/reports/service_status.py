@@ -8,10 +8,10 @@ from holdfast.scanner.messages.types import EntryReport, ServiceReport
 
 if TYPE_CHECKING:
     from holdfast.scanner.jetstream.buckets import Buckets
+    from holdfast.scanner.nats.outbox import Outbox
     from holdfast.scanner.placement import Placement
     from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.presence import Presence
-    from holdfast.scanner.publish.outbox import Outbox
 
 MAX_REFUSED_SHOWN = 100
 """Limit of refused entries in an answer."""
