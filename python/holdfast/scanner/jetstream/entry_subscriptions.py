@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from dataclasses import dataclass, field
+from enum import Enum
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -38,6 +39,14 @@ MAX_ENTRIES = 50_000
 
 MAX_HELD_BYTES = 64 * 1024 * 1024
 """Limit of the values of refused entries that are kept to try them again."""
+
+
+class Outcome(Enum):
+    """What has become of an entry."""
+
+    CARRIED_OUT = "its subscription is that of its value"
+    REFUSED = "refused; nothing has changed"
+    ENDED = "refused; the subscription of its former value has ended"
 
 
 @dataclass
@@ -127,7 +136,7 @@ class EntrySubscriptions:
                 if written is not None and self._is_new(key, written):
                     wanted.append((key, written))
             await self._carry_out(wanted)
-            if gone or wanted:
+            if gone or wanted:  # One of these may have been why others were refused.
                 await self._carry_out(self._refused_entries(but={key for key, _ in wanted}))
 
     def _is_new(self, key: str, written: Written) -> bool:
@@ -144,6 +153,7 @@ class EntrySubscriptions:
                 return False
             self._entries[key] = Entry()
             return True
+        # After a reconnect, all entries are read again.
         return entry.written != _identity(written)
 
     async def _forget(self, key: str) -> None:
@@ -175,30 +185,29 @@ class EntrySubscriptions:
         ]
 
     async def _carry_out(self, wanted: Iterable[tuple[str, Written]]) -> None:
-        """Carries out entries; those that others refuse are tried once more after these."""
+        """Carries out entries. Refused ones are tried once more if a subscription has ended.
+
+        It may have been why another entry was refused, as when two entries exchange their devices.
+        """
         refused = await self._carry_out_once(wanted)
-        if any(released for _, _, released in refused):
+        if any(outcome is Outcome.ENDED for _, _, outcome in refused):
             await self._carry_out_once((key, written) for key, written, _ in refused)
 
     async def _carry_out_once(
         self, wanted: Iterable[tuple[str, Written]]
-    ) -> list[tuple[str, Written, bool]]:
-        """Carries out entries concurrently. Returns the refused ones.
-
-        The third value is whether the entry had a subscription, which has ended.
-        """
+    ) -> list[tuple[str, Written, Outcome]]:
+        """Carries out entries concurrently. Returns the refused ones."""
         pairs = list(wanted)
-        results = await asyncio.gather(
+        outcomes = await asyncio.gather(
             *(self._carry_out_one(key, written) for key, written in pairs)
         )
         return [
-            (key, written, released)
-            for (key, written), released in zip(pairs, results, strict=True)
-            if released is not None
+            (key, written, outcome)
+            for (key, written), outcome in zip(pairs, outcomes, strict=True)
+            if outcome is not Outcome.CARRIED_OUT
         ]
 
-    async def _carry_out_one(self, key: str, written: Written) -> bool | None:
-        """Carries out an entry. If it is refused, returns whether it had a subscription."""
+    async def _carry_out_one(self, key: str, written: Written) -> Outcome:
         entry = self._entries[key]
         had_subscription = entry.subscription is not None
         try:
@@ -217,9 +226,9 @@ class EntrySubscriptions:
         else:
             self._set_refused(entry, None)
             entry.written = _identity(written)
-            return None
+            return Outcome.CARRIED_OUT
         await self._refuse(key, written, reason, had_subscription=had_subscription)
-        return had_subscription
+        return Outcome.ENDED if had_subscription else Outcome.REFUSED
 
     async def _refuse(
         self, key: str, written: Written, reason: str, *, had_subscription: bool
