@@ -15,6 +15,7 @@ from holdfast.scanner.jetstream import BUCKET as KEPT
 from holdfast.scanner.jetstream import WATCH_TIMES, WatchTimes
 from holdfast.scanner.messages import (
     DIALECTS,
+    Adjustments,
     SubscribeRequest,
     decode_lenient,
     tentacle_next,
@@ -701,7 +702,9 @@ def test_an_unknown_number_of_a_function_is_not_guessed() -> None:
 
 def test_a_request_that_is_too_large_is_refused() -> None:
     with pytest.raises(Refused, match="has 13 bytes, allowed: 12"):
-        decode_lenient(b'{"tags":null}', SubscribeRequest, 12, None, tentacle_next.normalized)
+        decode_lenient(
+            b'{"tags":null}', SubscribeRequest, 12, Adjustments(), tentacle_next.normalized
+        )
 
 
 @pytest.mark.parametrize(

@@ -59,13 +59,10 @@ class Requests:
     async def subscribe(self, message: Msg) -> Answer:
         """Adds the subscription of a request. Raises `Refused`."""
         async with self._responder.in_order(message):
-            rules, adjustments = self._rules, Adjustments()
+            rules, adjustments = self._rules, Adjustments(not self._rules.strict)
+            max_bytes, normalize = rules.limits.request, rules.dialect.normalize
             request = decode_lenient(
-                message.data,
-                SubscribeRequest,
-                rules.limits.request,
-                None if rules.strict else adjustments,
-                rules.dialect.normalize,
+                message.data, SubscribeRequest, max_bytes, adjustments, normalize
             )
             asked = subscription_of(request, rules, adjustments)
             self._buckets.check_not_entry(asked.device, asked.subscriber)
@@ -85,13 +82,9 @@ class Requests:
     async def unsubscribe(self, message: Msg) -> Answer:
         """Removes tags of a subscription. Raises `Refused`."""
         async with self._responder.in_order(message):
-            rules, adjustments = self._rules, Adjustments()
-            request = decode_lenient(
-                message.data,
-                UnsubscribeRequest,
-                rules.limits.request,
-                None if rules.strict else adjustments,
-            )
+            rules, adjustments = self._rules, Adjustments(not self._rules.strict)
+            max_bytes = rules.limits.request
+            request = decode_lenient(message.data, UnsubscribeRequest, max_bytes, adjustments)
             rules.dialect.check_unsubscribe(request)
             self._buckets.check_not_entry(request.device_id, request.subscriber_id)
         async with self._devices.turn(request.device_id):
@@ -139,14 +132,9 @@ class Requests:
 
     def check_entry(self, key: str, value: bytes) -> Subscription:
         """Returns the subscription of an entry. Raises `Refused`."""
-        rules, adjustments = self._rules, Adjustments()
-        request = decode_lenient(
-            value,
-            SubscribeRequest,
-            rules.limits.request,
-            None if rules.strict else adjustments,
-            rules.dialect.normalize,
-        )
+        rules, adjustments = self._rules, Adjustments(not self._rules.strict)
+        max_bytes, normalize = rules.limits.request, rules.dialect.normalize
+        request = decode_lenient(value, SubscribeRequest, max_bytes, adjustments, normalize)
         check_entry(key, request)
         asked = subscription_of(request, rules, adjustments)
         self._log.adjusted(asked.subscriber, asked.device, adjustments)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from holdfast.scanner.messages.decoding import decode_lenient
 from holdfast.scanner.messages.dialects import DIALECTS
+from holdfast.scanner.messages.leniency import Adjustments
 from holdfast.scanner.messages.types import (
     Answer,
     BrowseRequest,
@@ -15,6 +16,7 @@ from holdfast.scanner.messages.types import (
 
 __all__ = [
     "DIALECTS",
+    "Adjustments",
     "Answer",
     "BrowseRequest",
     "FunctionCode",

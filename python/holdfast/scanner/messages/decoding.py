@@ -46,10 +46,10 @@ def decode_lenient(
     data: bytes,
     kind: type[Lenient],
     max_bytes: int,
-    adjustments: Adjustments | None,
+    adjustments: Adjustments,
     normalize: Normalize | None = None,
 ) -> Lenient:
-    """Parses a request, and adds what was adjusted; without `adjustments`, nothing may be.
+    """Parses a request, and adds what was adjusted to `adjustments`, if they are allowed.
 
     `normalize` makes the keys of `kind` from those that the programs of a dialect send. Raises
     `Refused`, also for more than `max_bytes`.
@@ -62,7 +62,7 @@ def decode_lenient(
         found = normalize(found)
         return _converted(found, kind)
     except Refused:
-        if adjustments is None:
+        if not adjustments.are_allowed:
             raise
         found = _object(data) if found is None else found
         if found is None:  # Nothing in it can be adjusted, so the error above says it best.

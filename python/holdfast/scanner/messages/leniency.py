@@ -37,6 +37,8 @@ _NUMBER = re.compile(r"[+-]?[0-9]{1,15}(\.[0-9]{0,15})?([eE][+-]?[0-9]{1,2})?")
 class Adjustments:
     """What was changed in a request, for the log; and what its caller must know of its tags."""
 
+    are_allowed: bool = True
+    """Whether a request may be changed; otherwise it is refused."""
     changes: list[tuple[str, str]] = field(default_factory=list)
     """The kind of each change, which is an event of the log, and what was found."""
     byte_orders: list[tuple[str, str]] = field(default_factory=list)
