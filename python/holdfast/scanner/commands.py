@@ -103,6 +103,7 @@ class Commands:
         self, device_id: str, tag_id: str, text: str, remaining_s: Callable[[], float]
     ) -> bool:
         """Writes to a device. Returns whether this scanner polls it. Raises `Refused`."""
+        # Looked up again: the device may have been replaced while the command waited.
         device = self._registry.devices.get(device_id)
         if device is None or tag_id not in device.tags:
             raise Refused(f"no tag {tag_id!r} of {device_id}")
@@ -134,7 +135,7 @@ async def write_tag(
     except ValueError as error:
         raise Refused(f"not written: {error}") from None
     fault = await polling.write(device, request, within=remaining_s())
-    if fault == STANDBY:
+    if fault == STANDBY:  # Its fence is closed, so nothing was sent.
         raise Moved(f"not written: {fault_text(fault)}")
     if fault:
         outcome = "not written" if is_unwritten(fault) else "not confirmed"

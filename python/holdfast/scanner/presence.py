@@ -68,7 +68,7 @@ class Presence:
             self._announce()
             if self._placement.writes_heartbeat:
                 await self.heartbeat.beat(self._client())
-            tasks.check()
+            tasks.check()  # nats-py may have swallowed a cancellation during the heartbeat.
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(HEARTBEAT_INTERVAL_S):
                     await self._is_due.wait()

@@ -67,7 +67,7 @@ class Requests:
             asked = subscription_of(request, rules, adjustments)
             self._buckets.check_not_entry(asked.device, asked.subscriber)
         async with self._devices.turn(asked.device):
-            fresh = self._registry.fresh(asked)
+            fresh = self._registry.fresh(asked)  # Before the change, after which no tag is fresh.
             add = partial(self._devices.add, asked)
             await self._placement.store(asked.device, add, asked.subscriber)
             if rules.dialect.replaces_subscription:
@@ -121,7 +121,7 @@ class Requests:
                 return
             try:
                 await self._remove_stored(UnsubscribeRequest(device_id, subscriber_id))
-            except Refused:
+            except Refused:  # JetStream fails: the subscription must not stay for ever.
                 ttls.renew(device_id, subscriber_id, RETRY_EXPIRY_S)
                 return
         logs.write(logging.INFO, "expired", device=device_id, subscriber=subscriber_id)
@@ -180,6 +180,7 @@ class Requests:
             tags: set[str] = set()
             for request in requests:
                 asked = subscription_of(request, self._rules)
+                # A large subscription is stored as several requests.
                 await self._devices.add(asked, renewed=subscriber in renewed)
                 tags |= asked.tags.keys()
             self._devices.keep_only(device, subscriber, tags)

@@ -61,6 +61,7 @@ class Responder:
         self, kind: str, handle: Handle, message: Msg
     ) -> Answer | BrowseAnswer | bytes:
         try:
+            # Checked here and not before the task: a refusal is an answer, too.
             if len(self._tasks) > self._max_pending:
                 limit = f"{self._max_pending} are pending, which is the limit"
                 raise Refused(f"too many requests: {limit}")
@@ -89,5 +90,5 @@ class Responder:
         """Serializes requests. Lets polls run before a request that takes milliseconds."""
         async with self._request_lock:
             if is_large or len(message.data) > LARGE_REQUEST_BYTES:
-                await asyncio.sleep(0)
+                await asyncio.sleep(0)  # The event loop handles the results of polls meanwhile.
             yield

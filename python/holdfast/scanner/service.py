@@ -149,7 +149,7 @@ class Scanner:
         try:
             done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
-                task.result()
+                task.result()  # Raises the error with which a part has ended, if it has.
         finally:
             await self._stop(running)
             logs.LOGGER.removeHandler(log_mirror)
@@ -183,6 +183,7 @@ class Scanner:
         if not self._has_logged_access:
             self._has_logged_access = True
             logs.write(logging.INFO, "write_access", **self._settings.write_access)
+        # What was sent just before the connection was lost may not have arrived.
         for device in self._registry.devices.values():
             self._publishers.repeat(device)
 
@@ -229,6 +230,7 @@ class Scanner:
 
     async def _stop(self, running: Sequence[asyncio.Task[object]]) -> None:
         """Stops all parts, each with a timeout."""
+        # First nothing new may begin; then other nodes take over while this one still polls.
         self._buckets.connected(None)
         await self._placement.leave()
         await _within(self._polling.stop())

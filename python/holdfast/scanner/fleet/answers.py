@@ -45,7 +45,7 @@ class NodeAnswers:
             return min(self._commands.remaining_s(message), command.within)
 
         try:
-            # The sender may know a later lease than this node has heard of losing.
+            # The sender may know of a later lease, which this node has not heard of yet.
             is_current = device is not None and self._member.is_current(device, command.epoch)
             done = is_current and await self._commands.write(
                 command.device, command.tag, command.text, remaining_s

@@ -233,6 +233,8 @@ class FleetMember:
         The lock of the device is held. `subscriber` has renewed its subscription. Raises `Refused`;
         then nothing has changed.
         """
+        # The change is made here first: it may be refused. If another node was faster, its value is
+        # adopted, which undoes the change, and the change is made again on top of it.
         for _ in range(MAX_STORE_ATTEMPTS):
             await change()
             now = int(time.time() * 1000)

@@ -70,7 +70,7 @@ class OtherNodes:
         end = time.monotonic() + self._move_timeout_s
         why = f"no node polls {device.id} now"
         while True:
-            left = remaining_s()
+            left = remaining_s()  # Each time: this loop may run for seconds.
             owner = self._fleet.holder(device.partition)
             if self._member.is_own(device):
                 if await own():
@@ -100,7 +100,7 @@ class OtherNodes:
         timeout = self._move_timeout_s + 2 * device.source.timeout / 1000 + ANSWER_TIMEOUT_S
         try:
             done = await self._ask(owner, "command", command, Executed, timeout)
-        except NoRespondersError:
+        except NoRespondersError:  # The only error that is certain: nobody has the command.
             return f"node {owner.node} is gone"
         except (Error, OSError):
             raise Refused(f"not confirmed: node {owner.node} did not answer") from None

@@ -101,7 +101,7 @@ class FleetPlacement:
 
     async def leave(self) -> None:
         """Hands all devices over to other nodes."""
-        # Whatever fails, the leases end by themselves.
+        # Whatever fails here, the leases end by themselves, and others take over then.
         with contextlib.suppress(Exception):
             async with asyncio.timeout(LEAVE_TIMEOUT_S):
                 await self.member.leave()

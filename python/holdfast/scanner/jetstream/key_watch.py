@@ -129,7 +129,7 @@ class KeyWatch:
             try:
                 await self._follow(client)
             except _Missed:
-                pass
+                pass  # JetStream works: all keys are read again soon.
             except Exception as error:  # JetStream may fail in any way; it is tried again.
                 pause = min(FIRST_RETRY_S * 2 ** min(self._failures, 10), self._times.retry_s)
                 self._failures += 1
@@ -217,7 +217,7 @@ class _Reader:
 
     def _read(self, message: Msg) -> tuple[str, Written | None]:
         number = message.metadata.sequence.consumer
-        if number != self.received + 1:
+        if number != self.received + 1:  # The server counts what it sends without gaps.
             raise _Missed
         self.received = number
         headers = message.headers or {}

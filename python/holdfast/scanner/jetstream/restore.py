@@ -135,6 +135,7 @@ class StoredSubscriptions:
             is_ours = owner in self._store.touched or self._is_known(owner)
             if not self._has_read and not is_ours:
                 self._pending.setdefault(owner, []).append(request)
+            # An owner that is returned replaces or removes what is stored under its keys.
             if is_ours or owner in self._pending:
                 owners[key] = owner
         self._has_read = True

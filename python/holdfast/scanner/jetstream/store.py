@@ -179,6 +179,7 @@ class EntryStore:
                 if isinstance(result, BaseException):
                     self._touched.add(owner)
                     errors.append(result)
+                # An owner that was touched again meanwhile is written again first.
                 elif owner not in self._touched and owner in self._waiting:
                     self._waiting.pop(owner).set()
             if errors:
@@ -190,7 +191,7 @@ class EntryStore:
         wanted = self._entries(owner)
         stored = self._stored.setdefault(owner, {})
         for key, value in wanted.items():
-            if stored.get(key) != hash(value):
+            if stored.get(key) != hash(value):  # A hash: values may take 128 KiB each.
                 await bucket.put(key, value)
                 stored[key] = hash(value)
         for key in [key for key in stored if key not in wanted]:

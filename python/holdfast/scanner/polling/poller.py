@@ -237,6 +237,7 @@ class Polling:
                 if self._stopping.is_set():
                     return
                 continue
+            # The event loop has handled the last batch: otherwise results would pile up in it.
             self._may_take.acquire()
             if self._stopping.is_set():
                 return
@@ -251,7 +252,7 @@ class Polling:
                     done.set_result(fault)
             for name, due, blocks in polls:
                 device = self._devices.get(name)
-                if device is not None:
+                if device is not None:  # Else it was changed meanwhile, and has another name.
                     self._take(device, due, blocks)
         finally:
             self._may_take.release()

@@ -95,6 +95,7 @@ class Publishers:
             error=health.error,
             timestamp=int(time.time() * 1000),
         )
+        # Stored as well as published: a program that starts later reads the last state.
         device.status = msgspec.json.encode(status)
         self._placement.state_changed(device.id)
         for name in device.subjects:

@@ -54,6 +54,8 @@ def _needed(
     """The rate at which every value of a tag is published."""
     narrowest: dict[str, float] = {}
     """The smallest deadband of a tag so far, at this rate or faster."""
+    # Sorted: first those for every value, then by rate, then by deadband. So each demand needs to
+    # look only at the demands before it.
     for (change, rate, deadband), ids in sorted(demands.items()):
         if change:
             needed = [

@@ -99,12 +99,13 @@ class Health:
             unreached = any(fault in (NO_CONNECTION, UNREACHABLE) for fault, _ in faults)
             if self.state != "online" or self.failures > TOLERATED_FAILURES or unreached:
                 self.state = "offline"
-        if self.state != before[0]:
+        if self.state != before[0]:  # At the time of the response, not of this call.
             self.since = blocks[-1][5]
         self.error = None
         if faults:
             fault, self.last_error_at = faults[0]
             self.error = self.last_error = fault_text(fault)
+        # After a timeout, the rest of a scan is skipped: older results of its blocks stay.
         cut_short = not all(is_exception(fault) for fault, _ in faults)
         self.blocks = [*without_overlap(self.blocks, blocks), *blocks] if cut_short else blocks
         return before != (self.state, self.error if self.state == "online" else None)

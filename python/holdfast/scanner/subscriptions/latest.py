@@ -39,7 +39,7 @@ class LatestBlocks:
             if data is None:
                 continue
             place = (area, address, count)
-            if place not in self._blocks:
+            if place not in self._blocks:  # The plan has changed, so former blocks may overlap.
                 self._forget_inside(area, address, address + count)
             self._blocks[place] = (data, time)
 

@@ -106,6 +106,7 @@ class Registry:
         source, former = self._check(device, asked, len(new))
         if not asked.tags and (device is None or asked.subscriber not in device.subscribers):
             return Change(device)
+        # From here on, nothing is refused any more.
         before = device.rate if device is not None and device.subscribers else None
         fresh = self.fresh(asked)
         if former is not None or asked.publish == "scan" or self._dialect.repeats_values:
@@ -208,6 +209,7 @@ class Registry:
         found = {
             (device, id) for id in self._ids(name) for device in self._devices_of_tag.get(id, ())
         }
+        # Device ids and tag ids may have dots, so each dot may be the border between them.
         parts = name.split(".")
         for at in range(1, len(parts)):
             device = ".".join(parts[:at])
@@ -253,7 +255,7 @@ class Registry:
         if id is None:
             return
         settings = _settings(target)
-        # All others are like this one.
+        # One is enough: each was compared with the others when it was added.
         for key, known in _settings(self.devices[id].source.target).items():
             if known != settings[key]:
                 at = "on one serial line" if isinstance(target, SerialTarget) else "at one address"

@@ -55,6 +55,7 @@ class SubscriptionTtls:
         After `end`, it must not be due any more.
         """
         while True:
+            # A list: `end` changes the dictionary.
             for key in list(filter(self.is_due, self._ends)):
                 await end(key)
             self._changed.clear()
