@@ -36,7 +36,7 @@ class FleetSettings:
     lease_times: LeaseTimes = LEASE_TIMES
     """The same for all nodes, or two of them use a device."""
     check_interval_s: float = 5.0
-    """Between looks whether changes of subscriptions still come."""
+    """Between checks whether changes of subscriptions still arrive."""
 
 
 @dataclass(frozen=True)

@@ -200,7 +200,7 @@ class DesiredState:
         return is_stored and bool(former.value)
 
     async def is_followed(self) -> bool:
-        """Whether changes of the bucket still come. Raises errors of nats-py."""
+        """Whether changes of the bucket still arrive. Raises errors of nats-py."""
         if self._client is None or self._following is None:
             return False
         info = await self._client.jetstream(timeout=TIMEOUT_S).stream_info(self._stream)

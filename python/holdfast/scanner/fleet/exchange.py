@@ -16,7 +16,7 @@ class Command(msgspec.Struct, kw_only=True):
     epoch: int
     """The revision of the lease that the sender knows. A node with an older one must not write."""
     within: float = 0.0
-    """Seconds that it may wait for the device, but for one timeout of that."""
+    """Seconds that it may wait for the device, besides one timeout of the device."""
 
 
 class Executed(msgspec.Struct, kw_only=True, omit_defaults=True):

@@ -152,7 +152,7 @@ class Fleet:
     def connected(self) -> None:
         """Gives messages greater numbers than those sent over the former connection.
 
-        A server that was frozen sends what it had received before when it goes on.
+        A server that was frozen sends older messages when it continues.
         """
         for partition, epoch in self._epochs.items():
             self._epochs[partition] = max(self.revision(partition), epoch)
@@ -289,7 +289,7 @@ class Fleet:
     def _settle(self, key: str) -> None:
         """Begins or ends with the devices of a partition, as its lease is now.
 
-        It may be another one than that of the event: the thread of the leases goes on meanwhile.
+        It may have changed again since the event: the thread of the leases runs meanwhile.
         """
         if not key.startswith(PARTITION):
             return

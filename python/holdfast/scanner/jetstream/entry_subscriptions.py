@@ -233,7 +233,7 @@ class EntrySubscriptions:
     async def _refuse(
         self, key: str, written: Written, reason: str, *, had_subscription: bool
     ) -> None:
-        """Refuses an entry. A subscription of its subscriber by request goes on."""
+        """Refuses an entry. A subscription that its subscriber has by request stays."""
         entry = self._entries[key]
         if had_subscription:
             await self._release(entry)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from nats.js import JetStreamContext
 
 MAX_FIRST_READ_WAIT_S = 2.0
-"""How long requests wait until the bucket is read. Reading goes on after that."""
+"""How long requests wait for the bucket to be read. After that, reading continues."""
 
 MAX_SETTLE_S = 2.0
 """Time after which changes are reported, even if further ones follow."""

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.registry import Registry
 
 MAX_RESTORE_WAIT_S = 2.0
-"""How long requests wait for stored subscriptions. Restoring them goes on after that."""
+"""How long requests wait for stored subscriptions. After that, restoring continues."""
 
 
 class StoredSubscriptions:

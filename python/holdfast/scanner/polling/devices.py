@@ -121,7 +121,7 @@ class Devices:
             self._placement.state_changed(device.id)
 
     def _poll(self, device: ScannedDevice, *, at_once: bool = True) -> None:
-        """Polls a device as it is now, if this scanner polls it."""
+        """Applies changes of a device to the poller, if this scanner polls it."""
         if self._placement.is_own(device):
             self._polling.renew(device, at_once=at_once)
 

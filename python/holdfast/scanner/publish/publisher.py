@@ -90,8 +90,8 @@ class Publisher:
 
     def regroup(self, groups: Sequence[Group], new_tags: Collection[str]) -> None:
         """Changes the groups now. The next value of `new_tags` is published even if unchanged."""
-        # A group with the same rate and mode goes on in its rhythm, with the times of its last
-        # publication: a new subscriber must not shift the times of the others.
+        # A group with the same rate and mode keeps the time of its last publication: a new
+        # subscriber must not shift the times of the others.
         before = {
             (due.group.change, due.group.rate): due for due in self._groups if not due.is_once
         }

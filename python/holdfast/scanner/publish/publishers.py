@@ -37,7 +37,7 @@ class Publishers:
     def update(
         self, device: ScannedDevice, fresh: Collection[str] = (), *, with_state: bool = False
     ) -> None:
-        """Publishes a device as it is now, and the next value of `fresh` tags in any case."""
+        """Applies changes of a device, and publishes the next value of `fresh` tags in any case."""
         publisher = self._publishers.get(device.id)
         if publisher is None:
             publisher = self._publishers[device.id] = self._publisher(device)

@@ -1,7 +1,7 @@
 """The registry of all subscriptions. A request is carried out completely or not at all.
 
-All checks run before the first change, without an await in between. A `Subscription` is valid by
-itself; the registry checks it against those that it has.
+All checks run before the first change, without an await in between. A `Subscription` was checked
+alone before; the registry compares it with those that it has.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A subscribe request that is valid by itself. Does no I/O."""
+"""A subscribe request, checked without regard to other subscriptions. Does no I/O."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SETTINGS = ("timeout", "release", "plan")
 
 @dataclass(frozen=True)
 class Subscription:
-    """A subscribe request that is valid by itself."""
+    """A valid subscribe request. It may still contradict other subscriptions."""
 
     device: str
     subscriber: str
@@ -52,7 +52,7 @@ class Subscription:
 def subscription_of(
     request: SubscribeRequest, rules: Rules, adjustments: Adjustments | None = None
 ) -> Subscription:
-    """Checks a request by itself. Adds to `adjustments` what is adjusted. Raises `Refused`."""
+    """Checks a request alone. Adds to `adjustments` what is adjusted. Raises `Refused`."""
     adjustments = Adjustments() if adjustments is None else adjustments
     defaults = rules.defaults
     _check_id(request.device_id)

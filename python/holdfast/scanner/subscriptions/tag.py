@@ -71,7 +71,7 @@ class Tag:
         return range(self.address, self.end) if self.meaning is None else self.meaning.span
 
     def scaled(self, raw: Any, content: Any) -> Scaled:
-        """The value, from the contents of its registers and of that of its scale."""
+        """The value, from its registers and the register that contains its scale."""
         assert self.meaning is not None, "only tags of profiles have a scale"
         return self.meaning.scaled(raw, content)
 
