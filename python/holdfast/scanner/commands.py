@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 def value(text: str, tag: Tag) -> Any:
     """Parses a text to a value of a tag's type. Raises `Refused`."""
     try:
-        made = from_text(text, parsed(tag.type), tag.asked_type)
+        made = from_text(text, parsed(tag.type), tag.requested_type)
     except ValueError as error:
         raise Refused(str(error)) from None
     return _checked(made, tag)
@@ -56,7 +56,7 @@ def _checked(made: Any, tag: Tag) -> Any:
     try:
         encode(made, tag.type, tag.order, encoding=tag.encoding)
     except ConversionError as error:
-        raise Refused(str(error).replace(tag.type, tag.asked_type)) from None
+        raise Refused(str(error).replace(tag.type, tag.requested_type)) from None
     return made
 
 

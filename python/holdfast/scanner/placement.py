@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 class DeviceHost(Protocol):
     """The devices of the scanner."""
 
-    def turn(self, device: str) -> asyncio.Lock:
+    def lock(self, device: str) -> asyncio.Lock:
         """Returns the lock that serializes changes of a device."""
 
     def begin(self, device: ScannedDevice) -> None:

@@ -66,7 +66,7 @@ class Requests:
             )
             asked = subscription_of(request, rules, adjustments)
             self._buckets.check_not_entry(asked.device, asked.subscriber)
-        async with self._devices.turn(asked.device):
+        async with self._devices.lock(asked.device):
             fresh = self._registry.fresh(asked)  # Before the change, after which no tag is fresh.
             add = partial(self._devices.add, asked)
             await self._placement.store(asked.device, add, asked.subscriber)
@@ -87,7 +87,7 @@ class Requests:
             request = decode_lenient(message.data, UnsubscribeRequest, max_bytes, adjustments)
             rules.dialect.check_unsubscribe(request)
             self._buckets.check_not_entry(request.device_id, request.subscriber_id)
-        async with self._devices.turn(request.device_id):
+        async with self._devices.lock(request.device_id):
             await self._remove_stored(request)
         await self._placement.settled(request.device_id, request.subscriber_id)
         self._log.adjusted(request.subscriber_id, request.device_id, adjustments)
@@ -107,7 +107,7 @@ class Requests:
         device_id, subscriber_id = subscription.device, subscription.subscriber
         assert subscriber_id is not None
         ttls = self._devices.ttls
-        async with self._devices.turn(device_id):
+        async with self._devices.lock(device_id):
             if not ttls.is_due(subscription):  # It was renewed while this waited.
                 return
             device = self._registry.devices.get(device_id)
@@ -142,7 +142,7 @@ class Requests:
 
     async def carry_out_entry(self, asked: Subscription) -> None:
         """Makes a subscription that of its entry. Raises `Refused`."""
-        async with self._devices.turn(asked.device):
+        async with self._devices.lock(asked.device):
             await self._devices.add(asked)
             self._devices.keep_only(asked.device, asked.subscriber, asked.tags)
         self._log.subscribed(asked)
@@ -151,7 +151,7 @@ class Requests:
         """Ends the subscription of an entry."""
         assert subscription.subscriber is not None
         request = UnsubscribeRequest(subscription.device, subscription.subscriber)
-        async with self._devices.turn(subscription.device):
+        async with self._devices.lock(subscription.device):
             self._devices.remove(request)
         self._log.unsubscribed(request)
 
@@ -161,7 +161,7 @@ class Requests:
             return
         adjustments = Adjustments()
         asked = subscription_of(request, self._rules, adjustments)
-        async with self._devices.turn(asked.device):
+        async with self._devices.lock(asked.device):
             await self._devices.add(asked, is_stored=True)
         self._log.byte_orders(asked, adjustments, asked.tags)
 

@@ -131,7 +131,7 @@ class Scanner:
         Raises `OSError` for a file of the settings that can't be used.
         """
         device_tls.check(self._settings.device_tls)
-        self._polling.start(self._devices.take)
+        self._polling.start(self._devices.on_poll)
         works = [
             self._buckets.run(self._requests),  # First: it may pause polling.
             self._broker.run(),

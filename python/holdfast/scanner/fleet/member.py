@@ -203,7 +203,7 @@ class FleetMember:
         self._has_touched.set()
 
     async def _adopt(self, device: str) -> None:
-        async with self._device_host.turn(device):
+        async with self._device_host.lock(device):
             await self._adopt_now(device)
 
     async def _adopt_now(self, device: str) -> Refused | None:

@@ -116,7 +116,7 @@ def _tag(tag: Tag, wanted: TagOptions) -> bytes:
         id=tag.id,
         address=tag.address,
         function_code=CODE_OF_AREA[tag.area],
-        datatype=tag.asked_type,
+        datatype=tag.requested_type,
         byte_order=tag.order,
         encoding=tag.encoding,
         writable=wanted.writable,

@@ -50,12 +50,12 @@ class Devices:
         self._publishers = publishers
         self._placement = placement
         self._begin_task = begin_task
-        self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self.ttls = SubscriptionTtls()
 
-    def turn(self, device: str) -> asyncio.Lock:
+    def lock(self, device: str) -> asyncio.Lock:
         """Returns the lock that serializes changes of a device."""
-        return self._turns.setdefault(device, asyncio.Lock())
+        return self._locks.setdefault(device, asyncio.Lock())
 
     async def add(
         self,
@@ -157,14 +157,14 @@ class Devices:
             device.health.disable()
             self._publishers.publish_state(device)
 
-    def take(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
+    def on_poll(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
         """Publishes the results of a poll."""
         try:
-            self._take(device, due, blocks)
+            self._handle_poll(device, due, blocks)
         except Exception:  # An error with one device must not affect the others.
             logs.problem("scan_failed", device=device.id)
 
-    def _take(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
+    def _handle_poll(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
         if not self._placement.is_own(device):
             return  # Another node may have published newer values.
         self._publishers.scans += 1
@@ -181,7 +181,7 @@ class Devices:
 
     async def _look_up(self, device: ScannedDevice) -> None:
         """Looks up the name of a device that does not respond; its address may have changed."""
-        async with self.turn(device.id):
+        async with self.lock(device.id):
             if self._registry.devices.get(device.id) is not device:
                 return
             try:

@@ -78,12 +78,12 @@ class Polling:
         self._may_take = threading.Semaphore(1)
         self._thread = threading.Thread(target=self._run, name="holdfast-scan", daemon=True)
 
-    def start(self, take: Callable[[ScannedDevice, float, list[PolledBlock]], None]) -> None:
-        """Calls `take` in the running event loop for each poll.
+    def start(self, on_poll: Callable[[ScannedDevice, float, list[PolledBlock]], None]) -> None:
+        """Calls `on_poll` in the running event loop for each poll.
 
         Its arguments are the device, the scheduled time in seconds, and the blocks.
         """
-        self._take = take
+        self._on_poll = on_poll
         self._loop = asyncio.get_running_loop()
         self._poller = _core.Poller([]) if self._shared_poller is None else self._shared_poller
         self._results = self._poller.receiver()
@@ -253,6 +253,6 @@ class Polling:
             for name, due, blocks in polls:
                 device = self._devices.get(name)
                 if device is not None:  # Else it was changed meanwhile, and has another name.
-                    self._take(device, due, blocks)
+                    self._on_poll(device, due, blocks)
         finally:
             self._may_take.release()

@@ -173,12 +173,12 @@ class _DeviceReport:
 
     def _blocks(self, ids: Set[str]) -> Iterator[BlockReport]:
         """Yields the blocks that contain some of these tags."""
-        asked = self._device.health.blocks
+        blocks = self._device.health.blocks
         if self._device.health.state != "online":
             planned = self._device.source.plan.blocks(self._tags)
-            unasked = [(*block[:3], None, 0, 0.0) for block in without_overlap(planned, asked)]
-            asked = [*asked, *unasked]
-        for area, address, count, _, fault, _ in asked:
+            not_read = [(*block[:3], None, 0, 0.0) for block in without_overlap(planned, blocks)]
+            blocks = [*blocks, *not_read]
+        for area, address, count, _, fault, _ in blocks:
             inside = self._places.inside(area, address, count)
             if not any(tag.id in ids for tag in inside):
                 continue
@@ -209,7 +209,7 @@ class _DeviceReport:
                 id=tag.id,
                 address=tag.address,
                 function_code=CODE_OF_AREA[tag.area],
-                datatype=tag.asked_type,
+                datatype=tag.requested_type,
                 byte_order=tag.order,
                 encoding=tag.encoding,
                 writable=self._device.unwritable(tag) is None,

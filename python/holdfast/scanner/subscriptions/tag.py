@@ -76,7 +76,7 @@ class Tag:
         return self.meaning.scaled(raw, content)
 
     @property
-    def asked_type(self) -> str:
+    def requested_type(self) -> str:
         """The type as requests name it."""
         bools = parsed(self.type).base == "bool"
         return "boolean" + self.type.removeprefix("bool") if bools else self.type
@@ -91,11 +91,11 @@ class Tag:
         """Returns why no Modbus request can write the tag; `None` if one can."""
         if self.area not in WRITE_LIMITS:
             return f"functionCode {CODE_OF_AREA[self.area]} is not writable"
-        return unwritable(self.area, parsed(self.type), self.asked_type)
+        return unwritable(self.area, parsed(self.type), self.requested_type)
 
     def __str__(self) -> str:
         kind = "" if self.of_bits else f" {self.order}"
-        return f"{self.asked_type}{kind} at {CODE_OF_AREA[self.area]} {self.address}"
+        return f"{self.requested_type}{kind} at {CODE_OF_AREA[self.area]} {self.address}"
 
     @property
     def of_bits(self) -> bool:
