@@ -23,7 +23,7 @@ from holdfast.config.scanning import PING_INTERVAL, PINGS_OUTSTANDING
 from holdfast.net.secret_file import read_secret
 from holdfast.net.tls import NO_FILES, Tls, broker_context
 from holdfast.scanner.credentials import Credentials
-from holdfast.scanner.receiving import SafeClient, TlsClient
+from holdfast.scanner.receiving import SafeClient
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -109,7 +109,7 @@ class Broker:
         self,
         servers: Servers,
         handlers: Mapping[str, Handler],
-        connected: Callable[[Client | None], None],
+        connected: Callable[[SafeClient | None], None],
         ping: Ping,
         *,
         name: str = "holdfast scan",
@@ -148,7 +148,7 @@ class Broker:
         Raises `OSError` for an unusable file before the first connection.
         """
         while True:
-            client = TlsClient() if self._servers.secure else SafeClient()
+            client = SafeClient(requires_tls=self._servers.secure)
             ended = asyncio.Event()
             try:
                 await self._connect(client, ended)
@@ -265,7 +265,7 @@ async def connected_once(
     Raises `ConnectionError`, which names the servers, if there is none in time, and `OSError` for
     an unusable file.
     """
-    client = TlsClient() if servers.secure else SafeClient()
+    client = SafeClient(requires_tls=servers.secure)
     options = servers.options()
     failures: list[Exception] = []
 

@@ -15,7 +15,7 @@ from nats.errors import Error
 from holdfast.faults import fault_text, is_exception
 from holdfast.net.event_loop import EventLoop
 from holdfast.outputs.sending import soon_after
-from holdfast.scanner.receiving import SafeClient, TlsClient
+from holdfast.scanner.receiving import SafeClient
 from holdfast.scanner.subjects import data_subject, names
 from holdfast.scanner.tags import datatype
 from holdfast.tags.text import plain
@@ -126,7 +126,7 @@ class NatsOutput:
             async def is_lost() -> None:
                 lost.set()
 
-            client = TlsClient() if self._servers.secure else SafeClient()
+            client = SafeClient(requires_tls=self._servers.secure)
             try:
                 await asyncio.wait_for(self._connect(client, is_lost), CONNECTING)
             except BaseException:

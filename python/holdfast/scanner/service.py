@@ -97,6 +97,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.fleet.wants import Want
     from holdfast.scanner.keeping import Unit
     from holdfast.scanner.messages import BrowseAnswer
+    from holdfast.scanner.receiving import SafeClient
     from holdfast.scanner.registry import Subscription
     from holdfast.tags import TagList
     from holdfast.types import PolledBlock
@@ -316,7 +317,7 @@ class Scanner:
         """Ends the service."""
         self._ended.set()
 
-    def _connected(self, client: Client | None) -> None:
+    def _connected(self, client: SafeClient | None) -> None:
         """Handles a new or lost connection.
 
         Messages that were sent before a disconnect may be lost, so a new connection publishes all
