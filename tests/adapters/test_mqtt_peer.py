@@ -181,6 +181,21 @@ def test_a_release_of_something_unknown_is_answered(rig: Rig, fake: FakeBroker) 
         works(rig, peer, fake.version)
 
 
+def test_an_identifier_can_be_used_again_after_its_release(rig: Rig, fake: FakeBroker) -> None:
+    """Also if the broker does not set the flags of the release."""
+    run(rig, fake)
+    with fake.accept() as peer:
+        peer.welcome()
+        for value, release in enumerate((b"\x62\x02\x00\x07", b"\x60\x02\x00\x07", b""), 1):
+            message = text(command([value]))
+            peer.send(publish("plant/ingest", message, 2, 7, version=fake.version))
+            assert peer.expect(mqtt.PUBREC).identifier == 7
+            assert rig.registers(0, 1) == [value]
+            if release:
+                peer.send(release)
+                assert peer.expect(mqtt.PUBCOMP).identifier == 7
+
+
 # What it says
 
 
@@ -473,14 +488,13 @@ def test_a_packet_too_large_is_not_kept_while_it_comes(
     rig: Rig, fake: FakeBroker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept = []
-    read = link.BrokerConnection._packet_read
+    read = link.BrokerConnection.read_more
 
-    def spy(self: link.BrokerConnection) -> Any:
-        code = read(self)
-        kept.append(len(self._in_packet["packet"]))
-        return code
+    def spy(self: link.BrokerConnection) -> None:
+        read(self)
+        kept.append(len(self._packets._body) + len(self._packets._left))
 
-    monkeypatch.setattr(link.BrokerConnection, "_packet_read", spy)
+    monkeypatch.setattr(link.BrokerConnection, "read_more", spy)
     run(rig, fake)
     with fake.accept() as peer:
         peer.welcome()
@@ -576,7 +590,7 @@ class Jammed(socket.socket):
 def test_nothing_piles_up_while_the_broker_does_not_read(
     rig: Rig, fake5: FakeBroker, monkeypatch: pytest.MonkeyPatch, qos: int
 ) -> None:
-    dial, queue = dialing.dial, link.BrokerConnection._packet_queue
+    dial, read = dialing.dial, link.BrokerConnection.read_more
     most = {"packets": 0, "answers": 0}
 
     def dial_one_that_jams(*arguments: Any) -> socket.socket:
@@ -584,14 +598,13 @@ def test_nothing_piles_up_while_the_broker_does_not_read(
         connection.setblocking(False)
         return connection
 
-    def spy(self: link.BrokerConnection, *arguments: Any) -> Any:
-        code = queue(self, *arguments)
-        most["packets"] = max(most["packets"], self.unsent)
-        most["answers"] = max(most["answers"], len(self._out_messages))
-        return code
+    def spy(self: link.BrokerConnection) -> None:
+        read(self)
+        most["packets"] = max(most["packets"], self.connection.unsent)
+        most["answers"] = max(most["answers"], len(self._on_the_way) + len(self._waiting))
 
     monkeypatch.setattr(adapter, "dial", dial_one_that_jams)
-    monkeypatch.setattr(link.BrokerConnection, "_packet_queue", spy)
+    monkeypatch.setattr(link.BrokerConnection, "read_more", spy)
     monkeypatch.setattr(Jammed, "jam", threading.Event())
     running = run(rig, fake5)
     with fake5.accept() as peer:

@@ -12,7 +12,7 @@ from holdfast.adapters.mqtt.answers import Answers
 from holdfast.adapters.mqtt.backoff import FIRST_PAUSE, MAX_PAUSE, Backoff
 from holdfast.adapters.mqtt.filters import Filters
 from holdfast.adapters.mqtt.inbox import Inbox
-from holdfast.adapters.mqtt.link import MAX_UNSENT, BrokerConnection
+from holdfast.adapters.mqtt.link import BrokerConnection
 from holdfast.adapters.mqtt.values import Values
 from holdfast.mqtt.dialing import dial
 from holdfast.mqtt.password import read_password
@@ -145,21 +145,20 @@ class Mqtt:
         """Reads and writes until the connection ends."""
         welcome = time.monotonic() + WELCOME
         tick = min(_TICK, self._settings.keep_alive / 2)
-        while (connection := link.socket()) is not None:
+        while link.is_open:
             if self._connected_at is None and time.monotonic() > welcome:
                 raise TimeoutError(f"the broker did not answer within {WELCOME:g} s")
-            pending = getattr(connection, "pending", int)() > 0
-            read = link.unsent < MAX_UNSENT
+            pending = link.pending
             readable, writable = waiter.wait(
-                connection,  # type: ignore[arg-type]
-                read=read,
-                write=link.want_write(),
-                seconds=0.0 if pending and read else tick,
+                link.connection.connection,
+                read=link.may_read,
+                write=link.connection.unsent > 0,
+                seconds=0.0 if pending else tick,
             )
             if writable:
-                link.loop_write()
-            if readable or (pending and read):
-                link.loop_read()
+                link.connection.flush()
+            if readable or pending:
+                link.read_more()
             link.loop_misc()
         self._ending = link.trouble or self._ending
 

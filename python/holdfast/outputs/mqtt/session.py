@@ -168,7 +168,7 @@ class Session:
             try:
                 connection.greet()
                 end = time.monotonic() + WELCOME
-                while not self._is_accepted and connection.socket() is not None:
+                while not self._is_accepted and connection.is_open:
                     if time.monotonic() > end:
                         raise TimeoutError(f"the broker did not answer within {WELCOME:g} s")
                     self._step(connection, waiter)
@@ -190,7 +190,7 @@ class Session:
         """Serves the connection to its end."""
         connection = self._connection
         try:
-            while connection.socket() is not None:
+            while connection.is_open:
                 with self._lock:
                     new, self._new = self._new, []
                     topics, self._topics = self._topics, []
@@ -222,18 +222,17 @@ class Session:
 
     def _step(self, connection: Connection, waiter: Waiter) -> None:
         """Waits once, then reads and writes."""
-        open_socket = connection.socket()
-        assert open_socket is not None, "called only while it is open"
-        pending = getattr(open_socket, "pending", int)() > 0
+        open_socket = connection.connection
+        pending = open_socket.pending
         readable, writable = waiter.wait(
-            open_socket,  # type: ignore[arg-type]
+            open_socket.connection,
             read=True,
-            write=connection.want_write(),
+            write=open_socket.unsent > 0,
             seconds=0.0 if pending else min(LOOK, self._settings.keep_alive / 2),
         )
         self._check()
         if writable:
-            connection.loop_write()
+            open_socket.flush()
         if (readable or pending) and connection.read_more():
             self._tell()
         connection.loop_misc()
