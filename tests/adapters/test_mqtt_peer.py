@@ -14,6 +14,7 @@ import pytest
 from holdfast.adapters.mqtt import adapter, inbox, link
 from holdfast.ingest import MemoryAccess
 from holdfast.mqtt import dialing
+from holdfast.mqtt.stream import BrokerSocket
 from support import mqtt_peer as mqtt
 from support import wire
 from support.mqtt_peer import FakeBroker, publish
@@ -593,10 +594,11 @@ def test_nothing_piles_up_while_the_broker_does_not_read(
     dial, read = dialing.dial, link.BrokerConnection.read_more
     most = {"packets": 0, "answers": 0}
 
-    def dial_one_that_jams(*arguments: Any) -> socket.socket:
-        connection = Jammed(fileno=dial(*arguments).detach())
-        connection.setblocking(False)
-        return connection
+    def dial_one_that_jams(*arguments: Any) -> BrokerSocket:
+        dialed = dial(*arguments)
+        dialed.connection = Jammed(fileno=dialed.connection.detach())
+        dialed.connection.setblocking(False)
+        return dialed
 
     def spy(self: link.BrokerConnection) -> None:
         read(self)

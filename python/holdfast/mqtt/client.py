@@ -13,13 +13,13 @@ from paho.mqtt.enums import CallbackAPIVersion, LogLevel, MQTTErrorCode, MQTTPro
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from holdfast.mqtt.stream import BrokerSocket, head
+from holdfast.mqtt.stream import head
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Callable
 
     from holdfast.config import BrokerConfig
+    from holdfast.mqtt.stream import BrokerSocket
 
 
 class BrokerClient(Client):
@@ -30,7 +30,7 @@ class BrokerClient(Client):
         settings: BrokerConfig,
         client_id: str,
         password: bytes | None,
-        dial: Callable[[], socket.socket],
+        dial: Callable[[], BrokerSocket],
         *,
         session_expiry: int,
     ) -> None:
@@ -110,5 +110,5 @@ class BrokerClient(Client):
             self.trouble = text
 
     def _create_socket(self) -> BrokerSocket:
-        self._connection = BrokerSocket(self._dial())
+        self._connection = self._dial()
         return self._connection

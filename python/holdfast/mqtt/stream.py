@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ssl
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,7 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Iterator
 
-_NOT_NOW = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
+    from holdfast.net.secure_channel import SecureChannel
 
 
 class Packets:
@@ -104,9 +103,10 @@ class BrokerSocket:
     Packets that can't be sent at once wait in it, those of paho and those of `put` in their order.
     """
 
-    def __init__(self, connection: socket.socket) -> None:
-        """`connection` does not block."""
+    def __init__(self, connection: socket.socket, channel: SecureChannel | None = None) -> None:
+        """`connection` does not block. With a `channel`, it carries TLS."""
         self.connection = connection
+        self._channel = channel
         self.for_paho = bytearray()
         self.failure: Exception | None = None
         """Why the connection has ended: an `OSError`, or an `EOFError` if the broker closed it."""
@@ -118,29 +118,46 @@ class BrokerSocket:
         """The number of packets, or of batches of them, that wait."""
         return len(self._unsent)
 
-    @property
-    def pending(self) -> bool:
-        """Whether there is something that no wait for the socket tells: bytes, or its end."""
-        return self.failure is not None or getattr(self.connection, "pending", int)() > 0
-
     def read(self, size: int) -> bytes:
         """Returns what has arrived; nothing if that is nothing, or the connection has ended."""
         try:
             data = self.connection.recv(size)
-        except _NOT_NOW:
+            if not data:
+                self._end()
+            elif self._channel is not None:
+                return self._decrypted(self._channel, data)
+        except BlockingIOError:
             return b""
         except OSError as error:
             self.failure = error
             return b""
-        if not data:
-            self.failure = EOFError("the broker closed the connection")
         return data
+
+    def _end(self) -> None:
+        if self._channel is not None:
+            self._channel.check_lost()
+        self.failure = EOFError("the broker closed the connection")
+
+    def _decrypted(self, channel: SecureChannel, data: bytes) -> bytes:
+        try:
+            return channel.receive(data)
+        finally:
+            self._send(channel.outgoing())
+
+    def greet(self) -> None:
+        """Begins TLS."""
+        if self._channel is not None:
+            self._send(self._channel.outgoing())
 
     def put(self, packets: bytes) -> None:
         """Sends packets, now or when the broker takes more."""
-        self._unsent.append(packets)
-        if len(self._unsent) == 1:
-            self.flush()
+        self._send(packets if self._channel is None else self._channel.encrypted(packets))
+
+    def _send(self, data: bytes) -> None:
+        if data:
+            self._unsent.append(data)
+            if len(self._unsent) == 1:
+                self.flush()
 
     def flush(self) -> None:
         """Sends what waits, as far as the broker takes it."""
@@ -152,7 +169,7 @@ class BrokerSocket:
                     self._unsent[0] = memoryview(data)[sent:]
                 else:
                     self._unsent.popleft()
-        except _NOT_NOW:
+        except BlockingIOError:
             return
         except OSError as error:
             self.failure = error
@@ -180,6 +197,8 @@ class BrokerSocket:
 
     def close(self) -> None:
         """Closes the connection."""
+        if self.is_open and self._channel is not None and self.failure is None:
+            self._send(self._channel.end())
         self.is_open = False
         self.connection.close()
 

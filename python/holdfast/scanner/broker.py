@@ -21,7 +21,8 @@ from nats.errors import Error
 from holdfast import logs
 from holdfast.config.scanning import PING_INTERVAL, PINGS_OUTSTANDING
 from holdfast.net.secret_file import read_secret
-from holdfast.net.tls import NO_FILES, Tls, broker_context
+from holdfast.net.secure_channel import SecureChannel
+from holdfast.net.tls import NO_FILES, Tls
 from holdfast.scanner.credentials import Credentials
 from holdfast.scanner.receiving import SafeClient
 
@@ -88,7 +89,8 @@ class Servers:
             options["signature_cb"] = credentials.sign
             options["user_jwt_cb"] = credentials.jwt
         if self.secure:
-            options["tls"] = broker_context(self.tls)
+            SecureChannel("localhost", self.tls)  # Checks the files.
+            options["tls"] = self.tls
         return options
 
 

@@ -4,12 +4,15 @@ The server forwards subjects with invalid UTF-8 or vertical tabs, and malformed 
 of nats-py stops at any of them, permanently or for some time. So this transport takes the messages
 out of what the server sends, and the parser gets the other lines only.
 
+TLS is the core's, and the certificate of a server is judged as that of a device.
+
 It also notes what is known of the age of each message: NATS does not tell when one was sent. The
 server answers pings in order, so what follows an answer was sent after the ping.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 from collections import deque
@@ -18,6 +21,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from nats.aio.transport import TcpTransport
 from nats.errors import Error, ProtocolError
 
+from holdfast.net.secure_channel import SecureChannel
+from holdfast.net.tls import NO_FILES, Tls
 from holdfast.standstill import now
 
 if TYPE_CHECKING:
@@ -25,6 +30,7 @@ if TYPE_CHECKING:
     from urllib.parse import ParseResult
 
 END = b"\r\n"
+CHUNK = 65_536
 PING, PONG = b"PING\r\n", b"PONG\r\n"
 MAX_LINE = 1024 * 1024
 """The longest line of the protocol in bytes. INFO lines are the longest."""
@@ -59,6 +65,9 @@ class MessageTransport(TcpTransport):
         self._requires_tls = requires_tls
         self._buffer = bytearray()
         self._head: _Head | None = None
+        self._channel: SecureChannel | None = None
+        self._early = b""
+        """What was decrypted and is not read yet."""
         self._pings: deque[tuple[float, bool]] = deque()
         """Times of pings without an answer, and whether the client does not know of them."""
         self.pinged = self.answered = -math.inf
@@ -76,7 +85,7 @@ class MessageTransport(TcpTransport):
     def ping(self) -> None:
         """Pings the server, without the knowledge of the client."""
         self._note_ping(hidden=True)
-        super().write(PING)  # type: ignore[no-untyped-call]
+        self._send(PING)
 
     def _note_ping(self, *, hidden: bool) -> None:
         self.pinged = now()
@@ -85,36 +94,103 @@ class MessageTransport(TcpTransport):
     async def connect(self, uri: ParseResult, buffer_size: int, connect_timeout: int) -> None:
         """Connects anew, after the end of the connection before."""
         # A connection that was refused, such as for its credentials: nats-py would forget it open.
-        self.close()  # type: ignore[no-untyped-call]
+        self.close()
         self._buffer.clear()
         self._head = None
+        self._early = b""
         self._pings.clear()
         await super().connect(uri, buffer_size, connect_timeout)
+
+    def close(self) -> None:
+        """Closes the connection, if there is one."""
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            super().write(channel.end())  # type: ignore[no-untyped-call]
+        super().close()  # type: ignore[no-untyped-call]
+
+    async def connect_tls(
+        self, uri: str | ParseResult, ssl_context: Any, buffer_size: int, connect_timeout: int
+    ) -> None:
+        """Begins TLS. `ssl_context` is a `Tls`; otherwise the system's authorities are trusted.
+
+        Raises `OSError` for a server that is not trusted, and for unusable files.
+        """
+        files = ssl_context if isinstance(ssl_context, Tls) else NO_FILES
+        host = uri if isinstance(uri, str) else str(uri.hostname)
+        channel = SecureChannel(host, files)
+        try:
+            async with asyncio.timeout(connect_timeout):
+                super().write(channel.outgoing())  # type: ignore[no-untyped-call]
+                while not channel.is_ready:
+                    self._early += await self._decrypted(channel, buffer_size)
+        except BaseException:
+            self.close()
+            raise
+        self._channel = channel
+
+    async def _decrypted(self, channel: SecureChannel, buffer_size: int) -> bytes:
+        data: bytes = await super().read(buffer_size)
+        if not data:
+            channel.check_lost()
+            raise ConnectionResetError("the server closed the connection")
+        try:
+            return channel.receive(data)
+        finally:
+            super().write(channel.outgoing())  # type: ignore[no-untyped-call]
 
     def write(self, payload: bytes) -> None:
         """Sends bytes, and notes when a ping is sent."""
         if payload == PING:
             self._note_ping(hidden=False)
-        super().write(payload)  # type: ignore[no-untyped-call]
+        self._send(payload)
+
+    def writelines(self, payload: list[bytes]) -> None:
+        """Sends bytes."""
+        self._send(b"".join(payload))
+
+    def _send(self, data: bytes) -> None:
+        if self._channel is not None:
+            data = self._channel.encrypted(data)
+        elif self._requires_tls:
+            return  # At its end, nats-py sends what waits, also to a server that was refused.
+        super().write(data)  # type: ignore[no-untyped-call]
 
     async def readline(self) -> bytes:
         """Returns one of the lines that begin a connection."""
-        try:
-            line: bytes = await super().readline()  # type: ignore[no-untyped-call]
-        except ValueError:
-            raise Error("nats: the server sent a line that is too long") from None
+        line = await self._line()
         if line.startswith(PONG):
             self._answer()
         elif self._requires_tls and line.startswith(b"INFO"):
             _check_tls(_decoded(line.removeprefix(b"INFO")))
         return line
 
+    async def _line(self) -> bytes:
+        if self._channel is None:
+            try:
+                line: bytes = await super().readline()  # type: ignore[no-untyped-call]
+            except ValueError:
+                raise Error("nats: the server sent a line that is too long") from None
+            return line
+        while b"\n" not in self._early:
+            if len(self._early) > MAX_LINE:
+                raise Error("nats: the server sent a line that is too long")
+            self._early += await self._decrypted(self._channel, CHUNK)
+        line, end, self._early = self._early.partition(b"\n")
+        return line + end
+
+    async def _received(self, buffer_size: int) -> bytes:
+        if self._channel is None:
+            plain: bytes = await super().read(buffer_size)
+            return plain
+        early, self._early = self._early, b""
+        return early or await self._decrypted(self._channel, buffer_size)
+
     async def read(self, buffer_size: int) -> bytes:
         """Delivers the messages that have arrived, and returns the other lines.
 
         Raises `ProtocolError` for malformed lines.
         """
-        self._buffer += await super().read(buffer_size)
+        self._buffer += await self._received(buffer_size)
         others = b""
         while self._buffer:
             if self._head is not None:

@@ -18,10 +18,8 @@ from holdfast.mqtt.dialing import dial
 from holdfast.mqtt.password import read_password
 from holdfast.mqtt.waiting import Ended, Waiter
 from holdfast.net.addresses import joined
-from holdfast.net.tls import NO_FILES, broker_context
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Mapping
 
     from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags
@@ -30,6 +28,7 @@ if TYPE_CHECKING:
 
     from holdfast.config import MappedTag, MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.ingest import MemoryAccess
+    from holdfast.mqtt.stream import BrokerSocket
     from holdfast.stop import Stop
 
 WELCOME = 10.0
@@ -126,11 +125,9 @@ class Mqtt:
 
     def _link(self, waiter: Waiter) -> BrokerConnection:
         settings = self._settings
-        tls = NO_FILES if settings.tls is None else settings.tls.files
-        context = broker_context(tls) if settings.secure else None
 
-        def open_socket() -> socket.socket:
-            return dial(settings.host, settings.port, context, waiter)
+        def open_socket() -> BrokerSocket:
+            return dial(settings.host, settings.port, settings.tls_files, waiter)
 
         password = read_password(settings.password_file)
         link = BrokerConnection(

@@ -21,7 +21,6 @@ from holdfast.mqtt.packets import MAX_PROPERTIES, parse_publish
 from holdfast.mqtt.stream import Packets, acknowledgement
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Callable, Iterator, Mapping
 
     from paho.mqtt.client import Client
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from holdfast.adapters.mqtt.inbox import Inbox
     from holdfast.config import MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.mqtt.packets import Publish
+    from holdfast.mqtt.stream import BrokerSocket
 
 SESSION_EXPIRY = 3600
 """Seconds that the broker keeps the session while this client is disconnected. MQTT 5 only."""
@@ -69,7 +69,7 @@ class BrokerConnection(BrokerClient):
         self,
         settings: MqttConfig,
         password: bytes | None,
-        dial: Callable[[], socket.socket],
+        dial: Callable[[], BrokerSocket],
         unreleased: set[int],
         inbox: Inbox,
         answer: Callable[[BrokerConnection, Publish, Mapping[str, object]], None],
@@ -105,9 +105,7 @@ class BrokerConnection(BrokerClient):
     @property
     def pending(self) -> bool:
         """Whether `read_more` has something to do though nothing arrives."""
-        if self.connection.failure is not None:
-            return True
-        return self.may_read and (self._is_late or self.connection.pending)
+        return self.connection.failure is not None or (self.may_read and self._is_late)
 
     def accepted(self, properties: Properties | None) -> None:
         """Applies the limits from the broker's CONNACK."""

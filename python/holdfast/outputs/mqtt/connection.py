@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from holdfast.config import BrokerConfig
     from holdfast.mqtt.packets import Publish
+    from holdfast.mqtt.stream import BrokerSocket
     from holdfast.outputs.mqtt.messages import Delivery
 
 WINDOW = {"5": 1000, "3.1.1": 100}
@@ -66,7 +67,7 @@ class Connection(BrokerClient):
         settings: BrokerConfig,
         client_id: str,
         password: bytes | None,
-        dial: Callable[[], socket.socket],
+        dial: Callable[[], BrokerSocket],
         on_command: Callable[[Publish, bool], None],
         *,
         qos: int,

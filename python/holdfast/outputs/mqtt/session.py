@@ -13,14 +13,12 @@ from holdfast import logs
 from holdfast.mqtt.dialing import dial
 from holdfast.mqtt.password import read_password
 from holdfast.mqtt.waiting import Ended, Waiter
-from holdfast.net.tls import NO_FILES, broker_context
 from holdfast.outputs.mqtt.connection import Connection
 from holdfast.outputs.mqtt.messages import Delivery, Message
 from holdfast.standstill import LOOK, Standstill
 from holdfast.stop import Stop
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Callable, Sequence
 
     from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags
@@ -28,6 +26,7 @@ if TYPE_CHECKING:
 
     from holdfast.config import BrokerConfig
     from holdfast.mqtt.packets import Publish
+    from holdfast.mqtt.stream import BrokerSocket
 
 WELCOME = 10.0
 """Seconds to wait for the broker's CONNACK."""
@@ -142,12 +141,10 @@ class Session:
     def _opened(self, client_id: str, will: Message | None) -> Connection:
         """Connects, and waits for the broker's consent. A stop interrupts it."""
         settings = self._settings
-        tls = NO_FILES if settings.tls is None else settings.tls.files
-        context = broker_context(tls) if settings.secure else None
         with Waiter(self._stop) as waiter:
 
-            def open_socket() -> socket.socket:
-                return dial(settings.host, settings.port, context, waiter)
+            def open_socket() -> BrokerSocket:
+                return dial(settings.host, settings.port, settings.tls_files, waiter)
 
             password = read_password(settings.password_file)
             connection = Connection(
@@ -223,7 +220,7 @@ class Session:
     def _step(self, connection: Connection, waiter: Waiter) -> None:
         """Waits once, then reads and writes."""
         open_socket = connection.connection
-        pending = open_socket.pending
+        pending = open_socket.failure is not None
         readable, writable = waiter.wait(
             open_socket.connection,
             read=True,
