@@ -508,6 +508,21 @@ def test_a_packet_too_large_is_not_kept_while_it_comes(
     assert max(kept) < inbox.MAX_BYTES
 
 
+def test_a_broker_that_sends_messages_lives_though_it_answers_no_ping(
+    rig: Rig, fake: FakeBroker
+) -> None:
+    """Its answer may be behind many messages."""
+    run(rig, fake, keep_alive=1)
+    pings = 0
+    with fake.accept() as peer:
+        peer.welcome()
+        while pings < 2:
+            peer.send(publish("plant/ingest", text(command([1])), 1, 7, version=fake.version))
+            while (got := peer.receive()).kind != mqtt.PUBACK:
+                assert got.kind == mqtt.PINGREQ
+                pings += 1
+
+
 # Answers
 
 

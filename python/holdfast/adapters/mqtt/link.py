@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -51,7 +52,7 @@ _LARGEST = MAX_BYTES + _KEPT
 
 _READ = 65_536
 
-_PUBLISH, _PUBACK, _PUBREC, _PUBREL, _PUBCOMP = 0x30, 0x40, 0x50, 0x60, 0x70
+_PUBLISH, _PUBACK, _PUBREC, _PUBREL, _PUBCOMP, _PINGRESP = 0x30, 0x40, 0x50, 0x60, 0x70, 0xD0
 
 
 class _Pending(NamedTuple):
@@ -88,6 +89,7 @@ class BrokerConnection(BrokerClient):
         self.most_qos = 1
         """The highest quality of service that the broker accepts, at most 1."""
         self._packets = Packets(_LARGEST, _KEPT)
+        self._alive_at = time.monotonic()
         self._arrived: Iterator[tuple[int, bytes | bytearray, int]] = iter(())
         """What was read and is not handled yet."""
         self._is_late = False
@@ -167,7 +169,10 @@ class BrokerConnection(BrokerClient):
     def read_more(self) -> None:
         """Reads and handles what has arrived, while the broker takes the answers."""
         if not self._is_late:
-            self._arrived = self._packets.feed(self.connection.read(_READ))
+            data = self.connection.read(_READ)
+            self._arrived = self._packets.feed(data)
+            if data:
+                self._note_alive()
         self._is_late = True
         for first, body, size in self._arrived:
             self._handle(first, body, size)
@@ -176,6 +181,13 @@ class BrokerConnection(BrokerClient):
         self._is_late = False
         if self.connection.failure is not None:
             self.notice()
+
+    def _note_alive(self) -> None:
+        """Tells paho that the broker lives: its answer to a ping may be behind many messages."""
+        now = time.monotonic()
+        if now - self._alive_at >= self._settings.keep_alive / 4:
+            self._alive_at = now
+            self.pass_on(_PINGRESP, b"")
 
     def _handle(self, first: int, body: bytes | bytearray, size: int) -> None:
         """Handles a packet, whose body is cut if it is shorter than `size`."""
