@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast.config.scanning import Publish
+    from holdfast.scanner.nats.tolerant_client import SafeClient
     from holdfast.types import PolledBlock
 
 TARGET = NetworkTarget("tcp", "127.0.0.1", 502)
@@ -356,10 +357,11 @@ class Wire:
         self.pending_data_size = 0
         self.sent: list[bytes] = []
         self.stats = {"out_msgs": 0, "out_bytes": 0}
-        self._flush_queue = None
 
     async def _send_command(self, texts: bytes) -> None:
         self.sent.append(texts)
+
+    async def _flush_pending(self) -> None: ...
 
 
 async def _run(outbox: Outbox, seconds: float = 0.1) -> None:
@@ -371,7 +373,7 @@ async def _run(outbox: Outbox, seconds: float = 0.1) -> None:
 def test_messages_flow_in_order_while_they_are_taken() -> None:
     async def flow() -> list[bytes]:
         wire, outbox = Wire(), Outbox()
-        outbox.connected(cast("Client", wire))
+        outbox.connected(cast("SafeClient", wire))
         outbox.put([("a", b"1"), ("b", b"2"), ("a", b"3")])
         outbox.put([("a", b"4")])
         await _run(outbox)
@@ -388,7 +390,7 @@ def test_each_has_its_turn_while_more_comes_than_is_taken(monkeypatch: pytest.Mo
     async def flow() -> list[bytes]:
         wire, outbox = Wire(), Outbox()
         outbox.put([(key, b"%02d" % key) for key in keys])
-        outbox.connected(cast("Client", wire))
+        outbox.connected(cast("SafeClient", wire))
         running = asyncio.create_task(outbox.run())
         while len(wire.sent) < 30:
             await asyncio.sleep(0)
@@ -411,13 +413,13 @@ def test_the_newest_of_each_is_kept_while_they_are_not_taken(
         wire, outbox = Wire(), Outbox(max_kept=3)
         if how == "slow":
             wire.pending_data_size = outboxes.MAX_BACKLOG_BYTES
-            outbox.connected(cast("Client", wire))
+            outbox.connected(cast("SafeClient", wire))
         for text in (b"a1", b"b1", b"a2", b"c1", b"b2", b"d1"):
             outbox.put([(text[:1], text)])
         await _run(outbox)
         assert wire.sent == []
         wire.pending_data_size = 0
-        outbox.connected(cast("Client", wire))
+        outbox.connected(cast("SafeClient", wire))
         await _run(outbox)
         outbox.put([("e", b"e1"), ("e", b"e2")])
         await _run(outbox)

@@ -103,9 +103,9 @@ class Inbox:
 class Caller:
     """A NATS client beside the scanner; `options` are for `Client.connect`."""
 
-    def __init__(self, url: str | list[str], **options: Any) -> None:
+    def __init__(self, url: str | list[str], client: Client | None = None, **options: Any) -> None:
         self._loop = _Loop()
-        self.client = Client()
+        self.client = client or Client()
         self._loop.do(
             self.client.connect(
                 url,

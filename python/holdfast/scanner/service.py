@@ -33,7 +33,6 @@ from holdfast.scanner.subscriptions.rules import Rules
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Sequence
 
-    from nats.aio.client import Client
     from nats.aio.msg import Msg
 
     from holdfast._core import Poller
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.jetstream.buckets import Buckets
     from holdfast.scanner.messages.dialect import Dialect
     from holdfast.scanner.nats.connection import Handler
+    from holdfast.scanner.nats.tolerant_client import SafeClient
     from holdfast.scanner.placement import Placement
     from holdfast.scanner.settings import Settings
 
@@ -168,10 +168,10 @@ class Scanner:
         """Ends the service."""
         self._ended.set()
 
-    def _client(self) -> Client | None:
+    def _client(self) -> SafeClient | None:
         return self._broker.client
 
-    def _connected(self, client: Client | None) -> None:
+    def _connected(self, client: SafeClient | None) -> None:
         """Handles a new or lost connection."""
         self.outbox.connected(client)
         self._placement.connected(client)

@@ -21,9 +21,10 @@ from nats.errors import Error
 from holdfast import logs
 from holdfast.config.scanning import PING_INTERVAL, PINGS_OUTSTANDING
 from holdfast.net.secret_file import read_secret
-from holdfast.net.tls import NO_FILES, Tls, broker_context
+from holdfast.net.secure_channel import SecureChannel
+from holdfast.net.tls import NO_FILES, Tls
 from holdfast.scanner.nats.credentials import Credentials
-from holdfast.scanner.nats.tolerant_client import SafeClient, TlsClient
+from holdfast.scanner.nats.tolerant_client import SafeClient
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -88,7 +89,8 @@ class Servers:
             options["signature_cb"] = credentials.sign
             options["user_jwt_cb"] = credentials.jwt
         if self.secure:
-            options["tls"] = broker_context(self.tls)
+            SecureChannel("localhost", self.tls)  # Checks the files.
+            options["tls"] = self.tls
         return options
 
 
@@ -109,7 +111,7 @@ class Broker:
         self,
         servers: Servers,
         handlers: Mapping[str, Handler],
-        connected: Callable[[Client | None], None],
+        connected: Callable[[SafeClient | None], None],
         ping: Ping,
         *,
         name: str = "holdfast scan",
@@ -148,7 +150,7 @@ class Broker:
         Raises `OSError` for an unusable file before the first connection.
         """
         while True:
-            client = TlsClient() if self._servers.secure else SafeClient()
+            client = SafeClient(requires_tls=self._servers.secure)
             ended = asyncio.Event()
             try:
                 await self._connect(client, ended)
@@ -265,7 +267,7 @@ async def connected_once(
     Raises `ConnectionError`, which names the servers, if there is none in time, and `OSError` for
     an unusable file.
     """
-    client = TlsClient() if servers.secure else SafeClient()
+    client = SafeClient(requires_tls=servers.secure)
     options = servers.options()
     failures: list[Exception] = []
 

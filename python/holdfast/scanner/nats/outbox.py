@@ -19,7 +19,7 @@ from holdfast.scanner.nats import wire
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from nats.aio.client import Client
+    from holdfast.scanner.nats.tolerant_client import SafeClient
 
 MAX_BACKLOG_BYTES = 2 * 1024 * 1024
 """Unsent bytes above which the connection counts as slow."""
@@ -52,7 +52,7 @@ class Outbox:
         self._may_send = may_send
         self._on_drop = on_drop
         self._at_once = at_once
-        self._client: Client | None = None
+        self._client: SafeClient | None = None
         self._queue: list[bytes] = []
         self._queue_bytes = 0
         self._kept: OrderedDict[object, bytes] = OrderedDict()
@@ -65,7 +65,7 @@ class Outbox:
         self.dropped = 0
         """Messages lost because too many were kept."""
 
-    def connected(self, client: Client | None) -> None:
+    def connected(self, client: SafeClient | None) -> None:
         """Sets the client for further messages; `None` while there is no connection."""
         self._client = client
         self._has_messages.set()
@@ -114,7 +114,7 @@ class Outbox:
             with contextlib.suppress(Error):
                 await self._client.flush()
 
-    async def _send(self, client: Client) -> None:
+    async def _send(self, client: SafeClient) -> None:
         texts = self._queue
         self._queue, self._queue_bytes = [], 0
         if not texts:

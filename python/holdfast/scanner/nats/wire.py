@@ -17,16 +17,16 @@ The texts are not checked here. `publishing` creates them from device ids that `
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 from typing import TYPE_CHECKING
 
 import msgspec
-from nats.aio.transport import TcpTransport
 from nats.errors import Error
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
+
+    from holdfast.scanner.nats.tolerant_client import SafeClient
 
 _encode = msgspec.json.Encoder().encode
 
@@ -72,19 +72,20 @@ async def send(client: Client, texts: bytes, count: int) -> None:
     client.stats["out_msgs"] += count
     client.stats["out_bytes"] += len(texts)
     with contextlib.suppress(OSError, Error):  # The client notices the error and reconnects.
+        is_first = backlog(client) == 0  # Otherwise its flusher is already awake.
         await client._send_command(texts)
-        if client._flush_queue is not None and client._flush_queue.empty():
+        if is_first:
             await client._flush_pending()
 
 
-def send_at_once(client: Client, texts: bytes, count: int) -> None:
+def send_at_once(client: SafeClient, texts: bytes, count: int) -> None:
     """Hands the texts of `count` messages to the system, before the event loop runs anything else.
 
     Only if `unsent` is 0, else they wait. They are lost if the connection breaks.
     """
     client.stats["out_msgs"] += count
     client.stats["out_bytes"] += len(texts)
-    _writer(client).write(texts)
+    client.transport.write(texts)
 
 
 def backlog(client: Client) -> int:
@@ -92,13 +93,6 @@ def backlog(client: Client) -> int:
     return client.pending_data_size
 
 
-def unsent(client: Client) -> int:
+def unsent(client: SafeClient) -> int:
     """Returns the number of bytes that this process has not handed to the system."""
-    return client.pending_data_size + _writer(client).transport.get_write_buffer_size()
-
-
-def _writer(client: Client) -> asyncio.StreamWriter:
-    transport = client._transport
-    assert isinstance(transport, TcpTransport), "servers are nats:// or tls://"
-    assert transport._io_writer is not None, "it was connected"
-    return transport._io_writer
+    return client.pending_data_size + client.transport.unsent

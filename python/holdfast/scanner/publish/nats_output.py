@@ -16,7 +16,7 @@ from holdfast.faults import fault_text, is_exception
 from holdfast.net.event_loop import EventLoop
 from holdfast.outputs.sending import soon_after
 from holdfast.scanner.messages.dialects import DIALECTS
-from holdfast.scanner.nats.tolerant_client import SafeClient, TlsClient
+from holdfast.scanner.nats.tolerant_client import SafeClient
 from holdfast.scanner.subscriptions.tag import datatype
 from holdfast.tags.text import plain
 
@@ -124,7 +124,7 @@ class NatsOutput:
             async def is_lost() -> None:
                 lost.set()
 
-            client = TlsClient() if self._servers.secure else SafeClient()
+            client = SafeClient(requires_tls=self._servers.secure)
             try:
                 await asyncio.wait_for(self._connect(client, is_lost), CONNECT_TIMEOUT_S)
             except BaseException:
