@@ -21,10 +21,9 @@ import common
 from nats.aio.client import Client
 
 from holdfast.nats_server import TemporaryServer
-from holdfast.scanner import wire
-from holdfast.scanner.groups import Group
-from holdfast.scanner.publishing import Publisher
-from holdfast.scanner.tags import Tag
+from holdfast.scanner.nats import wire
+from holdfast.scanner.publish import Publisher
+from holdfast.scanner.subscriptions import Group, Tag
 
 TAGS = 100
 TICKS = os.sysconf("SC_CLK_TCK")

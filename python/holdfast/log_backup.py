@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from nats.errors import Error, NoRespondersError
 
 from holdfast.net import event_loop
-from holdfast.scanner.broker import connected_once
+from holdfast.scanner.nats import connected_once
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast.scanner import Servers
-    from holdfast.scanner.receiving import SafeClient
+    from holdfast.scanner.nats import SafeClient
 
     T = TypeVar("T")
 

@@ -14,6 +14,7 @@ import pytest
 from holdfast.adapters.mqtt import adapter, inbox, link
 from holdfast.ingest import MemoryAccess
 from holdfast.mqtt import dialing
+from holdfast.mqtt.stream import BrokerSocket
 from support import mqtt_peer as mqtt
 from support import wire
 from support.mqtt_peer import FakeBroker, publish
@@ -179,6 +180,21 @@ def test_a_release_of_something_unknown_is_answered(rig: Rig, fake: FakeBroker) 
         peer.send(mqtt.acknowledge(mqtt.PUBREL, 1234))
         assert peer.expect(mqtt.PUBCOMP).identifier == 1234
         works(rig, peer, fake.version)
+
+
+def test_an_identifier_can_be_used_again_after_its_release(rig: Rig, fake: FakeBroker) -> None:
+    """Also if the broker does not set the flags of the release."""
+    run(rig, fake)
+    with fake.accept() as peer:
+        peer.welcome()
+        for value, release in enumerate((b"\x62\x02\x00\x07", b"\x60\x02\x00\x07", b""), 1):
+            message = text(command([value]))
+            peer.send(publish("plant/ingest", message, 2, 7, version=fake.version))
+            assert peer.expect(mqtt.PUBREC).identifier == 7
+            assert rig.registers(0, 1) == [value]
+            if release:
+                peer.send(release)
+                assert peer.expect(mqtt.PUBCOMP).identifier == 7
 
 
 # What it says
@@ -473,14 +489,13 @@ def test_a_packet_too_large_is_not_kept_while_it_comes(
     rig: Rig, fake: FakeBroker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept = []
-    read = link.BrokerConnection._packet_read
+    read = link.BrokerConnection.read_more
 
-    def spy(self: link.BrokerConnection) -> Any:
-        code = read(self)
-        kept.append(len(self._in_packet["packet"]))
-        return code
+    def spy(self: link.BrokerConnection) -> None:
+        read(self)
+        kept.append(len(self._packets._body) + len(self._packets._left))
 
-    monkeypatch.setattr(link.BrokerConnection, "_packet_read", spy)
+    monkeypatch.setattr(link.BrokerConnection, "read_more", spy)
     run(rig, fake)
     with fake.accept() as peer:
         peer.welcome()
@@ -491,6 +506,21 @@ def test_a_packet_too_large_is_not_kept_while_it_comes(
 
     assert rig.memory_access.counts()["refused"] == {"too_large": 1}
     assert max(kept) < inbox.MAX_BYTES
+
+
+def test_a_broker_that_sends_messages_lives_though_it_answers_no_ping(
+    rig: Rig, fake: FakeBroker
+) -> None:
+    """Its answer may be behind many messages."""
+    run(rig, fake, keep_alive=1)
+    pings = 0
+    with fake.accept() as peer:
+        peer.welcome()
+        while pings < 2:
+            peer.send(publish("plant/ingest", text(command([1])), 1, 7, version=fake.version))
+            while (got := peer.receive()).kind != mqtt.PUBACK:
+                assert got.kind == mqtt.PINGREQ
+                pings += 1
 
 
 # Answers
@@ -576,22 +606,22 @@ class Jammed(socket.socket):
 def test_nothing_piles_up_while_the_broker_does_not_read(
     rig: Rig, fake5: FakeBroker, monkeypatch: pytest.MonkeyPatch, qos: int
 ) -> None:
-    dial, queue = dialing.dial, link.BrokerConnection._packet_queue
+    dial, read = dialing.dial, link.BrokerConnection.read_more
     most = {"packets": 0, "answers": 0}
 
-    def dial_one_that_jams(*arguments: Any) -> socket.socket:
-        connection = Jammed(fileno=dial(*arguments).detach())
-        connection.setblocking(False)
-        return connection
+    def dial_one_that_jams(*arguments: Any) -> BrokerSocket:
+        dialed = dial(*arguments)
+        dialed.connection = Jammed(fileno=dialed.connection.detach())
+        dialed.connection.setblocking(False)
+        return dialed
 
-    def spy(self: link.BrokerConnection, *arguments: Any) -> Any:
-        code = queue(self, *arguments)
-        most["packets"] = max(most["packets"], self.unsent)
-        most["answers"] = max(most["answers"], len(self._out_messages))
-        return code
+    def spy(self: link.BrokerConnection) -> None:
+        read(self)
+        most["packets"] = max(most["packets"], self.connection.unsent)
+        most["answers"] = max(most["answers"], len(self._on_the_way) + len(self._waiting))
 
     monkeypatch.setattr(adapter, "dial", dial_one_that_jams)
-    monkeypatch.setattr(link.BrokerConnection, "_packet_queue", spy)
+    monkeypatch.setattr(link.BrokerConnection, "read_more", spy)
     monkeypatch.setattr(Jammed, "jam", threading.Event())
     running = run(rig, fake5)
     with fake5.accept() as peer:

@@ -13,8 +13,8 @@ import pytest
 
 from holdfast.appliance import control
 from holdfast.scanner import Servers
-from holdfast.scanner.broker import connected_once
-from holdfast.scanner.fleet.looking import FleetUnavailable, Looker
+from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
+from holdfast.scanner.nats import connected_once
 from support import wire
 from support.brokers import NatsServer, free_port
 from support.cli import failure
@@ -98,7 +98,7 @@ def fleet(tmp_path: Path) -> Iterator[NatsServer]:
 
 def test_a_look_at_a_fleet_ends_with_its_connection(fleet: NatsServer) -> None:
     async def look() -> None:
-        async with Looker("plant", Servers((fleet.url,))) as looker:
+        async with FleetObserver("plant", Servers((fleet.url,))) as looker:
             assert not (await looker.look()).nodes
             fleet.kill()
             async with asyncio.timeout(wire.DEADLINE):
@@ -112,7 +112,7 @@ def test_a_look_at_a_fleet_ends_with_its_connection(fleet: NatsServer) -> None:
 
 def test_a_server_without_jetstream_is_named(tmp_path: Path) -> None:
     async def look() -> None:
-        async with Looker("plant", Servers((server.url,))):
+        async with FleetObserver("plant", Servers((server.url,))):
             pass
 
     server = NatsServer(tmp_path, jetstream=False)

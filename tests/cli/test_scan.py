@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import pytest
 from nats.errors import NoRespondersError
 
-from holdfast.scanner.schema import json_schema
+from holdfast.scanner.messages.schema import json_schema
 from support import wire
 from support.brokers import NatsServer
 from support.cli import done, invoke, usage_error

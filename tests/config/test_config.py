@@ -353,7 +353,7 @@ def test_a_url_says_where_the_broker_is(
     loaded: Callable[..., Config], url: str, parts: tuple[str, int, bool]
 ) -> None:
     mqtt = mqtt_of(loaded, f"url: '{url}'")
-    assert (mqtt.host, mqtt.port, mqtt.secure) == parts
+    assert (mqtt.host, mqtt.port, mqtt.tls_files is not None) == parts
 
 
 def test_mqtt_has_the_documented_defaults(loaded: Callable[..., Config]) -> None:

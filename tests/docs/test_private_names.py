@@ -24,7 +24,7 @@ from packaging.version import Version
 from support.paths import DOCS, ROOT
 
 PRODUCT = ROOT / "python" / "holdfast"
-UNDOCUMENTED = ("nats.protocol.parser", "uvicorn.protocols", "uvicorn.server")
+UNDOCUMENTED = ("nats.aio.transport", "nats.protocol", "uvicorn.protocols", "uvicorn.server")
 """Modules that nothing in their package's documentation speaks of."""
 
 HTTP = "uvicorn.protocols.http"
@@ -38,11 +38,7 @@ VARIABLES = {
         "state": "uvicorn.server.ServerState",
         "server_state": "uvicorn.server.ServerState",
     },
-    "scanner/receiving.py": {"nc": "nats.aio.client.Client"},
-    "scanner/wire.py": {
-        "client": "nats.aio.client.Client",
-        "transport": "nats.aio.transport.TcpTransport",
-    },
+    "scanner/nats/wire.py": {"client": "nats.aio.client.Client"},
 }
 """What variables hold that a file takes private names of, by their names."""
 

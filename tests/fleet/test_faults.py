@@ -30,6 +30,7 @@ from support.fleet_nodes import (
 from support.judges import Judges
 from support.leases import BRIEF
 from support.nats_bus import Caller, Running, logged
+from support.scanner_parts import member_of, registry_of
 from support.scanner_process import begin_scanner, freeze
 from support.tcp_proxy import Proxy
 
@@ -100,9 +101,8 @@ def settings(name: str, url: str, writes: Writes = "tags") -> Settings:
 
 
 def partitions(running: Running) -> int:
-    part = running.scanner._part
-    assert part is not None
-    return len(part.fleet.partitions)
+    member = member_of(running.scanner)
+    return len(member.fleet.partitions)
 
 
 def share(*nodes: Running) -> None:
@@ -204,7 +204,7 @@ def test_the_newest_of_what_nodes_know_is_restored(
     share(late, other)
     with Caller(server.url) as caller:
         subscribe_all(caller, judges)
-        registries = [running.scanner._registry for running in (late, other)]
+        registries = [registry_of(running.scanner) for running in (late, other)]
         wire.until(lambda: all(len(each.devices) == DEVICES for each in registries), "known")
         proxies[0].down()
         wire.until(lambda: partitions(other) == PARTITIONS, "the other node has all")
@@ -268,7 +268,7 @@ def test_a_subscription_reaches_all_nodes_after_a_server_has_ended(
 ) -> None:
     nodes = [first_of(cluster, node), node("b", *cluster.urls)]
     share(*nodes)
-    registries = [running.scanner._registry for running in nodes]
+    registries = [registry_of(running.scanner) for running in nodes]
     with Caller(cluster.urls) as caller:
         # Each server may be the one that sends changes to a node that is connected elsewhere.
         for number, server in enumerate(list(cluster.servers.values())):
@@ -329,28 +329,27 @@ def test_wall_time_may_jump(
         [timed, *_] = judges.devices
         subscribed(caller, 0, timed, scanRate=100, ttl=3600)
         now = time.time
-        taken = [part_of(each).fleet.leases.held for each in nodes]
+        taken = [as_member(each).fleet.leases.held for each in nodes]
         for jump in (86_400.0, -86_400.0, 0.0):
             monkeypatch.setattr(time, "time", lambda jump=jump: now() + jump)
             monkeypatch.setattr(time, "time_ns", lambda jump=jump: int((now() + jump) * 1e9))
             subscribed(caller, 1, judges.devices[1], scanRate=100, ttl=3600)
-            revisions = [part_of(each).fleet.leases.revision("partition.0") for each in nodes]
+            revisions = [as_member(each).fleet.leases.revision("partition.0") for each in nodes]
             wire.until(partial(are_renewed, nodes, revisions), "leases are renewed")
             until_scanned(judges)
-        assert [part_of(each).fleet.leases.held for each in nodes] == taken
+        assert [as_member(each).fleet.leases.held for each in nodes] == taken
         assert not logged(caplog, "lease_lost")
         assert not logged(caplog, "expired")
         assert known(caller) == EVERYTHING
     check(judges)
 
 
-def part_of(running: Running) -> Any:
-    assert running.scanner._part is not None
-    return running.scanner._part
+def as_member(running: Running) -> Any:
+    return member_of(running.scanner)
 
 
 def are_renewed(nodes: list[Running], revisions: list[int]) -> bool:
-    found: int = sum(part_of(each).fleet.leases.revision("partition.0") for each in nodes)
+    found: int = sum(as_member(each).fleet.leases.revision("partition.0") for each in nodes)
     return found > sum(revisions)
 
 

@@ -12,17 +12,18 @@ import pytest
 
 from holdfast.leases import LEASE_TIMES, LeaseTimes
 from holdfast.scanner import FleetSettings
-from holdfast.scanner.fleet import part as parts
+from holdfast.scanner.fleet import member as members
 from support import wire
 from support.fleet_nodes import FLEET, prepare
 from support.judges import Judges
 from support.leases import BRIEF
 from support.nats_bus import Caller, logged
+from support.scanner_parts import client_of, member_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from holdfast.scanner.fleet.part import FleetPart
+    from holdfast.scanner.fleet.member import FleetMember
     from support.brokers import NatsServer
     from support.judges import Judge
     from support.nats_bus import Run, Running
@@ -47,17 +48,15 @@ def judges() -> Iterator[Judges]:
         yield judges
 
 
-def part_of(running: Running) -> FleetPart:
-    part = running.scanner._part
-    assert part is not None
-    return part
+def as_member(running: Running) -> FleetMember:
+    return member_of(running.scanner)
 
 
 def share(*nodes: Running) -> None:
     """Waits until each node has its share of the partitions."""
     each = [PARTITIONS // len(nodes)] * len(nodes)
     wire.until(
-        lambda: [len(part_of(node).fleet.partitions) for node in nodes] == each, "they are shared"
+        lambda: [len(as_member(node).fleet.partitions) for node in nodes] == each, "they are shared"
     )
 
 
@@ -96,13 +95,13 @@ def test_a_busy_event_loop_loses_no_device(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(parts, "HANGING", math.inf)
+    monkeypatch.setattr(members, "HANG_AFTER_S", math.inf)
     times = LeaseTimes(ttl_s=2.0, hold_s=1.5, renewal_s=0.2)
     one, two = node("a", times), node("b", times)
     share(one, two)
     subscribe(own_nats, judges)
     polled(judges)
-    fleet, seen = part_of(one).fleet, part_of(two).fleet.leases.seen
+    fleet, seen = as_member(one).fleet, as_member(two).fleet.leases.seen
     held = dict(fleet.leases.held)
 
     async def be_busy() -> None:
@@ -129,11 +128,11 @@ def test_others_take_over_from_a_node_whose_event_loop_hangs(
     one, two = node("a", BRIEF), node("b", BRIEF)
     share(one, two)
     subscribe(own_nats, judges)
-    part = part_of(one)
-    heartbeat, part._heartbeat = part._heartbeat, Hangs()  # type: ignore[assignment]
+    member = as_member(one)
+    heartbeat, member._heartbeat = member._heartbeat, Hangs()  # type: ignore[assignment]
     share(two)
     polled(judges)
-    part._heartbeat = heartbeat
+    member._heartbeat = heartbeat
     share(one, two)
     polled(judges)
 
@@ -144,10 +143,10 @@ def test_others_take_over_from_a_node_that_can_publish_nothing(
     one, two = node("a", BRIEF), node("b", BRIEF)
     share(one, two)
     subscribe(own_nats, judges)
-    part, client = part_of(one), one.scanner._broker.client
+    member, client = as_member(one), client_of(one.scanner)
 
     async def connected(is_connected: bool) -> None:
-        part.connected(client if is_connected else None)
+        member.connected(client if is_connected else None)
 
     one.do(connected(False))
     share(two)
@@ -163,7 +162,7 @@ def test_the_connection_of_leases_is_made_again(
     one, two = node("a"), node("b")
     share(one, two)
     subscribe(own_nats, judges)
-    leases, thread = part_of(one).fleet.leases, part_of(one).fleet._thread
+    leases, thread = as_member(one).fleet.leases, as_member(one).fleet._thread
     client = leases._client
     assert client is not None
     assert thread._loop is not None
@@ -176,9 +175,9 @@ def test_the_connection_of_leases_is_made_again(
 def test_the_thread_of_leases_ends_with_the_node(node: Callable[..., Running]) -> None:
     one = node("a")
     share(one)
-    thread = part_of(one).fleet._thread._thread
+    thread = as_member(one).fleet._thread._thread
     assert thread is not None
     assert thread.is_alive()
     one.stop()
     assert not thread.is_alive()
-    assert not part_of(one).fleet.leases.held
+    assert not as_member(one).fleet.leases.held

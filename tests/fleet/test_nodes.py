@@ -15,19 +15,21 @@ from nats.errors import TimeoutError as NoAnswer
 
 from holdfast.config.scanning import parse_pollable
 from holdfast.leases import LEASE_TIMES, LeaseTimes
-from holdfast.scanner import FleetRefused, FleetSettings, Scanner, Servers, Settings, service
-from holdfast.scanner.keeping import Unit
+from holdfast.scanner import FleetRefused, FleetSettings, Scanner, Servers, Settings
+from holdfast.scanner.fleet import reports
+from holdfast.scanner.subscriptions import SubscriptionKey
 from support import wire
 from support.cli import invoke
 from support.fleet_nodes import FLEET, prepare
 from support.judges import Judges
 from support.leases import BRIEF
 from support.nats_bus import Caller
+from support.scanner_parts import client_of, member_of, registry_of, ttls_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from holdfast.scanner.expiring import Expiring
+    from holdfast.scanner.subscriptions import SubscriptionTtls
     from support.brokers import NatsServer
     from support.judges import Judge
     from support.nats_bus import Run, Running
@@ -72,9 +74,8 @@ def wanted(judge: Judge, number: int = 0, **more: Any) -> dict[str, Any]:
 
 
 def partitions(running: Running) -> int:
-    part = running.scanner._part
-    assert part is not None
-    return len(part.fleet.partitions)
+    member = member_of(running.scanner)
+    return len(member.fleet.partitions)
 
 
 def subscribe_all(caller: Caller, judges: Judges) -> None:
@@ -209,7 +210,7 @@ def test_many_devices_are_browsed_in_pages(
     judges: Judges,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(service, "BROWSED", 3)
+    monkeypatch.setattr(reports, "DEVICES_PER_QUESTION", 3)
     share(node("a"), node("b"))
     subscribe_all(caller, judges)
 
@@ -288,10 +289,8 @@ def test_messages_over_a_new_connection_have_a_greater_number(
     caller.request("modbus.subscribe", wanted(judges.devices[0]))
     wire.until(lambda: all(map(bool, numbers.values())), "values and a status come")
     [first] = set(numbers["data"])
-    part, client = one.scanner._part, one.scanner._broker.client
-    assert part is not None
-    assert client is not None
-    leases = part.fleet.leases
+    member, client = member_of(one.scanner), client_of(one.scanner)
+    leases = member.fleet.leases
     held = next(key for key, since in leases.held.items() if since == first)
     wire.until(lambda: leases.revision(held) > first, "the lease is renewed")
     one.do(client.force_reconnect())
@@ -310,28 +309,28 @@ def test_a_subscription_ends_by_its_ttl_unless_any_node_renews_it(
     timed, kept, *_ = judges.devices
     assert caller.request("modbus.subscribe", wanted(kept, 1))["success"]
     assert caller.request("modbus.subscribe", wanted(timed, 0, ttl=1000))["success"]
-    unit = Unit("d0", "hmi")
-    times = [running.scanner._expiring for running in nodes]
-    wire.until(lambda: all(unit in each._ends for each in times), "both nodes know it")
+    key = SubscriptionKey("d0", "hmi")
+    times = [ttls_of(running.scanner) for running in nodes]
+    wire.until(lambda: all(key in each._ends for each in times), "both nodes know it")
     for _ in range(3):
-        before = [each._ends[unit] for each in times]
+        before = [each._ends[key] for each in times]
         assert caller.request("modbus.subscribe", wanted(timed, 0, ttl=1000))["success"]
-        wire.until(partial(are_later, times, unit, before), "both nodes have renewed it")
+        wire.until(partial(are_later, times, key, before), "both nodes have renewed it")
     for running in nodes:
-        running.do(let_pass(running.scanner._expiring, 1000))
+        running.do(let_pass(ttls_of(running.scanner), 1000))
     wire.until(lambda: caller.request("modbus.browse", "")["count"] == 1, "it has ended")
-    registries = [running.scanner._registry for running in nodes]
+    registries = [registry_of(running.scanner) for running in nodes]
     wire.until(lambda: all(len(each.devices) == 1 for each in registries), "for all")
 
 
-def are_later(times: list[Expiring], unit: Unit, before: list[float]) -> bool:
-    return all(each._ends[unit] > end for each, end in zip(times, before, strict=True))
+def are_later(times: list[SubscriptionTtls], key: SubscriptionKey, before: list[float]) -> bool:
+    return all(each._ends[key] > end for each, end in zip(times, before, strict=True))
 
 
-async def let_pass(expiring: Expiring, seconds: float) -> None:
+async def let_pass(ttls: SubscriptionTtls, seconds: float) -> None:
     """Moves the clock of the subscriptions of a node."""
-    expiring._clock = lambda: time.monotonic() + seconds
-    expiring._news.set()
+    ttls._clock = lambda: time.monotonic() + seconds
+    ttls._changed.set()
 
 
 def test_one_node_or_all_are_shut_down(node: Callable[..., Running], caller: Caller) -> None:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
-from holdfast.scanner import wire
-from holdfast.scanner.fleet.terms import Terms
-from holdfast.scanner.outbox import Outbox
+from holdfast.scanner.fleet.agreement import Terms
+from holdfast.scanner.nats import Outbox, wire
 
 
 def test_a_message_with_the_revision_of_its_lease_has_a_header() -> None:
@@ -27,7 +26,7 @@ def test_a_node_that_was_stopped_for_too_long_drops_what_waits() -> None:
 
     async def work() -> None:
         lost = asyncio.Event()
-        outbox = Outbox(may_send=lambda: False, lost=lost.set)
+        outbox = Outbox(may_send=lambda: False, on_drop=lost.set)
         outbox.connected(Connected())  # type: ignore[arg-type]
         outbox.put([(("d", "t"), b"PUB")])
         running = asyncio.create_task(outbox.run())

@@ -13,7 +13,7 @@ from nats.errors import TimeoutError as NatsTimeout
 from holdfast.leases import LeaseBucket, Leases, LeaseTimes
 from holdfast.leases.bucket import Outdated
 from holdfast.leases.entries import SETTLED
-from holdfast.scanner.broker import Broker, Ping, Servers
+from holdfast.scanner.nats import Broker, Ping, Servers
 from support import wire
 from support.brokers import NatsServer
 from support.leases import ENDLESS, LASTING, SHORT, make_settled

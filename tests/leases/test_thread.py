@@ -12,7 +12,7 @@ import pytest
 
 from holdfast.leases import Leases, LeaseThread, LeaseTimes, Relay
 from holdfast.runtime import tasks
-from holdfast.scanner.broker import Broker, Ping, Servers
+from holdfast.scanner.nats import Broker, Ping, Servers
 from support import wire
 from support.brokers import NatsServer
 from support.leases import ENDLESS, LASTING, make_settled

@@ -216,7 +216,7 @@ def test_a_broker_with_tls_is_trusted_by_its_authority(tmp_path: Path) -> None:
         plant.url = plant.url.replace("mqtt:", "mqtts:")
         plant.run()
         wire.until(lambda: plant.status().get("last_error") is not None, "an error")
-        assert str(plant.status()["last_error"]).startswith("unknown_issuer: ")
+        assert "the issuer of the certificate is unknown" in plant.status()["last_error"]
         plant.stop()
         plant.run(tls={"ca_file": str(authority.ca)})
         wire.until(lambda: plant.count("sent") >= 4, "values are sent")

@@ -10,8 +10,9 @@ import pytest
 
 from holdfast.config.outputs import MqttOutputConfig
 from holdfast.mqtt.packets import parse_publish
+from holdfast.mqtt.stream import Packets
 from holdfast.outputs.mqtt import MqttOutput
-from holdfast.outputs.mqtt.packets import Packets
+from holdfast.outputs.mqtt.connection import MAX_PACKET
 from holdfast.runtime.stop import Stop
 from support.readings import numbered
 
@@ -45,16 +46,16 @@ class Broker:
                         pass
 
     def _serve(self, connection: socket.socket, most: int) -> None:
-        packets, confirmed = Packets(), 0
+        packets, confirmed = Packets(MAX_PACKET), 0
         seen: list[int] = []
         self.seen.append(seen)
         while data := connection.recv(65536):
-            for first, body in packets.feed(data):
+            for first, body, size in packets.feed(data):
                 if first >> 4 == 1:
                     connection.sendall(b"\x20\x03\x00\x00\x00")
                 if first >> 4 != 3:
                     continue
-                message = parse_publish(first, body, len(body), five=True)
+                message = parse_publish(first, body, size, five=True)
                 is_value = message.topic.endswith("/t")
                 if is_value and confirmed == most:
                     return

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import random
+import socket
 from typing import TYPE_CHECKING
 
 import pytest
 
 from holdfast.config.topics import TopicNames
 from holdfast.mqtt.packets import parse_publish
+from holdfast.mqtt.stream import BrokerSocket, Packets
 from holdfast.mqtt.waiting import Waiter
+from holdfast.outputs.mqtt.connection import MAX_PACKET
 from holdfast.outputs.mqtt.messages import Delivery, Message, packed, packed_topic
-from holdfast.outputs.mqtt.packets import MAX_PACKET, Packets
 from holdfast.runtime.stop import Stop
 from support.config_folder import Folder
 
@@ -28,9 +30,9 @@ def message(payload: bytes = b"1", *, retain: bool = False) -> Message:
 def test_what_is_sent_is_what_is_parsed(size: int, five: bool) -> None:
     sent = [message(bytes([at]) * size, retain=at == 1) for at in range(3)]
     data = packed(sent, [7, 8, 9], qos=1, five=five)
-    found = list(Packets().feed(data))
-    assert [first & 1 for first, _ in found] == [0, 1, 0]
-    parsed = [parse_publish(first, body, len(body), five=five) for first, body in found]
+    found = list(Packets(MAX_PACKET).feed(data))
+    assert [first & 1 for first, _, _ in found] == [0, 1, 0]
+    parsed = [parse_publish(first, body, size, five=five) for first, body, size in found]
     assert [each.identifier for each in parsed] == [7, 8, 9]
     assert [bytes(each.payload) for each in parsed] == [each.payload for each in sent]
     assert {each.topic for each in parsed} == {"plant/pump/n"}
@@ -40,8 +42,8 @@ def test_packets_are_found_in_pieces_of_any_size() -> None:
     chance = random.Random(7)
     sent = [message(bytes(chance.randrange(300))) for _ in range(50)]
     data = packed(sent, range(1, 51), qos=1, five=True)
-    whole = list(Packets().feed(data))
-    packets, found = Packets(), []
+    whole = list(Packets(MAX_PACKET).feed(data))
+    packets, found = Packets(MAX_PACKET), []
     while data:
         size = chance.randrange(1, 40)
         found += list(packets.feed(data[:size]))
@@ -50,19 +52,51 @@ def test_packets_are_found_in_pieces_of_any_size() -> None:
 
 
 def test_a_packet_that_is_too_large_is_skipped_and_not_kept() -> None:
-    packets = Packets()
+    packets = Packets(MAX_PACKET)
     data = packed([message(bytes(10 * MAX_PACKET)), message(b"next")], [1, 2], qos=1, five=True)
     found = []
     for at in range(0, len(data), 1000):
         found += list(packets.feed(data[at : at + 1000]))
-        assert len(packets._left) <= MAX_PACKET
-    assert [body[-4:] for _, body in found] == [b"next"]
+        assert len(packets._left) + len(packets._body) <= MAX_PACKET
+    assert [body[-4:] for _, body, _ in found] == [b"next"]
     assert packets.skipped == 1
+
+
+@pytest.mark.parametrize("piece", [1, 7, 1000, 2**20])
+def test_a_packet_that_is_too_large_can_be_cut(piece: int) -> None:
+    packets = Packets(1000, kept=100)
+    large, small = message(bytes(range(256)) * 8), message(b"next")
+    data = packed([small, large, large, small], range(1, 5), qos=1, five=True)
+    found = []
+    for at in range(0, len(data), piece):
+        found += [(bytes(body), size) for _, body, size in packets.feed(data[at : at + piece])]
+        assert len(packets._left) + len(packets._body) <= 1000
+    whole = [body for _, body, _ in Packets(MAX_PACKET).feed(data)]
+    cut = [whole[0], whole[1][:100], whole[2][:100], whole[3]]
+    assert found == [(body, len(full)) for body, full in zip(cut, whole, strict=True)]
+
+
+def test_packets_keep_their_order_while_the_broker_takes_little() -> None:
+    mine, peer = socket.socketpair()
+    with mine, peer:
+        mine.setblocking(False)
+        mine.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        broker = BrokerSocket(mine)
+        sent = [bytes([number]) * 3000 for number in range(100)]
+        for number, packet in enumerate(sent):
+            assert (broker.send if number % 2 else broker.put)(packet) in (None, 3000)
+        assert broker.unsent > 10
+        got = b""
+        while len(got) < 300_000:
+            got += peer.recv(2**16)
+            broker.flush()
+        assert got == b"".join(sent)
+        assert not broker.unsent
 
 
 def test_a_length_of_five_bytes_is_malformed() -> None:
     with pytest.raises(ValueError, match="more than 4 bytes"):
-        list(Packets().feed(b"\x30\xff\xff\xff\xff\x01"))
+        list(Packets(MAX_PACKET).feed(b"\x30\xff\xff\xff\xff\x01"))
 
 
 def test_confirmations_count_without_a_gap() -> None:

@@ -12,8 +12,8 @@ from holdfast.outputs import Buffer, Sending
 from holdfast.outputs import sending as module
 from holdfast.runtime.stop import Stop
 from holdfast.scanner import Servers
-from holdfast.scanner import output as output_module
-from holdfast.scanner.output import NatsOutput
+from holdfast.scanner.publish import nats_output as output_module
+from holdfast.scanner.publish.nats_output import NatsOutput
 from support import wire
 from support.nats_bus import Caller
 from support.readings import TIME, numbered, reading, tag
@@ -130,7 +130,7 @@ def test_a_frozen_server_does_not_hold_up_a_stop(
     own_nats: NatsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "LAST", 0.05)
-    monkeypatch.setattr(output_module, "TIMEOUT", 3600.0)
+    monkeypatch.setattr(output_module, "CONFIRM_TIMEOUT_S", 3600.0)
     output = NatsOutput(Servers((own_nats.url,)), "modbus", "tentacle")
     buffer, stop = Buffer(), Stop()
     sending = Sending("nats", output, buffer)

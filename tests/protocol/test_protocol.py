@@ -10,7 +10,7 @@ import pytest
 from holdfast import _core, faults, protocol, types
 from holdfast.gateway.assets import FOLDER
 from holdfast.scanner.messages import FunctionCode
-from holdfast.scanner.tags import AREA_OF_CODE
+from holdfast.scanner.subscriptions import AREA_OF_CODE
 from support import server_model
 
 COILS, DISCRETE_INPUTS, HOLDING_REGISTERS, INPUT_REGISTERS = (

@@ -11,7 +11,7 @@ import pytest
 from holdfast.scanner import ScannerLimits
 from holdfast.scanner.commands import value
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.tags import Tag
+from holdfast.scanner.subscriptions import Tag
 from support import wire
 from support.fake_device import FakeDevice, exception, registers
 from support.nats_bus import leaving, subscription, tag

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.scanner.expiring import Expiring
-from holdfast.scanner.keeping import BUCKET, Unit
+from holdfast.scanner.jetstream import BUCKET
+from holdfast.scanner.subscriptions import SubscriptionKey, SubscriptionTtls
 from support import wire
 from support.nats_bus import Caller, leaving, subscription, tag
 
@@ -33,70 +33,70 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def expiring(clock: Clock) -> Expiring:
-    made = Expiring(clock)
+def ttls(clock: Clock) -> SubscriptionTtls:
+    made = SubscriptionTtls(clock)
     made.connected(True)
     return made
 
 
-UNIT = Unit("plc1", "hmi")
+KEY = SubscriptionKey("plc1", "hmi")
 
 
-def test_a_subscription_is_due_when_its_time_is_over(expiring: Expiring, clock: Clock) -> None:
-    expiring.renew("plc1", "hmi", 10)
+def test_a_subscription_is_due_when_its_time_is_over(ttls: SubscriptionTtls, clock: Clock) -> None:
+    ttls.renew("plc1", "hmi", 10)
     clock.now += 9.9
-    assert not expiring.is_due(UNIT)
+    assert not ttls.is_due(KEY)
     clock.now += 0.1
-    assert expiring.is_due(UNIT)
-    assert not expiring.is_due(Unit("plc1", "other"))
+    assert ttls.is_due(KEY)
+    assert not ttls.is_due(SubscriptionKey("plc1", "other"))
 
 
-def test_a_repeated_request_starts_the_time_again(expiring: Expiring, clock: Clock) -> None:
-    expiring.renew("plc1", "hmi", 10)
+def test_a_repeated_request_starts_the_time_again(ttls: SubscriptionTtls, clock: Clock) -> None:
+    ttls.renew("plc1", "hmi", 10)
     clock.now += 9
-    expiring.renew("plc1", "hmi", 10)
+    ttls.renew("plc1", "hmi", 10)
     clock.now += 9
-    assert not expiring.is_due(UNIT)
+    assert not ttls.is_due(KEY)
 
 
-def test_a_request_without_a_time_ends_the_time(expiring: Expiring, clock: Clock) -> None:
-    expiring.renew("plc1", "hmi", 10)
-    expiring.renew("plc1", "hmi", None)
+def test_a_request_without_a_time_ends_the_time(ttls: SubscriptionTtls, clock: Clock) -> None:
+    ttls.renew("plc1", "hmi", 10)
+    ttls.renew("plc1", "hmi", None)
     clock.now += 1000
-    assert not expiring.is_due(UNIT)
+    assert not ttls.is_due(KEY)
 
 
-def test_the_time_does_not_run_without_nats(expiring: Expiring, clock: Clock) -> None:
-    expiring.renew("plc1", "hmi", 10)
-    expiring.connected(False)
+def test_the_time_does_not_run_without_nats(ttls: SubscriptionTtls, clock: Clock) -> None:
+    ttls.renew("plc1", "hmi", 10)
+    ttls.connected(False)
     clock.now += 1000
-    assert not expiring.is_due(UNIT)
-    expiring.connected(True)
+    assert not ttls.is_due(KEY)
+    ttls.connected(True)
     clock.now += 9
-    assert not expiring.is_due(UNIT)
+    assert not ttls.is_due(KEY)
     clock.now += 1
-    assert expiring.is_due(UNIT)
+    assert ttls.is_due(KEY)
 
 
-def test_each_due_subscription_ends_once(expiring: Expiring, clock: Clock) -> None:
-    ended: list[Unit] = []
+def test_each_due_subscription_ends_once(ttls: SubscriptionTtls, clock: Clock) -> None:
+    ended: list[SubscriptionKey] = []
 
-    async def end(unit: Unit) -> None:
-        ended.append(unit)
-        expiring.renew(unit.device, str(unit.subscriber), None)
+    async def end(key: SubscriptionKey) -> None:
+        ended.append(key)
+        ttls.renew(key.device, str(key.subscriber), None)
 
     async def run() -> None:
-        running = asyncio.create_task(expiring.run(end))
-        expiring.renew("plc1", "hmi", 10)
-        expiring.renew("plc1", "trend", 20)
+        running = asyncio.create_task(ttls.run(end))
+        ttls.renew("plc1", "hmi", 10)
+        ttls.renew("plc1", "trend", 20)
         clock.now += 10
-        expiring.renew("plc2", "hmi", 5)
+        ttls.renew("plc2", "hmi", 5)
         for _ in range(100):
             await asyncio.sleep(0)
         running.cancel()
 
     asyncio.run(run())
-    assert ended == [UNIT]
+    assert ended == [KEY]
 
 
 def browsed(caller: Caller) -> list[Any]:

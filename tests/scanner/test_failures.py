@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.scanner import devices
-from holdfast.scanner.broker import MAX_PAUSE
+from holdfast.scanner.jetstream import State
+from holdfast.scanner.nats import MAX_PAUSE
+from holdfast.scanner.subscriptions import device as devices
 from support import wire
 from support.brokers import NatsServer
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
 from support.nats_bus import Caller, leaving, subscription, tag
+from support.scanner_parts import broker_of, client_of, presence_of, registry_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -94,7 +96,7 @@ def test_a_client_that_nats_throws_out_is_replaced(
 
 
 async def _nonsense(scanner: Any) -> None:
-    client = scanner._broker.client
+    client = client_of(scanner)
     await client._send_command(b"NONSENSE\r\n")
     await client._flush_pending()
 
@@ -161,7 +163,7 @@ def test_what_nats_took_before_it_died_is_published_anew(
 
     own_nats.freeze()
     memory.write("holding_registers", 0, [7])
-    device = scanner.scanner._registry.devices["plc1"]
+    device = registry_of(scanner.scanner).devices["plc1"]
     seen = device.health.scans + 3
     wire.until(lambda: device.health.scans > seen, "the change was handed to NATS")
 
@@ -183,7 +185,7 @@ def test_what_nats_took_before_it_died_is_published_anew(
 
 
 def test_nats_that_was_away_for_long_is_tried_every_other_second(run_scanner: Run) -> None:
-    broker = run_scanner(max_pause_s=MAX_PAUSE).scanner._broker
+    broker = broker_of(run_scanner(max_pause_s=MAX_PAUSE).scanner)
     client = broker.client
     assert client is not None
     broker._lost("tested")
@@ -334,7 +336,7 @@ def test_a_device_that_hangs_up_is_asked_again(
 def test_a_name_is_looked_up_again_when_the_device_does_not_answer(
     run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(devices, "LOOK_UP", 0.0)
+    monkeypatch.setattr(devices, "LOOKUP_INTERVAL_S", 0.0)
     port = server.address[1]
     known = [(socket.AF_INET, 1, 6, "", (host, port)) for host in ("127.0.0.2", "127.0.0.1")]
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: known)
@@ -391,7 +393,9 @@ def test_without_jetstream_it_says_so_once_and_goes_on(
             caller.request("modbus.subscribe", subscription(server, tag("a", 0)))
             data.next()
             for _ in range(3):
-                scanner.do(scanner.scanner._heart.beat(scanner.scanner._broker.client))
+                scanner.do(
+                    presence_of(scanner.scanner).heartbeat.beat(broker_of(scanner.scanner).client)
+                )
         [told] = [each for each in caplog.records if each.getMessage() == "no_heartbeat"]
         reason = "JetStream is not enabled on the server or for this account"
         assert told.__dict__["fields"]["reason"] == reason
@@ -409,8 +413,8 @@ def test_a_bucket_in_which_heartbeats_stay_for_ever_is_told_of_once(
     own_caller.do(_bucket_without_end(own_caller))
     scanner = run_scanner(own_nats)
     wire.until(lambda: "heartbeat" in events(caplog), "there is a heartbeat")
-    heart, broker = scanner.scanner._heart, scanner.scanner._broker
-    heart._works = None
+    heart, broker = presence_of(scanner.scanner).heartbeat, broker_of(scanner.scanner)
+    heart._availability.state = State.UNKNOWN
     scanner.do(heart.beat(broker.client))
     [told] = [each for each in caplog.records if each.getMessage() == "heartbeat_has_no_end"]
     assert told.__dict__["fields"]["bucket"] == "service_heartbeats"
@@ -516,12 +520,12 @@ def test_a_message_that_is_none_costs_no_other(
     run_scanner: Run, own_nats: NatsServer, own_caller: Caller, lines: bytes
 ) -> None:
     scanner = run_scanner(own_nats)
-    client = scanner.scanner._broker.client
+    client = client_of(scanner.scanner)
     _raw(own_nats, 3 * lines)
     assert own_caller.request("modbus.browse", b"")["success"]
     _raw(own_nats, lines)
     assert own_caller.request("modbus.browse", b"")["success"]
-    assert scanner.scanner._broker.client is client
+    assert client_of(scanner.scanner) is client
     assert client is not None
     assert client.stats["reconnects"] == 0
 

@@ -14,8 +14,7 @@ import pytest
 from nats.js import JetStreamContext
 from nats.js.kv import KeyValue
 
-from holdfast.scanner import keeping, kept_entries
-from holdfast.scanner.keeping import BUCKET
+from holdfast.scanner.jetstream import BUCKET, entries, store
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag
@@ -80,7 +79,7 @@ def test_a_state_that_is_being_stored_is_removed_when_the_scanner_stops(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     begun, stopping, put = threading.Event(), threading.Event(), KeyValue.put
-    purge, stop = JetStreamContext.purge_stream, keeping.Keeper.stop
+    purge, stop = JetStreamContext.purge_stream, store.EntryStore.stop
     sent: list[Future[int]] = []
     arrived: list[bool] = []
 
@@ -101,13 +100,13 @@ def test_a_state_that_is_being_stored_is_removed_when_the_scanner_stops(
         arrived.append(all(each.done() for each in sent))
         return await purge(jetstream, name, **more)
 
-    async def noted_stop(keeper: keeping.Keeper) -> None:
+    async def noted_stop(keeper: store.EntryStore) -> None:
         stopping.set()
         await stop(keeper)
 
     monkeypatch.setattr(KeyValue, "put", put_late)
     monkeypatch.setattr(JetStreamContext, "purge_stream", noted_purge)
-    monkeypatch.setattr(keeping.Keeper, "stop", noted_stop)
+    monkeypatch.setattr(store.EntryStore, "stop", noted_stop)
     running = run_scanner()
     caller.publish("modbus.subscribe", subscription(server, tag("a", 0)))
     assert begun.wait(wire.DEADLINE)
@@ -169,7 +168,7 @@ def test_a_large_subscription_is_kept_in_parts(
     server: holdfast.Server,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(kept_entries, "MAX_PART", 300)
+    monkeypatch.setattr(entries, "MAX_PART", 300)
     first = run_scanner()
     for start in range(0, 20, 5):
         tags = [tag(f"t{number}", number) for number in range(start, start + 5)]
@@ -297,7 +296,7 @@ def test_jetstream_that_fails_holds_no_request_up_and_gets_everything_later(
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(keeping, "RETRIED", 0.1)
+    monkeypatch.setattr(store, "MAX_RETRY_S", 0.1)
     bare = NatsServer(tmp_path, jetstream=False)
     try:
         scanner = run_scanner(bare)

@@ -11,16 +11,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.client.url import NetworkTarget
-from holdfast.scanner import outbox as outboxes
-from holdfast.scanner.browsing import browsed
-from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wanted
-from holdfast.scanner.groups import Group, grouped
-from holdfast.scanner.health import Health
-from holdfast.scanner.heartbeat import Heart
+from holdfast.scanner import ScannerLimits
+from holdfast.scanner.alone import Alone
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.jetstream import HeartbeatKey
 from holdfast.scanner.messages import BrowseRequest, HeartbeatMetadata, ServiceReport
-from holdfast.scanner.outbox import Outbox
-from holdfast.scanner.publishing import Publisher
-from holdfast.scanner.tags import Tag
+from holdfast.scanner.nats import Outbox
+from holdfast.scanner.nats import outbox as outboxes
+from holdfast.scanner.publish import Publisher
+from holdfast.scanner.reports import browsed
+from holdfast.scanner.subscriptions import Group, Registry, Tag, grouped
+from holdfast.scanner.subscriptions.device import (
+    Plan,
+    ScannedDevice,
+    Source,
+    Subscriber,
+    TagOptions,
+)
+from holdfast.scanner.subscriptions.health import Health
 from holdfast.tags.decoding import Places, decoder
 
 if TYPE_CHECKING:
@@ -29,6 +37,7 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast.config.scanning import Publish
+    from holdfast.scanner.nats.tolerant_client import SafeClient
     from holdfast.types import PolledBlock
 
 TARGET = NetworkTarget("tcp", "127.0.0.1", 502)
@@ -45,7 +54,7 @@ def device(**subscribers: tuple[int, Publish, float, str]) -> ScannedDevice:
     found = ScannedDevice("plc", Source(TARGET, 1, 1000, False, Plan()), TARGET, Health())
     for name, (rate, publish, deadband, ids) in subscribers.items():
         found.subscribers[name] = Subscriber(
-            rate, publish, deadband, dict.fromkeys(ids, Wanted(False, None))
+            rate, publish, deadband, dict.fromkeys(ids, TagOptions(False, None))
         )
         found.tags |= {id: made(id, ord(id) - ord("a")) for id in ids}
     return found
@@ -171,10 +180,10 @@ def test_everything_is_published_anew_when_that_is_asked_for(change: bool) -> No
     tags = tuple(made(id, ord(id) - ord("a")) for id in "abc")
     seldom = Group(60_000, change, tags[:2], (0.0, 0.0))
     often = Group(1000, False, tags[2:], (0.0,))
-    line.publisher.want(lambda: [often, seldom])
+    line.publisher.update(lambda: [often, seldom])
     assert line.at(0, 1, 2, 3) == {"a": 1, "b": 2, "c": 3}
     assert line.at(1, 1, 2, 3) == {"c": 3}
-    line.publisher.renew()
+    line.publisher.repeat_all()
     assert line.at(1.5, 1, 2, 3) == {"a": 1, "b": 2, "c": 3}
     assert line.at(2.5, 1, 2, 3) == {"c": 3}
 
@@ -182,13 +191,13 @@ def test_everything_is_published_anew_when_that_is_asked_for(change: bool) -> No
 def test_who_comes_to_known_tags_gets_their_next_values() -> None:
     line = Line()
     tags = tuple(made(id, ord(id) - ord("a")) for id in "ab")
-    line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))])
+    line.publisher.update(lambda: [Group(60_000, False, tags, (0.0, 0.0))])
     assert line.at(0, 1, 2) == {"a": 1, "b": 2}
     for newcomers in (["a"], ["b"]):
-        line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))], newcomers)
-    line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))])
+        line.publisher.update(lambda: [Group(60_000, False, tags, (0.0, 0.0))], newcomers)
+    line.publisher.update(lambda: [Group(60_000, False, tags, (0.0, 0.0))])
     assert line.at(10, 1, 2) == {"a": 1, "b": 2}
-    line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))], ["b", "gone"])
+    line.publisher.update(lambda: [Group(60_000, False, tags, (0.0, 0.0))], ["b", "gone"])
     assert line.at(20, 1, 2) == {"b": 2}
     assert line.at(30, 1, 2) == {}
 
@@ -208,12 +217,14 @@ def test_thousands_of_tags_far_apart_cost_no_more_each_than_a_few(
     tags = {f"t{at}": made(f"t{at}", 12 * at) for at in range(2000)}
     plc = device()
     plc.tags = tags
-    plc.subscribers["x"] = Subscriber(1000, "scan", 0.0, dict.fromkeys(tags, Wanted(False, None)))
+    plc.subscribers["x"] = Subscriber(
+        1000, "scan", 0.0, dict.fromkeys(tags, TagOptions(False, None))
+    )
     blocks: list[PolledBlock] = [
         ("holding_registers", 12 * at, 1, b"\0\1", 0, ANSWERED) for at in range(2000)
     ]
     line = Line()
-    line.publisher.want(lambda: grouped(plc))
+    line.publisher.update(lambda: grouped(plc))
     assert len(line.publisher.messages(0, blocks)) == 2000
     assert count <= 2 * 2000
     plc.health.judge([(*block[:3], None, 2, ANSWERED) for block in blocks])
@@ -346,10 +357,11 @@ class Wire:
         self.pending_data_size = 0
         self.sent: list[bytes] = []
         self.stats = {"out_msgs": 0, "out_bytes": 0}
-        self._flush_queue = None
 
     async def _send_command(self, texts: bytes) -> None:
         self.sent.append(texts)
+
+    async def _flush_pending(self) -> None: ...
 
 
 async def _run(outbox: Outbox, seconds: float = 0.1) -> None:
@@ -361,7 +373,7 @@ async def _run(outbox: Outbox, seconds: float = 0.1) -> None:
 def test_messages_flow_in_order_while_they_are_taken() -> None:
     async def flow() -> list[bytes]:
         wire, outbox = Wire(), Outbox()
-        outbox.connected(cast("Client", wire))
+        outbox.connected(cast("SafeClient", wire))
         outbox.put([("a", b"1"), ("b", b"2"), ("a", b"3")])
         outbox.put([("a", b"4")])
         await _run(outbox)
@@ -371,14 +383,14 @@ def test_messages_flow_in_order_while_they_are_taken() -> None:
 
 
 def test_each_has_its_turn_while_more_comes_than_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outboxes, "CHECK_INTERVAL", 0.001)
-    monkeypatch.setattr(outboxes, "PIECE", 20)
+    monkeypatch.setattr(outboxes, "CHECK_INTERVAL_S", 0.001)
+    monkeypatch.setattr(outboxes, "MAX_BATCH_BYTES", 20)
     keys = range(100)
 
     async def flow() -> list[bytes]:
         wire, outbox = Wire(), Outbox()
         outbox.put([(key, b"%02d" % key) for key in keys])
-        outbox.connected(cast("Client", wire))
+        outbox.connected(cast("SafeClient", wire))
         running = asyncio.create_task(outbox.run())
         while len(wire.sent) < 30:
             await asyncio.sleep(0)
@@ -395,19 +407,19 @@ def test_each_has_its_turn_while_more_comes_than_is_taken(monkeypatch: pytest.Mo
 def test_the_newest_of_each_is_kept_while_they_are_not_taken(
     how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(outboxes, "CHECK_INTERVAL", 0.001)
+    monkeypatch.setattr(outboxes, "CHECK_INTERVAL_S", 0.001)
 
     async def flow() -> tuple[Outbox, list[bytes]]:
-        wire, outbox = Wire(), Outbox(most=3)
+        wire, outbox = Wire(), Outbox(max_kept=3)
         if how == "slow":
-            wire.pending_data_size = outboxes.BACKLOG
-            outbox.connected(cast("Client", wire))
+            wire.pending_data_size = outboxes.MAX_BACKLOG_BYTES
+            outbox.connected(cast("SafeClient", wire))
         for text in (b"a1", b"b1", b"a2", b"c1", b"b2", b"d1"):
             outbox.put([(text[:1], text)])
         await _run(outbox)
         assert wire.sent == []
         wire.pending_data_size = 0
-        outbox.connected(cast("Client", wire))
+        outbox.connected(cast("SafeClient", wire))
         await _run(outbox)
         outbox.put([("e", b"e1"), ("e", b"e2")])
         await _run(outbox)
@@ -513,7 +525,7 @@ def test_a_heartbeat_that_fails_after_the_stop_is_not_logged(
 
     async def beaten(*, stopped: bool) -> list[str]:
         caplog.clear()
-        heart = Heart("plant", lambda: HeartbeatMetadata(0, 0, "1"), lambda _: None)
+        heart = HeartbeatKey("plant", lambda: HeartbeatMetadata(0, 0, "1"), lambda _: None)
         server = Jetstream()
         client = cast("Client", server)
         beating = asyncio.create_task(heart.beat(client))
@@ -526,3 +538,12 @@ def test_a_heartbeat_that_fails_after_the_stop_is_not_logged(
 
     assert asyncio.run(beaten(stopped=False)) == ["no_heartbeat"]
     assert asyncio.run(beaten(stopped=True)) == []
+
+
+def test_a_command_that_was_not_written_is_not_confirmed() -> None:
+    async def has_moved() -> bool:
+        return False
+
+    alone = Alone("modbus", Registry(ScannerLimits()), keeps_subscriptions=False)
+    with pytest.raises(Refused, match="not written: another node uses the device"):
+        asyncio.run(alone.write(device(), made("a"), "1", has_moved, lambda: 1.0))

@@ -13,8 +13,8 @@ from holdfast.client.url import NetworkTarget, SerialTarget
 from holdfast.config.scanning import parse_pollable
 from holdfast.scanner import ScannerLimits
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.hosts import Allowed
-from holdfast.scanner.schema import json_schema
+from holdfast.scanner.messages.schema import json_schema
+from holdfast.scanner.polling.allowed_devices import AllowedDevices
 from support.brokers import free_port
 from support.nats_bus import leaving, subscription, tag
 from support.paths import ROOT
@@ -343,7 +343,7 @@ def test_a_host_with_several_addresses_is_tried_at_one_after_the_other(
         ]
 
     monkeypatch.setattr(socket, "getaddrinfo", two)
-    allowed, asked = Allowed(), NetworkTarget("tcp", "plc", 502)
+    allowed, asked = AllowedDevices(), NetworkTarget("tcp", "plc", 502)
     found = [caller.do(allowed.address(asked))]
     for _ in range(3):
         found.append(caller.do(allowed.address(asked, after=found[-1])))
@@ -353,7 +353,7 @@ def test_a_host_with_several_addresses_is_tried_at_one_after_the_other(
 
 def test_serial_devices_beside_networks(caller: Caller) -> None:
     line_only = [parse_pollable("/dev/ttyUSB0")]
-    allowed = Allowed([*line_only, parse_pollable("10.0.0.0/8")])
+    allowed = AllowedDevices([*line_only, parse_pollable("10.0.0.0/8")])
     line = SerialTarget("rtu", "/dev/ttyUSB0")
     assert caller.do(allowed.address(line)) == line
     with pytest.raises(Refused):
@@ -361,7 +361,7 @@ def test_serial_devices_beside_networks(caller: Caller) -> None:
     device = NetworkTarget("tcp", "10.1.2.3", 502)
     assert caller.do(allowed.address(device)) == device
     with pytest.raises(Refused, match=r"10\.1\.2\.3 is not allowed, allowed: serial devices only"):
-        caller.do(Allowed(line_only).address(device))
+        caller.do(AllowedDevices(line_only).address(device))
 
 
 @pytest.mark.parametrize("entry", ["10.0.0.1/8", "plc", "::ffff:10.0.0.1", "COMPANY"])

@@ -11,10 +11,12 @@ import pytest
 from nats.aio.msg import Msg
 
 import holdfast
-from holdfast.scanner import service as services
-from holdfast.scanner.registry import understood
+from holdfast.scanner import requests as scanner_requests
+from holdfast.scanner import responder
+from holdfast.scanner.subscriptions.subscription import subscription_of
 from support import wire
 from support.nats_bus import leaving, subscription, tag
+from support.scanner_parts import broker_of, client_of, polling_of
 
 if TYPE_CHECKING:
     from support.nats_bus import Caller, Inbox, Run
@@ -417,7 +419,7 @@ def test_who_subscribes_to_known_tags_of_a_slow_device_gets_values_and_the_state
 def test_who_leaves_a_slow_device_causes_no_scan(
     run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    polling = run_scanner().scanner._polling
+    polling = polling_of(run_scanner().scanner)
     poller, replaced = polling._poller, []
 
     class Spy:
@@ -545,16 +547,15 @@ def test_between_two_large_requests_others_have_their_turn(
 
     def noted(*arguments: Any) -> Any:
         turns.append(turn)
-        return understood(*arguments)
+        return subscription_of(*arguments)
 
-    monkeypatch.setattr(services, "understood", noted)
-    monkeypatch.setattr(services, "LARGE", 100)
+    monkeypatch.setattr(scanner_requests, "subscription_of", noted)
+    monkeypatch.setattr(responder, "LARGE_REQUEST_BYTES", 100)
 
     async def ask() -> None:
         nonlocal turn
-        handle = scanner.scanner._handlers()["modbus.subscribe"]
-        client = scanner.scanner._broker.client
-        assert client is not None
+        handle = broker_of(scanner.scanner)._handlers["modbus.subscribe"]
+        client = client_of(scanner.scanner)
         for number in range(20):
             request = subscription(server, tag("a", 0), deviceId=f"d{number}", scanRate=60_000)
             await handle(Msg(client, data=json.dumps(request).encode()))

@@ -13,12 +13,14 @@ import pytest
 from nats.errors import NoRespondersError
 
 from holdfast.net.tls import Tls
-from holdfast.scanner import Scanner, Servers, Settings, broker
+from holdfast.scanner import Scanner, Servers, Settings
+from holdfast.scanner.nats import connection as broker
 from support import wire
 from support.brokers import NatsServer
 from support.certificates import Certificates
 from support.nats_bus import Caller, subscription, tag
 from support.nats_keys import ACCOUNT, Key, Operator, User, written
+from support.scanner_parts import broker_of, client_of, presence_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -89,7 +91,7 @@ def test_a_server_that_the_authority_does_not_vouch_for_is_refused(
     stranger = Certificates(tmp_path, "stranger")
     server = serve_nats("--tls", *certified(stranger, "nats"))
     scanner = run_scanner(wait=False, servers=Servers((server.url,), tls=Tls.of(authority.ca)))
-    assert failure(caplog).startswith("unknown_issuer: ")
+    assert "the issuer of the certificate is unknown" in failure(caplog)
     assert not scanner.serves
 
 
@@ -298,12 +300,11 @@ def test_credentials_that_expire_are_read_anew(
 
 def test_a_client_that_ends_without_a_word_is_replaced(run_scanner: Run) -> None:
     scanner = run_scanner()
-    client = scanner.scanner._broker.client
-    assert client is not None
+    client = client_of(scanner.scanner)
     # As when the server throws it out with something still to send, which it then fails to.
     client._disconnected_cb = client._closed_cb = None
     scanner.do(client.close())
-    wire.until(lambda: scanner.scanner._broker.client is not client, "it is noticed")
+    wire.until(lambda: broker_of(scanner.scanner).client is not client, "it is noticed")
     wire.until(lambda: scanner.serves, "there is another client")
 
 
@@ -312,8 +313,7 @@ def test_a_scanner_ends_while_its_client_has_ended_without_a_word(
 ) -> None:
     monkeypatch.setattr(broker, "CHECK_INTERVAL", 2 * wire.DEADLINE)
     scanner = run_scanner()
-    client = scanner.scanner._broker.client
-    assert client is not None
+    client = client_of(scanner.scanner)
     client._disconnected_cb = client._closed_cb = None
     scanner.do(client.close())
     scanner.stop()
@@ -347,7 +347,7 @@ def test_an_account_without_jetstream_has_no_heartbeat(
     scanner = run_scanner(servers=at(trusting, User(plant).write(file)))
     told(caplog, "no_heartbeat", "JetStream not enabled for account")
     for _ in range(3):
-        scanner.do(scanner.scanner._heart.beat(scanner.scanner._broker.client))
+        scanner.do(presence_of(scanner.scanner).heartbeat.beat(broker_of(scanner.scanner).client))
     assert scanner.serves
     assert len(reasons(caplog, "no_heartbeat")) == 1
 

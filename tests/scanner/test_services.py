@@ -12,11 +12,13 @@ import pytest
 
 import holdfast
 from holdfast import logs
-from holdfast.scanner import Ping, heartbeat, service
+from holdfast.scanner import Ping, presence
+from holdfast.scanner.jetstream import heartbeat
 from support import wire
 from support.brokers import NatsServer
 from support.fake_device import FakeDevice, exception, registers
 from support.nats_bus import Caller, logged, subscription, tag
+from support.scanner_parts import presence_of
 from support.tentacle import plc_subscribe, plc_tag
 
 if TYPE_CHECKING:
@@ -114,7 +116,7 @@ def beat(caller: Caller) -> Any:
 def test_the_heartbeat_counts_devices_and_tags(
     run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(service, "EVERY", 0.05)
+    monkeypatch.setattr(presence, "HEARTBEAT_INTERVAL_S", 0.05)
     run_scanner()
     for id in ("one", "two"):
         request = subscription(server, tag("a", 0), tag("b", 1), deviceId=id)
@@ -130,7 +132,7 @@ def test_a_second_scanner_is_logged_by_both_and_shown(
     assert "otherScanners" not in caller.request("modbus.browse", b"")["service"]
     second = run_scanner()
     wire.until(lambda: len(logged(caplog, "another_scanner")) == 2, "both say so")
-    started = {each.scanner._heart.started for each in (first, second)}
+    started = {presence_of(each.scanner).heartbeat.started for each in (first, second)}
     shown = caller.request("modbus.browse", b"")["service"]
     assert {shown["startedAt"], *(each["startedAt"] for each in shown["otherScanners"])} == started
     run_scanner(prefix="plant")
@@ -143,7 +145,7 @@ def test_another_service_is_noticed_by_its_heartbeat(
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(service, "EVERY", 0.05)
+    monkeypatch.setattr(presence, "HEARTBEAT_INTERVAL_S", 0.05)
     run_scanner()
     wire.until(lambda: beat(caller), "there is a heartbeat")
     started = beat(caller)["startedAt"]

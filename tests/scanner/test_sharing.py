@@ -11,6 +11,7 @@ from support import wire
 from support.fake_device import Stream
 from support.nats_bus import leaving, subscription, tag
 from support.running import endpoint
+from support.scanner_parts import polling_of, presence_of
 from support.shared import Careful, polled, read, with_gateway
 
 if TYPE_CHECKING:
@@ -133,8 +134,9 @@ def test_a_scanner_that_failed_continues_with_the_same_devices(
         async def broken(_: object) -> None:
             raise RuntimeError("broken by the test")
 
-        monkeypatch.setattr(service._heart, "beat", broken)
-        service._polling._loop.call_soon_threadsafe(service._due.set)
+        presence = presence_of(service)
+        monkeypatch.setattr(presence.heartbeat, "beat", broken)
+        polling_of(service)._loop.call_soon_threadsafe(presence.beat_soon)
         wire.until(lambda: status(appliance)["restarts"] == 1, "it is restarted")
         until_connected(appliance)
         data.take()

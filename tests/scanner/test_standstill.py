@@ -23,6 +23,7 @@ from support.fleet_nodes import FLEET, prepare, subscribed, wanted
 from support.judges import Judges
 from support.leases import BRIEF
 from support.nats_bus import Caller, logged, subscription, tag
+from support.scanner_parts import member_of, polling_of
 from support.scanner_process import begin_scanner, freeze
 
 if TYPE_CHECKING:
@@ -180,9 +181,8 @@ def test_a_command_of_another_node_is_refused_by_a_node_whose_loop_did_not_run(
     running = node(standstill_s=STANDSTILL_S)
     subscribed(own_caller, 0, judge)
     wire.until(partial(is_done, own_caller, "modbus.command.d0.t0", "1"), "it is written")
-    part = running.scanner._part
-    assert part is not None
-    where = subject("modbus", "a", "command", part.fleet.leases.process)
+    member = member_of(running.scanner)
+    where = subject("modbus", "a", "command", member.fleet.leases.process)
     command = msgspec.json.encode(Command(device="d0", tag="t0", text="3", epoch=0))
     # The thread of its leases goes on: the node has the device all the time.
     blocked = Blocked(running)
@@ -207,20 +207,19 @@ def test_a_command_of_another_node_waits_as_long_as_that_node_allows(
     running = node()
     subscribed(own_caller, 0, judges.devices[0])
     wire.until(partial(is_done, own_caller, "modbus.command.d0.t0", "1"), "it is written")
-    part, allowed = running.scanner._part, list[float]()
-    assert part is not None
+    member, allowed = member_of(running.scanner), list[float]()
 
     async def write(_device: object, _request: object, *, within: float) -> int:
         allowed.append(within)
         return 0
 
-    monkeypatch.setattr(running.scanner._polling, "write", write)
-    where = subject("modbus", "a", "command", part.fleet.leases.process)
+    monkeypatch.setattr(polling_of(running.scanner), "write", write)
+    where = subject("modbus", "a", "command", member.fleet.leases.process)
     for within in (4.0, 60.0):
         command = Command(device="d0", tag="t0", text="3", epoch=0, within=within)
         assert send(own_caller, where, msgspec.json.encode(command)).result(wire.DEADLINE) == {}
     assert allowed[0] == 4.0
-    assert 4.0 < allowed[1] <= lateness.WAITED
+    assert 4.0 < allowed[1] <= lateness.MAX_WAIT_S
 
 
 def test_a_standstill_is_logged_once(
@@ -248,7 +247,7 @@ def test_a_command_that_waited_for_long_in_the_scanner_is_refused(
     run_scanner()
     caller.request("modbus.subscribe", subscription(server, tag("a", 10)))
     with monkeypatch.context() as patched:
-        patched.setattr(lateness, "WAITED", -1.0)
+        patched.setattr(lateness, "MAX_WAIT_S", -1.0)
         answer = caller.request("modbus.command.a", "3")
     assert answer["success"] is False
     assert answer["error"].startswith("not written: the command waited for 0 s; send it again")
@@ -277,7 +276,7 @@ def test_a_command_that_waited_for_long_for_its_device_is_refused(
             assert is_reading.wait(wire.DEADLINE)
             assert caller.request("modbus.subscribe", other)["success"]
             with monkeypatch.context() as patched:
-                patched.setattr(lateness, "WAITED", 1.0)
+                patched.setattr(lateness, "MAX_WAIT_S", 1.0)
                 refused = caller.request("modbus.command.a", "3")
         finally:
             go_on.set()
@@ -294,12 +293,11 @@ def test_a_node_passes_no_command_on_that_waited_for_long(
     node: Callable[..., Running], own_caller: Caller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = node()
-    part = running.scanner._part
-    assert part is not None
+    member = member_of(running.scanner)
     with Judges(1) as judges:
         subscribed(own_caller, 0, judges.devices[0])
-        monkeypatch.setattr(part, "is_own", lambda _: False)  # It waits for a node that has it.
-        monkeypatch.setattr(lateness, "WAITED", 0.5)
+        monkeypatch.setattr(member, "is_own", lambda _: False)  # It waits for a node that has it.
+        monkeypatch.setattr(lateness, "MAX_WAIT_S", 0.5)
         answer = own_caller.request("modbus.command.d0.t0", "3")
         assert answer["error"].startswith("not written: the command waited for")
         assert not judges.devices[0].writes

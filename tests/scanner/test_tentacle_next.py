@@ -5,16 +5,25 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
 
 import holdfast
-from holdfast.scanner import Defaults, tentacle_next
+from holdfast.scanner import Defaults
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.keeping import BUCKET as KEPT
-from holdfast.scanner.watching import WATCH_TIMES, WatchTimes
+from holdfast.scanner.jetstream import BUCKET as KEPT
+from holdfast.scanner.jetstream import WATCH_TIMES, WatchTimes
+from holdfast.scanner.messages import (
+    DIALECTS,
+    Adjustments,
+    SubscribeRequest,
+    decode_lenient,
+    tentacle_next,
+)
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag
+from support.scanner_parts import allowed_of
 from support.tentacle_next import (
     BUCKET,
     ENABLED,
@@ -416,15 +425,15 @@ def test_an_entry_whose_host_is_not_found_is_tried_again(
     run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = run_scanner(**NEXT)
-    address = running.scanner._allowed.address
+    address = allowed_of(running.scanner).address
 
     async def not_found(*_: Any, **__: Any) -> Any:
         raise Refused("host plc.example: no such name")
 
-    monkeypatch.setattr(running.scanner._allowed, "address", not_found)
+    monkeypatch.setattr(allowed_of(running.scanner), "address", not_found)
     caller.put(BUCKET, key(), gateway_entry(server, gateway_tag("a", 0)))
     wire.until(lambda: key() in refused(caller), "it is refused")
-    monkeypatch.setattr(running.scanner._allowed, "address", address)
+    monkeypatch.setattr(allowed_of(running.scanner), "address", address)
     wire.until(lambda: tags(caller) == {"a"}, "it is subscribed")
     assert refused(caller) == {}
     running.stop()
@@ -670,28 +679,32 @@ def test_what_only_the_first_generation_has_is_not_here(
     assert devices(caller) == {}
 
 
+def normalized(data: bytes) -> bytes:
+    return msgspec.json.encode(tentacle_next.normalized(msgspec.json.decode(data)))
+
+
 def test_missing_keys_of_a_tag_have_its_defaults() -> None:
     data = b'{"deviceId":"a","tags":[{"id":"t","functionCode":"","datatype":""},{"id":"u"},7]}'
-    assert tentacle_next.request(data, 1000) == (
+    assert normalized(data) == (
         b'{"deviceId":"a","tags":[{"id":"t","functionCode":"holding","datatype":"uint16"},'
         b'{"id":"u","functionCode":"holding","datatype":"uint16"},7]}'
     )
 
 
 def test_an_empty_list_of_go_has_no_tags() -> None:
-    assert tentacle_next.request(b'{"tags":null}', 100) == b'{"tags":[]}'
+    assert normalized(b'{"tags":null}') == b'{"tags":[]}'
 
 
 def test_an_unknown_number_of_a_function_is_not_guessed() -> None:
     data = b'{"registers":[{"tag":"a","functionCode":16},7]}'
-    assert tentacle_next.request(data, 100) == (
-        b'{"tags":[{"id":"a","functionCode":16,"datatype":"uint16"},7]}'
-    )
+    assert normalized(data) == (b'{"tags":[{"id":"a","functionCode":16,"datatype":"uint16"},7]}')
 
 
 def test_a_request_that_is_too_large_is_refused() -> None:
     with pytest.raises(Refused, match="has 13 bytes, allowed: 12"):
-        tentacle_next.request(b'{"tags":null}', 12)
+        decode_lenient(
+            b'{"tags":null}', SubscribeRequest, 12, Adjustments(), tentacle_next.normalized
+        )
 
 
 @pytest.mark.parametrize(
@@ -707,7 +720,7 @@ def test_a_request_that_is_too_large_is_refused() -> None:
     ],
 )
 def test_the_text_of_a_value_is_exact(data: bytes, text: str) -> None:
-    assert tentacle_next.command(data) == text
+    assert DIALECTS["tentacle-next"].command_text(data) == text
 
 
 # The other dialect.

@@ -22,9 +22,19 @@ BY_VARIABLE = {
     "appliance/running.py": set(),  # The events of listeners.
     "appliance/shared_logs.py": set(EVENTS),
     "logs.py": set(),
-    "scanner/kept.py": {"restored", "not_restored"},
-    "scanner/service.py": {
-        *(f"device_{state}" for state in ("connecting", "online", "offline")),
+    "scanner/jetstream/availability.py": {
+        "bucket_not_watched",
+        "bucket_watched",
+        "heartbeat",
+        "no_heartbeat",
+        "subscriptions_kept",
+        "subscriptions_not_kept",
+    },
+    "scanner/jetstream/restore.py": {"restored", "not_restored"},
+    "scanner/polling/devices.py": {
+        f"device_{state}" for state in ("connecting", "online", "offline")
+    },
+    "scanner/request_log.py": {
         "datatype_ignored",
         "keys_ignored",
         "scan_rate_raised",

@@ -21,7 +21,7 @@ from nats.js.errors import NotFoundError
 
 from holdfast.config.scanning import parse_pollable
 from holdfast.scanner import Scanner, Servers, Settings
-from holdfast.scanner.keeping import BUCKET
+from holdfast.scanner.jetstream import BUCKET
 from support import wire
 from support.brokers import NatsServer
 
@@ -103,9 +103,9 @@ class Inbox:
 class Caller:
     """A NATS client beside the scanner; `options` are for `Client.connect`."""
 
-    def __init__(self, url: str | list[str], **options: Any) -> None:
+    def __init__(self, url: str | list[str], client: Client | None = None, **options: Any) -> None:
         self._loop = _Loop()
-        self.client = Client()
+        self.client = client or Client()
         self._loop.do(
             self.client.connect(
                 url,

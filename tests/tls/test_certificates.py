@@ -19,7 +19,7 @@ from holdfast.client.receiver import Receiver
 from holdfast.client.url import parse
 from holdfast.net.tls import Tls
 from support import native_poller, wire
-from support.certificate_cases import ACCEPTED, CASES, KEYS, OWN_KEYS, SERVED, Mint
+from support.certificate_cases import ACCEPTED, CASES, KEYS, OWN_KEYS, SERVED, made
 from support.certificates import Issued, openssl
 from support.config_folder import written
 from support.faces import FACES
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from support.certificate_cases import Case, Shown
+    from support.certificate_cases import Case, Mint, Shown
     from support.running import Run
 
     Address = tuple[str, int]
@@ -60,23 +60,6 @@ OPENSSL_REFUSES_WITH_TLS_1_2 = {
 @pytest.fixture(autouse=True)
 def every_refusal_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
-
-
-@pytest.fixture(scope="module")
-def mint(tmp_path_factory: pytest.TempPathFactory) -> Mint:
-    return Mint(tmp_path_factory.mktemp("mint"))
-
-
-@pytest.fixture(scope="module")
-def shown() -> dict[str, Shown]:
-    """What was made so far: all faces see the same certificates."""
-    return {}
-
-
-def made(case: Case, mint: Mint, shown: dict[str, Shown]) -> Shown:
-    if case.name not in shown:
-        shown[case.name] = case.show(mint)
-    return shown[case.name]
 
 
 def read(face: str, url: str) -> str:

@@ -26,11 +26,6 @@ LOCALHOST = "subjectAltName=DNS:localhost"
 
 
 @pytest.fixture(scope="module")
-def mint(tmp_path_factory: pytest.TempPathFactory) -> Mint:
-    return Mint(tmp_path_factory.mktemp("mint"))
-
-
-@pytest.fixture(scope="module")
 def client(mint: Mint) -> Issued:
     return mint.make(by=mint.authority, name="client", extensions=[NAME])
 

@@ -186,6 +186,6 @@ class _LogLeases:
                     logs.write(logging.WARNING, "device_not_polled", **fields)
 
     async def _connect(self, connected: Callable[[Any], None]) -> None:
-        from holdfast.scanner.broker import Broker, Ping
+        from holdfast.scanner.nats import Broker, Ping
 
         await Broker(self._servers, {}, connected, Ping(), name="holdfast leases").run()

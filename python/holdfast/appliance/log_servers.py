@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from holdfast import logs
 from holdfast.config.http_url import parse_http
-from holdfast.net.tls import NO_FILES, broker_context
+from holdfast.net.tls import NO_FILES, https_context
 
 if TYPE_CHECKING:
     from holdfast.config.logs import SharedLogConfig
@@ -73,7 +73,7 @@ def sync_interval(url: str, settings: SharedLogConfig) -> float | None:
     connection = http.client.HTTPConnection(host, port, timeout=ANSWER_S)
     if secure:
         tls = NO_FILES if settings.tls is None else settings.tls.files
-        context = broker_context(tls)
+        context = https_context(tls)
         connection = http.client.HTTPSConnection(host, port, timeout=ANSWER_S, context=context)
     try:
         connection.request("GET", f"{path.rstrip('/')}/jsz")

@@ -27,7 +27,7 @@ def receiver(name: str, settings: Output, site: Site) -> Receiver:
 
             return Influx(settings)
         case NatsOutputConfig():
-            from holdfast.scanner.output import NatsOutput
+            from holdfast.scanner.publish.nats_output import NatsOutput
 
             servers = assembly.nats_servers(settings)
             return NatsOutput(servers, settings.prefix, settings.dialect)

@@ -67,7 +67,7 @@ def _load_whole(path: Path | str) -> Config:
             except (OSError, ValueError) as error:
                 problems["devices", name, "forward", index, "url"] = str(error)
     if config.nats is not None and config.nats.device_tls is not None:
-        from holdfast.scanner import device_tls
+        from holdfast.scanner.polling import device_tls
 
         try:
             device_tls.check(assembly.scanner(config.nats).device_tls)

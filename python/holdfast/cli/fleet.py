@@ -19,7 +19,7 @@ from holdfast.cli.tls_options import tls_of, tls_options
 from holdfast.config.scanning import PREFIX
 from holdfast.net import event_loop
 from holdfast.scanner import Servers
-from holdfast.scanner.fleet.looking import FleetUnavailable, Looker
+from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -94,7 +94,7 @@ def status(name: str, as_json: bool, watch: bool, **options: Any) -> None:
 
 
 async def _status(name: str, servers: Servers, as_json: bool, watch: bool) -> bool:
-    async with Looker(name, servers) as looker:
+    async with FleetObserver(name, servers) as looker:
         before, at = await looker.look(), time.monotonic()
         while True:
             await asyncio.sleep(_BETWEEN)
@@ -153,5 +153,5 @@ def drain(name: str, node: str, prefix: str, **options: Any) -> None:
 
 
 async def _drain(name: str, node: str, prefix: str, servers: Servers) -> None:
-    async with Looker(name, servers) as looker:
+    async with FleetObserver(name, servers) as looker:
         await looker.drain(node, prefix)

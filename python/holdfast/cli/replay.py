@@ -20,7 +20,7 @@ from holdfast.cli.logs_of import chosen_log
 from holdfast.cli.signals import Signals
 from holdfast.nats_server import ServerUnusable
 from holdfast.runtime.text import listing
-from holdfast.scanner.broker import ANSWERING
+from holdfast.scanner.nats import ANSWERING
 from holdfast.server import Server
 
 if TYPE_CHECKING:

@@ -61,11 +61,11 @@ from holdfast.scanner import (
     ScannerLimits,
     Servers,
     Settings,
-    device_tls,
 )
-from holdfast.scanner.configured import BUCKET
-from holdfast.scanner.hosts import PRIVATE
-from holdfast.scanner.schema import json_schema
+from holdfast.scanner.jetstream.entry_subscriptions import BUCKET
+from holdfast.scanner.messages.schema import json_schema
+from holdfast.scanner.polling import device_tls
+from holdfast.scanner.polling.allowed_devices import PRIVATE
 from holdfast.scanner.write_access import places
 
 if TYPE_CHECKING:

@@ -61,7 +61,7 @@ from holdfast.config.server_tls import HttpsConfig
 from holdfast.config.syslog import Facility
 from holdfast.config.tags import TagConfig
 from holdfast.net.addresses import LOOPBACK
-from holdfast.net.tls import Tls
+from holdfast.net.tls import NO_FILES, Tls
 from holdfast.types import Access
 
 
@@ -189,9 +189,11 @@ class BrokerConfig(Model):
         return self.broker.port
 
     @property
-    def secure(self) -> bool:
-        """Whether the connection uses TLS."""
-        return self.broker.secure
+    def tls_files(self) -> Tls | None:
+        """The files for TLS; `None` without TLS."""
+        if not self.broker.secure:
+            return None
+        return NO_FILES if self.tls is None else self.tls.files
 
 
 class MappingConfig(Model):

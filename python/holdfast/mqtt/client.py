@@ -1,22 +1,25 @@
-"""One connection to a broker: paho's client, opened by `dial`.
+"""One connection to a broker: paho's client, with a socket that carries packets.
 
-Methods that begin with an underscore override methods of paho.
+paho gets the packets that `pass_on` gives to it, and sends its own. All others are read from the
+socket and put into it by the derived classes.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from paho.mqtt.client import Client
-from paho.mqtt.enums import CallbackAPIVersion, LogLevel, MQTTProtocolVersion
+from paho.mqtt.enums import CallbackAPIVersion, LogLevel, MQTTErrorCode, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
+from holdfast.mqtt.stream import head
+
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Callable
 
     from holdfast.config import BrokerConfig
+    from holdfast.mqtt.stream import BrokerSocket
 
 
 class BrokerClient(Client):
@@ -27,7 +30,7 @@ class BrokerClient(Client):
         settings: BrokerConfig,
         client_id: str,
         password: bytes | None,
-        dial: Callable[[], socket.socket],
+        dial: Callable[[], BrokerSocket],
         *,
         session_expiry: int,
     ) -> None:
@@ -45,8 +48,9 @@ class BrokerClient(Client):
             reconnect_on_failure=False,
         )
         self._dial = dial
+        self._connection: BrokerSocket | None = None
         self.trouble: str | None = None
-        """The last error that paho logged."""
+        """Why the connection ends, or the last error that paho logged."""
         self.on_log = self._note
         self.username_pw_set(settings.username, password)  # type: ignore[arg-type]
 
@@ -69,17 +73,42 @@ class BrokerClient(Client):
         )
 
     @property
-    def unsent(self) -> int:
-        """The number of unsent packets."""
-        return len(self._out_packet)
+    def connection(self) -> BrokerSocket:
+        """The socket; `open` makes it."""
+        assert self._connection is not None, "it was opened"
+        return self._connection
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the connection has begun and has not ended."""
+        return self._connection is not None and self._connection.is_open
+
+    def pass_on(self, first: int, body: bytes | bytearray) -> MQTTErrorCode:
+        """Passes a packet to paho, which closes the connection after an error."""
+        self.connection.for_paho += head(first, len(body)) + body
+        return self.notice()
+
+    def notice(self) -> MQTTErrorCode:
+        """Lets paho read, and send what its callbacks have published."""
+        code = self.loop_read()
+        if self.want_write() and self.is_open:
+            self.loop_write()
+        return code
+
+    def end(self, reason: str) -> None:
+        """Closes the connection without DISCONNECT, and notes why."""
+        self.trouble = reason
+        self.close()
 
     def close(self) -> None:
-        """Closes the socket, if it is open."""
-        self._sock_close()
+        """Closes the connection without DISCONNECT, if it is open."""
+        if self._connection is not None:
+            self._connection.close()
 
     def _note(self, _client: Client, _data: object, level: int, text: str) -> None:
         if level == LogLevel.MQTT_LOG_ERR or "malformed" in text:
             self.trouble = text
 
-    def _create_socket(self) -> Any:
-        return self._dial()
+    def _create_socket(self) -> BrokerSocket:
+        self._connection = self._dial()
+        return self._connection

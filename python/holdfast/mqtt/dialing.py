@@ -5,16 +5,20 @@ from __future__ import annotations
 import errno
 import os
 import socket
-import ssl
 import time
 from concurrent.futures import wait
 from typing import TYPE_CHECKING, Any
 
+from holdfast.mqtt.stream import BrokerSocket
 from holdfast.net.resolver import CONFIGURED
+from holdfast.net.secure_channel import SecureChannel
 
 if TYPE_CHECKING:
     from holdfast.mqtt.waiting import Waiter
     from holdfast.net.resolver import SocketAddress
+    from holdfast.net.tls import Tls
+
+READ = 65_536
 
 CONNECT_TIMEOUT = 10.0
 """Seconds for the connection to one address of the broker, including the TLS handshake."""
@@ -25,15 +29,16 @@ CHECK_INTERVAL = 0.1
 _UNDER_WAY = {0, errno.EINPROGRESS, errno.EWOULDBLOCK}
 
 
-def dial(host: str, port: int, context: ssl.SSLContext | None, waiter: Waiter) -> socket.socket:
+def dial(host: str, port: int, tls: Tls | None, waiter: Waiter) -> BrokerSocket:
     """Returns a non-blocking connection to the first address that accepts one.
 
-    Raises `OSError` when no address does, and `Ended` after a stop.
+    Raises `OSError` when no address does, or a file of `tls` is unusable, and `Ended` after a stop.
     """
     failure = OSError(f"{host} has no address")
     for family, address in _addresses(host, port, waiter):
         try:
-            return _open(family, address, host, context, waiter)
+            channel = None if tls is None else SecureChannel(host, tls)
+            return _open(family, address, channel, waiter)
         except OSError as error:
             failure = error
     raise failure
@@ -49,9 +54,7 @@ def _addresses(host: str, port: int, waiter: Waiter) -> list[SocketAddress]:
     return asked.result()
 
 
-def _open(
-    family: int, address: Any, host: str, context: ssl.SSLContext | None, waiter: Waiter
-) -> socket.socket:
+def _open(family: int, address: Any, channel: SecureChannel | None, waiter: Waiter) -> BrokerSocket:
     deadline = time.monotonic() + CONNECT_TIMEOUT
     connection = socket.socket(family, socket.SOCK_STREAM)
     try:
@@ -60,23 +63,25 @@ def _open(
         _raise_for(connection.connect_ex(address))
         _wait(connection, waiter, deadline, write=True)
         _raise_for(connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR))
-        if context is None:
-            return connection
-        secured = context.wrap_socket(
-            connection, server_hostname=host, do_handshake_on_connect=False
-        )
-        connection = secured
-        while True:
-            try:
-                secured.do_handshake()
-                return secured
-            except ssl.SSLWantReadError:
-                _wait(connection, waiter, deadline, read=True)
-            except ssl.SSLWantWriteError:
-                _wait(connection, waiter, deadline, write=True)
+        broker = BrokerSocket(connection, channel)
+        if channel is not None:
+            _agree(broker, channel, waiter, deadline)
     except BaseException:
         connection.close()
         raise
+    return broker
+
+
+def _agree(broker: BrokerSocket, channel: SecureChannel, waiter: Waiter, deadline: float) -> None:
+    """Completes the handshake of TLS."""
+    broker.greet()
+    while not channel.is_ready:
+        _wait(broker.connection, waiter, deadline, read=True, write=broker.unsent > 0)
+        broker.flush()
+        if broker.read(READ):
+            raise ConnectionError("the broker sent something before it was asked")
+        if isinstance(broker.failure, OSError):
+            raise broker.failure
 
 
 def _raise_for(code: int) -> None:

@@ -79,8 +79,8 @@ NO_FILES = Tls()
 """Trusts the system's CAs and presents no certificate."""
 
 
-def broker_context(tls: Tls) -> ssl.SSLContext:
-    """Returns a context that checks the certificate and the host name of a broker.
+def https_context(tls: Tls) -> ssl.SSLContext:
+    """Returns a context that checks the certificate and the host name of an HTTP server.
 
     The files are read at each call, so renewed certificates need no restart. Raises `OSError` for
     an unusable file.

@@ -12,7 +12,7 @@ from urllib.parse import urlencode
 
 from holdfast.net.addresses import joined
 from holdfast.net.secret_file import read_secret
-from holdfast.net.tls import NO_FILES, broker_context
+from holdfast.net.tls import NO_FILES, https_context
 from holdfast.outputs.line_protocol import lines
 from holdfast.outputs.sending import Refused, soon_after
 
@@ -138,7 +138,7 @@ class Influx:
         if not secure:
             return http.client.HTTPConnection(host, port, timeout=timeout)
         tls = NO_FILES if self._settings.tls is None else self._settings.tls.files
-        return http.client.HTTPSConnection(host, port, timeout=timeout, context=broker_context(tls))
+        return http.client.HTTPSConnection(host, port, timeout=timeout, context=https_context(tls))
 
     def _authorization(self) -> dict[str, str]:
         """The credentials, read each time, so that a new token needs no restart."""

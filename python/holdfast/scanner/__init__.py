@@ -3,26 +3,27 @@
 It has no configuration of devices. It connects to a device at the first subscription to its tags,
 and disconnects after the last one ends. It keeps subscriptions over a restart in JetStream only.
 
-The modules: `service` connects the parts. `broker`, `receiving`, `outbox` and `wire` communicate
-with NATS, `polling` and `commands` with devices. `registry` holds the subscriptions. `groups`,
-`decoding` and `publishing` convert values to messages. `registry` and these three do no I/O.
-`adjusting` reads inexact requests; `tentacle` has the rules of the first generation of programs.
-`keeping` and `kept` store subscriptions, and restore them. `expiring` ends those that are not
-renewed. `write_access` says at the start what may be written.
+`service` makes the parts, connects them and stops them. `requests` carries out subscriptions,
+`commands` writes, `reports` answers questions. `placement` is what differs between a scanner that
+is alone and a node of a fleet.
 
-`fleet` shares devices with other scanners.
-
-For the programs of tentacle-next: `watching` follows buckets, `configured` carries out the
-subscriptions in one, `enabling` pauses polling, `tentacle_next` reads messages of another form.
+* `messages`: the messages, and what the programs of each dialect send and expect
+* `subscriptions`: devices and tags, who has subscribed to them, and at what rate
+* `polling`: the devices in use: their addresses, and how polls and writes reach them
+* `publish`: from polls to messages
+* `jetstream`: what is kept in JetStream, and what is read there
+* `reports`: the answers to `browse` and `variables`
+* `fleet`: scanners that share their devices
 """
 
 from __future__ import annotations
 
-from holdfast.scanner.broker import Ping, Servers
-from holdfast.scanner.fleet.terms import FleetRefused, FleetSettings
-from holdfast.scanner.limits import ScannerLimits
-from holdfast.scanner.rules import Defaults
-from holdfast.scanner.service import Scanner, Settings
+from holdfast.scanner.fleet.agreement import FleetRefused
+from holdfast.scanner.nats.connection import Ping, Servers
+from holdfast.scanner.service import Scanner
+from holdfast.scanner.settings import FleetSettings, Settings
+from holdfast.scanner.subscriptions.limits import ScannerLimits
+from holdfast.scanner.subscriptions.rules import Defaults
 
 __all__ = [
     "Defaults",

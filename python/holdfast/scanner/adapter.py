@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from holdfast._core import Poller
     from holdfast.leases import StartThread
     from holdfast.runtime.stop import Stop
-    from holdfast.scanner.service import Settings
+    from holdfast.scanner.settings import Settings
 
 
 class ScannerAdapter:

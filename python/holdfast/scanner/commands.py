@@ -1,16 +1,18 @@
-"""Commands: write a value, given as text, to coils or holding registers of a device."""
+"""Commands: a value, given as text, is written to coils or holding registers of a device."""
 
 from __future__ import annotations
 
 import logging
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from holdfast import logs
 from holdfast.client.requests import write_typed
 from holdfast.faults import EXPIRED, STANDBY, fault_text
 from holdfast.scanner.errors import Moved, Refused
-from holdfast.scanner.health import is_unwritten
-from holdfast.scanner.lateness import AGAIN
+from holdfast.scanner.lateness import SEND_AGAIN, Lateness
+from holdfast.scanner.messages.types import Answer
+from holdfast.scanner.subscriptions.health import is_unwritten
 from holdfast.tags.text import value_from
 from holdfast.tags.writing import from_text
 from holdfast.values import ConversionError, encode
@@ -19,16 +21,23 @@ from holdfast.values.types import parsed
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from nats.aio.msg import Msg
+
     from holdfast import tags
-    from holdfast.scanner.devices import ScannedDevice
-    from holdfast.scanner.polling import Polling
-    from holdfast.scanner.tags import Tag
+    from holdfast.scanner.messages.dialect import Dialect
+    from holdfast.scanner.placement import Placement
+    from holdfast.scanner.polling.poller import Polling
+    from holdfast.scanner.responder import Responder
+    from holdfast.scanner.settings import Settings
+    from holdfast.scanner.subscriptions.device import ScannedDevice
+    from holdfast.scanner.subscriptions.registry import Registry
+    from holdfast.scanner.subscriptions.tag import Tag
 
 
 def value(text: str, tag: Tag) -> Any:
     """Parses a text to a value of a tag's type. Raises `Refused`."""
     try:
-        made = from_text(text, parsed(tag.type), tag.asked_type)
+        made = from_text(text, parsed(tag.type), tag.requested_type)
     except ValueError as error:
         raise Refused(str(error)) from None
     return _checked(made, tag)
@@ -47,17 +56,74 @@ def _checked(made: Any, tag: Tag) -> Any:
     try:
         encode(made, tag.type, tag.order, encoding=tag.encoding)
     except ConversionError as error:
-        raise Refused(str(error).replace(tag.type, tag.asked_type)) from None
+        raise Refused(str(error).replace(tag.type, tag.requested_type)) from None
     return made
 
 
-async def write(
-    polling: Polling, device: ScannedDevice, tag: Tag, text: str, check: Callable[[], float]
+class Commands:
+    """Handles the commands of callers, and those that other nodes of a fleet have received."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        dialect: Dialect,
+        registry: Registry,
+        polling: Polling,
+        placement: Placement,
+        responder: Responder,
+    ) -> None:
+        self._prefix = settings.prefix
+        self._max_bytes = settings.limits.command
+        self._dialect = dialect
+        self._registry = registry
+        self._polling = polling
+        self._placement = placement
+        self._responder = responder
+        self.lateness = Lateness(settings.standstill_s)
+
+    async def command(self, message: Msg) -> Answer:
+        """Writes to a device of the scanner, or of its fleet. Raises `Refused`."""
+        name = message.subject.removeprefix(f"{self._prefix}.")
+        name = name.removeprefix("module.").removeprefix("command.")
+        if len(message.data) > self._max_bytes:
+            raise Refused(f"the value has {len(message.data)} bytes, allowed: {self._max_bytes}")
+        text = self._dialect.command_text(message.data)
+        async with self._responder.in_order(message):
+            device, tag = self._registry.commanded(name)
+        remaining_s = partial(self.remaining_s, message)
+        own = partial(self.write, device.id, tag.id, text, remaining_s)
+        await self._placement.write(device, tag, text, own, remaining_s)
+        return Answer(success=True)
+
+    def remaining_s(self, message: Msg) -> float:
+        """Returns how many seconds a command may wait now. Raises `Refused` if it is too late."""
+        return self.lateness.check(message)
+
+    async def write(
+        self, device_id: str, tag_id: str, text: str, remaining_s: Callable[[], float]
+    ) -> bool:
+        """Writes to a device. Returns whether this scanner polls it. Raises `Refused`."""
+        # Looked up again: the device may have been replaced while the command waited.
+        device = self._registry.devices.get(device_id)
+        if device is None or tag_id not in device.tags:
+            raise Refused(f"no tag {tag_id!r} of {device_id}")
+        if not self._placement.takes_writes(device):
+            return False
+        try:
+            await write_tag(self._polling, device, device.tags[tag_id], text, remaining_s)
+        except Moved:
+            return False
+        return True
+
+
+async def write_tag(
+    polling: Polling, device: ScannedDevice, tag: Tag, text: str, remaining_s: Callable[[], float]
 ) -> None:
     """Writes a value, given as text. Returns when the device has confirmed it.
 
-    `check` is called at the last moment: it refuses what is too late, and returns how many seconds
-    the write may wait for the device. Raises `Refused`.
+    `remaining_s` is called at the last moment: it refuses what is too late, and returns how many
+    seconds the write may wait for the device. Raises `Refused`, and `Moved` if another node has
+    the device.
     """
     if (flaw := device.unwritable(tag)) is not None:
         raise Refused(f"tag {tag.id!r} of {device.id} is not writable: {flaw}")
@@ -68,11 +134,11 @@ async def write(
         )
     except ValueError as error:
         raise Refused(f"not written: {error}") from None
-    fault = await polling.write(device, request, within=check())
-    if fault == STANDBY:
+    fault = await polling.write(device, request, within=remaining_s())
+    if fault == STANDBY:  # Its fence is closed, so nothing was sent.
         raise Moved(f"not written: {fault_text(fault)}")
     if fault:
-        said = "not written" if is_unwritten(fault) else "not confirmed"
-        again = f"; {AGAIN}" if fault == EXPIRED else ""
-        raise Refused(f"{said}: {fault_text(fault)}{again}")
+        outcome = "not written" if is_unwritten(fault) else "not confirmed"
+        again = f"; {SEND_AGAIN}" if fault == EXPIRED else ""
+        raise Refused(f"{outcome}: {fault_text(fault)}{again}")
     logs.write(logging.INFO, "tag_written", device=device.id, tag=tag.id)

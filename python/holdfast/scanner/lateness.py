@@ -15,20 +15,20 @@ from nats.errors import Error
 from holdfast.faults import EXPIRES_AFTER
 from holdfast.runtime.standstill import Standstill, now
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.receiving import Received
+from holdfast.scanner.nats.tolerant_client import Received
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from nats.aio.msg import Msg
 
-    from holdfast.scanner.receiving import SafeClient
+    from holdfast.scanner.nats.tolerant_client import SafeClient
 
-WAITED = EXPIRES_AFTER
-"""Seconds that a command may wait between the socket and the device, but for one timeout of that.
+MAX_WAIT_S = EXPIRES_AFTER
+"""How long a command may wait between the socket and the device, besides one timeout of the device.
 In a fleet, it waits 6 seconds for a node."""
 
-AGAIN = "send it again if it is still wanted"
+SEND_AGAIN = "send it again if it is still wanted"
 
 
 class Lateness:
@@ -50,10 +50,12 @@ class Lateness:
         self._standstill.look()
         if message.sent_after < self._standstill.ended:
             seconds = self._standstill.lasted
-            raise Refused(f"not written: this scanner stood still for {seconds:.0f} s; {AGAIN}")
-        if (waited := now() - message.received) > WAITED:
-            raise Refused(f"not written: the command waited for {waited:.0f} s; {AGAIN}")
-        return WAITED - waited
+            raise Refused(
+                f"not written: this scanner stood still for {seconds:.0f} s; {SEND_AGAIN}"
+            )
+        if (waited := now() - message.received) > MAX_WAIT_S:
+            raise Refused(f"not written: the command waited for {waited:.0f} s; {SEND_AGAIN}")
+        return MAX_WAIT_S - waited
 
     async def run(self, client: Callable[[], SafeClient | None]) -> None:
         """Looks for standstills, and pings the server after each, until it is cancelled."""

@@ -1,4 +1,4 @@
-"""What callers may write, in words for the log: a scanner writes to devices for whoever asks.
+"""What callers may write, in words for the log: by default, every NATS client may.
 
 Does no I/O.
 """
@@ -12,8 +12,9 @@ from holdfast.config.scanning import written_pollable
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.config.scanning import Dialect, Writes
+    from holdfast.config.scanning import Writes
     from holdfast.net.allow_list import AllowEntry
+    from holdfast.scanner.messages.dialect import Dialect
 
 TAGS: dict[Writes, str] = {
     "tags": 'every subscribed coil and holding register without "writable": false',
@@ -34,10 +35,7 @@ def described(
     """Returns which tags may be written, at which addresses, by whom, and what narrows it."""
     if writes == "none":
         return {"tags": TAGS[writes], "set_by": "nats.writes (--writes): none"}
-    asked = ["subscribe", "command.>"]
-    if dialect == "tentacle-next":
-        asked.append("module.command.>")
-    subjects = ", ".join(f"{prefix}.{each}" for each in asked)
+    subjects = ", ".join(f"{prefix}.{each}" for each in ("subscribe", *dialect.command_subjects))
     return {
         "tags": TAGS[writes],
         "devices": places(allow),

@@ -17,7 +17,7 @@ from ruamel.yaml import YAML
 
 import holdfast
 from holdfast.outputs.text_file import COLUMNS
-from holdfast.scanner.schema import json_schema
+from holdfast.scanner.messages.schema import json_schema
 from holdfast.values import encode
 from holdfast.web import health as probes
 from support import wire

@@ -11,18 +11,16 @@ from holdfast import logs
 from holdfast.adapters.mqtt.answers import Answers
 from holdfast.adapters.mqtt.filters import Filters
 from holdfast.adapters.mqtt.inbox import Inbox
-from holdfast.adapters.mqtt.link import MAX_UNSENT, BrokerConnection
+from holdfast.adapters.mqtt.link import BrokerConnection
 from holdfast.adapters.mqtt.values import Values
 from holdfast.mqtt.dialing import dial
 from holdfast.mqtt.password import read_password
 from holdfast.mqtt.waiting import Ended, Waiter
 from holdfast.net.addresses import joined
-from holdfast.net.tls import NO_FILES, broker_context
-from holdfast.net.tls_reasons import failure_text
+from holdfast.net.secure_channel import failure_text
 from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Mapping
 
     from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags
@@ -31,14 +29,8 @@ if TYPE_CHECKING:
 
     from holdfast.config import MappedTag, MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.ingest import MemoryAccess
+    from holdfast.mqtt.stream import BrokerSocket
     from holdfast.runtime.stop import Stop
-
-FIRST_PAUSE = 1.0
-MAX_PAUSE = 10.0
-"""Seconds between attempts to connect. Each failure doubles the pause, up to the maximum."""
-
-PROVEN = 10.0
-"""After a connection of at least this many seconds, the pauses start from the first again."""
 
 WELCOME = 10.0
 """Seconds to wait for the broker's CONNACK."""
@@ -52,6 +44,14 @@ _TICK = 1.0
 _UNRELEASED: dict[tuple[str, str], set[int]] = {}
 """QoS 2 packet identifiers of each session, by broker and client id. A session goes on when the
 adapter is replaced by another one, after a reload or a failure."""
+
+
+FIRST_PAUSE = 1.0
+MAX_PAUSE = 10.0
+"""Seconds between attempts to connect. Each failure doubles the pause, up to the maximum."""
+
+PROVEN = 10.0
+"""After a connection of at least this many seconds, the pauses start from the first again."""
 
 
 class Mqtt:
@@ -134,11 +134,9 @@ class Mqtt:
 
     def _link(self, waiter: Waiter) -> BrokerConnection:
         settings = self._settings
-        tls = NO_FILES if settings.tls is None else settings.tls.files
-        context = broker_context(tls) if settings.secure else None
 
-        def open_socket() -> socket.socket:
-            return dial(settings.host, settings.port, context, waiter)
+        def open_socket() -> BrokerSocket:
+            return dial(settings.host, settings.port, settings.tls_files, waiter)
 
         password = read_password(settings.password_file)
         link = BrokerConnection(
@@ -153,21 +151,20 @@ class Mqtt:
         """Reads and writes until the connection ends."""
         welcome = time.monotonic() + WELCOME
         tick = min(_TICK, self._settings.keep_alive / 2)
-        while (connection := link.socket()) is not None:
+        while link.is_open:
             if self._connected_at is None and time.monotonic() > welcome:
                 raise TimeoutError(f"the broker did not answer within {WELCOME:g} s")
-            pending = getattr(connection, "pending", int)() > 0
-            read = link.unsent < MAX_UNSENT
+            pending = link.pending
             readable, writable = waiter.wait(
-                connection,  # type: ignore[arg-type]
-                read=read,
-                write=link.want_write(),
-                seconds=0.0 if pending and read else tick,
+                link.connection.connection,
+                read=link.may_read,
+                write=link.connection.unsent > 0,
+                seconds=0.0 if pending else tick,
             )
             if writable:
-                link.loop_write()
-            if readable or (pending and read):
-                link.loop_read()
+                link.connection.flush()
+            if readable or pending:
+                link.read_more()
             link.loop_misc()
         self._ending = link.trouble or self._ending
 

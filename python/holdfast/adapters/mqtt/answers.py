@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import msgspec
-from paho.mqtt.enums import MQTTErrorCode
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
@@ -61,13 +60,11 @@ class Answers:
             return False
         payload = msgspec.json.encode(answer)
         size = len(payload) + len(response_topic) + len(message.correlation or b"")
-        if link.unsent >= MAX_WAITING or not link.takes(size):
+        if link.connection.unsent >= MAX_WAITING or not link.takes(size):
             return False
         properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
         properties.ContentType = "application/json"
         if message.correlation is not None:
             properties.CorrelationData = message.correlation
         qos = min(message.qos, 1, link.most_qos)
-        return link.publish(topic, payload, qos, properties=properties).rc == (
-            MQTTErrorCode.MQTT_ERR_SUCCESS
-        )
+        return link.answer(topic, payload, qos, properties)

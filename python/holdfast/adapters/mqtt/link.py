@@ -1,35 +1,37 @@
-"""One connection to a broker: paho's client with four changes.
+"""One connection to a broker: paho's client, but messages are received here.
 
 - A message is acknowledged after it was written, with every quality of service. With QoS 2 paho
   sends PUBREC before it delivers the message, so a crash between the two would lose the message.
 - A message that a memory can't keep at the moment is not acknowledged, and the connection ends.
 - The properties of a message are parsed here, in linear time.
 - A packet over the size limit is not kept in memory while it arrives.
-
-Methods that begin with an underscore override methods of paho.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import time
+from collections import deque
+from typing import TYPE_CHECKING, NamedTuple
 
-from paho.mqtt.enums import MQTTErrorCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from holdfast.adapters.mqtt.inbox import MAX_BYTES
 from holdfast.ingest import KEEPING
 from holdfast.mqtt.client import BrokerClient
 from holdfast.mqtt.packets import MAX_PROPERTIES, parse_publish
+from holdfast.mqtt.stream import Packets, acknowledgement
 
 if TYPE_CHECKING:
-    import socket
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
+    from paho.mqtt.client import Client
     from paho.mqtt.properties import Properties
+    from paho.mqtt.reasoncodes import ReasonCode
 
     from holdfast.adapters.mqtt.inbox import Inbox
     from holdfast.config import MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.mqtt.packets import Publish
+    from holdfast.mqtt.stream import BrokerSocket
 
 SESSION_EXPIRY = 3600
 """Seconds that the broker keeps the session while this client is disconnected. MQTT 5 only."""
@@ -48,6 +50,18 @@ _KEPT = MAX_PROPERTIES + 2**17
 
 _LARGEST = MAX_BYTES + _KEPT
 
+_READ = 65_536
+
+_PUBLISH, _PUBACK, _PUBREC, _PUBREL, _PUBCOMP, _PINGRESP = 0x30, 0x40, 0x50, 0x60, 0x70, 0xD0
+
+
+class _Pending(NamedTuple):
+    """An answer that waits until the broker has acknowledged others."""
+
+    topic: str
+    payload: bytes
+    properties: Properties
+
 
 class BrokerConnection(BrokerClient):
     """One connection, from dialing to its end. A reconnect creates a new object."""
@@ -56,7 +70,7 @@ class BrokerConnection(BrokerClient):
         self,
         settings: MqttConfig,
         password: bytes | None,
-        dial: Callable[[], socket.socket],
+        dial: Callable[[], BrokerSocket],
         unreleased: set[int],
         inbox: Inbox,
         answer: Callable[[BrokerConnection, Publish, Mapping[str, object]], None],
@@ -74,13 +88,32 @@ class BrokerConnection(BrokerClient):
         self._largest_sent: int | None = None
         self.most_qos = 1
         """The highest quality of service that the broker accepts, at most 1."""
-        self.max_queued_messages = MAX_WAITING
+        self._packets = Packets(_LARGEST, _KEPT)
+        self._alive_at = time.monotonic()
+        self._arrived: Iterator[tuple[int, bytes | bytearray, int]] = iter(())
+        """What was read and is not handled yet."""
+        self._is_late = False
+        """Whether there may be something in `_arrived`."""
+        self._most_on_the_way = _MAX_ON_THE_WAY
+        self._on_the_way: set[int] = set()
+        self._waiting: deque[_Pending] = deque()
+        self.on_publish = self._send_waiting
+
+    @property
+    def may_read(self) -> bool:
+        """Whether the broker has taken enough of what is sent to it."""
+        return self.connection.unsent < MAX_UNSENT
+
+    @property
+    def pending(self) -> bool:
+        """Whether `read_more` has something to do though nothing arrives."""
+        return self.connection.failure is not None or (self.may_read and self._is_late)
 
     def accepted(self, properties: Properties | None) -> None:
         """Applies the limits from the broker's CONNACK."""
         self.on_log = None
         most: int = getattr(properties, "ReceiveMaximum", _MAX_ON_THE_WAY)
-        self._max_inflight_messages = min(most, _MAX_ON_THE_WAY)
+        self._most_on_the_way = min(most, _MAX_ON_THE_WAY)
         self._largest_sent = getattr(properties, "MaximumPacketSize", None)
         self.most_qos = min(getattr(properties, "MaximumQoS", 1), 1)
 
@@ -107,40 +140,91 @@ class BrokerConnection(BrokerClient):
         """Returns whether the broker accepts a message of this size, plus packet overhead."""
         return self._largest_sent is None or size + 64 <= self._largest_sent
 
-    def _packet_read(self) -> MQTTErrorCode:
-        code = super()._packet_read()
-        if self._in_packet["remaining_length"] > _LARGEST:
-            del self._in_packet["packet"][_KEPT:]
-        return code
+    def answer(self, topic: str, payload: bytes, qos: int, properties: Properties) -> bool:
+        """Publishes a message. Returns false if too many wait."""
+        if not qos:
+            self.publish(topic, payload, 0, properties=properties)
+            return True
+        if len(self._on_the_way) + len(self._waiting) >= MAX_WAITING:
+            return False
+        self._waiting.append(_Pending(topic, payload, properties))
+        self._send_waiting()
+        return True
 
-    def _handle_publish(self) -> MQTTErrorCode:
-        packet = self._in_packet
+    def _send_waiting(
+        self,
+        _client: Client | None = None,
+        _data: object = None,
+        identifier: int = 0,
+        _reason: ReasonCode | None = None,
+        _properties: Properties | None = None,
+    ) -> None:
+        """Publishes answers that wait, after the acknowledgement of another."""
+        self._on_the_way.discard(identifier)
+        while self._waiting and len(self._on_the_way) < self._most_on_the_way:
+            topic, payload, properties = self._waiting.popleft()
+            sent = self.publish(topic, payload, 1, properties=properties)
+            self._on_the_way.add(sent.mid)
+
+    def read_more(self) -> None:
+        """Reads and handles what has arrived, while the broker takes the answers."""
+        if not self._is_late:
+            data = self.connection.read(_READ)
+            self._arrived = self._packets.feed(data)
+            if data:
+                self._note_alive()
+        self._is_late = True
+        for first, body, size in self._arrived:
+            self._handle(first, body, size)
+            if not self.is_open or not self.may_read:
+                return
+        self._is_late = False
+        if self.connection.failure is not None:
+            self.notice()
+
+    def _note_alive(self) -> None:
+        """Tells paho that the broker lives: its answer to a ping may be behind many messages."""
+        now = time.monotonic()
+        if now - self._alive_at >= self._settings.keep_alive / 4:
+            self._alive_at = now
+            self.pass_on(_PINGRESP, b"")
+
+    def _handle(self, first: int, body: bytes | bytearray, size: int) -> None:
+        """Handles a packet, whose body is cut if it is shorter than `size`."""
+        if first & 0xF0 == _PUBLISH:
+            self._take(first, body, size)
+        elif first & 0xF0 == _PUBREL:
+            if len(body) < 2:
+                raise ValueError("a PUBREL packet without identifier")
+            identifier = int.from_bytes(body[:2])
+            self._unreleased.discard(identifier)
+            self._acknowledge(_PUBCOMP, identifier)
+        else:
+            self.pass_on(first, body)
+
+    def _take(self, first: int, body: bytes | bytearray, size: int) -> None:
         try:
-            message = parse_publish(
-                packet["command"], packet["packet"], packet["remaining_length"], five=self._five
-            )
+            message = parse_publish(first, body, size, five=self._five)
         except ValueError as error:
-            self.trouble = f"malformed message: {error}"
-            return MQTTErrorCode.MQTT_ERR_PROTOCOL
+            self.end(f"malformed message: {error}")
+            return
         if message.qos == 2 and message.identifier in self._unreleased:
-            return self._send_pubrec(message.identifier)
+            self._acknowledge(_PUBREC, message.identifier)
+            return
         result = self._inbox.take(message)
         if message.qos and result.get("reason") in KEEPING:
             # Without an acknowledgement, the broker sends the message again after a reconnect.
-            self.trouble = str(result["detail"])
-            return MQTTErrorCode.MQTT_ERR_CONN_LOST
-        code = MQTTErrorCode.MQTT_ERR_SUCCESS
+            self.end(str(result["detail"]))
+            return
         if message.qos == 1:
-            code = self._send_puback(message.identifier)
+            self._acknowledge(_PUBACK, message.identifier)
         elif message.qos == 2:
             self._unreleased.add(message.identifier)
-            code = self._send_pubrec(message.identifier)
+            self._acknowledge(_PUBREC, message.identifier)
         # The answer follows the acknowledgement: if the broker closes the connection because of
         # the answer, it does not deliver the message again.
-        if code == MQTTErrorCode.MQTT_ERR_SUCCESS:
+        if self.connection.failure is None:
             self._answer(self, message, result)
-        return code
 
-    def _send_pubcomp(self, mid: int) -> MQTTErrorCode:
-        self._unreleased.discard(mid)
-        return super()._send_pubcomp(mid)
+    def _acknowledge(self, first: int, identifier: int) -> None:
+        self.connection.put(acknowledgement(first, identifier))

@@ -1,7 +1,8 @@
-"""One connection to a broker, for many messages: paho's client with two changes.
+"""One connection to a broker, for many messages.
 
 - Many messages are sent with one call, and many confirmations read with one.
 - A packet over the size limit is skipped.
+- paho does the rest: CONNECT, SUBSCRIBE, DISCONNECT, and pings while nothing is sent.
 
 All methods are for the thread that serves the connection.
 """
@@ -10,7 +11,6 @@ from __future__ import annotations
 
 import logging
 import socket
-import ssl
 from collections import deque
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -23,9 +23,9 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 from holdfast import logs
 from holdfast.mqtt.client import BrokerClient
 from holdfast.mqtt.packets import parse_publish
+from holdfast.mqtt.stream import Packets, acknowledgement
 from holdfast.net.addresses import joined
 from holdfast.outputs.mqtt.messages import Message, packed, size_of
-from holdfast.outputs.mqtt.packets import MAX_PACKET, Packets
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from holdfast.config import BrokerConfig
     from holdfast.mqtt.packets import Publish
+    from holdfast.mqtt.stream import BrokerSocket
     from holdfast.outputs.mqtt.messages import Delivery
 
 WINDOW = {"5": 1000, "3.1.1": 100}
@@ -44,10 +45,14 @@ to tell."""
 FIRST_IDENTIFIER, LAST_IDENTIFIER = 5000, 65535
 """Packet identifiers of messages. paho counts those of subscriptions from 1."""
 
+MAX_PACKET = 65_536
+"""Bytes of a packet. A larger one is skipped: commands are short."""
+
 TOPICS = 100
 """Topics in one SUBSCRIBE packet."""
 
-PUBLISH, PUBACK, PINGREQ, PINGRESP = 0x30, 0x40, 0xC0, 0xD0
+PUBLISH, PUBACK, PINGRESP = 0x30, 0x40, 0xD0
+_PING = bytes((0xC0, 0))
 QUOTA_EXCEEDED = 0x97
 READ = 262_144
 QUICK_ACK: int | None = getattr(socket, "TCP_QUICKACK", None)
@@ -62,7 +67,7 @@ class Connection(BrokerClient):
         settings: BrokerConfig,
         client_id: str,
         password: bytes | None,
-        dial: Callable[[], socket.socket],
+        dial: Callable[[], BrokerSocket],
         on_command: Callable[[Publish, bool], None],
         *,
         qos: int,
@@ -77,7 +82,7 @@ class Connection(BrokerClient):
         self._window = WINDOW[settings.version]
         self._largest: int | None = None
         self._retains = True
-        self._packets = Packets()
+        self._packets = Packets(MAX_PACKET)
         self._asked: dict[int, Sequence[str]] = {}
         self.on_subscribe = self._tell_subscribed
         self._waiting: deque[Delivery] = deque()
@@ -154,8 +159,8 @@ class Connection(BrokerClient):
         if self._written and self._proves:
             if not self._pinged:
                 self._pinged, self._written = self._written, []
-                self._packet_queue(PINGREQ, bytes((PINGREQ, 0)), 0, 0)
-        elif self._written and not self.want_write():
+                self.connection.put(_PING)
+        elif self._written and not self.connection.unsent:
             news = self._confirm(self._written)
         return news
 
@@ -192,7 +197,7 @@ class Connection(BrokerClient):
             self._written.append(delivery)
         if some:
             data = packed(some, identifiers, qos=self._qos, five=self._five)
-            self._packet_queue(PUBLISH, data, 0, 1)
+            self.connection.put(data)
         return bool(large)
 
     def _fits(self, message: Message) -> bool:
@@ -207,52 +212,32 @@ class Connection(BrokerClient):
 
     def read_more(self) -> bool:
         """Reads what has arrived. Returns whether some deliveries are done."""
-        connection = self.socket()
-        if connection is None:
-            return False
-        try:
-            data = connection.recv(READ)
-        except (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError):
-            return False
-        except OSError as error:
-            self._end(f"the connection was lost: {error}")
-            return False
-        if not data:
-            self._end("the broker closed the connection")
+        connection = self.connection
+        data = connection.read(READ)
+        if connection.failure is not None:
+            is_closed = isinstance(connection.failure, EOFError)
+            lost = "" if is_closed else "the connection was lost: "
+            self.end(f"{lost}{connection.failure}")
             return False
         if QUICK_ACK is not None:
             # A broker that writes each confirmation by itself waits for an acknowledgement by TCP
             # between them, which the system would send 40 ms later.
-            connection.setsockopt(socket.IPPROTO_TCP, QUICK_ACK, 1)  # type: ignore[attr-defined]
+            connection.connection.setsockopt(socket.IPPROTO_TCP, QUICK_ACK, 1)
         news = False
-        for first, body in self._packets.feed(data):
+        for first, body, _ in self._packets.feed(data):
             if first == PUBACK:
                 news |= self._confirmed(body)
             elif first & 0xF0 == PUBLISH:
                 self._received(first, body)
             elif first == PINGRESP and self._pinged:
                 news |= self._confirm(self._pinged)
-            elif self._passed(first, body) != MQTTErrorCode.MQTT_ERR_SUCCESS:
-                self._end(self.trouble or "the broker sent a malformed packet")
-            if self.socket() is None:
+            elif self.pass_on(first, body) != MQTTErrorCode.MQTT_ERR_SUCCESS:
+                self.end(self.trouble or "the broker sent a malformed packet")
+            if not connection.is_open:
                 break
         return news
 
-    def _passed(self, first: int, body: bytes) -> MQTTErrorCode:
-        """Passes a packet to paho."""
-        self._in_packet = {
-            "command": first,
-            "have_remaining": 1,
-            "remaining_count": [],
-            "remaining_mult": 1,
-            "remaining_length": len(body),
-            "packet": bytearray(body),
-            "to_process": 0,
-            "pos": 0,
-        }
-        return self._packet_handle()
-
-    def _confirmed(self, body: bytes) -> bool:
+    def _confirmed(self, body: bytes | bytearray) -> bool:
         """Notes a confirmation. Returns whether the delivery is done."""
         known = self._in_flight.pop(int.from_bytes(body[:2]), None)
         if known is None:
@@ -264,19 +249,15 @@ class Connection(BrokerClient):
             return delivery.is_done
         reason = str(ReasonCode(PacketTypes.PUBACK, identifier=code))
         if code == QUOTA_EXCEEDED:
-            self._end(f"the broker did not accept a message: {reason}")
+            self.end(f"the broker did not accept a message: {reason}")
             return False
         delivery.refuse(index, reason)
         return delivery.is_done
 
-    def _received(self, first: int, body: bytes) -> None:
+    def _received(self, first: int, body: bytes | bytearray) -> None:
         message = parse_publish(first, body, len(body), five=self._five)
         if message.qos == 1:
-            self._send_puback(message.identifier)
+            self.connection.put(acknowledgement(PUBACK, message.identifier))
         elif message.qos == 2:
             raise ValueError("a message with a quality of service that was not requested")
         self._on_command(message, bool(first & 1))
-
-    def _end(self, reason: str) -> None:
-        self.trouble = reason
-        self._sock_close()

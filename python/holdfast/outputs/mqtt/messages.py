@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+from holdfast.mqtt.stream import head
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
@@ -41,21 +43,13 @@ def packed(
         if size < 128:
             out += (bytes((heads[retain], size)), topic, middle, payload)
         else:
-            out += (_head(heads[retain], size), topic, middle, payload)
+            out += (head(heads[retain], size), topic, middle, payload)
     return b"".join(out)
 
 
 def size_of(message: Message) -> int:
     """The most bytes that the packet of a message has."""
     return 7 + len(message.topic) + len(message.payload) + len(message.properties)
-
-
-def _head(first: int, size: int) -> bytes:
-    head = [first]
-    while size > 127:
-        head.append(size & 0x7F | 0x80)
-        size >>= 7
-    return bytes((*head, size))
 
 
 class Delivery:

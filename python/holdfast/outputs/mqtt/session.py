@@ -14,15 +14,13 @@ from holdfast import logs
 from holdfast.mqtt.dialing import dial
 from holdfast.mqtt.password import read_password
 from holdfast.mqtt.waiting import Ended, Waiter
-from holdfast.net.tls import NO_FILES, broker_context
-from holdfast.net.tls_reasons import failure_text
+from holdfast.net.secure_channel import failure_text
 from holdfast.outputs.mqtt.connection import Connection
 from holdfast.outputs.mqtt.messages import Delivery, Message
 from holdfast.runtime.standstill import LOOK, Standstill
 from holdfast.runtime.stop import Stop
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Callable, Sequence
 
     from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags
@@ -30,6 +28,7 @@ if TYPE_CHECKING:
 
     from holdfast.config import BrokerConfig
     from holdfast.mqtt.packets import Publish
+    from holdfast.mqtt.stream import BrokerSocket
 
 WELCOME = 10.0
 """Seconds to wait for the broker's CONNACK."""
@@ -144,12 +143,10 @@ class Session:
     def _opened(self, client_id: str, will: Message | None) -> Connection:
         """Connects, and waits for the broker's consent. A stop interrupts it."""
         settings = self._settings
-        tls = NO_FILES if settings.tls is None else settings.tls.files
-        context = broker_context(tls) if settings.secure else None
         with Waiter(self._stop) as waiter:
 
-            def open_socket() -> socket.socket:
-                return dial(settings.host, settings.port, context, waiter)
+            def open_socket() -> BrokerSocket:
+                return dial(settings.host, settings.port, settings.tls_files, waiter)
 
             password = read_password(settings.password_file)
             connection = Connection(
@@ -170,7 +167,7 @@ class Session:
             try:
                 connection.greet()
                 end = time.monotonic() + WELCOME
-                while not self._is_accepted and connection.socket() is not None:
+                while not self._is_accepted and connection.is_open:
                     if time.monotonic() > end:
                         raise TimeoutError(f"the broker did not answer within {WELCOME:g} s")
                     self._step(connection, waiter)
@@ -195,7 +192,7 @@ class Session:
         """Serves the connection to its end."""
         connection = self._connection
         try:
-            while connection.socket() is not None:
+            while connection.is_open:
                 with self._lock:
                     new, self._new = self._new, []
                     topics, self._topics = self._topics, []
@@ -227,18 +224,17 @@ class Session:
 
     def _step(self, connection: Connection, waiter: Waiter) -> None:
         """Waits once, then reads and writes."""
-        open_socket = connection.socket()
-        assert open_socket is not None, "called only while it is open"
-        pending = getattr(open_socket, "pending", int)() > 0
+        open_socket = connection.connection
+        pending = open_socket.failure is not None
         readable, writable = waiter.wait(
-            open_socket,  # type: ignore[arg-type]
+            open_socket.connection,
             read=True,
-            write=connection.want_write(),
+            write=open_socket.unsent > 0,
             seconds=0.0 if pending else min(LOOK, self._settings.keep_alive / 2),
         )
         self._check()
         if writable:
-            connection.loop_write()
+            open_socket.flush()
         if (readable or pending) and connection.read_more():
             self._tell()
         connection.loop_misc()

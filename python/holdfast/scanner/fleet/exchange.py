@@ -14,9 +14,9 @@ class Command(msgspec.Struct, kw_only=True):
     tag: str
     text: str
     epoch: int
-    """The revision of the lease that the sender knows: whoever has an older one is not meant."""
+    """The revision of the lease that the sender knows. A node with an older one must not write."""
     within: float = 0.0
-    """Seconds that it may wait for the device, but for one timeout of that."""
+    """Seconds that it may wait for the device, besides one timeout of the device."""
 
 
 class Executed(msgspec.Struct, kw_only=True, omit_defaults=True):
@@ -27,13 +27,13 @@ class Executed(msgspec.Struct, kw_only=True, omit_defaults=True):
     """The node does not poll the device any more. Nothing was written."""
 
 
-class About(msgspec.Struct, kw_only=True):
+class ReportQuestion(msgspec.Struct, kw_only=True):
     """Asks for reports, or for variables, of devices that the other node polls."""
 
     devices: list[str]
 
 
-class Told(msgspec.Struct, kw_only=True):
+class NodeReports(msgspec.Struct, kw_only=True):
     """The reports, or the variables, of some of the devices: as many as fit into a message."""
 
     devices: dict[str, Any]

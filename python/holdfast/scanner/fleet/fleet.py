@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast import logs
 from holdfast.leases import Leases, LeaseThread, Relay
-from holdfast.scanner.fleet.placement import partition_of, placed
-from holdfast.scanner.fleet.terms import FleetRefused, FleetSettings, Terms, digest
+from holdfast.scanner.fleet.agreement import FleetRefused, Terms, digest
+from holdfast.scanner.fleet.assignment import assigned, partition_of
+from holdfast.scanner.settings import FleetSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -23,17 +24,17 @@ if TYPE_CHECKING:
 NODE = "node."
 PARTITION = "partition."
 
-TOGETHER = 4
+MAX_CONCURRENT_HANDOVERS = 4
 """Partitions that are handed over at once."""
 
-ENDING = 5.0
-"""Seconds to wait for polls and writes of a partition before it is given back."""
+DEVICE_STOP_TIMEOUT_S = 5.0
+"""Time to wait for polls and writes of a partition before it is given back."""
 
-SETTLED = 0.05
-"""Seconds in which changes are gathered before partitions are placed anew."""
+SETTLE_S = 0.05
+"""Time in which changes are gathered before partitions are placed anew."""
 
-LOOKED = 0.5
-"""The longest time in seconds between two looks at which leases have ended."""
+CHECK_INTERVAL_S = 0.5
+"""The longest time between two looks at which leases have ended."""
 
 
 def leases_of(fleet: str) -> str:
@@ -72,12 +73,12 @@ class Fleet:
         self._gained = gained
         self._lost = lost
         self._is_leaving = False
-        self._news = asyncio.Event()
+        self._has_changed = asyncio.Event()
         self._ending: dict[str, asyncio.Task[None]] = {}
-        self._may_end = asyncio.Semaphore(TOGETHER)
+        self._may_end = asyncio.Semaphore(MAX_CONCURRENT_HANDOVERS)
         self._started = int(time.time() * 1000)
         self._named_since = time.monotonic()
-        """When this process was the node the last time, or nobody was."""
+        """When no other process had the name of this node, the last time."""
         self._begun: dict[int, int] = {}
         """The partitions whose devices are used, with the revision of the lease."""
         self._epochs: dict[int, int] = {}
@@ -151,7 +152,7 @@ class Fleet:
     def connected(self) -> None:
         """Gives messages greater numbers than those sent over the former connection.
 
-        A server that was frozen sends what it had received before when it goes on.
+        A server that was frozen sends older messages when it continues.
         """
         for partition, epoch in self._epochs.items():
             self._epochs[partition] = max(self.revision(partition), epoch)
@@ -204,7 +205,7 @@ class Fleet:
         self._named_since = time.monotonic()
         while not self.leases.since(key):
             self._check_name()
-            await asyncio.sleep(SETTLED)
+            await asyncio.sleep(SETTLE_S)
         logs.write(
             logging.INFO,
             "fleet_joined",
@@ -233,21 +234,21 @@ class Fleet:
         known: list[str] = []
         while True:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(LOOKED):
-                    await self._news.wait()
-            await asyncio.sleep(SETTLED)
-            self._news.clear()
+                async with asyncio.timeout(CHECK_INTERVAL_S):
+                    await self._has_changed.wait()
+            await asyncio.sleep(SETTLE_S)
+            self._has_changed.clear()
             self._check_name()
             nodes = self.nodes
             if nodes != known:
                 fields = {"fleet": self.settings.name, "nodes": ",".join(nodes)}
                 logs.write(logging.INFO, "fleet_changed", **fields)
                 known = nodes
-            self._place(nodes)
+            self._assign(nodes)
             if time.monotonic() > self._shown_at + self.leases.times.renewal_s:
                 self._show()
 
-    def _place(self, nodes: list[str]) -> None:
+    def _assign(self, nodes: list[str]) -> None:
         if self._is_leaving:
             return
         held = {
@@ -255,7 +256,7 @@ class Fleet:
             for partition in range(self.settings.partitions)
             if (holder := self.holder(partition)) is not None
         }
-        target = placed(self.settings.partitions, nodes, held)
+        target = assigned(self.settings.partitions, nodes, held)
         mine = {f"{PARTITION}{each}" for each, node in target.items() if node == self.node}
         self._thread.want([f"{NODE}{self.node}", *mine])
         for key in self.leases.held:
@@ -269,7 +270,7 @@ class Fleet:
 
     async def _give_back(self, key: str, may_end: asyncio.Semaphore) -> None:
         async with may_end:
-            await self._thread.give_back(key, ENDING)
+            await self._thread.give_back(key, DEVICE_STOP_TIMEOUT_S)
         self._settle(key)
 
     async def leave(self) -> None:
@@ -288,7 +289,7 @@ class Fleet:
     def _settle(self, key: str) -> None:
         """Begins or ends with the devices of a partition, as its lease is now.
 
-        It may be another one than that of the event: the thread of the leases goes on meanwhile.
+        It may have changed again since the event: the thread of the leases runs meanwhile.
         """
         if not key.startswith(PARTITION):
             return
@@ -306,18 +307,18 @@ class Fleet:
 
     def taken(self, key: str) -> None:
         """A lease was taken."""
-        self._news.set()
+        self._has_changed.set()
         self._settle(key)
 
     def lost(self, key: str, reason: str) -> None:
         """A lease is not held any more."""
-        self._news.set()
+        self._has_changed.set()
         logs.refused("lease_lost", kind="lease", fleet=self.settings.name, lease=key, reason=reason)
         self._settle(key)
 
     def changed(self) -> None:
         """Somebody else has taken or left a lease."""
-        self._news.set()
+        self._has_changed.set()
 
     def works(self, reason: str | None) -> None:
         """The bucket of leases works; or it does not, for this reason."""

@@ -1,0 +1,45 @@
+"""What all nodes of a fleet have in common."""
+
+from __future__ import annotations
+
+import hashlib
+
+import msgspec
+
+PROTOCOL = 1
+"""The version of the buckets and messages that nodes share."""
+
+
+class FleetRefused(Exception):
+    """The node can't be a part of the fleet with these settings."""
+
+
+def digest(terms: bytes) -> str:
+    """What a node shows of its terms."""
+    return hashlib.blake2b(terms, digest_size=8).hexdigest()
+
+
+class Terms(msgspec.Struct, frozen=True, kw_only=True):
+    """The settings that all nodes have in common: any of them answers any request."""
+
+    protocol: int
+    partitions: int
+    prefix: str
+    allow: list[str]
+    writes: str
+    strict: bool
+    defaults: str
+    limits: str
+    profiles: str
+
+    def encoded(self) -> bytes:
+        """How they are stored."""
+        return msgspec.json.encode(self)
+
+    def difference(self, other: Terms) -> str | None:
+        """The first setting in which the other terms differ, with both values."""
+        for key in self.__struct_fields__:
+            own, theirs = getattr(self, key), getattr(other, key)
+            if own != theirs:
+                return f"{key} is {own}, and {theirs} in the fleet"
+        return None

@@ -1,0 +1,319 @@
+"""What the subscribers of a fleet desired: a key for each device, in a bucket."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import msgspec
+from nats.errors import Error
+from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy, StorageType, StreamConfig
+from nats.js.errors import APIError, NotFoundError
+
+from holdfast import logs
+from holdfast.leases import Outdated, first_revision, made
+from holdfast.scanner.fleet.agreement import FleetRefused, Terms
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from nats.aio.client import Client
+    from nats.aio.msg import Msg
+    from nats.js import JetStreamContext
+    from nats.js.api import RawStreamMsg, StreamInfo
+
+TIMEOUT_S = 2.0
+"""Time to wait for an answer of JetStream."""
+
+TERMS = "terms"
+DEVICE = "device."
+
+WRONG_SEQUENCE = (10071, 10164)
+"""Error codes of JetStream: the key has another revision than expected."""
+
+
+VISIBLE_AFTER_S = 1.0
+"""Time in which nodes that start at the same time see each other."""
+
+MAX_CONCURRENT_WRITES = 32
+"""Values of a lost bucket that are stored again at once."""
+
+FORMER_HEADER = "Holdfast-Former"
+"""The header of a value that is from a lost bucket: which one, and its revision there."""
+
+
+class DesiredDevice(msgspec.Struct, kw_only=True):
+    """The value of a device: its subscriptions, as requests."""
+
+    requests: list[msgspec.Raw]
+    renewed: dict[str, int] = {}
+    """Milliseconds since 1970 at which each subscriber with a `ttl` has sent its last request."""
+
+
+@dataclass(frozen=True)
+class _Former:
+    """A value of a lost bucket."""
+
+    bucket: str
+    revision: int
+    value: bytes
+
+    def header(self) -> str:
+        return f"{self.bucket} {self.revision}"
+
+    def replaces(self, header: str) -> bool:
+        """Whether another node has stored an older value of the same bucket."""
+        bucket, _, revision = header.rpartition(" ")
+        return bucket == self.bucket and revision.isdecimal() and int(revision) < self.revision
+
+
+class DesiredState:
+    """The bucket. Each node knows all of it, and stores it again if it gets lost."""
+
+    def __init__(
+        self, fleet: str, on_change: Callable[[str], None], on_loss: Callable[[], None]
+    ) -> None:
+        """`on_change` is called for each device that has a new value.
+
+        `on_loss` is called when all revisions that are known have become void.
+        """
+        self.bucket = f"holdfast_fleet_{fleet}_wants"
+        self._stream = f"KV_{self.bucket}"
+        self._subject_prefix = f"$KV.{self.bucket}."
+        self._fleet = fleet
+        self._on_change = on_change
+        self._on_loss = on_loss
+        self._client: Client | None = None
+        self._following: JetStreamContext.PushSubscription | None = None
+        self._values: dict[str, tuple[int, bytes]] = {}
+        """Revision and value of each device; the value is empty if it was deleted."""
+        self._made_at = ""
+        self._former: dict[str, _Former] = {}
+        """The values of a lost bucket that are not stored again yet."""
+        self.is_read = asyncio.Event()
+        """Set when all values that were stored at the start are known."""
+
+    async def open(
+        self,
+        client: Client,
+        terms: Terms,
+        is_in_force: Callable[[bytes], bool],
+        *,
+        has_joined: bool,
+    ) -> None:
+        """Makes the bucket, agrees on the terms, and begins to follow the values.
+
+        Raises `FleetRefused` for terms in force that are others, and errors of nats-py.
+        """
+        self._client = client
+        found = await self._make(client.jetstream(timeout=TIMEOUT_S))
+        self._identify(str(found.created), found.state.last_seq)
+        await self.agree(terms, is_in_force, may_replace=has_joined)
+        await self._restore()
+        if self._following is not None:
+            with contextlib.suppress(Error):
+                await self._following.unsubscribe()
+        config = ConsumerConfig(
+            deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
+            ack_policy=AckPolicy.NONE,
+            mem_storage=True,
+            inactive_threshold=30.0,
+        )
+        context = client.jetstream(timeout=TIMEOUT_S)
+        following = await context.subscribe(
+            f"{self._subject_prefix}{DEVICE}>",
+            stream=self._stream,
+            config=config,
+            cb=self._on_message,
+        )
+        self._following = following
+        info = await following.consumer_info()
+        if not info.num_pending and not (info.delivered and info.delivered.consumer_seq):
+            self.is_read.set()
+
+    async def _make(self, context: JetStreamContext) -> StreamInfo:
+        try:
+            return await context.stream_info(self._stream)
+        except NotFoundError:
+            config = StreamConfig(
+                name=self._stream,
+                subjects=[f"{self._subject_prefix}>"],
+                max_msgs_per_subject=1,
+                storage=StorageType.FILE,
+                deny_delete=True,
+                allow_rollup_hdrs=True,
+                allow_direct=True,
+                first_seq=first_revision(self._latest),
+            )
+            await made(context, config, 3)
+            return await context.stream_info(self._stream)
+
+    @property
+    def _latest(self) -> int:
+        return max((revision for revision, _ in self._values.values()), default=0)
+
+    def _identify(self, made_at: str, last: int) -> None:
+        """Notes that the bucket is another one, or was set back, and that its values are lost."""
+        before, self._made_at = self._made_at, made_at
+        if not before or (before == made_at and last >= self._latest):
+            return
+        self._former |= {
+            device: _Former(before, revision, value)
+            for device, (revision, value) in self._values.items()
+        }
+        self._values = {}
+        self._on_loss()
+        known = sum(bool(former.value) for former in self._former.values())
+        fields = {"fleet": self._fleet, "bucket": self.bucket, "devices": known}
+        logs.write(logging.WARNING, "fleet_storage_lost", **fields)
+
+    async def _restore(self) -> None:
+        """Stores what a lost bucket had. Raises errors of nats-py."""
+        if not self._former:
+            return
+        stored, left = 0, list(self._former)
+        while left:
+            batch, left = left[:MAX_CONCURRENT_WRITES], left[MAX_CONCURRENT_WRITES:]
+            stored += sum(await asyncio.gather(*map(self._restore_one, batch)))
+        fields = {"fleet": self._fleet, "bucket": self.bucket, "devices": stored}
+        logs.write(logging.INFO, "subscriptions_restored", **fields)
+
+    async def _restore_one(self, device: str) -> bool:
+        """Returns whether the value is stored now. One that is newer stays as it is."""
+        former, key = self._former[device], DEVICE + _token(device)
+        is_stored, revision = False, 0
+        while not is_stored:
+            try:
+                await self._put(key, former.value, revision, {FORMER_HEADER: former.header()})
+                is_stored = True
+            except Outdated:
+                found = await self._found(key)
+                header = "" if found is None else (found.headers or {}).get(FORMER_HEADER, "")
+                if found is None or not former.replaces(header):
+                    break
+                revision = found.seq or 0
+        del self._former[device]
+        return is_stored and bool(former.value)
+
+    async def is_followed(self) -> bool:
+        """Whether changes of the bucket still arrive. Raises errors of nats-py."""
+        if self._client is None or self._following is None:
+            return False
+        info = await self._client.jetstream(timeout=TIMEOUT_S).stream_info(self._stream)
+        if str(info.created) != self._made_at or info.state.last_seq < self._latest:
+            return False
+        await self._following.consumer_info()  # Its server may have ended.
+        return True
+
+    async def agree(
+        self, terms: Terms, is_in_force: Callable[[bytes], bool], *, may_replace: bool
+    ) -> None:
+        """The first node decides the terms. Others replace those of nodes that have ended.
+
+        `is_in_force` returns whether a live node has these terms. Only a node that others see may
+        replace them: two may start at the same time. Raises `FleetRefused` for terms in force.
+        """
+        value, has_waited = terms.encoded(), False
+        while True:
+            revision, found = await self._get(TERMS)
+            if found:
+                try:
+                    difference = terms.difference(msgspec.json.decode(found, type=Terms))
+                except msgspec.DecodeError:
+                    difference = "the protocol is another one"
+                if difference is None:
+                    return
+                if is_in_force(found):
+                    raise FleetRefused(difference)
+                if not may_replace:
+                    return
+                if not has_waited:
+                    await asyncio.sleep(VISIBLE_AFTER_S)
+                    has_waited = True
+                    continue
+            with contextlib.suppress(Outdated):
+                await self._put(TERMS, value, revision)
+                return
+
+    def value(self, device: str) -> tuple[int, DesiredDevice | None]:
+        """The last known revision and value of a device; `None` without subscriptions."""
+        revision, value = self._values.get(device, (0, b""))
+        return revision, msgspec.json.decode(value, type=DesiredDevice) if value else None
+
+    @property
+    def devices(self) -> list[str]:
+        """All devices with subscriptions."""
+        return [device for device, (_, value) in self._values.items() if value]
+
+    async def store(self, device: str, desired: DesiredDevice | None, revision: int) -> int:
+        """Replaces that revision of a device. Returns the new one.
+
+        Raises `Outdated` and errors of nats-py.
+        """
+        value, made_at = b"" if desired is None else msgspec.json.encode(desired), self._made_at
+        stored = await self._put(DEVICE + _token(device), value, revision)
+        if made_at != self._made_at:
+            raise Outdated(device)
+        self._learn(device, stored, value)
+        return stored
+
+    async def read(self, device: str) -> None:
+        """Reads the value of a device anew. Raises errors of nats-py."""
+        revision, value = await self._get(DEVICE + _token(device))
+        self._learn(device, revision, value)
+
+    def _learn(self, device: str, revision: int, value: bytes) -> bool:
+        if revision <= self._values.get(device, (0, b""))[0]:
+            return False
+        self._values[device] = (revision, value)
+        return True
+
+    async def _on_message(self, message: Msg) -> None:
+        metadata = message.metadata
+        with contextlib.suppress(ValueError):
+            device = _text(message.subject.removeprefix(self._subject_prefix + DEVICE))
+            if self._learn(device, metadata.sequence.stream, message.data):
+                self._on_change(device)
+        if metadata.num_pending == 0:
+            self.is_read.set()
+
+    async def _get(self, key: str) -> tuple[int, bytes]:
+        found = await self._found(key)
+        return (0, b"") if found is None else (found.seq or 0, found.data or b"")
+
+    async def _found(self, key: str) -> RawStreamMsg | None:
+        assert self._client is not None, "the bucket is open"
+        context = self._client.jetstream(timeout=TIMEOUT_S)
+        try:
+            return await context.get_last_msg(self._stream, f"{self._subject_prefix}{key}")
+        except NotFoundError:
+            return None
+
+    async def _put(
+        self, key: str, value: bytes, revision: int, more: Mapping[str, str] | None = None
+    ) -> int:
+        assert self._client is not None, "the bucket is open"
+        headers = {"Nats-Expected-Last-Subject-Sequence": str(revision), **(more or {})}
+        if not value:
+            headers["KV-Operation"] = "DEL"
+        context = self._client.jetstream(timeout=TIMEOUT_S)
+        try:
+            ack = await context.publish(f"{self._subject_prefix}{key}", value, headers=headers)
+        except APIError as error:
+            if error.err_code in WRONG_SEQUENCE:
+                raise Outdated(key) from None
+            raise
+        return ack.seq
+
+
+def _token(device: str) -> str:
+    """A device id as a part of a key."""
+    return base64.urlsafe_b64encode(device.encode()).rstrip(b"=").decode()
+
+
+def _text(token: str) -> str:
+    return base64.urlsafe_b64decode(token + "=" * (-len(token) % 4)).decode()

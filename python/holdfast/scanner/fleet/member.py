@@ -1,0 +1,338 @@
+"""A node of a fleet: its membership, its leases, and the desired state.
+
+All nodes know all subscriptions, so any of them answers any request. A device is polled by the node
+that has the lease of its partition.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+from nats.errors import Error
+from nats.js.errors import NoStreamResponseError
+
+from holdfast import logs
+from holdfast.client.url import connection_of
+from holdfast.leases import Outdated
+from holdfast.runtime import tasks
+from holdfast.runtime.heartbeat import Heartbeat
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
+from holdfast.scanner.fleet.fleet import Fleet
+from holdfast.scanner.jetstream.entries import requests as stored_requests
+from holdfast.scanner.jetstream.entries import restored
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator
+
+    from nats.aio.client import Client
+
+    from holdfast import _core
+    from holdfast.leases import Connect, StartThread
+    from holdfast.scanner.fleet.agreement import Terms
+    from holdfast.scanner.messages.types import SubscribeRequest
+    from holdfast.scanner.placement import DeviceHost, SubscriptionHost
+    from holdfast.scanner.settings import FleetSettings
+    from holdfast.scanner.subscriptions.device import ScannedDevice
+    from holdfast.scanner.subscriptions.registry import Registry
+
+OPEN_RETRY_S = 0.5
+"""Between attempts to open the buckets."""
+
+ADOPT_RETRY_S = 10.0
+"""Between attempts to carry out a subscription of another node that is refused here."""
+
+MAX_STORE_ATTEMPTS = 20
+"""Attempts to store a device that other nodes change at the same time."""
+
+CONNECTION_CHECK_S = 0.1
+"""Between looks whether there is a connection."""
+
+HANG_AFTER_S = 5.0
+"""Time without a sign of life of the event loop after which leases are not renewed."""
+
+
+class FleetMember:
+    """Joins the fleet, follows the desired state, and knows which devices are its own."""
+
+    def __init__(
+        self,
+        settings: FleetSettings,
+        terms: Terms,
+        registry: Registry,
+        about: Callable[[], dict[str, Any]],
+        connect: Connect,
+        start_thread: StartThread,
+    ) -> None:
+        """`connect` makes a connection for the leases alone, `start_thread` starts their thread."""
+        self.fleet = Fleet(
+            settings,
+            terms,
+            about,
+            self._gained,
+            self._lost,
+            connect=connect,
+            withheld=self._withheld,
+            start_thread=start_thread,
+        )
+        self._heartbeat = Heartbeat()
+        self.desired = DesiredState(settings.name, self._on_change, self._on_loss)
+        self._check_interval_s = settings.check_interval_s
+        self._registry = registry
+        self._client: Client | None = None
+        self._has_new_client = asyncio.Event()
+        self._has_touched = asyncio.Event()
+        self._touched: set[str] = set()
+        self._failed: set[str] = set()
+        self._renewed: dict[tuple[str, str], int] = {}
+        self._applied: dict[str, int] = {}
+        """The revision of each device that is carried out here. Only that one may be replaced: one
+        that is newer has what others have changed."""
+        self._devices: dict[int, dict[str, ScannedDevice]] = {}
+        self.is_joined = False
+
+    def connected(self, client: Client | None) -> None:
+        """Sets the client; `None` while there is no connection."""
+        self._client = client
+        self._has_new_client.set()
+        if client is not None:
+            self.fleet.connected()
+
+    def _withheld(self) -> str | None:
+        """Why this node can't publish values; then others should have its devices."""
+        if self._client is None:
+            return "the other connection to NATS was lost"
+        if self._heartbeat.age > HANG_AFTER_S:
+            return f"the event loop hangs for {HANG_AFTER_S:g} s"
+        return None
+
+    async def run(
+        self, devices: DeviceHost, subscriptions: SubscriptionHost, ready: asyncio.Event
+    ) -> None:
+        """Is a node of the fleet until it is cancelled. Raises `FleetRefused`.
+
+        Sets `ready` when it knows the desired state.
+        """
+        self._device_host, self._subscription_host = devices, subscriptions
+        running: list[asyncio.Task[None]] = []
+        self.fleet.start()
+        try:
+            async with self._heartbeat.kept():
+                await self._open(ready)
+                works = (self.fleet.run(), self._follow_again(), self._adopt_changes())
+                running += [asyncio.create_task(work) for work in works]
+                done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    task.result()
+        finally:
+            await tasks.end(running)
+            await self.fleet.stop()
+
+    async def _open(self, ready: asyncio.Event) -> None:
+        """Joins the fleet, and reads the desired state."""
+        while not self.is_joined:
+            client, leases = self._client, self.fleet.leases
+            if client is None or leases.reason is not None or not leases.is_read:
+                await asyncio.sleep(CONNECTION_CHECK_S)
+                continue
+            try:
+                fleet = self.fleet
+                await self.desired.open(client, fleet.terms, fleet.has_terms, has_joined=False)
+                self._has_new_client.clear()
+                await fleet.join()
+                await self.desired.agree(fleet.terms, fleet.has_terms, may_replace=True)
+                await self._read(ready)
+                self.is_joined = True
+            except (Error, OSError) as error:
+                logs.refused("fleet_unavailable", kind="fleet", reason=str(error) or repr(error))
+                await asyncio.sleep(OPEN_RETRY_S)
+
+    async def _read(self, ready: asyncio.Event) -> None:
+        await self.desired.is_read.wait()
+        for device in self.desired.devices:
+            await self._adopt(device)
+        ready.set()
+
+    async def _follow_again(self) -> None:
+        """Follows the bucket anew after each reconnect, and whenever nothing comes from it.
+
+        The server may have forgotten who follows it, or have lost the bucket.
+        """
+        while True:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(self._check_interval_s):
+                    await self._has_new_client.wait()
+            client = self._client
+            if client is None:
+                await asyncio.sleep(CONNECTION_CHECK_S)
+                continue
+            if not self._has_new_client.is_set():
+                with contextlib.suppress(Error, OSError):
+                    if await self.desired.is_followed():
+                        continue
+            self._has_new_client.clear()
+            try:
+                await self.desired.open(client, self.fleet.terms, lambda _: True, has_joined=True)
+            except (Error, OSError) as error:
+                logs.refused("fleet_unavailable", kind="fleet", reason=str(error) or repr(error))
+                await asyncio.sleep(OPEN_RETRY_S)
+                self._has_new_client.set()
+
+    async def _adopt_changes(self) -> None:
+        """Carries out what other nodes have stored."""
+        while True:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(ADOPT_RETRY_S):
+                    await self._has_touched.wait()
+                    self._has_touched.clear()
+            if not self._touched:
+                self._touched, self._failed = self._failed, set()
+            touched, self._touched = self._touched, set()
+            for device in touched:
+                await self._adopt(device)
+
+    def _on_loss(self) -> None:
+        self._applied.clear()
+
+    def _on_change(self, device: str) -> None:
+        self._touched.add(device)
+        self._has_touched.set()
+
+    async def _adopt(self, device: str) -> None:
+        async with self._device_host.lock(device):
+            await self._adopt_now(device)
+
+    async def _adopt_now(self, device: str) -> Refused | None:
+        """Returns why it is refused here."""
+        revision, desired = self.desired.value(device)
+        times = {} if desired is None else desired.renewed
+        renewed = {each for each, at in times.items() if self._renewed.get((device, each)) != at}
+        try:
+            wanted: dict[str, list[SubscribeRequest]] = {}
+            for text in () if desired is None else desired.requests:
+                request = restored(bytes(text))
+                wanted.setdefault(request.subscriber_id, []).append(request)
+            await self._subscription_host.adopt(device, wanted, renewed)
+        except Refused as refused:
+            logs.refused("not_restored", kind="fleet", device=device, reason=str(refused))
+            self._failed.add(device)
+            return refused
+        self._applied[device] = revision
+        self._renewed |= {(device, each): at for each, at in times.items()}
+        return None
+
+    async def store(
+        self, device: str, change: Callable[[], Awaitable[object]], subscriber: str | None = None
+    ) -> None:
+        """Makes a change of the subscriptions of a device, here and in the bucket.
+
+        The lock of the device is held. `subscriber` has renewed its subscription. Raises `Refused`;
+        then nothing has changed.
+        """
+        # The change is made here first: it may be refused. If another node was faster, its value is
+        # adopted, which undoes the change, and the change is made again on top of it.
+        for _ in range(MAX_STORE_ATTEMPTS):
+            await change()
+            now = int(time.time() * 1000)
+            renewed = {
+                each: now if each == subscriber else self._renewed.get((device, each), now)
+                for each in self._subscribers_with_ttl(device)
+            }
+            requests = [msgspec.Raw(each) for each in self._requests(device)]
+            desired = DesiredDevice(requests=requests, renewed=renewed) if requests else None
+            try:
+                self._check_size(device, desired)
+                revision = self._applied.get(device, 0)
+                self._applied[device] = await self.desired.store(device, desired, revision)
+            except Outdated:
+                with contextlib.suppress(Error, OSError):
+                    await self.desired.read(device)
+                if (refused := await self._adopt_now(device)) is not None:
+                    raise Refused(f"the fleet's subscriptions of {device}: {refused}") from None
+                continue
+            except Refused:
+                await self._adopt_now(device)
+                raise
+            except (Error, OSError) as error:
+                self._has_new_client.set()  # The bucket may be lost.
+                await self._adopt_now(device)
+                reason = str(error) or type(error).__name__
+                is_certain = isinstance(error, NoStreamResponseError)
+                outcome = "not stored in" if is_certain else "not confirmed by"
+                raise Refused(f"{outcome} {self.desired.bucket}: {reason}") from None
+            self._renewed |= {(device, each): at for each, at in renewed.items()}
+            return
+        raise Refused(
+            f"{device} was changed by other nodes {MAX_STORE_ATTEMPTS} times meanwhile: try again"
+        )
+
+    def _requests(self, device_id: str) -> Iterator[bytes]:
+        """Yields the requests that make the subscriptions of a device."""
+        device = self._registry.devices.get(device_id)
+        for subscriber in () if device is None else device.subscribers:
+            assert device is not None, "it has subscribers"
+            yield from stored_requests(device, subscriber)
+
+    def _subscribers_with_ttl(self, device_id: str) -> list[str]:
+        device = self._registry.devices.get(device_id)
+        subscribers = {} if device is None else device.subscribers
+        return [name for name, each in subscribers.items() if each.ttl is not None]
+
+    def _check_size(self, device: str, desired: DesiredDevice | None) -> None:
+        client = self._client
+        if desired is None or client is None:
+            return
+        size, most = len(msgspec.json.encode(desired)), client.max_payload - 1024
+        if size > most:
+            raise Refused(
+                f"the subscriptions of {device} take {size} bytes, a fleet stores at most {most}: "
+                "use fewer tags, or set max_payload of the NATS server"
+            )
+
+    def added(self, device: ScannedDevice) -> None:
+        """A device is known from now on."""
+        device.partition = self.fleet.partition(connection_of(device.source.target))
+        self._devices.setdefault(device.partition, {})[device.id] = device
+
+    def dropped(self, device: ScannedDevice) -> None:
+        """A device is known no more."""
+        of_partition = self._devices.get(device.partition, {})
+        if of_partition.get(device.id) is device:
+            del of_partition[device.id]
+
+    def is_own(self, device: ScannedDevice) -> bool:
+        """Whether this node polls a device, now."""
+        return self.fleet.is_own(device.partition)
+
+    def fence(self, device: ScannedDevice) -> _core.Fence:
+        """The fence of a device."""
+        return self.fleet.fence(device.partition)
+
+    def is_current(self, device: ScannedDevice, epoch: int) -> bool:
+        """Whether this node has the lease of a device since that revision, or a later one."""
+        return self.is_own(device) and self.fleet.revision(device.partition) >= epoch
+
+    @property
+    def own(self) -> Iterator[ScannedDevice]:
+        """The devices that this node polls."""
+        for partition in self.fleet.partitions:
+            yield from self._devices.get(partition, {}).values()
+
+    def _gained(self, partition: int) -> None:
+        for device in list(self._devices.get(partition, {}).values()):
+            self._device_host.begin(device)
+
+    def _lost(self, partition: int) -> None:
+        for device in list(self._devices.get(partition, {}).values()):
+            self._device_host.end(device)
+
+    async def leave(self) -> None:
+        """Hands everything over."""
+        if self.is_joined:
+            logs.write(logging.INFO, "fleet_leaving", fleet=self.fleet.settings.name)
+            await self.fleet.leave()

@@ -1,0 +1,164 @@
+"""Looks at a fleet from outside: its nodes are in the bucket of leases."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+from nats.errors import Error, NoRespondersError
+from nats.js.errors import NotFoundError
+
+from holdfast.leases import LEASE_TIMES, Holding, LeaseBucket
+from holdfast.scanner.fleet.exchange import subject
+from holdfast.scanner.fleet.fleet import NODE, PARTITION, leases_of
+from holdfast.scanner.nats.connection import ANSWERING, connected_once
+
+if TYPE_CHECKING:
+    from types import TracebackType
+    from typing import Self
+
+    from holdfast.leases import Entry
+    from holdfast.scanner.nats.connection import Servers
+
+CHECK_INTERVAL_S = 0.05
+"""Time between two looks at a node that leaves."""
+
+LEAVE_TIMEOUT_S = 30.0
+"""Time in which a node must hand its devices over."""
+
+
+class FleetUnavailable(Exception):
+    """NATS or the fleet can't be reached, or a node does not do what it was asked."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A fleet at one moment."""
+
+    fleet: str
+    nodes: dict[str, Holding]
+    partitions: dict[str, str]
+    """The node of each partition that has one."""
+    total: int
+
+    def shown(self, before: Seen, seconds: float) -> dict[str, Any]:
+        """What programs are shown; rates since an earlier look."""
+        nodes = []
+        for name, holding in sorted(self.nodes.items()):
+            about = holding.about
+            was = before.nodes.get(name)
+            scans = about.get("scans", 0) - (0 if was is None else was.about.get("scans", 0))
+            nodes.append(
+                {
+                    "node": name,
+                    "state": "leaving" if about.get("leaving") else "running",
+                    "started": about.get("started", 0),
+                    "partitions": sum(node == name for node in self.partitions.values()),
+                    "devices": about.get("devices", 0),
+                    "tags": about.get("tags", 0),
+                    "scans_per_second": round(max(scans, 0) / seconds, 1),
+                    "missed": about.get("missed", 0),
+                    "lost": about.get("lost", 0),
+                    "version": about.get("version", ""),
+                }
+            )
+        return {
+            "fleet": self.fleet,
+            "partitions": self.total,
+            "free_partitions": self.total - len(self.partitions),
+            "nodes": nodes,
+        }
+
+
+class FleetObserver:
+    """A connection that reads the bucket of leases."""
+
+    def __init__(self, fleet: str, servers: Servers, within_s: float = ANSWERING) -> None:
+        """`within_s` is the time to connect, and to read all that there is."""
+        self._fleet = fleet
+        self._servers = servers
+        self._within_s = within_s
+        self._seen: dict[str, Entry] = {}
+        self._ending = AsyncExitStack()
+
+    async def __aenter__(self) -> Self:
+        async with AsyncExitStack() as ending:
+            connecting = connected_once(self._servers, "holdfast fleet", self._within_s)
+            began = time.monotonic()
+            self._client = await ending.enter_async_context(connecting)
+            left = began + self._within_s - time.monotonic()
+            bucket, is_read = LeaseBucket(self._client, leases_of(self._fleet)), asyncio.Event()
+            try:
+                async with asyncio.timeout(max(left, 0.0)):
+                    await bucket.follow(self._saw, is_read.set)
+                    await is_read.wait()
+            except NotFoundError:
+                raise FleetUnavailable(f"there is no fleet {self._fleet} yet") from None
+            except TimeoutError:
+                raise FleetUnavailable(f"{self._where} does not answer") from None
+            except (Error, OSError) as error:
+                raise FleetUnavailable(f"{self._where}: {_reason(error)}") from None
+            self._ending = ending.pop_all()
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self._ending.aclose()
+
+    @property
+    def _where(self) -> str:
+        return f"JetStream of NATS at {self._servers.shown}"
+
+    def _saw(self, key: str, entry: Entry) -> None:
+        before = self._seen.get(key)
+        if before is None or entry.revision > before.revision:
+            self._seen[key] = entry
+
+    async def look(self) -> Seen:
+        """Returns what is known now. Raises `FleetUnavailable`."""
+        if not self._client.is_connected:
+            where = f"NATS at {self._servers.shown}"
+            raise FleetUnavailable(f"the connection to {where} was lost")
+        now = time.monotonic()
+        live = {
+            key: entry.holding
+            for key, entry in self._seen.items()
+            if entry.is_live(now, LEASE_TIMES) and entry.holding is not None
+        }
+        nodes = {key.removeprefix(NODE): each for key, each in live.items() if key.startswith(NODE)}
+        totals = [each.about.get("total", 0) for each in nodes.values()]
+        return Seen(
+            self._fleet,
+            nodes,
+            {key: each.node for key, each in live.items() if key.startswith(PARTITION)},
+            max(totals, default=0),
+        )
+
+    async def drain(self, node: str, prefix: str) -> None:
+        """Has a node leave. Raises `FleetUnavailable` if it does not."""
+        where = subject(prefix, node, "drain")
+        try:
+            answer = await self._client.request(where, b"", timeout=self._within_s)
+            if not msgspec.json.decode(answer.data, type=dict[str, Any]).get("success"):
+                raise FleetUnavailable(f"node {node} does not leave")
+        except NoRespondersError:
+            raise FleetUnavailable(f"there is no node {node} at {prefix}.fleet") from None
+        except (Error, OSError, msgspec.DecodeError) as error:
+            raise FleetUnavailable(f"node {node} does not answer: {_reason(error)}") from None
+        end = time.monotonic() + LEAVE_TIMEOUT_S
+        while node in (await self.look()).nodes:
+            await asyncio.sleep(CHECK_INTERVAL_S)
+            if time.monotonic() > end:
+                raise FleetUnavailable(f"node {node} has not left within {LEAVE_TIMEOUT_S:g} s")
+
+
+def _reason(error: Exception) -> str:
+    return str(error).removeprefix("nats: ") or type(error).__name__

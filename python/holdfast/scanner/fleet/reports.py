@@ -1,0 +1,100 @@
+"""Answers `browse` and `variables` with the devices of all nodes.
+
+All nodes know all devices. What a device has is asked of the node that polls it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from holdfast.scanner.messages.types import DeviceReport
+
+if TYPE_CHECKING:
+    from nats.aio.msg import Msg
+
+    from holdfast.scanner.fleet.nodes import OtherNodes
+    from holdfast.scanner.messages.types import BrowseAnswer
+    from holdfast.scanner.placement import ReportHost
+    from holdfast.scanner.subscriptions.device import ScannedDevice
+    from holdfast.scanner.subscriptions.registry import Registry
+
+DEVICES_PER_QUESTION = 100
+"""Devices that other nodes are asked for at once."""
+
+ENVELOPE_BYTES = 512
+"""Bytes of an answer without devices."""
+
+
+class FleetReports:
+    """Reports devices of all nodes."""
+
+    def __init__(self, registry: Registry, own: ReportHost, nodes: OtherNodes) -> None:
+        self._registry = registry
+        self._own = own
+        self._nodes = nodes
+
+    async def browse(self, message: Msg) -> BrowseAnswer:
+        """Reports devices. Raises `Refused`."""
+        request = self._own.browse_request(message)
+        ids = sorted(self._registry.devices)
+        if request.device_id is not None:
+            ids = [id for id in ids if id == request.device_id]
+        offset = request.offset or 0
+        page = ids[offset : offset + DEVICES_PER_QUESTION]
+        devices = [self._registry.devices[id] for id in page]
+        found = await self._nodes.reports("browse", devices)
+        answer = self._own.browsed(msgspec.structs.replace(request, offset=None), page)
+        answer.count = len(self._registry.devices)
+        shown: list[DeviceReport] = []
+        room = self._own.max_bytes - ENVELOPE_BYTES
+        for report in answer.devices:
+            # A page of tags is that of this node: the others report whole devices only.
+            if report.device_id in found and request.tag_offset is None:
+                with contextlib.suppress(msgspec.ValidationError):
+                    report = msgspec.convert(found[report.device_id], DeviceReport)
+            room -= len(msgspec.json.encode(report)) + 1
+            if room < 0 and shown:
+                break
+            shown.append(report)
+        if answer.next is not None or len(shown) < len(answer.devices):
+            answer.next = offset + len(shown)
+        elif offset + len(page) < len(ids):
+            answer.next = offset + len(page)
+        answer.devices = shown
+        return answer
+
+    async def variables(self, message: Msg) -> bytes:
+        """Returns the latest values as JSON. Raises `Refused`."""
+        request = self._own.variables_request(message)
+        left, texts = request.offset or 0, list[bytes]()
+        room = self._own.max_bytes - ENVELOPE_BYTES
+        ids = sorted(self._registry.devices)
+        for at in range(0, len(ids), DEVICES_PER_QUESTION):
+            page = self._page(ids[at : at + DEVICES_PER_QUESTION], request.device_id)
+            skipped = 0
+            while skipped < len(page) and left >= len(page[skipped].tags):
+                left -= len(page[skipped].tags)
+                skipped += 1
+            page = page[skipped:]
+            found = await self._nodes.reports("variables", page)
+            for device in page:
+                values = found.get(device.id)
+                if values is None:
+                    own = self._own.device_variables([device.id])
+                    values = next((each for _, each in own), [])
+                for value in values[left:]:
+                    text = msgspec.json.encode(value)
+                    room -= len(text) + 1
+                    if room < 0:
+                        return b"[" + b",".join(texts) + b"]"
+                    texts.append(text)
+                left = 0
+        return b"[" + b",".join(texts) + b"]"
+
+    def _page(self, ids: list[str], device_id: str | None) -> list[ScannedDevice]:
+        """Returns the devices with these ids that are still known, and are asked for."""
+        known = self._registry.devices
+        return [known[id] for id in ids if device_id in (None, id) and id in known]

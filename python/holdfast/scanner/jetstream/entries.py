@@ -1,0 +1,134 @@
+"""The entries that `store` writes: subscribe requests and states, and their keys. Does no I/O."""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from holdfast.client.url import NetworkTarget
+from holdfast.scanner.messages.decoding import decode
+from holdfast.scanner.messages.subjects import subject_id
+from holdfast.scanner.messages.types import SubscribeRequest, TagRequest
+from holdfast.scanner.subscriptions.tag import CODE_OF_AREA
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator
+
+    from holdfast.scanner.messages.types import Marker
+    from holdfast.scanner.subscriptions.device import ScannedDevice, TagOptions
+    from holdfast.scanner.subscriptions.tag import Tag
+
+MAX_PART = 128 * 1024
+"""The size in bytes of tags above which a further entry is made."""
+
+MAX_ENTRY = 8 * 1024 * 1024
+"""The size limit of a stored request in bytes."""
+
+_PLAIN = re.compile(r"[A-Za-z0-9_-]+")
+_encode = msgspec.json.Encoder().encode
+
+
+def status_key(prefix: str, device: str) -> str:
+    """Returns the key of a device's status, which is also the subject of its messages."""
+    return f"{prefix}.status.{subject_id(device)}"
+
+
+def numbered(
+    prefix: str, device: str, subscriber: str, values: Iterable[bytes]
+) -> dict[str, bytes]:
+    """Returns the requests of a subscriber for a device by their keys."""
+    keys = f"{prefix}.subscription.{_token(subscriber)}.{subject_id(device)}"
+    return {f"{keys}.{number}": value for number, value in enumerate(values)}
+
+
+def number(key: str) -> int:
+    """Returns the number of a request from its key; 0 for a key of another form."""
+    last = key.rpartition(".")[2]
+    return int(last) if last.isdecimal() else 0
+
+
+def _token(text: str) -> str:
+    """Returns a text as part of a key: in base64 after `=`, if it has other characters."""
+    if _PLAIN.fullmatch(text):
+        return text
+    return "=" + base64.urlsafe_b64encode(text.encode()).rstrip(b"=").decode()
+
+
+def requests(device: ScannedDevice, subscriber: str) -> Iterator[bytes]:
+    """Yields the requests that make the subscription of a subscriber, each of limited size."""
+    known = device.subscribers[subscriber]
+    head = {
+        "deviceId": device.id,
+        "subscriberId": subscriber,
+        **_place(device),
+        "unitId": device.source.unit,
+        "timeout": device.source.timeout,
+        "release": device.source.release,
+        "scanRate": known.rate,
+        "publish": known.publish,
+        "deadband": known.deadband if known.publish == "change" else None,
+        "plan": device.source.plan.request,
+        "ttl": known.ttl,
+    }
+    before = _encode({key: value for key, value in head.items() if value is not None})[:-1]
+    part: list[bytes] = []
+    size = 0
+    for id, wanted in known.tags.items():
+        text = _tag(device.tags[id], wanted)
+        if part and size + len(text) > MAX_PART:
+            yield before + b',"tags":[' + b",".join(part) + b"]}"
+            part, size = [], 0
+        part.append(text)
+        size += len(text)
+    if part:
+        yield before + b',"tags":[' + b",".join(part) + b"]}"
+
+
+def restored(value: bytes) -> SubscribeRequest:
+    """Parses a stored request. Raises `Refused`."""
+    return decode(value, SubscribeRequest, MAX_ENTRY)
+
+
+def without(found: Iterable[SubscribeRequest], ids: Collection[str]) -> list[SubscribeRequest]:
+    """Returns the requests without the tags with these ids, if they have tags left."""
+    left = (
+        msgspec.structs.replace(each, tags=[tag for tag in each.tags if tag.id not in ids])
+        for each in found
+    )
+    return [each for each in left if each.tags]
+
+
+def _place(device: ScannedDevice) -> dict[str, object]:
+    if device.source.url is not None:
+        return {"url": device.source.url}
+    target = device.source.target
+    assert isinstance(target, NetworkTarget)
+    return {"host": target.host, "port": target.port, "transport": target.transport}
+
+
+def _tag(tag: Tag, wanted: TagOptions) -> bytes:
+    """Returns a tag as JSON; without a description that would make it too long."""
+    made = TagRequest(
+        id=tag.id,
+        address=tag.address,
+        function_code=CODE_OF_AREA[tag.area],
+        datatype=tag.requested_type,
+        byte_order=tag.order,
+        encoding=tag.encoding,
+        writable=wanted.writable,
+        description=wanted.description,
+        null=[_marker(marker) for marker in tag.null] or None,
+        profile=tag.profile,
+    )
+    text = _encode(made)
+    if len(text) > MAX_PART:
+        text = _encode(msgspec.structs.replace(made, description=None))
+    return text
+
+
+def _marker(marker: Marker) -> Marker:
+    return "nan" if isinstance(marker, float) and math.isnan(marker) else marker

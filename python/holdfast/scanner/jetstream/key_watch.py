@@ -1,0 +1,244 @@
+"""Follows the keys of a JetStream bucket: reads all of them, then each change.
+
+It starts again with all keys after each connection, after an error of JetStream, and when it has
+missed a change. A missing bucket is created.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
+from nats.js.errors import NotFoundError
+
+from holdfast.runtime import tasks
+from holdfast.runtime.backoff import Backoff
+from holdfast.scanner.jetstream.availability import JETSTREAM_TIMEOUT_S, Availability
+from holdfast.scanner.jetstream.store import (
+    FETCH_BATCH,
+    FIRST_RETRY_S,
+    MAX_RETRY_S,
+    READER_EXPIRES_S,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping
+
+    from nats.aio.client import Client
+    from nats.aio.msg import Msg
+    from nats.js import JetStreamContext
+
+MAX_FIRST_READ_WAIT_S = 2.0
+"""How long requests wait for the bucket to be read. After that, reading continues."""
+
+MAX_SETTLE_S = 2.0
+"""Time after which changes are reported, even if further ones follow."""
+
+MARKER_HEADERS = ("KV-Operation", "Nats-Marker-Reason")
+"""The headers of messages that stand for deleted or expired keys."""
+
+
+@dataclass(frozen=True)
+class WatchTimes:
+    """When something is done about a bucket, in seconds."""
+
+    quiet_s: float = 5.0
+    """Without a change for so long, it is checked that the server still has the reader."""
+    settle_s: float = 0.2
+    """Without a further change for so long, changes are reported. Programs of tentacle-next delete
+    an entry before they write it again."""
+    retry_s: float = MAX_RETRY_S
+    """Until what failed or was refused is tried again, at most."""
+
+
+WATCH_TIMES = WatchTimes()
+
+
+class Written(NamedTuple):
+    """A value of a key, and the number of the message that wrote it."""
+
+    value: bytes
+    revision: int
+
+
+class _Missed(Exception):
+    """A change was not received."""
+
+
+class KeyWatch:
+    """Follows the keys of one bucket."""
+
+    def __init__(
+        self,
+        bucket: str,
+        keys: str,
+        on_change: Callable[[Mapping[str, Written | None], bool], Awaitable[None]],
+        times: WatchTimes,
+    ) -> None:
+        """`keys` is a key, or `>` for all.
+
+        `on_change` gets what changed keys have, `None` for a deleted one, and whether these are
+        all keys of the bucket.
+        """
+        self._bucket = bucket
+        self._stream = f"KV_{bucket}"
+        self._subject_prefix = f"$KV.{bucket}."
+        self._keys = keys
+        self._on_change = on_change
+        self._times = times
+        self._client: Client | None = None
+        self._has_new_client = asyncio.Event()
+        events = "bucket_watched", "bucket_not_watched"
+        self._availability = Availability(*events, bucket=bucket)
+        self._backoff = Backoff(FIRST_RETRY_S, times.retry_s, jitter=True)
+        self.tried = asyncio.Event()
+        """Set after the first attempt to read the bucket."""
+
+    def connected(self, client: Client | None) -> None:
+        """Sets the client; `None` while there is no connection."""
+        self._client = client
+        self._has_new_client.set()
+
+    async def read(self) -> None:
+        """Waits until the bucket is read for the first time, but not for long."""
+        if not self.tried.is_set():
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(MAX_FIRST_READ_WAIT_S):
+                    await self.tried.wait()
+
+    async def run(self) -> None:
+        """Follows the bucket, until it is cancelled."""
+        while True:
+            await self._has_new_client.wait()
+            self._has_new_client.clear()
+            if self._client is None:
+                continue
+            works = (self._keep_following(self._client), self._has_new_client.wait())
+            running = [asyncio.create_task(work) for work in works]
+            try:
+                await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                await tasks.end(running)
+
+    async def _keep_following(self, client: Client) -> None:
+        while not client.is_closed:  # nats-py then replaces a cancellation by an error.
+            pause = FIRST_RETRY_S
+            try:
+                await self._follow(client)
+            except _Missed:
+                pass  # JetStream works: all keys are read again soon.
+            except Exception as error:  # JetStream may fail in any way; it is tried again.
+                pause = self._backoff.failed()
+                if self._client is client:  # Else the connection has ended, and not JetStream.
+                    self._availability.failed(error)
+                self.tried.set()
+            if not client.is_closed:
+                await asyncio.sleep(pause)
+
+    async def _follow(self, client: Client) -> None:
+        """Reads all keys, then reports changes. Raises `_Missed`, or an error of JetStream."""
+        jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
+        await self._open(jetstream)
+        reader = _Reader(self._stream, self._subject_prefix, self._times)
+        try:
+            count = await reader.begin(jetstream, self._keys)
+            found: dict[str, Written | None] = {}
+            while (left := count - reader.received) > 0:
+                found |= await reader.fetch(min(left, FETCH_BATCH), JETSTREAM_TIMEOUT_S)
+            await self._on_change(found, True)
+            self._backoff.succeeded()
+            self._availability.succeeded()
+            self.tried.set()
+            while True:
+                if changes := await reader.changes():
+                    await self._on_change(changes, False)
+        except Exception:
+            await reader.delete()
+            raise
+        finally:
+            await reader.close()
+
+    async def _open(self, jetstream: JetStreamContext) -> None:
+        try:
+            await jetstream.stream_info(self._stream)
+        except NotFoundError:
+            await jetstream.create_key_value(bucket=self._bucket, history=1)
+
+
+class _Reader:
+    """A consumer of a bucket's messages.
+
+    A watcher of nats-py may report the end before the first key. The number of messages that a new
+    pull consumer has is certain.
+    """
+
+    def __init__(self, stream: str, subject_prefix: str, times: WatchTimes) -> None:
+        self._stream = stream
+        self._subject_prefix = subject_prefix
+        self._times = times
+        self.received = 0
+        """The number of the last message, counted by the server."""
+
+    async def begin(self, jetstream: JetStreamContext, keys: str) -> int:
+        """Creates the consumer. Returns the number of messages that it has for now."""
+        config = ConsumerConfig(
+            deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
+            ack_policy=AckPolicy.NONE,
+            inactive_threshold=READER_EXPIRES_S,
+        )
+        self._jetstream = jetstream
+        self._subscription = await jetstream.pull_subscribe(
+            self._subject_prefix + keys, stream=self._stream, config=config
+        )
+        info = await self._subscription.consumer_info()
+        self._name = info.name
+        return info.num_pending or 0
+
+    async def changes(self) -> dict[str, Written | None]:
+        """Waits for changes. Returns them when no more follow, or nothing after a while."""
+        try:
+            found = await self.fetch(1, self._times.quiet_s)
+        except TimeoutError:
+            await self._check()
+            return {}
+        end = time.monotonic() + MAX_SETTLE_S
+        with contextlib.suppress(TimeoutError):
+            while time.monotonic() < end:
+                found |= await self.fetch(FETCH_BATCH, self._times.settle_s)
+        return found
+
+    async def fetch(self, most: int, timeout: float) -> dict[str, Written | None]:
+        """Returns the next messages, at least one. Raises `TimeoutError` if there are none."""
+        return dict(map(self._read, await self._subscription.fetch(most, timeout=timeout)))
+
+    def _read(self, message: Msg) -> tuple[str, Written | None]:
+        number = message.metadata.sequence.consumer
+        if number != self.received + 1:  # The server counts what it sends without gaps.
+            raise _Missed
+        self.received = number
+        headers = message.headers or {}
+        is_marker = any(header in headers for header in MARKER_HEADERS)
+        key = message.subject.removeprefix(self._subject_prefix)
+        revision = message.metadata.sequence.stream
+        return key, None if is_marker else Written(message.data, revision)
+
+    async def _check(self) -> None:
+        """Checks that the server has the consumer, and delivered nothing that did not arrive."""
+        info = await self._subscription.consumer_info()
+        delivered = 0 if info.delivered is None else info.delivered.consumer_seq
+        if delivered != self.received and self._subscription.pending_msgs == 0:
+            raise _Missed
+
+    async def delete(self) -> None:
+        """Deletes the consumer, if the server can be reached. It expires anyway."""
+        with contextlib.suppress(Exception):
+            await self._jetstream.delete_consumer(self._stream, self._name)
+
+    async def close(self) -> None:
+        """Ends the subscription, which nats-py would repeat after each reconnect."""
+        with contextlib.suppress(Exception):
+            await self._subscription.unsubscribe()

@@ -1,0 +1,196 @@
+"""What is kept in JetStream: subscriptions and states of devices, and how they are restored."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from holdfast import logs
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.jetstream.entries import (
+    number,
+    numbered,
+    requests,
+    restored,
+    status_key,
+    without,
+)
+from holdfast.scanner.jetstream.store import MAX_RETRY_S, EntryStore
+from holdfast.scanner.messages.types import Status
+from holdfast.scanner.subscriptions.key import SubscriptionKey
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from nats.aio.client import Client
+
+    from holdfast.scanner.messages.types import SubscribeRequest, UnsubscribeRequest
+    from holdfast.scanner.placement import SubscriptionHost
+    from holdfast.scanner.subscriptions.registry import Registry
+
+MAX_RESTORE_WAIT_S = 2.0
+"""How long requests wait for stored subscriptions. After that, restoring continues."""
+
+
+class StoredSubscriptions:
+    """Stores the subscriptions and states of the registry, and restores them after a start."""
+
+    def __init__(self, prefix: str, registry: Registry) -> None:
+        self._prefix = prefix
+        self._registry = registry
+        self._host: SubscriptionHost | None = None
+        self._pending: dict[SubscriptionKey, list[SubscribeRequest]] = {}
+        """Stored requests that are not carried out yet."""
+        self._logged: set[SubscriptionKey] = set()
+        """Pending subscriptions whose refusal is logged."""
+        self._has_read = False
+        self._found_pending = asyncio.Event()
+        self._store = EntryStore(prefix, self._entries, self._on_read)
+
+    def connected(self, client: Client | None) -> None:
+        """Sets the client; `None` while there is no connection."""
+        self._store.connected(client)
+
+    async def run(self, host: SubscriptionHost, ready: asyncio.Event) -> None:
+        """Restores and stores, until it is cancelled.
+
+        `host` carries out stored requests. Subscriptions from entries of another bucket are not
+        stored. Sets `ready` after the first attempt to restore, or when it takes too long.
+        """
+        self._host = host
+        async with asyncio.TaskGroup() as running:
+            running.create_task(self._store.run())
+            running.create_task(self._restore(host, ready))
+
+    async def close(self) -> None:
+        """Removes the states of devices, which would be out of date. Then stores nothing."""
+        await self._store.stop()
+
+    def changed(self, device: str, subscriber: str) -> None:
+        """Stores a subscription that has changed, instead of what is pending."""
+        self._touch(SubscriptionKey(device, subscriber))
+
+    def state_changed(self, device: str) -> None:
+        """Stores the state of a device; removes it if the device is gone."""
+        self._store.touch(SubscriptionKey(device))
+
+    def unsubscribed(self, request: UnsubscribeRequest) -> None:
+        """Removes tags of a subscription, also of a pending one."""
+        owner = SubscriptionKey(request.device_id, request.subscriber_id)
+        ids = request.ids
+        left = [] if ids is None else without(self._pending.get(owner, []), set(ids))
+        self._touch(owner)
+        if left:
+            self._pending[owner] = left
+
+    async def settled(self, device: str, subscriber: str) -> None:
+        """Waits until a changed subscription is stored; not while JetStream fails."""
+        await self._store.settled(SubscriptionKey(device, subscriber))
+
+    def _touch(self, owner: SubscriptionKey) -> None:
+        self._pending.pop(owner, None)
+        self._logged.discard(owner)
+        self._store.touch(owner)
+
+    def _entries(self, owner: SubscriptionKey) -> Mapping[str, bytes]:
+        """Returns the entries of an owner: nothing, if it is gone."""
+        assert self._host is not None, "the store runs"
+        if self._host.is_entry(owner.device, owner.subscriber):
+            return {}
+        if owner in self._pending:
+            assert owner.subscriber is not None
+            pending = map(msgspec.json.encode, self._pending[owner])
+            return numbered(self._prefix, owner.device, owner.subscriber, pending)
+        device = self._registry.devices.get(owner.device)
+        if device is None:
+            return {}
+        if owner.subscriber is None:
+            return {status_key(self._prefix, device.id): device.status}
+        if owner.subscriber not in device.subscribers:
+            return {}
+        values = requests(device, owner.subscriber)
+        return numbered(self._prefix, device.id, owner.subscriber, values)
+
+    def _on_read(self, entries: list[tuple[str, bytes]]) -> Mapping[str, SubscriptionKey]:
+        """Takes the stored entries. At the first time, their subscriptions become pending.
+
+        Everything known is compared with them again: the bucket may have been lost.
+        Later, subscriptions that are not known here are left alone: another scanner may have stored
+        them.
+        """
+        owners: dict[str, SubscriptionKey] = {}
+        for key, value in sorted(entries, key=lambda entry: number(entry[0])):
+            try:
+                if key.startswith(f"{self._prefix}.status."):
+                    owners[key] = SubscriptionKey(msgspec.json.decode(value, type=Status).device_id)
+                    continue
+                request = restored(value)
+            except (Refused, msgspec.DecodeError) as error:
+                logs.refused("kept_entry_malformed", kind="kept", key=key, reason=str(error))
+                continue
+            owner = SubscriptionKey(request.device_id, request.subscriber_id)
+            is_ours = owner in self._store.touched or self._is_known(owner)
+            if not self._has_read and not is_ours:
+                self._pending.setdefault(owner, []).append(request)
+            # An owner that is returned replaces or removes what is stored under its keys.
+            if is_ours or owner in self._pending:
+                owners[key] = owner
+        self._has_read = True
+        for device in self._registry.devices.values():
+            for name in (None, *device.subscribers):
+                self._store.touch(SubscriptionKey(device.id, name))
+        if self._pending:
+            self._found_pending.set()
+        return owners
+
+    def _is_known(self, owner: SubscriptionKey) -> bool:
+        device = self._registry.devices.get(owner.device)
+        return device is not None and owner.subscriber in device.subscribers
+
+    async def _restore(self, host: SubscriptionHost, ready: asyncio.Event) -> None:
+        """Carries out pending requests, until it is cancelled."""
+        await self._store.tried.wait()
+        while True:
+            work = asyncio.create_task(self._restore_all(host))
+            try:
+                await asyncio.wait([work], timeout=None if ready.is_set() else MAX_RESTORE_WAIT_S)
+                ready.set()
+                await work
+            finally:
+                work.cancel()
+            if self._pending:
+                await asyncio.sleep(MAX_RETRY_S)
+            else:
+                self._found_pending.clear()
+                await self._found_pending.wait()
+
+    async def _restore_all(self, host: SubscriptionHost) -> None:
+        devices: dict[str, list[SubscriptionKey]] = {}
+        for owner in self._pending:
+            devices.setdefault(owner.device, []).append(owner)
+        await asyncio.gather(*(self._restore_device(host, each) for each in devices.values()))
+
+    async def _restore_device(self, host: SubscriptionHost, owners: list[SubscriptionKey]) -> None:
+        for owner in owners:
+            found = self._pending.get(owner, [])
+            try:
+                for request in found:
+                    if self._pending.get(owner) is not found:
+                        break  # A caller has changed it.
+                    await host.restore(request)
+            except Refused as refused:
+                if owner not in self._logged:
+                    self._logged.add(owner)
+                    self._log(logging.WARNING, "not_restored", owner, reason=str(refused))
+                continue
+            if found and self._pending.get(owner) is found:
+                self._touch(owner)
+                tags = sum(len(request.tags) for request in found)
+                self._log(logging.INFO, "restored", owner, tags=tags)
+
+    @staticmethod
+    def _log(level: int, event: str, owner: SubscriptionKey, **more: object) -> None:
+        logs.write(level, event, device=owner.device, subscriber=owner.subscriber, **more)

@@ -1,0 +1,250 @@
+"""Keeps subscriptions and states of devices in JetStream, so that a restart loses nothing.
+
+All keys are in one bucket without TTL. `PREFIX.subscription.SUBSCRIBER.DEVICE.N` is a subscribe
+request: a part of the tags of a subscriber, so that no value is larger than a message.
+`PREFIX.status.DEVICE` is the last status of a device. Both are written when they change. JetStream
+is optional: without it, nothing is kept, and nothing waits for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
+from nats.js.errors import NotFoundError
+
+from holdfast.runtime import tasks
+from holdfast.runtime.backoff import Backoff
+from holdfast.scanner.jetstream.availability import JETSTREAM_TIMEOUT_S, Availability
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Set
+
+    from nats.aio.client import Client
+    from nats.js import JetStreamContext
+    from nats.js.kv import KeyValue
+
+    from holdfast.scanner.subscriptions.key import SubscriptionKey
+
+BUCKET = "holdfast_scanner"
+STREAM = f"KV_{BUCKET}"
+KEY_SUBJECTS = f"$KV.{BUCKET}."
+
+READER_EXPIRES_S = 30.0
+"""Time after which the server removes a reader that was left behind."""
+
+FETCH_BATCH = 256
+"""Entries that are read at once."""
+
+FIRST_RETRY_S = 0.5
+MAX_RETRY_S = 10.0
+"""Between attempts while JetStream fails. Each failure doubles the pause, up to the second."""
+
+MAX_CONCURRENT_WRITES = 16
+"""Subscriptions that are written at once."""
+
+
+class EntryStore:
+    """Writes entries to the bucket, as soon as their owner is touched.
+
+    An owner of entries is a subscription, or the status of a device.
+    """
+
+    def __init__(
+        self,
+        prefix: str,
+        entries: Callable[[SubscriptionKey], Mapping[str, bytes]],
+        on_read: Callable[[list[tuple[str, bytes]]], Mapping[str, SubscriptionKey]],
+    ) -> None:
+        """`entries` returns what is to be stored for an owner: nothing, if it is gone.
+
+        `on_read` gets the stored entries after each connection. It returns the owners of those that
+        are to be replaced or removed when their owner does not want them.
+        """
+        self._prefix = prefix
+        self._entries = entries
+        self._on_read = on_read
+        self._client: Client | None = None
+        self._has_work = asyncio.Event()
+        self._touched: set[SubscriptionKey] = set()
+        self._writing: set[SubscriptionKey] = set()
+        self._waiting: dict[SubscriptionKey, asyncio.Event] = {}
+        self._stored: dict[SubscriptionKey, dict[str, int]] = {}
+        """The hashes of the stored entries, by key."""
+        events = "subscriptions_kept", "subscriptions_not_kept"
+        self._availability = Availability(*events, bucket=BUCKET)
+        self._backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S, jitter=True)
+        self._pause_s = 0.0
+        self._busy = asyncio.Lock()
+        """Held while entries are read or written."""
+        self.tried = asyncio.Event()
+        """Set after the first attempt to read the stored entries."""
+
+    @property
+    def touched(self) -> Set[SubscriptionKey]:
+        """The owners that are not stored yet."""
+        return self._touched | self._writing
+
+    def connected(self, client: Client | None) -> None:
+        """Sets the client; `None` while there is no connection."""
+        self._client = client
+        self._has_work.set()
+
+    def touch(self, owner: SubscriptionKey) -> None:
+        """Writes the entries of an owner soon."""
+        self._touched.add(owner)
+        self._has_work.set()
+
+    async def settled(self, owner: SubscriptionKey) -> None:
+        """Waits until the entries of a touched owner are stored; not while JetStream fails."""
+        if not self._availability.is_available or self._client is None:
+            return
+        if owner in self._touched or owner in self._writing:
+            stored = self._waiting.setdefault(owner, asyncio.Event())
+            await stored.wait()
+
+    async def run(self) -> None:
+        """Reads the entries after each connection, and writes changes, until it is cancelled."""
+        bucket: KeyValue | None = None
+        client: Client | None = None
+        while True:
+            tasks.check()
+            await self._wait()
+            if self._client is not client:
+                client, bucket = self._client, None
+            if client is None:
+                self._release()
+                continue
+            try:
+                async with self._busy:
+                    if bucket is None:
+                        bucket = await self._read(client)
+                    await self._write(client.jetstream(timeout=JETSTREAM_TIMEOUT_S), bucket)
+            except Exception as error:  # Keeping is optional, no error may stop the scanner.
+                bucket = None
+                if self._client is client:  # Else the connection has ended, and not JetStream.
+                    self._pause_s = self._backoff.failed()
+                    self._availability.failed(error)
+            else:
+                self._backoff.succeeded()
+                self._availability.succeeded()
+            self.tried.set()
+            if not self._availability.is_available:
+                self._release()
+
+    async def _wait(self) -> None:
+        """Waits for work; while JetStream fails, for the next attempt."""
+        if self._availability.is_unavailable and self._client is not None:
+            client = self._client
+            try:
+                async with asyncio.timeout(self._pause_s):
+                    while self._client is client:
+                        self._has_work.clear()
+                        await self._has_work.wait()
+            except TimeoutError:
+                pass
+            return
+        await self._has_work.wait()
+        self._has_work.clear()
+
+    async def _read(self, client: Client) -> KeyValue:
+        """Opens the bucket and reports its entries."""
+        jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
+        try:
+            bucket = await jetstream.key_value(BUCKET)
+        except NotFoundError:
+            bucket = await jetstream.create_key_value(bucket=BUCKET, history=1)
+        entries = []
+        for kind in ("subscription.*.*.*", "status.*"):
+            entries += await _entries(jetstream, f"{self._prefix}.{kind}")
+        owners = self._on_read(entries)
+        self._stored = {}
+        for key, value in entries:
+            if key in owners:
+                self._stored.setdefault(owners[key], {})[key] = hash(value)
+        self._touched.update(owners.values())
+        return bucket
+
+    async def _write(self, jetstream: JetStreamContext, bucket: KeyValue) -> None:
+        """Writes the entries of all touched owners. Those that failed are still touched then."""
+        while self._touched:
+            count = min(MAX_CONCURRENT_WRITES, len(self._touched))
+            self._writing = {self._touched.pop() for _ in range(count)}
+            owners = list(self._writing)
+            work = (self._write_owner(jetstream, bucket, owner) for owner in owners)
+            results = await asyncio.gather(*work, return_exceptions=True)
+            self._writing = set()
+            errors = []
+            for owner, result in zip(owners, results, strict=True):
+                if isinstance(result, BaseException):
+                    self._touched.add(owner)
+                    errors.append(result)
+                # An owner that was touched again meanwhile is written again first.
+                elif owner not in self._touched and owner in self._waiting:
+                    self._waiting.pop(owner).set()
+            if errors:
+                raise errors[0]
+
+    async def _write_owner(
+        self, jetstream: JetStreamContext, bucket: KeyValue, owner: SubscriptionKey
+    ) -> None:
+        wanted = self._entries(owner)
+        stored = self._stored.setdefault(owner, {})
+        for key, value in wanted.items():
+            if stored.get(key) != hash(value):  # A hash: values may take 128 KiB each.
+                await bucket.put(key, value)
+                stored[key] = hash(value)
+        for key in [key for key in stored if key not in wanted]:
+            # Unlike a deletion, a purge leaves no marker behind.
+            await jetstream.purge_stream(STREAM, subject=KEY_SUBJECTS + key)
+            del stored[key]
+        if not stored:
+            del self._stored[owner]
+
+    def _release(self) -> None:
+        """Lets requests go on that wait for JetStream."""
+        for stored in self._waiting.values():
+            stored.set()
+        self._waiting.clear()
+
+    async def stop(self) -> None:
+        """Removes the states of devices, which would be out of date. Then writes nothing."""
+        client, self._client = self._client, None
+        self._has_work.set()
+        if client is not None and self._availability.is_available:
+            jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
+            async with self._busy:  # What is on its way to the server comes before the removal.
+                await jetstream.purge_stream(
+                    STREAM, subject=f"{KEY_SUBJECTS}{self._prefix}.status.*"
+                )
+
+
+async def _entries(jetstream: JetStreamContext, keys: str) -> list[tuple[str, bytes]]:
+    """Returns the entries whose keys match.
+
+    A watcher of nats-py may report the end before the first entry. The number of entries that a new
+    pull consumer has is certain.
+    """
+    config = ConsumerConfig(
+        deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
+        ack_policy=AckPolicy.NONE,
+        inactive_threshold=READER_EXPIRES_S,
+    )
+    reader = await jetstream.pull_subscribe(KEY_SUBJECTS + keys, stream=STREAM, config=config)
+    try:
+        info = await reader.consumer_info()
+        left = info.num_pending or 0
+        found = []
+        while left > 0:
+            messages = await reader.fetch(min(left, FETCH_BATCH), timeout=JETSTREAM_TIMEOUT_S)
+            left -= len(messages)
+            found += [
+                (message.subject.removeprefix(KEY_SUBJECTS), message.data)
+                for message in messages
+                if not message.headers  # Only markers of deleted keys have headers.
+            ]
+        await jetstream.delete_consumer(STREAM, info.name)
+        return found
+    finally:
+        await reader.unsubscribe()

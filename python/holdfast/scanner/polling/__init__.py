@@ -1,0 +1,1 @@
+"""The devices that are polled: their addresses, and how polls and writes reach them."""

@@ -1,0 +1,196 @@
+"""Polls and publishes devices, as their subscriptions change."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING
+from weakref import WeakValueDictionary
+
+from holdfast import logs
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.messages.types import UnsubscribeRequest
+from holdfast.scanner.subscriptions.health import Health
+from holdfast.scanner.subscriptions.ttl import SubscriptionTtls
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Coroutine
+    from typing import Any
+
+    from holdfast.scanner.placement import Placement
+    from holdfast.scanner.polling.device_address import DeviceAddresses
+    from holdfast.scanner.polling.poller import Polling
+    from holdfast.scanner.publish.publishers import Publishers
+    from holdfast.scanner.subscriptions.device import ScannedDevice
+    from holdfast.scanner.subscriptions.registry import Registry
+    from holdfast.scanner.subscriptions.subscription import Subscription
+    from holdfast.types import PolledBlock
+
+PROMPT_POLL_MAX_MS = 1000
+"""Scan interval up to which a new subscriber waits for the next regular scan."""
+
+
+class Devices:
+    """The devices of the registry, from their first subscription to their last."""
+
+    def __init__(
+        self,
+        registry: Registry,
+        addresses: DeviceAddresses,
+        polling: Polling,
+        publishers: Publishers,
+        placement: Placement,
+        begin_task: Callable[[Coroutine[Any, Any, None]], None],
+    ) -> None:
+        """`begin_task` runs a lookup of an address beside the polls."""
+        self._registry = registry
+        self._addresses = addresses
+        self._polling = polling
+        self._publishers = publishers
+        self._placement = placement
+        self._begin_task = begin_task
+        self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        self.ttls = SubscriptionTtls()
+
+    def lock(self, device: str) -> asyncio.Lock:
+        """Returns the lock that serializes changes of a device."""
+        return self._locks.setdefault(device, asyncio.Lock())
+
+    async def add(
+        self,
+        asked: Subscription,
+        *,
+        is_stored: bool = False,
+        renewed: bool = True,
+    ) -> None:
+        """Adds a subscription, and polls and publishes accordingly. Raises `Refused`.
+
+        A subscription that `is_stored` is not stored again. If it is not `renewed`, its time to
+        live runs on.
+        """
+        known = self._registry.known(asked)
+        # A known device keeps its address: a lookup could give another one of its name.
+        address, endpoint = (
+            await self._addresses.find(asked.source.target)
+            if known is None
+            else (known.address, known.endpoint)
+        )
+        change = self._registry.subscribe(asked, address)
+        device = change.device
+        if device is None or asked.subscriber not in device.subscribers:
+            return
+        if renewed:
+            self.ttls.renew(device.id, asked.subscriber, asked.ttl)
+        if change.former is not None:
+            self._drop(change.former)
+        device.endpoint = endpoint
+        self._placement.added(device)
+        if not is_stored:
+            self._placement.subscribed(device.id, asked.subscriber)
+        # A caller that subscribes to tags one by one knows the state already.
+        with_state = change.former is not None or not change.only_adds_tags
+        self._publishers.update(device, change.fresh, with_state=with_state)
+        # At a short interval, the next regular scan comes soon enough for a new subscriber.
+        waits_long = bool(change.fresh) and device.rate > PROMPT_POLL_MAX_MS
+        if change.polling or change.former or waits_long:
+            self._poll(device)
+
+    def keep_only(self, device_id: str, subscriber_id: str, tags: Collection[str]) -> None:
+        """Removes the other tags of a subscription."""
+        device = self._registry.devices.get(device_id)
+        subscriber = None if device is None else device.subscribers.get(subscriber_id)
+        others = [] if subscriber is None else [id for id in subscriber.tags if id not in tags]
+        if others:
+            self.remove(UnsubscribeRequest(device_id, subscriber_id, others))
+
+    def remove(self, request: UnsubscribeRequest) -> None:
+        """Removes tags of a subscription, and polls and publishes accordingly."""
+        self._placement.unsubscribed(request)
+        device, changed = self._registry.unsubscribe(request)
+        if device is None:
+            return
+        if request.subscriber_id not in device.subscribers:
+            self.ttls.renew(device.id, request.subscriber_id, None)
+        if device.subscribers:
+            self._publishers.update(device)
+            if changed:
+                self._poll(device, at_once=False)
+        elif changed:  # It was the last subscriber.
+            self._drop(device)
+            self._placement.state_changed(device.id)
+
+    def _poll(self, device: ScannedDevice, *, at_once: bool = True) -> None:
+        """Applies changes of a device to the poller, if this scanner polls it."""
+        if self._placement.is_own(device):
+            self._polling.renew(device, at_once=at_once)
+
+    def _drop(self, device: ScannedDevice) -> None:
+        """Removes a device without subscribers."""
+        self._publishers.remove(device)
+        self._placement.dropped(device)
+        if device.polled_as:
+            self._polling.drop(device)
+
+    def begin(self, device: ScannedDevice) -> None:
+        """Polls a device that another node has polled until now."""
+        device.health = Health()
+        self._publishers.restart(device)
+        self._publishers.publish_state(device)
+        with contextlib.suppress(Refused):  # It is stopping.
+            self._poll(device)
+
+    def end(self, device: ScannedDevice) -> None:
+        """Polls a device no more: another node will."""
+        if device.polled_as:
+            self._polling.drop(device)
+            device.polled_as = ""
+
+    def resume(self) -> None:
+        """Polls all devices again."""
+        self._polling.resume()
+
+    def pause(self) -> None:
+        """Stops polling all devices until `resume`."""
+        self._polling.pause()
+        for device in self._registry.devices.values():
+            device.health.disable()
+            self._publishers.publish_state(device)
+
+    def on_poll(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
+        """Publishes the results of a poll."""
+        try:
+            self._handle_poll(device, due, blocks)
+        except Exception:  # An error with one device must not affect the others.
+            logs.problem("scan_failed", device=device.id)
+
+    def _handle_poll(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
+        if not self._placement.is_own(device):
+            return  # Another node may have published newer values.
+        self._publishers.scans += 1
+        health = device.health
+        if health.judge(blocks):
+            self._publishers.publish_state(device)
+            level = logging.WARNING if health.error else logging.INFO
+            reason = {} if health.error is None else {"error": health.error}
+            logs.write(level, f"device_{health.state}", device=device.id, **reason)
+        if device.may_have_moved():
+            self._begin_task(self._look_up(device))
+        device.latest.take(blocks)
+        self._publishers.publish_values(device, due, blocks)
+
+    async def _look_up(self, device: ScannedDevice) -> None:
+        """Looks up the name of a device that does not respond; its address may have changed."""
+        async with self.lock(device.id):
+            if self._registry.devices.get(device.id) is not device:
+                return
+            try:
+                target = device.source.target
+                address, endpoint = await self._addresses.find(target, after=device.address)
+            except Refused as refused:
+                logs.refused("not_found", kind="name", device=device.id, reason=str(refused))
+                return
+            if address != device.address:
+                device.address, device.endpoint = address, endpoint
+                self._polling.renew(device)
+                logs.write(logging.INFO, "moved", device=device.id, address=str(address))

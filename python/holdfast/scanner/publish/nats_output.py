@@ -1,0 +1,193 @@
+"""An output to NATS: the values of configured devices, in the messages of the scanner.
+
+Programs that read what the scanner publishes for subscribers read these too.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+from nats.errors import Error
+
+from holdfast.faults import fault_text, is_exception
+from holdfast.net.event_loop import EventLoop
+from holdfast.net.secure_channel import failure_text
+from holdfast.outputs.sending import soon_after
+from holdfast.scanner.messages.dialects import DIALECTS
+from holdfast.scanner.nats.tolerant_client import SafeClient
+from holdfast.scanner.subscriptions.tag import datatype
+from holdfast.tags.text import plain
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from holdfast.config.scanning import Dialect
+    from holdfast.polling import Reading
+    from holdfast.runtime.stop import Stop
+    from holdfast.scanner.nats.connection import Servers
+
+CONFIRM_TIMEOUT_S = 5.0
+"""Time for the server to confirm what was sent."""
+
+CONNECT_TIMEOUT_S = 3.0
+
+CHECK_INTERVAL_S = 0.05
+"""Time between checks whether the connection has ended."""
+
+CLOSE_TIMEOUT_S = 1.0
+
+MAX_PENDING_BYTES = 64 * 2**20
+"""The limit of nats-py's send buffer in bytes, far above one step."""
+
+_encode = msgspec.json.Encoder().encode
+
+
+class NatsOutput:
+    """One connection, on an event loop that runs in the thread of the output."""
+
+    def __init__(self, servers: Servers, prefix: str, dialect: Dialect) -> None:
+        self._servers, self._prefix, self._dialect = servers, prefix, DIALECTS[dialect]
+        self._runner = asyncio.Runner(loop_factory=EventLoop)
+        self._client: SafeClient | None = None
+        self._lost: asyncio.Event | None = None
+        """Set when the connection of the client has ended."""
+        self._states: dict[str, str] = {}
+
+    def until(self, stop: Stop) -> None:
+        """Ends a wait for the server soon after the stop. Called before all else."""
+        soon_after(stop, self._end)
+
+    def send(self, readings: list[Reading]) -> None:
+        """Publishes values, and states that have changed. The server has them when this returns."""
+        try:
+            self._runner.run(self._send(readings))
+        except (OSError, Error) as error:
+            self._states.clear()  # What was published last is not certain.
+            self._close_client()
+            raise OSError(failure_text(error).removeprefix("nats: ")) from error
+
+    def idle(self) -> None:
+        """Lets the client answer pings of the server."""
+        if self._client is not None:
+            self._runner.run(asyncio.sleep(0))
+
+    def close(self) -> None:
+        """Closes the connection."""
+        self._close_client()
+        self._runner.close()
+
+    def status(self) -> dict[str, object]:
+        """Where values go."""
+        return {"servers": list(self._servers.urls), "prefix": self._prefix}
+
+    def _end(self) -> None:
+        """Called by another thread: what waits for the server gets an error."""
+        lost = self._lost
+        if lost is not None:
+            with contextlib.suppress(RuntimeError):  # The loop may be closed.
+                self._runner.get_loop().call_soon_threadsafe(lost.set)
+
+    async def _send(self, readings: list[Reading]) -> None:
+        client = await self._connected()
+        for reading in readings:
+            for subject, payload in self._messages(reading):
+                await client.publish(subject, payload)
+        await self._confirmed(client)
+
+    async def _confirmed(self, client: SafeClient) -> None:
+        """Waits until the server has everything. A connection that ends is an error at once."""
+        assert self._lost is not None, "set with the client"
+        flushing = asyncio.ensure_future(client.flush(timeout=int(CONFIRM_TIMEOUT_S)))
+        losing = asyncio.ensure_future(self._lost.wait())
+        try:
+            while not flushing.done():
+                # nats-py does not call `disconnected_cb` if it fails to send the last bytes.
+                if losing.done() or client.is_closed:
+                    raise ConnectionError("the connection was lost")
+                await asyncio.wait(
+                    {flushing, losing},
+                    timeout=CHECK_INTERVAL_S,
+                    return_when=asyncio.FIRST_COMPLETED,
+                )
+            flushing.result()
+        finally:
+            for task in (flushing, losing):
+                task.cancel()
+
+    async def _connected(self) -> SafeClient:
+        if self._client is None or self._client.is_closed:
+            lost = self._lost = asyncio.Event()
+
+            async def is_lost() -> None:
+                lost.set()
+
+            client = SafeClient(requires_tls=self._servers.secure)
+            try:
+                await asyncio.wait_for(self._connect(client, is_lost), CONNECT_TIMEOUT_S)
+            except BaseException:
+                await client.close()
+                raise
+            self._client = client
+        return self._client
+
+    async def _connect(self, client: SafeClient, lost: Callable[[], Awaitable[None]]) -> None:
+        """Tries each server once."""
+        options: dict[str, Any] = self._servers.options()
+        await client.connect(
+            **options,
+            allow_reconnect=False,
+            connect_timeout=int(CONNECT_TIMEOUT_S),
+            max_reconnect_attempts=1,
+            reconnect_time_wait=0,
+            pending_size=MAX_PENDING_BYTES,
+            error_cb=_ignore_error,
+            disconnected_cb=lost,
+        )
+
+    def _close_client(self) -> None:
+        client, self._client = self._client, None
+        if client is not None:
+            try:
+                self._runner.run(asyncio.wait_for(client.close(), CLOSE_TIMEOUT_S))
+            except (TimeoutError, OSError, Error):
+                return
+
+    def _messages(self, reading: Reading) -> list[tuple[str, bytes]]:
+        device, tag, value, time, fault, _ = reading
+        stamp = int(time * 1000)
+        made = self._state(device, fault, stamp)
+        if not fault:
+            message = {
+                "moduleId": self._prefix,
+                "deviceId": device,
+                "variableId": tag.name,
+                "value": plain(tag, value),
+                "datatype": datatype(tag.of_type),
+                "timestamp": stamp,
+            }
+            subject = self._dialect.data_subject(self._prefix, device, tag.name)
+            made.append((subject, _encode(message)))
+        return made
+
+    def _state(self, device: str, fault: int, stamp: int) -> list[tuple[str, bytes]]:
+        """The state of a device, if it has changed. One that answers with exceptions is online."""
+        state = "offline" if fault and not is_exception(fault) else "online"
+        if self._states.get(device) == state:
+            return []
+        self._states[device] = state
+        message: dict[str, Any] = {"deviceId": device, "state": state, "failures": 0}
+        if state == "offline":
+            message |= {"failures": 1, "error": fault_text(fault)}
+        message["timestamp"] = stamp
+        payload = _encode(message)
+        return [
+            (f"{self._prefix}.status.{name}", payload)
+            for name in self._dialect.device_names(device)
+        ]
+
+
+async def _ignore_error(_: Exception) -> None:
+    """Ignores an error: it also ends `send`, which reports it."""

@@ -1,0 +1,327 @@
+"""Converts the polls of a device to messages that are due, as text for NATS. Does no I/O.
+
+The blocks of a device nearly always have the same shape. For each shape, `_Part` caches everything
+that does not depend on the values: their places, and the text around them. A value then costs only
+its own JSON and one formatting of bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import compress
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import msgspec
+
+from holdfast.scanner.messages.dialects import TENTACLE
+from holdfast.scanner.nats import wire
+from holdfast.scanner.subscriptions.groups import Group
+from holdfast.scanner.subscriptions.tag import clean
+from holdfast.tags.changing import differs
+from holdfast.tags.decoding import Places, Undecoded, decoder
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence, Set
+
+    from holdfast.scanner.messages.dialect import Dialect
+    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.tags.decoding import Decoder
+    from holdfast.types import Area, PolledBlock
+
+Place: TypeAlias = "tuple[Area, int, int]"
+"""Area, address and count of a block."""
+
+Shape: TypeAlias = tuple[Place, ...]
+Message: TypeAlias = tuple[str, bytes]
+"""The id of a tag, and the text that publishes its value."""
+
+MAX_SHAPES = 64
+"""Limit of cached shapes. A device that refuses some blocks has more than one shape."""
+
+SLACK_S = 0.0005
+"""Tolerance when scheduled times are compared, because they are rounded."""
+
+_UNKNOWN = object()
+_encode = msgspec.json.Encoder().encode
+
+
+class Publisher:
+    """Creates the messages of one device."""
+
+    def __init__(
+        self, prefix: str, device: str, dialect: Dialect = TENTACLE, lease: int | None = None
+    ) -> None:
+        """In a fleet, messages have the revision of the `lease` of the device."""
+        self._lease = lease
+        self._header = b"" if lease is None else wire.lease_header(lease)
+        self._prefix = prefix
+        self._device = device
+        self._dialect = dialect
+        self._new_groups: Callable[[], Sequence[Group]] | None = None
+        """Returns the groups from the next poll on; `None` if they have not changed."""
+        self._new_tags: set[str] = set()
+        self._repeat_all = False
+        self._groups: list[_ScheduledGroup] = []
+        self._shapes: dict[Shape, list[tuple[_ScheduledGroup, list[_Placed]]]] = {}
+        self._fresh: set[str] = set()
+        """Tags whose next value is published even if it is not due."""
+        self._last: dict[str, Any] = {}
+        """The last published values of tags in groups that publish changes."""
+        self.undecoded: dict[str, str] = {}
+        """The errors of tags whose registers were read but can't be decoded."""
+
+    def update(self, groups: Callable[[], Sequence[Group]], new_tags: Iterable[str] = ()) -> None:
+        """Changes the groups from the next poll on. Combines all changes before that poll."""
+        self._new_groups = groups
+        self._new_tags.update(new_tags)
+
+    def repeat_all(self, lease: int | None = None) -> None:
+        """Publishes the next values of all tags, even if they are unchanged or not due.
+
+        In a fleet, messages have the revision `lease` from now on.
+        """
+        self._repeat_all = True
+        if lease is None or lease == self._lease:
+            return
+        self._lease, self._header = lease, wire.lease_header(lease)
+        self._shapes.clear()
+        for due in self._groups:
+            due.parts.clear()
+
+    def regroup(self, groups: Sequence[Group], new_tags: Collection[str]) -> None:
+        """Changes the groups now. The next value of `new_tags` is published even if unchanged."""
+        # A group with the same rate and mode keeps the time of its last publication: a new
+        # subscriber must not shift the times of the others.
+        before = {
+            (due.group.change, due.group.rate): due for due in self._groups if not due.is_once
+        }
+        tags = {tag.id: tag for group in groups for tag in group.tags}
+        known = {tag.id for due in before.values() for tag in due.group.tags} - self._fresh
+        self._fresh = (tags.keys() - known) | (tags.keys() & new_tags)
+        ids = {tag.id for group in groups for tag in group.tags if group.change}
+        same = ids == self._last.keys()
+        self._last = {id: self._last.get(id, _UNKNOWN) for id in ids}
+        self._last |= dict.fromkeys(ids & self._fresh, _UNKNOWN)
+        self._groups = []
+        for group in groups:
+            due = before.get((group.change, group.rate))
+            is_same = same and due is not None and due.group == group
+            self._groups.append(due if is_same and due is not None else _ScheduledGroup(group, due))
+        publish_now = {id for due in self._groups for id in due.publish_now(self._fresh)}
+        self._schedule_first_values(self._fresh - publish_now)
+        # Tags that are not published any more have no error any more.
+        self.undecoded = {id: why for id, why in self.undecoded.items() if id in tags}
+
+    def _apply_updates(self) -> None:
+        """Applies the changes that were requested since the last poll."""
+        # The groups are computed here, and not with each request: a caller may subscribe to a
+        # thousand tags one by one.
+        groups = None if self._new_groups is None else self._new_groups()
+        if groups is None and self._repeat_all:
+            groups = [due.group for due in self._groups if not due.is_once]
+        if groups is None:
+            return
+        new_tags = self._new_tags
+        if self._repeat_all:
+            new_tags = {tag.id for group in groups for tag in group.tags}
+        self.regroup(groups, new_tags)
+        self._new_groups, self._new_tags, self._repeat_all = None, set(), False
+
+    def messages(self, due: float, blocks: Sequence[PolledBlock]) -> list[Message]:
+        """Returns the messages after a poll. `due` is its scheduled time in seconds."""
+        self._apply_updates()
+        shape = tuple(block[:3] for block in blocks if block[3] is not None)
+        parts = self._shapes.get(shape)
+        if parts is None:
+            parts = self._compiled(shape)
+        answered = [
+            (block[3], b"%d" % (block[5] * 1000)) for block in blocks if block[3] is not None
+        ]
+        made: list[Message] = []
+        first: set[str] = set()
+        for group, compiled in parts:
+            if not compiled or not group.now(due):
+                continue
+            for block, part in compiled:
+                found = self._messages_of(part, *answered[block])
+                if first and not group.is_once:
+                    found = (message for message in found if message[0] not in first)
+                made += found
+            if group.is_once:
+                first = {id for id, _ in made}
+        if self._fresh and any(id in self._fresh for id, _ in made):
+            self._fresh.difference_update(id for id, _ in made)
+            self._schedule_first_values(self._fresh)
+        return made
+
+    def _schedule_first_values(self, ids: Set[str]) -> None:
+        """Publishes the next values of these tags even if their groups are not due."""
+        groups = [due for due in self._groups if not due.is_once]
+        tags = {tag.id: tag for due in groups for tag in due.group.tags if tag.id in ids}
+        if tags:
+            first = Group(0, False, tuple(tags.values()), (0.0,) * len(tags))
+            groups.insert(0, _ScheduledGroup(first, None, is_once=True))
+        self._groups = groups
+        self._shapes.clear()
+
+    def _messages_of(self, part: _Part, data: bytes, timestamp: bytes) -> Iterable[Message]:
+        """Returns the messages of the tags of one group in one block."""
+        values = part.decoder(data)
+        if part.needs_cleaning:
+            values = [clean(value, tag) for value, tag in zip(values, part.tags, strict=True)]
+        if part.is_plain_json:  # One call for all values, instead of one for each.
+            texts = _encode(values)[1:-1].split(b",")
+        else:
+            texts = [b"null" if type(value) is Undecoded else _encode(value) for value in values]
+        rows: Iterator[Any] = zip(part.ids, part.lengths, part.templates, texts, strict=True)
+        if part.needs_filter:
+            rows = compress(rows, self._filtered(part, values))
+        digits = len(timestamp)
+        return (
+            (id, template % (length + digits + len(text), text, timestamp))
+            for id, length, template, text in rows
+        )
+
+    def _filtered(self, part: _Part, values: Sequence[Any]) -> list[bool]:
+        """Returns which values to publish; in a group that publishes changes, the changed ones.
+
+        Records errors of decoding. An undecoded value counts as no value.
+        """
+        picked = []
+        for id, value, deadband in zip(part.ids, values, part.deadbands, strict=True):
+            if type(value) is Undecoded:
+                self.undecoded[id] = value.error
+                value = None
+            else:
+                self.undecoded.pop(id, None)
+            last = self._last.get(id, _UNKNOWN)
+            wanted = not part.change or differs(value, last, deadband)
+            if wanted and id in self._last:
+                self._last[id] = value
+            picked.append(wanted)
+        return picked
+
+    def _compiled(self, shape: Shape) -> list[tuple[_ScheduledGroup, list[_Placed]]]:
+        """Compiles the parts of all groups for a shape. Each tag is read from its first block."""
+        if len(self._shapes) >= MAX_SHAPES:
+            self._shapes.clear()
+        parts = [(due, list(self._parts(due, shape))) for due in self._groups]
+        self._shapes[shape] = parts
+        return parts
+
+    def _parts(self, due: _ScheduledGroup, shape: Shape) -> Iterator[_Placed]:
+        taken: set[str] = set()
+        for index, block in enumerate(shape):
+            part = due.parts.get(block)
+            if part is None or not taken.isdisjoint(part.ids):
+                inside = due.places.inside(*block)
+                tags = [tag for tag in inside if tag.id not in taken]
+                if not tags:
+                    continue
+                part = self._part(due, tags, block)
+                if len(tags) == len(inside):
+                    due.keep(block, part)
+            taken.update(part.ids)
+            yield index, part
+
+    def _part(self, due: _ScheduledGroup, tags: list[Tag], block: Place) -> _Part:
+        _, address, count = block
+        group = due.group
+        texts = [self._template(tag) for tag in tags]
+        is_infallible = all(tag.type in _INFALLIBLE_TYPES and tag.source is None for tag in tags)
+        remembered = group.change or any(tag.id in self._last for tag in tags)
+        return _Part(
+            decoder(tags, address, count),
+            tags,
+            [tag.id for tag in tags],
+            [text for text, _ in texts],
+            [length for _, length in texts],
+            [due.deadbands[tag.id] for tag in tags],
+            is_plain_json=is_infallible,
+            needs_cleaning=remembered or any(tag.null or tag.meaning is not None for tag in tags),
+            change=group.change,
+            needs_filter=remembered or not is_infallible,
+        )
+
+    def _template(self, tag: Tag) -> tuple[bytes, int]:
+        """Returns the text of a message, with placeholders, and the fixed part of its length."""
+        head = {"moduleId": self._prefix, "deviceId": self._device, "variableId": tag.id}
+        before = _encode(head)[:-1] + b',"value":'
+        after = b',"datatype":"%b","timestamp":' % tag.datatype.encode()
+        text = before.replace(b"%", b"%%") + b"%b" + after + b"%b}"
+        subject = self._dialect.data_subject(self._prefix, self._device, tag.id).encode()
+        size, header = len(before) + len(after) + 1, self._header
+        escaped = subject.replace(b"%", b"%%")
+        head_line = b"PUB %b %%d\r\n" % escaped
+        if header:
+            head_line = b"HPUB %b %d %%d\r\n%b" % (escaped, len(header), header)
+        return head_line + text + b"\r\n", size + len(header)
+
+
+_INFALLIBLE_TYPES = {
+    "bool",
+    *(f"bit:{bit}" for bit in range(16)),
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (16, 32, 64)),
+    *(f"float{bits}" for bits in (16, 32, 64)),
+}
+"""Types that decode any registers, to a single JSON number or word."""
+
+
+class _Part(NamedTuple):
+    """The tags of a group that are in one block."""
+
+    decoder: Decoder
+    tags: Sequence[Tag]
+    ids: Sequence[str]
+    templates: Sequence[bytes]
+    """The messages, with placeholders for length, value and time."""
+    lengths: Sequence[int]
+    """The lengths of the payloads without values and times."""
+    deadbands: Sequence[float]
+    is_plain_json: bool
+    """Whether all values can be encoded as one JSON array and split at the commas."""
+    needs_cleaning: bool
+    """Whether some values must be converted, such as NaN or a marker to `null`."""
+    change: bool
+    needs_filter: bool
+    """Whether some values may be omitted, or must be remembered."""
+
+
+_Placed: TypeAlias = tuple[int, _Part]
+"""The index of a block, and the part in it."""
+
+
+class _ScheduledGroup:
+    """A group, and the time of its last publication."""
+
+    def __init__(
+        self, group: Group, before: _ScheduledGroup | None, *, is_once: bool = False
+    ) -> None:
+        self.group = group
+        self.is_once = is_once
+        self._last: float = -math.inf if before is None else before._last
+        self.places = Places(group.tags)
+        self.deadbands = {
+            tag.id: deadband for tag, deadband in zip(group.tags, group.deadbands, strict=True)
+        }
+        self.parts: dict[Place, _Part] = {}
+        """The compiled parts of blocks, shared by all shapes."""
+
+    def publish_now(self, fresh: Collection[str]) -> Iterable[str]:
+        """Makes the group due if all of its tags are fresh. Returns its tags if it is due then."""
+        if all(id in fresh for id in self.deadbands):
+            self._last = -math.inf
+        return self.deadbands if self._last == -math.inf else ()
+
+    def keep(self, place: Place, part: _Part) -> None:
+        """Caches a part. The cache is limited, because blocks may differ at every poll."""
+        if len(self.parts) >= MAX_SHAPES + 2 * len(self.group.tags):
+            self.parts.clear()
+        self.parts[place] = part
+
+    def now(self, due: float) -> bool:
+        """Returns whether the group is due at this scan, and records the publication if so."""
+        if due < self._last + self.group.rate / 1000 - SLACK_S:
+            return False
+        self._last = due
+        return True

@@ -1,0 +1,110 @@
+"""Publishes the values and the states of all devices."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from holdfast.scanner.messages.types import Status
+from holdfast.scanner.nats import wire
+from holdfast.scanner.publish.publisher import Publisher
+from holdfast.scanner.subscriptions.groups import grouped
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from holdfast.scanner.messages.dialect import Dialect
+    from holdfast.scanner.nats.outbox import Outbox
+    from holdfast.scanner.placement import Placement
+    from holdfast.scanner.subscriptions.device import ScannedDevice
+    from holdfast.types import PolledBlock
+
+
+class Publishers:
+    """The publishers of devices, by id."""
+
+    def __init__(self, prefix: str, dialect: Dialect, outbox: Outbox, placement: Placement) -> None:
+        self._prefix = prefix
+        self._dialect = dialect
+        self._outbox = outbox
+        self._placement = placement
+        self._publishers: dict[str, Publisher] = {}
+        self.scans = 0
+        """Polls that were published."""
+
+    def update(
+        self, device: ScannedDevice, fresh: Collection[str] = (), *, with_state: bool = False
+    ) -> None:
+        """Applies changes of a device, and publishes the next value of `fresh` tags in any case."""
+        publisher = self._publishers.get(device.id)
+        if publisher is None:
+            publisher = self._publishers[device.id] = self._publisher(device)
+        # Where another node polls the device, `restart` makes all of its tags fresh.
+        publisher.update(lambda: grouped(device), fresh if self._placement.is_own(device) else ())
+        if with_state:
+            self.publish_state(device)
+
+    def restart(self, device: ScannedDevice) -> None:
+        """Publishes a device that another node has published until now."""
+        publisher = self._publishers[device.id] = self._publisher(device)
+        publisher.update(lambda: grouped(device), device.tags)
+
+    def remove(self, device: ScannedDevice) -> None:
+        """Publishes a device no more."""
+        del self._publishers[device.id]
+
+    def undecoded(self, device_id: str) -> Mapping[str, str]:
+        """Returns the errors of the tags of a device that could not be decoded."""
+        return self._publishers[device_id].undecoded
+
+    def repeat_values(self) -> None:
+        """Publishes the next value of every tag, even if it is unchanged."""
+        for publisher in self._publishers.values():
+            publisher.repeat_all()
+
+    def repeat(self, device: ScannedDevice) -> None:
+        """Publishes the state and all values of a device again, over a new connection.
+
+        Messages that were sent before a disconnect may be lost.
+        """
+        self._publishers[device.id].repeat_all(self._placement.lease(device))
+        self.publish_state(device)
+
+    def publish_values(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
+        """Publishes the results of a poll that are due."""
+        id = device.id
+        messages = self._publishers[id].messages(due, blocks)
+        self._outbox.put([((id, tag), text) for tag, text in messages])
+        if len(device.subjects) > 1:
+            one, other = (f"{self._prefix}.data.{name}" for name in device.subjects)
+            self._outbox.put(
+                [((id, tag, other), wire.readdressed(text, one, other)) for tag, text in messages]
+            )
+
+    def publish_state(self, device: ScannedDevice) -> None:
+        """Publishes and stores the state of a device, if this scanner polls it."""
+        if not self._placement.is_own(device):
+            return
+        health = device.health
+        status = Status(
+            device_id=device.id,
+            state=health.state,
+            failures=health.failures,
+            error=health.error,
+            timestamp=int(time.time() * 1000),
+        )
+        # Stored as well as published: a program that starts later reads the last state.
+        device.status = msgspec.json.encode(status)
+        self._placement.state_changed(device.id)
+        for name in device.subjects:
+            subject = f"{self._prefix}.status.{name}"
+            text = wire.text(subject, device.status)
+            if (lease := self._placement.lease(device)) is not None:
+                text = wire.leased(text, lease)
+            self._outbox.put([((device.id, subject), text)])
+
+    def _publisher(self, device: ScannedDevice) -> Publisher:
+        lease = self._placement.lease(device)
+        return Publisher(self._prefix, device.id, self._dialect, lease)

@@ -1,0 +1,94 @@
+"""Carries out requests concurrently, and answers each of them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, TypeAlias
+
+import msgspec
+
+from holdfast import logs
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.messages.types import Answer, BrowseAnswer
+from holdfast.scanner.nats import wire
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Coroutine
+    from typing import Any
+
+    from nats.aio.msg import Msg
+
+    from holdfast.scanner.nats.outbox import Outbox
+
+Handle: TypeAlias = "Callable[[Msg], Awaitable[Answer | BrowseAnswer | bytes]]"
+"""Carries out a message. Returns the answer, or its JSON."""
+
+LARGE_REQUEST_BYTES = 16 * 1024
+"""Size of a request that takes milliseconds to parse."""
+
+
+class Responder:
+    """Runs requests as tasks, up to a limit."""
+
+    def __init__(
+        self, max_pending: int, outbox: Outbox, until_ready: Callable[[], Awaitable[None]]
+    ) -> None:
+        """Requests wait for `until_ready`."""
+        self._max_pending = max_pending
+        self._outbox = outbox
+        self._until_ready = until_ready
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._request_lock = asyncio.Lock()
+        """Held while a request is parsed and checked."""
+
+    def answering(self, kind: str, handle: Handle) -> Callable[[Msg], Awaitable[None]]:
+        """Returns a handler that carries out messages concurrently and answers them."""
+
+        async def carry_out(message: Msg) -> None:
+            answer = await self._answer(kind, handle, message)
+            if message.reply:
+                payload = answer if isinstance(answer, bytes) else msgspec.json.encode(answer)
+                await self._outbox.answer(message.reply, wire.text(message.reply, payload))
+
+        async def begin(message: Msg) -> None:
+            self.begin(carry_out(message))
+
+        return begin
+
+    async def _answer(
+        self, kind: str, handle: Handle, message: Msg
+    ) -> Answer | BrowseAnswer | bytes:
+        try:
+            # Checked here and not before the task: a refusal is an answer, too.
+            if len(self._tasks) > self._max_pending:
+                limit = f"{self._max_pending} are pending, which is the limit"
+                raise Refused(f"too many requests: {limit}")
+            await self._until_ready()
+            return await handle(message)
+        except Refused as refused:
+            logs.refused("request_refused", kind=kind, subject=message.subject, reason=str(refused))
+            return Answer(success=False, error=str(refused))
+        except Exception as error:  # An error in one request must not stop the service.
+            logs.problem("request_failed", subject=message.subject)
+            return Answer(success=False, error=f"internal error: {type(error).__name__}")
+
+    def begin(self, work: Coroutine[Any, Any, None]) -> None:
+        """Runs a task that `cancel` ends."""
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def cancel(self) -> None:
+        """Ends all tasks."""
+        for task in list(self._tasks):
+            task.cancel()
+
+    @contextlib.asynccontextmanager
+    async def in_order(self, message: Msg, *, is_large: bool = False) -> AsyncIterator[None]:
+        """Serializes requests. Lets polls run before a request that takes milliseconds."""
+        async with self._request_lock:
+            if is_large or len(message.data) > LARGE_REQUEST_BYTES:
+                await asyncio.sleep(0)  # The event loop handles the results of polls meanwhile.
+            yield

@@ -1,0 +1,85 @@
+"""The settings of a scanner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from holdfast.config.scanning import PARTITIONS
+from holdfast.leases import LEASE_TIMES, LeaseTimes
+from holdfast.net.tls import NO_FILES, Tls
+from holdfast.runtime.standstill import LONG
+from holdfast.scanner import write_access
+from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
+from holdfast.scanner.messages.dialects import DIALECTS
+from holdfast.scanner.messages.tentacle import PAUSES_S
+from holdfast.scanner.nats.connection import MAX_PAUSE, Ping, Servers
+from holdfast.scanner.subscriptions.limits import ScannerLimits
+from holdfast.scanner.subscriptions.rules import Defaults
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from holdfast.config import scanning
+    from holdfast.net.allow_list import AllowEntry
+    from holdfast.tags import TagList
+
+
+@dataclass(frozen=True)
+class FleetSettings:
+    """The fleet that a scanner is a part of."""
+
+    name: str
+    node: str
+    """The name of this scanner in the fleet; unique."""
+    partitions: int = PARTITIONS
+    lease_times: LeaseTimes = LEASE_TIMES
+    """The same for all nodes, or two of them use a device."""
+    check_interval_s: float = 5.0
+    """Between checks whether changes of subscriptions still arrive."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The settings of a scanner."""
+
+    servers: Servers = field(default_factory=Servers)
+    prefix: str = "modbus"
+    """The first part of all subjects, and the id of the module in messages."""
+    allow: tuple[AllowEntry, ...] = ()
+    """Networks and serial devices, see `AllowedDevices`."""
+    limits: ScannerLimits = field(default_factory=ScannerLimits)
+    device_tls: Tls = NO_FILES
+    """The TLS files for connections to devices."""
+    defaults: Defaults = field(default_factory=Defaults)
+    """What subscribe requests leave out."""
+    writes: scanning.Writes = "tags"
+    """Which tags callers may write."""
+    strict: bool = False
+    """Whether requests are refused that would otherwise be adjusted."""
+    ping: Ping = field(default_factory=Ping)
+    """How a NATS server that does not answer is detected."""
+    max_pause_s: float = MAX_PAUSE
+    """Between attempts to connect to NATS."""
+    publish_logs: bool = True
+    """Whether the log is also published."""
+    keep_subscriptions: bool = True
+    """Whether subscriptions and states are kept in JetStream."""
+    dialect: scanning.Dialect = "tentacle"
+    """The programs that it serves."""
+    profiles: Mapping[str, TagList] = field(default_factory=dict)
+    """The tags that requests can name by their profile."""
+    fleet: FleetSettings | None = None
+    """The fleet of scanners that it is a node of."""
+    exact_pauses_s: tuple[float, float] = PAUSES_S
+    """The first and the longest pause after failures of a device; only with dialect `tentacle`."""
+    watch_times: WatchTimes = WATCH_TIMES
+    """Those of the buckets of tentacle-next."""
+    standstill_s: float = LONG
+    """The shortest time without the event loop after which commands that waited are refused."""
+
+    @property
+    def write_access(self) -> dict[str, str]:
+        """What may be written, where, by whom, and what narrows it, in words."""
+        dialect = DIALECTS[self.dialect]
+        return write_access.described(self.writes, self.allow, self.prefix, dialect)

@@ -1,0 +1,160 @@
+"""From the tags of subscribe requests, and of the profiles that they name, to tags. Does no I/O."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holdfast import tags
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.messages.types import TagRequest
+from holdfast.scanner.subscriptions.device import NO_OPTIONS, TagOptions
+from holdfast.scanner.subscriptions.tag import AREA_OF_CODE, CODE_OF_AREA, Tag
+from holdfast.tags.markers import as_decoded
+from holdfast.types import BIT_AREAS
+from holdfast.values import ConversionError, WrongArea, codec_for
+from holdfast.values.types import parsed
+
+if TYPE_CHECKING:
+    from holdfast.scanner.messages.leniency import Adjustments
+    from holdfast.scanner.messages.types import SubscribeRequest
+    from holdfast.scanner.subscriptions.rules import Rules
+    from holdfast.tags.markers import Marker
+    from holdfast.values.types import Type
+
+ORDERS = {"big": "ABCD", "little": "DCBA"}
+"""Other names of byte orders, as callers of tentacle-modbus use them."""
+
+NUMERIC = ("bcd", "float", "int", "uint")
+"""What the names of numeric types begin with."""
+
+NO_MARKERS: frozenset[Marker] = frozenset()
+"""One object for nearly all tags."""
+
+
+def requested_tags(
+    request: SubscribeRequest, rules: Rules, adjustments: Adjustments
+) -> tuple[dict[str, Tag], dict[str, TagOptions]]:
+    """Returns the tags of a request by id, and what it sets for each. Raises `Refused`.
+
+    A tag of the request replaces that of its profile.
+    """
+    order = ORDERS.get(request.byte_order or "big", request.byte_order or "")
+    of_profile = [] if request.profile is None else _profile_requests(request.profile, rules)
+    replaceable = {entry.id for entry in of_profile}
+    entries = [(f"profile {request.profile}", entry) for entry in of_profile]
+    entries += ((f"tags[{index}]", entry) for index, entry in enumerate(request.tags))
+    options = {entry.id: _options(entry) for _, entry in entries}
+    found: dict[str, Tag] = {}
+    for where, entry in entries:
+        made = _tag(entry, order, where, rules, adjustments)
+        before = found.get(made.id)
+        if before is not None and made.id in replaceable:
+            replaceable -= {made.id}  # A second one in the request would be a repetition.
+        elif before is not None:
+            if rules.strict:
+                raise Refused(f"{where}: duplicate id {made.id!r}")
+            if made != before and not rules.dialect.last_definition_counts:
+                raise Refused(f"{where}: {made.id!r} is {made}, and already {before}")
+            adjustments.changes.append(("tag_repeated", made.id))
+        found[made.id] = made
+    return found, options
+
+
+def _options(entry: TagRequest) -> TagOptions:
+    if entry.writable is None and entry.description is None:
+        return NO_OPTIONS
+    return TagOptions(entry.writable, entry.description)
+
+
+def _tag(
+    request: TagRequest, order: str, where: str, rules: Rules, adjustments: Adjustments
+) -> Tag:
+    """Creates the tag of a request; `order` is the default byte order. Raises `Refused`.
+
+    Unless the rules are strict, a number in an area of bits becomes a boolean, and `writable` is
+    ignored in an area that can't be written. Adds this to `adjustments`.
+    """
+    if request.profile is not None:
+        return _of_profile(request.profile, request.id, where, rules)
+    area = AREA_OF_CODE[request.function_code]
+    name = request.datatype
+    if name == "boolean" or name.startswith("boolean["):
+        name = "bool" + name.removeprefix("boolean")
+    order = request.byte_order or order
+    order = ORDERS.get(order, order)
+    try:
+        type = parsed(name)
+        if _is_number(type) and area in BIT_AREAS and not rules.strict:
+            adjustments.changes.append(("datatype_ignored", f"{request.id} ({name} in {area})"))
+            name, type = "bool", parsed("bool")
+        if type.base == "bool":
+            order = "ABCD"  # It has none: then equal tags are equal, whatever a request says.
+        elif area not in BIT_AREAS:
+            for note in rules.dialect.byte_order_notes(request, area, order):
+                adjustments.byte_orders.append((request.id, note))
+            order = rules.dialect.byte_orders.get((name, order), order)
+        codec_for(area, name, order, request.encoding)
+    except WrongArea:
+        raise Refused(
+            f"{where}: datatype is {name}, functionCode {request.function_code} reads boolean"
+        ) from None
+    except ConversionError as error:
+        raise Refused(f"{where}: {error}") from None
+    if request.address + type.registers > ADDRESSES:
+        raise Refused(
+            f"{where}: {name} from address {request.address}: the last address is {LAST_ADDRESS}"
+        )
+    null = _null_markers(request, type, where)
+    made = Tag(request.id, area, request.address, name, order, null, request.encoding)
+    if request.writable and (flaw := made.unwritable) is not None:
+        if area in WRITE_LIMITS or rules.strict:
+            raise Refused(f"{where}: {flaw}")
+        adjustments.changes.append(("writable_ignored", f"{request.id} ({area})"))
+    return made
+
+
+def _null_markers(request: TagRequest, type: Type, where: str) -> frozenset[Marker]:
+    if not request.null:
+        return NO_MARKERS
+    try:
+        return frozenset(as_decoded(each, type, request.encoding) for each in request.null)
+    except ValueError as error:
+        raise Refused(f"{where}.null: {error}") from None
+
+
+def _is_number(type: Type) -> bool:
+    return type.count is None and type.base.startswith(NUMERIC)
+
+
+def _profile_requests(name: str, rules: Rules) -> list[TagRequest]:
+    """Returns the tags of a profile as requests. Raises `Refused`."""
+    return [
+        TagRequest(
+            id=tag.name,
+            address=tag.address,
+            function_code=CODE_OF_AREA[tag.area],
+            datatype=tag.type,
+            writable=tag.writable,
+            description=tag.description or None,
+            profile=name,
+        )
+        for tag in _profile(name, "profile", rules)
+    ]
+
+
+def _of_profile(name: str, id: str, where: str, rules: Rules) -> Tag:
+    profile = _profile(name, f"{where}.profile", rules)
+    if id not in profile:
+        raise Refused(f"{where}: the profile {name} has no tag {id!r}")
+    tag = profile[id]
+    made = (tag.area, tag.address, tag.type, tag.order, tag.null, tag.encoding)
+    return Tag(id, *made, profile=name, meaning=tag)
+
+
+def _profile(name: str, where: str, rules: Rules) -> tags.TagList:
+    found = rules.profiles.get(name)
+    if found is None:
+        allowed = ", ".join(rules.profiles) or "none, the configuration has no profiles"
+        raise Refused(f"{where} is {name!r}, allowed: {allowed}")
+    return found
