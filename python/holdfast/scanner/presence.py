@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from holdfast import _core, tasks
+from holdfast import _core
+from holdfast.runtime import tasks
 from holdfast.scanner.jetstream.heartbeat import HeartbeatKey
 from holdfast.scanner.messages.types import Announcement, HeartbeatMetadata
 from holdfast.scanner.nats import wire
