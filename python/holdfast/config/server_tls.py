@@ -19,9 +19,6 @@ class _ServerFiles(Model):
     """The key of that certificate."""
     key_passphrase_file: Annotated[FilePath | None, NotNull()] = None
     """A file that contains the passphrase of the key."""
-    review: DurationOrZero = 3600.0
-    """At most so many seconds pass until the certificates of open connections are judged again; 0:
-    only at a reload."""
 
 
 class ServerTlsConfig(_ServerFiles):
@@ -33,6 +30,9 @@ class ServerTlsConfig(_ServerFiles):
     """Certificate revocation lists: one of each authority in the chain of a client."""
     expired_crl: ExpiredLists = "refuse"
     """Clients of an authority whose list is past its nextUpdate."""
+    review: DurationOrZero = 3600.0
+    """At most so many seconds pass until the certificates of open connections are judged again; 0:
+    only at a reload."""
 
 
 class HttpsConfig(_ServerFiles):
@@ -46,6 +46,9 @@ class HttpsConfig(_ServerFiles):
     client_ca_file."""
     expired_crl: ExpiredLists = "refuse"
     """Clients of an authority whose list is past its nextUpdate."""
+    review: DurationOrZero = 3600.0
+    """At most so many seconds pass until the certificates of open connections are judged again; 0:
+    only at a reload."""
     roles: Roles = None
     """Roles of client certificates; "" is a certificate without a role; requires client_ca_file.
     Default: any role."""

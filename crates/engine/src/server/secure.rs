@@ -40,8 +40,10 @@ pub(crate) async fn secured(
         shaken = timeout(time_limit, stream.handshake(time_limit)) => Some(shaken),
     };
     let Some(shaken) = shaken else {
-        // The peer may have completed its side.
-        stream.announce_end();
+        if stream.has_begun() {
+            // The peer may have completed its side.
+            stream.announce_end();
+        }
         return ended(Kind::Closed);
     };
     let certificate = match shaken {

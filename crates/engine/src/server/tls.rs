@@ -89,6 +89,11 @@ impl ServerTlsStream {
         self.channel.presented_subject()
     }
 
+    /// Whether the peer has begun the handshake.
+    pub(crate) fn has_begun(&self) -> bool {
+        self.channel.has_begun()
+    }
+
     /// Announces the end without waiting.
     pub(crate) fn announce_end(&mut self) {
         let mut unsent = Vec::new();

@@ -241,6 +241,11 @@ impl ServerChannel {
         self.channel.end(out);
     }
 
+    /// Whether the client has said what it supports.
+    pub(crate) fn has_begun(&self) -> bool {
+        self.first.is_none()
+    }
+
     pub(crate) fn is_handshaking(&self) -> bool {
         self.channel.is_handshaking()
     }
