@@ -225,8 +225,8 @@ impl super::line::Line {
     }
 }
 
-/// Hands a request to its handler, and returns the response. hyper reads on once this returns the future,
-/// so it notes what is read next before.
+/// Hands a request to its handler, and returns the response. hyper reads the body once this returns the
+/// future, so what has arrived, and what is read next, is noted before.
 fn answered(
     front: Arc<Front>,
     line: SharedLine,
@@ -234,13 +234,18 @@ fn answered(
 ) -> impl Future<Output = Result<Response<Output>, Abandoned>> {
     let exchange = front.exchange();
     let len = request.body().size_hint().exact();
-    let is_ambiguous = line.lock().begin(Arc::clone(&exchange), len);
+    let expects = request.headers().contains_key(EXPECT);
+    let (is_ambiguous, is_here) = {
+        let mut line = line.lock();
+        let is_here = !expects && len.is_some_and(|len| line.has(len));
+        (line.begin(Arc::clone(&exchange), len), is_here)
+    };
     async move {
         if is_ambiguous {
             front.ended(Kind::BrokenRequest, line.lock().peer.clone());
             return Ok(refused(&front, exchange, line));
         }
-        handled(front, line, exchange, request).await
+        handled(front, line, exchange, request, is_here).await
     }
 }
 
@@ -249,15 +254,13 @@ async fn handled(
     line: SharedLine,
     exchange: Arc<Exchange>,
     request: Request<Incoming>,
+    is_here: bool,
 ) -> Result<Response<Output>, Abandoned> {
     let (parts, body) = request.into_parts();
     let len = body.size_hint().exact();
     let expects = parts.headers.contains_key(EXPECT);
     let is_old = parts.version == Version::HTTP_10;
-    let (is_here, peer) = {
-        let line = line.lock();
-        (!expects && len.is_some_and(|len| line.has(len)), line.peer.clone())
-    };
+    let peer = line.lock().peer.clone();
     let mut upload = Upload {
         line: line.clone(),
         body,

@@ -155,23 +155,34 @@ async fn handle(inbox: &Inbox, bodies: &Mutex<Vec<Bytes>>) {
     }
 }
 
+/// A connection on which these bytes arrive, and what is written to it.
+async fn line(
+    front: &Arc<Front>,
+    sent: &[&[u8]],
+    is_pausing: bool,
+) -> (SharedLine, Arc<Mutex<Vec<u8>>>) {
+    let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
+    let socket = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
+    let pieces = sent.iter().flat_map(|piece| piece.chunks(9000)).map(<[u8]>::to_vec).collect();
+    let written = Arc::new(Mutex::new(Vec::new()));
+    let stream = Pieces { pieces, is_pausing, turns: 0, written: Arc::clone(&written), socket };
+    let peer = SocketAddr::from(([127, 0, 0, 1], 50_000));
+    let (ticket, _) = front.context.admission.admit(peer).unwrap();
+    let line = SharedLine::new(Arc::clone(front), (ticket, Peer::from(peer)), Box::new(stream));
+    (line, written)
+}
+
 fn outcome(runtime: &Runtime, sent: &[&[u8]], is_pausing: bool) -> Outcome {
     let (front, inbox) = front();
-    let (written, bodies) = (Arc::new(Mutex::new(Vec::new())), Mutex::new(Vec::new()));
-    runtime.block_on(async {
-        let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
-        let socket = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
-        let pieces = sent.iter().flat_map(|piece| piece.chunks(9000)).map(<[u8]>::to_vec).collect();
-        let stream = Pieces { pieces, is_pausing, turns: 0, written: Arc::clone(&written), socket };
-        let peer = SocketAddr::from(([127, 0, 0, 1], 50_000));
-        let (ticket, _) = front.context.admission.admit(peer).unwrap();
-        let line =
-            SharedLine::new(Arc::clone(&front), (ticket, Peer::from(peer)), Box::new(stream));
+    let bodies = Mutex::new(Vec::new());
+    let written = runtime.block_on(async {
+        let (line, written) = line(&front, sent, is_pausing).await;
         let (_stop, stopping) = watch::channel(false);
         tokio::select! {
             _ = converse(&front, &line, stopping) => {}
             () = handle(&inbox, &bodies) => {}
         }
+        written
     });
     let written = String::from_utf8(std::mem::take(&mut *written.lock().unwrap())).unwrap();
     let lines = written.split_inclusive("\r\n").filter(|line| !line.starts_with("date: "));
@@ -256,4 +267,19 @@ fn joined_requests_have_the_same_outcome_as_those_that_are_sent_apart() {
             assert_eq!(outcome(&runtime, &pieces, false), apart, "{first} {second}");
         }
     }
+}
+
+#[test]
+fn a_body_that_has_arrived_with_its_header_is_handed_over_with_it() {
+    let (runtime, (front, inbox)) = (runtime(), front());
+    let request = post("/", "", "four");
+    let event = runtime.block_on(async {
+        let (line, _) = line(&front, &[request.as_bytes()], false).await;
+        let (_stop, stopping) = watch::channel(false);
+        tokio::select! {
+            _ = converse(&front, &line, stopping) => unreachable!("there is no response"),
+            event = async { loop { match inbox.take().pop() { Some(event) => break event, None => yield_now().await } } } => event,
+        }
+    });
+    assert!(matches!(event, Event::Request { body: Some(body), .. } if body == "four"));
 }
