@@ -506,6 +506,9 @@ class HttpServer:
         that have arrived), `too_large`, `broken`, `gone` or `room`.
         """
 
+    def flush(self) -> None:
+        """Sends the responses since the last call."""
+
     def events(self) -> list[tuple[str, dict[str, Any]]]:
         """Takes events of connections: a name, and fields for a log."""
 
@@ -547,7 +550,7 @@ class HttpExchange:
     def respond(
         self, status: int, headers: Sequence[tuple[bytes, bytes]], body: bytes, closes: bool
     ) -> None:
-        """Answers the request; with `closes`, the connection ends after it.
+        """Answers the request at the next `flush`; with `closes`, the connection ends after it.
 
         Raises `ValueError` for an invalid header or status.
         """

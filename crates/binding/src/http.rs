@@ -150,6 +150,11 @@ impl HttpServer {
         Ok((requests, events))
     }
 
+    /// Sends the responses since the last call.
+    fn flush(&self) {
+        self.core.flush();
+    }
+
     /// Takes events of connections, as the fields of a log.
     fn events<'py>(&self, py: Python<'py>) -> PyResult<Vec<(&'static str, Bound<'py, PyDict>)>> {
         let mut events = Vec::new();

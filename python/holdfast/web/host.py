@@ -43,6 +43,9 @@ if TYPE_CHECKING:
 KEEP_ALIVE = 60.0
 """Seconds after which an idle connection is closed."""
 
+FLUSHED = 16
+"""Responses that are sent together. Waking the core for each costs more than the response."""
+
 GRACE = 1.0
 """Seconds that a peer has to send a request, or to take a response, before it can be evicted."""
 
@@ -213,8 +216,12 @@ class Host:
     def _take(self, server: HttpServer, loop: asyncio.AbstractEventLoop) -> None:
         """Takes a batch of requests, and what has happened to others."""
         requests, events = server.take()
-        for given in requests:
+        for number, given in enumerate(requests, 1):
             self._begin(_Exchanged(*given), loop)
+            if number % FLUSHED == 0:
+                server.flush()
+        if requests:
+            server.flush()
         for number, kind, value in events:
             request = self._open.get(number)
             if request is not None:
@@ -252,6 +259,8 @@ class Host:
             request.exchange.end(answer is None)
         elif answer is not None:
             self._respond(request, answer)
+            if self._server is not None:
+                self._server.flush()
         else:
             request.exchange.abandon()
 

@@ -118,7 +118,7 @@ fn front() -> (Arc<Front>, Arc<Inbox>) {
 async fn handle(inbox: &Inbox, bodies: &Mutex<Vec<Bytes>>) {
     let mut waiting: Vec<Arc<Exchange>> = Vec::new();
     let mut known = HashSet::new();
-    let respond = |exchange: &Exchange, status: u16, closes: bool| {
+    let respond = |exchange: &Arc<Exchange>, status: u16, closes: bool| {
         let head = ResponseHead::new(status, std::iter::empty()).unwrap();
         exchange.respond(head, Bytes::from_static(b"said"), closes);
     };
@@ -151,6 +151,7 @@ async fn handle(inbox: &Inbox, bodies: &Mutex<Vec<Bytes>>) {
             let exchange = waiting.iter().find(|exchange| exchange.number == number).unwrap();
             respond(exchange, status, status != 200);
         }
+        inbox.flush();
         yield_now().await;
     }
 }
@@ -181,6 +182,7 @@ fn outcome(runtime: &Runtime, sent: &[&[u8]], is_pausing: bool) -> Outcome {
         tokio::select! {
             _ = converse(&front, &line, stopping) => {}
             () = handle(&inbox, &bodies) => {}
+            () = inbox.deliver() => {}
         }
         written
     });

@@ -114,13 +114,14 @@ impl Exchange {
         self.order(Order::Receive(most));
     }
 
-    /// Answers the request.
-    pub fn respond(&self, mut head: ResponseHead, body: Bytes, closes: bool) {
+    /// Answers the request, after the next [`super::HttpServer::flush`].
+    pub fn respond(self: &Arc<Self>, mut head: ResponseHead, body: Bytes, closes: bool) {
         let has_body = !matches!(head.status, StatusCode::NO_CONTENT | StatusCode::NOT_MODIFIED);
         if has_body && !head.headers.contains_key(CONTENT_LENGTH) {
             head.headers.insert(CONTENT_LENGTH, HeaderValue::from(body.len()));
         }
-        self.order(Order::Respond { head, body, closes });
+        self.state().orders.push_back(Order::Respond { head, body, closes });
+        self.inbox.note_answered(Arc::clone(self));
     }
 
     /// Answers the request with a stream. A client that sends no more is gone from here on, because a
@@ -180,6 +181,11 @@ impl Exchange {
             }
         })
         .await
+    }
+
+    /// Wakes the task of the connection.
+    pub(super) fn wake(&self) {
+        wake(self.state());
     }
 
     pub(super) fn tell(&self, event: Event) {

@@ -8,6 +8,7 @@ use std::mem;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
+use tokio::sync::Notify;
 
 use super::exchange::{Exchange, RequestHead};
 use crate::wake::{Wakes, pair};
@@ -35,13 +36,18 @@ pub enum Event {
 pub(super) struct Inbox {
     events: Mutex<Vec<Event>>,
     wake: Wakes,
+    /// Exchanges with a response that their connections do not know of yet. Waking another thread for each
+    /// response costs more than the response: a batch is handed over at once.
+    answered: Mutex<Vec<Arc<Exchange>>>,
+    has_answered: Notify,
 }
 
 impl Inbox {
     /// The second result becomes readable when there are events.
     pub(super) fn new() -> io::Result<(Inbox, Wakes)> {
         let (wake, wakes) = pair()?;
-        Ok((Inbox { events: Mutex::default(), wake }, wakes))
+        let (answered, has_answered) = (Mutex::default(), Notify::new());
+        Ok((Inbox { events: Mutex::default(), wake, answered, has_answered }, wakes))
     }
 
     pub(super) fn push(&self, event: Event) {
@@ -58,6 +64,25 @@ impl Inbox {
     pub(super) fn wake(&self) {
         // A full socket wakes the event loop too, and a closed one has no event loop.
         let _ = (&self.wake).write(&[0]);
+    }
+
+    /// Notes a response. It is sent after the next `flush`.
+    pub(super) fn note_answered(&self, exchange: Arc<Exchange>) {
+        self.answered.lock().unwrap_or_else(PoisonError::into_inner).push(exchange);
+    }
+
+    pub(super) fn flush(&self) {
+        self.has_answered.notify_one();
+    }
+
+    /// Tells connections of their responses. Runs in their thread, so that it is woken once for many.
+    pub(super) async fn deliver(&self) {
+        loop {
+            self.has_answered.notified().await;
+            let answered =
+                mem::take(&mut *self.answered.lock().unwrap_or_else(PoisonError::into_inner));
+            answered.iter().for_each(|exchange| exchange.wake());
+        }
     }
 
     /// Takes all events.

@@ -172,6 +172,8 @@ impl HttpServer {
         let (front, heartbeat) = (Arc::clone(&self.front), Arc::clone(&self.heartbeat));
         let (stop, mut abort) = (self.stop.subscribe(), self.abort.subscribe());
         let worker = runtime.handle().clone();
+        let inbox = Arc::clone(&front.inbox);
+        runtime.spawn(async move { inbox.deliver().await });
         let work = async move {
             let context = Arc::clone(&front.context);
             let live = Arc::new(Live::from(front));
@@ -191,6 +193,11 @@ impl HttpServer {
     /// Takes what has happened to requests.
     pub fn take(&self) -> Vec<Event> {
         self.front.inbox.take()
+    }
+
+    /// Sends the responses of the exchanges that were answered since the last call.
+    pub fn flush(&self) {
+        self.front.inbox.flush();
     }
 
     /// Takes the next event of a connection.
