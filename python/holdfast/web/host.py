@@ -16,6 +16,7 @@ from urllib.parse import unquote
 
 from holdfast import logs
 from holdfast._core import HttpServer
+from holdfast.net import event_loop
 from holdfast.net.addresses import joined, parse_address
 from holdfast.runtime.heartbeat import PERIOD, Heartbeat
 from holdfast.web.requests import (
@@ -138,7 +139,7 @@ class Host:
 
     def run(self, stop: Stop) -> None:
         """Serves in this thread until `stop` is set. Can be called again: the socket stays open."""
-        asyncio.run(self._serve(stop))
+        event_loop.run(self._serve(stop), event_loop.fastest)
 
     async def _serve(self, stop: Stop) -> None:
         loop = asyncio.get_running_loop()
