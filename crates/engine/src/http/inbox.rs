@@ -1,45 +1,23 @@
-//! What happens to requests, for an event loop in another thread.
+//! What happens in the thread of a server, for an event loop in another thread.
 //!
 //! Whoever reports never waits for the event loop: events wait in a queue, and a byte in a socket wakes
 //! the event loop when the queue was empty.
 
 use std::io::{self, Write};
 use std::mem;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 
-use bytes::Bytes;
-
-use super::exchange::{Exchange, RequestHead};
 use crate::wake::{Wakes, pair};
 
-/// What happened to a request. Later events name it by its number.
 #[derive(Debug)]
-pub enum Event {
-    /// A request, with its body if all of it has arrived.
-    Request { exchange: Arc<Exchange>, head: Box<RequestHead>, body: Option<Bytes> },
-    /// The body that the handler has asked for.
-    Body { number: u64, body: Bytes },
-    /// The body is longer than the handler allows.
-    TooLarge { number: u64 },
-    /// The body has not arrived in time. This many bytes of it have.
-    Late { number: u64, received: usize },
-    /// The body is not HTTP.
-    Broken { number: u64 },
-    /// The client is gone, before it had its response.
-    Gone { number: u64 },
-    /// The client has taken the data before: the stream has room.
-    Room { number: u64 },
-}
-
-#[derive(Debug)]
-pub(super) struct Inbox {
+pub(super) struct Inbox<Event> {
     events: Mutex<Vec<Event>>,
     wake: Wakes,
 }
 
-impl Inbox {
+impl<Event> Inbox<Event> {
     /// The second result becomes readable when there are events.
-    pub(super) fn new() -> io::Result<(Inbox, Wakes)> {
+    pub(super) fn new() -> io::Result<(Inbox<Event>, Wakes)> {
         let (wake, wakes) = pair()?;
         Ok((Inbox { events: Mutex::default(), wake }, wakes))
     }
