@@ -27,7 +27,7 @@ use crate::server::{Peer, WhenFull};
 const TURNS: usize = 12;
 
 /// The most bytes of a body.
-const MOST: usize = 1024;
+const MAX_BODY: usize = 1024;
 
 /// A connection whose bytes a test has.
 struct Pieces {
@@ -130,13 +130,13 @@ async fn handle(inbox: &Inbox<Event>, bodies: &Mutex<Vec<Bytes>>) {
                     let is_early = head.parts.uri.path() == "/early";
                     match body {
                         _ if is_early => respond(&exchange, 415, false),
-                        Some(body) if body.len() > MOST => respond(&exchange, 413, true),
+                        Some(body) if body.len() > MAX_BODY => respond(&exchange, 413, true),
                         Some(body) => {
                             bodies.lock().unwrap().push(body);
                             respond(&exchange, 200, false);
                         }
                         None => {
-                            exchange.receive(MOST);
+                            exchange.receive(MAX_BODY);
                             waiting.push(exchange);
                         }
                     }
