@@ -10,7 +10,7 @@ from typing import Any
 def use(name: str) -> None:
     """Makes this process use asyncio's own event loop, or uvloop. Call it before other imports."""
     modules: Any = sys.modules
-    if name == "uvloop":
+    if name == "uvloop":  # HTTP hosts choose it themselves, but not those of older checkouts.
         import uvloop
 
         asyncio.set_event_loop_policy(uvloop.EventLoopPolicy())

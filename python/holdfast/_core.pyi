@@ -456,10 +456,11 @@ class ServerTls:
     def warnings(self) -> list[str]:
         """What is doubtful about the files: dates, and revocation lists."""
 
+@final
 class ListeningSocket:
     """A TCP socket that listens on `address:port`; `[::]` includes IPv4. Raises `OSError`."""
 
-    def __init__(self, bind_address: str) -> None: ...
+    def __new__(cls, bind_address: str) -> ListeningSocket: ...
     def __enter__(self) -> Self: ...
     def __exit__(self, *args: object) -> None: ...
     def getsockname(self) -> tuple[str, int]:
@@ -468,6 +469,7 @@ class ListeningSocket:
     def close(self) -> None:
         """Stops listening, when the servers of the socket have ended too."""
 
+@final
 class HttpServer:
     """A server of HTTP/1.1 in a thread of its own.
 
@@ -478,8 +480,8 @@ class HttpServer:
     name: `not_http`, `header_too_large`, `not_tls`.
     """
 
-    def __init__(
-        self,
+    def __new__(
+        cls,
         name: str,
         socket: ListeningSocket,
         *,
@@ -493,7 +495,7 @@ class HttpServer:
         leaving: bool = False,
         tls: ServerTls | None = None,
         refusals: Sequence[tuple[str, Sequence[tuple[bytes, bytes]], bytes]],
-    ) -> None: ...
+    ) -> HttpServer: ...
     def detach(self) -> int:
         """The handle of a socket that is readable when there is something to take."""
 
@@ -537,6 +539,7 @@ class HttpServer:
     def close(self) -> None:
         """Ends all connections, and waits for the thread."""
 
+@final
 class HttpExchange:
     """One request and its response. If it is dropped without a response, the connection ends."""
 

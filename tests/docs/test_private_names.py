@@ -24,22 +24,10 @@ from packaging.version import Version
 from support.paths import DOCS, ROOT
 
 PRODUCT = ROOT / "python" / "holdfast"
-UNDOCUMENTED = ("nats.aio.transport", "nats.protocol", "uvicorn.protocols", "uvicorn.server")
+UNDOCUMENTED = ("nats.aio.transport", "nats.protocol")
 """Modules that nothing in their package's documentation speaks of."""
 
-HTTP = "uvicorn.protocols.http"
-VARIABLES = {
-    "web/host.py": {
-        "cycle": f"{HTTP}.httptools_impl.RequestResponseCycle",
-        "_cycle": f"{HTTP}.httptools_impl.RequestResponseCycle",
-        "connection": f"{HTTP}.httptools_impl.HttpToolsProtocol",
-        "_connection": f"{HTTP}.httptools_impl.HttpToolsProtocol",
-        "flow": f"{HTTP}.flow_control.FlowControl",
-        "state": "uvicorn.server.ServerState",
-        "server_state": "uvicorn.server.ServerState",
-    },
-    "scanner/nats/wire.py": {"client": "nats.aio.client.Client"},
-}
+VARIABLES = {"scanner/nats/wire.py": {"client": "nats.aio.client.Client"}}
 """What variables hold that a file takes private names of, by their names."""
 
 DERIVED = {"BrokerClient": "paho.mqtt.client.Client"}
@@ -245,7 +233,7 @@ def test_the_versions_of_packages_with_private_names_are_capped() -> None:
         ("from click._compat import WIN", "click._compat", "WIN"),
         ("from click import _compat", "click", "_compat"),
         ("import click._compat", "click", "_compat"),
-        ("from uvicorn.server import ServerState", "uvicorn.server", "ServerState"),
+        ("from nats.aio.transport import TcpTransport", "nats.aio.transport", "TcpTransport"),
         ("print(thing.part._secret)", "?", "_secret"),
         ("thing._secret = 1", "?", "_secret"),
         (

@@ -1,9 +1,10 @@
-"""The event loop that does not wait for lookups of names."""
+"""The event loop that does not wait for lookups of names, and the fastest one."""
 
 from __future__ import annotations
 
 import asyncio
 import socket
+import sys
 import threading
 
 import pytest
@@ -75,3 +76,21 @@ def test_what_is_no_lookup_for_a_connection_is_as_usual() -> None:
 
     usual = socket.getaddrinfo(None, 502, family=socket.AF_INET, type=socket.SOCK_DGRAM)
     assert event_loop.run(main()) == usual
+
+
+def test_the_fastest_loop_is_that_of_uvloop() -> None:
+    uvloop = pytest.importorskip("uvloop", reason="there is none for Windows")
+
+    async def main() -> bool:
+        return isinstance(asyncio.get_running_loop(), uvloop.Loop)
+
+    assert event_loop.run(main(), event_loop.fastest)
+
+
+def test_the_fastest_loop_without_uvloop_is_the_usual_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "uvloop", None)
+
+    async def main() -> type:
+        return type(asyncio.get_running_loop())
+
+    assert event_loop.run(main(), event_loop.fastest) == asyncio.run(main())

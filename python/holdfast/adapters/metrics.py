@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 
     from prometheus_client.metrics_core import Metric
 
-    from holdfast._core import ListeningSocket
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.config import MetricsConfig
     from holdfast.runtime.stop import Stop
     from holdfast.web.health import HealthSource
     from holdfast.web.https import Https
+    from holdfast.web.port import ListeningSocket
     from holdfast.web.requests import Request
 
 Result = TypeVar("Result")

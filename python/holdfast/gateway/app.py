@@ -104,6 +104,8 @@ class App(Application):
         self._requests = self._failed = self._writes = 0
         self._refused: dict[str, int] = {}
         self._ending = asyncio.Event()
+        self._enders: dict[Callable[[], None], float] = {}
+        """What ends requests, and how many seconds after a stop."""
         self._lenient = port_of_call.PATHS if settings.compat == "port-of-call" else frozenset()
         """The paths of endpoints that take requests as Port of Call does."""
 
@@ -123,7 +125,12 @@ class App(Application):
 
     def end(self) -> None:
         """Ends all streams. Thread-safe."""
-        self.call_soon(self._ending.set)
+        self.call_soon(self._end_soon)
+
+    def _end_soon(self) -> None:
+        self._ending.set()
+        for end, grace in self._enders.items():
+            asyncio.get_running_loop().call_later(grace, end)
 
     def __call__(self, request: Request) -> Response | Coroutine[Any, Any, Response | None]:
         """Counts and answers one request."""
@@ -202,11 +209,6 @@ class App(Application):
             if not self._shares[key]:
                 del self._shares[key]
 
-    async def _end(self, grace: float) -> None:
-        """Returns `grace` seconds after the gateway began to stop."""
-        await self._ending.wait()
-        await asyncio.sleep(grace)
-
     async def _while_there(
         self, request: Request, work: Coroutine[Any, Any, Result], *, grace: float
     ) -> Result:
@@ -214,20 +216,28 @@ class App(Application):
 
         Raises `ClientDisconnected` in both cases.
         """
-        task = asyncio.create_task(work)
-        others: list[asyncio.Task[Any]] = [
-            asyncio.create_task(request.gone()),
-            asyncio.create_task(self._end(grace)),
-        ]
+        task = asyncio.current_task()
+        assert task is not None
+        ends = False
+
+        def end() -> None:
+            nonlocal ends
+            ends = True
+            task.cancel()
+
+        request.when_gone(end)
+        self._enders[end] = grace
+        if self._ending.is_set():
+            asyncio.get_running_loop().call_later(grace, end)
         try:
-            await asyncio.wait([task, *others], return_when=asyncio.FIRST_COMPLETED)
-            if not task.done():
-                raise ClientDisconnected
-            return task.result()
+            return await work
+        except asyncio.CancelledError:
+            if ends and not task.uncancel():
+                raise ClientDisconnected from None
+            raise
         finally:
-            for each in (task, *others):
-                each.cancel()
-            await asyncio.gather(task, *others, return_exceptions=True)
+            del self._enders[end]
+            request.when_gone(None)
 
     # Requests to devices.
 

@@ -1,7 +1,8 @@
-"""An event loop that does not wait for lookups of names when it is closed.
+"""The event loops that services run in.
 
-asyncio makes lookups in threads, and waits for them at its end: many seconds if no name server
-answers. Programs that hand names to asyncio, such as nats-py, run in this loop.
+asyncio makes lookups of names in threads, and waits for them at its end: many seconds if no name
+server answers. Programs that hand names to asyncio, such as nats-py, run in `EventLoop`, which does
+not wait. HTTP hosts look no names up: they run in the fastest one.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from holdfast.net.resolver import CONFIGURED
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Callable, Coroutine
 
 if sys.platform == "win32":
     _Usual = asyncio.ProactorEventLoop
@@ -49,7 +50,19 @@ class EventLoop(_Usual):
         return [(each, type, socket.IPPROTO_TCP, "", address) for each, address in kept]
 
 
-def run(main: Coroutine[Any, Any, Result]) -> Result:
+def run(
+    main: Coroutine[Any, Any, Result],
+    loop_factory: Callable[[], asyncio.AbstractEventLoop] = EventLoop,
+) -> Result:
     """As `asyncio.run`, in such a loop."""
-    with asyncio.Runner(loop_factory=EventLoop) as runner:
+    with asyncio.Runner(loop_factory=loop_factory) as runner:
         return runner.run(main)
+
+
+def fastest() -> asyncio.AbstractEventLoop:
+    """Creates an event loop of uvloop if it is installed, otherwise the usual one."""
+    try:
+        import uvloop
+    except ImportError:
+        return _Usual()
+    return uvloop.new_event_loop()

@@ -16,6 +16,7 @@ from urllib.parse import unquote
 
 from holdfast import logs
 from holdfast._core import HttpServer
+from holdfast.net import event_loop
 from holdfast.net.addresses import joined, parse_address
 from holdfast.runtime.heartbeat import PERIOD, Heartbeat
 from holdfast.web.requests import (
@@ -141,7 +142,7 @@ class Host:
 
     def run(self, stop: Stop) -> None:
         """Serves in this thread until `stop` is set. Can be called again: the socket stays open."""
-        asyncio.run(self._serve(stop))
+        event_loop.run(self._serve(stop), event_loop.fastest)
 
     async def _serve(self, stop: Stop) -> None:
         loop = asyncio.get_running_loop()
@@ -332,7 +333,7 @@ class _Wakes(asyncio.BufferedProtocol):
 class _Exchanged(Request):
     """A request from the core."""
 
-    __slots__ = ("_gone", "_waiter", "exchange", "has_begun")
+    __slots__ = ("_gone", "_is_gone", "_waiter", "_when_gone", "exchange", "has_begun")
 
     def __init__(
         self,
@@ -349,7 +350,9 @@ class _Exchanged(Request):
         self.exchange = exchange
         self.has_begun = False
         """Whether a stream has begun."""
-        self._gone: asyncio.Future[None] | bool = False
+        self._is_gone = False
+        self._gone: asyncio.Future[None] | None = None
+        self._when_gone: Callable[[], object] | None = None
         self._waiter: asyncio.Future[tuple[str, Any]] | None = None
         super().__init__(
             method,
@@ -367,9 +370,11 @@ class _Exchanged(Request):
         if self._waiter is not None and not self._waiter.done():
             self._waiter.set_result((kind, value))
         if kind == "gone":
-            if isinstance(self._gone, asyncio.Future) and not self._gone.done():
+            self._is_gone = True
+            if self._gone is not None and not self._gone.done():
                 self._gone.set_result(None)
-            self._gone = True
+            if self._when_gone is not None:
+                self._when_gone()
 
     async def receive(self, most: int) -> bytes:
         """Waits for the body."""
@@ -387,11 +392,15 @@ class _Exchanged(Request):
 
     async def gone(self) -> None:
         """Returns when the client is gone."""
-        if self._gone is True:
-            return
-        if self._gone is False:
-            self._gone = asyncio.get_running_loop().create_future()
-        await asyncio.shield(self._gone)
+        if not self._is_gone:
+            self._gone = self._gone or asyncio.get_running_loop().create_future()
+            await asyncio.shield(self._gone)
+
+    def when_gone(self, function: Callable[[], object] | None) -> None:
+        """Calls a function when the client is gone, or at once if it is; `None`: no more."""
+        self._when_gone = function
+        if self._is_gone and function is not None:
+            function()
 
     async def begin(self, status: int, headers: Headers) -> None:
         """Begins a stream."""
@@ -411,7 +420,7 @@ class _Exchanged(Request):
 
     async def _next(self) -> tuple[str, Any]:
         """Waits for the next event. Raises `ClientDisconnected` if the client is gone already."""
-        if self._gone is True:
+        if self._is_gone:
             raise ClientDisconnected
         self._waiter = asyncio.get_running_loop().create_future()
         try:

@@ -13,7 +13,7 @@ import time
 from typing import TYPE_CHECKING
 
 from holdfast import logs
-from holdfast._core import ListeningSocket
+from holdfast._core import ListeningSocket as ListeningSocket
 from holdfast.net.addresses import joined
 from holdfast.runtime.backoff import Backoff
 

@@ -114,6 +114,10 @@ class Request:
         """Returns when the client is gone. The body must have been read."""
         raise NotImplementedError
 
+    def when_gone(self, function: Callable[[], object] | None) -> None:
+        """Calls a function when the client is gone, or at once if it is; `None`: no more."""
+        raise NotImplementedError
+
     async def begin(self, status: int, headers: Headers) -> None:
         """Begins a stream. From here on, a half-close of the client means that it is gone."""
         raise NotImplementedError

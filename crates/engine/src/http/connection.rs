@@ -19,11 +19,11 @@ use tokio::net::TcpStream;
 use tokio::sync::watch;
 use tokio::time::{Sleep, sleep_until, timeout};
 
-use super::exchange::{Abandoned, Exchange, Order, Output, RequestHead, ResponseHead};
-use super::inbox::Event;
+use super::exchange::{Abandoned, Event, Exchange, Order, RequestHead, ResponseHead};
+use super::front::Front;
 use super::line::{SharedLine, Verdict, Wire};
+use super::output::Output;
 use super::refusal::{Refusal, RefusalBody};
-use super::server::Front;
 use crate::server::Peer;
 use crate::server::admission::Ticket;
 use crate::server::event::Kind;

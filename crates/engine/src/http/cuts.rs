@@ -13,11 +13,11 @@ use tokio::sync::watch;
 use tokio::task::yield_now;
 
 use super::connection::converse;
-use super::exchange::{Exchange, ResponseHead};
-use super::inbox::{Event, Inbox};
+use super::exchange::{Event, Exchange, ResponseHead};
+use super::front::{Front, HttpSettings};
+use super::inbox::Inbox;
 use super::line::SharedLine;
 use super::refusal::{Refusal, RefusalBody};
-use super::server::{Front, HttpSettings};
 use crate::server::admission::ConnectionLimits;
 use crate::server::event::{self, Kind, Verbosity};
 use crate::server::stream::{End, Stream};
@@ -89,7 +89,7 @@ struct Outcome {
     broken: u64,
 }
 
-fn front() -> (Arc<Front>, Arc<Inbox>) {
+fn front() -> (Arc<Front>, Arc<Inbox<Event>>) {
     let (inbox, _wakes) = Inbox::new().unwrap();
     let inbox = Arc::new(inbox);
     let refusal = RefusalBody { headers: b"content-length: 7\r\n".into(), body: b"refused".into() };
@@ -115,7 +115,7 @@ fn front() -> (Arc<Front>, Arc<Inbox>) {
 }
 
 /// Answers requests: those to `/early` without their body, the others with its length.
-async fn handle(inbox: &Inbox, bodies: &Mutex<Vec<Bytes>>) {
+async fn handle(inbox: &Inbox<Event>, bodies: &Mutex<Vec<Bytes>>) {
     let mut waiting: Vec<Arc<Exchange>> = Vec::new();
     let mut known = HashSet::new();
     let respond = |exchange: &Arc<Exchange>, status: u16, closes: bool| {

@@ -2,18 +2,15 @@
 
 use std::collections::VecDeque;
 use std::future::poll_fn;
-use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, Waker};
 
 use bytes::Bytes;
-use hyper::body::{Body, Frame, SizeHint};
-use hyper::header::{CONNECTION, CONTENT_LENGTH, HeaderName, HeaderValue};
+use hyper::header::{CONTENT_LENGTH, HeaderName, HeaderValue};
 use hyper::http::request::Parts;
-use hyper::{HeaderMap, Response, StatusCode};
+use hyper::{HeaderMap, StatusCode};
 
-use super::inbox::{Event, Inbox};
-use super::line::SharedLine;
+use super::inbox::Inbox;
 use crate::server::Peer;
 
 /// A request without its body.
@@ -45,13 +42,6 @@ impl ResponseHead {
         }
         Ok(head)
     }
-
-    fn response(self, output: Output) -> Response<Output> {
-        let mut response = Response::new(output);
-        *response.status_mut() = self.status;
-        *response.headers_mut() = self.headers;
-        response
-    }
 }
 
 /// What a handler wants of the connection.
@@ -69,10 +59,29 @@ pub(super) enum Order {
     Late,
 }
 
+/// What happened to a request. Later events name it by its number.
+#[derive(Debug)]
+pub enum Event {
+    /// A request, with its body if all of it has arrived.
+    Request { exchange: Arc<Exchange>, head: Box<RequestHead>, body: Option<Bytes> },
+    /// The body that the handler has asked for.
+    Body { number: u64, body: Bytes },
+    /// The body is longer than the handler allows.
+    TooLarge { number: u64 },
+    /// The body has not arrived in time. This many bytes of it have.
+    Late { number: u64, received: usize },
+    /// The body is not HTTP.
+    Broken { number: u64 },
+    /// The client is gone, before it had its response.
+    Gone { number: u64 },
+    /// The client has taken the data before: the stream has room.
+    Room { number: u64 },
+}
+
 #[derive(Debug)]
 pub struct Exchange {
     pub number: u64,
-    inbox: Arc<Inbox>,
+    inbox: Arc<Inbox<Event>>,
     state: Mutex<State>,
 }
 
@@ -105,7 +114,7 @@ pub enum Sent {
 }
 
 impl Exchange {
-    pub(super) fn new(number: u64, inbox: Arc<Inbox>) -> Arc<Exchange> {
+    pub(super) fn new(number: u64, inbox: Arc<Inbox<Event>>) -> Arc<Exchange> {
         Arc::new(Exchange { number, inbox, state: Mutex::default() })
     }
 
@@ -115,13 +124,18 @@ impl Exchange {
     }
 
     /// Answers the request, after the next [`super::HttpServer::flush`].
-    pub fn respond(self: &Arc<Self>, mut head: ResponseHead, body: Bytes, closes: bool) {
+    pub fn respond(&self, mut head: ResponseHead, body: Bytes, closes: bool) {
         let has_body = !matches!(head.status, StatusCode::NO_CONTENT | StatusCode::NOT_MODIFIED);
         if has_body && !head.headers.contains_key(CONTENT_LENGTH) {
             head.headers.insert(CONTENT_LENGTH, HeaderValue::from(body.len()));
         }
-        self.state().orders.push_back(Order::Respond { head, body, closes });
-        self.inbox.note_answered(Arc::clone(self));
+        let mut state = self.state();
+        state.orders.push_back(Order::Respond { head, body, closes });
+        let waker = state.waker.take();
+        drop(state);
+        if let Some(waker) = waker {
+            self.inbox.wake_later(waker);
+        }
     }
 
     /// Answers the request with a stream. A client that sends no more is gone from here on, because a
@@ -183,11 +197,6 @@ impl Exchange {
         .await
     }
 
-    /// Wakes the task of the connection.
-    pub(super) fn wake(&self) {
-        wake(self.state());
-    }
-
     pub(super) fn tell(&self, event: Event) {
         self.inbox.push(event);
     }
@@ -212,7 +221,11 @@ impl Exchange {
         }
     }
 
-    fn poll_data(&self, context: &Context<'_>) -> Poll<Option<Result<Bytes, Abandoned>>> {
+    /// The next data of a stream.
+    pub(super) fn poll_data(
+        &self,
+        context: &Context<'_>,
+    ) -> Poll<Option<Result<Bytes, Abandoned>>> {
         let mut state = self.state();
         if let Some(data) = state.data.take() {
             state.is_unsent = true;
@@ -248,82 +261,3 @@ fn wake(mut state: MutexGuard<'_, State>) {
 #[derive(Debug, thiserror::Error)]
 #[error("the response is cut off")]
 pub(super) struct Abandoned;
-
-/// The body of a response. When it is dropped, the response is complete, or the connection is broken.
-pub(super) struct Output {
-    exchange: Arc<Exchange>,
-    line: SharedLine,
-    content: Content,
-}
-
-enum Content {
-    Whole(Option<Bytes>),
-    Stream,
-    Ended,
-}
-
-impl Output {
-    pub(super) fn whole(
-        (exchange, line): (Arc<Exchange>, SharedLine),
-        mut head: ResponseHead,
-        body: Bytes,
-        closes: bool,
-    ) -> Response<Output> {
-        if closes {
-            head.headers.insert(CONNECTION, HeaderValue::from_static("close"));
-        }
-        let content = if body.is_empty() { Content::Ended } else { Content::Whole(Some(body)) };
-        head.response(Output { exchange, line, content })
-    }
-
-    pub(super) fn stream(
-        (exchange, line): (Arc<Exchange>, SharedLine),
-        head: ResponseHead,
-    ) -> Response<Output> {
-        head.response(Output { exchange, line, content: Content::Stream })
-    }
-}
-
-impl Body for Output {
-    type Data = Bytes;
-    type Error = Abandoned;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, Self::Error>>> {
-        let data = match &mut self.content {
-            Content::Whole(body) => body.take().map(Ok),
-            Content::Stream => match self.exchange.poll_data(context) {
-                Poll::Ready(data) => data,
-                Poll::Pending => return Poll::Pending,
-            },
-            Content::Ended => None,
-        };
-        if data.is_none() || matches!(self.content, Content::Whole(_)) {
-            self.content = Content::Ended;
-        }
-        Poll::Ready(data.map(|data| data.map(Frame::data)))
-    }
-
-    fn is_end_stream(&self) -> bool {
-        matches!(self.content, Content::Ended)
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        match &self.content {
-            Content::Whole(Some(body)) => SizeHint::with_exact(body.len() as u64),
-            Content::Whole(None) | Content::Ended => SizeHint::with_exact(0),
-            Content::Stream => SizeHint::default(),
-        }
-    }
-}
-
-impl Drop for Output {
-    fn drop(&mut self) {
-        // hyper drops a body without asking for it in the response to HEAD.
-        let is_complete = !matches!(self.content, Content::Stream);
-        self.exchange.finish(is_complete);
-        self.line.lock().note_answered();
-    }
-}

@@ -1,50 +1,30 @@
-//! What happens to requests, for an event loop in another thread.
+//! What happens in the thread of a server, for an event loop in another thread.
 //!
 //! Whoever reports never waits for the event loop: events wait in a queue, and a byte in a socket wakes
 //! the event loop when the queue was empty.
 
 use std::io::{self, Write};
 use std::mem;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
+use std::task::Waker;
 
-use bytes::Bytes;
 use tokio::sync::Notify;
 
-use super::exchange::{Exchange, RequestHead};
 use crate::wake::{Wakes, pair};
 
-/// What happened to a request. Later events name it by its number.
 #[derive(Debug)]
-pub enum Event {
-    /// A request, with its body if all of it has arrived.
-    Request { exchange: Arc<Exchange>, head: Box<RequestHead>, body: Option<Bytes> },
-    /// The body that the handler has asked for.
-    Body { number: u64, body: Bytes },
-    /// The body is longer than the handler allows.
-    TooLarge { number: u64 },
-    /// The body has not arrived in time. This many bytes of it have.
-    Late { number: u64, received: usize },
-    /// The body is not HTTP.
-    Broken { number: u64 },
-    /// The client is gone, before it had its response.
-    Gone { number: u64 },
-    /// The client has taken the data before: the stream has room.
-    Room { number: u64 },
-}
-
-#[derive(Debug)]
-pub(super) struct Inbox {
+pub(super) struct Inbox<Event> {
     events: Mutex<Vec<Event>>,
     wake: Wakes,
-    /// Exchanges with a response that their connections do not know of yet. Waking another thread for each
-    /// response costs more than the response: a batch is handed over at once.
-    answered: Mutex<Vec<Arc<Exchange>>>,
+    /// Tasks of connections that have a response. Waking their thread for each response costs more than
+    /// the response, so they are woken together.
+    answered: Mutex<Vec<Waker>>,
     has_answered: Notify,
 }
 
-impl Inbox {
+impl<Event> Inbox<Event> {
     /// The second result becomes readable when there are events.
-    pub(super) fn new() -> io::Result<(Inbox, Wakes)> {
+    pub(super) fn new() -> io::Result<(Inbox<Event>, Wakes)> {
         let (wake, wakes) = pair()?;
         let (answered, has_answered) = (Mutex::default(), Notify::new());
         Ok((Inbox { events: Mutex::default(), wake, answered, has_answered }, wakes))
@@ -66,22 +46,22 @@ impl Inbox {
         let _ = (&self.wake).write(&[0]);
     }
 
-    /// Notes a response. It is sent after the next `flush`.
-    pub(super) fn note_answered(&self, exchange: Arc<Exchange>) {
-        self.answered.lock().unwrap_or_else(PoisonError::into_inner).push(exchange);
+    /// Wakes a task that has a response, after the next `flush`.
+    pub(super) fn wake_later(&self, task: Waker) {
+        self.answered.lock().unwrap_or_else(PoisonError::into_inner).push(task);
     }
 
     pub(super) fn flush(&self) {
         self.has_answered.notify_one();
     }
 
-    /// Tells connections of their responses. Runs in their thread, so that it is woken once for many.
+    /// Wakes tasks that have a response. Runs in their thread, which is woken once for all of them.
     pub(super) async fn deliver(&self) {
         loop {
             self.has_answered.notified().await;
             let answered =
                 mem::take(&mut *self.answered.lock().unwrap_or_else(PoisonError::into_inner));
-            answered.iter().for_each(|exchange| exchange.wake());
+            answered.into_iter().for_each(Waker::wake);
         }
     }
 

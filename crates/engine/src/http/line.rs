@@ -10,9 +10,9 @@ use hyper::rt::{Read, ReadBufCursor, Write};
 use socket2::SockRef;
 
 use super::exchange::{Exchange, Order};
+use super::front::Front;
 use super::portion::{ChunksEnd, HeadEnd, Portion};
 use super::refusal::{self, Refusal};
-use super::server::Front;
 use crate::server::Peer;
 use crate::server::admission::{Ticket, WaitingFor};
 use crate::server::event::Kind;

@@ -12,13 +12,15 @@ mod connection;
 #[cfg(test)]
 mod cuts;
 mod exchange;
+mod front;
 mod inbox;
 mod line;
+mod output;
 mod portion;
 mod refusal;
 mod server;
 
-pub use exchange::{Exchange, RequestHead, ResponseHead, Sent};
-pub use inbox::Event;
+pub use exchange::{Event, Exchange, RequestHead, ResponseHead, Sent};
+pub use front::HttpSettings;
 pub use refusal::{Refusal, RefusalBody};
-pub use server::{HttpServer, HttpSettings, bind};
+pub use server::{HttpServer, bind};

@@ -2,26 +2,23 @@
 
 use std::io;
 use std::net::{IpAddr, TcpListener};
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use ipnet::IpNet;
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::watch;
 use tokio::time::sleep;
 
 use super::connection::serve;
-use super::exchange::Exchange;
-use super::inbox::{Event, Inbox};
-use super::refusal::{Refusal, RefusalBody};
+use super::exchange::Event;
+use super::front::{Front, HttpSettings};
+use super::inbox::Inbox;
 use crate::heartbeat::Heartbeat;
 use crate::own_threads::OwnThreads;
 use crate::server::Peer;
-use crate::server::admission::ConnectionLimits;
 use crate::server::counters::ConnectionCounters;
-use crate::server::event::{self, Events, Kind, Reporter, Verbosity};
+use crate::server::event::{self, Events, Kind, Verbosity};
 use crate::server::listener::{Admitted, ListenerContext, Service, accept};
 use crate::server::live::Live;
 use crate::tls::server::ServerTls;
@@ -32,86 +29,11 @@ pub use crate::server::listener::bind_tcp as bind;
 /// How often the end of the last connection is looked for when the server ends.
 const ENDING_PERIOD: Duration = Duration::from_millis(5);
 
-#[derive(Debug)]
-pub struct HttpSettings {
-    pub name: String,
-    /// A socket that listens.
-    pub socket: TcpListener,
-    /// The networks of the clients.
-    pub sources: Vec<IpNet>,
-    pub limits: ConnectionLimits,
-    /// For a request to arrive, and for a response to be taken.
-    pub request_timeout: Duration,
-    /// For the next request to begin.
-    pub idle_timeout: Duration,
-    /// Whether a client that sends no more is gone.
-    pub leaving: bool,
-    pub tls: Option<Arc<ServerTls>>,
-    /// In the order of [`Refusal::ALL`].
-    pub refusals: [RefusalBody; Refusal::ALL.len()],
-}
-
-/// What the connections of a server have in common.
-pub(super) struct Front {
-    pub(super) context: Arc<ListenerContext>,
-    inbox: Arc<Inbox>,
-    sources: Vec<IpNet>,
-    pub(super) request_timeout: Duration,
-    pub(super) idle_timeout: Duration,
-    pub(super) leaving: bool,
-    tls: Option<Live<ServerTls>>,
-    refusals: [RefusalBody; Refusal::ALL.len()],
-    next: AtomicU64,
-}
-
-impl Front {
-    /// Also returns the socket.
-    pub(super) fn new(
-        settings: HttpSettings,
-        inbox: Arc<Inbox>,
-        reporter: Reporter,
-    ) -> (Front, TcpListener) {
-        let context = ListenerContext::new(&settings.name, Some(settings.limits), reporter, None);
-        let front = Front {
-            context: Arc::new(context),
-            inbox,
-            sources: settings.sources,
-            request_timeout: settings.request_timeout,
-            idle_timeout: settings.idle_timeout,
-            leaving: settings.leaving,
-            tls: settings.tls.map(Live::from),
-            refusals: settings.refusals,
-            next: AtomicU64::new(0),
-        };
-        (front, settings.socket)
-    }
-
-    pub(super) fn tls(&self) -> Option<Arc<ServerTls>> {
-        self.tls.as_ref().map(Live::get)
-    }
-
-    pub(super) fn refusal(&self, refusal: Refusal) -> &RefusalBody {
-        &self.refusals[refusal as usize]
-    }
-
-    /// Counts and reports the end of a connection, or what is wrong with it.
-    pub(super) fn ended(&self, kind: Kind, peer: Peer) {
-        self.context.ended(kind, peer);
-        self.inbox.wake();
-    }
-
-    /// A new exchange.
-    pub(super) fn exchange(&self) -> Arc<Exchange> {
-        Exchange::new(self.next.fetch_add(1, Ordering::Relaxed), Arc::clone(&self.inbox))
-    }
-}
-
 impl Service for Front {
     type PeerRights = ();
 
     fn rights(&self, peer: IpAddr) -> Option<Arc<()>> {
-        let peer = peer.to_canonical();
-        self.sources.iter().any(|network| network.contains(&peer)).then(|| Arc::new(()))
+        self.admits(peer).then(|| Arc::new(()))
     }
 
     fn ends(&self, _before: &Front, _peer: &Peer) -> Option<Kind> {
@@ -224,9 +146,7 @@ impl HttpServer {
 
     /// Uses these certificates for new connections, and judges open ones by them.
     pub fn set_tls(&self, tls: Arc<ServerTls>) {
-        if let Some(live) = &self.front.tls {
-            live.replace(tls);
-        }
+        self.front.set_tls(tls);
         self.review();
     }
 

@@ -10,13 +10,13 @@ from holdfast.adapters.rest.operations import OPERATIONS, document
 from holdfast.web.host import STOP_TIMEOUT, ConnectionLimits, Host
 
 if TYPE_CHECKING:
-    from holdfast._core import ListeningSocket
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.sessions import SessionControl
     from holdfast.config import RestConfig
     from holdfast.ingest import MemoryAccess
     from holdfast.runtime.stop import Stop
     from holdfast.web.https import Https
+    from holdfast.web.port import ListeningSocket
 
 __all__ = ["Rest"]
 

@@ -1,0 +1,106 @@
+//! What the connections of a server have in common: settings, certificates, counters, and where
+//! requests go.
+
+use std::net::{IpAddr, TcpListener};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use ipnet::IpNet;
+
+use super::exchange::{Event, Exchange};
+use super::inbox::Inbox;
+use super::refusal::{Refusal, RefusalBody};
+use crate::server::Peer;
+use crate::server::admission::ConnectionLimits;
+use crate::server::event::{Kind, Reporter};
+use crate::server::listener::ListenerContext;
+use crate::server::live::Live;
+use crate::tls::server::ServerTls;
+
+#[derive(Debug)]
+pub struct HttpSettings {
+    pub name: String,
+    /// A socket that listens.
+    pub socket: TcpListener,
+    /// The networks of the clients.
+    pub sources: Vec<IpNet>,
+    pub limits: ConnectionLimits,
+    /// For a request to arrive, and for a response to be taken.
+    pub request_timeout: Duration,
+    /// For the next request to begin.
+    pub idle_timeout: Duration,
+    /// Whether a client that sends no more is gone.
+    pub leaving: bool,
+    pub tls: Option<Arc<ServerTls>>,
+    /// In the order of [`Refusal::ALL`].
+    pub refusals: [RefusalBody; Refusal::ALL.len()],
+}
+
+/// What the connections of a server have in common.
+pub(super) struct Front {
+    pub(super) context: Arc<ListenerContext>,
+    pub(super) inbox: Arc<Inbox<Event>>,
+    sources: Vec<IpNet>,
+    pub(super) request_timeout: Duration,
+    pub(super) idle_timeout: Duration,
+    pub(super) leaving: bool,
+    tls: Option<Live<ServerTls>>,
+    refusals: [RefusalBody; Refusal::ALL.len()],
+    next: AtomicU64,
+}
+
+impl Front {
+    /// Also returns the socket.
+    pub(super) fn new(
+        settings: HttpSettings,
+        inbox: Arc<Inbox<Event>>,
+        reporter: Reporter,
+    ) -> (Front, TcpListener) {
+        let context = ListenerContext::new(&settings.name, Some(settings.limits), reporter, None);
+        let front = Front {
+            context: Arc::new(context),
+            inbox,
+            sources: settings.sources,
+            request_timeout: settings.request_timeout,
+            idle_timeout: settings.idle_timeout,
+            leaving: settings.leaving,
+            tls: settings.tls.map(Live::from),
+            refusals: settings.refusals,
+            next: AtomicU64::new(0),
+        };
+        (front, settings.socket)
+    }
+
+    /// Whether a client may connect.
+    pub(super) fn admits(&self, peer: IpAddr) -> bool {
+        let peer = peer.to_canonical();
+        self.sources.iter().any(|network| network.contains(&peer))
+    }
+
+    /// Uses these certificates for new connections.
+    pub(super) fn set_tls(&self, tls: Arc<ServerTls>) {
+        if let Some(live) = &self.tls {
+            live.replace(tls);
+        }
+    }
+
+    pub(super) fn tls(&self) -> Option<Arc<ServerTls>> {
+        self.tls.as_ref().map(Live::get)
+    }
+
+    pub(super) fn refusal(&self, refusal: Refusal) -> &RefusalBody {
+        &self.refusals[refusal as usize]
+    }
+
+    /// Counts and reports the end of a connection, or what is wrong with it.
+    pub(super) fn ended(&self, kind: Kind, peer: Peer) {
+        self.context.ended(kind, peer);
+        self.inbox.wake();
+    }
+
+    /// A new exchange.
+    pub(super) fn exchange(&self) -> Arc<Exchange> {
+        Exchange::new(self.next.fetch_add(1, Ordering::Relaxed), Arc::clone(&self.inbox))
+    }
+}

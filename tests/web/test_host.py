@@ -1,0 +1,39 @@
+"""The host of HTTP services: the event loop that calls its handlers."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from contextlib import closing
+from ipaddress import ip_network
+
+import pytest
+
+from holdfast.web.host import ConnectionLimits, Host
+from holdfast.web.port import listen
+from holdfast.web.requests import Request, Response
+from support import web
+
+
+def loop_of_a_handler() -> str:
+    """The package that has the event loop in which a host calls its handler."""
+
+    def answer(_: Request) -> Response:
+        loop = type(asyncio.get_running_loop())
+        return Response(200, loop.__module__.partition(".")[0].encode())
+
+    sources, limits = [ip_network("127.0.0.0/8")], ConnectionLimits(1)
+    with closing(listen("127.0.0.1", 0)) as listener:
+        host = Host("x", answer, listener, sources=sources, limits=limits, request_timeout=9)
+        with web.in_a_thread(host), closing(web.Client(listener.getsockname())) as client:
+            return client.get("/").body.decode()
+
+
+def test_a_host_runs_in_uvloop_where_it_is_installed() -> None:
+    pytest.importorskip("uvloop", reason="there is none for Windows")
+    assert loop_of_a_handler() == "uvloop"
+
+
+def test_a_host_runs_without_uvloop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "uvloop", None)
+    assert loop_of_a_handler() == "asyncio"
