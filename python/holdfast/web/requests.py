@@ -100,6 +100,7 @@ class Request:
     identity: Identity | None = None
     who: str = "-"
     """The name of the token's owner; `-` until the token was checked."""
+    _by_name: dict[bytes, list[bytes]] | None = field(default=None, init=False, repr=False)
 
     # What a host provides.
 
@@ -154,7 +155,12 @@ class Request:
 
     def values(self, wanted: bytes) -> list[bytes]:
         """Returns the values of all headers of this name."""
-        return [value for name, value in self.headers if name == wanted]
+        by_name = self._by_name
+        if by_name is None:
+            by_name = self._by_name = {}
+            for name, value in self.headers:
+                by_name.setdefault(name, []).append(value)
+        return by_name.get(wanted, [])
 
     def header(self, wanted: bytes) -> bytes | None:
         """Returns the value of the last header of this name, if there is one."""

@@ -9,6 +9,7 @@ use std::sync::{Mutex, PoisonError};
 use std::task::Waker;
 
 use tokio::sync::Notify;
+use tokio::task::yield_now;
 
 use crate::wake::{Wakes, pair};
 
@@ -20,14 +21,21 @@ pub(super) struct Inbox<Event> {
     /// the response, so they are woken together.
     answered: Mutex<Vec<Waker>>,
     has_answered: Notify,
+    has_events: Notify,
 }
 
 impl<Event> Inbox<Event> {
     /// The second result becomes readable when there are events.
     pub(super) fn new() -> io::Result<(Inbox<Event>, Wakes)> {
         let (wake, wakes) = pair()?;
-        let (answered, has_answered) = (Mutex::default(), Notify::new());
-        Ok((Inbox { events: Mutex::default(), wake, answered, has_answered }, wakes))
+        let inbox = Inbox {
+            events: Mutex::default(),
+            wake,
+            answered: Mutex::default(),
+            has_answered: Notify::new(),
+            has_events: Notify::new(),
+        };
+        Ok((inbox, wakes))
     }
 
     pub(super) fn push(&self, event: Event) {
@@ -40,10 +48,9 @@ impl<Event> Inbox<Event> {
         }
     }
 
-    /// Wakes the event loop.
+    /// Wakes the event loop soon.
     pub(super) fn wake(&self) {
-        // A full socket wakes the event loop too, and a closed one has no event loop.
-        let _ = (&self.wake).write(&[0]);
+        self.has_events.notify_one();
     }
 
     /// Wakes a task that has a response, after the next `flush`.
@@ -55,13 +62,21 @@ impl<Event> Inbox<Event> {
         self.has_answered.notify_one();
     }
 
-    /// Wakes tasks that have a response. Runs in their thread, which is woken once for all of them.
+    /// Wakes the event loop for events, and tasks for their responses. Runs in the thread of the tasks,
+    /// behind those that are ready: so each side wakes the other once for all that it has.
     pub(super) async fn deliver(&self) {
         loop {
-            self.has_answered.notified().await;
-            let answered =
-                mem::take(&mut *self.answered.lock().unwrap_or_else(PoisonError::into_inner));
-            answered.into_iter().for_each(Waker::wake);
+            tokio::select! {
+                () = self.has_answered.notified() => {
+                    let mut answered = self.answered.lock().unwrap_or_else(PoisonError::into_inner);
+                    mem::take(&mut *answered).into_iter().for_each(Waker::wake);
+                }
+                () = self.has_events.notified() => {
+                    yield_now().await;
+                    // A full socket wakes the event loop too, and a closed one has no event loop.
+                    let _ = (&self.wake).write(&[0]);
+                }
+            }
         }
     }
 
