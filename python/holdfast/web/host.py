@@ -126,6 +126,8 @@ class Host:
         self._open: dict[int, _Exchanged] = {}
         """The requests whose handlers are coroutines, by number."""
         self._tasks: set[asyncio.Task[None]] = set()
+        self._flushes = False
+        """Whether responses of coroutines are about to be sent."""
 
     def counts(self) -> dict[str, int]:
         """Returns the counts of connections. Thread-safe. What is counted has been logged."""
@@ -260,8 +262,10 @@ class Host:
             request.exchange.end(answer is None)
         elif answer is not None:
             self._respond(request, answer)
-            if self._server is not None:
-                self._server.flush()
+            if not self._flushes:
+                # Requests that wait for the same thing are often answered in one turn of the loop.
+                self._flushes = True
+                asyncio.get_running_loop().call_soon(self._flush)
         else:
             request.exchange.abandon()
 
@@ -277,6 +281,11 @@ class Host:
     def _respond(self, request: _Exchanged, answer: Response) -> None:
         exchange = request.exchange
         exchange.respond(answer.status, answer.headers, answer.body, answer.closes)
+
+    def _flush(self) -> None:
+        self._flushes = False
+        if self._server is not None:
+            self._server.flush()
 
     def _log_events(self, server: HttpServer) -> None:
         """Logs what has happened to connections. Thread-safe."""
