@@ -496,6 +496,9 @@ class HttpServer:
         tls: ServerTls | None = None,
         refusals: Sequence[tuple[str, Sequence[tuple[bytes, bytes]], bytes]],
     ) -> HttpServer: ...
+    def start(self) -> None:
+        """Begins to serve, in a thread of its own."""
+
     def detach(self) -> int:
         """The handle of a socket that is readable when there is something to take."""
 

@@ -116,7 +116,12 @@ impl HttpServer {
             tls: tls.map(|tls| tls.of_https()).transpose()?,
             refusals: bodies(&refusals)?,
         };
-        Ok(HttpServer { core: CoreServer::start(settings)? })
+        Ok(HttpServer { core: CoreServer::new(settings)? })
+    }
+
+    /// Begins to serve, in a thread of its own.
+    fn start(&self) -> PyResult<()> {
+        Ok(self.core.start()?)
     }
 
     /// Takes the handle of the socket that becomes readable when there is something to take.

@@ -134,8 +134,9 @@ class Host:
         server = self._server
         if server is None:
             return self._counts
+        counters = server.counters()
         self._log_events(server)
-        return server.counters()
+        return counters
 
     def tls_failures(self) -> dict[str, int]:
         """Returns the counts of failures of TLS, by reason. Thread-safe."""
@@ -162,6 +163,7 @@ class Host:
             transport, _ = await loop.create_connection(
                 lambda: _Wakes(lambda: self._take(server, loop)), sock=wakes
             )
+            server.start()
             while not stopped.is_set():
                 self.heartbeat.beat()
                 self._review(server)

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use tokio::runtime::{Builder, Runtime};
+use tokio::runtime::Builder;
 use tokio::sync::watch;
 use tokio::time::sleep;
 
@@ -60,37 +60,44 @@ pub struct HttpServer {
     heartbeat: Arc<Heartbeat>,
     events: Events,
     wakes: Mutex<Option<Wakes>>,
+    /// Until it starts.
+    socket: Mutex<Option<TcpListener>>,
 }
 
 impl HttpServer {
     pub const HTTP_10: hyper::Version = hyper::Version::HTTP_10;
 
-    /// Serves in a thread of its own.
+    /// A server that accepts nothing yet.
     ///
     /// # Errors
-    /// The system has no sockets or threads left.
-    pub fn start(settings: HttpSettings) -> io::Result<HttpServer> {
+    /// The system has no sockets left.
+    pub fn new(settings: HttpSettings) -> io::Result<HttpServer> {
         let (inbox, wakes) = Inbox::new()?;
         let (reporter, events) = event::channel(Verbosity::Refusals);
         settings.socket.set_nonblocking(true)?;
         let thread = format!("http-{}", settings.name);
         let (front, socket) = Front::new(settings, Arc::new(inbox), reporter);
-        let front = Arc::new(front);
-        let server = HttpServer {
-            front,
+        Ok(HttpServer {
+            front: Arc::new(front),
             stop: watch::Sender::new(false),
             abort: watch::Sender::new(false),
             threads: OwnThreads::default(),
-            heartbeat: Arc::new(Heartbeat::new(thread.clone())),
+            heartbeat: Arc::new(Heartbeat::new(thread)),
             events,
             wakes: Mutex::new(Some(wakes)),
-        };
-        let runtime = Builder::new_current_thread().enable_io().enable_time().build()?;
-        server.run(thread, runtime, socket)?;
-        Ok(server)
+            socket: Mutex::new(Some(socket)),
+        })
     }
 
-    fn run(&self, name: String, runtime: Runtime, socket: TcpListener) -> io::Result<()> {
+    /// Serves in a thread of its own. A second call does nothing.
+    ///
+    /// # Errors
+    /// The system has no threads left.
+    pub fn start(&self) -> io::Result<()> {
+        let socket = self.socket.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let Some(socket) = socket else { return Ok(()) };
+        let runtime = Builder::new_current_thread().enable_io().enable_time().build()?;
+        let name = self.heartbeat.thread().to_owned();
         let (front, heartbeat) = (Arc::clone(&self.front), Arc::clone(&self.heartbeat));
         let (stop, mut abort) = (self.stop.subscribe(), self.abort.subscribe());
         let worker = runtime.handle().clone();
