@@ -65,7 +65,8 @@ pub(super) async fn serve(
 ) {
     let Admitted { stream, peer, ticket, .. } = connection;
     set_options(&stream);
-    let Some((stream, peer)) = begin(&front, (stream, peer), &ticket, stop.clone()).await else {
+    let Some((stream, peer)) = Box::pin(begin(&front, (stream, peer), &ticket, stop.clone())).await
+    else {
         return;
     };
     let line = SharedLine::new(Arc::clone(&front), (ticket, peer), stream);
@@ -165,7 +166,8 @@ pub(super) async fn converse(
         .max_buf_size(MAX_HEADER + 8192)
         .header_read_timeout(None)
         .serve_connection(Wire(line.clone()), service);
-    let mut connection = pin!(connection);
+    // In a box of its own: most connections are idle, and this is most of the memory of one.
+    let mut connection = Box::pin(connection);
     let mut is_stopping = false;
     poll_fn(|context| {
         if !is_stopping && stopped.as_mut().poll(context).is_ready() {

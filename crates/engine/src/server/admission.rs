@@ -303,7 +303,7 @@ impl Table {
         let candidates = self.sessions.iter().filter(|(_, held)| {
             held.task.is_some() && held.is_of(source) && held.may_go(now, grace)
         });
-        let id = candidates.min_by_key(|(id, held)| held.rank(**id)).map(|(id, _)| *id);
+        let id = candidates.min_by_key(|(id, held)| held.rank(**id, now, grace)).map(|(id, _)| *id);
         let held = self.end(id.ok_or(Full)?).ok_or(Full)?;
         Ok(Evicted::Connection(held.peer))
     }
@@ -363,12 +363,15 @@ impl Table {
 }
 
 impl Held {
-    /// The order in which sessions give way.
-    fn rank(&self, id: u64) -> (bool, i128, u64) {
+    /// The order in which sessions give way. Among those of HTTP, which have a `grace`, a session that
+    /// has just had its response does not give way to make room for those that never complete a request.
+    fn rank(&self, id: u64, now: u64, grace: u64) -> (u8, i128, u64) {
         let last_request = self.activity.last_request.load(Ordering::Relaxed);
         let silence = if last_request == self.admitted { SILENCE.as_micros() } else { 0 };
         let is_amid_packet = self.activity.is_amid_packet.load(Ordering::Relaxed);
-        (is_amid_packet, i128::from(last_request) - silence as i128, id)
+        let is_recent = now.saturating_sub(last_request) < grace;
+        let class = if is_amid_packet { 1 } else { 2 * u8::from(is_recent) };
+        (class, i128::from(last_request) - silence as i128, id)
     }
 
     /// Whether it may be closed for another connection now.
@@ -577,10 +580,12 @@ mod tests {
         use WaitingFor::{Handler, Request, Rest};
         let of = |seconds: u64| Duration::from_millis(seconds * 1000 + 500);
         type Case<'a> = (&'a [(WaitingFor, Duration)], Option<usize>);
-        let cases: [Case<'_>; 8] = [
+        let cases: [Case<'_>; 10] = [
             (&[(Request, of(2)), (Request, of(3)), (Request, of(1))], Some(1)),
-            (&[(Request, of(0)), (Rest, of(99))], Some(0)),
-            (&[(Rest, of(99)), (Request, of(0))], Some(1)),
+            (&[(Request, of(0)), (Rest, of(99))], Some(1)),
+            (&[(Request, of(2)), (Rest, of(99))], Some(0)),
+            (&[(Request, of(0)), (Rest, of(0))], Some(0)),
+            (&[(Rest, of(99)), (Request, of(1))], Some(1)),
             (&[(Rest, of(91)), (Rest, of(92)), (Rest, of(0))], Some(1)),
             (&[(Handler, of(99)), (Rest, of(1))], Some(1)),
             (&[(Handler, of(99)), (Handler, of(99))], None),
