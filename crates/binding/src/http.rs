@@ -342,11 +342,8 @@ fn bodies(given: &[(String, Headers, Vec<u8>)]) -> PyResult<[RefusalBody; Refusa
         let found = given.iter().find(|(name, ..)| name == refusal.name());
         let (_, headers, body) = found
             .ok_or_else(|| PyValueError::new_err(format!("refusals has no {}", refusal.name())))?;
-        let mut lines = format!("content-length: {}\r\n", body.len()).into_bytes();
-        for (name, value) in headers {
-            lines.extend([name, &b": "[..], value, b"\r\n"].concat());
-        }
-        bodies[refusal as usize] = RefusalBody { headers: lines, body: body.clone() };
+        let ResponseHead { headers, .. } = response_head(400, headers)?;
+        bodies[refusal as usize] = RefusalBody { headers, body: Bytes::copy_from_slice(body) };
     }
     Ok(bodies)
 }

@@ -86,7 +86,8 @@ class Host:
     `rejection` creates the response to requests that never reach the handler, from the status, the
     reason and a sentence.
 
-    With `https`, connections use TLS; the limits and `request_timeout` include the handshake.
+    With `https`, connections use TLS. `request_timeout` includes the handshake; connections in it
+    have as many places of their own as `limits` gives to all.
 
     A peer that half-closes the connection still gets its responses. With `leaving`, a half-close
     means that the client is gone, because a full close looks the same to the server.
@@ -157,7 +158,7 @@ class Host:
                 loop.call_soon_threadsafe(stopped.set)
 
         stop.then(end)
-        server = self._server = self._started()
+        server = self._server = self._new_server()
         try:
             wakes = socket.socket(fileno=server.detach())
             transport, _ = await loop.create_connection(
@@ -177,7 +178,7 @@ class Host:
             self._counts, self._tls_failures = self.counts(), server.tls_failures()
             self._server = None
 
-    def _started(self) -> HttpServer:
+    def _new_server(self) -> HttpServer:
         limits, https = self._limits, self._https
         refused = {
             name: self._rejection(status, "malformed", text)

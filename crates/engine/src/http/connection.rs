@@ -14,10 +14,10 @@ use hyper::body::{Body, Incoming};
 use hyper::header::EXPECT;
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
-use hyper::{Request, Response, Version};
+use hyper::{Request, Response, StatusCode, Version};
 use tokio::net::TcpStream;
 use tokio::sync::watch;
-use tokio::time::{Sleep, sleep_until, timeout};
+use tokio::time::{Sleep, sleep_until, timeout_at};
 
 use super::exchange::{Abandoned, Event, Exchange, Order, RequestHead, ResponseHead};
 use super::front::Front;
@@ -65,11 +65,11 @@ pub(super) async fn serve(
 ) {
     let Admitted { stream, peer, ticket, .. } = connection;
     set_options(&stream);
-    let Some((stream, peer)) = Box::pin(begin(&front, (stream, peer), &ticket, stop.clone())).await
-    else {
-        return;
-    };
-    let line = SharedLine::new(Arc::clone(&front), (ticket, peer), stream);
+    // One time for the handshake and the first request.
+    let due = Instant::now() + front.request_timeout;
+    let begun = begin(&front, (stream, peer), &ticket, due, stop.clone()).await;
+    let Some((stream, peer)) = begun else { return };
+    let line = SharedLine::new(Arc::clone(&front), (ticket, peer), stream, due);
     let end = converse(&front, &line, stop.clone()).await;
     let Some(mut line) = line.into_line() else { return };
     match end {
@@ -89,6 +89,7 @@ async fn begin(
     front: &Front,
     (stream, peer): (TcpStream, SocketAddr),
     ticket: &Ticket,
+    due: Instant,
     mut stop: watch::Receiver<bool>,
 ) -> Option<(Box<dyn Stream>, Peer)> {
     let Some(tls) = front.tls() else {
@@ -98,13 +99,13 @@ async fn begin(
     let peeked = tokio::select! {
         biased;
         _ = stop.wait_for(|stop| *stop) => return None,
-        peeked = timeout(front.request_timeout, stream.peek(&mut first)) => peeked,
+        peeked = timeout_at(due.into(), stream.peek(&mut first)) => peeked,
     };
     match peeked {
         Err(_) => front.ended(Kind::TlsFailed("timeout"), peer.into()),
         Ok(Ok(1)) if first == [HANDSHAKE] => {
             let context = &front.context;
-            let limit = front.request_timeout;
+            let limit = due.saturating_duration_since(Instant::now());
             let (stream, peer) =
                 secured(&tls, context, (stream, peer), ticket, limit, stop).await?;
             return Some((Box::new(stream), peer));
@@ -130,7 +131,7 @@ async fn refuse_plain(
     }
     let refusal = front.refusal(Refusal::NotTls);
     let head = b"HTTP/1.1 400 Bad Request\r\nconnection: close\r\n";
-    let response = [&head[..], &refusal.headers, b"\r\n", &refusal.body].concat();
+    let response = [&head[..], &refusal.lines(), b"\r\n", &refusal.body].concat();
     if stream.try_write(&response).is_ok() {
         drain_for(LINGER, &mut stream, stop, |_| ()).await;
     }
@@ -166,8 +167,7 @@ pub(super) async fn converse(
         .max_buf_size(MAX_HEADER + 8192)
         .header_read_timeout(None)
         .serve_connection(Wire(line.clone()), service);
-    // In a box of its own: most connections are idle, and this is most of the memory of one.
-    let mut connection = Box::pin(connection);
+    let mut connection = pin!(connection);
     let mut is_stopping = false;
     poll_fn(|context| {
         if !is_stopping && stopped.as_mut().poll(context).is_ready() {
@@ -298,13 +298,9 @@ async fn handled(
 /// Refuses a request that hyper accepts.
 fn refused(front: &Front, exchange: Arc<Exchange>, line: SharedLine) -> Response<Output> {
     let RefusalBody { headers, body } = front.refusal(Refusal::NotHttp);
-    let headers = headers.split(|byte| *byte == b'\n').filter_map(|line| {
-        let colon = line.iter().position(|byte| *byte == b':')?;
-        Some((&line[..colon], line[colon + 1..].trim_ascii()))
-    });
-    let head = ResponseHead::new(400, headers).expect("the headers of a refusal are valid");
+    let head = ResponseHead { status: StatusCode::BAD_REQUEST, headers: headers.clone() };
     line.lock().note_answering();
-    Output::whole((exchange, line.clone()), head, Bytes::copy_from_slice(body), true)
+    Output::whole((exchange, line.clone()), head, body.clone(), true)
 }
 
 /// Tells the handler that the client is gone if the connection ends before there is a response.
@@ -406,7 +402,10 @@ impl Upload {
                 },
             };
             match order {
-                Order::Receive(most) => wanted = Some(most),
+                Order::Receive(most) => {
+                    wanted = Some(most);
+                    self.line.lock().note_asked();
+                }
                 Order::Late => {
                     wanted = None;
                     exchange.tell(Event::Late { number, received: self.received.len() });
@@ -422,6 +421,7 @@ impl Upload {
 
     /// Reads the rest of the request, so that the next one can follow. Returns whether it is read.
     async fn skipped(&mut self, front: &Front, exchange: &Exchange, closes: bool) -> bool {
+        self.line.lock().note_asked();
         while !self.is_over && !closes {
             self.received.clear();
             tokio::select! {

@@ -4,7 +4,7 @@ use std::collections::{HashSet, VecDeque};
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use tokio::net::{TcpListener, TcpStream};
@@ -92,7 +92,7 @@ struct Outcome {
 fn front() -> (Arc<Front>, Arc<Inbox<Event>>) {
     let (inbox, _wakes) = Inbox::new().unwrap();
     let inbox = Arc::new(inbox);
-    let refusal = RefusalBody { headers: b"content-length: 7\r\n".into(), body: b"refused".into() };
+    let refusal = RefusalBody { body: Bytes::from_static(b"refused"), ..RefusalBody::default() };
     let settings = HttpSettings {
         name: "test".into(),
         socket: std::net::TcpListener::bind(("127.0.0.1", 0)).unwrap(),
@@ -168,8 +168,10 @@ async fn line(
     let written = Arc::new(Mutex::new(Vec::new()));
     let stream = Pieces { pieces, is_pausing, turns: 0, written: Arc::clone(&written), socket };
     let peer = SocketAddr::from(([127, 0, 0, 1], 50_000));
+    let due = Instant::now() + front.request_timeout;
     let (ticket, _) = front.context.admission.admit(peer).unwrap();
-    let line = SharedLine::new(Arc::clone(front), (ticket, Peer::from(peer)), Box::new(stream));
+    let line =
+        SharedLine::new(Arc::clone(front), (ticket, Peer::from(peer)), Box::new(stream), due);
     (line, written)
 }
 

@@ -55,8 +55,8 @@ pub(super) struct Line {
     portion: Portion,
     /// Whether the peer sends no more.
     pub(super) is_ended: bool,
-    /// Whether hyper waits for bytes of the peer.
-    is_wanted: bool,
+    /// Whether somebody waits for the body of the request. hyper reads ahead without it.
+    is_asked: bool,
     /// Whether the peer has sent anything.
     is_used: bool,
     answer: Answer,
@@ -92,10 +92,11 @@ impl SharedLine {
         front: Arc<Front>,
         (ticket, peer): (Ticket, Peer),
         stream: Box<dyn Stream>,
+        request_due: Instant,
     ) -> SharedLine {
         let now = Instant::now();
         let line = Line {
-            request_due: Some(now + front.request_timeout),
+            request_due: Some(request_due),
             front,
             ticket,
             peer,
@@ -105,7 +106,7 @@ impl SharedLine {
             taken: 0,
             portion: Portion::Head(HeadEnd::default()),
             is_ended: false,
-            is_wanted: false,
+            is_asked: false,
             is_used: false,
             answer: Answer::None,
             exchange: None,
@@ -156,6 +157,10 @@ impl Line {
         self.note_waiting();
     }
 
+    pub(super) fn note_asked(&mut self) {
+        self.is_asked = true;
+    }
+
     pub(super) fn note_answering(&mut self) {
         self.answer = Answer::Begun;
         self.note_waiting();
@@ -197,6 +202,7 @@ impl Line {
         self.answer = Answer::None;
         self.exchange = None;
         self.is_late = false;
+        self.is_asked = false;
         let now = Instant::now();
         self.since = now;
         if self.taken < self.held.len() {
@@ -329,7 +335,7 @@ impl Line {
     fn be_late(&mut self, now: Instant) -> Verdict {
         match &self.exchange {
             _ if self.is_late => Verdict::DropAgain,
-            Some(_) if self.is_busy() && !self.is_wanted => {
+            Some(_) if self.is_busy() && !self.is_asked => {
                 // The peer waits for the handler, not the handler for the peer.
                 self.request_due = Some(now + self.front.request_timeout);
                 Verdict::Stay
@@ -389,7 +395,6 @@ impl Read for Wire {
             if len > 0 {
                 buffer.put_slice(&line.held[line.taken..line.taken + len]);
                 line.note_taken(len);
-                line.is_wanted = false;
                 return Poll::Ready(Ok(()));
             }
             if line.portion.is_over() {
@@ -399,7 +404,6 @@ impl Read for Wire {
             if line.is_ended {
                 return Poll::Ready(Ok(()));
             }
-            line.is_wanted = true;
             if ready!(line.poll_fill(context)).is_err() {
                 return Poll::Ready(Err(io::ErrorKind::ConnectionReset.into()));
             }

@@ -3,8 +3,8 @@
 //!
 //! * A request is handed over with its body if both have arrived together; otherwise the handler asks
 //!   for the body, after it has judged the rest.
-//! * hyper gets the bytes of one request at a time. So what becomes of bytes does not depend on how
-//!   the network has cut or joined them, and requests that were sent ahead wait as bytes.
+//! * hyper gets the bytes of one request at a time: what becomes of bytes does not depend on how the
+//!   network has cut or joined them, and requests that were sent ahead wait as bytes.
 //! * A connection has three deadlines: for its request to arrive, for its response to be taken, and
 //!   for its next request to begin.
 

@@ -1,6 +1,7 @@
 //! Refusals of what no handler sees.
 
-use hyper::StatusCode;
+use bytes::Bytes;
+use hyper::{HeaderMap, StatusCode};
 
 /// Why a request reaches no handler.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,9 +29,19 @@ impl Refusal {
 /// The headers and the body of a refusal, as an application words them.
 #[derive(Debug, Clone, Default)]
 pub struct RefusalBody {
-    /// Lines that end with CR LF, with Content-Length.
-    pub headers: Vec<u8>,
-    pub body: Vec<u8>,
+    pub headers: HeaderMap,
+    pub body: Bytes,
+}
+
+impl RefusalBody {
+    /// The headers as lines that end with CR LF, with Content-Length.
+    pub(super) fn lines(&self) -> Vec<u8> {
+        let mut lines = format!("content-length: {}\r\n", self.body.len()).into_bytes();
+        for (name, value) in &self.headers {
+            lines.extend([name.as_str().as_bytes(), b": ", value.as_bytes(), b"\r\n"].concat());
+        }
+        lines
+    }
 }
 
 /// The end of a header.
@@ -47,7 +58,7 @@ pub(super) fn completed(response: &[u8], refusal: &RefusalBody) -> Vec<u8> {
         Some(at) => [&header[..at], &header[at + NO_BODY.len()..]].concat(),
         None => header,
     };
-    [&header, &refusal.headers[..], b"\r\n", &refusal.body].concat()
+    [&header, &refusal.lines()[..], b"\r\n", &refusal.body].concat()
 }
 
 /// The refusal of which hyper's response tells the status.
@@ -67,7 +78,7 @@ mod tests {
 
     #[test]
     fn a_refusal_has_the_body_of_the_application() {
-        let refusal = RefusalBody { headers: b"content-length: 2\r\n".into(), body: b"{}".into() };
+        let refusal = RefusalBody { headers: HeaderMap::new(), body: Bytes::from_static(b"{}") };
         let hyper = b"HTTP/1.1 431 Request Header Fields Too Large\r\nconnection: close\r\n\
             content-length: 0\r\ndate: Sun\r\n\r\n";
         assert_eq!(of_response(hyper), Refusal::HeaderTooLarge);
