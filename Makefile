@@ -8,6 +8,7 @@ RUST := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name Cargo.to
 CRATES := -p holdfast-memory -p holdfast-protocol -p holdfast-journal -p holdfast-engine
 PROTOCOL := -p holdfast-protocol
 NO_STD := crates/protocol/tests/no_std/Cargo.toml
+FUZZ := fuzz/Cargo.toml
 BARE_METAL := thumbv7em-none-eabi
 PEERS := tests/peers/drivers
 VERSION := $(shell sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml)
@@ -18,14 +19,14 @@ ifneq ($(OS),Windows_NT)
 export PATH := $(CURDIR)/.cache/toolchain/bin:$(PATH)
 endif
 
-.PHONY: build run test test-python test-rust test-slow explore torture lint audit no-std format bench docs site \
+.PHONY: build run test test-python test-rust test-slow explore fuzz proof torture lint audit no-std format bench docs site \
   pictures dist dist-check lock clean deb container release-check
 .DELETE_ON_ERROR:
 
 build: .venv/core.stamp
 
 run: .venv/core.stamp
-	@exec $(BIN)/holdfast run examples/plant.yaml
+	@exec $(BIN)/python tools/tour.py
 
 # The same cases in every run, but for those of tests/slow.txt. Both parts mostly wait: they run side by side.
 test: .venv/core.stamp .venv/dev.stamp
@@ -39,7 +40,8 @@ test-python: .venv/core.stamp .venv/dev.stamp
 RUST_LOG := .cache/test-rust.log
 test-rust: $(TOOLCHAIN)
 	@cargo test --locked --quiet $(CRATES) --lib --tests > $(RUST_LOG) 2>&1 && \
-	  cargo test --locked --quiet $(CRATES) --doc >> $(RUST_LOG) 2>&1 || \
+	  cargo test --locked --quiet $(CRATES) --doc >> $(RUST_LOG) 2>&1 && \
+	  cargo test --locked --quiet --manifest-path $(FUZZ) --target-dir target/fuzz --tests >> $(RUST_LOG) 2>&1 || \
 	  { cat $(RUST_LOG); exit 1; }
 	@awk '/^test result/ {passed += $$4} END {print "Rust: " passed " passed"}' $(RUST_LOG)
 
@@ -57,10 +59,30 @@ explore: .venv/core.stamp .venv/dev.stamp
 	PROPTEST_CASES=5000 cargo test --locked --quiet $(CRATES) --lib --tests; rust=$$?; \
 	HOLDFAST_EXPLORE=1 $(BIN)/pytest -m hypothesis && exit $$rust
 
+# Puts the faults of tests/conformance/mutations.toml into the program, one after the other: the test of each must
+# fail. Takes an hour; changes files of the checkout meanwhile, and restores them.
+proof: .venv/core.stamp .venv/dev.stamp
+	$(BIN)/python tests/conformance/mutate.py
+
+# Looks for inputs that break a check of fuzz/src for SECONDS, and keeps those that reach new code in .cache/fuzz.
+# One that fails is printed and kept in fuzz/artifacts. Commit it to fuzz/corpus with the mend.
+CARGO_FUZZ := 0.13.2
+TARGET ?= request
+SECONDS ?= 60
+fuzz: .cache/tools/cargo-fuzz-$(CARGO_FUZZ).stamp
+	@cargo +nightly --version > /dev/null 2>&1 || \
+	  { echo "fuzzing needs nightly Rust: rustup toolchain install nightly"; exit 1; }
+	@[ -d fuzz/corpus/$(TARGET) ] || { echo "TARGET is $(TARGET), allowed:" $(notdir $(wildcard fuzz/corpus/*)); exit 1; }
+	@mkdir -p .cache/fuzz/$(TARGET)
+	PATH="$(CURDIR)/.cache/tools/bin:$$PATH" cargo +nightly fuzz run --target-dir target/fuzz --features libfuzzer $(TARGET) \
+	  .cache/fuzz/$(TARGET) fuzz/corpus/$(TARGET) -- -max_total_time=$(SECONDS)
+
 lint: no-std .venv/core.stamp .venv/dev.stamp
 	cargo fmt --check
 	cargo fmt --check --manifest-path $(NO_STD)
 	cargo fmt --check --manifest-path $(PEERS)/rust/Cargo.toml
+	cargo fmt --check --manifest-path $(FUZZ)
+	cargo clippy --locked --quiet --manifest-path $(FUZZ) --target-dir target/fuzz --lib --tests -- -D warnings
 	cargo clippy --locked --quiet --workspace --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets --no-default-features -- -D warnings
@@ -69,6 +91,7 @@ lint: no-std .venv/core.stamp .venv/dev.stamp
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	@$(BIN)/lint-imports --no-logo --cache-dir .cache/imports > .cache/imports.log || { cat .cache/imports.log; exit 1; }
 	$(BIN)/python -m mypy.stubtest holdfast._core
 
 # Licences, origins and known vulnerabilities of all dependencies.
@@ -76,8 +99,9 @@ CARGO_DENY := 0.20.2
 audit: .venv/core.stamp .venv/dev.stamp .venv/release.stamp .cache/tools/cargo-deny-$(CARGO_DENY).stamp
 	PATH="$(CURDIR)/.cache/tools/bin:$$PATH" $(BIN)/python tools/dependencies.py
 
-.cache/tools/cargo-deny-$(CARGO_DENY).stamp: $(TOOLCHAIN)
-	cargo install --locked --quiet --root .cache/tools --version $(CARGO_DENY) cargo-deny
+# A tool of Rust and its version: cargo-NAME-VERSION.
+.cache/tools/cargo-%.stamp: $(TOOLCHAIN)
+	cargo install --locked --quiet --root .cache/tools cargo-$(subst -,@,$*)
 	@touch $@
 
 # Links a program without the standard library with the protocol crate: for this machine, and for a
@@ -92,9 +116,11 @@ no-std:
 	else echo "$(BARE_METAL) is not installed: built for this machine only"; fi
 
 format: .venv/dev.stamp
+	$(BIN)/python tools/sync_operations.py
 	cargo fmt
 	cargo fmt --manifest-path $(NO_STD)
 	cargo fmt --manifest-path $(PEERS)/rust/Cargo.toml
+	cargo fmt --manifest-path $(FUZZ)
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
@@ -113,7 +139,7 @@ bench: .venv/core.stamp .venv/dev.stamp
 
 # Writes what is made from the program: the schema of the configuration.
 docs: .venv/core.stamp
-	$(BIN)/holdfast schema > docs/config.schema.json
+	$(BIN)/holdfast check --schema > docs/config.schema.json
 	$(BIN)/holdfast scan --schema > docs/scanner.schema.json
 
 # Builds the documentation site in site/: its first page is site/index.html. A broken link is an error.
@@ -131,7 +157,7 @@ dist: .venv/run.stamp $(TOOLCHAIN)
 
 # Checks what is in dist, and installs and tries the wheel for this machine.
 dist-check: .venv/core.stamp .venv/dev.stamp
-	HOLDFAST_DIST=dist $(BIN)/pytest tests/packaging
+	HOLDFAST_DIST=dist $(BIN)/pytest tests/packaging tests/docs/test_fresh_clone.py
 
 # The Debian packages of the wheels in dist (docs/service.md). Needs debhelper.
 deb: .venv/dev.stamp
@@ -160,11 +186,13 @@ lock: .venv/dev.stamp
 	  --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate \
 	  --output-file requirements/$$set.lock requirements/$$set.in; done
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-	  --no-header --no-annotate --extra sparkplug --extra windows-service --constraint requirements/dev.lock \
+	  --no-header --no-annotate --extra certs --extra mqtt --extra nats --extra sparkplug --extra windows \
+	  --constraint requirements/dev.lock \
 	  --output-file requirements/appliance.lock pyproject.toml
 	cargo update
 	cargo update --manifest-path $(NO_STD)
 	cargo update --manifest-path $(PEERS)/rust/Cargo.toml
+	cargo update --manifest-path $(FUZZ)
 	cd $(PEERS)/node && npm install --package-lock-only --ignore-scripts
 	cd $(PEERS)/go && go mod tidy
 	cd crates/journal/tests/checker && go get -u ./... && go mod tidy
@@ -190,5 +218,6 @@ $(TOOLCHAIN): tools/prepare.py requirements/rust.lock requirements/zig.lock .ven
 	@touch $@
 
 .venv/core.stamp: $(RUST) pyproject.toml .venv/run.stamp $(TOOLCHAIN)
-	PIP_QUIET=1 $(BIN)/python -m maturin develop --release --locked --quiet
+	@echo "Compiling the native core, which takes minutes in a fresh clone" >&2
+	@PIP_QUIET=1 $(BIN)/python -m maturin develop --release --locked --quiet
 	@touch $@

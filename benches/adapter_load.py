@@ -148,7 +148,7 @@ class Bench:
         whole = command(REGISTERS)
         body = f"[{','.join([whole] * ((MAX_BODY - 1) // (len(whole) + 1)))}]".encode()
         request = common.http_request(self.rest, "/api/v1/ingest", token=TOKEN, body=body)
-        return common.http_load(self.rest, self.request, request, connections)
+        return common.http_load(self.rest, self.request, [request], connections)
 
     def _flood(self) -> contextlib.AbstractContextManager[object]:
         flood = common.bench(

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from holdfast import logs
 from holdfast.appliance import Appliance
-from holdfast.audit import Audit
 from holdfast.config import load
+from holdfast.events import log_lines
+from holdfast.events.audit import Audit
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -87,7 +87,7 @@ def compared(folder: Path, batch: int) -> tuple[float, float]:
 
 def appended(descriptor: int, batch: int) -> None:
     """Appends lines as the bare loop does."""
-    now = logs.timestamp(time.time())
+    now = log_lines.timestamp(time.time())
     lines = (msgspec.json.encode({"time": now, **FIELDS}) + b"\n" for _ in range(batch))
     os.write(descriptor, b"".join(lines))
 

@@ -65,6 +65,7 @@ async def answer(scope: Any, receive: Any, send: Any) -> None:
 # With the protocol, asyncio sends small pieces at once.
 with socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP) as listener:
     listener.bind(("127.0.0.1", 0))
+    listener.listen()
     host, port = listener.getsockname()
     print(f"listening {host}:{port}", flush=True)
     loop: Any = sys.argv[1]

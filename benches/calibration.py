@@ -1,4 +1,4 @@
-"""Measures how far the confidence of `holdfast guess` and `holdfast describe` can be trusted.
+"""Measures how far the confidence of `describe guess` and `describe` can be trusted.
 
 Judges their claims about the blocks of `tests/calibration`: the corpus that judges (`judging.py`),
 and the one to which the rules are adjusted (`tuning.py`), if it exists. The result depends on the

@@ -44,10 +44,13 @@ def python(script: str, *arguments: object, checkout: Path | None = None) -> lis
     return [str(interpreter), str((checkout or ROOT) / "benches" / script), *map(str, arguments)]
 
 
-def http_load(address: str, file: Path, request: bytes, connections: int) -> list[str]:
-    """The command line of a load with an HTTP request, which is written into the file."""
-    file.write_bytes(request)
-    return bench("load", "--address", address, "--http", file, "--connections", connections)
+def http_load(address: str, file: Path, requests: Sequence[bytes], connections: int) -> list[str]:
+    """The command line of a load with HTTP requests, which are written into files."""
+    files = [file.with_suffix(f".{number}") for number in range(len(requests))]
+    for each, request in zip(files, requests, strict=True):
+        each.write_bytes(request)
+    options = [word for each in files for word in ("--http", each)]
+    return bench("load", "--address", address, *options, "--connections", connections)
 
 
 def http_request(

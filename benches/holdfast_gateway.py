@@ -13,9 +13,9 @@ loop, device = sys.argv[1:]
 event_loops.use(loop)
 
 from holdfast.adapters import Stop  # noqa: E402
-from holdfast.config.egress import parse_allowed  # noqa: E402
+from holdfast.config.values.allow_entries import parse_allowed  # noqa: E402
 from holdfast.gateway import Gateway, GatewayLimits, Settings  # noqa: E402
-from holdfast.web.port import listen  # noqa: E402
+from holdfast.net.http.port import listen  # noqa: E402
 
 LIMITS = GatewayLimits(streams=200, connections=200, requests=200, requests_of_device=200)
 """The watchers of a turn may come before those of the last one are gone."""

@@ -6,6 +6,10 @@ with tokens, rules, an audit log and limits. The bare application parses the sam
 and answers with the same JSON; it has no memory, no tokens and no device. Each runs in asyncio's
 event loop and in uvloop.
 
+By default, as in a configuration, the gateway sends the device one request at a time, and equal
+reads that wait share a reply. With `--different` all reads differ; with `--in-flight 32` none of
+them waits.
+
 With `--against`, the server of another checkout takes part, which needs a built core and packages
 of its own. `--watchers` measures event streams instead, and `--slow` connections that are slow or
 idle.
@@ -89,7 +93,8 @@ class Bench:
         self._requests = requests(stack.enter_context(start).address)
         self.servers: dict[str, Server] = {}
         for name, loop, checkout in variants(options):
-            running = common.appliance(REST + LIMITS + GATEWAY, options.core, 3, loop, checkout)
+            gateway = f"{GATEWAY}  in_flight: {options.in_flight}\n"
+            running = common.appliance(REST + LIMITS + gateway, options.core, 3, loop, checkout)
             self.servers[name] = stack.enter_context(running)
         self._start_peers()
 
@@ -126,8 +131,14 @@ class Bench:
     def load(self, name: str, kind: str) -> Result:
         """Measures one server with one kind of request."""
         (path, body), address = self._requests[kind], self._address(name, kind)
-        request = common.http_request(address, path, token=TOKEN, body=body)
-        command = common.http_load(address, self._folder / "request", request, CONNECTIONS)
+        bodies = [body]
+        if kind == "gateway" and self._options.different and body is not None:
+            bodies = [
+                json.dumps({**json.loads(body), "address": number}).encode()
+                for number in range(CONNECTIONS)
+            ]
+        requests = [common.http_request(address, path, token=TOKEN, body=each) for each in bodies]
+        command = common.http_load(address, self._folder / "request", requests, CONNECTIONS)
         return common.load(command, self._options.seconds, self._options.other, self.servers[name])
 
     def _address(self, name: str, kind: str) -> str:
@@ -175,6 +186,14 @@ def arguments() -> argparse.Namespace:
     """The options of the command line."""
     parser = common.parser(__doc__, seconds=2, rounds=9)
     parser.add_argument("--against", type=Path, help="folder of another checkout to compare with")
+    parser.add_argument(
+        "--in-flight", type=int, default=1, help="of the gateway to the device; default 1"
+    )
+    parser.add_argument(
+        "--different",
+        action="store_true",
+        help="no reads of the device are equal",
+    )
     parser.add_argument("--loops", default=",".join(LOOPS), help="default: asyncio,uvloop")
     parser.add_argument("--only", default=",".join(TITLES), help=f"default: {','.join(TITLES)}")
     parser.add_argument("--watchers", action="store_true", help="measure 100 event streams")

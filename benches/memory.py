@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import common
 
 from holdfast import Tag, raw_ingest
-from holdfast.outputs.buffer import Buffer
+from holdfast.outputs import Buffer
 from holdfast.polling import Reading
 
 if TYPE_CHECKING:

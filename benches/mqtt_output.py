@@ -26,10 +26,11 @@ from common import medians, pinned, python, ratio, turns
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 
-from holdfast.config.outputs import MqttOutputConfig
+from holdfast.config.models.outputs import MqttOutputConfig
 from holdfast.outputs import Buffer, Sending
 from holdfast.outputs.mqtt import MqttOutput
 from holdfast.outputs.mqtt.payloads import Payloads
+from holdfast.outputs.site import DeviceInfo
 from holdfast.polling import Reading
 from holdfast.runtime.stop import Stop
 from holdfast.tags import Tag
@@ -140,6 +141,9 @@ class Site:
     """A site without devices: only values are published."""
 
     revision = answers = 0
+
+    def devices(self) -> dict[str, DeviceInfo]:
+        return {}
 
     def tags(self) -> dict[str, list[Tag]]:
         return {}

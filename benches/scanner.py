@@ -20,10 +20,11 @@ from typing import Any
 import common
 from nats.aio.client import Client
 
-from holdfast.nats_server import TemporaryServer
-from holdfast.scanner.nats import wire
-from holdfast.scanner.publish import Publisher
-from holdfast.scanner.subscriptions import Group, Tag
+from holdfast.net.nats import batch
+from holdfast.net.nats_server import TemporaryServer
+from holdfast.scanner.publish.publisher import Publisher
+from holdfast.scanner.subscriptions.groups import Group
+from holdfast.scanner.subscriptions.tag import Tag
 
 TAGS = 100
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -198,14 +199,14 @@ async def publishing(url: str) -> dict[str, float]:
         await client.publish(subject, payload)
     await client.flush()
     one = time.perf_counter() - start
-    texts = wire.text(subject, payload) * TAGS
+    texts = batch.text(subject, payload) * TAGS
     start = time.perf_counter()
     for _ in range(count // TAGS):
-        await wire.send(client, texts, TAGS)
+        await batch.send(client, texts, TAGS)
     await client.flush()
-    batch = time.perf_counter() - start
+    batched = time.perf_counter() - start
     await client.close()
-    return {"publish": one / count * 1e6, "batch": batch / count * 1e6}
+    return {"publish": one / count * 1e6, "batch": batched / count * 1e6}
 
 
 def main() -> None:

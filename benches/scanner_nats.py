@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from holdfast.nats_server import TemporaryServer
+from holdfast.net.nats_server import TemporaryServer
 
 with TemporaryServer(0) as server:
     print(f"listening {server.url.removeprefix('nats://')}", flush=True)

@@ -12,9 +12,11 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 import holdfast
-from holdfast import logs
-from holdfast.appliance import Appliance, supervision
+from holdfast.appliance import Appliance
+from holdfast.appliance.services import supervision
 from holdfast.config import load
+from holdfast.events import log_lines
+from holdfast.events.throttle import Throttle
 from support import cases, wire
 from support.machine import has_ipv6, missing
 from support.running import (
@@ -82,13 +84,13 @@ def collected(request: pytest.FixtureRequest) -> list[str]:
 @pytest.fixture(autouse=True)
 def _forget_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
     """Refusals of one test do not limit how many another one logs."""
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+    monkeypatch.setattr(log_lines, "_REFUSALS", Throttle())
 
 
 @pytest.fixture(autouse=True)
 def _adapters_have_their_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """A loaded machine could leave threads of the lowest priority without any time for minutes."""
-    monkeypatch.setattr(supervision, "POLITENESS", 0)
+    monkeypatch.setattr(supervision, "NICE", 0)
 
 
 @pytest.fixture
@@ -172,7 +174,7 @@ def server_process() -> Iterator[Process]:
 @pytest.fixture(autouse=True)
 def logging_as_it_was() -> Iterator[None]:
     """Restores the log, which commands that run in the test's process configure."""
-    logger = logs.LOGGER
+    logger = log_lines.LOGGER
     before = (list(logger.handlers), logger.level, logger.propagate)
     yield
     logger.handlers[:], logger.propagate = before[0], before[2]

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast import bounded_files
-from holdfast.bounded_files import (
+from holdfast.client.endpoint import endpoint
+from holdfast.client.url import parse
+from holdfast.runtime import bounded_files
+from holdfast.runtime.bounded_files import (
     FileWork,
     NotAnswered,
     TooLarge,
@@ -21,8 +23,6 @@ from holdfast.bounded_files import (
     read,
     require_stored,
 )
-from holdfast.client.endpoint import endpoint
-from holdfast.client.url import parse
 from support import wire
 from support.silent_files import Silent, threads
 
@@ -158,7 +158,7 @@ def test_what_other_code_reads_by_its_name_must_answer_and_end(
     good, large = tmp_path / "good", tmp_path / "large"
     good.write_bytes(b"content")
     with large.open("wb") as file:
-        file.truncate(bounded_files.MAX_CERTIFICATES + 1)
+        file.truncate(bounded_files.MAX_CERTIFICATES_BYTES + 1)
     require_stored(good, None, tmp_path / "missing", tmp_path)
     for unusable, reason in (
         (pipe, "it is a named pipe, allowed: a regular file"),

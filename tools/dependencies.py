@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-MANIFESTS = ("Cargo.toml", "crates/protocol/tests/no_std/Cargo.toml")
+MANIFESTS = ("Cargo.toml", "crates/protocol/tests/no_std/Cargo.toml", "fuzz/Cargo.toml")
 
 PERMISSIVE = (
     "Apache",

@@ -62,6 +62,7 @@ def environment() -> None:
             "on Debian and Ubuntu: apt install python3-venv"
         ) from None
     if not _has_pip():
+        say("Making .venv, with the packages of requirements/run.lock")
         venv.create(ROOT / ".venv", with_pip=True, clear=True, symlinks=os.name != "nt")
     install("run", python=_python())
 
@@ -91,8 +92,8 @@ def rust_required() -> tuple[int, ...]:
     """The oldest Rust that builds the core."""
     import tomllib
 
-    crate = tomllib.loads((ROOT / "crates" / "binding" / "Cargo.toml").read_text())
-    return _numbers(crate["package"]["rust-version"])
+    workspace = tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]
+    return _numbers(workspace["package"]["rust-version"])
 
 
 def rust_found(path: str) -> tuple[int, ...] | None:

@@ -2,7 +2,7 @@
 
 Needs nothing but Python and Holdfast, so it also runs in containers and emulators. Asks every
 command for its help, reads and writes a simulated device, and runs the appliance of
-examples/plant.yaml.
+examples/plant.yaml. Further arguments name commands that must say that an extra is missing.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ HOLDFAST = [sys.executable, "-m", "holdfast"]
 UTF8 = {**os.environ, "PYTHONUTF8": "1"}
 """Else Windows encodes what is printed to a pipe in another way."""
 
+MISSING = re.compile(r"holdfast: this command requires \S+, not installed: pip install '\S+'\n")
 TIMEOUT = 120.0
 """Seconds for one command: emulators are slow."""
 
@@ -44,26 +45,36 @@ def ran(*arguments: str) -> str:
     return done.stdout
 
 
-def helps() -> int:
-    """Asks every command and every group for its help, in one process. Returns how many."""
+def helps() -> tuple[int, set[str]]:
+    """Asks every command and every group for its help, in one process.
+
+    Returns how many have one, and the names of those that miss an extra.
+    """
     import click
 
     from holdfast.cli import main
 
     def ask(command: Any, path: list[str]) -> int:
-        printed = io.StringIO()
-        with redirect_stdout(printed):
-            main.main([*path, "--help"], "holdfast", standalone_mode=False)
+        printed, errors = io.StringIO(), io.StringIO()
+        try:
+            with redirect_stdout(printed), redirect_stderr(errors):
+                main.main([*path, "--help"], "holdfast", standalone_mode=False)
+        except SystemExit:
+            assert MISSING.fullmatch(errors.getvalue()), errors.getvalue()
+            missing.add(" ".join(path))
+            return 0
         assert printed.getvalue().startswith(" ".join(["Usage: holdfast", *path])), path
         if not isinstance(command, click.Group):
             return 1
-        context = click.Context(command)
+        # Else a command whose extra is missing would be an error already here.
+        context = click.Context(command, resilient_parsing=True)
         below = [
             (name, command.get_command(context, name)) for name in command.list_commands(context)
         ]
         return 1 + sum(ask(each, [*path, name]) for name, each in below)
 
-    return ask(main, [])
+    missing: set[str] = set()
+    return ask(main, []), missing
 
 
 @contextmanager
@@ -98,7 +109,7 @@ def serving(*arguments: str) -> Iterator[str]:
 def try_device(examples: Path) -> None:
     """Reads and writes a simulated device."""
     tags = str(examples / "tags" / "heater.yaml")
-    with serving("simulate", tags, "--port", "0") as address:
+    with serving("simulate", tags, "--bind", ":0") as address:
         device = f"tcp://{address}"
         assert "setpoint" in ran("read", device, "--tags", tags)
         ran("write", device, "setpoint=21.5", "--tags", tags)
@@ -122,10 +133,11 @@ def try_appliance(examples: Path) -> None:
 
 def main() -> None:
     """Tries all; a failure ends it."""
-    examples = Path(sys.argv[1])
+    examples, without = Path(sys.argv[1]), set(sys.argv[2:])
     print(ran("--version").strip(), flush=True)
-    asked = helps()
+    asked, missing = helps()
     assert asked > 20, asked
+    assert missing == without, missing
     print(f"{asked} commands have a help", flush=True)
     try_device(examples)
     print("a simulated device was read and written", flush=True)

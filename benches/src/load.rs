@@ -32,7 +32,7 @@ const PIECE: usize = 16384;
 struct Options {
     address: SocketAddr,
     request: String,
-    http: Option<Vec<u8>>,
+    http: Vec<Vec<u8>>,
     connections: usize,
     in_flight: usize,
     quantity: u16,
@@ -50,23 +50,17 @@ struct Connection {
 }
 
 /// `--address A --connections C --in-flight K --request read-registers|read-coils|write-registers
-/// --quantity Q --warmup S --seconds S`; with `--http FILE`, the request is in the file.
+/// --quantity Q --warmup S --seconds S`; with `--http FILE`, the request is in the file. With several
+/// files, each connection sends the request of another one.
 pub(crate) fn main(arguments: lexopt::Parser) -> Result<(), Failure> {
     let options = parse(arguments)?;
-    let (request, (reply, date)) = if let Some(request) = &options.http {
-        (request.clone(), http::first_reply(options.address, request)?)
-    } else {
-        let request = request(&options.request, options.quantity)?;
-        let reply = first_reply(options.address, &request)?;
-        (request, (reply, 0..0))
-    };
+    let exchanges = exchanges(&options)?;
+    let longest = exchanges.iter().map(|one| one.expected.replies.len()).max().unwrap_or_default();
     let mut load = Load {
         poller: Poller::new()?,
         connections: Vec::with_capacity(options.connections),
-        requests: request.repeat(options.in_flight),
-        expected: Expected { replies: reply.repeat(options.in_flight), len: reply.len(), date },
-        buffer: vec![0; reply.len() * options.in_flight],
-        request_len: request.len(),
+        exchanges,
+        buffer: vec![0; longest],
     };
     load.connect(&options)?;
     let mut outcome = Outcome::new(options.period)?;
@@ -80,11 +74,33 @@ pub(crate) fn main(arguments: lexopt::Parser) -> Result<(), Failure> {
 struct Load {
     poller: Poller,
     connections: Vec<Connection>,
-    /// The requests in flight of a connection, as bytes.
-    requests: Vec<u8>,
-    expected: Expected,
+    /// Connection N has that of number N modulo their count.
+    exchanges: Vec<Exchange>,
     buffer: Vec<u8>,
+}
+
+/// What a connection sends and receives.
+struct Exchange {
+    /// All requests in flight, as bytes.
+    requests: Vec<u8>,
     request_len: usize,
+    expected: Expected,
+}
+
+fn exchanges(options: &Options) -> Result<Vec<Exchange>, Failure> {
+    let exchange = |request: &[u8], (reply, date): (Vec<u8>, Range<usize>)| Exchange {
+        requests: request.repeat(options.in_flight),
+        request_len: request.len(),
+        expected: Expected { replies: reply.repeat(options.in_flight), len: reply.len(), date },
+    };
+    if options.http.is_empty() {
+        let request = request(&options.request, options.quantity)?;
+        let reply = first_reply(options.address, &request)?;
+        return Ok(vec![exchange(&request, (reply, 0..0))]);
+    }
+    let of =
+        |request: &Vec<u8>| Ok(exchange(request, http::first_reply(options.address, request)?));
+    options.http.iter().map(of).collect()
 }
 
 /// What the server has to answer.
@@ -108,8 +124,9 @@ impl Load {
             self.connections.push(Connection { stream, part: 0, open: 0, sent });
         }
         let now = Instant::now();
-        for connection in &mut self.connections {
-            connection.send(&self.requests, options.in_flight, now)?;
+        for (connection, exchange) in self.connections.iter_mut().zip(self.exchanges.iter().cycle())
+        {
+            connection.send(&exchange.requests, options.in_flight, now)?;
         }
         Ok(())
     }
@@ -125,13 +142,14 @@ impl Load {
             }
             for number in ready {
                 let connection = &mut self.connections[number];
-                let mut left = connection.receive(&self.expected, &mut self.buffer)?;
+                let exchange = &self.exchanges[number % self.exchanges.len()];
+                let mut left = connection.receive(&exchange.expected, &mut self.buffer)?;
                 let answered = left;
                 now = Instant::now();
                 while let Some((sent, count)) = connection.take(&mut left) {
                     outcome.record(sent, now, count)?;
                 }
-                let requests = &self.requests[..answered * self.request_len];
+                let requests = &exchange.requests[..answered * exchange.request_len];
                 connection.send(requests, answered, now)?;
             }
         }
@@ -150,7 +168,8 @@ impl Load {
             }
             for number in ready {
                 let connection = &mut self.connections[number];
-                let answered = connection.receive(&self.expected, &mut self.buffer)?;
+                let exchange = &self.exchanges[number % self.exchanges.len()];
+                let answered = connection.receive(&exchange.expected, &mut self.buffer)?;
                 open -= answered;
                 outcome.late(answered);
             }
@@ -230,7 +249,7 @@ fn parse(arguments: lexopt::Parser) -> Result<Options, Failure> {
     let mut parsed = Options {
         address: SocketAddr::from(([127, 0, 0, 1], 502)),
         request: "read-registers".into(),
-        http: None,
+        http: Vec::new(),
         connections: 1,
         in_flight: 1,
         quantity: 10,
@@ -240,7 +259,7 @@ fn parse(arguments: lexopt::Parser) -> Result<Options, Failure> {
         match name {
             "address" => parsed.address = value.parse()?,
             "request" => parsed.request = value,
-            "http" => parsed.http = Some(fs::read(value)?),
+            "http" => parsed.http.push(fs::read(value)?),
             "connections" => parsed.connections = value.parse()?,
             "in-flight" => parsed.in_flight = value.parse()?,
             "quantity" => parsed.quantity = value.parse()?,

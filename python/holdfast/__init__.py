@@ -6,28 +6,54 @@ configuration in `holdfast.config`, and the native core in `holdfast._core`.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from holdfast import raw_ingest, values
-from holdfast._core import Memory, OutOfRange, Rule, ServerTls, __version__
-from holdfast.client import Client, SyncClient
-from holdfast.errors import (
-    ConnectFailed,
-    ConnectionLost,
-    InvalidResponse,
-    ModbusError,
-    ModbusException,
-    RequestTimeout,
-    TlsFailed,
-)
-from holdfast.polling import Poller
-from holdfast.server import Server
-from holdfast.tags import Tag, TagError, TagList
-from holdfast.write_callback import WriteCallback
+from holdfast.runtime.lazy_names import imported_on_use
 
 if TYPE_CHECKING:
-    from holdfast.config.tag_files import load_tags
+    from holdfast import raw_ingest, values
+    from holdfast._core import Memory, OutOfRange, Rule, ServerTls, __version__
+    from holdfast.client import Client, SyncClient
+    from holdfast.config.tag_files.read import load_tags
+    from holdfast.errors import (
+        ConnectFailed,
+        ConnectionLost,
+        InvalidResponse,
+        ModbusError,
+        ModbusException,
+        RequestTimeout,
+        TlsFailed,
+    )
+    from holdfast.polling import Poller
+    from holdfast.server import Server
+    from holdfast.server.write_callback import WriteCallback
+    from holdfast.tags import Tag, TagError, TagList
+else:
+    _CORE = ("Memory", "OutOfRange", "Rule", "ServerTls", "__version__")
+    _ERRORS = (
+        "ConnectFailed",
+        "ConnectionLost",
+        "InvalidResponse",
+        "ModbusError",
+        "ModbusException",
+        "RequestTimeout",
+        "TlsFailed",
+    )
+    __getattr__ = imported_on_use(
+        __name__,
+        {
+            **dict.fromkeys(_CORE, "holdfast._core"),
+            **dict.fromkeys(("Client", "SyncClient"), "holdfast.client"),
+            **dict.fromkeys(_ERRORS, "holdfast.errors"),
+            **dict.fromkeys(("Tag", "TagError", "TagList"), "holdfast.tags"),
+            "Poller": "holdfast.polling",
+            "Server": "holdfast.server",
+            "WriteCallback": "holdfast.server.write_callback",
+            "load_tags": "holdfast.config.tag_files.read",
+            "raw_ingest": "holdfast.raw_ingest",
+            "values": "holdfast.values",
+        },
+    )
 
 __all__ = [
     "Client",
@@ -56,10 +82,5 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """Supports the former name of `raw_ingest`, and imports what needs a YAML parser on demand."""
-    if name == "load_tags":
-        return importlib.import_module("holdfast.config.tag_files").load_tags
-    if name == "raw":
-        return importlib.import_module("holdfast.raw")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+def __dir__() -> list[str]:
+    return __all__

@@ -7,9 +7,17 @@ from os import PathLike
 from typing import Any, Final, Literal, Self, final
 
 from holdfast.errors import ModbusError
+from holdfast.server.options import (
+    DatagramOptions,
+    RawIngestOptions,
+    SerialOptions,
+    StreamOptions,
+)
+from holdfast.server.write_callback import WriteCallback
 from holdfast.types import (
     Access,
     Area,
+    BitArea,
     Extent,
     Forward,
     ListenerCounters,
@@ -24,7 +32,6 @@ from holdfast.types import (
     TlsFiles,
     WhenFull,
 )
-from holdfast.write_callback import WriteCallback
 
 __all__ = [
     "ADDRESSES",
@@ -32,12 +39,16 @@ __all__ = [
     "EXCEPTIONS",
     "FAULTS",
     "FUNCTIONS",
+    "MAX_LATENESS",
     "MAX_PDU",
     "OTHER_READS",
+    "READ_RECORDS",
+    "RETRY_PAUSES",
     "SUB_FUNCTIONS",
     "TLS_REASONS",
     "WRITE_FILE_RECORD",
     "Attempt",
+    "Batch",
     "BatchRefused",
     "BlockingClient",
     "Caller",
@@ -77,8 +88,7 @@ __all__ = [
     "plan_blocks",
     "read_memory_file",
     "release_memory_file",
-    "tell_disabled",
-    "write_across",
+    "write_disabled_status",
 ]
 
 __version__: str
@@ -99,11 +109,14 @@ registers that it reads and writes."""
 SUB_FUNCTIONS: Final[tuple[tuple[int, str, bool], ...]]
 """Each sub-function of function 8: code, name, and whether it changes the device."""
 
+READ_RECORDS: Final[int]
+"""Maximum number of file records that one request reads."""
+
 OTHER_READS: Final[tuple[int, ...]]
-"""Functions of the standard that only read, and that memories do not know."""
+"""Functions of the standard that only read, and that memories do not serve."""
 
 WRITE_FILE_RECORD: Final[int]
-"""The function that writes file records, which memories do not know."""
+"""The function that writes file records, which memories do not serve."""
 
 EXCEPTIONS: Final[dict[int, str]]
 """The names of exceptions, by code."""
@@ -113,6 +126,12 @@ FAULTS: Final[dict[str, int]]
 
 TLS_REASONS: Final[tuple[str, ...]]
 """Why TLS failed, as a word."""
+
+MAX_LATENESS: Final[float]
+"""The seconds after its timeout in which a late reply may come, without transaction ids."""
+
+RETRY_PAUSES: Final[tuple[float, float]]
+"""The first and the longest pause after failures, in seconds, where a device has no others."""
 
 class OutOfRange(IndexError):
     """The range is not inside the area. Nothing was read or written."""
@@ -368,25 +387,37 @@ class BatchRefused(ValueError):
     """`invalid_type`: a value of another type, or with `index` `None`, values that are not a
     sequence of integers. `invalid_value`: an integer out of range."""
 
-def write_across(
-    writes: Iterable[
-        tuple[Memory, Area, int, Iterable[int]] | tuple[Memory, Area, int, Iterable[int], bool]
-    ],
-    before: Callable[[bool], object] | None = None,
-) -> tuple[int, int | None]:
-    """Writes to several memories (memory, area, address, values) in one step.
+@final
+class Batch:
+    """Writes to several memories (memory, area, address, values), which were checked.
 
-    Returns the number of written values, and the sequence of the step if a log has carried it out.
     Readers of the memories see all writes or none. If one write ends with `True`, the batch is
     written only while all its memories are sealed: they are judged under the locks of the write.
-
-    `before` is called once all other checks have passed, with whether the writes can still be
-    refused: by a journal, or because a memory is not sealed. If it raises, nothing is written.
-
-    Raises `BatchRefused` for the first write with an invalid area, number of values or range, else
-    for the first invalid value. An error prevents all writes. An exception from the iterable
-    `writes` takes precedence over errors in later writes, and over errors in values.
     """
+
+    def __new__(
+        cls,
+        writes: Iterable[
+            tuple[Memory, Area, int, Iterable[int]] | tuple[Memory, Area, int, Iterable[int], bool]
+        ],
+    ) -> Batch:
+        """Checks the writes.
+
+        Raises `BatchRefused` for the first write with an invalid area, number of values or range,
+        else for the first invalid value. An exception from the iterable `writes` takes precedence
+        over errors in later writes, and over errors in values.
+        """
+
+    @property
+    def is_refusable(self) -> bool:
+        """Whether `write` can still refuse: by a journal, or because a memory is not sealed."""
+
+    def write(self) -> tuple[int, int | None]:
+        """Writes all values in one step.
+
+        Returns the number of written values, and the sequence of the step if a log has carried it
+        out. Raises `BatchRefused`; nothing has changed then.
+        """
 
 @final
 class Rule:
@@ -398,7 +429,8 @@ class Rule:
     both. `roles`, only with TLS, are the allowed roles of the peer's certificate: "" is a
     certificate without a role, `None` is any role. `narrowed` are units with rights of their own:
     access, functions, denied functions, and the ranges that they may read and write, each an area,
-    its first address and a count; `None` is everything.
+    its first address and a count; `None` is everything. `exception_status` is where units have the
+    eight bits that function 7 reads: area and address. Other units do not have the function.
 
     Raises `ValueError` for an invalid source or access.
     """
@@ -413,6 +445,7 @@ class Rule:
         deny: Sequence[int] | None = None,
         roles: Sequence[str] | None = None,
         narrowed: Mapping[int, NarrowedRights] | None = None,
+        exception_status: Mapping[int, tuple[BitArea, int]] | None = None,
     ) -> Rule: ...
 
 @final
@@ -598,93 +631,26 @@ def https_server_tls(
 class Listener:
     """The settings of a listener. The constructor makes a listener for Modbus over TCP connections.
 
-    `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP, `ascii` for ASCII over TCP; `tls`
-    enables TLS, with at most `max_handshakes` connections that are not authenticated yet, in
-    addition to `max_connections`. Times are in seconds; `idle_timeout` 0 is unlimited. With
-    `listen_only`, function 8 may set a unit to listen only mode, for all peers. `raw_ingest`, only
-    with `mbap` and without TLS, is a listener for packets whose connections come to the same port:
-    its own bind and limits are ignored. Raises `ValueError` for an invalid address, limit or time.
+    The options have all keys of their kind, see `holdfast.server.options`. Raises `ValueError` for
+    an invalid address, limit or time, `TypeError` for a key that is missing or has another type.
     """
 
     def __new__(
-        cls,
-        name: str,
-        bind: str,
-        rules: Sequence[Rule],
-        *,
-        framing: Literal["mbap", "rtu", "ascii"] = "mbap",
-        max_connections: int = 256,
-        max_connections_per_source: int | None = None,
-        when_full: WhenFull = "refuse",
-        idle_timeout: float = 300.0,
-        request_timeout: float = 10.0,
-        frame_timeout: float | None = None,
-        listen_only: bool = False,
-        tls: ServerTls | None = None,
-        max_handshakes: int = 256,
-        raw_ingest: Listener | None = None,
+        cls, name: str, bind: str, rules: Sequence[Rule], options: StreamOptions
     ) -> Listener: ...
     @staticmethod
-    def udp(
-        name: str,
-        bind: str,
-        rules: Sequence[Rule],
-        *,
-        framing: Literal["mbap", "rtu"] = "mbap",
-        listen_only: bool = False,
-    ) -> Listener:
-        """A listener for Modbus over UDP.
-
-        `framing` is `mbap` for Modbus UDP, `rtu` for RTU over UDP.
-        """
+    def udp(name: str, bind: str, rules: Sequence[Rule], options: DatagramOptions) -> Listener:
+        """A listener for Modbus over UDP."""
 
     @staticmethod
-    def serial(
-        name: str,
-        device: str,
-        rule: Rule,
-        *,
-        mode: Literal["rtu", "ascii"],
-        baud: int,
-        parity: Literal["none", "even", "odd"],
-        stop_bits: int,
-        data_bits: int,
-        silence: float | None = None,
-        rs485: Literal["rts", "rts-low"] | None = None,
-    ) -> Listener:
-        """A listener for a serial line; the sources of the rule are ignored.
-
-        `silence`, in seconds, ends an RTU frame; `None` is 3.5 characters. With `rs485`, the driver
-        switches the direction of the line by RTS, which is high or low while sending.
-        """
+    def serial(name: str, device: str, rule: Rule, options: SerialOptions) -> Listener:
+        """A listener for a serial line; the sources of the rule are ignored."""
 
     @staticmethod
     def raw_ingest(
-        name: str,
-        bind: str,
-        rules: Sequence[RawRule],
-        *,
-        format: Literal["v1", "crc"] = "v1",
-        crc: Literal["required", "none"] = "required",
-        flags: Literal["strict", "ignore"] = "strict",
-        max_connections: int = 256,
-        max_connections_per_source: int | None = None,
-        when_full: WhenFull = "refuse",
-        request_timeout: float = 10.0,
-        packets: Literal["one", "many"] = "one",
-        idle_timeout: float = 300.0,
-        after_refusal: Literal["close", "continue"] = "close",
-        tls: ServerTls | None = None,
-        max_handshakes: int = 256,
+        name: str, bind: str, rules: Sequence[RawRule], options: RawIngestOptions
     ) -> Listener:
-        """A listener for Raw Ingest packets.
-
-        With `crc` none, packets end with their payload. With `flags` ignore, flags and the reserved
-        byte may have any value. With `packets` many, a connection carries any number of them, until
-        the sender closes, one is refused, or none comes for `idle_timeout` seconds. With
-        `after_refusal` continue, only an invalid header or CRC ends the connection. `tls` and
-        `max_handshakes` are those of the constructor.
-        """
+        """A listener for Raw Ingest packets."""
 
 @final
 class Engine:
@@ -821,6 +787,30 @@ class Request:
         """Function 8."""
 
     @staticmethod
+    def exception_status() -> Request:
+        """Function 7."""
+
+    @staticmethod
+    def event_log() -> Request:
+        """Function 12."""
+
+    @staticmethod
+    def read_files(ranges: Sequence[tuple[int, int, int]]) -> Request:
+        """Function 20. Each range is a file, its first record and the number of records."""
+
+    @staticmethod
+    def write_files(ranges: Sequence[tuple[int, int, Iterable[int]]]) -> Request:
+        """Function 21. Each range is a file, its first record and the records."""
+
+    @staticmethod
+    def read_queue(address: int) -> Request:
+        """Function 24."""
+
+    @staticmethod
+    def of_function(code: int, data: bytes) -> Request:
+        """Any function. The result is what the reply has after the function code."""
+
+    @staticmethod
     def event_counter() -> Request:
         """Function 11."""
 
@@ -894,7 +884,7 @@ class Endpoint:
         close_after: int = 0,
         reconnect: float = 0.0,
     ) -> Endpoint:
-        """The same device, treated as `holdfast.client.tolerance.Tolerance` says."""
+        """The same device, treated as `holdfast.client.url.Tolerance` says."""
 
 @final
 class TlsChannel:
@@ -1055,7 +1045,8 @@ class Log:
     `tls` are files: trusted authorities, certificate, key. All files are read for each connection.
     With `when_behind="refuse"`, all reads are refused after `max_lag` seconds without contact.
     Servers that know less than this node have lost messages if that lasts `cut_off` seconds; the
-    error names `kept_file`, where a `MemoryFile` keeps the contents.
+    error names `kept_file`, where a `MemoryFile` keeps the contents. What is not given is as
+    `Settings::new` has it (crates/journal/src/log/defaults.rs).
 
     Raises `ValueError` for an unusable argument, also for a memory that has a log already.
     """
@@ -1067,17 +1058,13 @@ class Log:
         servers: Sequence[str],
         memories: Sequence[tuple[str, Memory]],
         *,
-        replicas: int = 1,
-        write_timeout: float = 1.0,
-        when_behind: Literal["serve", "refuse"] = "serve",
-        max_lag: float = 5.0,
-        snapshot_steps: int = 100_000,
-        snapshot_seconds: float = 600.0,
-        digest_steps: int = 10_000,
-        queue: int = 4096,
-        cut_off: float = 30.0,
+        replicas: int | None = None,
+        write_timeout: float | None = None,
+        when_behind: Literal["serve", "refuse"] | None = None,
+        max_lag: float | None = None,
+        digest_steps: int | None = None,
+        cut_off: float | None = None,
         kept_file: str | None = None,
-        connect_timeout: float = 2.0,
         user: str | None = None,
         password_file: str | PathLike[str] | None = None,
         token_file: str | PathLike[str] | None = None,
@@ -1126,7 +1113,7 @@ class LogFollower:
         time_ns: int | None = None,
         follow: bool = False,
         timeout: float = 10.0,
-        connect_timeout: float = 2.0,
+        connect_timeout: float | None = None,
         user: str | None = None,
         password_file: str | PathLike[str] | None = None,
         token_file: str | PathLike[str] | None = None,
@@ -1166,10 +1153,10 @@ class PolledDevice:
     (default: the interval). `report` takes the polls; `fields` are areas, addresses and counts that
     are read only for it, and not forwarded. `release` closes the
     connection after each poll. With `measured`, measurements replace `cost` after a while. `retry`
-    are the first and the longest pause after failures (default: 1 and 60). With `jitter`, they are
-    up to a quarter shorter, and the device is retried at the next time of its schedule; without,
-    when they end. With a `fence`, the device is polled and written to while that is open; devices
-    of one link have the same. Times are in seconds; interval 0 polls without a pause.
+    are the first and the longest pause after failures (default: `RETRY_PAUSES`). With `jitter`,
+    they are up to a quarter shorter, and the device is retried at the next time of its schedule;
+    without, when they end. With a `fence`, the device is polled and written to while that is open;
+    devices of one link have the same. Times are in seconds; interval 0 polls without a pause.
     """
 
     def __new__(
@@ -1394,7 +1381,7 @@ class Poller:
         `queue` is the most requests of listeners that wait, with `coalesce` one request answers
         equal reads that wait at the same time, for `cache` seconds a reply answers equal reads,
         reads of the addresses in `preferred` go before those of others, and `retry` are the first
-        and the longest pause after failures (default: 1 and 60). Raises `ValueError`, and
+        and the longest pause after failures (default: `RETRY_PAUSES`). Raises `ValueError`, and
         `RuntimeError` after `stop`.
         """
 
@@ -1458,7 +1445,7 @@ def encode_raw_ingest(
     above 65535.
     """
 
-def tell_disabled(memory: Memory, block: StatusBlock) -> None:
+def write_disabled_status(memory: Memory, block: StatusBlock) -> None:
     """Writes the status block of a device that is not polled.
 
     Raises `ValueError` if it does not fit.

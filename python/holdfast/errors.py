@@ -5,7 +5,7 @@
     ├── ConnectionLost       the connection ended before the reply
     │   ├── ConnectFailed    could not connect: nothing was sent
     │   └── TlsFailed        TLS failed: reason
-    ├── RequestTimeout       no reply within the timeout
+    ├── RequestTimeout       no reply or no connection within the timeout
     └── InvalidResponse      an invalid reply: reason
 
 Messages are for people. Programs should use classes and attributes.
@@ -80,7 +80,14 @@ class TlsFailed(ConnectionLost):
 
 
 class RequestTimeout(ModbusError, TimeoutError):
-    """No reply arrived within the timeout. The device may have executed the request."""
+    """No reply arrived within the timeout, or no connection was made in that time.
+
+    `maybe_sent` says whether the device may have executed the request.
+    """
+
+    def __init__(self, text: str = "", maybe_sent: bool = True) -> None:
+        self.maybe_sent = maybe_sent
+        super().__init__(text)
 
 
 class InvalidResponse(ModbusError):

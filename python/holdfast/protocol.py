@@ -57,8 +57,17 @@ CODES = tuple(OF_CODE)
 MAX_CODE = 0x7F
 """The largest function code; greater ones are exceptions (V1.1b3, 4.1)."""
 
+READ_RECORDS = _core.READ_RECORDS
+"""Maximum number of file records that one request reads."""
+
 OTHER_READS = _core.OTHER_READS
 """Functions that only devices have, and that change nothing."""
+
+READ_EXCEPTION_STATUS = 7
+"""Memories have this function only where the bits that it reads are set."""
+
+GET_COMM_EVENT_LOG = 12
+"""Memories have this function only on listeners with an event log."""
 
 WRITE_FILE_RECORD = _core.WRITE_FILE_RECORD
 WRITING_CODES = tuple(each.code for each in FUNCTIONS if each.writes)
@@ -90,6 +99,9 @@ READ_REGISTERS = READ_LIMITS["holding_registers"]
 READ_BITS = READ_LIMITS["coils"]
 WRITE_REGISTERS = WRITE_LIMITS["holding_registers"]
 WRITE_BITS = WRITE_LIMITS["coils"]
+
+MAX_ROLE = 255
+"""Bytes of the longest role of a certificate that rules can have."""
 
 EXCEPTIONS = _core.EXCEPTIONS
 """The names of exceptions, by code (V1.1b3, 7)."""

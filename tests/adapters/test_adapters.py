@@ -14,8 +14,8 @@ import pytest
 from holdfast import Memory
 from holdfast.adapters import Grant, MemoryAccess, Refused, Stop
 from holdfast.adapters.foreign import UnknownAdapter
-from holdfast.appliance import supervision as supervisor
-from holdfast.appliance.supervision import Supervisor
+from holdfast.appliance.services import supervision as supervisor
+from holdfast.appliance.services.supervision import Supervisor
 from support import wire
 from support.paths import EXAMPLES
 from support.running import endpoint
@@ -152,7 +152,7 @@ class Scripted:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pauses that tests can wait for."""
-    monkeypatch.setattr(supervisor, "FIRST_PAUSE", 0.001)
+    monkeypatch.setattr(supervisor, "FIRST_PAUSE_S", 0.001)
 
 
 @pytest.fixture
@@ -255,7 +255,7 @@ def test_a_status_that_raises_is_left_out(supervised: list[Supervisor]) -> None:
 
 
 def test_an_adapter_that_does_not_stop_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor, "STOP_TIMEOUT", 0.01)
+    monkeypatch.setattr(supervisor, "STOP_TIMEOUT_S", 0.01)
     free = threading.Event()
 
     class Stubborn(Scripted):

@@ -17,10 +17,12 @@ from prometheus_client.parser import text_string_to_metric_families
 import holdfast
 from holdfast.adapters import Grant, MemoryAccess, Refused
 from holdfast.adapters.metrics import Metrics
-from holdfast.appliance.supervision import Supervisor
-from holdfast.config import MetricsConfig
-from holdfast.web.health import Check
-from holdfast.web.port import listen
+from holdfast.appliance.parts.devices import Devices
+from holdfast.appliance.parts.mirrors import Mirrors
+from holdfast.appliance.services.supervision import Supervisor
+from holdfast.config import Config, MetricsConfig
+from holdfast.net.http.health import Check
+from holdfast.net.http.port import listen
 from support import web, wire
 
 if TYPE_CHECKING:
@@ -120,9 +122,9 @@ def memory_access(memories: dict[str, holdfast.Memory]) -> MemoryAccess:
 
 @pytest.fixture
 def diagnostics(memories: dict[str, holdfast.Memory], memory_access: MemoryAccess) -> Diagnostics:
-    engine = web.StandIn({"scada": LISTENER, "replication": RAW}, lost_events=11)
-    engine.threads = [("holdfast-io-0", 0.25, threading.get_native_id()), ("gone", 7.5, None)]
-    made = web.diagnostics_of(memories, engine)
+    others = web.StandIn({"scada": LISTENER, "replication": RAW}, events_lost=11)
+    others.threads = [("holdfast-io-0", 0.25, threading.get_native_id()), ("gone", 7.5, None)]
+    made = web.diagnostics_of(memories, others, devices())
     status = {
         "state": "failed",
         "restarts": 3,
@@ -137,10 +139,19 @@ def diagnostics(memories: dict[str, holdfast.Memory], memory_access: MemoryAcces
             "restarts": 0,
             "connections": {"refused_full": 3, "idle": 1, "broken_request": 4, "open": 2},
             "tls_failures": {"not_tls": 6},
+            **memory_access.counts(),
         }
     )
     mqtt: Any = SimpleNamespace(status=lambda: status)
-    made.adapters = {"rest": (rest, memory_access), "mqtt": (mqtt, None)}
+    made.adapters = {"rest": rest, "mqtt": mqtt}
+    return made
+
+
+def devices() -> Devices:
+    nothing: Any = None
+    spare: Any = SimpleNamespace(enabled=False)
+    config = Config.model_construct(devices={"spare": spare})
+    made = Devices(config, nothing, nothing, Mirrors(config))
     polled: Any = SimpleNamespace(
         counters=lambda: {
             "meter": METER,
@@ -149,9 +160,8 @@ def diagnostics(memories: dict[str, holdfast.Memory], memory_access: MemoryAcces
         }
     )
     made.poller = polled
-    made.disabled = ["spare"]
     bus: Any = SimpleNamespace(counters=lambda: LINK)
-    made.links = {"bus": bus}
+    made._links = {"bus": bus}
     return made
 
 
@@ -178,7 +188,7 @@ def address(diagnostics: Diagnostics, health: Healthy) -> Iterator[tuple[str, in
     settings = MetricsConfig.model_validate({"bind": "127.0.0.1:0"})
     listener = listen("127.0.0.1", 0)
     supervisor = Supervisor("metrics", lambda: Metrics(settings, diagnostics, health, listener))
-    diagnostics.adapters["metrics"] = (supervisor, None)
+    diagnostics.adapters["metrics"] = supervisor
     with web.supervised(supervisor, listener):
         yield listener.getsockname()
 
@@ -359,8 +369,7 @@ AUDIT = {
 def test_the_audit_log_when_there_is_one(
     client: web.Client, diagnostics: Diagnostics, audit: dict[str, object] | None
 ) -> None:
-    log: Any = None if audit is None else SimpleNamespace(counts=lambda: audit)
-    diagnostics.audit = log
+    web.stand_in(diagnostics).audit = audit
     seen = samples(client.get("/metrics").body.decode())
     assert seen.get(("holdfast_audit_lines_total",)) == (None if audit is None else 5)
     assert seen.get(("holdfast_audit_failed_total",)) == (None if audit is None else 1)
@@ -379,7 +388,7 @@ def test_a_real_server_is_shown(
     with wire.Connection(server.address) as modbus:
         modbus.ask(bytes.fromhex("0300000001"))
         modbus.ask(bytes.fromhex("03ffff0002"))
-        diagnostics._engine.listeners = {"real": server.counters()}  # type: ignore[attr-defined]
+        web.stand_in(diagnostics).listeners = {"real": server.counters()}
         seen = samples(client.get("/metrics").body.decode())
     assert seen["holdfast_requests_total", "3", "real"] == 2
     assert seen["holdfast_exceptions_total", "2", "real"] == 1
@@ -391,7 +400,7 @@ def test_no_counter_of_a_real_listener_is_forgotten(
 ) -> None:
     """What a listener newly counts as refused or closed belongs to a metric with its reason."""
     counters = server.counters()
-    diagnostics._engine.listeners = {"real": counters}  # type: ignore[attr-defined]
+    web.stand_in(diagnostics).listeners = {"real": counters}
     seen = samples(client.get("/metrics").body.decode())
     others = {key[1] for key in seen if key[0] == "holdfast_listener_total"}
     assert {name for name in others if name.startswith("connections")} == {
@@ -507,7 +516,7 @@ def test_nothing_else_is_there(client: web.Client, path: str) -> None:
 
 def test_a_name_of_any_kind_is_quoted(client: web.Client, diagnostics: Diagnostics) -> None:
     name = 'a"b\\c\nd'
-    diagnostics._engine.listeners[name] = {"requests": {3: 1}}  # type: ignore[attr-defined]
+    web.stand_in(diagnostics).listeners[name] = {"requests": {3: 1}}
     seen = samples(client.get("/metrics").body.decode())
     assert seen["holdfast_requests_total", "3", name] == 1
 
@@ -515,8 +524,8 @@ def test_a_name_of_any_kind_is_quoted(client: web.Client, diagnostics: Diagnosti
 def test_a_fault_of_one_part_is_answered_without_a_detail(
     client: web.Client, diagnostics: Diagnostics
 ) -> None:
-    diagnostics._engine.listeners["broken"] = None  # type: ignore[attr-defined]
+    web.stand_in(diagnostics).listeners["broken"] = None
     answer = client.get("/metrics")
     assert (answer.status, answer.json["reason"]) == (500, "internal_error")
-    del diagnostics._engine.listeners["broken"]  # type: ignore[attr-defined]
+    del web.stand_in(diagnostics).listeners["broken"]
     assert client.get("/metrics").status == 200

@@ -215,7 +215,7 @@ BAD = {
         text(command([1]), command([2], 5), command([1, 70000], 7)),
         "invalid_value",
     ),
-    "too many bytes": (" " * (inbox.MAX_BYTES - 1) + "{}", "too_large"),
+    "too many bytes": (" " * (inbox.MAX_PAYLOAD_BYTES - 1) + "{}", "too_large"),
 }
 
 
@@ -245,7 +245,7 @@ def test_the_largest_message_is_taken(rig: Rig) -> None:
     broker = rig.broker()
     running = rig.connected(broker)
 
-    payload = text(command([7])).ljust(inbox.MAX_BYTES)
+    payload = text(command([7])).ljust(inbox.MAX_PAYLOAD_BYTES)
     rig.probe(broker).publish("plant/ingest", payload)
     running.wait_until_received(1)
 
@@ -257,7 +257,7 @@ def test_a_message_of_many_times_the_limit(rig: Rig) -> None:
     running = rig.connected(broker)
 
     probe = rig.probe(broker)
-    probe.publish("plant/ingest", b"[" * (10 * inbox.MAX_BYTES))
+    probe.publish("plant/ingest", b"[" * (10 * inbox.MAX_PAYLOAD_BYTES))
     probe.publish("plant/ingest", text(command([7])))
     running.wait_until_received(2)
 

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from paho.mqtt.client import topic_matches_sub
 
-from holdfast.adapters.mqtt.adapter import Mqtt
-from holdfast.adapters.mqtt.filters import Filters
+from holdfast.adapters.mqtt import Mqtt
+from holdfast.adapters.mqtt.inbox import Filters
 from holdfast.ingest import MemoryAccess
-from holdfast.mqtt.packets import parse_publish
+from holdfast.net.mqtt.packets import parse_publish
 from holdfast.runtime.stop import Stop
 from support import mqtt_peer as mqtt
 from support.mqtt_rig import settings, subscription

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.adapters.mqtt import adapter, inbox, link
+from holdfast.adapters.mqtt import adapter, connection, inbox
 from holdfast.ingest import MemoryAccess
-from holdfast.mqtt import dialing
-from holdfast.mqtt.stream import BrokerSocket
+from holdfast.net.mqtt import dialing
+from holdfast.net.mqtt.stream import BrokerSocket
 from support import mqtt_peer as mqtt
 from support import wire
 from support.mqtt_peer import FakeBroker, publish
@@ -207,7 +207,7 @@ def test_it_asks_for_a_session_that_is_kept(rig: Rig, fake: FakeBroker, tmp_path
     with fake.accept() as peer:
         body = peer.expect(mqtt.CONNECT).body
 
-    expiry = bytes([mqtt.SESSION_EXPIRY]) + struct.pack(">I", link.SESSION_EXPIRY)
+    expiry = bytes([mqtt.SESSION_EXPIRY]) + struct.pack(">I", connection.SESSION_EXPIRY_S)
     assert body == b"".join(
         [
             mqtt.string("MQTT"),
@@ -373,12 +373,12 @@ def test_it_survives_packets_in_single_bytes(rig: Rig, fake: FakeBroker) -> None
 def test_a_broker_that_says_nothing_is_left(
     rig: Rig, fake: FakeBroker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(adapter, "WELCOME", 0.1)
-    monkeypatch.setattr(adapter, "_TICK", 0.05)
+    monkeypatch.setattr(adapter, "CONNACK_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(adapter, "_CHECK_INTERVAL_S", 0.05)
     running = run(rig, fake)
     with fake.accept() as peer:
         peer.wait_until_closed()
-    monkeypatch.setattr(adapter, "WELCOME", wire.DEADLINE)
+    monkeypatch.setattr(adapter, "CONNACK_TIMEOUT_S", wire.DEADLINE)
     wire.until(lambda: "did not answer" in str(running.status()["last_error"]), "it gave up")
     with welcomed(fake) as peer:
         works(rig, peer, fake.version)
@@ -489,23 +489,23 @@ def test_a_packet_too_large_is_not_kept_while_it_comes(
     rig: Rig, fake: FakeBroker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept = []
-    read = link.BrokerConnection.read_more
+    read = connection.BrokerConnection.read_more
 
-    def spy(self: link.BrokerConnection) -> None:
+    def spy(self: connection.BrokerConnection) -> None:
         read(self)
         kept.append(len(self._packets._body) + len(self._packets._left))
 
-    monkeypatch.setattr(link.BrokerConnection, "read_more", spy)
+    monkeypatch.setattr(connection.BrokerConnection, "read_more", spy)
     run(rig, fake)
     with fake.accept() as peer:
         peer.welcome()
-        size = 6 * inbox.MAX_BYTES
+        size = 6 * inbox.MAX_PAYLOAD_BYTES
         peer.send(publish("plant/ingest", b"[" * size, 1, 3, version=fake.version))
         assert peer.expect(mqtt.PUBACK).identifier == 3
         works(rig, peer, fake.version)
 
     assert rig.memory_access.counts()["refused"] == {"too_large": 1}
-    assert max(kept) < inbox.MAX_BYTES
+    assert max(kept) < inbox.MAX_PAYLOAD_BYTES
 
 
 def test_a_broker_that_sends_messages_lives_though_it_answers_no_ping(
@@ -606,7 +606,7 @@ class Jammed(socket.socket):
 def test_nothing_piles_up_while_the_broker_does_not_read(
     rig: Rig, fake5: FakeBroker, monkeypatch: pytest.MonkeyPatch, qos: int
 ) -> None:
-    dial, read = dialing.dial, link.BrokerConnection.read_more
+    dial, read = dialing.dial, connection.BrokerConnection.read_more
     most = {"packets": 0, "answers": 0}
 
     def dial_one_that_jams(*arguments: Any) -> BrokerSocket:
@@ -615,13 +615,13 @@ def test_nothing_piles_up_while_the_broker_does_not_read(
         dialed.connection.setblocking(False)
         return dialed
 
-    def spy(self: link.BrokerConnection) -> None:
+    def spy(self: connection.BrokerConnection) -> None:
         read(self)
         most["packets"] = max(most["packets"], self.connection.unsent)
         most["answers"] = max(most["answers"], len(self._on_the_way) + len(self._waiting))
 
     monkeypatch.setattr(adapter, "dial", dial_one_that_jams)
-    monkeypatch.setattr(link.BrokerConnection, "read_more", spy)
+    monkeypatch.setattr(connection.BrokerConnection, "read_more", spy)
     monkeypatch.setattr(Jammed, "jam", threading.Event())
     running = run(rig, fake5)
     with fake5.accept() as peer:
@@ -632,13 +632,17 @@ def test_nothing_piles_up_while_the_broker_does_not_read(
         sender = threading.Thread(target=peer.send, args=[messages])
         sender.start()  # apart, because the adapter may stop reading
         if qos:
-            wire.until(lambda: most["packets"] >= link.MAX_UNSENT, "it stops reading")
+            wire.until(lambda: most["packets"] >= connection.MAX_UNSENT_PACKETS, "it stops reading")
         else:
             wire.until(lambda: running.status()["received"] == 5000, "it goes on reading")
 
         assert running.status()["answers_dropped"] > 0
-        assert link.MAX_WAITING <= most["packets"] <= link.MAX_UNSENT + link.MAX_WAITING
-        assert most["answers"] <= link.MAX_WAITING
+        assert (
+            connection.MAX_WAITING_PACKETS
+            <= most["packets"]
+            <= connection.MAX_UNSENT_PACKETS + connection.MAX_WAITING_PACKETS
+        )
+        assert most["answers"] <= connection.MAX_WAITING_PACKETS
 
         Jammed.jam.clear()  # the broker reads again, and things go on
         for _ in range(5000 if qos else 0):

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import pytest
 
 import holdfast
-from holdfast import logs
 from holdfast.adapters import Grant, MemoryAccess, Stop
 from holdfast.adapters.rest.operations import document as document_of
-from holdfast.audit import Audit
-from holdfast.web.host import ConnectionLimits, Host
-from holdfast.web.port import listen
+from holdfast.events import log_lines
+from holdfast.events.audit import Audit
+from holdfast.events.throttle import Throttle
+from holdfast.net.http.host import ConnectionLimits, Host
+from holdfast.net.http.port import listen
 from support import web, wire
 from support.audits import writes
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from holdfast.web.requests import Request, Response
+    from holdfast.net.http.requests import Request, Response
 
 ADMIN, READER, NARROW, OTHER = "secret-admin", "secret-reader", "secret-narrow", "secret-other"
 TOKENS = [
@@ -103,14 +104,14 @@ def client(service: web.Service, connect: Connect) -> web.Client:
 @pytest.fixture
 def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[web.Records]:
     """All that the project logs, nothing held back."""
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle(burst=10**6))
+    monkeypatch.setattr(log_lines, "_REFUSALS", Throttle(burst=10**6))
     records = web.Records()
-    level = logs.LOGGER.level
-    logs.LOGGER.addHandler(records)
-    logs.LOGGER.setLevel("DEBUG")
+    level = log_lines.LOGGER.level
+    log_lines.LOGGER.addHandler(records)
+    log_lines.LOGGER.setLevel("DEBUG")
     yield records
-    logs.LOGGER.removeHandler(records)
-    logs.LOGGER.setLevel(level)
+    log_lines.LOGGER.removeHandler(records)
+    log_lines.LOGGER.setLevel(level)
 
 
 # Writing.
@@ -751,7 +752,7 @@ def test_memories_with_areas_starts_sizes_and_seal(client: web.Client) -> None:
 
 
 def test_stats_count_what_came(client: web.Client, service: web.Service) -> None:
-    service.diagnostics._engine.listeners["scada"] = {  # type: ignore[attr-defined]
+    web.stand_in(service.diagnostics).listeners["scada"] = {
         "requests": {3: 5},
         "exceptions": {2: 1},
     }
@@ -776,7 +777,7 @@ def test_mqtt_when_there_is_none(client: web.Client) -> None:
 def test_mqtt_when_there_is_one(client: web.Client, service: web.Service) -> None:
     status = {"connected": True, "broker": "mqtt://b:1883", "topics": ["a"], "last_error": "x"}
     told: Any = SimpleNamespace(status=lambda: status)
-    service.diagnostics.adapters["mqtt"] = (told, None)
+    service.diagnostics.adapters["mqtt"] = told
     assert client.get("/api/v1/diagnostics/mqtt").json == status
 
 

@@ -185,7 +185,7 @@ def test_a_reconnect_begins_with_the_current_state(
 def test_while_nothing_changes_there_are_signs_of_life(
     monkeypatch: pytest.MonkeyPatch, service: web.Service, follow: Follow
 ) -> None:
-    monkeypatch.setattr(changes, "HEARTBEAT", 0.02)
+    monkeypatch.setattr(changes, "HEARTBEAT_INTERVAL_S", 0.02)
     events = iter(follow(service, span(min_interval=3600)))
     assert [next(events).name for _ in range(4)] == ["values", ":", ":", ":"]
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast import logs
+from holdfast.events import log_lines
 from support import web
 
 if TYPE_CHECKING:
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 def log() -> Iterator[web.Records]:
     """All that the project logs, from level info."""
     records = web.Records()
-    level = logs.LOGGER.level
-    logs.LOGGER.addHandler(records)
-    logs.LOGGER.setLevel("INFO")
+    level = log_lines.LOGGER.level
+    log_lines.LOGGER.addHandler(records)
+    log_lines.LOGGER.setLevel("INFO")
     yield records
-    logs.LOGGER.removeHandler(records)
-    logs.LOGGER.setLevel(level)
+    log_lines.LOGGER.removeHandler(records)
+    log_lines.LOGGER.setLevel(level)

@@ -15,8 +15,8 @@ import pytest
 
 from holdfast.adapters import Stop
 from holdfast.net.addresses import joined
-from holdfast.web import port as ports
-from holdfast.web.port import Port
+from holdfast.net.http import port as ports
+from holdfast.net.http.port import Port
 from support import web, wire
 from support.cli import RunCommand
 from support.running import endpoint
@@ -75,8 +75,8 @@ def taken() -> Iterator[Taken]:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pauses that tests can wait for."""
-    monkeypatch.setattr(ports, "FIRST_PAUSE", 0.01)
-    monkeypatch.setattr(ports, "MAX_PAUSE", 0.02)
+    monkeypatch.setattr(ports, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(ports, "MAX_PAUSE_S", 0.02)
 
 
 def status(appliance: Appliance, name: str) -> dict[str, Any]:
@@ -145,7 +145,7 @@ def test_metrics_show_that_a_service_has_no_port(run: Run, taken: Taken) -> None
 def test_a_stop_ends_the_wait_for_a_port_at_once(
     run: Run, taken: Taken, log: web.Records, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for pause in ("FIRST_PAUSE", "MAX_PAUSE"):
+    for pause in ("FIRST_PAUSE_S", "MAX_PAUSE_S"):
         monkeypatch.setattr(ports, pause, 10 * wire.DEADLINE)
     appliance = run(taken.configuration())
     appliance.stop()
@@ -251,7 +251,7 @@ def test_another_reason_and_a_long_time_are_logged_again(
     reasons += [errno.EADDRNOTAVAIL, *[errno.EADDRINUSE] * 3]
     port = Port("rest", "127.0.0.1", 80)
     assert not port.wait(Clocked(3))
-    monkeypatch.setattr(ports, "LOG_INTERVAL", 0)
+    monkeypatch.setattr(ports, "LOG_INTERVAL_S", 0)
     assert not port.bind()
     assert [(each["reason"], each["attempts"]) for each in log.of("adapter_not_listening")] == [
         ("Cannot assign requested address", 1),

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.appliance import running
 from holdfast.runtime.standstill import WallClock
 from support import wire
 from support.audits import lines
@@ -37,7 +36,7 @@ def test_a_step_of_the_wall_clock_is_logged_and_recorded(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(running, "HEALTH_CHECK_INTERVAL", 0.0)
+    monkeypatch.setattr("holdfast.appliance.appliance.CHECK_INTERVAL_S", 0.0)
     appliance = run(CONFIGURATION)
     appliance.log_events(0)
     real = time.time

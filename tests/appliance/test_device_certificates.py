@@ -102,7 +102,7 @@ def test_the_poller_presents_them(owned: Owned, start: Any) -> None:
     rig = start({"memories": {"plant": {"holding_registers": 10}}, "devices": {"plc": device}})
 
     def has(health: str) -> bool:
-        return bool(rig.appliance.diagnostics.devices()["plc"]["health"] == health)
+        return bool(rig.appliance.diagnostics.stats()["devices"]["plc"]["health"] == health)
 
     wire.until(lambda: has("error"), "the device refuses the certificate")
     owned.renew()

@@ -19,7 +19,7 @@ import pytest
 from holdfast.appliance import Appliance
 from holdfast.client.url import connection_of, parse
 from holdfast.config import ConfigError, load
-from holdfast.leases import LEASE_TIMES, LeaseTimes
+from holdfast.replication.leases import LEASE_TIMES, LeaseTimes
 from support import wire
 from support.brokers import NatsServer
 from support.cli import RunCommand, invoke
@@ -39,7 +39,7 @@ RUN = f"""
 import sys
 from holdfast.appliance import Appliance
 from holdfast.config import load
-from holdfast.leases import LeaseTimes
+from holdfast.replication.leases import LeaseTimes
 with Appliance(load(sys.argv[1]), lease_times={BRIEF}) as appliance:
     while True:
         appliance.log_events(1.0)
@@ -140,7 +140,7 @@ def ask(appliance: Appliance, pdu: str) -> str:
 
 
 def health(appliance: Appliance) -> str:
-    found: str = appliance.diagnostics.devices()["meter"]["health"]
+    found: str = appliance.diagnostics.stats()["devices"]["meter"]["health"]
     return found
 
 
@@ -309,12 +309,12 @@ def test_replicas_shows_who_polls_what(settings: Callable[..., Path], device: De
 
 
 def check_replicas(file: Path) -> None:
-    result = invoke("replicas", str(file))
+    result = invoke("log", "status", str(file))
     assert result.exit_code == 0, result.output
     assert "polled by" in result.stdout
     [line] = [line for line in result.stdout.splitlines() if line.strip().startswith("meter")]
     assert line.split() == ["meter", "a"]
-    result = invoke("replicas", str(file), "--json")
+    result = invoke("log", "status", str(file), "--json")
     [status] = json.loads(result.stdout)["logs"].values()
     assert status["devices"] == {"meter": {"node": "a", "polled_here": True}}
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast import ecs, logs, security_events
+from holdfast.events import ecs, log_lines, security
 from support import wire
 from support.cli import RunCommand
 
@@ -94,7 +94,7 @@ def test_other_events_are_in_another_dataset_and_have_no_category() -> None:
         "dataset": "holdfast.log",
         "action": "device_health",
     }
-    assert "device_health" not in security_events.EVENTS
+    assert "device_health" not in security.EVENTS
 
 
 def test_an_exception_is_an_error_message() -> None:
@@ -104,7 +104,7 @@ def test_an_exception_is_an_error_message() -> None:
         info = (OSError, error, None)
     record = logging.LogRecord("holdfast", logging.ERROR, "", 0, "audit_failed", (), info)
     record.fields = {"file": "/var/log/audit.log"}
-    made = json.loads(logs.EcsFormatter().format(record))
+    made = json.loads(log_lines.LineFormatter("ecs").format(record))
     assert made["error"] == {"message": "OSError: no space left"}
     assert made["file"] == {"path": "/var/log/audit.log"}
     assert made["event"]["outcome"] == "failure"

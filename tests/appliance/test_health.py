@@ -6,29 +6,31 @@ import json
 import socket
 import threading
 from contextlib import closing
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from holdfast.adapters import Stop
-from holdfast.appliance import Appliance, liveness, running
+from holdfast.appliance import Appliance, liveness
 from holdfast.appliance.health import Health
-from holdfast.appliance.liveness import MAIN_STALLED, STALLED, Liveness
-from holdfast.appliance.shared_logs import _obstacle
-from holdfast.appliance.supervision import Supervisor
+from holdfast.appliance.liveness import MAIN_STALLED_S, STALLED_S, Liveness
+from holdfast.appliance.parts.shared_logs import _obstacle
+from holdfast.appliance.services.supervision import Supervisor
 from holdfast.config import load
-from holdfast.web import port
-from holdfast.web.health import Check
-from holdfast.web.port import Port
+from holdfast.net.http import port
+from holdfast.net.http.health import Check
+from holdfast.net.http.port import Port
 from support import web, wire
 from support.brokers import NatsServer
 from support.running import endpoint, log_events
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     import holdfast
+    from holdfast.appliance.parts.part import Part
     from support.running import Run
 
 LISTENER = """
@@ -52,8 +54,8 @@ devices:
 
 @pytest.fixture(autouse=True)
 def short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running, "HEALTH_CHECK_INTERVAL", 0.0)
-    monkeypatch.setattr(port, "FIRST_PAUSE", 0.05)
+    monkeypatch.setattr("holdfast.appliance.appliance.CHECK_INTERVAL_S", 0.0)
+    monkeypatch.setattr(port, "FIRST_PAUSE_S", 0.05)
 
 
 def probe(appliance: Appliance, path: str = "ready") -> tuple[int, dict[str, Any]]:
@@ -200,8 +202,7 @@ def test_probes_are_told_of_a_stop_that_waits(run: Run, monkeypatch: pytest.Monk
     until_ready(appliance)
     address = endpoint(appliance, "metrics")
     waits = threading.Event()
-    assert appliance._running is not None
-    monkeypatch.setattr(appliance._running._logs, "stop", waits.wait)
+    monkeypatch.setattr(appliance._parts().leases, "close", waits.wait)
     stopping = threading.Thread(target=appliance.stop)
     with closing(web.Client(address)) as client:
         stopping.start()
@@ -237,11 +238,11 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 def test_a_main_thread_that_hangs_is_stalled_and_a_suspended_process_is_not(clock: Clock) -> None:
     ages = {"io": 0.5, "without a loop": 0.0}
     watched = Liveness(lambda: [(name, age, None) for name, age in ages.items()])
-    clock.now += MAIN_STALLED
+    clock.now += MAIN_STALLED_S
     assert watched.stalled() == []
     clock.now += 1
     assert watched.stalled() == ["main"]
-    ages["io"] = MAIN_STALLED + 1.5
+    ages["io"] = MAIN_STALLED_S + 1.5
     assert watched.stalled() == []
     ages["io"] = 0.5
     watched.check()
@@ -252,12 +253,11 @@ def test_the_watchdog_has_the_judgement_of_the_probe(
     run: Run, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     appliance = run(PLANT)
-    running = appliance._running
-    assert running is not None
+    running = appliance._parts()
     wire.until(lambda: probe(appliance, "live")[0] == 200, "it is served")
     assert appliance.is_live
     monkeypatch.setattr(
-        running.liveness, "_heartbeats", lambda: [("holdfast-poller", STALLED + 2, None)]
+        running.liveness, "_heartbeats", lambda: [("holdfast-poller", STALLED_S + 2, None)]
     )
     clock.now += 1
     running.liveness.check()
@@ -297,3 +297,22 @@ def test_devices_that_another_node_polls_are_no_reason_to_wait() -> None:
     assert health._started() == Check(False, "not polled yet: d")
     devices["d"] = "standby"
     assert health._started() == Check(True, "2 polled, 1 without valid replies, 2 on standby")
+
+
+def test_a_part_that_fails_to_close_does_not_keep_the_others_open(run: Run) -> None:
+    appliance = run(PLANT)
+    running = appliance._running
+    assert running is not None
+    closed: list[Part] = []
+
+    def close(part: Part, original: Callable[[], None]) -> None:
+        original()
+        closed.append(part)
+        if len(closed) == 1:
+            raise OSError("the first one")
+
+    for part in running._parts:
+        part.close = partial(close, part, part.close)  # type: ignore[method-assign]
+    with pytest.raises(OSError, match="the first one"):
+        appliance.stop()
+    assert sorted(map(id, closed)) == sorted(map(id, running._parts))

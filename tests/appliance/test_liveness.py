@@ -9,8 +9,8 @@ import pytest
 
 from holdfast import _core
 from holdfast.appliance import liveness
-from holdfast.appliance.liveness import STALLED, Liveness, cpu_time
-from holdfast.appliance.supervision import Supervisor
+from holdfast.appliance.liveness import STALLED_S, Liveness, cpu_time
+from holdfast.appliance.services.supervision import Supervisor
 from holdfast.runtime.heartbeat import Heartbeat
 from support import wire
 
@@ -85,9 +85,9 @@ def test_a_stalled_thread_is_logged_once_and_when_it_is_back(
         watched.check()
         return not watched.stalled()
 
-    ages["io"] = STALLED
+    ages["io"] = STALLED_S
     assert check()
-    for age in (STALLED + 2, STALLED + 3, STALLED + 0.1):
+    for age in (STALLED_S + 2, STALLED_S + 3, STALLED_S + 0.1):
         ages["io"] = age
         assert not check()
     assert [each["thread"] for each in log.of("thread_stalled")] == ["io"]
@@ -114,7 +114,7 @@ def test_a_process_that_was_suspended_has_no_stalled_threads(
 
 
 def test_a_thread_that_has_ended_as_it_should_is_not_stalled(clock: Clock) -> None:
-    beats: list[ThreadHeartbeat] = [("nats", STALLED + 2, None)]
+    beats: list[ThreadHeartbeat] = [("nats", STALLED_S + 2, None)]
     watched = Liveness(lambda: beats)
     clock.now += 1
     watched.check()
@@ -243,7 +243,7 @@ def test_a_thread_that_has_died_is_stalled(supervise: Any, monkeypatch: pytest.M
         raise KeyboardInterrupt
 
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
-    monkeypatch.setattr("holdfast.appliance.supervision._step_back", die)
+    monkeypatch.setattr("holdfast.appliance.services.supervision._lower_priority", die)
     supervisor = supervise(Adapter())
     wire.until(lambda: (age_of(supervisor) or 0.0) > 0.0, "the age of the thread grows")
     supervisor._has_ended = True

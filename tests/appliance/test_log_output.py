@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast import log_output
-from holdfast.log_output import QueuedHandler
+from holdfast.events import writer as log_output
+from holdfast.events.writer import QueuedHandler
 from support import wire
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def test_lines_arrive_in_order(pipe: tuple[int, Any]) -> None:
 def test_a_reader_that_stops_loses_the_newest_lines_which_are_counted(
     pipe: tuple[int, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(log_output, "MAX_LINES", 100)
+    monkeypatch.setattr(log_output, "MAX_WAITING_LINES", 100)
     reader, stream = pipe
     handler, text = QueuedHandler(stream, timeout=0.05), "x" * 999
     while handler.dropped < 5:

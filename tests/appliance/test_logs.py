@@ -7,8 +7,8 @@ import logging
 
 import pytest
 
-from holdfast import logs
-from holdfast.logs import NOBODY, OTHERS, Origin
+from holdfast.events import log_lines
+from holdfast.events.throttle import NOBODY, OTHERS, Origin, Throttle, origin
 
 
 def record(**fields: object) -> logging.LogRecord:
@@ -19,18 +19,18 @@ def record(**fields: object) -> logging.LogRecord:
 
 
 def test_text_has_time_level_event_and_fields() -> None:
-    line = logs.TextFormatter().format(record(listener="scada", peer="10.0.0.9:1"))
+    line = log_lines.LineFormatter("text").format(record(listener="scada", peer="10.0.0.9:1"))
     assert line == "1970-01-01T00:00:00.250Z warning refused listener=scada peer=10.0.0.9:1"
 
 
 @pytest.mark.parametrize("value", ["a b", "a=b", 'a"b', "a\nb", ""])
 def test_a_field_that_could_be_mistaken_is_quoted(value: str) -> None:
-    line = logs.TextFormatter().format(record(name=value))
+    line = log_lines.LineFormatter("text").format(record(name=value))
     assert line.endswith(f"name={json.dumps(value)}")
 
 
 def test_json_has_the_same_fields() -> None:
-    line = json.loads(logs.JsonFormatter().format(record(listener="scada", count=3)))
+    line = json.loads(log_lines.LineFormatter("json").format(record(listener="scada", count=3)))
     assert line == {
         "time": "1970-01-01T00:00:00.250Z",
         "level": "warning",
@@ -43,7 +43,7 @@ def test_json_has_the_same_fields() -> None:
 def test_what_was_held_back_is_told_even_if_nothing_follows(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    throttle = logs.Throttle(burst=2, window=10)
+    throttle = Throttle(burst=2, window=10)
     for now in (0.0, 1.0, 2.0, 3.0):
         throttle.admit("a", now)
     throttle.admit("b", 0.0)
@@ -53,19 +53,19 @@ def test_what_was_held_back_is_told_even_if_nothing_follows(
     assert throttle.over(30.0) == []
     assert throttle.admit("a", 11.0) == (True, 0)
 
-    throttle = logs.Throttle(burst=1, window=3600)
-    monkeypatch.setattr(logs, "_REFUSALS", throttle)
+    throttle = Throttle(burst=1, window=3600)
+    monkeypatch.setattr(log_lines, "_REFUSALS", throttle)
     for _ in range(4):
-        logs.refused("refused_source", kind=("scada", None))
-    logs.tell_held_back()
+        log_lines.refused("refused_source", kind=("scada", None))
+    log_lines.tell_held_back()
     assert not [each for each in caplog.records if each.message == "held_back"]
-    logs.tell_held_back(all_of_them=True)
+    log_lines.tell_held_back(all_of_them=True)
     [told] = [vars(each)["fields"] for each in caplog.records if each.message == "held_back"]
     assert told == {"of": "refused_source", "kind": "scada", "count": 3}
 
 
 def test_a_flood_is_held_back_and_its_number_told() -> None:
-    throttle = logs.Throttle(burst=2, window=10.0)
+    throttle = Throttle(burst=2, window=10.0)
     assert [throttle.admit("kind", now) for now in (0.0, 1.0, 2.0, 3.0)] == [
         (True, 0),
         (True, 0),
@@ -81,7 +81,7 @@ NOISE = Origin("10.0.0.9")
 
 
 def test_a_noisy_source_does_not_hide_others() -> None:
-    throttle = logs.Throttle(burst=20, window=10.0)
+    throttle = Throttle(burst=20, window=10.0)
     assert sum(throttle.admit("kind", 0.0, NOISE)[0] for _ in range(1000)) == 20
     others = [Origin("10.0.0.9", "CN=a", "subject"), Origin("10.0.0.7"), Origin("10.0.0.8")]
     assert [throttle.admit("kind", 1.0, by) for by in others] == [(True, 0)] * 3
@@ -91,13 +91,13 @@ def test_a_noisy_source_does_not_hide_others() -> None:
 
 
 def test_events_that_were_counted_before_are_held_back_except_one() -> None:
-    throttle = logs.Throttle(burst=20, window=10.0)
+    throttle = Throttle(burst=20, window=10.0)
     assert throttle.admit("kind", 0.0, NOISE, times=100) == (True, 0)
     assert throttle.admit("kind", 10.0, NOISE) == (True, 99)
 
 
 def test_sources_and_subjects_beyond_the_table_are_counted_together() -> None:
-    throttle = logs.Throttle(burst=0, window=10.0, most=8, of_source=2)
+    throttle = Throttle(burst=0, window=10.0, most=8, of_source=2)
     for subject in range(100):
         throttle.admit("kind", 0.0, Origin("10.0.0.9", f"CN={subject}", "subject"), times=2)
     for source in range(100):
@@ -132,20 +132,20 @@ def test_sources_and_subjects_beyond_the_table_are_counted_together() -> None:
 def test_the_origin_of_an_event_is_its_source_and_its_subject(
     fields: dict[str, object], expected: Origin
 ) -> None:
-    assert logs.origin("refused", fields) == expected
+    assert origin("refused", fields) == expected
 
 
 def test_the_subject_of_a_message_is_nobody() -> None:
-    assert logs.origin("message_malformed", {"subject": "modbus.x"}) == NOBODY
+    assert origin("message_malformed", {"subject": "modbus.x"}) == NOBODY
 
 
 def test_what_was_held_back_is_told_with_its_origin(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle(burst=1, window=0))
+    monkeypatch.setattr(log_lines, "_REFUSALS", Throttle(burst=1, window=0))
     fields = {"listener": "scada", "peer": "10.0.0.9:51200", "subject": "CN=a"}
-    logs.count(logging.WARNING, "tls_failed", fields, kind=("scada", "expired"), times=7)
-    logs.tell_held_back()
+    log_lines.count(logging.WARNING, "tls_failed", fields, kind=("scada", "expired"), times=7)
+    log_lines.tell_held_back()
     [told] = [vars(each)["fields"] for each in caplog.records if each.message == "held_back"]
     assert told == {
         "of": "tls_failed",

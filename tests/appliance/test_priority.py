@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 from nats.errors import Error
 
-from holdfast.appliance import supervision
+from holdfast.appliance.services import supervision
 from support import wire
 from support.nats_bus import Caller, subscription, tag
 
@@ -38,7 +38,7 @@ def lower(monkeypatch: pytest.MonkeyPatch) -> int:
     own = os.getpriority(os.PRIO_PROCESS, 0)
     if own >= 19:
         pytest.skip("the tests have the lowest priority")
-    monkeypatch.setattr(supervision, "POLITENESS", own + 1)
+    monkeypatch.setattr(supervision, "NICE", own + 1)
     return own + 1
 
 
@@ -98,7 +98,7 @@ def test_a_starter_tells_that_a_thread_can_not_be_started(threads: Threads) -> N
     with pytest.raises(RuntimeError, match="once"):
         starter.start(started)
     starter.close()
-    wire.until(lambda: not threads.named("holdfast-starter"), "it has ended")
+    wire.until(lambda: not threads.named("holdfast-starter_0"), "it has ended")
 
 
 def test_the_starter_ends_with_the_adapter(
@@ -106,7 +106,7 @@ def test_the_starter_ends_with_the_adapter(
 ) -> None:
     appliance = run(NODE.format(url=own_nats.url))
     wire.until(lambda: threads.named("holdfast-leases"), "the leases have their thread")
-    assert threads.named("holdfast-starter")
+    assert threads.named("holdfast-starter_0")
     wire.until(lambda: is_connected(appliance), "the scanner is connected")
     appliance.stop()
-    wire.until(lambda: not threads.named("holdfast-starter"), "it has ended")
+    wire.until(lambda: not threads.named("holdfast-starter_0"), "it has ended")

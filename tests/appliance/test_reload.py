@@ -17,9 +17,9 @@ import pytest
 
 import holdfast
 from holdfast import raw_ingest
-from holdfast.appliance import Appliance, running
-from holdfast.appliance.changes import ReloadIncomplete, ReloadRefused
-from holdfast.appliance.mirrors import Mirrors
+from holdfast.appliance import Appliance
+from holdfast.appliance.parts.mirrors import Mirrors
+from holdfast.appliance.reload import ReloadIncomplete, ReloadRefused, restart_reasons
 from holdfast.config import load
 from support import wire
 from support.certificates import Certificates, Issued, named
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from holdfast.config import Config
     from support.running import Connect, Serve
 
 READ = bytes.fromhex("0300070001")
@@ -227,6 +228,34 @@ def test_what_requires_a_restart_is_refused(
     assert client.ask(WRITE) == WRITE
 
 
+def test_each_reason_for_a_restart_is_told_in_the_order_of_the_docs(rig: Rig) -> None:
+    def config(number: int) -> Config:
+        kept = {"coils": 8, "keep": {"file": f"{number}.hfm"}}
+        device = {"url": "tcp://10.0.0.2", "interval": 1, "in_flight": number}
+        settings = {
+            "memories": {"plant": {"coils": 8 * number}, "kept": kept, f"only{number}": kept},
+            "listeners": {"scada": listener(rule("127.0.0.0/8"))},
+            "workers": number,
+            "audit": {"file": f"{number}.log"},
+            "links": {"line": {"url": "tcp://10.0.0.1", "queue": number}},
+            "devices": {"pump": device},
+        }
+        found: Config = rig.load(settings)
+        return found
+
+    assert list(restart_reasons(config(1), config(1))) == []
+    assert list(restart_reasons(config(1), config(2))) == [
+        "memories.plant: areas or seal changed",
+        "memories.kept: keep changed",
+        "memories.only1: removed; its values would be lost",
+        "memories.only2: added with keep or replicate",
+        "workers: changed",
+        "audit: changed",
+        "links.line: settings of a connection in use changed",
+        "devices.pump: in_flight, retry or tolerance of a connection in use changed",
+    ]
+
+
 def test_memories_are_added_and_initial_values_are_not_written_again(
     rig: Rig, connect: Connect
 ) -> None:
@@ -350,7 +379,7 @@ def test_a_revoked_client_is_ended_and_the_others_stay(
 def test_an_expired_certificate_ends_its_open_session(
     rig: Rig, party: Party, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(running, "HEALTH_CHECK_INTERVAL", 0.0)
+    monkeypatch.setattr("holdfast.appliance.appliance.CHECK_INTERVAL_S", 0.0)
     extensions = ("extendedKeyUsage=clientAuth", named("laptop"))
     settings = party.settings("engineer", "laptop")
     settings["listeners"]["scada"]["tls"]["review"] = 0.01
@@ -498,20 +527,20 @@ def test_devices_come_change_and_go(rig: Rig, serve: Serve, connect: Connect) ->
     assert rig.reload(plant(devices={"pump": polled(first)})) == ["devices.pump"]
     wire.until(lambda: memory.read("holding_registers", 50, 2) == [1, 1], "it is polled")
     assert client.ask(into_mirrored) == bytes.fromhex("8602"), "the range is mirrored"
-    polls = rig.appliance.diagnostics.devices()["pump"]["polls"]
+    polls = rig.appliance.diagnostics.stats()["devices"]["pump"]["polls"]
     assert rig.reload(plant(devices={"pump": polled(first)})) == []
     rig.reload(plant(devices={"pump": polled(second)}))
     wire.until(lambda: memory.read("holding_registers", 50, 2) == [2, 2], "the other is polled")
-    assert rig.appliance.diagnostics.devices()["pump"]["polls"] >= polls
+    assert rig.appliance.diagnostics.stats()["devices"]["pump"]["polls"] >= polls
     rig.appliance.log_events(0)
 
     with pytest.raises(ReloadRefused, match=r"devices\.pump: in_flight, retry or tolerance of"):
         rig.reload(plant(devices={"pump": polled(second, in_flight=2)}))
 
     rig.reload(plant(devices={"pump": polled(second, enabled=False)}))
-    assert rig.appliance.diagnostics.devices() == {"pump": {"health": "disabled"}}
+    assert rig.appliance.diagnostics.stats()["devices"] == {"pump": {"health": "disabled"}}
     rig.reload(plant())
-    assert rig.appliance.diagnostics.devices() == {}
+    assert rig.appliance.diagnostics.stats()["devices"] == {}
     assert client.ask(into_mirrored) == into_mirrored
 
 

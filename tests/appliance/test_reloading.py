@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.appliance.service_manager import ServiceManager
-from holdfast.cli import reloading
 from holdfast.cli.configuration import load_whole
-from holdfast.cli.reloading import Reloading
-from holdfast.cli.watched_files import WatchedFiles
+from holdfast.cli.services import reloader
+from holdfast.cli.services.file_snapshot import FileSnapshot
+from holdfast.cli.services.reloader import Reloader
 from support import wire
 from support.silent_files import Silent, threads
 
@@ -50,7 +50,7 @@ class Plant:
         self.config = load_whole(self.file)
         self.taken: list[Config] = []
         this: Any = self
-        self.reloading = Reloading(
+        self.reloading = Reloader(
             this,
             ServiceManager({}),
             lambda: load_whole(self.file),
@@ -86,27 +86,27 @@ class Plant:
 
 
 @pytest.fixture
-def looks(monkeypatch: pytest.MonkeyPatch) -> list[WatchedFiles]:
+def looks(monkeypatch: pytest.MonkeyPatch) -> list[FileSnapshot]:
     """The looks at the files that have begun."""
-    found: list[WatchedFiles] = []
+    found: list[FileSnapshot] = []
 
-    class Watched(WatchedFiles):
+    class Watched(FileSnapshot):
         def __init__(self, files: Any, *, hold: bool) -> None:
             super().__init__(files, hold=hold)
             found.append(self)
 
-    monkeypatch.setattr(reloading, "WatchedFiles", Watched)
+    monkeypatch.setattr(reloader, "FileSnapshot", Watched)
     return found
 
 
-def look_on(plant: Plant, looks: list[WatchedFiles]) -> None:
+def look_on(plant: Plant, looks: list[FileSnapshot]) -> None:
     """Has files looked at so often that a change would have been noticed."""
     enough = len(looks) + 5
     plant.step_until(lambda: len(looks) >= enough, "the files were looked at")
 
 
 def test_a_slow_writer_changes_nothing_until_a_reload_is_requested(
-    tmp_path: Path, looks: list[WatchedFiles], log: web.Records
+    tmp_path: Path, looks: list[FileSnapshot], log: web.Records
 ) -> None:
     """Half of the file is valid too: without the second listener."""
     plant = Plant(tmp_path)
@@ -131,7 +131,7 @@ def test_a_slow_writer_changes_nothing_until_a_reload_is_requested(
 
 
 def test_a_file_that_was_renamed_into_place_is_taken_over(
-    tmp_path: Path, looks: list[WatchedFiles], log: web.Records
+    tmp_path: Path, looks: list[FileSnapshot], log: web.Records
 ) -> None:
     plant = Plant(tmp_path)
     for number, text in enumerate((HEAD, HEAD + MORE, HEAD), start=1):
@@ -169,7 +169,7 @@ def test_a_file_that_is_written_after_it_was_renamed_waits_for_the_writer(
         (tmp_path / "new").rename(plant.file)
         lines = iter(["# more\n"] * 20)
 
-        class Watched(WatchedFiles):
+        class Watched(FileSnapshot):
             """Between any two looks, the writer writes another line."""
 
             def __init__(self, files: Any, *, hold: bool) -> None:
@@ -178,14 +178,14 @@ def test_a_file_that_is_written_after_it_was_renamed_waits_for_the_writer(
                 writer.flush()
                 sizes.append(plant.file.stat().st_size)
 
-        monkeypatch.setattr(reloading, "WatchedFiles", Watched)
+        monkeypatch.setattr(reloader, "FileSnapshot", Watched)
         plant.step_until(lambda: len(sizes) >= 20, "the writer has ended")
         assert plant.taken == []
         plant.step_until(lambda: plant.taken, "it was taken over")
 
 
 def test_a_file_that_has_the_number_of_an_old_one_is_noticed(
-    tmp_path: Path, looks: list[WatchedFiles]
+    tmp_path: Path, looks: list[FileSnapshot]
 ) -> None:
     """The known file is kept open, so that no other one gets its number."""
     plant = Plant(tmp_path)
@@ -198,7 +198,7 @@ def test_a_file_that_has_the_number_of_an_old_one_is_noticed(
 
 
 def test_profiles_are_watched_too(
-    tmp_path: Path, looks: list[WatchedFiles], log: web.Records
+    tmp_path: Path, looks: list[FileSnapshot], log: web.Records
 ) -> None:
     profile = tmp_path / "meter.yaml"
     profile.write_text(PROFILE % 1)
@@ -219,7 +219,7 @@ def test_profiles_are_watched_too(
 
 
 def test_a_removed_file_changes_nothing(
-    tmp_path: Path, looks: list[WatchedFiles], log: web.Records
+    tmp_path: Path, looks: list[FileSnapshot], log: web.Records
 ) -> None:
     plant = Plant(tmp_path)
     plant.file.unlink()
@@ -231,7 +231,7 @@ def test_a_removed_file_changes_nothing(
 
 
 def test_a_wrong_file_is_refused_once(
-    tmp_path: Path, looks: list[WatchedFiles], log: web.Records
+    tmp_path: Path, looks: list[FileSnapshot], log: web.Records
 ) -> None:
     plant = Plant(tmp_path)
     plant.replace("wrong")

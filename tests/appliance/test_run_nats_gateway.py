@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import NoRespondersError
 
-from holdfast import logs
+from holdfast.events import log_lines
 from support import web, wire
 from support.brokers import NatsServer, free_port
 from support.cli import RunCommand as Command
@@ -90,10 +90,10 @@ def read(server: holdfast.Server, address: int = 0) -> dict[str, Any]:
 @pytest.fixture
 def log() -> Iterator[web.Records]:
     records = web.Records()
-    logs.LOGGER.addHandler(records)
-    logs.LOGGER.setLevel("INFO")
+    log_lines.LOGGER.addHandler(records)
+    log_lines.LOGGER.setLevel("INFO")
     yield records
-    logs.LOGGER.removeHandler(records)
+    log_lines.LOGGER.removeHandler(records)
 
 
 @pytest.fixture
@@ -388,5 +388,5 @@ def test_what_is_not_served_is_not_imported(
             timeout=wire.DEADLINE,
             check=True,
         )
-    heavy = {"nats", "paho", "holdfast.web.host", "holdfast.gateway", "holdfast.scanner"}
+    heavy = {"nats", "paho", "holdfast.net.http.host", "holdfast.gateway", "holdfast.scanner"}
     assert heavy & set(made.stdout.split()) == parts

@@ -186,7 +186,7 @@ def test_the_watchdog_is_fed_at_half_of_its_time(
 
 def test_a_stalled_thread_starves_the_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop of `run` feeds it only while the appliance is live."""
-    from holdfast.cli import run as command
+    from holdfast.cli.services import run as command
 
     steps: list[str] = []
 
@@ -225,13 +225,15 @@ def test_a_stalled_thread_starves_the_watchdog(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(command, "Appliance", Appliance)
     monkeypatch.setattr(command, "Signals", Signals)
     monkeypatch.setattr(command, "ServiceManager", Recorder)
-    for skipped in ("allow_open_files", "_connections", "give_way"):
+    for skipped in ("raise_open_file_limit", "_connections", "yield_interpreter"):
         monkeypatch.setattr(command, skipped, lambda *_: 0)
-    monkeypatch.setattr("holdfast.logs.configure", lambda *_: None)
+    monkeypatch.setattr(command, "spare_what_stays", lambda: steps.append("freeze"))
+    monkeypatch.setattr("holdfast.events.log_lines.configure", lambda *_: None)
     settings: Any = SimpleNamespace(log=SimpleNamespace(level="info", format="text"))
     command.serve(settings, lambda _: "served", named="test")
     assert steps == [
         "start",
+        "freeze",
         "ready",
         "live True",
         "feed_watchdog",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from holdfast.appliance.shared_logs import EVENTS
+from holdfast.appliance.parts.shared_logs import EVENTS
 from support.paths import ROOT
 
 NATIVE = ROOT / "crates" / "journal" / "src" / "log"

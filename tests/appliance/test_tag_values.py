@@ -132,7 +132,7 @@ def test_tags_and_reads_share_a_poll_and_only_reads_are_stored(
         wire.until(
             lambda: there.read("holding_registers", 0, 2) == [215, 0], "the read is mirrored"
         )
-        counters = appliance.diagnostics.devices()["m"]
+        counters = appliance.diagnostics.stats()["devices"]["m"]
     assert counters["requests_per_poll"] == 2
     assert there.read("holding_registers", 2, 8) == [0] * 8
     assert memory.read("holding_registers", 0, 1) == [215]

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.appliance import auditing
-from holdfast.audit import Audit, Unrecorded, verify
+from holdfast.events.audit import Audit, Unrecorded, verify
 from holdfast.ingest import Grant, MemoryAccess, Refused
 from support import routed, wire
 from support.audits import await_writes, full, lines, writes
@@ -68,7 +67,7 @@ COMMAND: dict[str, Any] = {
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(auditing, "RETRY", 0.01)
+    monkeypatch.setattr("holdfast.appliance.parts.audit.RETRY_S", 0.01)
 
 
 def contents(appliance: Appliance) -> list[int]:
@@ -77,7 +76,7 @@ def contents(appliance: Appliance) -> list[int]:
 
 
 def audit_of(appliance: Appliance) -> Audit:
-    audit = appliance.diagnostics.audit
+    audit = appliance._parts().audit.log
     assert audit is not None
     return audit
 
@@ -235,16 +234,43 @@ def test_a_batch_is_recorded_whole_or_not_at_all(
     log = tmp_path / "audit.log"
     audit = Audit(log, max_bytes=2000, keep=5, closed=True)
     for _ in range(4):
-        audit.write_first([{"number": number} for number in range(8)])
+        audit.write_group(audit.queue([{"number": number} for number in range(8)]))
     assert len(list(tmp_path.iterdir())) == 4
     make_room = full(monkeypatch, room=1000)
     with pytest.raises(Unrecorded):
-        audit.write_first([{"number": number} for number in range(8)])
+        audit.write_group(audit.queue([{"number": number} for number in range(8)]))
     make_room()
     audit.close()
     files = list(tmp_path.iterdir())
     assert sum(len(writes(file)) for file in files) == 32
     assert verify(files).error is None
+
+
+@pytest.mark.parametrize("has_room", [True, False])
+def test_writes_that_begin_together_are_recorded_before_the_first_is_carried_out(
+    access: Callable[[str], tuple[Appliance, MemoryAccess]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    has_room: bool,
+) -> None:
+    appliance, rest = access(CLOSED)
+    log, commands = tmp_path / "audit.log", [COMMAND, COMMAND | {"address": 2}]
+    begun = [rest.begin(json.dumps(each).encode(), GRANT, "127.0.0.1:9") for each in commands]
+    assert (writes(log), any(contents(appliance))) == ([], False)
+    if has_room:
+        begun[0]()
+        assert [line["address"] for line in writes(log)] == [1, 2]
+        assert contents(appliance)[1:3] == [500, 0]
+        begun[1]()
+        assert len(writes(log)) == 2
+        assert contents(appliance)[1:3] == [500, 500]
+        return
+    full(monkeypatch, room=200)
+    for finish in begun:
+        with pytest.raises(Refused) as caught:
+            finish()
+        assert caught.value.reason == "unrecorded"
+    assert not any(contents(appliance))
 
 
 def test_a_full_disk_at_the_stop_is_reported(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.audit import Audit, Copies, Journal, Syslog, copies
+from holdfast.events.audit import Audit, Copies, Journal, Syslog, copies
 from support import wire
 from support.audits import full, lines
 
@@ -34,7 +34,7 @@ MESSAGE = re.compile(
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(copies, "PAUSE", 0.01)
+    monkeypatch.setattr(copies, "RETRY_DELAY_S", 0.01)
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def test_syslog_over_udp_receives_the_lines_of_the_file(
     udp: socket.socket, audit: Callable[..., Audit], tmp_path: Path
 ) -> None:
     file = tmp_path / "audit.log"
-    log = audit(Copies("syslog", Syslog("udp", udp.getsockname(), "local0")), file=file)
+    log = audit(Copies("syslog", Syslog("udp", udp.getsockname())), file=file)
     log.write_all([{"number": 1}, {"number": 2}])
     received = [record(udp.recv(65536)) for _ in range(3)]
     assert received == lines(file)
@@ -124,7 +124,7 @@ def test_syslog_over_udp_receives_the_lines_of_the_file(
 def test_syslog_over_tcp_has_framed_messages_and_connects_again(
     tcp: socket.socket, audit: Callable[..., Audit]
 ) -> None:
-    log = audit(Copies("syslog", Syslog("tcp", tcp.getsockname(), "local0")))
+    log = audit(Copies("syslog", Syslog("tcp", tcp.getsockname())))
     log.write(number=1)
     with accepted(tcp) as first:
         assert record(framed(first))["number"] == 1
@@ -140,7 +140,7 @@ def test_lines_wait_for_a_receiver_that_is_down(
 ) -> None:
     caplog.set_level("INFO")
     path = str(tmp_path / "later.sock")
-    log = audit(Copies("syslog", Syslog("unix", path, "local0")))
+    log = audit(Copies("syslog", Syslog("unix", path)))
     log.write_all([{"number": 1}, {"number": 2}])
     wire.until(lambda: counts(log, "syslog")["failed"] > 1, "it was tried twice")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
@@ -154,9 +154,9 @@ def test_lines_wait_for_a_receiver_that_is_down(
 def test_lines_that_find_no_room_are_dropped_and_counted(
     tmp_path: Path, audit: Callable[..., Audit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(copies, "MAX_BYTES", 1000)
+    monkeypatch.setattr(copies, "MAX_WAITING_BYTES", 1000)
     file = tmp_path / "audit.log"
-    log = audit(Copies("syslog", Syslog("unix", str(tmp_path / "none"), "local0")), file=file)
+    log = audit(Copies("syslog", Syslog("unix", str(tmp_path / "none"))), file=file)
     log.write_all([{"number": number} for number in range(100)])
     told = counts(log, "syslog")
     assert told["dropped"] + told["waiting"] == 101
@@ -167,7 +167,7 @@ def test_lines_that_find_no_room_are_dropped_and_counted(
 def test_a_line_that_is_too_long_for_a_datagram_is_dropped(
     udp: socket.socket, audit: Callable[..., Audit]
 ) -> None:
-    log = audit(Copies("syslog", Syslog("udp", udp.getsockname(), "local0")))
+    log = audit(Copies("syslog", Syslog("udp", udp.getsockname())))
     log.write(values=[65535] * 20_000)
     log.write(number=2)
     assert record(udp.recv(65536))["number"] == 2
@@ -209,7 +209,7 @@ def test_a_line_that_the_file_lacks_is_copied_without_a_place_in_the_chain(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     file = tmp_path / "audit.log"
-    log = audit(Copies("syslog", Syslog("udp", udp.getsockname(), "local0")), file=file)
+    log = audit(Copies("syslog", Syslog("udp", udp.getsockname())), file=file)
     make_room = full(monkeypatch)
     log.write(number=1)
     missing = record(udp.recv(65536))
@@ -222,7 +222,7 @@ def test_a_line_that_the_file_lacks_is_copied_without_a_place_in_the_chain(
 def test_the_last_lines_are_sent_before_the_end(
     udp: socket.socket, audit: Callable[..., Audit]
 ) -> None:
-    log = audit(Copies("syslog", Syslog("udp", udp.getsockname(), "local0")))
+    log = audit(Copies("syslog", Syslog("udp", udp.getsockname())))
     log.write_all([{"number": number} for number in range(50)])
     log.close()
     assert [record(udp.recv(65536))["number"] for _ in range(50)] == list(range(50))
@@ -231,8 +231,8 @@ def test_the_last_lines_are_sent_before_the_end(
 def test_the_end_does_not_wait_for_a_receiver_that_is_down(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(copies, "LAST", 0.01)
-    receiver = Copies("syslog", Syslog("unix", str(tmp_path / "none"), "local0"))
+    monkeypatch.setattr(copies, "CLOSE_TIMEOUT_S", 0.01)
+    receiver = Copies("syslog", Syslog("unix", str(tmp_path / "none")))
     log = Audit(None, max_bytes=10**6, keep=1, copies=[receiver])
     log.write_all([{"number": 1}, {"number": 2}])
     log.close()
@@ -247,7 +247,7 @@ def test_an_appliance_can_do_without_a_file(run: Run, udp: socket.socket) -> Non
         "listeners: {raw: {type: raw-ingest, format: crc, compat: {crc: none}, "
         "bind: '127.0.0.1:0', "
         "rules: [{sources: [127.0.0.0/8], memories: [plant], areas: [coils]}]}}\n"
-        f"audit: {{syslog: {{url: 'udp://{host}:{port}'}}}}\n"
+        f"audit: {{syslog: 'udp://{host}:{port}'}}\n"
     )
     appliance.stop()
     assert [record(udp.recv(65536))["event"] for _ in range(2)] == ["start", "stop"]

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast import logs
-from holdfast.audit import Audit, verify
+from holdfast.events import log_lines as logs
+from holdfast.events.audit import Audit, verify
+from holdfast.events.throttle import Throttle
 from support import wire
 from support.audits import full
 
@@ -262,7 +263,7 @@ def test_two_processes_can_not_write_one_file(log: Path) -> None:
 def test_lines_that_could_not_be_written_are_counted_and_leave_a_mark(
     log: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+    monkeypatch.setattr(logs, "_REFUSALS", Throttle())
     audit = opened(log)
     audit.write(number=1)
     caplog.set_level("INFO")

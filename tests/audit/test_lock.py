@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.audit import lock as own
+from holdfast.events.audit import lock as own
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,8 +11,8 @@ import pytest
 
 import holdfast
 from holdfast import _core
-from holdfast.appliance import auditing
-from holdfast.audit import Audit, verify
+from holdfast.appliance.parts.audit import WriteRecorder
+from holdfast.events.audit import Audit, verify
 from holdfast.ingest import Grant, MemoryAccess, Refused
 from support import wire
 from support.audits import await_writes, lines, writes
@@ -163,7 +163,7 @@ def test_datagrams_and_packets_are_audited(run: Run, tmp_path: Path) -> None:
 
 def test_what_comes_by_a_door_is_audited_before_it_is_answered(run: Run, tmp_path: Path) -> None:
     appliance = run(CONFIGURATION)
-    audit = appliance.diagnostics.audit
+    audit = appliance._parts().audit.log
     assert audit is not None
     memory_access = MemoryAccess("rest", appliance.memories, audit)
     grant = Grant("gateway", ("plant",), ("coils",))
@@ -184,7 +184,7 @@ def test_a_record_is_written_without_waiting_for_a_timeout(
     run: Run, connect: Connect, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither does the stop. The thread waits longer than the test unless it is woken."""
-    monkeypatch.setattr(auditing, "TIMEOUT", 2 * wire.DEADLINE)
+    monkeypatch.setattr("holdfast.appliance.parts.audit.TIMEOUT_S", 2 * wire.DEADLINE)
     appliance = run(CONFIGURATION)
     client = connect(endpoint(appliance, "scada"))
     for count in range(1, 4):
@@ -198,12 +198,12 @@ def test_a_record_is_written_without_waiting_for_a_timeout(
 def test_the_thread_ends_although_the_engine_has_stopped_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(auditing, "TIMEOUT", 2 * wire.DEADLINE)
+    monkeypatch.setattr("holdfast.appliance.parts.audit.TIMEOUT_S", 2 * wire.DEADLINE)
     engine = _core.Engine([], identity=[(0, "a"), (1, "b"), (2, "c")], audit="open")
     engine.stop()
     assert engine.next_writes(0, 1) == []
     audit = Audit(tmp_path / "audit.log", max_bytes=65536, keep=1)
-    recorder = auditing.WriteRecorder(audit, engine)
+    recorder = WriteRecorder(audit, engine)
     assert engine.next_writes(0, 1) == []
     recorder.start()
     finishing = threading.Thread(target=recorder.finish)

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast import logs
-from holdfast.appliance import auditing, running
+from holdfast.events import log_lines
+from holdfast.events.audit.refusals import MAX_ORIGINS, Refusals
+from holdfast.events.throttle import NOBODY, Throttle, origin
 from support import web, wire
 from support.audits import lines, writes
 from support.certificates import Certificates
@@ -28,8 +29,8 @@ NOISE = 200
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
-    monkeypatch.setattr(running, "HEALTH_CHECK_INTERVAL", 0.0)
+    monkeypatch.setattr(log_lines, "_REFUSALS", Throttle())
+    monkeypatch.setattr("holdfast.appliance.appliance.CHECK_INTERVAL_S", 0.0)
 
 
 def configured(**more: Any) -> str:
@@ -50,7 +51,7 @@ def refused(folder: Path) -> list[dict[str, Any]]:
     for line in found:
         for key in ("time", "seq", "prev", "serial"):
             line.pop(key, None)
-        line["peer"] = str(logs.origin("", line).source)
+        line["peer"] = str(origin("", line).source)
     return found
 
 
@@ -65,7 +66,7 @@ def test_a_noisy_source_hides_nobody(
     appliance.stop()
 
     logged = Counter(
-        logs.origin("", record.fields).source  # type: ignore[attr-defined]
+        origin("", record.fields).source  # type: ignore[attr-defined]
         for record in caplog.records
         if record.message == "refused_source"
     )
@@ -155,29 +156,43 @@ def test_requests_without_the_right_are_recorded(run: Run, tmp_path: Path) -> No
 
 
 def test_an_attacker_can_not_fill_the_audit_log() -> None:
-    refusals = auditing.Refusals(interval=3600)
+    refusals = Refusals(interval=3600)
 
     def attacked() -> list[dict[str, object]]:
         for number in range(2_000):
             fields = {"listener": "scada", "peer": f"[2001:db8:0:{number:x}::1]:1"}
-            refusals.note("refused_source", fields, logs.origin("refused_source", fields))
+            refusals.note("refused_source", fields, origin("refused_source", fields))
         return refusals.take()
 
-    assert len(attacked()) == auditing.MAX_ORIGINS + 1
+    assert len(attacked()) == MAX_ORIGINS + 1
     assert attacked() == []
     rest = refusals.rest()
-    assert len(rest) == auditing.MAX_ORIGINS + 1
+    assert len(rest) == MAX_ORIGINS + 1
     assert rest[-1] == {
         "event": "refused_source",
         "listener": "scada",
         "peer": "others",
-        "count": 2 * (2_000 - auditing.MAX_ORIGINS) - 1,
+        "count": 2 * (2_000 - MAX_ORIGINS) - 1,
     }
 
 
+def test_a_source_with_many_subjects_leaves_room_for_others() -> None:
+    refusals = Refusals(interval=3600)
+
+    def fields(number: int) -> dict[str, object]:
+        return {"listener": "scada", "peer": "10.0.0.9:1", "subject": f"CN={number}"}
+
+    for number in range(100):
+        found = fields(number)
+        refusals.note("tls_failed", found, origin("tls_failed", found))
+    expected = [{"event": "tls_failed", **fields(number), "count": 1} for number in range(17)]
+    assert refusals.take() == expected  # The last one stands for all others.
+    assert [(line["subject"], line["count"]) for line in refusals.rest()] == [("others", 83)]
+
+
 def test_other_events_are_not_recorded() -> None:
-    refusals = auditing.Refusals()
+    refusals = Refusals()
     for event in ("secured", "slow_reader", "packet_refused", "ingest_refused"):
-        refusals.note(event, {"reason": "malformed"}, logs.NOBODY)
-    refusals.note("refused_unit", {"function": 6}, logs.NOBODY)
+        refusals.note(event, {"reason": "malformed"}, NOBODY)
+    refusals.note("refused_unit", {"function": 6}, NOBODY)
     assert refusals.rest() == []

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 from calibration.cases import EMPTY, NOW, Case, Truth
-from holdfast.tools.description import Description, conclude
-from holdfast.tools.discovery import Survey
-from holdfast.tools.inference import guess
+from holdfast.discovery.address_search import Survey
+from holdfast.discovery.description import Description, conclude
+from holdfast.discovery.type_guess import guess
 from holdfast.values import ConversionError, decode
 from holdfast.values.types import parsed
 
@@ -128,7 +128,7 @@ def of_describe(case: Case, now: float = NOW) -> Iterator[Claim]:
     """What the description of a device with this block alone concludes."""
     size = len(case.reads[0])
     survey = Survey(["holding_registers"])
-    survey.areas[0].found(0, size)
+    survey.areas[0].ranges.append(range(size))
     found = Description(1, survey)
     found.reads["holding_registers", range(size)] = [list(read) for read in case.reads]
     conclude(found, now)

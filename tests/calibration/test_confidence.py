@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from calibration import judge, tuning
-from holdfast.tools.segments import confidence
+from holdfast.discovery.segments import confidence
 
 BLOCKS = range(0, 300, 12)
 """The blocks of the tuning half that are judged in every run: about 300 values."""

@@ -15,9 +15,9 @@ from calibration.blocks import Row as Value
 from calibration.blocks import build, constant, empty, near
 from calibration.cases import EMPTY, NOW, READS, Case, Truth
 from calibration.judge import Claim, Row, verdict
-from holdfast.tools import description
-from holdfast.tools.description import Described, Description
-from holdfast.tools.inference import Guess
+from holdfast.discovery import description
+from holdfast.discovery.description import Described, Description
+from holdfast.discovery.type_guess import Guess
 from holdfast.values import encode
 
 if TYPE_CHECKING:

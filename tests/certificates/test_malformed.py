@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from holdfast.bounded_files import MAX_CERTIFICATES
-from holdfast.certificates import authority, expiry, inspection, own, pem
-from holdfast.web.https import Https, HttpsFiles
+from holdfast.net.certificates import authority, expiry, inspection, parser, pem
+from holdfast.net.http.https import Https, HttpsFiles
+from holdfast.runtime.bounded_files import MAX_CERTIFICATES_BYTES
 from support.cases import examples
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def test_a_file_is_either_usable_or_named_as_unusable(tmp_path: Path, text: byte
         inspection.describe,
         expiry.of_certificates,
         expiry.of_revocation_lists,
-        own.nameless,
+        expiry.nameless,
         lambda file: Https(HttpsFiles(file, file)),
     ):
         with contextlib.suppress(pem.UnusableFile):
@@ -56,6 +56,6 @@ def test_a_file_is_either_usable_or_named_as_unusable(tmp_path: Path, text: byte
 
 def test_large_files_are_not_read(tmp_path: Path) -> None:
     file = tmp_path / "large.pem"
-    file.write_bytes(b" " * (MAX_CERTIFICATES + 1))
+    file.write_bytes(b" " * (MAX_CERTIFICATES_BYTES + 1))
     with pytest.raises(pem.UnusableFile, match="more than 4194304 bytes"):
-        pem.certificates(file)
+        parser.certificates(file)

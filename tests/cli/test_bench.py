@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from holdfast.tools.load import Latencies, Load
+from holdfast.client.load import Latencies, Load
 from support import cli, wire
 from support.cli import answer, done, failure, invoke, usage_error
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
@@ -23,7 +23,7 @@ from support.terminal import Terminal
 if TYPE_CHECKING:
     import holdfast
 
-SHORT = ("--seconds", "0.1")
+SHORT = ("--duration", "0.1")
 
 
 def test_rate_latencies_and_histogram_are_shown(server: holdfast.Server) -> None:
@@ -43,7 +43,7 @@ def test_rate_latencies_and_histogram_are_shown(server: holdfast.Server) -> None
 
 
 def test_the_server_answers_as_many_as_are_counted(server: holdfast.Server) -> None:
-    options = ("--area", "co", "--address", "7", "--count", "100", "--connections", "3")
+    options = ("co:7", "100", "--connections", "3")
     found = answer("bench", cli.url(server), *SHORT, *options)
     assert found["ok"] is True
     counters = server.counters()
@@ -71,7 +71,7 @@ def test_errors_are_counted_by_kind() -> None:
             return HANG_UP if number in (9, 10) else registers(pdu)
 
         with FakeDevice(answers) as device:
-            options = ("--timeout", str(timeout), "--seconds", str(3 * timeout))
+            options = ("--timeout", str(timeout), "--duration", str(3 * timeout))
             found = answer("bench", device.url, *options)
         if next(numbers) < 12 or found["errors"]["timeout"] > 1:
             return False
@@ -89,10 +89,11 @@ def test_errors_are_counted_by_kind() -> None:
 
 def test_a_device_that_refuses_is_told_at_once(server: holdfast.Server) -> None:
     url = cli.url(server)
-    assert failure("bench", url, "--address", "1000") == [
-        f"holdfast: {url}: exception 02 (Illegal Data Address)"
+    assert failure("bench", url, "hr:1000") == [
+        f"holdfast: {url}: exception 02 (Illegal Data Address)",
+        f"hint: 'holdfast describe map {url}' finds the addresses that exist",
     ]
-    assert answer("bench", url, "--address", "1000", code=1)["code"] == 2
+    assert answer("bench", url, "hr:1000", code=1)["code"] == 2
     assert failure("bench", "tcp://127.0.0.1:1")[0].startswith("holdfast: tcp://127.0.0.1:1: can't")
 
 
@@ -103,7 +104,7 @@ def test_no_answer_after_the_first_is_a_failure() -> None:
         return exception(pdu, 4) if next(numbers) else registers(pdu)
 
     with FakeDevice(answers) as device:
-        result = invoke("bench", device.url, *SHORT)
+        result = invoke("bench", device.url, "hr:0", "10", *SHORT)
     assert result.exit_code == 1
     assert re.search(r"requests +0\n", result.stdout)
     assert "exception 04 (Server Device Failure)" in result.stdout
@@ -113,14 +114,14 @@ def test_no_answer_after_the_first_is_a_failure() -> None:
     ("arguments", "told"),
     [
         (("tcp://127.0.0.1", "--count", "126"), "count is 126, allowed: 1 to 125."),
-        (("tcp://127.0.0.1", "--address", "65530"), "the last address is 65535."),
+        (("tcp://127.0.0.1", "hr:65530", "10"), "the last address is 65535."),
         (
             ("udp://127.0.0.1", "--in-flight", "2"),
             "more than one request in flight requires tcp or tls.",
         ),
         (("rtu:///dev/ttyX", "--connections", "2"), "a serial line has one connection."),
-        (("tcp://127.0.0.1", "--area", "x"), "'x' is not an area"),
-        (("tcp://127.0.0.1", "--seconds", "inf"), "'inf' is not a number of seconds"),
+        (("tcp://127.0.0.1", "x:0"), "'x' is not an area"),
+        (("tcp://127.0.0.1", "--duration", "inf"), "'inf' is not a time"),
     ],
 )
 def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:
@@ -132,7 +133,7 @@ def test_the_help_warns() -> None:
 
 
 def test_it_can_be_ended_earlier_with_what_was_measured(server: holdfast.Server) -> None:
-    with Terminal("bench", cli.url(server), "--seconds", "1000") as terminal:
+    with Terminal("bench", cli.url(server), "--duration", "1000") as terminal:
         wire.until(lambda: server.counters()["requests"].get(3, 0) > 10, "it is loaded")
         terminal.until("Loading", "/s")
         assert terminal.end(signal.SIGINT) == 0

@@ -16,8 +16,8 @@ from cryptography import x509
 
 import holdfast
 from holdfast.appliance import Appliance
-from holdfast.certificates.authority import KEY_KINDS
 from holdfast.config import load
+from holdfast.net.certificates.authority import KEY_KINDS
 from support import wire
 from support.certificates import PAST, ROLE, Certificates, named
 from support.cli import invoke, usage_error
@@ -63,7 +63,7 @@ class Pki:
 
     def shown(self, file: Path | str) -> list[dict[str, Any]]:
         result = self.tries("show", str(self / str(file)), "--json")
-        found: list[dict[str, Any]] = json.loads(result.stdout)
+        found: list[dict[str, Any]] = json.loads(result.stdout)["found"]
         return found
 
 

@@ -1,4 +1,4 @@
-"""`holdfast check` and `holdfast schema`, as people and programs use them."""
+"""`holdfast check` and `holdfast check --schema`, as people and programs use them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import pytest
 from click.testing import CliRunner
 
 import holdfast
-from holdfast import bounded_files
 from holdfast.cli import COMMANDS, main
 from holdfast.cli.configuration import load_or_exit
 from holdfast.config import json_schema, load
+from holdfast.runtime import bounded_files
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -149,7 +149,7 @@ def test_a_command_ends_with_2_on_a_wrong_configuration(
 
 
 def test_schema_prints_the_schema() -> None:
-    result = CliRunner().invoke(main, ["schema"])
+    result = CliRunner().invoke(main, ["check", "--schema"])
     assert result.exit_code == 0
     assert json.loads(result.stdout) == json_schema()
 

@@ -1,4 +1,4 @@
-"""`holdfast completion`: what a shell gets."""
+"""`holdfast --completion`: what a shell gets."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_there_is_a_script_for_every_shell(shell: str) -> None:
-    script = "\n".join(done("completion", shell))
+    script = "\n".join(done("--completion", shell))
     assert f"_HOLDFAST_COMPLETE={shell}_complete" in script
 
 
 def test_other_shells_are_wrong_usage() -> None:
-    assert "'csh' is not one of 'bash', 'zsh', 'fish'." in usage_error("completion", "csh")
+    assert "'csh' is not one of 'bash', 'zsh', 'fish'." in usage_error("--completion", "csh")
 
 
 def test_bash_completes_commands(tmp_path: Path) -> None:
     bash = tool("bash")
     script = tmp_path / "holdfast.bash"
-    script.write_text("\n".join(done("completion", "bash")))
+    script.write_text("\n".join(done("--completion", "bash")))
     program = tmp_path / "holdfast"
     main = "from holdfast.cli import main; main(prog_name='holdfast')"
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -c "{main}" "$@"\n')
@@ -58,4 +58,8 @@ def test_commands_areas_and_options_are_completed(monkeypatch: pytest.MonkeyPatc
 
     assert set(completed("holdfast", '""')) == set(COMMANDS)
     assert completed("holdfast", "read", "tcp://plc", "hol") == ["holding_registers"]
-    assert completed("holdfast", "map", "--ex") == ["--exact"]
+    for words in (("map",), ("describe", "map")):
+        assert completed("holdfast", *words, "--ex") == ["--exact"]
+    assert completed("holdfast", "gue") == ["guess"]
+    assert completed("holdfast", "describe", '""') == ["map", "guess", "identify", "status"]
+    assert completed("holdfast", "check", "pl")[0] == "plan"

@@ -13,7 +13,7 @@ import pytest
 
 import holdfast
 from holdfast import values
-from holdfast.config.tag_files import load_tags
+from holdfast.config.tag_files.read import load_tags
 from support import cli, sunspec_device, wire
 from support.cli import answer, done, usage_error
 from support.commands import Command
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from support.fake_device import Asked
     from support.running import Serve
 
-QUICK = ("--reads", "1", "--areas", "hr,co")
+QUICK = ("--times", "1", "--areas", "hr,co")
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def test_nothing_is_written_to_the_device() -> None:
         return registers(pdu) if pdu[0] == 3 and first + count <= 9 else exception(pdu, 2)
 
     with FakeDevice(answers) as device:
-        assert cli.invoke("describe", device.url, "--units", "1", "--reads", "1").exit_code == 0
+        assert cli.invoke("describe", device.url, "--units", "1", "--times", "1").exit_code == 0
         assert {pdu[0] for pdu in device.asked} == {1, 2, 3, 4, 17, 43}
 
 
@@ -185,7 +185,7 @@ def test_findings_are_printed_before_the_search_ends() -> None:
         output, _ = process.communicate(wire.DEADLINE)
     assert cli.elements(early[3:]) == [
         {"unit": 1, "identification": {}},
-        {"unit": 1, "area": "holding_registers", "first": 0, "last": 8},
+        {"unit": 1, "area": "holding_registers", "address": 0, "count": 9},
     ]
     assert json.loads("".join(early) + output)["ok"] is True
 
@@ -233,7 +233,7 @@ def test_a_device_that_goes_away_leaves_what_was_found(tmp_path: Path) -> None:
     with FakeDevice(answers) as device:
         process = Command(
             *("describe", device.url, *options, "--output", str(file)),
-            *("--reads", "100", "--every", "0.01", "--timeout", "5"),
+            *("--times", "100", "--every", "0.01", "--timeout", "5"),
         )
         assert again.wait(wire.DEADLINE)
     output, log = process.communicate(wire.DEADLINE)

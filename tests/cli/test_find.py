@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 import holdfast
+from holdfast.discovery import device_search
 from holdfast.server import Identity
-from holdfast.tools import finding
 from support import cli, lines, wire
 from support.cli import answer, done, failure, usage_error
 from support.commands import Command
@@ -80,11 +80,12 @@ def test_hosts_that_answer_are_found_and_others_told_apart(serve: Serve) -> None
             "4 refuse them, 0 do not respond"
         )
         found = json.loads(document.stdout)
-        assert (found["ok"], found["complete"], found["asked"]) == (True, True, 2)
-        assert found["counts"] == {"modbus": 1, "open": 1, "refused": 0, "silent": 0}
-        assert found["hosts"][0]["identification"]["vendor_name"] == "Acme"
-        assert sorted(found["found"], key=lambda host: host["address"]) == found["hosts"]
-        assert (found["hosts"][0]["url"], found["hosts"][0]["unit"]) == (cli.url(server), 1)
+        assert (found["ok"], found["complete"]) == (True, True)
+        states = {"modbus": 1, "open": 1, "refused": 0, "silent": 0, "asked": 2, "not_asked": 0}
+        assert found["counts"] == states
+        hosts = sorted(found["found"], key=lambda host: host["host"])
+        assert hosts[0]["identification"]["vendor_name"] == "Acme"
+        assert (hosts[0]["url"], hosts[0]["unit"]) == (cli.url(server), 1)
         return True
 
     wire.until_long_enough(are_found, "the device answers, and no host is silent")
@@ -99,7 +100,7 @@ def test_a_host_that_answers_only_another_unit_id_is_found() -> None:
         with Stream("tcp", then=behave) as host:
             options = ("--port", str(host.port), "--timeout", str(timeout), "--json")
             result = cli.invoke("find", "127.0.0.1", *options)
-        return result.exit_code == 0 and json.loads(result.stdout)["hosts"][0]["unit"] == 255
+        return result.exit_code == 0 and json.loads(result.stdout)["found"][0]["unit"] == 255
 
     wire.until_long_enough(is_found, "unit id 255 answers")
 
@@ -107,7 +108,7 @@ def test_a_host_that_answers_only_another_unit_id_is_found() -> None:
 def test_a_gateway_without_its_device_is_found() -> None:
     with FakeDevice(lambda pdu: exception(pdu, 0x0B)) as host:
         found = answer("find", "127.0.0.1", "--port", str(host.port))
-    assert (found["hosts"][0]["modbus"], found["hosts"][0]["unit"]) == (True, None)
+    assert (found["found"][0]["modbus"], found["found"][0]["unit"]) == (True, None)
 
 
 def test_nothing_is_a_failure() -> None:
@@ -124,8 +125,8 @@ def test_connections_begin_at_the_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     async def sleep(seconds: float) -> None:
         waits.append(seconds)
 
-    monkeypatch.setattr(finding, "sleep", sleep)
-    monkeypatch.setattr(finding, "monotonic", lambda: 100.0)
+    monkeypatch.setattr(device_search, "sleep", sleep)
+    monkeypatch.setattr(device_search, "monotonic", lambda: 100.0)
     with socket.create_server(("127.0.0.1", 0)) as unused:
         port = unused.getsockname()[1]
     cli.invoke("find", "127.0.0.0/29", "--port", str(port), "--rate", "4")
@@ -175,7 +176,7 @@ def test_unit_ids_are_printed_as_they_are_found(number: signal.Signals) -> None:
     found = json.loads("".join(early) + output)
     assert (process.returncode, log) == (1, "")
     assert (found["ok"], found["complete"], found["detail"]) == (False, False, "interrupted")
-    assert ([each["unit"] for each in found["units"]], found["not_asked"]) == (
+    assert ([each["unit"] for each in found["found"]], found["not_asked"]) == (
         [1, 2],
         [3, 4, 5, 6, 7, 8, 9],
     )
@@ -200,7 +201,7 @@ def test_unit_ids_stay_known_if_the_device_goes_away() -> None:
         (("10.0.0.0/8", "--large"), "16777216 addresses, allowed: 65536."),
         (("fd00::/64",), "allowed: 1024; --large"),
         (("10.0.0.1/24",), "has host bits set: the network is 10.0.0.0/24"),
-        (("plc1",), "type: holdfast find tcp://plc1"),
+        (("plc1",), "type 'holdfast find tcp://plc1'."),
         (("tcp://a", "10.0.0.1"), "Give one URL or one serial line, or several networks."),
         (("10.0.0.1", "--units", "1-300"), "'1-300' is not a unit id or FIRST-LAST"),
         (("10.0.0.1", "--rate", "0"), "0 is not in the range"),
@@ -228,7 +229,7 @@ def test_unit_ids_behind_a_gateway_are_found() -> None:
             table = cli.invoke("find", host.url, *options)
             document = cli.invoke("find", host.url, *options, "--json")
         found = json.loads(document.stdout)
-        if "2 unit ids of 7" not in table.stdout or len(found["units"]) < 2:
+        if "2 unit ids of 7" not in table.stdout or len(found["found"]) < 2:
             return False
         assert (table.exit_code, table.stderr, document.exit_code, document.stderr) == (
             0,
@@ -244,7 +245,7 @@ def test_unit_ids_behind_a_gateway_are_found() -> None:
             f"{host.url}: 2 unit ids of 7 asked answer".split(),
             ["no", "device:", "1-2,", "4-5,", "20"],
         ]
-        assert [each["unit"] for each in found["units"]] == [3, 17]
+        assert [each["unit"] for each in found["found"]] == [3, 17]
         assert (found["asked"], found["not_asked"]) == ([1, 2, 3, 4, 5, 17, 20], [])
         assert found["ignores_unit"] is False
         return True
@@ -314,7 +315,7 @@ def test_the_baud_of_a_line_is_found(tmp_path: Path) -> None:
         assert last == (
             f"{tmp_path / 'line'}: 1 unit id found; unit ids asked: 1-2, 3 settings tried"
         )
-        assert json.loads(document.stdout)["units"] == [
+        assert json.loads(document.stdout)["found"] == [
             {"url": line, "unit": 2, "detail": "answers", "identification": {}},
         ]
         return True

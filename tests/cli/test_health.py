@@ -221,7 +221,7 @@ def test_texts_of_a_stranger_are_shown_without_control_characters(
         (("--url", "127.0.0.1:9464"), "allowed: http://HOST:PORT"),
         (("--url", "http://127.0.0.1:9464/metrics"), "allowed: http://HOST:PORT"),
         (("--url", "http://127.0.0.1:99999"), "allowed: http://HOST:PORT"),
-        (("--url", "http://127.0.0.1:1", "--timeout", "0"), "is not in the range"),
+        (("--url", "http://127.0.0.1:1", "--timeout", "0"), "is not a time"),
         (("--url", "https://127.0.0.1:1", "--tls-cert", __file__), "requires --tls-key"),
     ],
 )

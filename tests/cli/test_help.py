@@ -10,6 +10,7 @@ import pytest
 
 import holdfast
 from holdfast.cli import COMMANDS, GROUPS
+from holdfast.cli.old_spellings import OLD_NAMES
 from support import cli
 from support.cli import done, usage_error
 
@@ -18,7 +19,8 @@ def test_commands_are_in_groups_and_those_for_beginners_are_first() -> None:
     shown = "\n".join(done("--help"))
     order = re.findall(r"^  ([a-z-]+) {2,}\S", shown, re.M)
     assert [name for name in order if name in COMMANDS] == list(COMMANDS)
-    assert list(COMMANDS)[:7] == ["read", "write", "watch", "find", "describe", "map", "guess"]
+    assert list(COMMANDS)[:5] == ["read", "write", "watch", "find", "describe"]
+    assert len(COMMANDS) <= 24, "the help must stay short: put a command under another one"
     assert list(GROUPS)[:2] == ["Devices", "Services"]
     assert list(COMMANDS)[-1] == "bench"
     assert re.search(r"scan +Run the NATS service", shown)
@@ -28,7 +30,7 @@ def test_commands_are_in_groups_and_those_for_beginners_are_first() -> None:
 def test_the_help_imports_no_command() -> None:
     code = (
         "import sys; from holdfast.cli import main; main(['--help'], standalone_mode=False); "
-        "sys.exit('holdfast.cli.run' in sys.modules)"
+        "sys.exit('holdfast.cli.services.run' in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
@@ -38,6 +40,8 @@ def test_the_help_imports_no_command() -> None:
     [
         (("raed",), "No such command 'raed'. Did you mean 'read'"),
         (("Describe",), "Did you mean 'describe'?"),
+        (("mpa",), "Did you mean 'describe map'?"),
+        (("replicsa",), "Did you mean 'log status' or 'log replay'?"),
         (("import", "mmaa"), "No such command 'mmaa'. Did you mean 'mma'?"),
         (("xyzzy",), "No such command 'xyzzy'."),
         (("tcp://plc",), "Did you mean 'holdfast read tcp://plc'?"),
@@ -50,6 +54,21 @@ def test_the_help_imports_no_command() -> None:
 )
 def test_an_error_says_what_to_type(arguments: tuple[str, ...], told: str) -> None:
     assert told in usage_error(*arguments)
+
+
+@pytest.mark.parametrize("old", OLD_NAMES)
+def test_an_old_name_works_and_hints_at_the_new_one(old: str) -> None:
+    new = OLD_NAMES[old]
+    options = ["bash"] if old == "completion" else [] if old == "schema" else ["--help"]
+    result = cli.invoke(old, *options)
+    assert result.exit_code == 0
+    assert result.stderr == f"hint: 'holdfast {old}' is now 'holdfast {new}'\n"
+    assert result.stdout == cli.invoke(*new.split(), *options).stdout != ""
+
+
+def test_a_command_with_subcommands_lists_them() -> None:
+    for command, listed in (("describe", "map +Find the"), ("check", "plan +Print the requests")):
+        assert re.search(f"^Commands:\n  {listed}", cli.invoke(command, "--help").stdout, re.M)
 
 
 def test_a_host_without_a_scheme_is_one_over_tcp(

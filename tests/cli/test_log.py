@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import NoRespondersError
 
-from holdfast import log_backup
 from holdfast.appliance import Appliance
 from holdfast.config import load
+from holdfast.replication import backup as log_backup
 from support import nats_cluster, wire
 from support.brokers import NatsServer, free_port
 from support.cli import done, invoke
@@ -168,10 +168,10 @@ class Servers:
 
 
 def test_a_request_that_nobody_takes_yet_is_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(log_backup, "AGAIN", 0.001)
+    monkeypatch.setattr(log_backup, "RETRY_S", 0.001)
     config = log_backup._config(Servers(3), "site")  # type: ignore[arg-type]
     assert asyncio.run(config) == {"num_replicas": 3}
-    monkeypatch.setattr(log_backup, "SETTLING", 0.0)
+    monkeypatch.setattr(log_backup, "LEADER_TIMEOUT_S", 0.0)
     config = log_backup._config(Servers(10**6), "site")  # type: ignore[arg-type]
     with pytest.raises(
         log_backup.BackupFailed, match=r"STREAM\.INFO\.site: nobody answers; JetStream"

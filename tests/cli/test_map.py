@@ -1,4 +1,4 @@
-"""`holdfast map`, as people and programs use it."""
+"""`holdfast describe map`, as people and programs use it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 import holdfast
-from holdfast.tools.discovery import USUAL_STARTS
+from holdfast.discovery.address_search import USUAL_STARTS
 from holdfast.types import AREAS
 from support import cli, wire
-from support.cli import answer, done, failure, usage_error
+from support.cli import answer, done, failure, invoke, usage_error
 from support.commands import Command
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
 from support.paths import DOCS
@@ -39,7 +39,7 @@ def split(lines: list[str]) -> tuple[list[str], list[str]]:
 
 
 def test_ranges_are_a_picture_and_a_table(url: str) -> None:
-    ranges, [head, empty, *lines] = split(done("map", url))
+    ranges, [head, empty, *lines] = split(done("describe", "map", url))
     assert [line.split() for line in ranges] == [
         ["area", "first", "last", "count"],
         ["holding_registers", "1000", "17383", "16384"],
@@ -68,7 +68,7 @@ def test_ranges_are_a_picture_and_a_table(url: str) -> None:
 
 
 def test_a_program_gets_the_same(url: str) -> None:
-    found = answer("map", url)
+    found = answer("describe", "map", url)
     assert (found["ok"], found["exact"]) == (True, False)
     assert {area: each["ranges"] for area, each in found["areas"].items()} == {
         "coils": [[0, 63]],
@@ -77,9 +77,9 @@ def test_a_program_gets_the_same(url: str) -> None:
         "input_registers": [[65000, 65009]],
     }
     assert found["found"] == [
-        {"area": "holding_registers", "first": 1000, "last": 17383},
-        {"area": "input_registers", "first": 65000, "last": 65009},
-        {"area": "coils", "first": 0, "last": 63},
+        {"area": "holding_registers", "address": 1000, "count": 16384},
+        {"area": "input_registers", "address": 65000, "count": 10},
+        {"area": "coils", "address": 0, "count": 64},
     ]
     assert {each["not_searched_from"] for each in found["areas"].values()} == {None}
     assert found["requests"] == sum(each["requests"] for each in found["areas"].values())
@@ -94,8 +94,10 @@ def test_exact_finds_what_samples_miss() -> None:
 
     with FakeDevice(hidden) as device:
         options = ("--areas", "hr", "--range", "900-1099")
-        fast = answer("map", device.url, *options)["areas"]["holding_registers"]
-        exact = answer("map", device.url, *options, "--exact")["areas"]["holding_registers"]
+        fast = answer("describe", "map", device.url, *options)["areas"]["holding_registers"]
+        exact = answer("describe", "map", device.url, *options, "--exact")["areas"][
+            "holding_registers"
+        ]
     assert (fast["ranges"], exact["ranges"]) == ([], [[1012, 1014]])
     assert (fast["absent"][0], fast["absent"][-1]) == ([900, 901], [1099, 1099])
     assert fast["not_asked"] == 200 - fast["requests"]
@@ -106,7 +108,7 @@ def test_exact_finds_what_samples_miss() -> None:
 def test_reads_stay_within_what_is_allowed() -> None:
     with FakeDevice(registers) as device:
         options = ("--areas", "ir,hr", "--range", "0x10-99", "--max-quantity", "7")
-        found = answer("map", device.url, *options)
+        found = answer("describe", "map", device.url, *options)
         asked = [
             (pdu[0], int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])) for pdu in device.asked
         ]
@@ -126,8 +128,8 @@ def test_failures_are_told_apart() -> None:
         return registers(pdu) if address + count <= 9 else exception(pdu, 2)
 
     with FakeDevice(answers) as device:
-        lines = done("map", device.url, "--exact", "--range", "0-15")
-        areas = answer("map", device.url, "--exact", "--range", "0-15")["areas"]
+        lines = done("describe", "map", device.url, "--exact", "--range", "0-15")
+        areas = answer("describe", "map", device.url, "--exact", "--range", "0-15")["areas"]
     assert "holding registers  █████!███·······" in lines
     assert lines[-4:] == [
         "coils: exception 01 (Illegal Function); area skipped",
@@ -140,22 +142,31 @@ def test_failures_are_told_apart() -> None:
     assert (failed["reason"], failed["code"], failed["ranges"]) == ("exception", 4, [[5, 5]])
 
 
+def test_a_gateway_without_the_device_is_hinted_at_once() -> None:
+    with FakeDevice(lambda pdu: exception(pdu, 11)) as device:
+        result = invoke("describe", "map", device.url, "--areas", "hr,ir", "--range", "0-9")
+        hint = f"hint: 'holdfast find {device.url}' finds the unit ids that answer"
+        assert result.stderr.splitlines() == [hint]
+
+
 def test_a_device_without_addresses_is_no_failure() -> None:
     with FakeDevice(lambda pdu: exception(pdu, 2)) as device:
-        assert "No address was found." in done("map", device.url, "--range", "0-99")
+        assert "No address was found." in done("describe", "map", device.url, "--range", "0-99")
 
 
 def test_a_device_that_does_not_answer_is_a_failure() -> None:
     with FakeDevice(lambda _: None) as device:
-        assert failure("map", device.url, "--timeout", "0.02") == [
+        assert failure("describe", "map", device.url, "--timeout", "0.02") == [
             f"holdfast: {device.url}: no answer to 4 reads"
         ]
-        found = answer("map", device.url, "--timeout", "0.02", code=1)
+        found = answer("describe", "map", device.url, "--timeout", "0.02", code=1)
     assert (found["ok"], found["detail"]) == (False, "no answer to 4 reads")
 
 
 def test_only_ascii_is_shown_where_there_is_no_more(url: str) -> None:
-    with Terminal("map", url, "--areas", "hr", columns=80, PYTHONIOENCODING="ascii") as terminal:
+    with Terminal(
+        "describe", "map", url, "--areas", "hr", columns=80, PYTHONIOENCODING="ascii"
+    ) as terminal:
         assert re.search(r"holding registers  -#{14}-\.{44}\n", terminal.until("searched"))
 
 
@@ -171,11 +182,11 @@ def test_only_ascii_is_shown_where_there_is_no_more(url: str) -> None:
     ],
 )
 def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:
-    assert told in usage_error("map", "tcp://127.0.0.1:1", *arguments)
+    assert told in usage_error("describe", "map", "tcp://127.0.0.1:1", *arguments)
 
 
 def test_the_requests_are_announced_and_the_progress_fits_a_narrow_terminal(url: str) -> None:
-    with Terminal("map", url, columns=40) as terminal:
+    with Terminal("describe", "map", url, columns=40) as terminal:
         shown = terminal.until("Nothing is known")
         assert terminal.end() == 0
     assert re.search(r"At least \d{4} requests if nothing exists, at most 20000\.", shown)
@@ -185,7 +196,7 @@ def test_the_requests_are_announced_and_the_progress_fits_a_narrow_terminal(url:
 
 
 def test_progress_is_shown_on_a_terminal_and_the_picture_has_its_width(url: str) -> None:
-    with Terminal("map", url, columns=60) as terminal:
+    with Terminal("describe", "map", url, columns=60) as terminal:
         terminal.until("Mapping", "input_registers")
         assert terminal.end() == 0
     shown = plain(terminal.shown)
@@ -205,7 +216,7 @@ def test_what_was_found_is_shown_when_it_is_interrupted() -> None:
 
     with FakeDevice(answers) as device:
         options = ("--areas", "hr", "--exact", "--timeout", "60")
-        with Terminal("map", device.url, *options) as terminal:
+        with Terminal("describe", "map", device.url, *options) as terminal:
             assert reached.wait(wire.DEADLINE)
             terminal.process.send_signal(signal.SIGINT)
             go_on.set()
@@ -230,8 +241,8 @@ def test_a_search_ends_after_its_requests_and_says_what_was_not_asked() -> None:
 
     with FakeDevice(answers) as device:
         options = ("--areas", "hr,ir", "--max-requests", "30")
-        found = answer("map", device.url, *options, code=1)
-        result = cli.invoke("map", device.url, *options)
+        found = answer("describe", "map", device.url, *options, code=1)
+        result = cli.invoke("describe", "map", device.url, *options)
     assert (found["ok"], found["complete"], found["requests"]) == (False, False, 30)
     assert found["detail"] == "stopped after 30 requests; --max-requests sets the limit"
     holding, inputs = found["areas"].values()
@@ -252,7 +263,7 @@ def test_requests_can_be_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time, "sleep", pauses.append)
     with FakeDevice(lambda pdu: exception(pdu, 2)) as device:
         options = ("--areas", "hr", "--range", "0-9", "--exact", "--delay", "0.25")
-        assert answer("map", device.url, *options)["requests"] == 10
+        assert answer("describe", "map", device.url, *options)["requests"] == 10
     assert pauses == [0.25] * 9
 
 
@@ -271,7 +282,7 @@ def test_short_ranges_at_usual_places_are_found() -> None:
         )
 
     with FakeDevice(answers) as device:
-        found = answer("map", device.url, "--areas", "hr")["areas"]["holding_registers"]
+        found = answer("describe", "map", device.url, "--areas", "hr")["areas"]["holding_registers"]
     assert found["ranges"] == [[first, first + count - 1] for first, count in layout]
     assert found["requests"] < 2700
 
@@ -291,7 +302,7 @@ def held_at(address: int, reached: threading.Event, go_on: threading.Event) -> A
 
 def test_a_device_is_asked_for_registers_at_usual_starts_first() -> None:
     with FakeDevice(lambda pdu: exception(pdu, 2)) as device:
-        done("map", device.url, "--range", "0-1100", "--step", "1000")
+        done("describe", "map", device.url, "--range", "0-1100", "--step", "1000")
         asked = [(pdu[0], int.from_bytes(pdu[1:3])) for pdu in device.asked]
     starts = (0, 1, 100, 200, 300, 500, 700, 1000, 1001)
     assert asked[: 2 * len(starts)] == [(code, start) for start in starts for code in (3, 4)]
@@ -305,7 +316,7 @@ def test_ranges_are_printed_before_the_search_ends() -> None:
     reached, go_on = threading.Event(), threading.Event()
     with (
         FakeDevice(held_at(1000, reached, go_on)) as device,
-        Terminal("map", device.url, "--range", "0-1999", columns=80) as terminal,
+        Terminal("describe", "map", device.url, "--range", "0-1999", columns=80) as terminal,
     ):
         assert reached.wait(wire.DEADLINE)
         shown = terminal.until("input_registers")
@@ -320,13 +331,14 @@ def test_ranges_are_printed_before_the_search_ends() -> None:
 def test_a_program_can_read_ranges_before_the_search_ends() -> None:
     reached, go_on = threading.Event(), threading.Event()
     with FakeDevice(held_at(1000, reached, go_on)) as device:
-        process = Command("map", device.url, "--json", "--range", "0-1999")
+        process = Command("describe", "map", device.url, "--json", "--range", "0-1999")
         assert reached.wait(wire.DEADLINE)
         early = cli.early_lines(process, 6)
         go_on.set()
         output, log = process.communicate(wire.DEADLINE)
     assert cli.elements(early[4:]) == [
-        {"area": area, "first": 0, "last": 8} for area in ("holding_registers", "input_registers")
+        {"area": area, "address": 0, "count": 9}
+        for area in ("holding_registers", "input_registers")
     ]
     assert (json.loads("".join(early) + output)["ok"], log) == (True, "")
 
@@ -335,7 +347,7 @@ def test_a_program_can_read_ranges_before_the_search_ends() -> None:
 def test_a_program_gets_what_was_found_before_an_interruption(number: signal.Signals) -> None:
     reached, go_on = threading.Event(), threading.Event()
     with FakeDevice(held_at(1000, reached, go_on)) as device:
-        process = Command("map", device.url, "--json", "--range", "0-1999")
+        process = Command("describe", "map", device.url, "--json", "--range", "0-1999")
         assert reached.wait(wire.DEADLINE)
         process.send_signal(number)
         output, log = process.communicate(wire.DEADLINE)
@@ -361,7 +373,7 @@ def test_a_second_interruption_ends_the_command_at_once() -> None:
 
     with FakeDevice(answers) as device:
         options = ("--areas", "hr", "--range", "0-4999", "--step", "2")
-        process = Command("map", device.url, "--json", *options)
+        process = Command("describe", "map", device.url, "--json", *options)
         assert enough.wait(wire.DEADLINE)
         process.send_signal(signal.SIGINT)
         # Nobody reads the pipe: what was found does not fit, so the command can't end by itself.
@@ -385,7 +397,7 @@ def test_a_device_that_goes_away_leaves_what_was_found() -> None:
         return registers(pdu) if pdu[0] >= 3 and first + count <= 9 else exception(pdu, 2)
 
     with FakeDevice(answers) as device:
-        result = cli.invoke("map", device.url, "--areas", "hr")
+        result = cli.invoke("describe", "map", device.url, "--areas", "hr")
     assert (result.exit_code, result.stderr) == (
         1,
         f"holdfast: {device.url}: the device stopped answering\n",

@@ -52,8 +52,11 @@ def test_a_file_is_verified(file: str) -> None:
         "plant: coils 0 to 9, 1 not 0",
         "plant: holding_registers 50 to 69, 2 not 0",
     ]
-    areas = {"coils": {"start": 0, "size": 10}, "holding_registers": {"start": 50, "size": 20}}
-    shown = {"file": file, "memories": {"plant": areas}, "set_aside": {}}
+    areas = {
+        "coils": {"address": 0, "count": 10},
+        "holding_registers": {"address": 50, "count": 20},
+    }
+    shown = {"ok": True, "target": file, "memories": {"plant": areas}, "set_aside": {}}
     assert answer("memory", "verify", file) == shown
 
 
@@ -127,7 +130,7 @@ def test_wrong_values_change_nothing(file: str, tmp_path: Path) -> None:
 def test_with_several_memories_one_is_named(tmp_path: Path) -> None:
     file = str(tmp_path / "two.redb")
     keep(tmp_path / "two.redb", first=[1, 0, 0], second=[2, 0, 0])
-    assert usage_error("memory", "export", file).endswith("add --memory: first, second")
+    assert usage_error("memory", "export", file).endswith("add --memory: first, second.")
     message = usage_error("memory", "export", file, "--memory", "secnd")
     assert "has no memory 'secnd', allowed: first, second; did you mean 'second'?" in message
     assert "holding_registers,60,2" in done("memory", "export", file, "--memory", "second")
@@ -139,7 +142,7 @@ def test_with_several_memories_one_is_named(tmp_path: Path) -> None:
 
 def test_a_form_is_chosen_by_its_ending(file: str, tmp_path: Path) -> None:
     message = usage_error("memory", "export", file, "--output", str(tmp_path / "v.txt"))
-    assert message.endswith("found v.txt, allowed: a file with one of .csv, .yaml, .yml")
+    assert message.endswith("found v.txt, allowed: a file with one of .csv, .yaml, .yml.")
 
 
 def test_values_that_were_cut_can_be_exported_and_released(file: str) -> None:
@@ -151,7 +154,10 @@ def test_values_that_were_cut_can_be_exported_and_released(file: str) -> None:
         "set aside of plant: holding_registers 61 to 69, 1 not 0",
     ]
     assert answer("memory", "verify", file)["set_aside"] == {
-        "plant": {"coils": {"start": 0, "size": 10}, "holding_registers": {"start": 61, "size": 9}}
+        "plant": {
+            "coils": {"address": 0, "count": 10},
+            "holding_registers": {"address": 61, "count": 9},
+        }
     }
     header = "area,address,value"
     assert done("memory", "export", file) == [header, "holding_registers,60,7"]
@@ -171,7 +177,7 @@ def test_values_of_one_memory_are_released(tmp_path: Path) -> None:
     keep(path, first=[1, 2, 3], second=[4, 5, 6])
     cut(path, first=holdfast.Memory(coils=10), second=holdfast.Memory(coils=10))
     file = str(path)
-    assert usage_error("memory", "release", file).endswith("add --memory: first, second")
+    assert usage_error("memory", "release", file).endswith("add --memory: first, second.")
     assert "has no memory 'thrid'" in usage_error("memory", "release", file, "--memory", "thrid")
     done("memory", "release", file, "--memory", "first")
     assert registers(file, "first") == [0, 0, 0, 1]

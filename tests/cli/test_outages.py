@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.appliance import control
+from holdfast.net.nats import connected_once
 from holdfast.scanner import Servers
 from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
-from holdfast.scanner.nats import connected_once
 from support import wire
 from support.brokers import NatsServer, free_port
 from support.cli import failure
@@ -29,8 +29,8 @@ COMMANDS = {
     "fleet drain": "fleet drain plant scan-a --nats {url}",
     "log backup": "log backup {file} {folder}/backup",
     "log replicas": "log replicas {file}",
-    "replay": "replay {file}",
-    "replay --follow": "replay {file} --follow",
+    "log replay": "log replay {file}",
+    "log replay --follow": "log replay {file} --follow",
     "health": "health --url http://{address}",
 }
 
@@ -144,4 +144,4 @@ def test_an_appliance_that_hangs_is_not_waited_for(hanging: Path) -> None:
 
 def test_a_reload_waits_for_long_only_if_the_appliance_answers(hanging: Path) -> None:
     with pytest.raises(control.NotRunning, match=r"has not answered within 0\.05 s"):
-        control.ask(hanging, "reload", within_s=control.RELOADING, ping_s=0.05)
+        control.ask(hanging, "reload", within_s=control.RELOAD_TIMEOUT_S, ping_s=0.05)

@@ -40,7 +40,7 @@ listeners:
         units:
           1: plant
           2-3: {memory: plant, access: read-only, functions: [3, 4]}
-          4: {memory: plant, read: [{area: coils, start: 0, count: 4}], write: [{area: coils,
+          4: {memory: plant, read: [{area: coils, start: 0, end: 3}], write: [{area: coils,
             start: 1, end: 2}]}
       - {sources: [10.0.0.0/8], access: read-only, units: {1-2: plant, 9: {route: bus}}}
   meters: {type: modbus-udp, bind: "127.0.0.1:5020", rules: [{sources: [10.1.0.0/16], access:
@@ -184,7 +184,7 @@ def ranges(draw: st.DrawFn, areas: tuple[str, ...]) -> list[dict[str, Any]]:
     found = []
     for area in draw(st.lists(st.sampled_from(areas), min_size=1, max_size=4)):
         start = draw(st.integers(0, SIZE - 1))
-        found.append({"area": area, "start": start, "count": draw(st.integers(1, SIZE - start))})
+        found.append({"area": area, "start": start, "end": draw(st.integers(start, SIZE - 1))})
     return found
 
 

@@ -82,7 +82,9 @@ def test_unit_sends_everything_to_one_device(device: Stream, proxy: Proxy) -> No
 
 
 def test_read_only_refuses_writes(device: Stream, proxy: Proxy) -> None:
-    with wire.Connection(proxy(device.url, "--read-only").wait_until_it_serves()) as client:
+    with wire.Connection(
+        proxy(device.url, "--access", "read-only").wait_until_it_serves()
+    ) as client:
         assert client.ask(WRITE) == exception(WRITE, 1)
         assert client.ask(READ) == FIVE
     assert [asked.pdu for asked in device.requests] == [READ]
@@ -126,7 +128,7 @@ def test_a_serial_line_has_broadcasts(proxy: Proxy, tmp_path: Path) -> None:
 def test_a_signal_ends_it_with_exit_code_0(
     device: Stream, proxy: Proxy, number: signal.Signals
 ) -> None:
-    running = proxy(device.url, "--json-log")
+    running = proxy(device.url, "--log-format", "json")
     with wire.Connection(running.wait_until_it_serves()) as client:
         assert client.ask(READ) == FIVE
         code, log = running.end(number)
@@ -137,7 +139,7 @@ def test_a_signal_ends_it_with_exit_code_0(
 def test_a_port_that_is_taken_is_one_line_and_exit_code_1() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        process = ServingCommand("proxy", NOBODY, "--listen", f"127.0.0.1:{port}").process
+        process = ServingCommand("proxy", NOBODY, "--bind", f"127.0.0.1:{port}").process
         out, log = process.communicate(timeout=wire.DEADLINE)
     assert (process.returncode, out) == (1, "")
     assert log.startswith("holdfast: listener proxy: ")
@@ -149,10 +151,10 @@ def test_a_port_that_is_taken_is_one_line_and_exit_code_1() -> None:
     ("arguments", "error"),
     [
         (["plc"], "Error: Invalid value for 'DEVICE-URL': 'plc' is not the URL of a device, "),
-        ([NOBODY, "--listen", "localhost:1"], "Error: Invalid value for '--listen': found "
+        ([NOBODY, "--bind", "localhost:1"], "Error: Invalid value for '--bind': found "
          "'localhost:1', allowed: address:port with an IP address, as in 127.0.0.1:502 or "
          "[::1]:502."),
-        ([NOBODY, "--listen", "0.0.0.0:1"], "Error: --listen 0.0.0.0:1 is reachable from other "
+        ([NOBODY, "--bind", "0.0.0.0:1"], "Error: --bind 0.0.0.0:1 is reachable from other "
          "machines: name the clients that may connect with --source NETWORK."),
         ([NOBODY, "--source", "10.0.0.1/8"], "Error: Invalid value for '--source': found "
          "'10.0.0.1/8', which has host bits set: the network is 10.0.0.0/8."),
@@ -160,20 +162,20 @@ def test_a_port_that_is_taken_is_one_line_and_exit_code_1() -> None:
          "0<=x<=255."),
         (["rtu:///dev/none", "--unit", "248"], "Error: --unit on a serial line is 1 to 247, not "
          "248."),
-        ([NOBODY, "--timeout", "0"], "Error: Invalid value for '--timeout': '0' is not a number "
-         "of seconds from 0.001 to 31622400."),
-        ([NOBODY, "--timeout", "nan"], "Error: Invalid value for '--timeout': 'nan' is not a "
-         "number of seconds from 0.001 to 31622400."),
-        ([NOBODY, "--cache", "-1"], "Error: Invalid value for '--cache': '-1' is not a number of "
-         "seconds from 0.001 to 31622400."),
+        ([NOBODY, "--timeout", "0"], "Error: Invalid value for '--timeout': '0' is not a time, as "
+         "in 500ms, 2s or 2 (seconds): from 0.001, up to 31622400 s."),
+        ([NOBODY, "--timeout", "nan"], "Error: Invalid value for '--timeout': 'nan' is not a time, "
+         "as in 500ms, 2s or 2 (seconds): from 0.001, up to 31622400 s."),
+        ([NOBODY, "--cache", "-1"], "Error: Invalid value for '--cache': '-1' is not a time, as in "
+         "500ms, 2s or 2 (seconds): 0, or from 0.001, up to 31622400 s."),
         ([NOBODY, "--in-flight", "1025"], "Error: Invalid value for '--in-flight': '1025' is not "
          "auto or a number from 1 to 1024."),
         ([NOBODY, "--functions", "3,128"], "Error: Invalid value for '--functions': '128' is not "
          "a function code from 1 to 127."),
         ([NOBODY, "--functions", "3,3"], "Error: Invalid value for '--functions': function 3 is "
-         "listed twice."),
-        ([NOBODY, "--functions", "3,65", "--read-only"], "Error: --functions 65 may write: omit "
-         "it, or --read-only."),
+         "given twice."),
+        ([NOBODY, "--functions", "3,65", "--access", "read-only"], "Error: --functions 65 may write"
+         ": omit it, or --access read-only."),
         (["tls://plc?ca=/none.pem"], "Error: "),
     ],
 )  # fmt: skip

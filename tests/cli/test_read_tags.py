@@ -65,7 +65,7 @@ def test_an_array_is_a_value_for_each_element(server: holdfast.Server) -> None:
     found = answer("read", cli.url(server), "hr:0:float32[2]:CDAB", "co:2:bool[2]")
     assert found == {
         "ok": True,
-        "url": cli.url(server),
+        "target": cli.url(server),
         "unit": 1,
         "values": {"hr:0": 230.1, "hr:2": found["values"]["hr:2"], "co:2": False, "co:3": True},
         "states": {},
@@ -136,7 +136,8 @@ def without_register_1(pdu: bytes) -> bytes:
 def test_a_refused_register_costs_only_its_tag() -> None:
     with FakeDevice(without_register_1) as device:
         result = invoke("read", device.url, "hr:0", "hr:1", "hr:2")
-        assert (result.exit_code, result.stderr) == (1, "")
+        hint = f"hint: 'holdfast describe map {device.url}' finds the addresses that exist\n"
+        assert (result.exit_code, result.stderr) == (1, hint)
         assert [line.split()[1] for line in result.stdout.splitlines()[1:]] == ["7", "?", "7"]
         assert result.stdout.splitlines()[2] == (
             "hr:1      ?  holding_registers 1 uint16  exception 02 (Illegal Data Address)"
@@ -148,7 +149,19 @@ def test_a_refused_register_costs_only_its_tag() -> None:
         result = invoke("read", device.url, "hr:0", "hr:1", "--csv")
         assert result.exit_code == 1
         assert result.stdout.splitlines()[1].endswith("Z,7,")
-        assert result.stderr == f"holdfast: hr:1: {detail}\n"
+        assert result.stderr == f"holdfast: hr:1: {detail}\n{hint}"
+
+
+def test_a_hint_is_printed_once_for_all_tags_and_readings() -> None:
+    often = ("--every", "0.01", "--times", "2")
+    with FakeDevice(lambda pdu: exception(pdu, 11)) as device:
+        hint = f"hint: 'holdfast find {device.url}' finds the unit ids that answer"
+        one = "exception 0B (Gateway Target Device Failed To Respond)"
+        for items in (("hr:0", "hr:9"), ("hr", "0")):
+            result = invoke("read", device.url, *items, *often)
+            assert result.output.count(one) == 2, result.output
+            assert result.stderr.splitlines().count(hint) == 1
+            assert result.stderr.count("hint: ") == 1
 
 
 def test_an_error_of_all_tags_is_one_line(unused: str) -> None:
@@ -169,7 +182,7 @@ def test_readings_are_repeated_and_recorded(
     record = tmp_path / "values.csv"
     often = ("--every", "0.01", "--record", str(record))
     arguments = ("read", cli.url(server), "--tags", tags)
-    shown = invoke(*arguments, *often, "--count", "2", "--csv").stdout.splitlines()
+    shown = invoke(*arguments, *often, "--times", "2", "--csv").stdout.splitlines()
     assert shown == record.read_text().splitlines()
     head, *rows = csv.reader(shown)
     assert head == ["time", "voltage", "power", "state", "level", "pump"]
@@ -265,16 +278,19 @@ def test_ctrl_c_leaves_a_whole_recording(server: holdfast.Server, tmp_path: Path
         (("hr:0:uint16[9000]",), "more than 8192 values"),
         (("hr:0", "hr:0"), "two tags have the name 'hr:0:uint16'"),
         (("hr:0", "--type", "float32"), "--type and --order can't be used with AREA:ADDRESS"),
-        (("hr:0", "--csv", "--json"), "--json and --csv can't be used together."),
-        (("hr:0", "--count", "2"), "--count requires --every."),
+        (("hr:0", "--count", "2"), "--times requires --every."),
         (("hr", "0", "--csv"), "--csv requires AREA:ADDRESS or --tags."),
         (("hr", "0", "--record", "x.csv"), "--record requires AREA:ADDRESS or --tags."),
         (("--profile", "x"), "--profile requires --tags."),
-        (("hr:0", "1"), "'1' is not an area"),
     ],
 )
 def test_wrong_usage_is_told(words: tuple[str, ...], told: str) -> None:
     assert told in usage_error("read", "tcp://127.0.0.1", *words)
+
+
+def test_there_is_one_form_at_a_time() -> None:
+    found = answer("read", "tcp://127.0.0.1", "hr:0", "--csv", code=2)
+    assert found["detail"] == "--json and --csv can't be used together."
 
 
 def test_problems_of_a_tag_list_are_told_with_their_places(tmp_path: Path) -> None:

@@ -107,7 +107,7 @@ listeners:
       - sources: [127.0.0.0/8]
         access: read-write
         units:
-          1: {memory: plant, deny: [6], read: [{area: holding_registers, start: 2, count: 3}]}
+          1: {memory: plant, deny: [6], read: [{area: holding_registers, start: 2, end: 4}]}
           2: {memory: plant, access: read-only, functions: [1, 3]}
 """)
     running = run(file)

@@ -115,7 +115,13 @@ def test_the_scanner_ends(
 
 @pytest.mark.parametrize(
     "words",
-    [("map",), ("watch", "hr", "0"), ("read", "hr", "0"), ("write", "hr", "0", "1"), ("identify",)],
+    [
+        ("describe map",),
+        ("watch", "hr", "0"),
+        ("read", "hr", "0"),
+        ("write", "hr", "0", "1"),
+        ("describe identify",),
+    ],
     ids=lambda words: words[0],
 )
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -123,7 +129,9 @@ def test_a_command_for_one_device_ends(
     device: ScriptedDevice, words: tuple[str, ...], number: signal.Signals, running: ExitStack
 ) -> None:
     name, *more = words
-    command = started(running, ServingCommand(name, device.url, *more, "--timeout", str(TIMEOUT)))
+    command = started(
+        running, ServingCommand(*name.split(), device.url, *more, "--timeout", str(TIMEOUT))
+    )
     device.await_requests(1)
     code, log = command.end(number, END_TIMEOUT)
     assert "Traceback" not in log

@@ -7,6 +7,7 @@ import re
 import shlex
 import signal
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -27,7 +28,7 @@ def simulate() -> Iterator[Callable[..., tuple[ServingCommand, str]]]:
     running = []
 
     def start(*arguments: str) -> tuple[ServingCommand, str]:
-        command = ServingCommand("simulate", *arguments, "--port", "0", "--every", "0.01")
+        command = ServingCommand("simulate", *arguments, "--bind", ":0", "--every", "0.01")
         running.append(command)
         found = re.search(r"tcp://\S+:\d+", command.wait_for_greeting())
         assert found is not None, command.greeting
@@ -60,6 +61,16 @@ def test_the_example_is_simulated_read_and_written(
     assert command.process.returncode == 0
 
 
+def test_a_simulated_device_has_an_event_log(
+    simulate: Callable[..., tuple[ServingCommand, str]],
+) -> None:
+    _, url = simulate(HEATER)
+    place = urlsplit(url)
+    with wire.Connection((str(place.hostname), place.port or 0)) as client:
+        # Status, no event, this message, its arrival.
+        assert client.ask(b"\x0c") == bytes.fromhex("0c07000000000001 80")
+
+
 def test_without_a_file_a_heater_is_simulated(
     simulate: Callable[..., tuple[ServingCommand, str]], tmp_path: Path
 ) -> None:
@@ -67,7 +78,7 @@ def test_without_a_file_a_heater_is_simulated(
     found = re.findall("^  holdfast (.*)$", command.greeting, re.MULTILINE)
     describe, watch = (line.replace("heater.yaml", str(tmp_path / "tags.yaml")) for line in found)
     done(*describe.split(), "--every", "0.01")
-    watched = invoke(*watch.split(), "--count", "1", "--json")
+    watched = invoke(*watch.split(), "--times", "1", "--json")
     assert (watched.exit_code, "ir_0" in watched.stdout) == (0, True)
     usage = usage_error("simulate", "--profile", "heater")
     assert "--profile needs FILE, a configuration." in usage
@@ -126,18 +137,22 @@ def test_an_address_in_use_is_told(simulate: Callable[..., tuple[ServingCommand,
     _, url = simulate(HEATER)
     port = url.rpartition(":")[2]
     for more in ((), ("--drop", "0.1")):
-        result = invoke("simulate", HEATER, "--port", port, *more)
+        result = invoke("simulate", HEATER, "--bind", port, *more)
         assert result.exit_code == 1
-        assert result.stderr.startswith(f"holdfast: can't listen on 127.0.0.1:{port}: ")
+        assert result.stderr.startswith(f"holdfast: can't listen on 127.0.0.1:{port}: Address ")
+        assert result.stderr.count("can't listen") == result.stderr.count(port) == 1
 
 
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("--bind", "0.0.0.0"), "--bind 0.0.0.0 is reachable from other machines: name the"),
-        (("--bind", "localhost"), "'localhost' does not appear to be an IPv4 or IPv6 address"),
+        (("--bind", "0.0.0.0"), "--bind 0.0.0.0:5020 is reachable from other machines: name the"),
+        (("--bind", "localhost"), "found 'localhost', allowed: address:port"),
         (("--set", "voltage"), "--set: 'voltage' is not NAME=GENERATOR."),
-        (("--set", "volts=sine:0:1:1"), "--set: no tag has the name 'volts'."),
+        (
+            ("--set", "volts=sine:0:1:1"),
+            "no tag has the name 'volts'; did you mean 'voltage'?",
+        ),
         (("--set", "voltage=sine:0:1"), "--set: voltage: 'sine:0:1' is not sine:LOW:HIGH:SECONDS"),
         (
             ("--set", "water=constant:9999"),
@@ -147,7 +162,7 @@ def test_an_address_in_use_is_told(simulate: Callable[..., tuple[ServingCommand,
         (("--drop", "5%"), "'5%' is not a share from 0 to 1, as in 0.05."),
         (("--drop", "0.6", "--exception", "0.6"), "--drop and --exception are more than 1"),
         (("--exception", "0.1:0"), "is not SHARE[:CODE] with a code from 1 to 255"),
-        (("--latency", "2-1"), "'2-1' is not SECONDS or MIN-MAX up to 60"),
+        (("--latency", "2-1"), "'2-1' is not TIME or MIN-MAX, as in"),
         (("--play", "/nonexistent.csv"), "/nonexistent.csv: No such file or directory."),
     ],
 )

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from holdfast.cli import main
 from holdfast.config import load
-from holdfast.config.source import parse
+from holdfast.config.text.source import parse
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -61,7 +61,7 @@ def test_a_secret_is_32_random_bytes() -> None:
 
 def test_programs_get_json() -> None:
     answer = json.loads(run("--name", "node-red", "--json").stdout)
-    assert list(answer) == ["name", "token", "sha256"]
+    assert list(answer) == ["ok", "name", "token", "sha256"]
     assert answer["name"] == "node-red"
     assert answer["sha256"] == digest(answer["token"])
 
@@ -143,4 +143,4 @@ def test_the_entry_of_the_gateway_fits_into_a_configuration(tmp_path: Path) -> N
 def test_there_is_one_form_at_a_time(options: tuple[str, ...]) -> None:
     result = run(*options)
     assert result.exit_code == 2
-    assert "can't be used together" in result.stderr
+    assert "can't be used together" in result.output

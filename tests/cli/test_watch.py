@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 import holdfast
-from holdfast.cli.sources import WatchedRange, by_modbus, cut, within
-from holdfast.cli.watching import WINDOW, Tracker
+from holdfast.cli.live.appliance_sources import by_modbus
+from holdfast.cli.live.changes import RATE_WINDOW_S, Tracker
+from holdfast.cli.live.sources import WatchedRange, cut, within
 from holdfast.config import load
 from support import cli, wire
 from support.cli import answer, failure, invoke, usage_error
@@ -120,7 +121,8 @@ def test_changes_are_objects_for_programs(
     memory.write("coils", 3, [1])
     change = json.loads(watching.line())
     assert change.pop("time").endswith("Z")
-    assert change == {"ok": True, "area": "coils", "address": 3, "was": 0, "now": 1}
+    whose = {"ok": True, "target": cli.url(server), "unit": 1}
+    assert change == {**whose, "area": "coils", "address": 3, "was": 0, "now": 1}
     assert watching.end() == 0
 
 
@@ -274,7 +276,7 @@ def test_what_a_unit_may_not_read_is_not_watched(tmp_path: Path) -> None:
     file = tmp_path / "plant.yaml"
     units = (
         "{1: {memory: pumps, functions: [6]}, 2: {memory: pumps, read: [{area: holding_registers, "
-        "start: 2, count: 3}]}}"
+        "start: 2, end: 4}]}}"
     )
     listener = LISTENER.replace("{3: boiler, 4: boiler, 5: pumps}", units)
     memories = "memories: {pumps: {coils: 8, holding_registers: 10}}\n"
@@ -286,7 +288,8 @@ def test_what_a_unit_may_not_read_is_not_watched(tmp_path: Path) -> None:
 def test_the_first_reading_must_succeed(server: holdfast.Server, tmp_path: Path) -> None:
     url = cli.url(server)
     assert failure("watch", url, "hr", "999", "2") == [
-        f"holdfast: {url}, unit 1: exception 02 (Illegal Data Address)"
+        f"holdfast: {url}, unit 1: exception 02 (Illegal Data Address)",
+        f"hint: 'holdfast describe map {url}' finds the addresses that exist",
     ]
     found = answer("watch", url, "hr", "999", "2", code=1)
     assert found["ok"] is False
@@ -425,7 +428,7 @@ def test_rates_are_taken_over_the_last_time() -> None:
     assert list(found) == [100, 102]
     assert [found[address][1].rate(7) for address in found] == [2, 1]
     assert found[100][1].changes == 7
-    assert found[100][1].rate(7 + WINDOW + 1) == 0
+    assert found[100][1].rate(7 + RATE_WINDOW_S + 1) == 0
     for second in range(8, 30):
         tracker.update(second, [[14 - second, 5, 1, 0]])
     assert found[100][1].rate(29) == pytest.approx(-1)

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from rich.cells import cell_len
 
-from holdfast.cli.tag_tracking import TagTracker
-from holdfast.cli.tag_view import TagView
+from holdfast.cli.tags.changes import TagTracker
+from holdfast.cli.tags.view import TagView
+from holdfast.client.tag_reading import Reading
 from holdfast.errors import ModbusException, RequestTimeout
 from holdfast.tags import Tag
-from holdfast.tools.tag_reading import Reading
 from support import cli, wire
 from support.cli import failure, invoke, usage_error
 from support.commands import Command
@@ -96,7 +96,7 @@ def test_changes_are_json_for_programs(server: holdfast.Server, memory: holdfast
 
 def test_csv_has_a_line_for_every_reading(server: holdfast.Server, tmp_path: Path) -> None:
     record = tmp_path / "values.csv"
-    often = ("--every", "0.01", "--count", "3")
+    often = ("--every", "0.01", "--times", "3")
     result = invoke(
         "watch", cli.url(server), "hr:0", "co:3", *often, "--csv", "--record", str(record)
     )

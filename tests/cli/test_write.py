@@ -91,7 +91,8 @@ def test_a_dry_run_prints_the_requests_and_sends_nothing(
     words: tuple[str, ...], pdus: list[str]
 ) -> None:
     assert done("write", NOWHERE, *words, "--dry-run") == pdus
-    assert answer("write", NOWHERE, *words, "--dry-run") == {"requests": pdus}
+    found = answer("write", NOWHERE, *words, "--dry-run")
+    assert (found["ok"], found["target"], found["pdus"]) == (True, NOWHERE, pdus)
 
 
 def test_many_values_are_written_by_several_requests_if_that_is_wanted(
@@ -127,6 +128,8 @@ def test_many_values_are_written_by_several_requests_if_that_is_wanted(
         (("hr", "0", "1", "0", "--type", "bit:1"), "bit:1 takes one value, found 2."),
         (("co", "0", "1", "--type", "int16"), "coils contain bits; the only type is bool."),
         (("hr", "0"), "Missing argument 'VALUE...'."),
+        (("setpoint=21.5",), "'setpoint=21.5': NAME=VALUE requires --tags or --config."),
+        (("hr", "0", "21,5", "--type", "float32"), "'21,5' is not a number; did you mean '21.5'?"),
         (("ir", "0", "1"), "input_registers can't be written, only read."),
         (("30001", "1", "--modicon"), "input_registers can't be written, only read."),
         (("hr", "0", "1", "--tpye", "int16"), "No such option '--tpye'."),
@@ -141,7 +144,8 @@ def test_wrong_usage_is_told(words: tuple[str, ...], told: str) -> None:
 def test_a_refusal_is_told(server: holdfast.Server) -> None:
     url = cli.url(server)
     assert failure("write", url, "hr", "1000", "1") == [
-        f"holdfast: {url}: exception 02 (Illegal Data Address)"
+        f"holdfast: {url}: exception 02 (Illegal Data Address)",
+        f"hint: 'holdfast describe map {url}' finds the addresses that exist",
     ]
     found = answer("write", url, "hr", "1000", "1", code=1)
     assert (found["ok"], found["code"], found["maybe_written"]) == (False, 2, False)
@@ -180,3 +184,45 @@ def test_what_can_not_be_read_back_is_told() -> None:
         ]
         found = answer(*call, code=1)
     assert (found["ok"], found["maybe_written"], found["code"]) == (False, True, 1)
+
+
+def test_records_of_a_file_are_written_and_read_back() -> None:
+    records = "06af04be"
+
+    def file(pdu: bytes) -> bytes:
+        return pdu if pdu[0] == 21 else bytes.fromhex("14060506" + records)
+
+    request = "150b0600040007000206af04be"
+    call = ("write", "file:4:7", "1711", "0x4BE")
+    with FakeDevice(file) as device:
+        to = (call[0], device.url, *call[1:])
+        written = "Written: file 4 records 7 to 8, 1 request"
+        assert done(*to) == [f"{written}."]
+        assert done(*to, "--verify") == [f"{written}; read back alike."]
+        assert answer(*to) == {
+            "ok": True,
+            "target": device.url,
+            "unit": 1,
+            "file": 4,
+            "record": 7,
+            "count": 2,
+        }
+        records = "06af04bf"
+        assert "file 4 record 8: wrote 1214, read back 1215" in cli.invoke(*to, "--verify").stderr
+        assert done(*to, "--dry-run") == [request]
+    assert [pdu.hex() for pdu in device.asked if pdu[0] == 21] == [request] * 4
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("fifo:1", "7"), "A queue can't be written"),
+        (("file:4:7",), "Missing argument 'VALUE...'"),
+        (("file:4:7", "65536"), "65536"),
+        (("file:4:7", "x"), "'x' is not an integer"),
+        (("file:4:7", *["1"] * 123), "count is 123, allowed: 1 to 122"),
+        (("file:4:7", "1", "--type", "int16"), "can't be used with file:4:7"),
+    ],
+)
+def test_what_cannot_be_written_to_a_file_is_wrong_usage(words: tuple[str, ...], told: str) -> None:
+    assert told in usage_error("write", NOWHERE, *words)

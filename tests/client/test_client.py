@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.client.tolerance import Tolerance
-from holdfast.client.url import NetworkTarget, SerialTarget, Tls, parse
+from holdfast.client.url import NetworkTarget, SerialTarget, Tls, Tolerance, parse
 from holdfast.server import Identity
 from holdfast.types import AREAS
 from support import lines, transports, wire
@@ -278,6 +277,8 @@ def test_nothing_is_read_from_all_units_of_a_line(client: Face) -> None:
         lambda: client.read_write(0, 1, 0, [1], unit=0),
         lambda: client.identify(unit=0),
         lambda: client.diagnostics(0, unit=0),
+        lambda: client.read_fifo_queue(0, unit=0),
+        lambda: client.call_function(65, unit=0),
     ):
         with pytest.raises(ValueError, match="unit 0 of a serial line is the broadcast"):
             read()
@@ -452,6 +453,35 @@ REFUSED: list[tuple[str, tuple[Any, ...], dict[str, Any], type[Exception], str]]
     ("diagnostics", (0, [65536]), {}, ValueError, "data contains 65536"),
     ("diagnostics", (0, [0] * 126), {}, ValueError, "does not allow these arguments"),
     ("diagnostics", (10, [1]), {}, ValueError, "does not allow these arguments"),
+    ("read_file_record", (0, 0), {}, ValueError, "file is 0, allowed: 1 to 65535"),
+    ("read_file_record", (1, 10_000), {}, ValueError, "record is 10000, allowed: 0 to 9999"),
+    ("read_file_record", (1, -1), {}, ValueError, "record is -1"),
+    ("read_file_record", (1, 0, 0), {}, ValueError, "count is 0, allowed: 1 to 121"),
+    ("read_file_record", (1, 0, -1), {}, ValueError, "count is -1"),
+    ("read_file_record", (1, 9999, 2), {}, ValueError, "the last record is 9999"),
+    ("read_file_record", (1, 9900, 200), {}, ValueError, "the last record is 9999"),
+    (
+        "read_file_record",
+        (1, 0, HUGE),
+        {},
+        ValueError,
+        "the last record is 9999",
+    ),
+    ("read_file_record", (1, 0, 1.0), {}, TypeError, "float"),
+    ("read_file_records", ([],), {}, ValueError, "the ranges take 0 bytes"),
+    ("read_file_records", ([(1, 0, 122)],), {}, ValueError, "count is 122, allowed: 1 to 121"),
+    ("read_file_records", ([(1, 0, 61), (1, 61, 61)],), {}, ValueError, "take 248 bytes"),
+    ("read_file_records", ([(1, 0, 1)] * 36,), {}, ValueError, "take 252 bytes"),
+    ("read_file_records", ([(1, 0)],), {}, ValueError, "tuple of length 3"),
+    ("write_file_record", (1, 0, []), {}, ValueError, "count is 0, allowed: 1 to 122"),
+    ("write_file_record", (1, 0, [0] * 123), {}, ValueError, "count is 123, allowed: 1 to 122"),
+    ("write_file_record", (1, 0, [65536]), {}, ValueError, r"values\[0\] is 65536"),
+    ("write_file_record", (65536, 0, [1]), {}, ValueError, "file is 65536"),
+    ("write_file_records", ([(1, 0, [0] * 61)] * 2,), {}, ValueError, "take 258 bytes"),
+    ("read_fifo_queue", (65536,), {}, ValueError, "address is 65536"),
+    ("call_function", (0,), {}, ValueError, "function is 0, allowed: 1 to 127"),
+    ("call_function", (128,), {}, ValueError, "function is 128"),
+    ("call_function", (65, bytes(253)), {}, ValueError, "length of data is 253, allowed: 0 to 252"),
     ("read", ("coil", 0, "bool"), {}, ValueError, 'unknown area "coil"'),
     ("read", ("coils", 0, "uint16"), {}, ValueError, "allowed in coils: bool"),
     ("read", ("holding_registers", 0, "int24"), {}, ValueError, "int24"),
@@ -562,7 +592,7 @@ def test_a_target_is_shown_as_a_url() -> None:
         ("tls://", "is not the address of a device"),
         ("tls://plc/unit", "is not the address of a device"),
         ("tls://plc?baud=9600", "unknown option 'baud', allowed: accept_unit, pad, .*, ca, cert"),
-        ("tls://plc?ca=a&ca=b", "duplicate option ca"),
+        ("tls://plc?ca=a&ca=b", "option 'ca' is given twice"),
         ("tls://plc?ca=", "ca is '', allowed: paths of files"),
         ("tls://plc?ca=a%00b", r"ca is 'a\\x00b', allowed: paths of files"),
         ("tls://plc?name=", "name is '', allowed: host names and IP addresses"),
@@ -589,7 +619,7 @@ def test_a_target_is_shown_as_a_url() -> None:
         ("rtu:///dev/x?silence=0", "silence is '0', allowed: seconds, up to 10"),
         ("rtu:///dev/x?echo=yes", "echo is 'yes', allowed: 0, 1"),
         ("rtu:///dev/x?speed=1", "unknown option 'speed', allowed: baud, parity"),
-        ("rtu:///dev/x?baud=9600&baud=9600", "duplicate option baud"),
+        ("rtu:///dev/x?baud=9600&baud=9600", "option 'baud' is given twice"),
         ("ascii:///dev/x?silence=1", "unknown option 'silence'"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import copy
 import socket
 import threading
 from contextlib import suppress
@@ -12,7 +13,7 @@ import pytest
 
 import holdfast
 from support import wire
-from support.fake_device import Stream
+from support.fake_device import Stream, silent
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -50,8 +51,9 @@ def test_a_lookup_has_the_timeout_of_the_request(unanswered: threading.Event) ->
 
 def test_a_call_that_is_cancelled_leaves_its_lookup_behind(unanswered: threading.Event) -> None:
     async def main() -> None:
-        reading = asyncio.create_task(read("tcp://plc7", 10 * wire.DEADLINE))
-        await asyncio.to_thread(unanswered.wait, wire.DEADLINE)
+        # Another name than before: equal lookups are shared, and the last one may still end.
+        reading = asyncio.create_task(read("tcp://plc8", 10 * wire.DEADLINE))
+        assert await asyncio.to_thread(unanswered.wait, wire.DEADLINE)
         reading.cancel()
         with pytest.raises(asyncio.CancelledError):
             await reading
@@ -62,13 +64,26 @@ def test_a_call_that_is_cancelled_leaves_its_lookup_behind(unanswered: threading
 def test_a_connection_that_is_not_made_in_time_is_told_without_the_name() -> None:
     with wire.dead_address() as (host, port):
         expected = rf"^no connection to tcp://{host}:{port} within 0\.1 s$"
-        with pytest.raises(holdfast.RequestTimeout, match=expected):
+        with pytest.raises(holdfast.RequestTimeout, match=expected) as awaited:
             asyncio.run(read(f"tcp://{host}:{port}", 0.1))
         with (
             holdfast.SyncClient(f"tcp://{host}:{port}", timeout=0.1) as plc,
-            pytest.raises(holdfast.RequestTimeout, match=expected),
+            pytest.raises(holdfast.RequestTimeout, match=expected) as blocking,
         ):
             plc.read_holding_registers(7, 1)
+    assert not awaited.value.maybe_sent
+    assert not blocking.value.maybe_sent
+    assert copy.copy(awaited.value).maybe_sent is False
+
+
+def test_a_request_without_a_reply_may_have_been_sent() -> None:
+    with (
+        Stream("tcp", then=silent) as device,
+        holdfast.SyncClient(device.url, timeout=0.1) as plc,
+        pytest.raises(holdfast.RequestTimeout) as error,
+    ):
+        plc.read_holding_registers(7, 1)
+    assert error.value.maybe_sent
 
 
 def test_a_name_that_is_not_known_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,9 +91,9 @@ def test_a_name_that_is_not_known_is_told(monkeypatch: pytest.MonkeyPatch) -> No
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
-    expected = r"^can't connect to tcp://plc7:502: Name or service not known$"
+    expected = r"^can't connect to tcp://plc9:502: Name or service not known$"
     with pytest.raises(holdfast.ConnectFailed, match=expected):
-        asyncio.run(read("tcp://plc7", wire.DEADLINE))
+        asyncio.run(read("tcp://plc9", wire.DEADLINE))
 
 
 def test_a_dead_address_of_a_name_leaves_time_for_the_next(monkeypatch: pytest.MonkeyPatch) -> None:

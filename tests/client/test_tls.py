@@ -649,7 +649,7 @@ def test_commands(device: Address, authority: Authority, plc: Owner, tmp_path: P
         url = relay.url(ca=authority.ca)
         told = answer("read", url, "hr", "0", "3")
         assert told["registers"] == [11, 22, 33]
-        told = answer("bench", url, "--count", "3", "--in-flight", "4", "--seconds", "0.05")
+        told = answer("bench", url, "--count", "3", "--in-flight", "4", "--duration", "50ms")
         assert told["errors"] == {}
 
         [told] = failure("read", relay.url(ca=authority.ca, name="plc7"), "hr", "0")
@@ -657,7 +657,7 @@ def test_commands(device: Address, authority: Authority, plc: Owner, tmp_path: P
         none = f"tls://plc?ca={tmp_path}/none.pem"
         for words in (("read", none, "hr", "0"), ("bench", none), ("watch", none, "hr", "0")):
             assert "No such file or directory" in usage_error(*words)
-        assert "1 request" in done("plan", none, "--read", "hr:0:3")
+        assert "1 request" in done("check", "plan", none, "hr:0-2")
 
 
 def test_an_appliance_polls_a_device_with_files_beside_its_configuration(

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.client.tolerance import Tolerance
-from holdfast.client.url import NetworkTarget, in_folder, parse
+from holdfast.client.url import NetworkTarget, Tolerance, in_folder, parse
 from support import wire
 from support.faces import FACES, Dial, connected, dialling, run
 from support.fake_device import (
@@ -627,7 +626,7 @@ def test_every_url_has_the_options(place: str) -> None:
         ("retry_busy=2", "retry_busy is '2', allowed: 0, 1"),
         ("close_after=65536", "close_after is '65536', allowed: 0 to 65535"),
         ("reconnect=", "reconnect is '', allowed: seconds, up to 60"),
-        ("pad=1&pad=1", "duplicate option pad"),
+        ("pad=1&pad=1", "option 'pad' is given twice"),
     ],
 )
 @pytest.mark.parametrize("place", ["tcp://plc", "tls://plc", "rtu+udp://plc", "rtu:///dev/a"])

@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 import pytest
 from hypothesis import given, settings
 
-from holdfast.client.receiver import Receiver
-from holdfast.client.url import parse
+from holdfast.client.url import Receiver, parse
 from holdfast.config import (
     AuditConfig,
     Config,
-    CostConfig,
     DestinationConfig,
     DeviceConfig,
     InitialRun,
@@ -34,10 +32,10 @@ from holdfast.config import (
     Seal,
     SerialRuleConfig,
     Span,
-    SyslogConfig,
     TokenConfig,
     json_schema,
     load,
+    planning,
 )
 from holdfast.config.dump import effective
 from support.cases import examples
@@ -236,9 +234,7 @@ def test_rtu_over_udp_is_set_like_modbus_udp(loaded: Callable[..., Config]) -> N
 def test_an_rtu_line_has_the_defaults_of_the_standard(loaded: Callable[..., Config]) -> None:
     text = f"type: modbus-rtu, serial: {{device: COM3}}, rules: [{LINE}]"
     listener = listener_of(loaded, text, ModbusRtuListener)
-    assert listener.serial == RtuSerialConfig(
-        device="COM3", baud=19200, parity="even", stop_bits=1, data_bits=8
-    )
+    assert listener.serial == RtuSerialConfig(device="COM3", baud=19200, parity="even", stop_bits=1)
     assert listener.rules == (SerialRuleConfig(units={247: "plant"}, access="read-only"),)
 
 
@@ -400,9 +396,9 @@ def test_an_audit_file_has_the_documented_limits(
 
 
 def test_syslog_or_the_journal_can_replace_the_audit_file(loaded: Callable[..., Config]) -> None:
-    audit = loaded((SMALL % "") + "audit: {syslog: {url: 'tcp://10.0.0.9'}}\n").audit
+    audit = loaded((SMALL % "") + "audit: {syslog: 'tcp://10.0.0.9'}\n").audit
     assert audit is not None
-    assert (audit.file, audit.syslog) == (None, SyslogConfig(url="tcp://10.0.0.9"))
+    assert (audit.file, audit.syslog) == (None, "tcp://10.0.0.9")
     audit = loaded((SMALL % "") + "audit: {journald: true}\n").audit
     assert audit == AuditConfig(journald=True)
 
@@ -419,7 +415,7 @@ def device_of(
 
 def test_a_device_has_the_documented_defaults(loaded: Callable[..., Config]) -> None:
     device = device_of(loaded)
-    assert (device.enabled, device.timeout, device.max_gap, device.cost) == (True, 1, 0, None)
+    assert (device.enabled, device.timeout, device.max_gap) == (True, 1, 0)
     assert (device.max_registers, device.max_bits) == (125, 2000)
     assert (device.readable, device.forbidden, device.forward, device.status) == ((), (), (), None)
     assert device.target == parse("tcp://10.0.0.9:502")
@@ -433,10 +429,9 @@ def test_a_device_has_the_documented_defaults(loaded: Callable[..., Config]) -> 
     )
 
 
-def test_a_device_with_costs_has_no_gap(loaded: Callable[..., Config]) -> None:
-    device = device_of(loaded, ", cost: {per_request: 12, per_register: 0.5}")
-    assert device.max_gap is None
-    assert device.cost == CostConfig(per_request=12, per_register=0.5)
+def test_a_device_with_an_automatic_gap_is_planned_by_costs(loaded: Callable[..., Config]) -> None:
+    rules = planning.rules(device_of(loaded, ", max_gap: auto"))
+    assert (rules["max_gap"], rules["cost"]) == (None, planning.UNMEASURED_COST_MS)
 
 
 @pytest.mark.parametrize(
@@ -444,10 +439,10 @@ def test_a_device_with_costs_has_no_gap(loaded: Callable[..., Config]) -> None:
     [
         ("start: 10, end: 19", range(10, 20)),
         ("start: 10, end: 10", range(10, 11)),
-        ("start: 65526, count: 10", range(65526, 65536)),
+        ("start: 65526, end: 65535", range(65526, 65536)),
     ],
 )
-def test_a_range_of_a_device_has_a_last_address_or_a_count(
+def test_a_range_of_a_device_has_a_last_address(
     loaded: Callable[..., Config], written: str, addresses: range
 ) -> None:
     device = device_of(loaded, f", forbidden: [{{area: holding_registers, {written}}}]")
@@ -571,7 +566,9 @@ def test_the_dump_of_the_example_shows_every_default(loaded: Callable[..., Confi
         "    when_full: refuse\n"
         "    idle_timeout: 300\n"
         "    request_timeout: 10\n"
+        "    keepalive: 60\n"
         "    listen_only: false\n"
+        "    event_log: false\n"
         "    rules:\n"
         "      - sources: [10.0.0.7/32, fd00::/64]\n"
         "        units: {1: plant, 16: plant}\n"
@@ -677,9 +674,9 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "AuditConfig": None,
         "BufferConfig": None,
         "ClientTlsConfig": None,
-        "CostConfig": ["per_request", "per_register"],
         "DestinationConfig": ["memory", "area", "address"],
         "DeviceConfig": ["url"],
+        "DeviceIdentityConfig": None,
         "FileConfig": ["type", "file", "format"],
         "ForwardConfig": ["url"],
         "ForwardedStatusConfig": ["area", "slot"],
@@ -713,7 +710,8 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "RawIngestListener": ["type", "bind", "rules"],
         "OffsetsConfig": None,
         "ProfileConfig": ["tags"],
-        "RangeConfig": ["area", "start"],
+        "ExceptionStatusConfig": ["area", "address"],
+        "RangeConfig": ["area", "start", "end"],
         "RawCompatConfig": None,
         "RawIngestConfig": ["rules"],
         "RawRuleConfig": ["sources", "areas"],
@@ -734,7 +732,6 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "StatusConfig": ["area", "slot", "memory"],
         "SparkplugConfig": ["url", "type", "group", "edge_node"],
         "SubscriptionConfig": ["topic", "memories", "areas"],
-        "SyslogConfig": ["url"],
         "TagConfig": ["area", "address"],
         "TlsRuleConfig": ["sources", "units", "access"],
         "TokenConfig": ["name", "sha256", "memories", "areas", "access"],

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.client.tolerance import Tolerance
-from holdfast.client.url import NetworkTarget, Tls
+from holdfast.client.url import NetworkTarget, Tls, Tolerance
 from support.config_folder import Folder
 
 if TYPE_CHECKING:
@@ -111,7 +110,8 @@ def test_a_right_device_is_right(folder: Folder) -> None:
          "8: timeout: found 0, allowed: a number from 0.001 to 31622400"),
         ("    reads", "    enabled: 1\n    reads",
          "8: enabled: found 1, allowed: true or false"),
-        ("    reads", "    max_gap: -1\n    reads", f"8: max_gap: found -1, allowed: {WORD}"),
+        ("    reads", "    max_gap: -1\n    reads",
+         f"8: max_gap: found -1, allowed: {WORD} or auto"),
         ("    reads", "    max_registers: 126\n    reads",
          "8: max_registers: found 126, allowed: an integer from 1 to 125"),
         ("    reads", "    max_bits: 0\n    reads",
@@ -135,28 +135,28 @@ def test_a_right_device_is_right(folder: Folder) -> None:
          "8: tolerance.echo: found true, allowed with RTU and ASCII frames only"),
         ("url: tcp://10.0.0.9\n", "url: tcp://10.0.0.9?pad=1\n    tolerance: {retries: 1}\n",
          "6: tolerance: found together with options of the URL, allowed: one of both"),
-        ("    reads", "    max_gap: 1\n    cost: {per_request: 1, per_register: 1}\n    reads",
-         "9: cost: found together with max_gap, allowed: only one of them"),
-        ("    reads", "    cost: {per_request: 1}\n    reads",
-         "8: cost.per_register: missing, allowed: a number from 0 to 3600000"),
-        ("    reads", "    cost: {per_request: -1, per_register: 1}\n    reads",
-         "8: cost.per_request: found -1, allowed: a number from 0 to 3600000"),
+        ("    reads", "    cost: {per_request: 1, per_register: 1}\n    reads",
+         "8: cost: removed, allowed: max_gap: auto, which measures the device, or max_gap: N with "
+         "N = per_request / per_register"),
         ("    reads", "    forbidden: [{area: coils, start: 1}]\n    reads",
-         "8: forbidden[0]: found neither end nor count, allowed: one of them"),
+         "8: forbidden[0].end: missing, allowed: an integer from 0 to 65535"),
         ("    reads", "    forbidden: [{area: coils, start: 1, end: 1, count: 1}]\n    reads",
-         "8: forbidden[0].count: found together with end, allowed: only one of them"),
+         "8: forbidden[0].count: removed, allowed: end, the last address: start + count - 1"),
+        ("    reads", "    readable: [{area: coils, start: 1, end: 1, count: 1}]\n    reads",
+         "8: readable[0].count: removed, allowed: end, the last address: start + count - 1"),
         ("    reads", "    readable: [{area: coils, start: 2, end: 1}]\n    reads",
          "8: readable[0].end: found 1, allowed: the last address, 2 or more"),
-        ("    reads", "    readable: [{area: coils, start: 65535, count: 2}]\n    reads",
-         "8: readable[0].count: found start 65535 and count 2, allowed: a sum up to 65536"),
-        ("    reads", "    forbidden: [{area: input_registers, start: 29, count: 1}]\n    reads",
+        ("    reads", "    readable: [{area: coils, start: 65535, end: 65536}]\n    reads",
+         "8: readable[0].end: found 65536, allowed: an integer from 0 to 65535"),
+        ("    reads", "    forbidden: [{area: input_registers, start: 29, end: 29}]\n    reads",
          "10: reads[0]: found 10 to 29, which overlaps 29 to 29 of forbidden[0] in line 8, "
          "allowed: other addresses"),
         ("    reads", "    forbidden: [{area: input_registers, start: 0, end: 10}]\n    reads",
          "10: reads[0]: found 10 to 29, which overlaps 0 to 10 of forbidden[0] in line 8, "
          "allowed: other addresses"),
         ("area: input_registers\n", "area: registers\n", "9: reads[0].area: found 'registers', "
-         "allowed: coils, discrete_inputs, holding_registers or input_registers"),
+         "allowed: coils, discrete_inputs, holding_registers or input_registers; did you mean "
+         "'input_registers'?"),
         ("address: 10\n", "address: 65536\n",
          f"10: reads[0].address: found 65536, allowed: {WORD}"),
         ("count: 20", "count: 0",
@@ -394,16 +394,14 @@ def test_a_read_that_goes_nowhere_is_a_warning(folder: Folder) -> None:
         ("", True),
         ("    max_gap: 0\n", True),
         ("    max_gap: 1\n", False),
-        ("    cost: {per_request: 1, per_register: 1}\n", False),
+        ("    max_gap: auto\n", False),
     ],
 )
 def test_readable_ranges_without_holes_are_a_warning(
     folder: Folder, more: str, warned: bool
 ) -> None:
     text = HEAD + METER + "    readable: [{area: coils, start: 0, end: 1}]\n" + more
-    message = (
-        "p.yaml:14: devices.meter.readable: has no effect: gaps are read only with max_gap or cost"
-    )
+    message = "p.yaml:14: devices.meter.readable: has no effect: gaps are read only with max_gap"
     assert folder.warnings(text) == ([message] if warned else [])
 
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.config import Config, ConfigError, Problem, load, source
-from holdfast.config.load import checked
-from holdfast.config.source import parse, table
+from holdfast.config import Config, ConfigError, Problem, load
+from holdfast.config.loader import checked
+from holdfast.config.text import source
+from holdfast.config.text.source import parse, table
 from support.config_folder import Folder
 from support.paths import EXAMPLES
 
@@ -49,7 +50,7 @@ def changed(old: str, new: str, text: str = GOOD) -> str:
 AREA = "an integer from 1 to 65536 or a mapping with the keys start, size"
 SOURCE = "a network or an address, as in 10.0.0.0/24, 10.0.0.7 or fd00::/64"
 BIND = "address:port with an IP address, as in 127.0.0.1:502 or [::1]:502"
-CODES = "1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23 or 43"
+CODES = "1, 2, 3, 4, 5, 6, 7, 8, 11, 12, 15, 16, 17, 22, 23 or 43"
 TOP = (
     "memories, logs, identity, listeners, profiles, devices, links, rest, mqtt, nats, gateway, "
     "outputs, adapters, metrics, audit, log, reload, workers"
@@ -435,7 +436,7 @@ def test_initial_values_from_csv_are_checked(folder: Folder, line: str, problem:
         ("coils: {6: [1, 1, 1]}", "1: coils.6[2]: found address 8, allowed in coils: 0 to 7"),
         ("coils: {0: [0, true]}", "1: coils.0[1]: found true, allowed in coils: 0 or 1"),
         ("coils:\n  0: [0, 1]\n  1: 1", "3: coils.1: duplicate coils 1, first in line 2"),
-        ("coils:\n  0: 1\n  0: 1", "3: coils: duplicate key 0, first in line 2"),
+        ("coils:\n  0: 1\n  0: 1", "3: coils: 0 is given twice, first in line 2"),
         ("coils: {a: 1}", "1: coils.a: found address 'a', allowed in coils: 0 to 7"),
         ("coils: [1]", "1: coils: found a list, allowed: {address: value}"),
         ("[1]", "1: found a list, allowed: area: {address: value}"),
@@ -461,7 +462,11 @@ def test_initial_values_from_yaml_are_checked(folder: Folder, values: str, probl
          f"1: found a mapping with 2 other keys, allowed: a mapping with the keys {TOP}"),
         ("secret: 1\n",
          f"1: found a mapping with another key, allowed: a mapping with the keys {TOP}"),
-        ("a: 1\n b: 2", "2: not YAML: mapping values are not allowed here"),
+        ("a: 1\n b: 2", "2: not YAML: a `:` where no key can be: indented further than the keys "
+         "above it, or a text with `: `, which needs quotes"),
+        ("a:\n\tb: 1", "2: not YAML: a tab indents this line, allowed: spaces"),
+        ("a:\n    b: 1\n  c: 2", "3: not YAML: indented unlike the keys above it, allowed: keys of "
+         "one mapping begin in the same column"),
         (
             "a: [1,\nb\nc: 3\n",
             "3: not YAML: expected ',' or ']', but got ':', "
@@ -514,13 +519,30 @@ def test_an_alias_of_itself_is_refused(folder: Folder) -> None:
 
 def test_a_key_that_comes_twice_is_named_with_both_lines(folder: Folder) -> None:
     assert folder.problems(MEMORIES + "  plant: {coils: 1}\n" + LISTENERS) == [
-        "p.yaml:3: memories: duplicate key 'plant', first in line 2"
+        "p.yaml:3: memories: 'plant' is given twice, first in line 2"
     ]
 
 
 def test_a_unit_id_that_comes_twice_in_two_notations_is_found(folder: Folder) -> None:
     assert folder.problems(changed("{1: plant}", "{1: plant, 0x1: plant}")) == [
-        f"p.yaml:9: {RULE}.units: duplicate key 1, first in line 9"
+        f"p.yaml:9: {RULE}.units: 1 is given twice, first in line 9"
+    ]
+
+
+def test_a_range_of_unit_ids_with_zeros_in_front_overlaps_like_any_other(folder: Folder) -> None:
+    (problem,) = folder.problems(changed("{1: plant}", "{1-5: plant, 03-9: plant}"))
+    assert problem.endswith(
+        "units.03-9: found 03-9, which overlaps 1-5 in line 9, allowed: each unit id once"
+    )
+
+
+def test_an_invalid_key_costs_only_the_checks_that_need_it(folder: Folder) -> None:
+    text = changed("holding_registers: 10", "holding_registers: {start: 1}, initial: v.csv")
+    problems = folder.problems(text, v_csv="coils,9,1\n")
+    assert [problem.partition(": found")[0] for problem in problems] == [
+        "p.yaml:2: memories.plant.holding_registers.size: missing, "
+        "allowed: an integer from 1 to 65536",
+        "v.csv:1",
     ]
 
 
@@ -586,7 +608,7 @@ def test_all_problems_of_all_kinds_are_told_at_once_in_the_order_of_lines(folder
         "p.yaml:3: memories.a.coil",
         "p.yaml:5: memories.a.holding_registers",
         "p.yaml:6: memories.a.seal.address",
-        "p.yaml:8: memories: duplicate key 'a', first in line 2",
+        "p.yaml:8: memories: 'a' is given twice, first in line 2",
         "p.yaml:13: listeners.one.idle_timeout",
         "p.yaml:15: listeners.one.rules[0].units.1",
         "p.yaml:15: listeners.one.rules[0].access",

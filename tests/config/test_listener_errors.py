@@ -107,7 +107,7 @@ def test_a_listener_of_an_unknown_type_has_its_memories_checked(folder: Folder) 
         (
             "    rules:",
             "    idle_timeout: 5\n    rules:",
-            "8: idle_timeout: unknown key, allowed: type, bind, listen_only, rules",
+            "8: idle_timeout: unknown key, allowed: type, bind, listen_only, event_log, rules",
         ),
         ("{1: plant}", "{256: plant}", "9: rules[0].units.256: found 256, allowed: a unit id from "
          "0 to 255, or a range, as in 20-40"),
@@ -146,15 +146,16 @@ def test_a_listener_for_rtu_over_tcp_is_checked_like_modbus_tcp(folder: Folder) 
         ("{device: a, stop_bits: true}", "serial.stop_bits: found true, allowed: 1 or 2"),
         ("{device: a, stop_bits: 1.0}", "serial.stop_bits: found 1.0, allowed: 1 or 2"),
         ("{device: a, stop_bits: }", "serial.stop_bits: found nothing, allowed: 1 or 2"),
-        ("{device: a, data_bits: 7}", "serial.data_bits: found 7, allowed: 8"),
+        ("{device: a, data_bits: 7}",
+         "serial.data_bits: removed, RTU has 8 data bits: delete the key"),
         ("{device: a, silence: 0}",
          "serial.silence: found 0, allowed: a number from 0.0001 to 10"),
         ("{device: a, silence: }",
          "serial.silence: found nothing, allowed: a number from 0.0001 to 10"),
         ("{device: a, sillence: 1}", "serial.sillence: unknown key, allowed: device, baud, parity, "
-         "stop_bits, data_bits, rs485, silence; did you mean 'silence'?"),
+         "stop_bits, rs485, silence; did you mean 'silence'?"),
         ("/dev/ttyUSB0", "serial: found '/dev/ttyUSB0', allowed: a mapping with the keys device, "
-         "baud, parity, stop_bits, data_bits, rs485, silence"),
+         "baud, parity, stop_bits, rs485, silence"),
     ],
 )  # fmt: skip
 def test_an_rtu_line_is_checked(folder: Folder, serial: str, problem: str) -> None:
@@ -168,7 +169,7 @@ def test_an_rtu_line_is_checked(folder: Folder, serial: str, problem: str) -> No
         ("data_bits: 6", "data_bits: found 6, allowed: 7 or 8"),
         (
             "silence: 1",
-            "silence: unknown key, allowed: device, baud, parity, stop_bits, data_bits, rs485",
+            "silence: unknown key, allowed: device, baud, parity, stop_bits, rs485, data_bits",
         ),
     ],
 )
@@ -246,13 +247,15 @@ def test_serial_lines_need_ports_of_their_own(folder: Folder, device: str) -> No
         ("    bind", "    when_full: wait\n    bind",
          "7: when_full: found 'wait', allowed: refuse or evict"),
         ("    bind", "    listen_only: true\n    bind", "7: listen_only: unknown key, allowed: "
-         "type, format, bind, tls, max_connections, max_connections_per_source, "
-         "when_full, max_handshakes, request_timeout, compat, idle_timeout, rules"),
+         "type, bind, max_connections, max_connections_per_source, when_full, idle_timeout, "
+         "request_timeout, format, tls, compat, rules"),
         ("    bind", "    tls: 1\n    bind", "7: tls: found 1, allowed: a mapping with the keys "
          "cert_file, key_file, key_passphrase_file, ca_file, crl_file, expired_crl, review"),
         ("    bind", "    max_writes_per_source: 20\n    bind",
          "7: max_writes_per_source: removed, there is no limit per second: an address waits only "
          "while others do: delete the key"),
+        ("    bind", "    max_handshakes: 9\n    bind", "7: max_handshakes: removed, it is "
+         "max_connections, at least 256: delete the key"),
         ("    bind", "    max_connections: 0\n    bind",
          "7: max_connections: found 0, allowed: an integer from 1 to 65535"),
         ("units: {1: plant}, ", "",
@@ -268,7 +271,8 @@ def test_serial_lines_need_ports_of_their_own(folder: Folder, device: str) -> No
         (", areas: [coils]", "", f"9: rules[0].areas: missing, allowed: {SOME}"),
         ("[coils]", "[]", f"9: rules[0].areas: found an empty list, allowed: {SOME}"),
         ("[coils]", "coils", f"9: rules[0].areas: found 'coils', allowed: {SOME}"),
-        ("[coils]", "[coil]", f"9: rules[0].areas[0]: found 'coil', allowed: {AREAS}"),
+        ("[coils]", "[coil]",
+         f"9: rules[0].areas[0]: found 'coil', allowed: {AREAS}; did you mean 'coils'?"),
         ("[coils]", "[coils, input_registers, coils]",
          "9: rules[0].areas[2]: found 'coils' again, allowed: once"),
         ("sources: [10.0.0.0/8], ", "", f"9: rules[0].sources: missing, allowed: {SOME}"),

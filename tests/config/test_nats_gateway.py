@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.appliance import assembly
+from holdfast.appliance.services.gateway import gateway_settings
+from holdfast.appliance.services.scanner import scanner_settings
 from holdfast.client.url import Tls
-from holdfast.config.scanning import written_pollable
+from holdfast.config.values.scanning import written_pollable
 from holdfast.gateway import GatewayLimits
 from holdfast.scanner import Defaults, Ping, ScannerLimits, Servers
 from support.config_folder import Folder
@@ -98,7 +99,7 @@ def test_the_scanner_is_told_what_the_file_says(folder: Folder, tmp_path: Path) 
         "  publish_logs: false\n  keep_subscriptions: false\n"
     )
     nats = nats_of(folder, text)
-    settings = assembly.scanner(nats)
+    settings = scanner_settings(nats)
     file = tmp_path / "p.yaml"
     assert settings.servers == Servers(
         ("nats://a", "tls://[fd00::1]:4443"),
@@ -120,7 +121,7 @@ def test_the_scanner_is_told_what_the_file_says(folder: Folder, tmp_path: Path) 
 
 @pytest.mark.parametrize("key", ["token", "credentials"])
 def test_the_scanner_has_another_identity(folder: Folder, tmp_path: Path, key: str) -> None:
-    servers = assembly.scanner(nats_of(folder, f"{NATS}  {key}_file: p.yaml\n")).servers
+    servers = scanner_settings(nats_of(folder, f"{NATS}  {key}_file: p.yaml\n")).servers
     file = {"token": servers.token_file, "credentials": servers.credentials}[key]
     assert (file, servers.user) == (tmp_path / "p.yaml", None)
 
@@ -129,17 +130,17 @@ def test_the_scanner_has_the_documented_defaults(folder: Folder) -> None:
     nats = nats_of(folder, NATS)
     assert (nats.prefix, nats.limits.devices, nats.limits.tags) == ("modbus", 5000, 500_000)
     assert (nats.username, nats.tls) == (None, None)
-    assert assembly.scanner(nats).limits == ScannerLimits()
-    assert assembly.scanner(nats).device_tls == Tls()
-    assert assembly.scanner(nats).defaults == Defaults(3000, "scan", 0.0, 1000)
-    assert assembly.scanner(nats).ping == Ping()
+    assert scanner_settings(nats).limits == ScannerLimits()
+    assert scanner_settings(nats).device_tls == Tls()
+    assert scanner_settings(nats).defaults == Defaults(3000, "scan", 0.0, 1000)
+    assert scanner_settings(nats).ping == Ping()
     assert (nats.writes, nats.strict) == ("tags", False)
     assert (nats.publish_logs, nats.keep_subscriptions) == (True, True)
-    assert assembly.scanner(nats).dialect == "tentacle"
+    assert scanner_settings(nats).dialect == "tentacle"
 
 
 def test_the_scanner_serves_the_programs_of_tentacle_next(folder: Folder) -> None:
-    settings = assembly.scanner(nats_of(folder, NATS + "  dialect: tentacle-next\n"))
+    settings = scanner_settings(nats_of(folder, NATS + "  dialect: tentacle-next\n"))
     assert settings.dialect == "tentacle-next"
 
 
@@ -147,7 +148,7 @@ def test_the_gateway_is_told_what_the_file_says(folder: Folder, tmp_path: Path) 
     text = changed(GATEWAY, "[10.0.0.0/8]\n  access: read-only", "['10.0.0.5:*', '[fd00::]/8']\n"
                    "  in_flight: 4\n  device_tls: {ca_file: p.yaml}\n"
                    "  access: read-write")  # fmt: skip
-    settings = assembly.gateway(gateway_of(folder, text))
+    settings = gateway_settings(gateway_of(folder, text))
     assert [str(entry) for entry in settings.allow] == ["10.0.0.5:*", "[fd00::]/8"]
     assert [str(network) for network in settings.sources] == ["10.0.0.0/8"]
     assert settings.tokens == (("panel", bytes.fromhex(HASH)),)
@@ -159,18 +160,18 @@ def test_the_gateway_is_told_what_the_file_says(folder: Folder, tmp_path: Path) 
 @pytest.mark.parametrize("source", ["127.0.0.0/8", "127.0.0.1", "::1"])
 def test_the_gateway_needs_no_tokens_for_this_machine(folder: Folder, source: str) -> None:
     text = GATEWAY[: GATEWAY.index("  tokens:")].replace("sources: [10.0.0.0/8]", "sources: [%s]")
-    settings = assembly.gateway(gateway_of(folder, text % f"'{source}'" + "  tokens: none\n"))
+    settings = gateway_settings(gateway_of(folder, text % f"'{source}'" + "  tokens: none\n"))
     assert (settings.tokens, settings.writes, settings.limits.in_flight) == ((), False, 1)
 
 
 def test_the_gateway_has_names_without_tokens(folder: Folder) -> None:
     text = changed(WITHOUT, "sources: [10.0.0.0/8]", "sources: ['::1']")
     more = "  tokens: none\n  hosts: [gw, Gateway.Plant.example]\n  compat: port-of-call\n"
-    settings = assembly.gateway(gateway_of(folder, text + more))
+    settings = gateway_settings(gateway_of(folder, text + more))
     assert settings.hosts == {"gw", "gateway.plant.example"}
     assert settings.compat == "port-of-call"
     assert folder.warnings(text + more) == []
-    assert assembly.gateway(gateway_of(folder, GATEWAY)).compat is None
+    assert gateway_settings(gateway_of(folder, GATEWAY)).compat is None
 
 
 def test_with_tokens_names_have_no_effect(folder: Folder) -> None:
@@ -373,7 +374,7 @@ def test_certificates_need_a_server_with_tls(folder: Folder) -> None:
         "p.yaml:4: nats.tls: found with servers that begin with nats://, allowed: only with tls://"
     ]
     both = changed(NATS, "[tls://nats.example]", "[nats://a, tls://b]")
-    assert assembly.scanner(nats_of(folder, both + tls)).servers.secure
+    assert scanner_settings(nats_of(folder, both + tls)).servers.secure
 
 
 def test_a_line_of_a_listener_or_a_device_is_not_polled_for_subscribers(folder: Folder) -> None:
@@ -414,7 +415,12 @@ def test_a_line_of_a_listener_or_a_device_is_not_polled_for_subscribers(folder: 
          "which has host bits set: the network is 10.0.0.0/8"),
         ("allow: [10.0.0.0/8]", "allow: ['10.0.0.1:9-8']",
          "4: allow[0]: found '10.0.0.1:9-8', allowed: ports 1 to 65535, the lower port first"),
-        ("read-only", "writes", "5: access: found 'writes', allowed: read-only or read-write"),
+        (
+            "read-only",
+            "writes",
+            "5: access: found 'writes', allowed: read-only or read-write; did you mean "
+            "'read-write'?",
+        ),
         ("  access", "  in_flight: 65\n  access",
          "5: in_flight: found 65, allowed: an integer from 1 to 64"),
         ("  access", "  writes: true\n  access", "5: writes: unknown key, allowed: bind, sources, "

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.config import ConfigError, load, output_checks
+from holdfast.config import ConfigError, load
 from holdfast.config.fingerprint import files_of, fingerprint
 
 if TYPE_CHECKING:
@@ -122,10 +123,10 @@ def test_two_edge_nodes_need_two_names(tmp_path: Path) -> None:
 def test_without_protobuf_sparkplug_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(output_checks, "find_spec", lambda _: None)
+    monkeypatch.setitem(sys.modules, "google.protobuf", None)
     file = tmp_path / "p.yaml"
     file.write_text(f"{DEVICE}outputs:\n  o: {NODE}\n")
     with pytest.raises(ConfigError) as caught:
         load(file)
     [problem] = caught.value.problems
-    assert "requires the Python package protobuf" in str(problem)
+    assert "found 'sparkplug', which requires protobuf, not installed" in str(problem)

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.client.tolerance import Tolerance
-from holdfast.client.url import parse
+from holdfast.client.url import Tolerance, parse
 from holdfast.config import LinkConfig, ModbusTcpListener, RouteConfig, UnitMemoryConfig
 from support.config_folder import Folder
 
@@ -289,8 +288,8 @@ def test_a_rule_with_a_route_takes_functions_that_only_devices_know(folder: Fold
 def test_a_rule_without_a_route_takes_only_functions_of_memories(folder: Folder, key: str) -> None:
     units = changed(', 7: {route: drive}, "20-40": {route: bus}', "")
     assert told(folder, f"{units}        {key}: [3, 65]\n") == [
-        f"14: listeners.scada.rules[0].{key}[1]: found 65, allowed: 1, 2, 3, 4, 5, 6, 8, 11, 15, "
-        "16, 17, 22, 23 or 43"
+        f"14: listeners.scada.rules[0].{key}[1]: found 65, allowed: 1, 2, 3, 4, 5, 6, 7, 8, 11, "
+        "12, 15, 16, 17, 22, 23 or 43"
     ]
 
 
@@ -309,7 +308,7 @@ def test_a_function_code_is_1_to_127(folder: Folder, code: str, shown: str) -> N
     "setting",
     [
         "interval: 1",
-        "cost: {per_request: 1, per_register: 1}",
+        "max_gap: auto",
         "forbidden: [{area: coils, start: 1, end: 2}]",
         "forward: [{url: 'raw://a:1', unit: 1}]",
     ],

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.config.tag_files import load_tags
-from holdfast.config.tag_output import tags_as_csv, tags_as_yaml
+from holdfast.config.tag_files.read import load_tags
+from holdfast.config.tag_files.write import tags_as_csv, tags_as_yaml
 from holdfast.tags import Tag, TagList
-from holdfast.tags.register_scale import Form, RegisterScale
+from holdfast.tags.scale import Form, RegisterScale
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.config import ConfigError, load
-from holdfast.config.tag_files import load_tags
+from holdfast.config.tag_files.read import load_tags
 from holdfast.tags import Tag
 
 if TYPE_CHECKING:
@@ -142,12 +142,12 @@ def test_a_scale_that_cannot_be_is_named_with_its_line(
     [
         ("max_registers: 12", "profile: power: ", "0 to 12 are 13 registers, max_registers is 12"),
         (
-            "forbidden: [{area: input_registers, start: 10, count: 1}]",
+            "forbidden: [{area: input_registers, start: 10, end: 10}]",
             "profile: power: ",
             "0 to 12 overlaps the forbidden range 10 to 10",
         ),
         (
-            "max_gap: 5, readable: [{area: input_registers, start: 0, count: 10}]",
+            "max_gap: 5, readable: [{area: input_registers, start: 0, end: 9}]",
             "profile: power: ",
             "1 to 11 are not readable",
         ),
@@ -245,7 +245,7 @@ def test_problems_in_profile_files_name_file_line_and_tag(tmp_path: Path) -> Non
         "a.yaml:3: tags.b.address: missing",
         "a.yaml:3: tags.b.area: found 'x'",
         "b.csv:2: tags.w.address: found 70000",
-        "b.csv:3: duplicate tag 'v', first in line 1",
+        "b.csv:3: the tag 'v' is given twice, first in line 1",
         "b.csv:4: tags.z.type: type 'flaot' is unknown",
         "b.csv:5: the tag has no name",
     ]

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.config import ModbusTcpListener, RangeConfig, RouteConfig, UnitMemoryConfig
-from holdfast.config.rights import together
+from holdfast.config.checks.rights import together
 from support.config_folder import Folder
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from holdfast.config.rights import UnitRights
+    from holdfast.config.checks.rights import UnitRights
 
 HEAD = """\
 memories:
@@ -28,9 +28,10 @@ listeners:
     rules:
 """
 UNIT = "{memory: plant, access: read-only, functions: [3, 8]}"
+STATUS = "1: {memory: plant, exception_status: {area: coils, address: 0}}"
 RANGES = (
     "{memory: plant, read: [{area: holding_registers, start: 100, end: 199}], "
-    "write: [{area: coils, start: 2, count: 3}]}"
+    "write: [{area: coils, start: 2, end: 4}]}"
 )
 
 
@@ -68,7 +69,7 @@ def test_a_unit_can_have_fewer_rights_than_its_rule(folder: Folder) -> None:
         3: UnitMemoryConfig(
             memory="plant",
             read=(RangeConfig(area="holding_registers", start=100, end=199),),
-            write=(RangeConfig(area="coils", start=2, count=3),),
+            write=(RangeConfig(area="coils", start=2, end=4),),
         ),
         4: RouteConfig(route="drive", deny=(6,)),
     }
@@ -113,8 +114,8 @@ def test_the_first_rule_that_names_a_unit_decides_for_it(folder: Folder) -> None
         **dict.fromkeys((1, 5, 6, 7), "read-only"),
         **dict.fromkeys((2, 3, 4, 9), "read-write"),
     }
-    assert 3 in units[2].codes()
-    assert not {5, 6, 15, 16, 22, 23} & set(units[1].codes())
+    assert 3 in units[2].codes(event_log=False)
+    assert not {5, 6, 15, 16, 22, 23} & set(units[1].codes(event_log=False))
 
 
 @pytest.mark.parametrize(
@@ -129,11 +130,11 @@ def test_the_first_rule_that_names_a_unit_decides_for_it(folder: Folder) -> None
         ("1: {memory: drive}", "access: read-only",
          "memory: found 'drive', the name of a device, allowed: a memory, or {route: drive}"),
         ("1: {memory: plant, route: drive}", "access: read-only",
-         "route: unknown key, allowed: memory, access, functions, deny, read, write; did you mean "
-         "'write'?"),
+         "route: unknown key, allowed: memory, access, functions, deny, read, write, "
+         "exception_status; did you mean 'write'?"),
         ("1: {memory: plant, acess: read-only}", "access: read-only",
-         "acess: unknown key, allowed: memory, access, functions, deny, read, write; did you mean "
-         "'access'?"),
+         "acess: unknown key, allowed: memory, access, functions, deny, read, write, "
+         "exception_status; did you mean 'access'?"),
         ("1: {route: drive, read: []}", "access: read-only",
          "read: unknown key, allowed: route, access, functions, deny"),
         ("1: {memory: plant, functions: [3, 4]}", "access: read-only, functions: [3, 1]",
@@ -145,24 +146,44 @@ def test_the_first_rule_that_names_a_unit_decides_for_it(folder: Folder) -> None
         ("1: {memory: plant, functions: []}", "access: read-only",
          "functions: found an empty list, allowed: a list with at least one entry"),
         ("1: {memory: plant, functions: [20]}", "access: read-only",
-         "functions[0]: found 20, allowed: 1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23 or 43"),
+         "functions[0]: found 20, allowed: 1, 2, 3, 4, 5, 6, 7, 8, 11, 12, 15, 16, 17, 22, 23 "
+         "or 43"),
         ("1: {memory: plant, functions: [3], deny: [4]}", "access: read-only",
          "deny: found together with functions, allowed: only one of them"),
         ("1: {memory: plant, read: []}", "access: read-only",
          "read: found an empty list, allowed: a list with at least one entry"),
         ("1: {memory: plant, read: [{area: coils, start: 4, end: 8}]}", "access: read-only",
          "read[0].start: found 4 to 8, allowed in coils of plant: 0 to 7"),
-        ("1: {memory: plant, read: [{area: holding_registers, start: 99, count: 2}]}",
+        ("1: {memory: plant, read: [{area: holding_registers, start: 99, end: 100}]}",
          "access: read-only", "read[0].start: found 99 to 100, allowed in holding_registers of "
          "plant: 100 to 199"),
         ("1: {memory: plant, read: [{area: coils, start: 4, end: 3}]}", "access: read-only",
          "read[0].end: found 3, allowed: the last address, 4 or more"),
         ("1: {memory: plant, read: [{area: coils, start: 4}]}", "access: read-only",
-         "read[0]: found neither end nor count, allowed: one of them"),
-        ("1: {memory: plant, write: [{area: input_registers, start: 4, count: 1}]}",
+         "read[0].end: missing, allowed: an integer from 0 to 65535"),
+        ("1: {memory: plant, write: [{area: input_registers, start: 4, end: 4}]}",
          "access: read-write", "write[0].area: found input_registers, which Modbus clients can't "
          "write, allowed: coils or holding_registers"),
-        ("1: {memory: plant, read: [{area: discrete_inputs, start: 4, count: 1}]}",
+        ("1: {memory: plant, exception_status: {area: coils, address: 1}}", "access: read-only",
+         "exception_status.address: found 1 to 8, allowed in coils of plant: 0 to 7"),
+        ("1: {memory: plant, exception_status: {area: discrete_inputs, address: 0}}",
+         "access: read-only", "exception_status.area: found 'discrete_inputs', an area that plant "
+         "does not have, allowed: coils, holding_registers"),
+        ("1: {memory: plant, exception_status: {area: holding_registers, address: 100}}",
+         "access: read-only", "exception_status.area: found 'holding_registers', allowed: coils or "
+         "discrete_inputs"),
+        ("1: {memory: plant, exception_status: {area: coils}}", "access: read-only",
+         "exception_status.address: missing, allowed: an integer from 0 to 65528"),
+        ("1: {memory: plant, exception_status: {area: coils, address: 65529}}",
+         "access: read-only", "exception_status.address: found 65529, allowed: an integer from 0 "
+         "to 65528"),
+        ("1: {memory: plant, read: [{area: coils, start: 0, end: 6}, {area: holding_registers, "
+         "start: 107, end: 107}], exception_status: {area: coils, address: 0}}",
+         "access: read-only", "exception_status: found coils 0 to 7, which read does not list, "
+         "allowed: bits that may be read"),
+        ("1: {route: drive, exception_status: {area: coils, address: 0}}", "access: read-only",
+         "exception_status: unknown key, allowed: route, access, functions, deny"),
+        ("1: {memory: plant, read: [{area: discrete_inputs, start: 4, end: 4}]}",
          "access: read-write", "read[0].area: found 'discrete_inputs', an area that plant does not "
          "have, allowed: coils, holding_registers"),
     ],
@@ -196,8 +217,12 @@ def test_a_raw_ingest_rule_has_no_rights_of_units(folder: Folder) -> None:
          "deny[0]: 4 has no effect: the rule does not allow it either"),
         ("1: {memory: plant, deny: [4]}", "access: read-only, functions: [3]",
          "deny[0]: 4 has no effect: the rule does not allow it either"),
-        ("1: {memory: plant, write: [{area: coils, start: 0, count: 1}]}", "access: read-only",
+        ("1: {memory: plant, write: [{area: coils, start: 0, end: 0}]}", "access: read-only",
          "write: has no effect: access is read-only"),
+        (STATUS, "access: read-only, deny: [7]",
+         "exception_status: has no effect: function 7 is not allowed"),
+        (STATUS, "access: read-only, functions: [3]",
+         "exception_status: has no effect: function 7 is not allowed"),
     ],
 )  # fmt: skip
 def test_a_right_without_effect_is_a_warning(
@@ -205,6 +230,29 @@ def test_a_right_without_effect_is_a_warning(
 ) -> None:
     found = folder.warnings(HEAD + rule(units, more))
     assert found == [f"p.yaml:11: listeners.scada.rules[0].units.1.{warning}"]
+
+
+def test_a_function_that_no_unit_has_is_a_warning(folder: Folder) -> None:
+    text = HEAD + rule("1: plant", "access: read-only, functions: [3, 7, 12]")
+    place = "p.yaml:11: listeners.scada.rules[0].functions"
+    assert folder.warnings(text) == [
+        f"{place}[1]: function 7 has no effect: no unit has an exception_status",
+        f"{place}[2]: function 12 has no effect: the listener has no event_log",
+    ]
+    both = HEAD.replace("    rules:", "    event_log: true\n    rules:")
+    assert folder.warnings(both + rule(STATUS, "access: read-only, functions: [3, 7, 12]")) == []
+    routed = rule("1: {route: drive}", "access: read-only, functions: [7, 12]")
+    assert folder.warnings(HEAD + routed) == []
+
+
+def test_the_codes_of_a_unit_are_those_that_it_has(folder: Folder) -> None:
+    units = rights(folder, HEAD + rule(f"{STATUS}, 2: plant, 3: {{route: drive}}"))
+
+    special = {7, 12}
+    assert special.intersection(units[1].codes(event_log=False)) == {7}
+    assert special.intersection(units[1].codes(event_log=True)) == {7, 12}
+    assert special.intersection(units[2].codes(event_log=True)) == {12}
+    assert special.intersection(units[3].codes(event_log=False)) == {7, 12}
 
 
 # What never matches

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+from typing import TYPE_CHECKING
 
 import pytest
 
 from support.paths import DOCS, ROOT, TESTS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 DRIVERS = TESTS / "peers" / "drivers"
 PAGE = (DOCS / "conformance.md").read_text()
@@ -92,11 +96,41 @@ def test_the_host_of_sparkplug_is_the_locked_one() -> None:
     assert f"(sparkplug-payload {node_versions()['sparkplug-payload']}, " in PAGE
 
 
-def test_the_tests_of_sparkplug_exist() -> None:
-    named = {
-        name for row in rows("Sparkplug B").values() for name in re.findall("`(test_\\w+)`", row[3])
+def requirements() -> Iterator[tuple[str, str, str]]:
+    """The rows of all tables that say what holds: where, whether it holds, and the tests."""
+    for page in sorted(DOCS.glob("conformance*.md")):
+        header: list[str] = []
+        for number, line in enumerate(page.read_text().splitlines(), 1):
+            cells = [cell.strip() for cell in line.strip("|").split("|")]
+            if not line.startswith("| "):
+                header = []
+            elif not header:
+                header = cells
+            elif "holds" in header and not line.startswith("| ---"):
+                row = dict(zip(header, cells, strict=True))
+                yield f"{page.name}:{number}", row["holds"], row["test"]
+
+
+def known_tests() -> set[str]:
+    """The names of all tests, in Python and in Rust."""
+    python = (file.read_text() for file in TESTS.rglob("test_*.py"))
+    rust = (file.read_text() for file in (ROOT / "crates").rglob("*.rs"))
+    return {
+        *(name for text in python for name in re.findall(r"def (test_\w+)\(", text)),
+        *(name for text in rust for name in re.findall(r"#\[test\]\s+fn (\w+)", text)),
     }
-    files = [*TESTS.glob("outputs/*.py"), *TESTS.glob("config/*.py"), *TESTS.glob("peers/*.py")]
-    there = {name for file in files for name in re.findall(r"def (test_\w+)", file.read_text())}
-    assert len(named) > 10
-    assert named <= there
+
+
+def test_what_holds_has_a_test_and_the_tests_exist() -> None:
+    there = known_tests()
+    problems, pages = [], set()
+    for place, holds, tests in requirements():
+        named = re.findall(r"`(\w+)`", tests)
+        pages.add(place.partition(":")[0])
+        problems += [f"{place}: there is no {name}" for name in named if name not in there]
+        if "yes" in holds and not named:
+            problems.append(f"{place}: it holds, but no test shows it")
+        if not re.search(r"yes|no\b|not |partly", holds):
+            problems.append(f"{place}: {holds!r} is no verdict")
+    assert problems == []
+    assert len(pages) == 4

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import re
 import tomllib
+from importlib import metadata
 from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from support.paths import DOCS, ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+MAX_BASE_PACKAGES = 13
 SETS = ("run", "dev", "docs", "release", "rust", "zig")
 
 
@@ -26,9 +29,9 @@ def named(requirement: str) -> str:
 
 
 def crates() -> set[str]:
-    """The crates of others that the workspace depends on."""
+    """The crates of others that the workspaces depend on."""
     found: set[str] = set()
-    for path in [ROOT / "benches" / "Cargo.toml", *ROOT.glob("crates/*/Cargo.toml")]:
+    for path in [*ROOT.glob("*/Cargo.toml"), *ROOT.glob("crates/*/Cargo.toml")]:
         parts: dict[str, Any] = tomllib.loads(path.read_text())
         for part in [parts, *parts.get("target", {}).values()]:
             found |= set(part.get("dependencies", ())) | set(part.get("dev-dependencies", ()))
@@ -51,7 +54,34 @@ def test_the_page_has_every_dependency() -> None:
 
 
 def test_the_set_to_run_is_that_of_the_project() -> None:
-    assert [each for each in listed("run") if named(each) != "maturin"] == PROJECT["dependencies"]
+    extras = PROJECT["optional-dependencies"]
+    required = {*PROJECT["dependencies"], *extras["certs"], *extras["mqtt"], *extras["nats"]}
+    assert {each for each in listed("run") if named(each) != "maturin"} == required
+
+
+def test_the_base_and_each_extra_are_on_the_page_on_installation() -> None:
+    page = (DOCS / "install.md").read_text()
+    rows = set(re.findall(r"^\| `([a-z]+)` \|", page, re.MULTILINE))
+    assert rows == set(PROJECT["optional-dependencies"])
+    names = [named(each) for each in PROJECT["dependencies"]]
+    assert f"packages: {', '.join(names)}" in page
+
+
+def test_the_base_requires_few_packages() -> None:
+    """Those that the base requires, with all that these require, in the versions of `run.lock`."""
+    found: set[str] = set()
+    left = list(PROJECT["dependencies"])
+    while left:
+        name = canonicalize_name(named(left.pop()))
+        if name in found:
+            continue
+        found.add(name)
+        left += [
+            each
+            for each in metadata.requires(name) or ()
+            if (marker := Requirement(each).marker) is None or marker.evaluate({"extra": ""})
+        ]
+    assert len(found) <= MAX_BASE_PACKAGES, sorted(found)
 
 
 @pytest.mark.parametrize("name", SETS)

@@ -41,6 +41,13 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
+def test_the_table_of_maturity_names_tests_that_exist() -> None:
+    table = (ROOT / "docs" / "compatibility.md").read_text().split("\n## Maturity\n")[1]
+    named = set(re.findall(r"`(tests/[\w/]+)`", table))
+    assert len(named) > 20
+    assert [each for each in sorted(named) if not (ROOT / each).is_dir()] == []
+
+
 NATS_CONFIGURATIONS = [
     *(ROOT / "docs").glob("*.md"),
     *(ROOT / "examples").rglob("*.conf"),

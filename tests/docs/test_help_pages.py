@@ -8,7 +8,8 @@ import re
 from typing import TYPE_CHECKING
 
 from holdfast._core import EXCEPTIONS
-from holdfast.cli import main
+from holdfast.cli import COMMANDS
+from holdfast.cli.exit_codes import MEANINGS, ExitCode
 from support.log_events import logged
 from support.paths import DOCS, ROOT
 
@@ -115,4 +116,9 @@ def test_each_log_event_is_explained() -> None:
 def test_the_page_of_the_command_line_has_every_command() -> None:
     table = (DOCS / "cli.md").read_text().split("\n## ")[0]
     named = {word.split()[0] for word in re.findall(r"`([a-z][^`]*)`", table)}
-    assert sorted(set(main.commands) - named) == []
+    assert sorted(set(COMMANDS) - named) == []
+
+
+def test_the_page_of_the_command_line_lists_the_exit_codes() -> None:
+    rows = re.findall(r"^\| (\d) \| (.+) \|$", (DOCS / "cli.md").read_text(), re.M)
+    assert rows == [(str(code.value), MEANINGS[code]) for code in ExitCode]

@@ -27,7 +27,7 @@ PRODUCT = ROOT / "python" / "holdfast"
 UNDOCUMENTED = ("nats.aio.transport", "nats.protocol")
 """Modules that nothing in their package's documentation speaks of."""
 
-VARIABLES = {"scanner/nats/wire.py": {"client": "nats.aio.client.Client"}}
+VARIABLES = {"net/nats/batch.py": {"client": "nats.aio.client.Client"}}
 """What variables hold that a file takes private names of, by their names."""
 
 DERIVED = {"BrokerClient": "paho.mqtt.client.Client"}
@@ -217,7 +217,9 @@ def test_every_private_name_in_the_table_exists(use: Use) -> None:
 
 def test_the_versions_of_packages_with_private_names_are_capped() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    required = {each.name: each for each in map(Requirement, project["dependencies"])}
+    of_extras = project["optional-dependencies"].values()
+    requirements = [*project["dependencies"], *(each for extra in of_extras for each in extra)]
+    required = {each.name: each for each in map(Requirement, requirements)}
     distributions = {"nats": "nats-py", "paho": "paho-mqtt"}
     for top in {use.owner.partition(".")[0] for use in in_table()}:
         name = distributions.get(top, top)

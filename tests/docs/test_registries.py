@@ -72,7 +72,7 @@ def test_nothing_installs_holdfast_from_a_registry() -> None:
     "line",
     [
         "pip install holdfast",
-        'C:\\Holdfast\\Scripts\\pip install "holdfast[windows-service]"',
+        'C:\\Holdfast\\Scripts\\pip install "holdfast[windows]"',
         ".venv/bin/pip install --quiet holdfast-modbus[embedded]==0.1.0",
         "It requires `pip install holdfast[embedded]`, or",
         "pipx install holdfast",
@@ -97,7 +97,7 @@ def test_an_installation_from_a_registry_is_found(line: str) -> None:
     "line",
     [
         "pip install dist/holdfast_modbus-0.1.0-cp311-abi3-manylinux2014_x86_64.whl",
-        'pip install "holdfast_modbus-0.1.0-cp311-abi3-win_amd64.whl[windows-service]"',
+        'pip install "holdfast_modbus-0.1.0-cp311-abi3-win_amd64.whl[windows]"',
         "pip install --no-index --find-links packages holdfast-modbus",
         "pip install --no-deps --target /usr/local/lib/holdfast NAME",
         "sudo apt install ./holdfast-modbus_0.1.0_amd64.deb",

@@ -9,8 +9,9 @@ import re
 import pytest
 from ruamel.yaml import YAML
 
-from holdfast import ecs, logs, security_events
 from holdfast.config import json_schema
+from holdfast.events import ecs, log_lines
+from holdfast.events import security as security_events
 from support.log_events import logged
 from support.paths import DOCS
 
@@ -87,7 +88,7 @@ def test_the_example_is_what_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     record = logging.LogRecord("holdfast", logging.WARNING, "", 0, "refused_source", (), None)
     record.created = 1795241901.0045
     record.fields = {"listener": "scada", "peer": "10.0.0.9:51200"}
-    made = logs.EcsFormatter().format(record)
+    made = log_lines.LineFormatter("ecs").format(record)
     assert json.loads(line) == json.loads(made)
     assert line == json.dumps(json.loads(made), separators=(",", ":"))
 

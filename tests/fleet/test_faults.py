@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.leases import LeaseTimes
+from holdfast.replication.leases import LeaseTimes
 from holdfast.scanner import FleetRefused, FleetSettings, Servers, Settings
 from support import nats_cluster, wire
 from support.fleet_nodes import (
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from holdfast.config.scanning import Writes
+    from holdfast.config.values.scanning import Writes
     from support.brokers import NatsServer
     from support.judges import Judge
     from support.nats_bus import Run

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.leases import LEASE_TIMES, LeaseTimes
+from holdfast.replication.leases import LEASE_TIMES, LeaseTimes
 from holdfast.scanner import FleetSettings
 from holdfast.scanner.fleet import member as members
 from support import wire

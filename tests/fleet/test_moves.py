@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.leases import LEASE_TIMES
+from holdfast.replication.leases import LEASE_TIMES
 from support import nats_cluster, wire
 from support.fleet_nodes import Commands, Nodes, Published, are_polled, known, subscribed
 from support.judges import Judges
@@ -237,8 +237,8 @@ def test_devices_do_not_rest_longer_than_promised_when_the_leader_of_the_leases_
             cluster.until_whole(LEASES)
     with capsys.disabled():
         parts = [min(rests), *quantiles(rests, n=20)[9::9], max(rests)]
-        told = "shortest {:.2f} s, median {:.2f}, 95 % {:.2f}, longest {:.2f}".format(*parts)
-        print(f"{told}, of {len(rests)} deaths")
+        summary = "shortest {:.2f} s, median {:.2f}, 95 % {:.2f}, longest {:.2f}".format(*parts)
+        print(f"{summary}, of {len(rests)} deaths")
     assert max(rests) <= LEADERLESS
 
 

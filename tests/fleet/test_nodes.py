@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import TimeoutError as NoAnswer
 
-from holdfast.config.scanning import parse_pollable
-from holdfast.leases import LEASE_TIMES, LeaseTimes
+from holdfast.config.values.scanning import parse_pollable
+from holdfast.replication.leases import LEASE_TIMES, LeaseTimes
 from holdfast.scanner import FleetRefused, FleetSettings, Scanner, Servers, Settings
 from holdfast.scanner.fleet import reports
-from holdfast.scanner.subscriptions import SubscriptionKey
+from holdfast.scanner.subscriptions.key import SubscriptionKey
 from support import wire
 from support.cli import invoke
 from support.fleet_nodes import FLEET, prepare
@@ -29,7 +29,7 @@ from support.scanner_parts import client_of, member_of, registry_of, ttls_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from holdfast.scanner.subscriptions import SubscriptionTtls
+    from holdfast.scanner.subscriptions.ttl import SubscriptionTtls
     from support.brokers import NatsServer
     from support.judges import Judge
     from support.nats_bus import Run, Running
@@ -272,7 +272,7 @@ def test_messages_have_the_revision_of_the_lease(
 def test_messages_over_a_new_connection_have_a_greater_number(
     node: Callable[..., Running], caller: Caller, judges: Judges
 ) -> None:
-    """What waits in a server of the former connection, which was frozen, can be told from them."""
+    """So a consumer drops what waited in a frozen server of the former connection."""
     numbers: dict[str, list[int]] = {"data": [], "status": []}
 
     async def listen() -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 
+from holdfast.net.nats import Outbox, batch
 from holdfast.scanner.fleet.agreement import Terms
-from holdfast.scanner.nats import Outbox, wire
 
 
 def test_a_message_with_the_revision_of_its_lease_has_a_header() -> None:
-    text = wire.text("modbus.data.boiler", b'{"value":"a\r\nb"}')
-    assert wire.leased(text, 42) == (
+    text = batch.text("modbus.data.boiler", b'{"value":"a\r\nb"}')
+    assert batch.leased(text, 42) == (
         b"HPUB modbus.data.boiler 32 48\r\n"
         b"NATS/1.0\r\nHoldfast-Lease: 42\r\n\r\n"
         b'{"value":"a\r\nb"}\r\n'

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast import logs
+from holdfast.events import log_lines
+from holdfast.events.throttle import Throttle
 from support import web
 from support.gateway_pages import Pages, browsing
 
@@ -24,11 +25,11 @@ def pages() -> Iterator[Pages]:
 @pytest.fixture
 def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[web.Records]:
     """All that the project logs, nothing held back."""
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle(burst=10**6))
+    monkeypatch.setattr(log_lines, "_REFUSALS", Throttle(burst=10**6))
     records = web.Records()
-    level = logs.LOGGER.level
-    logs.LOGGER.addHandler(records)
-    logs.LOGGER.setLevel("DEBUG")
+    level = log_lines.LOGGER.level
+    log_lines.LOGGER.addHandler(records)
+    log_lines.LOGGER.setLevel("DEBUG")
     yield records
-    logs.LOGGER.removeHandler(records)
-    logs.LOGGER.setLevel(level)
+    log_lines.LOGGER.removeHandler(records)
+    log_lines.LOGGER.setLevel(level)

@@ -435,7 +435,7 @@ def test_a_reply_to_an_earlier_request_is_not_taken_for_the_next_one(
         checks.append(pool)
 
     monkeypatch.setattr(Pool, "_close_unused", checked)
-    monkeypatch.setattr(pool, "CHECK_INTERVAL", 0.001)
+    monkeypatch.setattr(pool, "CHECK_INTERVAL_S", 0.001)
 
     def is_answered(timeout: float) -> bool:
         roaming = Roaming()
@@ -662,3 +662,30 @@ def test_a_gateway_says_what_it_may_do(client: web.Client) -> None:
         "limits": {"timeout": 60000, "interval": 100},
         "connections": 0,
     }
+
+
+# Registers in every type.
+
+
+def test_registers_are_shown_in_every_type_and_order(client: web.Client) -> None:
+    registers = [0x1234, 0x5678, 0x3FF8, 0x0A41]
+    answer = client.ask("POST", "/api/gateway/types", {"registers": registers}).json
+    four, eight = answer["tables"]
+    assert four["orders"] == ["ABCD", "CDAB", "BADC", "DCBA"]
+    texts = {row["type"]: row["texts"] for row in four["rows"]}
+    assert texts["uint16"] == ["4660", "4660", "13330", "13330"]
+    assert texts["bcd32"] == ["12345678", "56781234", "34127856", "78563412"]
+    assert texts["bits on"] == ["2 4–5 9 12", "2 4–5 9 12", "1 4 10 12–13", "1 4 10 12–13"]
+    assert texts["text"][0] == "·4Vx?··A"
+    assert texts["bytes"][1] == "0a413ff856781234"
+    assert texts["bool"] == ["true", "", "", ""]
+    assert [row["type"] for row in eight["rows"]] == ["int64", "uint64", "float64"]
+
+
+def test_types_that_do_not_fit_the_registers_are_not_shown(client: web.Client) -> None:
+    answer = client.ask("POST", "/api/gateway/types", {"registers": [0x00FA]}).json
+    [table] = answer["tables"]
+    assert [row["type"] for row in table["rows"]] == [
+        *("int16", "uint16", "float16", "bcd16", "text", "bytes", "bits on", "bool"),
+    ]
+    assert table["rows"][3]["texts"] == ["?", "?", "?", "?"]

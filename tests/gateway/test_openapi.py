@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from schemathesis import Case
     from schemathesis.specs.openapi.schemas import OpenApiSchema
 
+    from holdfast.client.async_transports import AsyncTransport
     from holdfast.client.url import NetworkTarget
-    from holdfast.config.services import Compat
+    from holdfast.config.models.services import Compat
     from support.gateways import Running
 
 EXCLUDED: list[Any] = [
@@ -59,9 +60,9 @@ class Everywhere(Dialed):
         super().__init__()
         self._device = device
 
-    def __call__(self, target: NetworkTarget, **options: Any) -> Any:
+    def __call__(self, target: NetworkTarget, in_flight: int) -> AsyncTransport:
         host, port = self._device
-        return super().__call__(replace(target, host=host, port=port), **options)
+        return super().__call__(replace(target, host=host, port=port), in_flight)
 
 
 @contextlib.contextmanager

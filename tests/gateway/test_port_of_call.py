@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.cli.gateway import _told
-from holdfast.config.egress import parse_allowed
+from holdfast.cli.services.gateway import _greeting_text
+from holdfast.config.values.allow_entries import parse_allowed
 from holdfast.gateway import Settings
 from support import gateways, web, wire
 from support.fake_device import FakeDevice, Stream
@@ -451,7 +451,7 @@ def test_without_names_an_error_says_how_to_add_one() -> None:
         answer = running.client().ask("GET", "/api/gateway", headers={"Host": NAME})
     assert (answer.status, answer.headers["holdfast-reason"]) == (403, "foreign_page")
     assert answer.json["error"] == (
-        "Host is a name, allowed without tokens: an IP address, localhost, or a name in --hosts, "
+        "Host is a name, allowed without tokens: an IP address, localhost, or a name in --host, "
         "or hosts in the configuration"
     )
 
@@ -460,7 +460,7 @@ def test_the_greeting_says_names_and_compatibility() -> None:
     settings = Settings(
         (parse_allowed("10.0.0.0/8"),), hosts=frozenset({NAME, "gw"}), compat="port-of-call"
     )
-    lines = _told("http://127.0.0.1:8090", settings).splitlines()
+    lines = _greeting_text("http://127.0.0.1:8090", settings).splitlines()
     assert lines[3:6] == [
         "  clients: 127.0.0.0/8, ::1/128; no tokens",
         f"  names: {NAME}, gw",

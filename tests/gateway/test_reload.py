@@ -101,7 +101,7 @@ def tokens(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def running(tokens: Path) -> Iterator[Running]:
-    made = Running("--token-file", str(tokens))
+    made = Running("--tokens", str(tokens))
     yield made
     made.kill()
 

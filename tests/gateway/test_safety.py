@@ -20,9 +20,9 @@ from click.testing import CliRunner
 
 import holdfast
 from holdfast.cli import main
-from holdfast.cli.gateway import _told
+from holdfast.cli.services.gateway import _greeting_text
 from holdfast.client.url import NetworkTarget
-from holdfast.config.egress import parse_allowed
+from holdfast.config.values.allow_entries import parse_allowed
 from holdfast.gateway import Settings, tokens
 from support import cli, gateways, web, wire
 from support.fake_device import FakeDevice, registers
@@ -799,7 +799,7 @@ def test_a_signal_ends_it_with_exit_code_0(server: holdfast.Server, number: int)
 )
 def test_the_greeting_has_an_example_that_may_be(allow: str, example: str) -> None:
     settings = Settings((parse_allowed(allow),))
-    assert f"-d '{example}'" in _told("http://127.0.0.1:8090", settings)
+    assert f"-d '{example}'" in _greeting_text("http://127.0.0.1:8090", settings)
 
 
 @pytest.mark.parametrize(
@@ -811,7 +811,7 @@ def test_the_greeting_has_an_example_that_may_be(allow: str, example: str) -> No
     ],
 )
 def test_the_greeting_names_an_address_that_can_be_opened(served: str, url: str) -> None:
-    lines = _told(served, Settings((parse_allowed("10.0.0.0/8"),))).splitlines()
+    lines = _greeting_text(served, Settings((parse_allowed("10.0.0.0/8"),))).splitlines()
     assert lines[0] == f"Console: {url}/, API documentation: {url}/docs"
 
 
@@ -823,11 +823,11 @@ def test_it_needs_an_egress_list() -> None:
     ("arguments", "says"),
     [
         (("--allow", "plc.local"), "NETWORK[:PORTS]"),
-        (("--allow", "10.0.0.0/8", "--bind", "8090"), "address:port"),
-        (("--allow", "10.0.0.0/8", "--hosts", "10.0.0.5"), "a host name without a port"),
+        (("--allow", "10.0.0.0/8", "--bind", "10.0.0.1:http"), "address:port"),
+        (("--allow", "10.0.0.0/8", "--host", "10.0.0.5"), "a host name without a port"),
         (("--allow", "10.0.0.0/8", "--compat", "tentacle"), "port-of-call"),
-        (("--allow", "10.0.0.0/8", "--sources", "10.0.0.0/8"), "--token-file"),
-        (("--allow", "10.0.0.0/8", "--token-file", "/nowhere"), "No such file"),
+        (("--allow", "10.0.0.0/8", "--source", "10.0.0.0/8"), "--tokens"),
+        (("--allow", "10.0.0.0/8", "--tokens", "/nowhere"), "No such file"),
         (("--allow", "10.0.0.0/8", "--in-flight", "0"), "--in-flight"),
     ],
 )

@@ -313,13 +313,13 @@ ALLOW = ("--bind", "127.0.0.1:0", "--allow", "127.0.0.0/8")
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ("--tls-ca none.pem", "none.pem' does not exist"),
-        ("--tls-ca text.pem", "text.pem: found no certificate"),
-        ("--tls-ca .", "is a directory"),
-        ("--tls-cert panel.pem", "--tls-cert requires --tls-key."),
-        ("--tls-key panel.key", "--tls-key requires --tls-cert."),
-        ("--tls-cert panel.pem --tls-key text.pem", "text.pem: found no"),
-        ("--tls-cert ca.pem --tls-key panel.key", "panel.key"),
+        ("--device-ca none.pem", "none.pem' does not exist"),
+        ("--device-ca text.pem", "text.pem: found no certificate"),
+        ("--device-ca .", "is a directory"),
+        ("--device-cert panel.pem", "--device-cert requires --device-key."),
+        ("--device-key panel.key", "--device-key requires --device-cert."),
+        ("--device-cert panel.pem --device-key text.pem", "text.pem: found no"),
+        ("--device-cert ca.pem --device-key panel.key", "panel.key"),
     ],
 )
 def test_files_that_can_not_be_used_are_told_at_start(

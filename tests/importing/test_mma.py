@@ -19,12 +19,11 @@ from hypothesis import strategies as st
 from holdfast.cli import main
 from holdfast.config import load
 from holdfast.config.dump import to_yaml
-from holdfast.config.source import parse
+from holdfast.config.text.source import parse
 from holdfast.importing import NotImportable, read_mma
-from holdfast.importing.filters import read_filter
-from holdfast.importing.functions import ALL, SOURCE, touching
+from holdfast.importing.function_rights import ALL, SOURCE, touching
 from holdfast.importing.notes import Desk
-from holdfast.importing.peers import EVERYBODY, Peers, parse_network
+from holdfast.importing.peers import EVERYBODY, Peers, parse_network, read_filter
 from holdfast.importing.policies import Policy, merged
 from holdfast.importing.sections import Section
 from holdfast.types import AREAS

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.config.dump import to_yaml
-from holdfast.importing import read_mma
 from support import wire
 from support.brokers import Mosquitto
+from support.imported import imported
 from support.machine import needs_127_0_0_2
 from support.mqtt_rig import Probe
 from support.running import endpoint
@@ -64,11 +64,7 @@ class Source:
         self._run, self._folder = run, folder
 
     def start(self, text: str, **options: Any) -> Appliance:
-        (self._folder / "mma.yaml").write_text(text)
-        imported = read_mma(self._folder / "mma.yaml", **options).data
-        for settings in (*imported["listeners"].values(), imported.get("rest", {})):
-            settings["bind"] = "127.0.0.1:0"
-        return self._run(to_yaml(imported))
+        return self._run(to_yaml(imported(text, self._folder, **options)))
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import holdfast
 from holdfast.ingest import Grant, MemoryAccess, Refused
 
 if TYPE_CHECKING:
-    from holdfast.audit import Audit
+    from holdfast.events.audit import Audit
 
 PEER = "10.0.0.7:50000"
 RESTORED = ("coils", "holding_registers")
@@ -169,9 +169,12 @@ class OpeningAudit:
     def write(self, **line: object) -> None:
         self.outcomes.append(line["outcome"])
 
-    def write_first(self, lines: Any) -> None:
+    def queue(self, lines: Any) -> list[Any]:
+        return list(lines)
+
+    def write_group(self, group: list[Any]) -> None:
         self.require()
-        self.write_all(lines)
+        self.write_all(group)
 
     def write_all(self, lines: Any, *, done: bool = False) -> None:  # noqa: ARG002
         self.outcomes += [line["outcome"] for line in lines]

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import TimeoutError as NatsTimeout
 
-from holdfast.leases import LeaseBucket, Leases, LeaseTimes
-from holdfast.leases.bucket import Outdated
-from holdfast.leases.entries import SETTLED
-from holdfast.scanner.nats import Broker, Ping, Servers
+from holdfast.net.nats import Broker, Ping, Servers
+from holdfast.replication.leases import LeaseBucket, Leases, LeaseTimes, Outdated
+from holdfast.replication.leases.bucket import SETTLED
 from support import wire
 from support.brokers import NatsServer
 from support.leases import ENDLESS, LASTING, SHORT, make_settled

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.leases import Leases, LeaseThread, LeaseTimes, Relay
+from holdfast.net.nats import Broker, Ping, Servers
+from holdfast.replication.leases import Leases, LeaseThread, LeaseTimes, Relay
 from holdfast.runtime import tasks
-from holdfast.scanner.nats import Broker, Ping, Servers
 from support import wire
 from support.brokers import NatsServer
 from support.leases import ENDLESS, LASTING, make_settled
@@ -103,7 +103,7 @@ class LosesCancellation(Node):
 def test_a_thread_ends_while_it_connects(
     server: NatsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tasks, "AGAIN", 0.01)
+    monkeypatch.setattr(tasks, "CANCEL_INTERVAL_S", 0.01)
     node = LosesCancellation(server, "a")
     node.thread.start()
     wire.until(lambda: node.connecting, "it connects")

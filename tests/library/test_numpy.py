@@ -11,7 +11,7 @@ import pytest
 
 import holdfast
 from holdfast import raw_ingest, values
-from holdfast._core import write_across
+from holdfast._core import Batch
 from holdfast.tags import TagError
 from holdfast.values import DoesNotFit, Field, Layout
 
@@ -61,7 +61,7 @@ def test_a_memory_takes_them(memory: holdfast.Memory) -> None:
     assert memory.read("holding_registers", TWO, TWO) == [1, 65535]
     memory.write_many([("coils", SMALL, [YES, NO, numpy.uint64(1)]), ("coils", 9, [TWO - 1])])
     assert memory.read_many([("coils", SMALL, SMALL), ("coils", 9, 1)]) == [[1, 0, 1], [1]]
-    assert write_across([(memory, "coils", TWO, numpy.array([True, False]))]) == (2, None)
+    assert Batch([(memory, "coils", TWO, numpy.array([True, False]))]).write() == (2, None)
     assert memory.read("coils", 2, 2) == [1, 0]
 
 

@@ -154,6 +154,24 @@ def test_the_exceptions_of_the_device_come_through(
     assert counters(appliance)["exceptions"] == 1
 
 
+@pytest.mark.parametrize(
+    ("request_", "reply"),
+    [
+        ("07", "0700ff"),
+        ("140706000400010002", "140405060dfe"),
+        ("15090600040007000106af", "15090600040007000106ae"),
+        ("1804de", "180006000301b81284"),
+    ],
+)
+def test_a_reply_that_contradicts_its_request_is_exception_0b(
+    unmodelled: FakeDevice, run: Run, connect: Connect, request_: str, reply: str
+) -> None:
+    unmodelled.answer = lambda _: bytes.fromhex(reply)
+    asked = bytes.fromhex(request_)
+
+    assert connect(scada(run(configuration(unmodelled.url)))).ask(asked) == exception(asked, 11)
+
+
 def test_a_request_that_a_memory_would_refuse_is_for_the_device_to_judge(
     unmodelled: FakeDevice, run: Run, connect: Connect
 ) -> None:
@@ -468,6 +486,30 @@ def test_a_device_that_can_t_be_reached_is_exception_0a(run: Run, connect: Conne
 
     assert front.ask(READ) == exception(READ, 0x0A)
     assert front.ask(WRITE) == exception(WRITE, 0x0A)
+
+
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp", "ascii+tcp"])
+def test_a_device_whose_machine_drops_packets_is_exception_0a(
+    run: Run, connect: Connect, kind: str
+) -> None:
+    with wire.dead_address() as (host, port):
+        appliance = run(configuration(f"{kind}://{host}:{port}", link={"timeout": 0.1}))
+        front = connect(scada(appliance))
+
+        assert front.ask(READ) == exception(READ, 0x0A)
+        assert front.ask(WRITE) == exception(WRITE, 0x0A)
+
+
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp", "ascii+tcp"])
+def test_a_silent_device_is_exception_0b_once_it_is_connected(
+    run: Run, connect: Connect, kind: str
+) -> None:
+    with Stream(kind, then=silent, port=closed_port()) as device:
+        device.stop()
+        front = connect(scada(run(configuration(device.url, link={"timeout": 0.1}))))
+        assert front.ask(READ) == exception(READ, 0x0A)
+        device.start()
+        wire.until(lambda: front.ask(READ) == exception(READ, 0x0B), "it is connected")
 
 
 def test_a_device_that_is_back_is_asked_again(run: Run, connect: Connect) -> None:

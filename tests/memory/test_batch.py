@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast import Memory
-from holdfast._core import BatchRefused, write_across
+from holdfast._core import Batch, BatchRefused
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
@@ -33,19 +33,19 @@ def content(of: list[Memory]) -> list[object]:
 
 def refusal(writes: Any) -> tuple[int, int | None, str]:
     with pytest.raises(BatchRefused) as caught:
-        write_across(writes)
+        Batch(writes).write()
     return caught.value.command, caught.value.index, caught.value.reason
 
 
 def test_a_batch_returns_how_many_values_it_wrote() -> None:
     first, second, _ = memories()
-    written = write_across(
+    written = Batch(
         [(first, "coils", 0, [1, True]), (second, "holding_registers", 1, range(5, 8))]
-    )
+    ).write()
     assert written == (5, None)
     assert first.read("coils", 0, 3) == [1, 1, 0]
     assert second.read("holding_registers", 0, 5) == [0, 5, 6, 7, 0]
-    assert write_across([]) == (0, None)
+    assert Batch([]).write() == (0, None)
 
 
 @pytest.mark.parametrize("place", [0, 1, 30])
@@ -100,7 +100,7 @@ def test_what_an_iterator_raises_goes_before_a_later_write_and_before_all_values
         raise KeyError("the next write")
 
     with pytest.raises(KeyError, match="the next write"):
-        write_across(writes(0))
+        Batch(writes(0)).write()
     assert refusal(writes(8)) == (0, None, "out_of_range")
     assert not any(memory.read("coils", 0, SIZE))
 
@@ -121,7 +121,7 @@ def test_values_that_change_while_they_are_read_write_nothing() -> None:
 
     values += [1, Clearing(), 1, 1]
     with pytest.raises(IndexError):
-        write_across([(memory, "holding_registers", 0, values)])
+        Batch([(memory, "holding_registers", 0, values)]).write()
     assert memory.read("holding_registers", 0, 4) == [0] * 4
 
     def writes() -> Iterator[Any]:
@@ -130,14 +130,14 @@ def test_values_that_change_while_they_are_read_write_nothing() -> None:
         others.append(1)
 
     with pytest.raises(RuntimeError, match="changed while they were read"):
-        write_across(writes())
+        Batch(writes()).write()
     assert not any(memory.read("coils", 0, SIZE))
 
 
 def test_a_batch_refusal_is_a_value_error_with_a_text() -> None:
     assert issubclass(BatchRefused, ValueError)
     with pytest.raises(ValueError, match=r"writes\[0\]: values\[1\]: invalid_value"):
-        write_across([(memories()[0], "coils", 0, [0, 2])])
+        Batch([(memories()[0], "coils", 0, [0, 2])]).write()
 
 
 areas = st.sampled_from(AREAS)
@@ -202,7 +202,7 @@ def test_a_batch_is_written_in_order_or_refused_as_a_whole(
         assert refusal(writes) == expected
         assert content(all_of) == before
         return
-    assert write_across(writes) == (sum(len(values) for *_, values in batch), None)
+    assert Batch(writes).write() == (sum(len(values) for *_, values in batch), None)
     for which, area, address, values in batch:
         one_by_one[which].write(area, address, values)
     for batched, single in zip(all_of, one_by_one, strict=True):
@@ -215,14 +215,16 @@ def test_a_batch_is_written_in_order_or_refused_as_a_whole(
 def test_a_write_can_require_that_all_memories_of_the_batch_are_sealed() -> None:
     sealed, other = (Memory(coils=8, holding_registers=8, seal=("coils", 0)) for _ in range(2))
     only: Any = (sealed, "holding_registers", 0, [7], True)
-    told: list[bool] = []
-    assert write_across([only, (other, "holding_registers", 0, [8])], told.append) == (2, None)
-    assert write_across([(other, "coils", 0, [1])], told.append) == (1, None)
-    assert told == [True, False]
+    both = Batch([only, (other, "holding_registers", 0, [8])])
+    assert both.is_refusable
+    assert both.write() == (2, None)
+    one = Batch([(other, "coils", 0, [1])])
+    assert not one.is_refusable
+    assert one.write() == (1, None)
     assert refusal([only, (other, "holding_registers", 0, [9])]) == (1, None, "unsealed")
     assert refusal([(other, "coils", 0, [1], True)]) == (0, None, "unsealed")
-    assert write_across([(other, "coils", 0, [1], False)]) == (1, None)
-    assert write_across([only, (sealed, "coils", 0, [1])]) == (2, None)
+    assert Batch([(other, "coils", 0, [1], False)]).write() == (1, None)
+    assert Batch([only, (sealed, "coils", 0, [1])]).write() == (2, None)
     assert refusal([only]) == (0, None, "unsealed")
     assert other.read("holding_registers", 0, 1) == [8]
 
@@ -230,4 +232,4 @@ def test_a_write_can_require_that_all_memories_of_the_batch_are_sealed() -> None
 @pytest.mark.parametrize("write", [[], (1, 2, 3), "text", (1, 2, 3, 4, 5, 6)])
 def test_what_is_no_write_is_a_type_error(write: object) -> None:
     with pytest.raises((TypeError, ValueError)):
-        write_across([write])  # type: ignore[list-item]
+        Batch([write]).write()  # type: ignore[list-item]

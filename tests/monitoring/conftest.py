@@ -82,7 +82,7 @@ def sections(folder: Path, nats: str, device: tuple[str, int]) -> dict[str, Any]
         "gateway": {**at, "tokens": "none", "allow": SOURCES, "access": "read-only"},
         "outputs": {"table": {"type": "file", "file": "out.jsonl", "format": "jsonl"}},
         "metrics": {**at, "values": True},
-        "audit": {"file": "audit.log", "syslog": {"url": f"udp://127.0.0.1:{free_port()}"}},
+        "audit": {"file": "audit.log", "syslog": f"udp://127.0.0.1:{free_port()}"},
     }
 
 
@@ -137,7 +137,7 @@ def metrics(appliance: Appliance) -> Labels:
     found: dict[str, dict[str, set[str]]] = {}
 
     def has_all() -> bool:
-        states = [supervisor.status()["state"] for supervisor, _ in adapters.values()]
+        states = [supervisor.status()["state"] for supervisor in adapters.values()]
         if set(states) != {"running"}:
             return False
         found.update(scraped(appliance))

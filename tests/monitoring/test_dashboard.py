@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -22,23 +24,58 @@ if TYPE_CHECKING:
     from holdfast.appliance import Appliance
     from support.promql import Labels
 
-DASHBOARD: dict[str, Any] = json.loads(
-    (ROOT / "monitoring" / "grafana-dashboard.json").read_text(encoding="utf-8")
-)
-PANELS: list[dict[str, Any]] = DASHBOARD["panels"]
-TARGETS = [(panel["title"], each) for panel in PANELS for each in panel.get("targets", ())]
-VARIABLES = {each["name"]: each for each in DASHBOARD["templating"]["list"]}
-QUERIES = [
-    *((title, target["expr"]) for title, target in TARGETS),
-    *((each["name"], each["expr"]) for each in DASHBOARD["annotations"]["list"]),
-]
+
+@dataclass(frozen=True)
+class Dashboard:
+    """A file for Grafana."""
+
+    file: str
+
+    @cached_property
+    def content(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads((MONITORING / self.file).read_text(encoding="utf-8"))
+        return found
+
+    @property
+    def panels(self) -> list[dict[str, Any]]:
+        found: list[dict[str, Any]] = self.content["panels"]
+        return found
+
+    @property
+    def targets(self) -> list[tuple[str, dict[str, Any]]]:
+        return [
+            (panel["title"], each) for panel in self.panels for each in panel.get("targets", ())
+        ]
+
+    @property
+    def annotations(self) -> list[dict[str, Any]]:
+        found: list[dict[str, Any]] = self.content["annotations"]["list"]
+        return found
+
+    @property
+    def variables(self) -> dict[str, dict[str, Any]]:
+        return {each["name"]: each for each in self.content["templating"]["list"]}
+
+    @property
+    def queries(self) -> list[tuple[str, str]]:
+        of_panels = [(title, target["expr"]) for title, target in self.targets]
+        return [*of_panels, *((each["name"], each["expr"]) for each in self.annotations)]
+
+
+MONITORING = ROOT / "monitoring"
+OPERATION = Dashboard("grafana-dashboard.json")
+VALUES = Dashboard("grafana-values.json")
+BOTH = [OPERATION, VALUES]
+each_dashboard = pytest.mark.parametrize("dashboard", BOTH, ids=lambda each: each.file)
+QUERIES = [query for dashboard in BOTH for query in dashboard.queries]
 SOURCE = {"type": "prometheus", "uid": "${datasource}"}
 COLUMNS = 24
 
 
 def with_values(query: str) -> str:
     """A query as Grafana sends it, with everything selected."""
-    chosen = {"instance": ".*", "device": ".*", "__rate_interval": "60s"}
+    every = dict.fromkeys(("instance", "device", "tag", "unit"), ".*")
+    chosen = {**every, "__rate_interval": "60s"}
     return re.sub(r"\$(\w+)", lambda found: chosen[found[1]], query)
 
 
@@ -53,37 +90,45 @@ def test_queries_name_only_what_an_appliance_has(metrics: Labels) -> None:
     assert found == []
 
 
-def test_legends_and_variables_name_only_labels_that_exist(metrics: Labels) -> None:
+@each_dashboard
+def test_legends_and_variables_name_only_labels_that_exist(
+    dashboard: Dashboard, metrics: Labels
+) -> None:
     found = [
         (title, label)
-        for title, target in TARGETS
+        for title, target in dashboard.targets
         for label in re.findall(r"\{\{(\w+)\}\}", target["legendFormat"])
         if label not in promql.labels(target["expr"], metrics)
     ]
     assert found == []
-    for name in ("instance", "device"):
-        asked = re.fullmatch(r"label_values\((.*), (\w+)\)", VARIABLES[name]["query"])
+    asking = [each for each in dashboard.variables.values() if each["type"] == "query"]
+    assert [each["name"] for each in asking[:2]] == ["instance", "device"]
+    for variable in asking:
+        asked = re.fullmatch(r"label_values\((.*), (\w+)\)", variable["query"])
         assert asked
         assert list(promql.problems(asked[1], metrics)) == []
         assert asked[2] in promql.labels(asked[1], metrics)
 
 
-def test_every_variable_that_is_used_is_declared() -> None:
-    used = set(re.findall(r"\$\{?(\w+)", json.dumps(DASHBOARD)))
-    assert used - {"__all", "__rate_interval"} == set(VARIABLES)
+@each_dashboard
+def test_every_variable_that_is_used_is_declared(dashboard: Dashboard) -> None:
+    used = set(re.findall(r"\$\{?(\w+)", json.dumps(dashboard.content)))
+    assert used - {"__all", "__rate_interval"} == set(dashboard.variables)
 
 
-def test_the_source_of_all_data_is_the_one_that_is_chosen() -> None:
-    parts = [panel for panel in PANELS if panel["type"] != "row"]
-    parts += [target for _, target in TARGETS] + DASHBOARD["annotations"]["list"]
-    parts += [each for each in VARIABLES.values() if each["type"] == "query"]
+@each_dashboard
+def test_the_source_of_all_data_is_the_one_that_is_chosen(dashboard: Dashboard) -> None:
+    parts = [panel for panel in dashboard.panels if panel["type"] != "row"]
+    parts += [target for _, target in dashboard.targets] + dashboard.annotations
+    parts += [each for each in dashboard.variables.values() if each["type"] == "query"]
     assert [each for each in parts if each["datasource"] != SOURCE] == []
 
 
-def test_panels_have_a_place_of_their_own_and_queries_a_name() -> None:
-    assert len({panel["id"] for panel in PANELS}) == len(PANELS)
+@each_dashboard
+def test_panels_have_a_place_of_their_own_and_queries_a_name(dashboard: Dashboard) -> None:
+    assert len({panel["id"] for panel in dashboard.panels}) == len(dashboard.panels)
     taken: set[tuple[int, int]] = set()
-    for panel in PANELS:
+    for panel in dashboard.panels:
         at = panel["gridPos"]
         assert at["x"] + at["w"] <= COLUMNS
         cells = {(at["x"] + x, at["y"] + y) for x in range(at["w"]) for y in range(at["h"])}
@@ -95,7 +140,7 @@ def test_panels_have_a_place_of_their_own_and_queries_a_name() -> None:
 
 
 def test_there_is_a_row_for_each_part() -> None:
-    rows = [panel["title"] for panel in PANELS if panel["type"] == "row"]
+    rows = [panel["title"] for panel in OPERATION.panels if panel["type"] == "row"]
     assert rows == [
         "Appliance",
         "Listeners",
@@ -106,6 +151,10 @@ def test_there_is_a_row_for_each_part() -> None:
         "Outputs",
         "Certificates",
     ]
+
+
+def test_the_dashboard_of_values_repeats_a_plot_for_each_unit() -> None:
+    assert [panel["title"] for panel in VALUES.panels if panel.get("repeat") == "unit"] == ["$unit"]
 
 
 def test_prometheus_can_parse_every_query(tmp_path: Path) -> None:
@@ -138,11 +187,11 @@ def prometheus(appliance: Appliance, metrics: Labels, tmp_path: Path) -> Iterato
 
 
 def test_every_panel_has_data_of_an_appliance(prometheus: Prometheus) -> None:
-    """Apart from queries that show only what has gone wrong."""
+    """Apart from queries that show only what has gone wrong, or tags without a unit."""
     waiting = {
         (title, query)
         for title, query in QUERIES
-        if not query.endswith("> 0") and "ALERTS{" not in query
+        if not query.endswith("> 0") and "ALERTS{" not in query and 'unit=""' not in query
     }
     assert len(waiting) > len(QUERIES) / 2
 

@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.config.outputs import MqttOutputConfig
+from holdfast.config.models.devices import DeviceIdentityConfig
+from holdfast.config.models.outputs import MqttOutputConfig
 from holdfast.outputs import sending
 from holdfast.outputs.mqtt.home_assistant import Discovery
 from holdfast.outputs.mqtt.payloads import Payloads
+from holdfast.outputs.site import DeviceInfo
 from holdfast.tags import Tag
-from holdfast.tags.register_scale import RegisterScale
+from holdfast.tags.scale import RegisterScale
 from support import wire
 from support.home_assistant import UNITS, Entity, entity
 from support.mqtt_plant import TAGS, Plant
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("FIRST_PAUSE", "MAX_PAUSE", "TICK"):
+    for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
         monkeypatch.setattr(sending, name, 0.05)
 
 
@@ -41,8 +43,21 @@ def settings(**more: Any) -> MqttOutputConfig:
 
 def found(of: Tag, device: str = "pump", **more: Any) -> Entity:
     """The only entity of a tag."""
-    [(topic, payload)] = Discovery("home", settings(**more)).entities({device: [of]}).items()
-    return entity(topic, payload)
+    [made] = [
+        each
+        for each in all_of({device: [of]}, **more)
+        if each.config.get("entity_category") != "diagnostic"
+    ]
+    return made
+
+
+INFO = DeviceInfo("tcp://10.0.0.5:502, unit 1", "10.0.0.5", None, None, None)
+
+
+def all_of(tags: dict[str, list[Tag]], info: DeviceInfo = INFO, **more: Any) -> list[Entity]:
+    """All entities, in their order."""
+    made = Discovery("home", settings(**more)).entities(tags, dict.fromkeys(tags, info))
+    return [entity(*each) for each in made.items()]
 
 
 STATES = {0: "off", 1: "it's on"}
@@ -94,8 +109,8 @@ def test_numbers_have_the_bounds_of_the_tag_or_of_its_registers() -> None:
 def test_no_two_tags_have_one_id() -> None:
     names = {"a": ["b_c", "b-c", "b.c"], "a_b": ["c"], "a-b": ["c"], "a.b": ["c"], "a-": ["-b"]}
     tags = {device: [tag(name) for name in some] for device, some in names.items()}
-    entities = Discovery("home", settings()).entities(tags)
-    assert len({entity(*each).config["unique_id"] for each in entities.items()}) == 7
+    ids = [each.config["unique_id"] for each in all_of(tags)]
+    assert len(set(ids)) == len(ids) == 7 + 1 + 2 * len(tags)
 
 
 @pytest.mark.parametrize("form", ["plain", "json", "device"])
@@ -130,12 +145,79 @@ def test_entities_appear_with_their_availability(plant: Plant) -> None:
         for message in seen
         if message.topic.startswith("homeassistant/")
     ]
-    assert sorted(each.component for each in entities) == ["number", "select", "sensor", "switch"]
+    shown = [each for each in entities if "entity_category" not in each.config]
+    assert sorted(each.component for each in shown) == ["number", "select", "sensor", "switch"]
     topics = {message.topic for message in seen}
     for each in entities:
         assert each.config["state_topic"] in topics
-        assert {of["topic"] for of in each.config["availability"]} <= topics
-        assert each.config["device"]["name"] == "pump"
+        assert {of["topic"] for of in each.config.get("availability", ())} <= topics
+    assert {each.config["device"]["name"] for each in shown} == {"pump"}
+
+
+def test_a_device_has_its_maker_model_version_and_address() -> None:
+    info = DeviceInfo("tcp://10.0.0.5:502, unit 1", "10.0.0.5", "Acme", "HF-1", "1.2")
+    *_, made = all_of({"pump": [tag()]}, info)
+    assert made.config["device"] == {
+        "identifiers": ["holdfast_home_pump"],
+        "name": "pump",
+        "manufacturer": "Acme",
+        "model": "HF-1",
+        "sw_version": "1.2",
+        "configuration_url": "http://10.0.0.5/",
+        "via_device": "holdfast_home",
+    }
+
+
+@pytest.mark.parametrize(
+    ("host", "page"),
+    [
+        ("plc.example", "http://plc.example/"),
+        ("fd00::5", "http://[fd00::5]/"),
+        ("127.0.0.1", None),
+        ("::1", None),
+        ("localhost", None),
+        (None, None),
+    ],
+)
+def test_a_device_on_the_network_has_a_link_to_its_page(host: str | None, page: str | None) -> None:
+    *_, made = all_of({"pump": [tag()]}, INFO._replace(host=host))
+    assert made.config["device"].get("configuration_url") == page
+
+
+def test_connections_and_addresses_are_diagnostic_entities() -> None:
+    hub, connection, address, value = all_of({"pump": [tag()]})
+    assert hub.config["device"]["name"] == "Holdfast home"
+    assert hub.config["state_topic"] == "plant/holdfast/status"
+    assert "availability" not in hub.config
+    assert connection.config["state_topic"] == "plant/holdfast/status/pump"
+    assert connection.config["availability"] == [{"topic": "plant/holdfast/status"}]
+    for each in (hub, connection):
+        assert each.config["device_class"] == "connectivity"
+        assert (each.config["payload_on"], each.config["payload_off"]) == ("online", "offline")
+    assert address.shown(b"online") == address.shown(b"offline") == "tcp://10.0.0.5:502, unit 1"
+    assert [each.config.get("entity_category") for each in (hub, connection, address, value)] == [
+        *["diagnostic"] * 3,
+        None,
+    ]
+
+
+def test_a_reload_publishes_another_maker(plant: Plant) -> None:
+    plant.device()
+    probe = plant.probe("#")
+    appliance = plant.run(discovery="homeassistant")
+    probe.until("plant/holdfast/status/pump", "online")
+    config = plant.config({"discovery": "homeassistant"})
+    pump = config.devices["pump"]
+    identity = DeviceIdentityConfig(vendor_name="Acme")
+    changed = pump.model_copy(update={"identity": identity})
+    appliance.reload(config.model_copy(update={"devices": {"pump": changed}}))
+    topic = "homeassistant/binary_sensor/holdfast_home/pump-connection/config"
+    found = entity(topic, probe.next_of(topic).payload).config["device"]
+    assert (found["manufacturer"], found["name"]) == ("Acme", "pump")
+
+
+DIAGNOSTICS = 3
+"""The diagnostic entities of an output with one device."""
 
 
 def configs(plant: Plant) -> set[str]:
@@ -165,7 +247,7 @@ def test_removed_entities_disappear_with_a_reload(plant: Plant) -> None:
     appliance.reload(plant.config({"discovery": "homeassistant"}, tags))
     probe.until("plant/pump/valve", "")
     probe.until("homeassistant/binary_sensor/holdfast_home/pump--valve/config", "")
-    assert len(configs(plant)) == 3
+    assert len(configs(plant)) == 3 + DIAGNOSTICS
 
 
 @pytest.mark.parametrize("version", ["5", "3.1.1"])
@@ -181,5 +263,5 @@ def test_entities_that_were_removed_while_it_was_stopped_disappear(
     probe.publish(foreign, "{}", retain=True)
     tags = {name: of for name, of in TAGS.items() if name != "valve"}
     plant.run(tags, discovery="homeassistant", version=version)
-    wire.until(lambda: len(configs(plant)) == 4, "one of ours is gone")
+    wire.until(lambda: len(configs(plant)) == 4 + DIAGNOSTICS, "one of ours is gone")
     assert foreign in configs(plant)

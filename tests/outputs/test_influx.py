@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.config.outputs import InfluxConfig
+from holdfast.config.models.outputs import InfluxConfig
 from holdfast.outputs import Buffer, Refused, Sending
 from holdfast.outputs import sending as module
 from holdfast.outputs.influx import Influx
@@ -195,7 +195,7 @@ def test_a_receiver_that_never_answers_does_not_hold_up_a_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its timeout is an hour; what it has not confirmed is in the file."""
-    monkeypatch.setattr(module, "LAST", 0.05)
+    monkeypatch.setattr(module, "STOP_TIMEOUT_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         url = f"http://127.0.0.1:{listener.getsockname()[1]}"
         output = influx(url, bucket="b", timeout=3600)

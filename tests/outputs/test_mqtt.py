@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("FIRST_PAUSE", "MAX_PAUSE", "TICK"):
+    for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
         monkeypatch.setattr(sending, name, 0.05)
 
 
@@ -166,7 +166,7 @@ def test_a_broker_that_has_lost_its_memory_gets_all_values_again(plant: Plant) -
 
 
 def test_a_frozen_broker_delays_no_poll(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "PROGRESS", 0.5)
+    monkeypatch.setattr(session, "CONFIRM_TIMEOUT_S", 0.5)
     device = plant.device()
     probe = plant.probe("plant/pump/n")
     plant.run(COUNTED)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.appliance import Appliance
-from holdfast.appliance.output_site import OutputSite
+from holdfast.appliance.services.outputs import OutputSite
 from holdfast.outputs import sending
-from holdfast.runtime.standstill import LONG
+from holdfast.runtime.standstill import STANDSTILL_S
 from support import wire
 from support.mqtt_plant import TAGS, Client, Plant
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("FIRST_PAUSE", "MAX_PAUSE", "TICK"):
+    for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
         monkeypatch.setattr(sending, name, 0.05)
 
 
@@ -242,7 +242,7 @@ def test_commands_that_waited_while_the_output_stood_still_are_not_written(
         for device, probe in probes.items():
             for _ in range(50):  # More than the broker sends before it has confirmations.
                 probe.publish(f"plant/{device}/temperature/set", "2")
-        end = time.monotonic() + LONG + 0.5
+        end = time.monotonic() + STANDSTILL_S + 0.5
         wire.until(lambda: time.monotonic() > end, "they stood still for long enough")
         goes_on.set()
 

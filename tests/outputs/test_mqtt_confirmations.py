@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.config.outputs import MqttOutputConfig
-from holdfast.mqtt.packets import parse_publish
-from holdfast.mqtt.stream import Packets
+from holdfast.config.models.outputs import MqttOutputConfig
+from holdfast.net.mqtt.packets import parse_publish
+from holdfast.net.mqtt.stream import Packets
 from holdfast.outputs.mqtt import MqttOutput
-from holdfast.outputs.mqtt.connection import MAX_PACKET
+from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES
 from holdfast.runtime.stop import Stop
 from support.readings import numbered
 
@@ -46,7 +46,7 @@ class Broker:
                         pass
 
     def _serve(self, connection: socket.socket, most: int) -> None:
-        packets, confirmed = Packets(MAX_PACKET), 0
+        packets, confirmed = Packets(MAX_PACKET_BYTES), 0
         seen: list[int] = []
         self.seen.append(seen)
         while data := connection.recv(65536):
@@ -76,6 +76,9 @@ class Site:
         self.refreshed = 0
 
     def tags(self) -> dict[str, Any]:
+        return {}
+
+    def devices(self) -> dict[str, Any]:
         return {}
 
     def answering(self) -> dict[str, bool]:

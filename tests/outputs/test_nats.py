@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.faults import NO_CONNECTION
 from holdfast.outputs import Buffer, Sending
 from holdfast.outputs import sending as module
+from holdfast.polling.faults import NO_CONNECTION
 from holdfast.runtime.stop import Stop
 from holdfast.scanner import Servers
 from holdfast.scanner.publish import nats_output as output_module
@@ -79,7 +79,7 @@ def test_tentacle_next_has_a_subject_for_each_tag(own_nats: NatsServer, own_call
 def test_nothing_is_lost_when_the_server_is_away(
     own_nats: NatsServer, output: NatsOutput, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("FIRST_PAUSE", "MAX_PAUSE", "TICK"):
+    for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
         monkeypatch.setattr(module, name, 0.05)
     buffer, stop = Buffer(), Stop()
     sending = Sending("nats", output, buffer)
@@ -129,7 +129,7 @@ def test_a_server_that_can_not_be_reached_is_an_error(own_nats: NatsServer) -> N
 def test_a_frozen_server_does_not_hold_up_a_stop(
     own_nats: NatsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "LAST", 0.05)
+    monkeypatch.setattr(module, "STOP_TIMEOUT_S", 0.05)
     monkeypatch.setattr(output_module, "CONFIRM_TIMEOUT_S", 3600.0)
     output = NatsOutput(Servers((own_nats.url,)), "modbus", "tentacle")
     buffer, stop = Buffer(), Stop()

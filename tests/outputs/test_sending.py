@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.outputs import Buffer, Refused, Sending
+from holdfast.outputs import Buffer, Receiver, Refused, Sending
 from holdfast.outputs import sending as module
 from holdfast.outputs.stored import Stored
 from holdfast.runtime.stop import Stop
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from holdfast.polling import Reading
 
 
-class Fake:
+class Fake(Receiver):
     """A receiver that does what a test wants."""
 
     def __init__(self) -> None:
@@ -35,9 +35,6 @@ class Fake:
         if self.error is not None:
             raise self.error
         self.sent += numbers(readings)
-
-    def idle(self) -> None:
-        pass
 
     def close(self) -> None:
         self.closed += 1
@@ -79,7 +76,7 @@ def count(caplog: pytest.LogCaptureFixture, event: str) -> int:
 
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("FIRST_PAUSE", "MAX_PAUSE", "TICK"):
+    for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
         monkeypatch.setattr(module, name, 0.01)
 
 
@@ -93,6 +90,30 @@ def output() -> Iterator[Running]:
     made = Running()
     yield made
     made.end()
+
+
+def test_a_receiver_without_readings_has_its_turn_every_second(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.undo()
+    waits, stop = [], Stop()
+
+    class Empty(Buffer):
+        def take(self, most: int, seconds: float) -> list[Reading]:  # noqa: ARG002
+            waits.append(seconds)
+            return []
+
+    class Idle(Fake):
+        def idle(self) -> None:
+            self.attempts += 1
+            if self.attempts == 3:
+                stop.set()
+
+    receiver = Idle()
+    Sending("out", receiver, Empty()).run(stop)
+
+    assert receiver.attempts == 3
+    assert waits == [1.0] * 3
 
 
 def test_everything_is_sent_in_order(output: Running) -> None:

@@ -24,9 +24,9 @@ REBIRTH: dict[str, Any] = {"name": "Node Control/Rebirth", "datatype": 11, "bool
 
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("FIRST_PAUSE", "MAX_PAUSE", "TICK"):
+    for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
         monkeypatch.setattr(sending, name, 0.05)
-    monkeypatch.setattr(output, "TIMEOUT", 0.05)
+    monkeypatch.setattr(output, "HOST_STATE_TIMEOUT_S", 0.05)
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def test_a_session_has_births_then_data_then_a_death(plant: Plant, version: str)
 def test_an_end_that_was_not_confirmed_has_the_will(
     plant: Plant, version: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "LAST", 0.0)
+    monkeypatch.setattr(session, "STOP_TIMEOUT_S", 0.0)
     plant.device()
     watching = watch(plant)
     plant.run(**SETTINGS, version=version)

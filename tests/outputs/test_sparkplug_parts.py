@@ -5,21 +5,21 @@ from __future__ import annotations
 import contextlib
 import math
 import struct
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from holdfast.faults import FAULTS
 from holdfast.outputs.sparkplug.datatypes import datatype_of, value_of
 from holdfast.outputs.sparkplug.definition import Metric, parsed
-from holdfast.outputs.sparkplug.names import Names
-from holdfast.outputs.sparkplug.node import EdgeNode
-from holdfast.outputs.sparkplug.primary_host import PrimaryHost
+from holdfast.outputs.sparkplug.node import EdgeNode, Names
+from holdfast.outputs.sparkplug.output import PrimaryHost
 from holdfast.polling import Reading
+from holdfast.polling.faults import FAULTS
 from holdfast.tags import Tag
-from holdfast.tags.register_scale import RegisterScale
+from holdfast.tags.scale import RegisterScale
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -196,6 +196,76 @@ def test_data_has_types_if_they_are_always_wanted(always_typed: bool) -> None:
         found += payload(message).metrics
     assert [metric.HasField("datatype") for metric in found] == [True, *[always_typed] * 3]
     assert {metric.datatype for metric in found} <= {0, 6}
+
+
+@pytest.mark.parametrize(
+    ("area", "type", "number", "field", "value"),
+    [
+        ("holding_registers", "int16", 2, "int_value", 7),
+        ("holding_registers", "int32", 3, "int_value", 7),
+        ("holding_registers", "int64", 4, "long_value", 7),
+        ("holding_registers", "uint16", 6, "int_value", 7),
+        ("holding_registers", "uint32", 7, "long_value", 7),
+        ("holding_registers", "uint64", 8, "long_value", 7),
+        ("holding_registers", "float32", 9, "float_value", 1.5),
+        ("holding_registers", "float64", 10, "double_value", 1.5),
+        ("coils", "bool", 11, "boolean_value", True),
+        ("holding_registers", "string:4", 12, "string_value", "ab"),
+        ("holding_registers", "bytes:4", 17, "bytes_value", b"ab"),
+    ],
+)
+def test_a_birth_has_type_and_value_of_each_metric(
+    area: Any, type: str, number: int, field: str, value: Any
+) -> None:
+    tag = Tag("speed", area, 0, type)
+    made = EdgeNode(Names("group", "edge"))
+    made.begin()
+    made.adopt({"pump": [tag]})
+    *_, birth = made.births({"pump": True}, lambda: latest(reading(value, 1.0, tag)))
+    [metric] = payload(birth).metrics
+    assert (metric.name, metric.datatype, metric.is_null) == ("speed", number, False)
+    assert (metric.HasField(field), getattr(metric, field)) == (True, value)
+
+
+def test_messages_have_the_time_now_and_metrics_the_time_of_their_reading(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(time, "time", lambda: 1_700_000_000.25)
+    now = 1_700_000_000_250
+    made = EdgeNode(Names("group", "edge"))
+    made.begin()
+    made.adopt({"pump": [SPEED, LEVEL]})
+    births = list(made.births({"pump": True}, lambda: latest(reading(5, 10.5))))
+    data = list(made.data([reading(3, 8.25), reading(6, 11.75)], latest))
+    messages = [*births, *data, *made.device_deaths({"pump": False}), made.death()]
+
+    times = [
+        (payload(message).timestamp, [metric.timestamp for metric in payload(message).metrics])
+        for message in messages
+    ]
+    assert kinds(messages) == ["NBIRTH", "DBIRTH", "DDATA", "DDATA", "DDEATH", "NDEATH"]
+    assert times == [
+        (now, [now, now]),
+        # There is no reading of the second tag yet.
+        (now, [10_500, now]),
+        (now, [8_250]),
+        (now, [11_750]),
+        (now, []),
+        (now, [now]),
+    ]
+
+
+def test_all_messages_but_the_death_of_the_node_are_numbered_from_its_birth() -> None:
+    made = EdgeNode(Names("group", "edge"))
+    made.begin()
+    made.adopt({"pump": [SPEED], "fan": [SPEED]})
+    births = made.births({"pump": True, "fan": True}, latest)
+    data = list(made.data([reading(3, 8.0)], latest))
+    deaths = made.device_deaths({"pump": False, "fan": True})
+
+    assert [payload(each).seq for each in [*births, *data, *deaths]] == [0, 1, 2, 3, 4]
+    assert not payload(made.death()).HasField("seq")
+    assert [payload(each).seq for each in made.births({"fan": True}, latest)] == [0, 1]
 
 
 def test_sequence_numbers_begin_again_after_255() -> None:

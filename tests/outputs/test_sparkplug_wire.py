@@ -35,7 +35,7 @@ def fake(request: pytest.FixtureRequest) -> Iterator[FakeBroker]:
 def test_the_session_is_clean_and_its_will_is_the_death(
     plant: Plant, fake: FakeBroker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "LAST", 0.05)
+    monkeypatch.setattr(session, "STOP_TIMEOUT_S", 0.05)
     plant.device()
     plant.run(**SETTINGS, url=fake.url, version=fake.version)
     with fake.accept() as peer:

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.config.outputs import FileConfig
-from holdfast.outputs.database import Database
-from holdfast.outputs.text_file import TextFile
+from holdfast.config.models.outputs import FileConfig
+from holdfast.outputs.text_file import Database, TextFile
 from support.line_protocol import parsed
 from support.readings import reading, tag
 

@@ -51,6 +51,17 @@ def test_pymodbus_is_asked_everything(pymodbus: Pymodbus, dial: Dial) -> None:
     assert client.diagnostics(0, [0x1234]) == [0x1234]
     assert len(client.diagnostics(11)) == 1
     assert client.event_counter()[0] is False
+    # Its files and queues always have the same values.
+    dummy = [int.from_bytes(pair) for pair in (b"SE", b"RV", b"ER", b" D", b"UM", b"MY", b" R")]
+    assert client.read_file_record(4, 1, 10)[:7] == dummy
+    assert [len(each) for each in client.read_file_records([(4, 1, 10), (3, 9, 10)])] == [10, 10]
+    with pytest.raises(holdfast.InvalidResponse, match="length"):
+        client.read_file_record(4, 1, 2)
+    client.write_file_record(4, 7, [0x06AF, 0x04BE, 0x100D])
+    assert client.read_fifo_queue(0x04DE) == [0, 1, 2, 3]
+    assert client.read_exception_status() == 0
+    log = client.event_log()
+    assert (log.events, log.messages) == (client.event_counter()[1], client.diagnostics(11)[0])
 
 
 def test_pymodbus_answers_several_tasks_one_after_the_other() -> None:

@@ -207,6 +207,21 @@ def test_pymodbus_is_told_that_there_is_no_event_log(client: Any) -> None:
     assert client.diag_get_comm_event_log().exception_code == 1
 
 
+def test_pymodbus_reads_the_exception_status_and_the_event_log(run: Run) -> None:
+    status = {"memory": "plant", "exception_status": {"area": "coils", "address": 3}}
+    rules = [{"sources": ["127.0.0.1"], "units": {1: status}, "access": "read-only"}]
+    appliance = run(configuration("tcp", rules=rules, event_log=True))
+    appliance.memories["plant"].write("coils", 3, [1, 0, 0, 0, 0, 1, 0, 1])
+    host, port = address(appliance)
+    with connected(ModbusTcpClient(host, port=port, **OPTIONS)) as client:
+        assert client.read_exception_status().status == 0b1010_0001
+        assert client.read_coils(5000).exception_code == 2
+        log = client.diag_get_comm_event_log()
+
+    assert (log.event_count, log.message_count) == (1, 3)
+    assert log.events == [0x80, 0x41, 0x80, 0x40, 0x80]
+
+
 def test_pymodbus_silences_a_unit_and_wakes_it(client: Any) -> None:
     client.diag_force_listen_only()
     client.diag_restart_communication(True, no_response_expected=True)

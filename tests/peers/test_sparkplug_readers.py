@@ -8,8 +8,7 @@ import pytest
 
 from holdfast.outputs.sparkplug.datatypes import datatype_of, value_of
 from holdfast.outputs.sparkplug.definition import parsed
-from holdfast.outputs.sparkplug.names import Names
-from holdfast.outputs.sparkplug.node import EdgeNode
+from holdfast.outputs.sparkplug.node import EdgeNode, Names
 from holdfast.polling import Reading
 from holdfast.tags import Tag
 from support.peer_programs import node

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.appliance import running
 from support.native_poller import ReportingPoller
 
 if TYPE_CHECKING:
@@ -23,4 +22,4 @@ def poller() -> Iterator[ReportingPoller]:
 @pytest.fixture
 def health_is_checked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """`Appliance.log_events` logs each change of a device, not only once a second."""
-    monkeypatch.setattr(running, "HEALTH_CHECK_INTERVAL", 0.0)
+    monkeypatch.setattr("holdfast.appliance.appliance.CHECK_INTERVAL_S", 0.0)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast import logs
-from holdfast.faults import fault_word
+from holdfast.events import log_lines
+from holdfast.polling.faults import fault_word
 from holdfast.types import AREAS
 from support import polled, web, wire
 from support.brokers import free_port
@@ -283,6 +283,20 @@ def test_a_line_that_is_not_there_is_unreachable_and_nobody_refuses(
     told = until_told(appliance, health=ERROR, last_error=UNREACHABLE)
     assert told.transport_errors > 0
     assert fault_word(counters(appliance, "meter")["last_error"]) == "unreachable"
+
+
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp", "ascii+tcp"])
+def test_a_device_whose_machine_drops_packets_is_left_alone_for_a_while(
+    run: Run, kind: str
+) -> None:
+    hour = {"first": 3600, "most": 3600}
+    with wire.dead_address() as (host, port), Fake(data) as good:
+        meter = device(f"{kind}://{host}:{port}", read("coils", 0, 1), timeout=0.05, retry=hour)
+        other = device(good.url, read("coils", 0, 1))
+        appliance = run(configuration({"meter": meter, "other": other}))
+        wire.until(lambda: counters(appliance, "meter")["last_error"] == TIMEOUT, "it is asked")
+        until_polled(appliance, "other", 20)
+        assert counters(appliance, "meter")["polls"] == 1
 
 
 def test_seconds_in_error_count_while_the_first_reply_is_awaited(run: Run) -> None:
@@ -970,7 +984,7 @@ def test_a_device_that_is_disabled_is_told_so_and_left_alone(run: Run) -> None:
 def test_an_appliance_without_enabled_devices_polls_nothing(run: Run) -> None:
     meter = device("tcp://127.0.0.1:1", read("coils", 0, 8, ("coils", 0)), enabled=False)
     appliance = run(configuration({"meter": meter}))
-    assert appliance.diagnostics.poller is None
+    assert appliance._parts().devices.poller is None
     assert appliance.diagnostics.stats()["devices"] == {"meter": {"health": "disabled"}}
 
 
@@ -1036,12 +1050,12 @@ def test_the_starts_of_many_devices_are_spread(run: Run) -> None:
 @pytest.fixture
 def records() -> Iterator[web.Records]:
     handler = web.Records()
-    logs.LOGGER.addHandler(handler)
-    level = logs.LOGGER.level
-    logs.LOGGER.setLevel("INFO")
+    log_lines.LOGGER.addHandler(handler)
+    level = log_lines.LOGGER.level
+    log_lines.LOGGER.setLevel("INFO")
     yield handler
-    logs.LOGGER.removeHandler(handler)
-    logs.LOGGER.setLevel(level)
+    log_lines.LOGGER.removeHandler(handler)
+    log_lines.LOGGER.setLevel(level)
 
 
 @pytest.mark.usefixtures("health_is_checked_at_once")
@@ -1100,8 +1114,8 @@ def test_a_missing_plan_and_refused_results_are_logged(run: Run, records: web.Re
     reads = [read("coils", 0, 8, ("coils", 0))]
     with Fake(data) as fake:
         appliance = run(configuration({"meter": device(fake.url, *reads)}))
-        parts: Any = appliance._parts()
-        parts._poller = altered = Altered(parts._poller)
+        devices: Any = appliance._parts().devices
+        devices.poller = altered = Altered(devices.poller)
         until_polled(appliance, "meter", 1)
         told = counters(appliance, "meter")
         assert (told["plan_error"], told["unplanned"], told["unstored"]) == (None, 0, 0)
@@ -1182,12 +1196,12 @@ def test_with_measured_costs_the_answers_decide_which_holes_are_read(
             url: tcp://{host}:{port}
             unit: 1
             interval: 0.01
-            cost: {{per_request: 0, per_register: 1, measured: true}}
+            max_gap: auto
             reads:
               - {{area: holding_registers, address: 0, count: 1,
                   into: {{memory: mirror, area: holding_registers, address: 0}}}}
-              - {{area: holding_registers, address: 10, count: 100,
-                  into: {{memory: mirror, area: holding_registers, address: 10}}}}
+              - {{area: holding_registers, address: 12, count: 100,
+                  into: {{memory: mirror, area: holding_registers, address: 12}}}}
         """
     )
 
@@ -1198,11 +1212,11 @@ def test_with_measured_costs_the_answers_decide_which_holes_are_read(
     wire.until(lambda: meter()["requests_per_poll"] == 2, "the first plan has two requests")
     wire.until(lambda: meter()["requests_per_poll"] == 1, "requests cost more than registers")
     memory.write("holding_registers", 0, [7])
-    memory.write("holding_registers", 109, [9])
+    memory.write("holding_registers", 111, [9])
     mirror = appliance.memories["mirror"]
     wire.until(
         lambda: (
-            mirror.read("holding_registers", 0, 1) + mirror.read("holding_registers", 109, 1)
+            mirror.read("holding_registers", 0, 1) + mirror.read("holding_registers", 111, 1)
             == [7, 9]
         ),
         "both reads are mirrored",

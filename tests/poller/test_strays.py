@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast import logs
+from holdfast.events import log_lines
 from support import web, wire
 from support.polled import (
     Datagrams,
@@ -36,9 +36,9 @@ READS = [read("holding_registers", 0, 1, ("holding_registers", 0))]
 @pytest.fixture
 def records() -> Iterator[web.Records]:
     handler = web.Records()
-    logs.LOGGER.addHandler(handler)
+    log_lines.LOGGER.addHandler(handler)
     yield handler
-    logs.LOGGER.removeHandler(handler)
+    log_lines.LOGGER.removeHandler(handler)
 
 
 def polled(run: Run, url: str, **more: Any) -> Appliance:

@@ -10,9 +10,9 @@ import pytest
 
 import holdfast
 from holdfast import Tag, TagList
-from holdfast.faults import NO_CONNECTION
 from holdfast.polling import Poller, Reading, WriteFailed
-from holdfast.tags.register_scale import RegisterScale
+from holdfast.polling.faults import NO_CONNECTION
+from holdfast.tags.scale import RegisterScale
 from support import wire
 from support.brokers import free_port
 

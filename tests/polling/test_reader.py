@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from holdfast.polling.reader import Reader
+from holdfast.polling.readings import Reader
 from holdfast.tags import Tag, TagList
-from holdfast.tags.register_scale import RegisterScale
+from holdfast.tags.scale import RegisterScale
 
 if TYPE_CHECKING:
     from holdfast.types import PolledBlock

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import re
 from typing import get_args
 
 import pytest
 
-from holdfast import _core, faults, protocol, types
+from holdfast import _core, protocol, types
+from holdfast.gateway import assets
 from holdfast.gateway.assets import FOLDER
-from holdfast.scanner.messages import FunctionCode
-from holdfast.scanner.subscriptions import AREA_OF_CODE
+from holdfast.polling import faults
+from holdfast.scanner.messages.types import FunctionCode
+from holdfast.scanner.subscriptions.tag import AREA_OF_CODE
 from support import server_model
 
 COILS, DISCRETE_INPUTS, HOLDING_REGISTERS, INPUT_REGISTERS = (
@@ -27,8 +30,10 @@ FUNCTIONS = [
     (4, "Read Input Registers", False, INPUT_REGISTERS, 125, 0),
     (5, "Write Single Coil", True, COILS, 0, 1),
     (6, "Write Single Register", True, HOLDING_REGISTERS, 0, 1),
+    (7, "Read Exception Status", False, None, 0, 0),
     (8, "Diagnostics", False, None, 0, 0),
     (11, "Get Comm Event Counter", False, None, 0, 0),
+    (12, "Get Comm Event Log", False, None, 0, 0),
     (15, "Write Multiple Coils", True, COILS, 0, 1968),
     (16, "Write Multiple Registers", True, HOLDING_REGISTERS, 0, 123),
     (17, "Report Server ID", False, None, 0, 0),
@@ -140,25 +145,25 @@ def test_no_fault_is_called_none() -> None:
 
 
 def test_the_console_has_the_same_areas_and_limits() -> None:
-    script = (FOLDER / "standard.js").read_text()
-    row = r'(\w+): \{ title: "([\w ]+)", code: (\d+), most: (\d+)(?:, mostWritten: (\d+))? \}'
-    rows = re.findall(row, script)
-    assert [(area, int(code), int(most)) for area, _, code, most, _ in rows] == [
+    script = assets.read("/console/standard.js")[1].decode()
+    [found] = re.findall(r"= (\{.*\});", script)
+    standard = json.loads(found)
+    rows = standard["AREAS"]
+    assert [(area, row["code"], row["most"]) for area, row in rows.items()] == [
         (area, function.code, function.most_read)
         for area, function in protocol.READ_FUNCTIONS.items()
     ]
-    written = {area: int(most) for area, *_, most in rows if most}
+    written = {area: row["mostWritten"] for area, row in rows.items() if row["mostWritten"]}
     assert written == protocol.WRITE_LIMITS
-    assert [title.lower().replace(" ", "_") for _, title, *_ in rows] == list(types.AREAS)
-    assert f"LAST = {protocol.LAST_ADDRESS};" in script
+    assert [row["title"].lower().replace(" ", "_") for row in rows.values()] == list(types.AREAS)
+    assert standard["LAST_ADDRESS"] == protocol.LAST_ADDRESS
 
 
 def test_nothing_else_of_the_console_knows_a_limit() -> None:
     for file in FOLDER.glob("*.js"):
-        if file.name != "standard.js":
-            found = re.findall(r"\b(2000|1968|125|123|121)\b", file.read_text())
-            assert found == [], file.name
-    page = (FOLDER / "index.html").read_text()
+        found = re.findall(r"\b(2000|1968|125|123|121|65535)\b", file.read_text())
+        assert found == [], file.name
+    page = assets.read("/")[1].decode()
     [quantity] = re.findall(r'id="quantity"[^>]* max="(\d+)"', page)
     assert int(quantity) == protocol.READ_REGISTERS
     addresses = re.findall(r'(?:id="address"|name="first"|name="last")[^>]* max="(\d+)"', page)

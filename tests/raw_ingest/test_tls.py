@@ -16,7 +16,7 @@ import pytest
 from holdfast import raw_ingest
 from holdfast.appliance import Appliance
 from holdfast.cli.configuration import load_whole
-from holdfast.client.receiver import Receiver, parse_receiver
+from holdfast.client.url import Receiver, parse_receiver
 from holdfast.config import ConfigError, load
 from support import wire
 from support.certificates import PAST, Certificates, Issued, named, openssl
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 DONE, REFUSED = b"\x00", b"\x01"
 CLIENT = "extendedKeyUsage=clientAuth"
 AREAS = ["coils", "holding_registers"]
+FLOOR = 256
+"""The fewest handshakes that a listener has room for."""
 PACKET = raw_ingest.encode("holding_registers", 0, [7], unit=1)
 LONG = raw_ingest.encode("holding_registers", 0, range(65535), unit=1)
 BY_ROLE: list[dict[str, Any]] = [
@@ -273,14 +275,14 @@ def test_bytes_behind_a_packet_are_counted_in_whatever_record_they_are(
 def test_silent_connections_displace_each_other_and_no_sender(
     run: Run, party: Party, when_full: str
 ) -> None:
-    limits = {"max_connections": 4, "max_handshakes": 5, "max_connections_per_source": None}
+    limits = {"max_connections": 4, "max_connections_per_source": None}
     settings: dict[str, Any] = {"compat": {"packets": "many"}, "when_full": when_full, **limits}
     plant = run(secured(party, **settings))
     with contextlib.ExitStack() as opened:
         client = opened.enter_context(connected(party, plant, party.line))
         client.sendall(PACKET)
         assert client.recv(1) == DONE
-        silent = [opened.enter_context(wire.Connection(address(plant))) for _ in range(12)]
+        silent = [opened.enter_context(wire.Connection(address(plant))) for _ in range(FLOOR + 7)]
         assert [each.rest() for each in silent[:7]] == [b""] * 7
         client.sendall(PACKET)
         assert client.recv(1) == DONE
@@ -575,13 +577,13 @@ def test_files_of_listeners_and_receivers_are_checked(party: Party, tmp_path: Pa
 
 
 def test_keys_of_tls_without_tls_are_errors(party: Party, tmp_path: Path) -> None:
-    text = secured(party, max_handshakes=9).replace('"tls":', '"not_tls":')
+    text = secured(party).replace('"tls":', '"not_tls":')
     file = tmp_path / "plant.yaml"
     file.write_text(text)
     with pytest.raises(ConfigError) as raised:
         load(file)
     problems = [str(problem) for problem in raised.value.problems]
-    for place in ("max_handshakes", "rules[0].roles", "rules[1].roles"):
+    for place in ("rules[0].roles", "rules[1].roles"):
         wrong = f"listeners.secure.{place}: found without tls, allowed: only with it"
         assert any(wrong in problem for problem in problems)
 

@@ -23,7 +23,7 @@ async def fails() -> None:
 
 
 def test_tasks_that_lose_a_cancellation_are_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tasks, "AGAIN", 0.01)
+    monkeypatch.setattr(tasks, "CANCEL_INTERVAL_S", 0.01)
 
     async def work() -> list[bool]:
         works = (loses(0), loses(1), loses(3), fails())
@@ -38,7 +38,7 @@ def test_tasks_that_lose_a_cancellation_are_ended(monkeypatch: pytest.MonkeyPatc
 def test_a_loop_can_notice_that_it_has_lost_a_cancellation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(tasks, "AGAIN", 3600.0)
+    monkeypatch.setattr(tasks, "CANCEL_INTERVAL_S", 3600.0)
     rounds = 0
 
     async def loop() -> None:

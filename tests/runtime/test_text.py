@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from holdfast.runtime.text import all_of, clip, either, guess, listing, quote
+from holdfast.runtime.text import all_of, clip, either, listing, quote, suggestion
 
 
 def test_a_long_text_is_cut() -> None:
@@ -13,7 +13,7 @@ def test_a_long_text_is_cut() -> None:
 
 def test_a_quoted_text_is_cut_and_has_no_control_characters() -> None:
     assert quote("pump\x1b[2J\n") == r"'pump\x1b[2J\n'"
-    assert quote("a" * 1000) == f"'{'a' * 40}…'"
+    assert quote("a" * 1000) == f"'{'a' * 40}'…"
 
 
 def test_lists_are_as_in_a_sentence() -> None:
@@ -24,5 +24,5 @@ def test_lists_are_as_in_a_sentence() -> None:
 
 
 def test_a_close_word_is_suggested() -> None:
-    assert guess("coil", ["holding_registers", "coils"]) == "; did you mean 'coils'?"
-    assert guess("x", ["holding_registers"]) == ""
+    assert suggestion("coil", ["holding_registers", "coils"]) == "; did you mean 'coils'?"
+    assert suggestion("x", ["holding_registers"]) == ""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from holdfast import logs
+from holdfast.events import log_lines
+from holdfast.events.throttle import Throttle
 
 
 @pytest.fixture(autouse=True)
 def _fresh_throttle(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets no test use up the log lines of another."""
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+    monkeypatch.setattr(log_lines, "_REFUSALS", Throttle())

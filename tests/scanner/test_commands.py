@@ -11,7 +11,7 @@ import pytest
 from holdfast.scanner import ScannerLimits
 from holdfast.scanner.commands import value
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.subscriptions import Tag
+from holdfast.scanner.subscriptions.tag import Tag
 from support import wire
 from support.fake_device import FakeDevice, exception, registers
 from support.nats_bus import leaving, subscription, tag
@@ -277,12 +277,12 @@ def test_what_the_device_refuses_is_told(caller: Caller) -> None:
         data = caller.listen("modbus.data.plc1")
         caller.request("modbus.subscribe", request)
         data.next()
-        for code, told in (
+        for code, error in (
             ("2", "not written: exception 02 (Illegal Data Address)"),
             ("4", "not confirmed: exception 04 (Server Device Failure)"),
             ("99", "not confirmed: exception 63"),
         ):
-            assert caller.request("modbus.command.a", code) == {"success": False, "error": told}
+            assert caller.request("modbus.command.a", code) == {"success": False, "error": error}
         caller.request("modbus.unsubscribe", leaving("a", subscriberId="x"))
 
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.scanner.jetstream import BUCKET
-from holdfast.scanner.subscriptions import SubscriptionKey, SubscriptionTtls
+from holdfast.scanner.jetstream.store import BUCKET
+from holdfast.scanner.subscriptions.key import SubscriptionKey
+from holdfast.scanner.subscriptions.ttl import SubscriptionTtls
 from support import wire
 from support.nats_bus import Caller, leaving, subscription, tag
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.scanner.jetstream import State
-from holdfast.scanner.nats import MAX_PAUSE
+from holdfast.net.nats import MAX_PAUSE
+from holdfast.scanner.jetstream.availability import State
 from holdfast.scanner.subscriptions import device as devices
 from support import wire
 from support.brokers import NatsServer
@@ -188,14 +188,14 @@ def test_nats_that_was_away_for_long_is_tried_every_other_second(run_scanner: Ru
     broker = broker_of(run_scanner(max_pause_s=MAX_PAUSE).scanner)
     client = broker.client
     assert client is not None
-    broker._lost("tested")
+    broker._note_lost("tested")
     pauses = set()
     for _ in range(50):
         broker._note(client, OSError("no route"))
         pauses.add(client.options["reconnect_time_wait"])
     assert max(pauses) <= MAX_PAUSE
     assert len({pause for pause in pauses if pause >= 0.75 * MAX_PAUSE}) > 40, "with jitter"
-    broker._made(client)
+    broker._note_connected(client)
 
 
 # Devices
@@ -396,11 +396,11 @@ def test_without_jetstream_it_says_so_once_and_goes_on(
                 scanner.do(
                     presence_of(scanner.scanner).heartbeat.beat(broker_of(scanner.scanner).client)
                 )
-        [told] = [each for each in caplog.records if each.getMessage() == "no_heartbeat"]
+        [record] = [each for each in caplog.records if each.getMessage() == "no_heartbeat"]
         reason = "JetStream is not enabled on the server or for this account"
-        assert told.__dict__["fields"]["reason"] == reason
-        [told] = [each for each in caplog.records if "_not_kept" in each.getMessage()]
-        assert told.__dict__["fields"] == {"bucket": "holdfast_scanner", "reason": reason}
+        assert record.__dict__["fields"]["reason"] == reason
+        [record] = [each for each in caplog.records if "_not_kept" in each.getMessage()]
+        assert record.__dict__["fields"] == {"bucket": "holdfast_scanner", "reason": reason}
         scanner.stop()
     finally:
         bare.kill()
@@ -416,9 +416,9 @@ def test_a_bucket_in_which_heartbeats_stay_for_ever_is_told_of_once(
     heart, broker = presence_of(scanner.scanner).heartbeat, broker_of(scanner.scanner)
     heart._availability.state = State.UNKNOWN
     scanner.do(heart.beat(broker.client))
-    [told] = [each for each in caplog.records if each.getMessage() == "heartbeat_has_no_end"]
-    assert told.__dict__["fields"]["bucket"] == "service_heartbeats"
-    assert "delete the bucket" in told.__dict__["fields"]["todo"]
+    [record] = [each for each in caplog.records if each.getMessage() == "heartbeat_has_no_end"]
+    assert record.__dict__["fields"]["bucket"] == "service_heartbeats"
+    assert "delete the bucket" in record.__dict__["fields"]["todo"]
 
 
 async def _bucket_without_end(caller: Caller) -> None:

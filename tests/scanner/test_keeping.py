@@ -14,7 +14,8 @@ import pytest
 from nats.js import JetStreamContext
 from nats.js.kv import KeyValue
 
-from holdfast.scanner.jetstream import BUCKET, entries, store
+from holdfast.scanner.jetstream import entries, store
+from holdfast.scanner.jetstream.store import BUCKET
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag
@@ -168,7 +169,7 @@ def test_a_large_subscription_is_kept_in_parts(
     server: holdfast.Server,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(entries, "MAX_PART", 300)
+    monkeypatch.setattr(entries, "MAX_PART_BYTES", 300)
     first = run_scanner()
     for start in range(0, 20, 5):
         tags = [tag(f"t{number}", number) for number in range(start, start + 5)]

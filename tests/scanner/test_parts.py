@@ -11,24 +11,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.client.url import NetworkTarget
-from holdfast.scanner import ScannerLimits
-from holdfast.scanner.alone import Alone
-from holdfast.scanner.errors import Refused
-from holdfast.scanner.jetstream import HeartbeatKey
-from holdfast.scanner.messages import BrowseRequest, HeartbeatMetadata, ServiceReport
-from holdfast.scanner.nats import Outbox
-from holdfast.scanner.nats import outbox as outboxes
-from holdfast.scanner.publish import Publisher
-from holdfast.scanner.reports import browsed
-from holdfast.scanner.subscriptions import Group, Registry, Tag, grouped
+from holdfast.net.nats import Outbox
+from holdfast.net.nats import outbox as outboxes
+from holdfast.scanner import ScannerLimits, Settings
+from holdfast.scanner.commands import Commands
+from holdfast.scanner.dialects import TENTACLE
+from holdfast.scanner.errors import Moved
+from holdfast.scanner.jetstream.heartbeat import HeartbeatKey
+from holdfast.scanner.messages.types import BrowseRequest, HeartbeatMetadata, ServiceReport
+from holdfast.scanner.placement import Placement
+from holdfast.scanner.publish.publisher import Publisher
+from holdfast.scanner.reports.browse import browsed
 from holdfast.scanner.subscriptions.device import (
-    Plan,
     ScannedDevice,
     Source,
     Subscriber,
     TagOptions,
 )
+from holdfast.scanner.subscriptions.groups import Group, grouped
 from holdfast.scanner.subscriptions.health import Health
+from holdfast.scanner.subscriptions.plan import Plan
+from holdfast.scanner.subscriptions.registry import Registry
+from holdfast.scanner.subscriptions.tag import Tag
 from holdfast.tags.decoding import Places, decoder
 
 if TYPE_CHECKING:
@@ -36,8 +40,8 @@ if TYPE_CHECKING:
 
     from nats.aio.client import Client
 
-    from holdfast.config.scanning import Publish
-    from holdfast.scanner.nats.tolerant_client import SafeClient
+    from holdfast.config.values.scanning import Publish
+    from holdfast.net.nats import SafeClient
     from holdfast.types import PolledBlock
 
 TARGET = NetworkTarget("tcp", "127.0.0.1", 502)
@@ -60,7 +64,7 @@ def device(**subscribers: tuple[int, Publish, float, str]) -> ScannedDevice:
     return found
 
 
-def told(groups: Sequence[Group]) -> list[tuple[bool, int, str, tuple[float, ...]]]:
+def contents(groups: Sequence[Group]) -> list[tuple[bool, int, str, tuple[float, ...]]]:
     return [
         (group.change, group.rate, "".join(tag.id for tag in group.tags), group.deadbands)
         for group in groups
@@ -69,7 +73,7 @@ def told(groups: Sequence[Group]) -> list[tuple[bool, int, str, tuple[float, ...
 
 def test_a_tag_is_published_as_often_as_the_fastest_wants_it() -> None:
     groups = grouped(device(slow=(1000, "scan", 0.0, "abc"), fast=(100, "scan", 0.0, "bcd")))
-    assert told(groups) == [
+    assert contents(groups) == [
         (False, 100, "bcd", (0.0, 0.0, 0.0)),
         (False, 1000, "a", (0.0,)),
     ]
@@ -83,7 +87,7 @@ def test_changes_are_wanted_beside_scans_only_where_they_come_sooner() -> None:
             later=(500, "change", 0.0, "b"),
         )
     )
-    assert told(groups) == [(False, 500, "ab", (0.0, 0.0)), (True, 100, "a", (2.0,))]
+    assert contents(groups) == [(False, 500, "ab", (0.0, 0.0)), (True, 100, "a", (2.0,))]
 
 
 def test_a_deadband_is_kept_only_where_no_other_is_as_narrow_and_as_fast() -> None:
@@ -94,7 +98,7 @@ def test_a_deadband_is_kept_only_where_no_other_is_as_narrow_and_as_fast() -> No
             wide=(1000, "change", 7.0, "ab"),
         )
     )
-    assert told(groups) == [(True, 100, "ab", (5.0, 5.0)), (True, 1000, "a", (1.0,))]
+    assert contents(groups) == [(True, 100, "ab", (5.0, 5.0)), (True, 1000, "a", (1.0,))]
 
 
 @given(
@@ -229,7 +233,7 @@ def test_thousands_of_tags_far_apart_cost_no_more_each_than_a_few(
     assert count <= 2 * 2000
     plc.health.judge([(*block[:3], None, 2, ANSWERED) for block in blocks])
     service = ServiceReport(0, 0, 0, 0, 0)
-    answer = browsed(BrowseRequest("plc"), {"plc": (plc, {})}, {}, service, 2**20)
+    answer = browsed(BrowseRequest("plc"), {"plc": plc}, {}, service, 2**20)
     [report] = answer.devices
     assert len(report.blocks or []) == len(report.tags or []) == 2000
     assert all(each.error for each in report.tags or [])
@@ -541,9 +545,13 @@ def test_a_heartbeat_that_fails_after_the_stop_is_not_logged(
 
 
 def test_a_command_that_was_not_written_is_not_confirmed() -> None:
-    async def has_moved() -> bool:
-        return False
+    class Elsewhere(Placement):
+        def takes_writes(self, _device: ScannedDevice, /) -> bool:
+            return False
 
-    alone = Alone("modbus", Registry(ScannerLimits()), keeps_subscriptions=False)
-    with pytest.raises(Refused, match="not written: another node uses the device"):
-        asyncio.run(alone.write(device(), made("a"), "1", has_moved, lambda: 1.0))
+    settings, registry = Settings(), Registry(ScannerLimits())
+    registry.devices["plc"] = device(hmi=(1000, "scan", 0.0, "a"))
+    unused = cast("Any", None)
+    commands = Commands(settings, TENTACLE, registry, unused, Elsewhere(), unused)
+    with pytest.raises(Moved, match="not written: another node uses the device"):
+        asyncio.run(commands.write("plc", "a", "1", lambda: 1.0))

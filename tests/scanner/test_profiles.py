@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.tags import Tag, TagList
-from holdfast.tags.register_scale import RegisterScale
+from holdfast.tags.scale import RegisterScale
 from support import wire
 from support.nats_bus import leaving, subscription, tag
 

@@ -10,7 +10,7 @@ import jsonschema_rs
 import pytest
 
 from holdfast.client.url import NetworkTarget, SerialTarget
-from holdfast.config.scanning import parse_pollable
+from holdfast.config.values.scanning import parse_pollable
 from holdfast.scanner import ScannerLimits
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.schema import json_schema

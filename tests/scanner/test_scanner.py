@@ -188,7 +188,7 @@ def test_a_change_of_tags_keeps_the_connection_and_what_is_known_of_the_device(
     assert "connections" in counters
     assert counters["connections"]["accepted"] == 1
     # A new connection to the broker publishes the state again.
-    states = [state for state, _ in itertools.groupby(status.take(), lambda told: told["state"])]
+    states = [state for state, _ in itertools.groupby(status.take(), lambda each: each["state"])]
     assert states == ["connecting", "online"]
 
 
@@ -554,7 +554,7 @@ def test_between_two_large_requests_others_have_their_turn(
 
     async def ask() -> None:
         nonlocal turn
-        handle = broker_of(scanner.scanner)._handlers["modbus.subscribe"]
+        handle = broker_of(scanner.scanner).handlers["modbus.subscribe"]
         client = client_of(scanner.scanner)
         for number in range(20):
             request = subscription(server, tag("a", 0), deviceId=f"d{number}", scanRate=60_000)

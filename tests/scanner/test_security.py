@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import pytest
 from nats.errors import NoRespondersError
 
+from holdfast.net.nats import connection as broker
 from holdfast.net.tls import Tls
 from holdfast.scanner import Scanner, Servers, Settings
-from holdfast.scanner.nats import connection as broker
 from support import wire
 from support.brokers import NatsServer
 from support.certificates import Certificates
@@ -62,7 +62,7 @@ def failure(caplog: pytest.LogCaptureFixture) -> str:
     return reasons(caplog, "nats_connect_failed")[0]
 
 
-def told(caplog: pytest.LogCaptureFixture, event: str, text: str) -> None:
+def until_logged(caplog: pytest.LogCaptureFixture, event: str, text: str) -> None:
     """Waits until an event is logged with a reason that has a text in it."""
     wire.until(lambda: text in str(reasons(caplog, event)), f"{event} tells {text!r}")
 
@@ -179,7 +179,7 @@ def test_a_right_that_is_missing_is_told_and_the_rest_works(
     url = server.url.replace("//", "//a:b@")
     running: Running = run_scanner(servers=Servers((url,)))
 
-    told(caplog, "nats_error", "ermissions")
+    until_logged(caplog, "nats_error", "ermissions")
     assert running.serves
 
 
@@ -276,10 +276,10 @@ def test_credentials_that_are_refused_are_told_and_read_anew(
         "operator": lambda: User(Operator().account()),
     }
     scanner = run_scanner(wait=False, servers=at(trusting, users[wrong]().write(file)))
-    told(caplog, "nats_connect_failed", "Authorization Violation")
+    until_logged(caplog, "nats_connect_failed", "Authorization Violation")
     assert not scanner.serves
     file.write_text("")
-    told(caplog, "nats_connect_failed", "block NATS USER JWT is missing")
+    until_logged(caplog, "nats_connect_failed", "block NATS USER JWT is missing")
     User(plant).write(file)
     wire.until(lambda: scanner.serves, "it is connected")
 
@@ -311,7 +311,7 @@ def test_a_client_that_ends_without_a_word_is_replaced(run_scanner: Run) -> None
 def test_a_scanner_ends_while_its_client_has_ended_without_a_word(
     run_scanner: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(broker, "CHECK_INTERVAL", 2 * wire.DEADLINE)
+    monkeypatch.setattr(broker, "CHECK_INTERVAL_S", 2 * wire.DEADLINE)
     scanner = run_scanner()
     client = client_of(scanner.scanner)
     client._disconnected_cb = client._closed_cb = None
@@ -345,7 +345,7 @@ def test_an_account_without_jetstream_has_no_heartbeat(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     scanner = run_scanner(servers=at(trusting, User(plant).write(file)))
-    told(caplog, "no_heartbeat", "JetStream not enabled for account")
+    until_logged(caplog, "no_heartbeat", "JetStream not enabled for account")
     for _ in range(3):
         scanner.do(presence_of(scanner.scanner).heartbeat.beat(broker_of(scanner.scanner).client))
     assert scanner.serves
@@ -366,7 +366,7 @@ def test_a_refused_publish_is_told_and_the_rest_works(
         status = caller.listen("modbus.status.plc1")
         assert caller.request("modbus.subscribe", subscription(server, tag("a", 0)))["success"]
         status.until(lambda message: message["state"] == "online", "it is online")
-    told(caplog, "nats_error", 'ermissions violation for publish to "modbus.data.plc1"')
+    until_logged(caplog, "nats_error", 'ermissions violation for publish to "modbus.data.plc1"')
     assert scanner.serves
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast import logs
+from holdfast.events import log_lines
 from holdfast.scanner import Ping, presence
 from holdfast.scanner.jetstream import heartbeat
 from support import wire
@@ -58,7 +58,7 @@ def test_only_the_scanner_s_own_log_is_published(
     caplog.set_level(logging.INFO, "holdfast")
     inbox = caller.listen("service.logs.>")
     run_scanner()
-    other = threading.Thread(target=logs.write, args=(logging.WARNING, "of_another_service"))
+    other = threading.Thread(target=log_lines.write, args=(logging.WARNING, "of_another_service"))
     other.start()
     other.join()
     caller.request("modbus.subscribe", "nonsense")
@@ -157,8 +157,8 @@ def test_another_service_is_noticed_by_its_heartbeat(
 
     caller.do(beat_too())
     wire.until(lambda: logged(caplog, "another_scanner"), "it is noticed")
-    [told] = logged(caplog, "another_scanner")
-    assert told["started"] == "1970-01-01T00:00:00.007Z"
+    [record] = logged(caplog, "another_scanner")
+    assert record["started"] == "1970-01-01T00:00:00.007Z"
     [shown] = caller.request("modbus.browse", b"")["service"]["otherScanners"]
     assert shown == {"startedAt": 7}
     wire.until(lambda: beat(caller)["startedAt"] == started, "its own heartbeat is back")

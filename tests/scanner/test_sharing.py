@@ -84,7 +84,7 @@ def test_all_that_uses_a_device_shares_its_only_connection(
 def test_devices_of_the_scanner_are_not_those_of_the_configuration(
     run: Run, nats: NatsServer, caller: Caller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("holdfast.appliance.running.HEALTH_CHECK_INTERVAL", 0)
+    monkeypatch.setattr("holdfast.appliance.appliance.CHECK_INTERVAL_S", 0)
     with Stream("tcp") as device, Stream("tcp") as other:
         appliance = run(configuration(nats, device.url, **polled(device.url)))
         until_connected(appliance)
@@ -92,8 +92,8 @@ def test_devices_of_the_scanner_are_not_those_of_the_configuration(
         request = wanted(other, tag("a", 5), deviceId="meter")
         assert caller.request(f"{PREFIX}.subscribe", request)["success"]
         assert data.next()["value"] == 5
-        assert list(appliance.diagnostics.devices()) == ["meter"]
-        assert appliance.diagnostics.devices()["meter"]["exceptions"] == 0
+        assert list(appliance.diagnostics.stats()["devices"]) == ["meter"]
+        assert appliance.diagnostics.stats()["devices"]["meter"]["exceptions"] == 0
         [report] = caller.request(f"{PREFIX}.browse", {})["devices"]
         assert report["deviceId"] == "meter"
         appliance.log_events(0)
@@ -119,7 +119,7 @@ def test_a_scanner_that_ends_stops_its_devices_and_no_others(
 def test_a_scanner_that_failed_continues_with_the_same_devices(
     run: Run, nats: NatsServer, caller: Caller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("holdfast.appliance.supervision.FIRST_PAUSE", 0.01)
+    monkeypatch.setattr("holdfast.appliance.services.supervision.FIRST_PAUSE_S", 0.01)
     with Stream("tcp", in_turn=True) as device:
         appliance = run(configuration(nats, device.url, **polled(device.url)))
         until_connected(appliance)
@@ -127,7 +127,7 @@ def test_a_scanner_that_failed_continues_with_the_same_devices(
         request = wanted(device, tag("a", 20))
         assert caller.request(f"{PREFIX}.subscribe", request)["success"]
         assert data.next()["value"] == 20
-        supervisor, _ = appliance.diagnostics.adapters["nats"]
+        supervisor = appliance.diagnostics.adapters["nats"]
         scanner: Any = supervisor._adapter
         service = scanner._scanner
 

@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from holdfast.scanner import FleetSettings, Servers, Settings, lateness
-from holdfast.scanner.fleet.exchange import Command, subject
+from holdfast.polling.write_ttl import WRITE_TTL_S
+from holdfast.scanner import FleetSettings, Servers, Settings
+from holdfast.scanner import late_commands as module
+from holdfast.scanner.fleet.nodes import Command, subject
 from support import wire
 from support.fake_device import FakeDevice, registers
 from support.fleet_nodes import FLEET, prepare, subscribed, wanted
@@ -219,7 +221,7 @@ def test_a_command_of_another_node_waits_as_long_as_that_node_allows(
         command = Command(device="d0", tag="t0", text="3", epoch=0, within=within)
         assert send(own_caller, where, msgspec.json.encode(command)).result(wire.DEADLINE) == {}
     assert allowed[0] == 4.0
-    assert 4.0 < allowed[1] <= lateness.MAX_WAIT_S
+    assert 4.0 < allowed[1] <= WRITE_TTL_S
 
 
 def test_a_standstill_is_logged_once(
@@ -247,7 +249,7 @@ def test_a_command_that_waited_for_long_in_the_scanner_is_refused(
     run_scanner()
     caller.request("modbus.subscribe", subscription(server, tag("a", 10)))
     with monkeypatch.context() as patched:
-        patched.setattr(lateness, "MAX_WAIT_S", -1.0)
+        patched.setattr(module, "WRITE_TTL_S", -1.0)
         answer = caller.request("modbus.command.a", "3")
     assert answer["success"] is False
     assert answer["error"].startswith("not written: the command waited for 0 s; send it again")
@@ -276,7 +278,7 @@ def test_a_command_that_waited_for_long_for_its_device_is_refused(
             assert is_reading.wait(wire.DEADLINE)
             assert caller.request("modbus.subscribe", other)["success"]
             with monkeypatch.context() as patched:
-                patched.setattr(lateness, "MAX_WAIT_S", 1.0)
+                patched.setattr(module, "WRITE_TTL_S", 1.0)
                 refused = caller.request("modbus.command.a", "3")
         finally:
             go_on.set()
@@ -297,7 +299,7 @@ def test_a_node_passes_no_command_on_that_waited_for_long(
     with Judges(1) as judges:
         subscribed(own_caller, 0, judges.devices[0])
         monkeypatch.setattr(member, "is_own", lambda _: False)  # It waits for a node that has it.
-        monkeypatch.setattr(lateness, "MAX_WAIT_S", 0.5)
+        monkeypatch.setattr(module, "WRITE_TTL_S", 0.5)
         answer = own_caller.request("modbus.command.d0.t0", "3")
         assert answer["error"].startswith("not written: the command waited for")
         assert not judges.devices[0].writes

@@ -10,6 +10,7 @@ import pytest
 import holdfast
 from holdfast import _core
 from holdfast.scanner import Defaults, Settings
+from holdfast.scanner.dialects import DIALECTS
 from support import wire
 from support.nats_bus import leaving, logged, subscription, tag
 from support.tentacle import (
@@ -298,7 +299,7 @@ def test_who_leaves_must_say_what(
 
 
 def test_the_pauses_of_the_first_generation_are_2_s_to_60_s() -> None:
-    assert Settings().exact_pauses_s == (2.0, 60.0)
+    assert DIALECTS[Settings().dialect].reconnect_pauses_s == (2.0, 60.0)
 
 
 @pytest.mark.parametrize("dialect", ["tentacle", "tentacle-next"])
@@ -313,7 +314,8 @@ def test_only_the_first_generation_waits_for_exact_pauses(
         return polled_device(*args, **more)
 
     monkeypatch.setattr(_core, "PolledDevice", noted)
-    running = run_scanner(dialect=dialect, exact_pauses_s=(0.01, 0.04))
+    shorter = (0.01, 0.04) if dialect == "tentacle" else None
+    running = run_scanner(dialect=dialect, exact_pauses_s=shorter)
     units = {1: holdfast.Memory(holding_registers=1)}
     with holdfast.Server(units, bind="127.0.0.1:0", access="read-only") as gone:
         # Without them, the next scan would be tried in a minute.
@@ -321,8 +323,7 @@ def test_only_the_first_generation_waits_for_exact_pauses(
     assert caller.request("modbus.subscribe", request)["success"]
     if dialect == "tentacle":
         wire.until(lambda: device(caller, "plc1")["failures"] > 3, "it is tried again and again")
-    pauses = ((0.01, 0.04), False) if dialect == "tentacle" else (None, True)
-    assert {(each["retry"], each["jitter"]) for each in made} == {pauses}
+    assert {(each["retry"], each["jitter"]) for each in made} == {(shorter, shorter is None)}
     running.stop()
     for bucket in ("scanner_config_modbus", "service_enabled"):
         caller.forget(bucket)

@@ -10,16 +10,12 @@ import pytest
 
 import holdfast
 from holdfast.scanner import Defaults
+from holdfast.scanner.dialects import DIALECTS, tentacle_next
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.jetstream import BUCKET as KEPT
-from holdfast.scanner.jetstream import WATCH_TIMES, WatchTimes
-from holdfast.scanner.messages import (
-    DIALECTS,
-    Adjustments,
-    SubscribeRequest,
-    decode_lenient,
-    tentacle_next,
-)
+from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
+from holdfast.scanner.jetstream.store import BUCKET as KEPT
+from holdfast.scanner.messages.decoding import Adjustments, decode_lenient
+from holdfast.scanner.messages.types import SubscribeRequest
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag

@@ -2,36 +2,26 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import struct
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pymodbus.client import AsyncModbusTcpClient, ModbusTcpClient
-from pymodbus.framer import FramerType
 
-import holdfast
-from holdfast.types import AREAS
 from support import lines, wire
 from support.cases import examples
-from support.machine import needs_127_0_0_2
-from support.pymodbus_peer import OPTIONS, Patient, connected, tour
 from support.running import content
 from support.transports import (
-    ALL,
     AsciiConnection,
     address,
     configuration,
     counters,
-    is_stranger,
     rule,
     running,
 )
-from support.vectors import cases, overlay
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -78,64 +68,7 @@ def sturdy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
         yield appliance
 
 
-# Vectors
-
-
-@pytest.mark.parametrize("case", cases("pdu.json"), ids=lambda case: case["name"])
-def test_a_pdu_is_answered_and_leaves_memory_as_its_vector_says(
-    case: dict[str, Any], run: Run, connect: Connect
-) -> None:
-    size = 1000
-    appliance = run(configuration("ascii", memories={"plant": dict.fromkeys(AREAS, size)}))
-    memory = appliance.memories["plant"]
-    expected = {area: [0] * size for area in AREAS}
-    overlay(expected, case["setup"])
-    for area in AREAS:
-        memory.write(area, 0, expected[area])
-
-    client = connect(appliance)
-    assert client.ask(bytes.fromhex(case["request"])).hex() == case["response"]
-    overlay(expected, case["after"])
-    assert {area: memory.read(area, 0, size) for area in AREAS} == expected
-    assert client.is_quiet()
-
-
-@pytest.mark.parametrize("case", cases("frames.json"), ids=lambda case: case["pdu"])
-def test_a_frame_is_served_as_its_vector_spells_it(
-    case: dict[str, Any], run: Run, connect: Connect
-) -> None:
-    client = connect(run(configuration("ascii", rules=[rule(["127.0.0.1"], case["unit"])])))
-    client.send(case["ascii"].encode())
-
-    [(unit, reply)] = client.replies(1)
-    assert (unit, reply[0] & 0x7F) == (case["unit"], int(case["pdu"][:2], 16) & 0x7F)
-
-
 # Pieces
-
-
-@settings(max_examples=examples(50))
-@given(data=st.data())
-def test_requests_may_arrive_cut_anywhere(data: st.DataObject, sturdy: Appliance) -> None:
-    values = data.draw(st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=30))
-    asked = [struct.pack(">BHH", 6, at, value) for at, value in enumerate(values)]
-    stream = framed(asked)
-    cuts = sorted(data.draw(st.sets(st.integers(1, len(stream) - 1), max_size=20)))
-    with AsciiConnection(address(sturdy)) as client:
-        for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
-            client.send(stream[start:end])
-        assert client.replies(len(asked)) == [(1, pdu) for pdu in asked]
-    assert sturdy.memories["plant"].read("holding_registers", 0, len(values)) == values
-
-
-def test_many_requests_in_one_piece_are_answered_in_order(
-    appliance: Appliance, client: AsciiConnection
-) -> None:
-    appliance.memories["plant"].write("holding_registers", 0, range(1000))
-    client.send(framed([struct.pack(">BHH", 3, at, 1) for at in range(1000)]))
-
-    replies = client.replies(1000)
-    assert replies == [(1, struct.pack(">BBH", 3, 2, value)) for value in range(1000)]
 
 
 def test_the_longest_request_and_the_longest_reply_are_served(client: AsciiConnection) -> None:
@@ -321,47 +254,7 @@ def test_a_changed_delimiter_concerns_only_the_connection_that_changed_it(
     assert counters(appliance)["frames"]["damaged"] == 0
 
 
-# Units and rules
-
-
-def test_a_unit_that_no_rule_maps_fails_to_respond(client: AsciiConnection) -> None:
-    for unit in (0, 2, 247, 255):
-        assert client.ask(READ, unit) == b"\x83\x0b"
-        assert client.ask(b"\x63", unit) == b"\xe3\x01"
-
-
-def test_unit_0_is_an_ordinary_unit(run: Run, connect: Connect) -> None:
-    rules = [{"sources": ["127.0.0.1"], "units": {0: "plant", 1: "other"}, "access": "read-write"}]
-    appliance = run(configuration("ascii", rules=rules, memories={"plant": ALL, "other": ALL}))
-    client = connect(appliance)
-
-    assert client.ask(WRITE, 0) == WRITE
-    assert client.ask(READ, 0) == bytes.fromhex("03021234")
-    assert client.ask(READ, 1) == ZERO
-
-
-@needs_127_0_0_2
-def test_a_stranger_is_disconnected_and_counted(run: Run) -> None:
-    appliance = run(configuration("ascii", rules=[rule(["127.0.0.1"])]))
-
-    assert is_stranger("ascii", appliance, address(appliance), "127.0.0.2")
-    assert counters(appliance)["requests"] == {}
-
-
-# Timeouts and stop
-
-
-@pytest.mark.parametrize("begun", [b":", lines.ascii_frame(WRITE, 1)[:-1]])
-def test_half_a_request_ends_the_connection_after_the_request_timeout(
-    begun: bytes, run: Run, connect: Connect
-) -> None:
-    appliance = run(configuration("ascii", request_timeout=0.2))
-    client = connect(appliance)
-    client.send(begun)
-
-    assert client.rest() == b""
-    wire.until(lambda: counters(appliance)["connections"]["request_timeout"] == 1, "it is counted")
-    assert appliance.memories["plant"].read("holding_registers", 0, 1) == [0]
+# Timeouts
 
 
 @pytest.mark.parametrize("sent", [b"no frame\r\n", lines.ASCII.damaged(READ, 1)])
@@ -377,57 +270,3 @@ def test_what_is_no_request_does_not_put_off_the_idle_timeout(
         return bool(counters(appliance)["connections"]["idle"])
 
     wire.until(idle, "the connection ends")
-
-
-def test_what_was_received_before_a_stop_is_answered(
-    appliance: Appliance, client: AsciiConnection
-) -> None:
-    assert client.ask(READ) == ZERO
-    client.send(framed([READ] * 100) + lines.ascii_frame(WRITE, 1)[:-1])
-    appliance.stop()
-
-    assert client.replies(100) == [(1, ZERO)] * 100
-    assert client.rest() == b""
-
-
-# Real clients
-
-
-def test_pymodbus_reads_and_writes(run: Run) -> None:
-    appliance = run(configuration("ascii", more={"identity": {"vendor_name": "Acme"}}))
-    host, port = address(appliance)
-
-    client = ModbusTcpClient(host, port=port, framer=FramerType.ASCII, **OPTIONS)
-    with connected(client):
-        tour(client, appliance.memories["plant"], 1)
-
-
-def test_pymodbus_reads_and_writes_with_asyncio(run: Run) -> None:
-    appliance = run(configuration("ascii", more={"identity": {"vendor_name": "Acme"}}))
-    host, port = address(appliance)
-
-    def made() -> AsyncModbusTcpClient:
-        return AsyncModbusTcpClient(host, port=port, framer=FramerType.ASCII, **OPTIONS)
-
-    with Patient(made) as client:
-        tour(client, appliance.memories["plant"], 1)
-
-
-def test_the_sync_client_reads_and_writes(appliance: Appliance) -> None:
-    host, port = address(appliance)
-    with holdfast.SyncClient(f"ascii+tcp://{host}:{port}", timeout=wire.DEADLINE) as plc:
-        plc.write_registers(5, list(range(123)))
-        assert plc.read_holding_registers(5, 123) == list(range(123))
-        with pytest.raises(holdfast.ModbusException):
-            plc.read_coils(1000, 1)
-
-
-def test_the_client_reads_and_writes(appliance: Appliance) -> None:
-    host, port = address(appliance)
-
-    async def asked() -> list[bool]:
-        async with holdfast.Client(f"ascii+tcp://{host}:{port}", timeout=wire.DEADLINE) as plc:
-            await plc.write_coils(3, [True, False, True])
-            return await plc.read_coils(3, 3)
-
-    assert asyncio.run(asked()) == [True, False, True]

@@ -2,7 +2,7 @@
 counters are as if each had come whole.
 
 Each first piece is read before the second one is sent. What becomes of disturbed frames in all
-pieces is tested without sockets, in `crates/engine/src/server/connection.rs`.
+pieces is tested without sockets, in `crates/engine/src/server/connections/connection.rs`.
 """
 
 from __future__ import annotations

@@ -11,16 +11,21 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pymodbus.client import AsyncModbusTcpClient, ModbusTcpClient
-from pymodbus.framer import FramerType
 
-from holdfast.types import AREAS
 from support import lines, wire
 from support.cases import examples
-from support.pymodbus_peer import OPTIONS, Patient, connected, tour
 from support.running import content
-from support.transports import ALL, RtuConnection, address, configuration, counters, rule, running
-from support.vectors import cases, overlay
+from support.transports import (
+    NOT_OF_THEIR_LENGTH,
+    TRANSPORTS,
+    RtuConnection,
+    address,
+    configuration,
+    counters,
+    rule,
+    running,
+)
+from support.vectors import cases
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -57,14 +62,6 @@ REQUESTS = [
 ]
 """Requests of every function, and some that are refused, whatever memory holds."""
 
-# The function and the byte count say how long a frame is: these PDUs have another length.
-NOT_OF_THEIR_LENGTH = {
-    "PDU too short",
-    "PDU too long",
-    "FC16 quantity 124",
-    "FC23 write quantity 122",
-}
-
 
 def framed(pdus: list[bytes]) -> bytes:
     return b"".join(lines.rtu(pdu, 1) for pdu in pdus)
@@ -93,7 +90,7 @@ def client(appliance: Appliance, connect: Callable[[Appliance], RtuConnection]) 
     return connect(appliance)
 
 
-PATIENT: dict[str, Any] = {"frame_timeout": wire.DEADLINE, "request_timeout": wire.DEADLINE}
+PATIENT = TRANSPORTS["rtu"].patient
 
 SILENCE_S = 0.3
 """The time after which a request has no reply; a multiple of the `frame_timeout`."""
@@ -115,29 +112,6 @@ def ask_until_answered(client: RtuConnection) -> None:
 
 @pytest.mark.parametrize(
     "case",
-    [case for case in cases("pdu.json") if case["name"] not in NOT_OF_THEIR_LENGTH],
-    ids=lambda case: case["name"],
-)
-def test_a_pdu_is_answered_and_leaves_memory_as_its_vector_says(
-    case: dict[str, Any], run: Run, connect: Callable[[Appliance], RtuConnection]
-) -> None:
-    size = 1000
-    appliance = run(configuration("rtu", memories={"plant": dict.fromkeys(AREAS, size)}))
-    memory = appliance.memories["plant"]
-    expected = {area: [0] * size for area in AREAS}
-    overlay(expected, case["setup"])
-    for area in AREAS:
-        memory.write(area, 0, expected[area])
-
-    client = connect(appliance)
-    assert client.ask(bytes.fromhex(case["request"])).hex() == case["response"]
-    overlay(expected, case["after"])
-    assert {area: memory.read(area, 0, size) for area in AREAS} == expected
-    assert client.is_quiet()
-
-
-@pytest.mark.parametrize(
-    "case",
     [case for case in cases("pdu.json") if case["name"] in NOT_OF_THEIR_LENGTH],
     ids=lambda case: case["name"],
 )
@@ -152,22 +126,6 @@ def test_a_pdu_that_is_not_as_long_as_its_function_says_is_not_carried_out(
 
     assert set(counters(appliance)["requests"]) == {3}
     assert content(appliance.memories["plant"]) == before
-
-
-@pytest.mark.parametrize(
-    "case",
-    # Not the reply among them: a request of its function is shorter.
-    [case for case in cases("frames.json") if case["pdu"][:4] != "0306"],
-    ids=lambda case: case["pdu"],
-)
-def test_a_frame_is_served_as_its_vector_spells_it(
-    case: dict[str, Any], run: Run, connect: Callable[[Appliance], RtuConnection]
-) -> None:
-    client = connect(run(configuration("rtu", rules=[rule(["127.0.0.1"], case["unit"])])))
-    client.send(bytes.fromhex(case["rtu"]))
-
-    [(unit, reply)] = client.replies(1)
-    assert (unit, reply[0] & 0x7F) == (case["unit"], int(case["pdu"][:2], 16) & 0x7F)
 
 
 # Pieces
@@ -195,36 +153,11 @@ def test_requests_may_arrive_in_pieces_of_any_size(
     assert client.is_quiet()
 
 
-@settings(max_examples=examples(50))
-@given(data=st.data())
-def test_requests_may_arrive_cut_anywhere(data: st.DataObject, sturdy: Appliance) -> None:
-    values = data.draw(st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=30))
-    asked = [struct.pack(">BHH", 6, at, value) for at, value in enumerate(values)]
-    stream = framed(asked)
-    cuts = sorted(data.draw(st.sets(st.integers(1, len(stream) - 1), max_size=20)))
-    with RtuConnection(address(sturdy)) as client:
-        for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
-            client.send(stream[start:end])
-        assert client.replies(len(asked)) == [(1, pdu) for pdu in asked]
-    assert sturdy.memories["plant"].read("holding_registers", 0, len(values)) == values
-
-
 @pytest.fixture(scope="module")
 def sturdy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
     """An appliance for many examples."""
     with running(tmp_path_factory.mktemp("rtu"), configuration("rtu", **PATIENT)) as appliance:
         yield appliance
-
-
-def test_many_requests_in_one_piece_are_answered_in_order(
-    appliance: Appliance, client: RtuConnection
-) -> None:
-    appliance.memories["plant"].write("holding_registers", 0, range(1000))
-    asked = [struct.pack(">BHH", 3, at, 1) for at in range(1000)]
-    client.send(framed(asked))
-
-    replies = client.replies(1000)
-    assert replies == [(1, struct.pack(">BBH", 3, 2, value)) for value in range(1000)]
 
 
 def test_the_longest_write_is_served(appliance: Appliance, client: RtuConnection) -> None:
@@ -421,41 +354,7 @@ def test_no_bytes_end_the_service(garbage: bytes, sturdy: Appliance) -> None:
         assert client.ask(b"\x11")[0] == 17
 
 
-# Units
-
-
-def test_a_unit_that_no_rule_maps_fails_to_respond(client: RtuConnection) -> None:
-    for unit in (0, 2, 247, 255):
-        assert client.ask(READ, unit) == b"\x83\x0b"
-        assert client.ask(b"\x63", unit) == b"\xe3\x01"
-
-
-def test_unit_0_is_an_ordinary_unit(
-    run: Run, connect: Callable[[Appliance], RtuConnection]
-) -> None:
-    rules = [{"sources": ["127.0.0.1"], "units": {0: "plant", 1: "other"}, "access": "read-write"}]
-    appliance = run(configuration("rtu", rules=rules, memories={"plant": ALL, "other": ALL}))
-    client = connect(appliance)
-
-    assert client.ask(WRITE, 0) == WRITE
-    assert client.ask(READ, 0) == bytes.fromhex("03021234")
-    assert client.ask(READ, 1) == ZERO
-
-
-# Timeouts and stop
-
-
-def test_half_a_request_ends_the_connection_after_the_request_timeout(
-    run: Run, connect: Callable[[Appliance], RtuConnection]
-) -> None:
-    appliance = run(configuration("rtu", request_timeout=0.2, frame_timeout=10))
-    client = connect(appliance)
-    assert client.ask(READ) == ZERO
-    client.send(lines.rtu(WRITE, 1)[:-1])
-
-    assert client.rest() == b""
-    wire.until(lambda: counters(appliance)["connections"]["request_timeout"] == 1, "it is counted")
-    assert appliance.memories["plant"].read("holding_registers", 0, 1) == [0]
+# Timeouts
 
 
 def test_an_unknown_function_whose_crc_never_fits_ends_after_the_request_timeout(
@@ -481,37 +380,3 @@ def test_damaged_frames_do_not_put_off_the_idle_timeout(
         return bool(counters(appliance)["connections"]["idle"])
 
     wire.until(idle, "the connection ends")
-
-
-def test_what_was_received_before_a_stop_is_answered(
-    appliance: Appliance, client: RtuConnection
-) -> None:
-    assert client.ask(READ) == ZERO
-    client.send(framed([READ] * 100) + lines.rtu(WRITE, 1)[:4])
-    appliance.stop()
-
-    assert client.replies(100) == [(1, ZERO)] * 100
-    assert client.rest() == b""
-
-
-# Real clients
-
-
-def test_pymodbus_reads_and_writes(run: Run) -> None:
-    appliance = run(configuration("rtu", more={"identity": {"vendor_name": "Acme"}}))
-    host, port = address(appliance)
-
-    client = ModbusTcpClient(host, port=port, framer=FramerType.RTU, **OPTIONS)
-    with connected(client):
-        tour(client, appliance.memories["plant"], 1)
-
-
-def test_pymodbus_reads_and_writes_with_asyncio(run: Run) -> None:
-    appliance = run(configuration("rtu", more={"identity": {"vendor_name": "Acme"}}))
-    host, port = address(appliance)
-
-    def made() -> AsyncModbusTcpClient:
-        return AsyncModbusTcpClient(host, port=port, framer=FramerType.RTU, **OPTIONS)
-
-    with Patient(made) as client:
-        tour(client, appliance.memories["plant"], 1)

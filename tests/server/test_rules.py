@@ -232,7 +232,7 @@ def test_a_unit_can_have_fewer_rights_than_its_rule(start: Start) -> None:
 def test_ranges_of_a_unit_limit_whole_requests(start: Start) -> None:
     ranges = {
         "read": [{"area": "holding_registers", "start": 0, "end": 3}],
-        "write": [{"area": "holding_registers", "start": 2, "count": 3}],
+        "write": [{"area": "holding_registers", "start": 2, "end": 4}],
     }
     units = {1: {"memory": "plant", **ranges}}
     peer = start({**rule(["127.0.0.1"]), "units": units}).peer()

@@ -850,6 +850,22 @@ def test_pymodbus_reads_and_writes(far: tuple[str, holdfast.Memory], mode: Mode)
         tour(client, memory, UNIT)
 
 
+def test_pymodbus_reads_the_exception_status_and_the_event_log(
+    cable: Cable, mode: Mode, run: Run
+) -> None:
+    device, far_end = cable.devices
+    unit = {"memory": "plant", "exception_status": {"area": "discrete_inputs", "address": 7}}
+    logs = {"event_log": True}
+    appliance = run(lines.configuration(mode, device, units={UNIT: unit}, listener=logs))
+    appliance.memories["plant"].write("discrete_inputs", 7, [0, 1, 1, 0, 0, 0, 0, 1])
+    made = ModbusSerialClient(str(far_end), framer=FRAMERS[mode.name], **OPTIONS)
+    with connected(made) as client:
+        assert client.read_exception_status(device_id=UNIT).status == 0b1000_0110
+        log = client.diag_get_comm_event_log(device_id=UNIT)
+
+    assert (log.event_count, log.message_count, log.events) == (1, 2, [0x80, 0x40, 0x80])
+
+
 def test_pymodbus_reads_and_writes_with_asyncio(
     far: tuple[str, holdfast.Memory], mode: Mode
 ) -> None:

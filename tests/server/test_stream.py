@@ -6,6 +6,7 @@ answered says the model, or, for the long run, rules that need none.
 
 from __future__ import annotations
 
+import os
 import random
 import select
 import struct
@@ -36,6 +37,8 @@ SEED = 20251121
 READ = bytes.fromhex("0300000002")
 WRITE = bytes.fromhex("1000030002041234abcd")
 WRITTEN = bytes.fromhex("1000030002")
+TCP_TABLE = Path("/proc/net/tcp")
+KEEPALIVE_TIMER = 2
 MAX_READ = struct.pack(">BHH", 3, 0, 125)
 
 
@@ -247,6 +250,30 @@ def test_a_connection_without_a_request_ends_after_the_idle_timeout(
     assert client.rest() == b""
     assert time.monotonic() - began >= 0.25
     wire.until(lambda: server.counters()["connections"]["idle"] == 1, "it is counted")
+
+
+@pytest.mark.skipif(not TCP_TABLE.exists(), reason="only Linux shows the timers of connections")
+@pytest.mark.parametrize(("keepalive", "shortest"), [(30, 0), (3000, 30)])
+def test_a_silent_peer_is_probed_after_the_keepalive_time(
+    keepalive: int, shortest: int, memory: holdfast.Memory, serve: Serve, connect: Connect
+) -> None:
+    server = serve({1: memory}, keepalive=keepalive)
+    client = connect(server)
+    client.ask(READ)
+
+    wire.until(lambda: _seconds_to_probe(server, client) is not None, "its timer runs")
+    remaining = _seconds_to_probe(server, client)
+    assert remaining is not None
+    assert shortest < remaining <= keepalive
+
+
+def _seconds_to_probe(server: holdfast.Server, client: wire.Connection) -> float | None:
+    """How long until the server's system probes the client; `None` while another timer runs."""
+    ends = [f"{end[1]:04X}" for end in (server.address, client.socket.getsockname())]
+    rows = [line.split() for line in TCP_TABLE.read_text().splitlines()[1:]]
+    [timer] = [row[5] for row in rows if [row[1].split(":")[1], row[2].split(":")[1]] == ends]
+    kind, ticks = (int(number, 16) for number in timer.split(":"))
+    return ticks / os.sysconf("SC_CLK_TCK") if kind == KEEPALIVE_TIMER else None
 
 
 def test_the_idle_timeout_begins_again_with_each_request(

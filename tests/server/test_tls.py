@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pytest
 from pymodbus.client import ModbusTlsClient
 
-from holdfast import logs
 from holdfast.appliance import Appliance
 from holdfast.cli.configuration import load_whole
 from holdfast.config import ConfigError, load
+from holdfast.events import log_lines
+from holdfast.types import AREAS
 from support import wire
 from support.certificates import (
     FUTURE,
@@ -44,6 +45,7 @@ from support.tls_peer import (
     reasons,
     verdict,
 )
+from support.vectors import cases, overlay
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -108,6 +110,8 @@ ANYONE: list[dict[str, Any]] = [{"sources": ["127.0.0.1"], "access": "read-write
 
 
 PLACES: dict[str, Any] = {"max_connections_per_source": None}
+HANDSHAKES = 256
+"""The handshakes that a listener for few connections has room for."""
 """All peers of these tests have one address, which may take all places."""
 
 
@@ -278,6 +282,19 @@ def test_a_client_without_a_certificate_is_refused(
     assert logged_subjects(caplog) == [None]
 
 
+def test_a_listener_without_authorities_for_clients_is_no_listener(
+    party: Party, tmp_path: Path
+) -> None:
+    whole = configuration(party.files(), ANYONE)
+    entry = f'"ca_file": "{party.authority.ca}"'
+    file = tmp_path / "plant.yaml"
+    for instead in ('"ca_file": null', '"expired_crl": "warn"'):
+        assert entry in whole
+        file.write_text(whole.replace(entry, instead))
+        with pytest.raises(ConfigError, match=r"listeners\.secure\.tls.*ca_file"):
+            load(file)
+
+
 def logged_subjects(caplog: pytest.LogCaptureFixture) -> list[str | None]:
     failures = [each for each in caplog.records if each.message == "tls_failed"]
     return [each.fields.get("subject") for each in failures]  # type: ignore[attr-defined]
@@ -343,7 +360,7 @@ def test_the_subject_of_a_refused_certificate_can_not_harm_the_log(
     [told] = logged_subjects(caplog)
     assert told is not None
     assert len(told) == 256
-    [line] = [logs.message(each) for each in caplog.records if each.message == "tls_failed"]
+    [line] = [log_lines.message(each) for each in caplog.records if each.message == "tls_failed"]
     assert line.isprintable()
 
 
@@ -530,6 +547,24 @@ def test_everything_may_arrive_byte_by_byte(secure: Appliance, party: Party, ver
         assert client.ask(READ) == ZERO
 
 
+def test_pdus_inside_tls_are_answered_as_their_vectors_say(run: Run, party: Party) -> None:
+    text = configuration(party.files(), ANYONE)
+    inputs = '"discrete_inputs": 1000, "input_registers": 1000, "coils": 1000'
+    appliance = run(text.replace('"coils": 1000', inputs))
+    memory = appliance.memories["plant"]
+    with peer(appliance, context(party.authority.ca, party.engineer)) as client:
+        client.shake()
+        for case in cases("pdu.json"):
+            expected = {area: [0] * 1000 for area in AREAS}
+            overlay(expected, case["setup"])
+            for area in AREAS:
+                memory.write(area, 0, expected[area])
+
+            assert client.ask(bytes.fromhex(case["request"])).hex() == case["response"]
+            overlay(expected, case["after"])
+            assert {area: memory.read(area, 0, 1000) for area in AREAS} == expected, case["name"]
+
+
 @versions
 def test_one_request_may_come_in_many_records_and_many_in_one(
     secure: Appliance, party: Party, version: str
@@ -631,11 +666,14 @@ def shaken(appliance: Appliance, party: Party, number: int, opened: contextlib.E
 def test_silent_connections_displace_each_other_and_no_session(
     run: Run, party: Party, when_full: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    limits = {**PLACES, "max_connections": 4, "max_handshakes": 10, "when_full": when_full}
+    limits = {**PLACES, "max_connections": 4, "when_full": when_full}
     appliance = run(configuration(party.files(), BY_ROLE, **limits))
     with contextlib.ExitStack() as opened:
         clients = shaken(appliance, party, 3, opened)
-        silent = [opened.enter_context(wire.Connection(address(appliance))) for _ in range(25)]
+        silent = [
+            opened.enter_context(wire.Connection(address(appliance)))
+            for _ in range(HANDSHAKES + 15)
+        ]
         assert [each.rest() for each in silent[:15]] == [b""] * 15
         assert all(client.ask(READ) == ZERO for client in clients)
         # The handshake of this one displaces another silent connection, and succeeds.
@@ -645,7 +683,11 @@ def test_silent_connections_displace_each_other_and_no_session(
 
         counted = connections(appliance)
         assert (counted["evicted"], counted["evicted_handshakes"]) == (0, 16)
-        assert (counted["open"], counted["tls_failed"], counted["refused_full"]) == (13, 0, 0)
+        assert (counted["open"], counted["tls_failed"], counted["refused_full"]) == (
+            4 + HANDSHAKES - 1,
+            0,
+            0,
+        )
         log_events(appliance)
         logged = [each for each in caplog.records if each.message == "evicted"]
         assert {each.fields["reason"] for each in logged} == {"handshake"}  # type: ignore[attr-defined]
@@ -655,7 +697,7 @@ def test_silent_connections_displace_each_other_and_no_session(
 def test_1500_half_open_handshakes_beside_sessions_that_notice_nothing(
     run: Run, party: Party
 ) -> None:
-    limits = {**PLACES, "max_connections": 20, "max_handshakes": 100, "when_full": "evict"}
+    limits = {**PLACES, "max_connections": 20, "when_full": "evict"}
     appliance = run(configuration(party.files(), BY_ROLE, **limits))
     with contextlib.ExitStack() as opened:
         clients = shaken(appliance, party, 19, opened)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import select
 import socket
@@ -16,14 +15,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from pymodbus.client import AsyncModbusUdpClient, ModbusUdpClient
 
-from holdfast.types import AREAS
 from support import wire
 from support.cases import examples
 from support.machine import needs_127_0_0_2
-from support.pymodbus_peer import OPTIONS, Patient, connected, tour
-from support.running import content
 from support.transports import (
     ALL,
     Datagrams,
@@ -35,7 +30,7 @@ from support.transports import (
     rule,
     running,
 )
-from support.vectors import cases, overlay
+from support.vectors import cases
 from support.wire import rounds
 
 if TYPE_CHECKING:
@@ -64,25 +59,6 @@ def client(appliance: Appliance) -> Iterator[Datagrams]:
 
 
 # Vectors
-
-
-@pytest.mark.parametrize("case", cases("pdu.json"), ids=lambda case: case["name"])
-def test_a_pdu_is_answered_and_leaves_memory_as_its_vector_says(
-    case: dict[str, Any], run: Run
-) -> None:
-    size = 1000
-    appliance = run(configuration("udp", memories={"plant": dict.fromkeys(AREAS, size)}))
-    memory = appliance.memories["plant"]
-    expected = {area: [0] * size for area in AREAS}
-    overlay(expected, case["setup"])
-    for area in AREAS:
-        memory.write(area, 0, expected[area])
-
-    with Datagrams(address(appliance)) as client:
-        assert client.ask(bytes.fromhex(case["request"])).hex() == case["response"]
-        assert client.is_quiet()
-    overlay(expected, case["after"])
-    assert {area: memory.read(area, 0, size) for area in AREAS} == expected
 
 
 @pytest.mark.parametrize("case", cases("frames.json"), ids=lambda case: case["pdu"])
@@ -158,12 +134,6 @@ def test_a_frame_of_a_foreign_protocol_is_discarded(
     assert counters(appliance)["frames"]["foreign"] == 1
 
 
-def test_the_longest_request_and_the_longest_reply_fit_a_datagram(client: Datagrams) -> None:
-    longest = bytes.fromhex("080000") + bytes(range(250))
-
-    assert client.ask(longest) == longest
-
-
 @pytest.fixture(scope="module")
 def sturdy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
     """An appliance for many datagrams, none of which can silence a unit."""
@@ -201,22 +171,6 @@ def test_no_datagram_ends_the_service(garbage: list[bytes], sturdy: Appliance) -
 
 
 @needs_127_0_0_2
-def test_a_stranger_is_not_answered_and_counted_and_logged(
-    run: Run, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.WARNING, "holdfast")
-    appliance = run(configuration("udp", rules=[rule(["127.0.0.1"])]))
-    to = address(appliance)
-
-    assert is_stranger("udp", appliance, to, "127.0.0.2")
-    with Datagrams(to) as client:
-        assert client.ask(READ) == ZERO
-    appliance.log_events(wire.DEADLINE)
-    assert "refused_source" in [record.message for record in caplog.records]
-    assert counters(appliance)["requests"] == {3: 1}
-
-
-@needs_127_0_0_2
 def test_each_datagram_is_judged_by_its_own_source(run: Run) -> None:
     rules = [
         rule(["127.0.0.1"]),
@@ -234,15 +188,6 @@ def test_each_datagram_is_judged_by_its_own_source(run: Run) -> None:
             assert guest.ask(READ) == bytes.fromhex("03020007")
 
 
-def test_a_read_only_unit_is_read_and_not_written(run: Run) -> None:
-    appliance = run(configuration("udp", rules=[rule(["127.0.0.1"], access="read-only")]))
-    with Datagrams(address(appliance)) as client:
-        assert client.ask(READ) == ZERO
-        assert client.ask(WRITE) == b"\x86\x01"
-        assert client.ask(bytes.fromhex("0800040000")) == b"\x88\x01"
-    assert not any(content(appliance.memories["plant"])["holding_registers"])
-
-
 def test_a_sealed_memory_is_busy_until_it_is_opened(run: Run) -> None:
     plant = {**ALL, "seal": {"area": "coils", "address": 5}}
     appliance = run(configuration("udp", memories={"plant": plant}))
@@ -250,18 +195,6 @@ def test_a_sealed_memory_is_busy_until_it_is_opened(run: Run) -> None:
         assert client.ask(READ) == b"\x83\x06"
         appliance.memories["plant"].write("coils", 5, [1])
         assert client.ask(READ) == ZERO
-
-
-def test_a_unit_in_listen_only_mode_keeps_silent(run: Run) -> None:
-    units = {"sources": ["127.0.0.1"], "units": {1: "plant", 2: "plant"}, "access": "read-write"}
-    appliance = run(configuration("udp", rules=[units], listen_only=True))
-    with Datagrams(address(appliance)) as client:
-        for request in (bytes.fromhex("0800040000"), READ, b"\x63"):
-            client.send(wire.frame(request))
-        assert client.ask(READ, 2) == ZERO
-        client.send(wire.frame(bytes.fromhex("0800010000")))
-        assert client.ask(READ) == ZERO
-        assert client.is_quiet()
 
 
 # Addresses
@@ -363,18 +296,7 @@ def test_a_peer_that_takes_no_replies_holds_up_nobody(
                 assert client.ask(READ) == ZERO
 
 
-# Start and stop
-
-
-def test_what_was_received_before_a_stop_is_answered(
-    appliance: Appliance, client: Datagrams
-) -> None:
-    for transaction in range(100):
-        client.send(wire.frame(READ, 1, transaction))
-    appliance.stop()
-
-    replies = [client.receive() for _ in range(100)]
-    assert replies == [(transaction, 1, ZERO) for transaction in range(100)]
+# Stop
 
 
 def test_a_stop_under_load_ends_and_frees_the_port(appliance: Appliance, run: Run) -> None:
@@ -410,24 +332,3 @@ def test_a_stop_under_load_ends_and_frees_the_port(appliance: Appliance, run: Ru
         # While the buffer of the new socket is full of the load, datagrams are lost.
         wire.until(is_answered, "the new socket answers")
         assert client.receive().transaction == 0xABCD
-
-
-# Real clients
-
-
-def test_pymodbus_reads_and_writes(run: Run) -> None:
-    appliance = run(configuration("udp", more={"identity": {"vendor_name": "Acme"}}))
-    host, port = address(appliance)
-
-    with connected(ModbusUdpClient(host, port=port, **OPTIONS)) as client:
-        tour(client, appliance.memories["plant"], 1)
-
-
-def test_pymodbus_reads_and_writes_with_asyncio(run: Run) -> None:
-    appliance = run(configuration("udp", more={"identity": {"vendor_name": "Acme"}}))
-    host, port = address(appliance)
-
-    with Patient(lambda: AsyncModbusUdpClient(host, port=port, **OPTIONS)) as client:
-        tour(client, appliance.memories["plant"], 1)
-        replies = client.many("read_holding_registers", range(100, 200))
-    assert [reply.registers for reply in replies] == [[value] for value in range(100)]

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
+from holdfast.client.tag_reading import TagReader
 from holdfast.errors import ModbusException
 from holdfast.simulation import generators, playback
 from holdfast.simulation.device import Refused, SimulatedDevice
 from holdfast.tags import Tag, TagList
-from holdfast.tags.register_scale import RegisterScale
-from holdfast.tools.tag_reading import TagReader
+from holdfast.tags.scale import RegisterScale
 from support import cli
 
 if TYPE_CHECKING:

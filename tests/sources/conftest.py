@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
 
-from holdfast.importing import read_mma
 from support.config_folder import written
+from support.imported import imported
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,17 +30,12 @@ class RunImported(Protocol):
 
 @pytest.fixture
 def run_imported(tmp_path: Path, run: Run) -> RunImported:
-    def imported(
+    def start(
         text: str, *, change: Callable[[dict[str, Any]], None] | None = None, **options: Any
     ) -> Appliance:
-        path = tmp_path / "mma.yaml"
-        path.write_text(text)
-        data: dict[str, Any] = read_mma(path, **options).data
-        for settings in (*data["listeners"].values(), data.get("rest", {})):
-            if settings:
-                settings["bind"] = "127.0.0.1:0"
+        data = imported(text, tmp_path, **options)
         if change is not None:
             change(data)
         return run(written(data))
 
-    return imported
+    return start

@@ -125,7 +125,7 @@ class ProxyCommand(ServingCommand):
     """A running `holdfast proxy` on a port that the system picks."""
 
     def __init__(self, *arguments: str) -> None:
-        super().__init__("proxy", *arguments, "--listen", "127.0.0.1:0")
+        super().__init__("proxy", *arguments, "--bind", "127.0.0.1:0")
 
     def wait_until_it_serves(self) -> tuple[str, int]:
         self.wait_for_greeting()

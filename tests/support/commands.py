@@ -9,7 +9,6 @@ from __future__ import annotations
 import atexit
 import fcntl
 import functools
-import importlib
 import json
 import os
 import select
@@ -25,15 +24,17 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from holdfast.appliance import supervision
-from holdfast.cli import COMMANDS, main
+import click
+
+from holdfast.appliance.services import supervision
+from holdfast.cli import COMMANDS, CommandWithSubcommands, main
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 LONG_TIMEOUTS = {
     name: {"timeout": "60"}
-    for name in ("read", "write", "watch", "describe", "map", "identify", "bench")
+    for name in ("read", "write", "watch", "describe", "describe map", "describe identify", "bench")
 }
 """Seconds to wait for a device: on a loaded machine, the default of 1 may not be enough."""
 
@@ -188,10 +189,14 @@ def _fork_server() -> socket.socket:
 
 def _serve(requests: socket.socket, listener: socket.socket) -> None:
     """Forks for each request. Returns in the children, which run a command."""
-    for place in COMMANDS.values():
-        importlib.import_module(place.partition(":")[0])
+    context = click.Context(main)
+    for name in COMMANDS:
+        command = main.get_command(context, name)
+        if isinstance(command, CommandWithSubcommands):
+            for subcommand in command.subcommands:
+                command.subcommand(subcommand)
     # A loaded machine could leave threads of the lowest priority without any time for minutes.
-    supervision.POLITENESS = 0
+    supervision.NICE = 0
     # Ctrl-C is for the tests.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)

@@ -6,7 +6,7 @@ from typing import Any, cast
 
 from hypothesis import strategies as st
 
-from holdfast.config.scalars import RESERVED
+from holdfast.config.values.scalars import RESERVED
 from support.paths import EXAMPLES
 
 NAMES = st.from_regex(r"[A-Za-z0-9_.-]{1,64}", fullmatch=True)
@@ -252,7 +252,6 @@ PLACES = st.sampled_from(
 STRETCHES: st.SearchStrategy[dict[str, int]] = SPANS.flatmap(
     lambda span: st.sampled_from(
         [
-            {"start": span["start"], "count": span["size"]},
             {"start": span["start"], "end": span["start"] + span["size"] - 1},
         ]
     )
@@ -270,7 +269,7 @@ FORWARDS = st.sampled_from(
     ]
 ).map(lambda named: {"url": "raw://[fd00::9]:9000", **cast("dict[str, Any]", named)})
 HOLES: st.SearchStrategy[dict[str, Any]] = st.sampled_from(
-    [{}, {"max_gap": 0}, {"max_gap": 65535}, {"cost": {"per_request": 12.5, "per_register": 1}}]
+    [{}, {"max_gap": 0}, {"max_gap": 65535}, {"max_gap": "auto"}]
 )
 
 
@@ -328,10 +327,7 @@ AUDITS = st.fixed_dictionaries(
         "keep": st.integers(1, 1000),
         "fail": st.sampled_from(["open", "closed"]),
         "journald": st.booleans(),
-        "syslog": st.fixed_dictionaries(
-            {"url": st.sampled_from(["udp://10.0.0.9", "tcp://[::1]:6514", "unix:///dev/log"])},
-            optional={"facility": st.sampled_from(["auth", "local7"])},
-        ),
+        "syslog": st.sampled_from(["udp://10.0.0.9", "tcp://[::1]:6514", "unix:///dev/log"]),
     },
 )
 

@@ -140,9 +140,9 @@ def request_length(received: bytes) -> int | None:
     if len(received) < 2:
         return None
     code = received[1]
-    counted = {15: 6, 16: 6, 23: 10}.get(code)
+    counted = {15: 6, 16: 6, 20: 2, 21: 2, 23: 10}.get(code)
     if counted is None:
-        return {11: 4, 17: 4, 22: 10, 43: 7}.get(code, 8)
+        return {7: 4, 11: 4, 12: 4, 17: 4, 22: 10, 24: 6, 43: 7}.get(code, 8)
     return None if len(received) <= counted else counted + 3 + received[counted]
 
 

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 STOPPED, START_PENDING, STOP_PENDING, RUNNING = 1, 2, 3, 4
 STOP, SHUTDOWN, PARAMCHANGE = 1, 5, 6
 
-OURS = ("holdfast.windows_service.installed", "holdfast.windows_service.host")
+OURS = (
+    "holdfast.appliance.windows_service.installation",
+    "holdfast.appliance.windows_service.host",
+)
 """Modules that import pywin32, and so have to be imported anew."""
 
 CONSTANTS = {

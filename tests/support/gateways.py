@@ -9,18 +9,18 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from holdfast.adapters import Stop
-from holdfast.config.egress import parse_allowed
+from holdfast.client.client import connection
+from holdfast.config.values.allow_entries import parse_allowed
 from holdfast.gateway import Gateway, GatewayLimits, Settings
-from holdfast.gateway.pool import dial
+from holdfast.net.http.port import listen
 from holdfast.net.resolver import NoSuchName
-from holdfast.web.port import listen
 from support import web, wire
 from support.event_streams import EventStream
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from holdfast.client import Client
+    from holdfast.client.async_transports import AsyncTransport
     from holdfast.client.url import NetworkTarget
     from holdfast.net.resolver import Resolve
 
@@ -29,17 +29,17 @@ PLC = "plc.factory.local"
 
 
 class Dialed:
-    """Creates clients as the gateway does, and records their targets; can redirect some."""
+    """Creates connections as the gateway does, and records their targets; can redirect some."""
 
     def __init__(self, elsewhere: dict[tuple[str, int], tuple[str, int]] | None = None) -> None:
         self.calls: list[NetworkTarget] = []
         self._elsewhere = elsewhere or {}
 
-    def __call__(self, target: NetworkTarget, *, timeout: float, in_flight: int) -> Client:
+    def __call__(self, target: NetworkTarget, in_flight: int) -> AsyncTransport:
         self.calls.append(target)
         host, port = self._elsewhere.get((target.host, target.port), (target.host, target.port))
         there = replace(target, host=host, port=port)
-        return dial(there, timeout=timeout, in_flight=in_flight)
+        return connection(there, in_flight)
 
 
 class Names:
@@ -108,7 +108,7 @@ def running(
         limits=replace(GatewayLimits(), **(limits or {})),
         **{"writes": True, **settings},
     )
-    gateway = Gateway(chosen, listener, resolve=resolve, dial=dialed or dial)
+    gateway = Gateway(chosen, listener, resolve=resolve, dial=dialed or connection)
     stop = Stop()
     with listener, web.in_a_thread(gateway, stop):
         started = Running(gateway, (host, port), stop)

@@ -15,6 +15,7 @@ TOPIC = re.compile(r"homeassistant/(\w+)/([a-zA-Z0-9_-]+)/([a-zA-Z0-9_-]+)/confi
 COMMON: dict[str, type | tuple[type, ...]] = {
     "name": str,
     "unique_id": str,
+    "entity_category": str,
     "state_topic": str,
     "value_template": str,
     "availability": list,
@@ -29,7 +30,7 @@ OWN: dict[str, dict[str, type | tuple[type, ...]]] = {
         "state_class": str,
         "unit_of_measurement": str,
     },
-    "binary_sensor": {"payload_on": str, "payload_off": str},
+    "binary_sensor": {"device_class": str, "payload_on": str, "payload_off": str},
     "switch": {
         "command_topic": str,
         "payload_on": str,
@@ -75,6 +76,18 @@ UNITS = {
 """The units of each device class that outputs use."""
 
 
+DEVICE = {
+    "identifiers",
+    "name",
+    "manufacturer",
+    "model",
+    "sw_version",
+    "configuration_url",
+    "via_device",
+}
+"""The keys of a device that outputs use."""
+
+
 @dataclass(frozen=True)
 class Entity:
     """An entity, as Home Assistant would add it."""
@@ -116,13 +129,17 @@ def entity(topic: str, payload: bytes) -> Entity:
     for key in config:
         if key.endswith("_topic"):
             assert not set(config[key]) & set("+#"), key
-    assert config["availability_mode"] in ("all", "any", "latest")
-    for each in config["availability"]:
+    assert config.get("availability_mode", "latest") in ("all", "any", "latest")
+    for each in config.get("availability", ()):
         assert each.keys() <= {"topic", "payload_available", "payload_not_available"}
         assert isinstance(each["topic"], str)
     device = config["device"]
-    assert device.keys() <= {"identifiers", "name", "manufacturer", "model", "sw_version"}
+    assert device.keys() <= DEVICE
     assert device["identifiers"], "a device needs identifiers or connections"
+    assert re.fullmatch(
+        r"(?:https?|homeassistant)://\S+", device.get("configuration_url", "http://a")
+    )
+    assert config.get("entity_category", "config") in ("config", "diagnostic")
     assert config["origin"].keys() <= {"name", "sw_version", "support_url"}
     assert config["origin"]["name"]
     _check_class(config, component)
@@ -145,6 +162,9 @@ def _check_class(config: dict[str, Any], component: str) -> None:
         assert config["options"]
         return
     assert component == "select" or "options" not in config
+    if device_class == "connectivity":
+        assert component == "binary_sensor"
+        return
     if device_class is not None:
         assert unit in UNITS[device_class], f"{device_class} in {unit}"
     state_class = config.get("state_class")

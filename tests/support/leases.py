@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from nats.aio.client import Client
 
-from holdfast.leases import LeaseBucket, LeaseTimes
+from holdfast.replication.leases import LeaseBucket, LeaseTimes
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -70,7 +70,7 @@ def rtu_length(received: bytes) -> int | None:
         )
     if code == 43:
         return identification_length(received)
-    fixed = {5: 8, 6: 8, 11: 8, 15: 8, 16: 8, 22: 10}
+    fixed = {5: 8, 6: 8, 7: 5, 11: 8, 15: 8, 16: 8, 22: 10}
     end = fixed.get(code, 5 + received[2])
     return end if len(received) >= end else None
 
@@ -145,6 +145,7 @@ def configuration(
     rule: dict[str, Any] | None = None,
     more_rules: Sequence[dict[str, Any]] = (),
     serial: dict[str, Any] | None = None,
+    listener: dict[str, Any] | None = None,
     **more: Any,
 ) -> str:
     """Builds a configuration with one listener, `line`, which serves unit 7 by default."""
@@ -154,10 +155,11 @@ def configuration(
     first = {"units": dict(units or {UNIT: "plant"}), "access": "read-write", **(rule or {})}
     rules = [first, *more_rules]
     line = {"device": str(device), "parity": "none", **(serial or {})}
+    whole = {"type": mode.listener, "serial": line, "rules": rules, **(listener or {})}
     return written(
         {
             "memories": memories or {"plant": everything},
-            "listeners": {"line": {"type": mode.listener, "serial": line, "rules": rules}},
+            "listeners": {"line": whole},
             **more,
         }
     )

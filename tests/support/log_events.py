@@ -7,7 +7,7 @@ import functools
 import re
 from typing import TYPE_CHECKING
 
-from holdfast.appliance.shared_logs import EVENTS
+from holdfast.appliance.parts.shared_logs import EVENTS
 from support.paths import ROOT
 
 if TYPE_CHECKING:
@@ -15,13 +15,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 PYTHON = ROOT / "python" / "holdfast"
-SERVER = ROOT / "crates" / "engine" / "src" / "server"
+SERVER = ROOT / "crates" / "engine" / "src" / "server" / "reports"
 
 BY_VARIABLE = {
-    "appliance/expiring.py": {"certificate_expires", "certificate_expired"},
-    "appliance/running.py": set(),  # The events of listeners.
-    "appliance/shared_logs.py": set(EVENTS),
-    "logs.py": set(),
+    "appliance/parts/certificate_expiry.py": {"certificate_expires", "certificate_expired"},
+    "appliance/parts/listeners.py": set(),  # The events of listeners.
+    "appliance/parts/log_servers.py": {"log_server_syncs_late", "log_server_not_checked"},
+    "appliance/parts/shared_logs.py": set(EVENTS),
+    "events/log_lines.py": set(),
     "scanner/jetstream/availability.py": {
         "bucket_not_watched",
         "bucket_watched",
@@ -34,19 +35,19 @@ BY_VARIABLE = {
     "scanner/polling/devices.py": {
         f"device_{state}" for state in ("connecting", "online", "offline")
     },
-    "scanner/request_log.py": {
+    "scanner/requests.py": {
         "datatype_ignored",
         "keys_ignored",
         "scan_rate_raised",
         "tag_repeated",
         "writable_ignored",
     },
-    "web/host.py": {"refused_source", "refused_full"},
+    "net/http/host.py": {"refused_source", "refused_full"},
 }
 """The names that a file logs without a literal."""
 
 PLACES = {"write": 1, "count": 1, "limited": 1, "refused": 0, "problem": 0}
-"""The functions of `logs`, and the place of the name among their arguments."""
+"""The functions of `log_lines`, and the place of the name among their arguments."""
 
 
 @functools.cache
@@ -78,9 +79,9 @@ def _names(file: Path) -> Iterator[ast.expr]:
             continue
         called = ast.unparse(node.func)
         owner, _, name = called.rpartition(".")
-        if (owner == "logs" or (file.name == "logs.py" and not owner)) and name in PLACES:
+        if (owner == "log_lines" or (file.name == "log_lines.py" and not owner)) and name in PLACES:
             yield node.args[PLACES[name]]
-        elif called == "logs.LOGGER.error" or (
+        elif called == "log_lines.LOGGER.error" or (
             file.name == "host.py" and called.endswith((".note", "host.note"))
         ):
             yield node.args[0]

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
+    from holdfast.config import Config
+
 TAGS: dict[str, Any] = {
     "temperature": {
         "area": "holding_registers",
@@ -112,7 +114,7 @@ class Plant:
 
     def config(
         self, output: dict[str, Any], tags: dict[str, Any] | None = None, **more: Any
-    ) -> holdfast.Config:
+    ) -> Config:
         """The configuration of an appliance that polls all devices."""
         devices = {
             name: {

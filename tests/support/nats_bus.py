@@ -19,9 +19,9 @@ import pytest
 from nats.aio.client import Client
 from nats.js.errors import NotFoundError
 
-from holdfast.config.scanning import parse_pollable
+from holdfast.config.values.scanning import parse_pollable
 from holdfast.scanner import Scanner, Servers, Settings
-from holdfast.scanner.jetstream import BUCKET
+from holdfast.scanner.jetstream.store import BUCKET
 from support import wire
 from support.brokers import NatsServer
 

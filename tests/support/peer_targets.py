@@ -116,7 +116,7 @@ def listening(scheme: str, cable: Cable | None, access: str) -> str:
     rule: dict[str, Any] = {"units": {peer_tour.UNIT: "plant"}, "access": access}
     where: dict[str, Any]
     if cable is not None:
-        where = {"serial": {"device": str(cable.devices[0]), "parity": "none", "data_bits": 8}}
+        where = {"serial": {"device": str(cable.devices[0]), "parity": "none"}}
     else:
         where = {"bind": "127.0.0.1:0"}
         rule["sources"] = ["127.0.0.1"]

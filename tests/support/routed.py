@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast import _core
 from holdfast.client.endpoint import endpoint
 from holdfast.client.url import parse
+from holdfast.server.options import STREAM_DEFAULTS
 from support import wire
 from support.config_folder import written
 from support.lines import Cable
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     import holdfast
     from holdfast.appliance import Appliance
     from holdfast.server import Identity
+    from holdfast.server.options import SerialOptions
     from support.fake_device import Asked
 
 LOOPBACK = ["127.0.0.0/8"]
@@ -101,12 +103,24 @@ def to_rtu_server(
             _core.Rule({unit: behind}, sources=LOOPBACK, access="read-write")
             for unit, behind in ((1, route), (1, memory))
         ]
-        settings: dict[str, Any] = {"baud": 19200, "parity": "none", "stop_bits": 2, "data_bits": 8}
+        line: SerialOptions = {
+            "mode": "rtu",
+            "baud": 19200,
+            "parity": "none",
+            "stop_bits": 2,
+            "data_bits": 8,
+            "silence": None,
+            "rs485": None,
+            "event_log": False,
+        }
         engine = _core.Engine(
             [
-                _core.Listener("front", "127.0.0.1:0", rules[:1]),
+                _core.Listener("front", "127.0.0.1:0", rules[:1], STREAM_DEFAULTS),
                 _core.Listener.serial(
-                    "line", str(cable.devices[0]), rules[1], mode="rtu", **settings
+                    "line",
+                    str(cable.devices[0]),
+                    rules[1],
+                    line,
                 ),
             ],
             identity=identity.objects(),

@@ -36,6 +36,7 @@ class ServerOptions(TypedDict, total=False):
     when_full: Literal["refuse", "evict"]
     idle_timeout: float
     request_timeout: float
+    keepalive: int
     listen_only: bool
     workers: int
     identity: Identity

@@ -28,7 +28,6 @@ TOKEN = re.compile(
     """,
     re.VERBOSE | re.DOTALL,
 )
-IMPORTED_EXCEPTION = re.compile(r"^\s*(?:pyo3::)?import_exception!\(([\w.]+),\s*(\w+)\)", re.M)
 IDENT = re.compile(r"[^\W\d]\w*")
 
 
@@ -97,17 +96,6 @@ def rust_imports(modules: Iterable[Module], crates: Iterable[Path], root: Path) 
             )
             found.setdefault((one.file, one.line, one.name), one)
     return list(found.values())
-
-
-def exceptions_from_python(modules: Iterable[Module], root: Path, importer: str) -> list[Import]:
-    """Returns the exceptions that native code imports from Python at run time."""
-    found = []
-    for module in modules:
-        text = module.file.read_text(encoding="utf-8")
-        for match in IMPORTED_EXCEPTION.finditer(text):
-            file, line = module.file.relative_to(root), text.count("\n", 0, match.start(1)) + 1
-            found.append(Import(importer, file, line, f"{match[1]}.{match[2]}", match[1]))
-    return found
 
 
 def modules(crate: Path) -> list[Module]:

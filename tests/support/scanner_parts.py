@@ -9,9 +9,9 @@ from holdfast.scanner.fleet.placement import FleetPlacement
 if TYPE_CHECKING:
     from nats.aio.client import Client
 
+    from holdfast.net.nats import Broker
     from holdfast.scanner import Scanner
     from holdfast.scanner.fleet.member import FleetMember
-    from holdfast.scanner.nats import Broker
     from holdfast.scanner.polling.allowed_devices import AllowedDevices
     from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.presence import Presence
@@ -59,4 +59,4 @@ def allowed_of(scanner: Scanner) -> AllowedDevices:
 def member_of(scanner: Scanner) -> FleetMember:
     """Returns it as a node of its fleet."""
     assert isinstance(scanner._placement, FleetPlacement), "it is a node"
-    return scanner._placement.member
+    return scanner._placement

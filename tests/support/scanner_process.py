@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 SCAN = """
 import asyncio, pickle, sys
-from holdfast import logs
+from holdfast.events import log_lines
 from holdfast.scanner import FleetRefused, Scanner
 
 async def scan():
     await Scanner(pickle.loads(bytes.fromhex(sys.argv[1]))).run()
 
-logs.configure("info", "text")
+log_lines.configure("info", "text")
 try:
     asyncio.run(scan())
 except FleetRefused as refused:

@@ -12,16 +12,16 @@ import json
 import logging
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from holdfast.adapters import MemoryAccess, Stop
 from holdfast.adapters.rest import Rest
 from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.liveness import Liveness
-from holdfast.appliance.supervision import Supervisor
+from holdfast.appliance.services.supervision import Supervisor
 from holdfast.config import RestConfig
-from holdfast.web.host import STOP_TIMEOUT
-from holdfast.web.port import listen
+from holdfast.net.http.host import STOP_TIMEOUT_S
+from holdfast.net.http.port import listen
 from support import wire
 
 if TYPE_CHECKING:
@@ -29,10 +29,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     import holdfast
-    from holdfast._core import Engine, ListeningSocket
-    from holdfast.audit import Audit
+    from holdfast._core import ListeningSocket
+    from holdfast.appliance.parts.part import Part
+    from holdfast.events.audit import Audit
+    from holdfast.net.http.https import Https
     from holdfast.types import ThreadHeartbeat
-    from holdfast.web.https import Https
 
 AREAS = ("coils", "discrete_inputs", "holding_registers", "input_registers")
 JSON = {"Content-Type": "application/json"}
@@ -122,24 +123,38 @@ class Client:
 
 @dataclass
 class StandIn:
-    """Replaces the engine for diagnostics."""
+    """Replaces the parts of an appliance for diagnostics."""
 
     listeners: dict[str, Any] = field(default_factory=dict)
-    lost_events: int = 0
+    events_lost: int = 0
     threads: list[ThreadHeartbeat] = field(default_factory=list)
+    audit: dict[str, object] | None = None
 
     def heartbeats(self) -> list[ThreadHeartbeat]:
         return self.threads
 
-    def counters(self) -> dict[str, Any]:
-        return self.listeners
+    def stats(self) -> dict[str, Any]:
+        of_no_part = ("devices", "links", "memory_files", "logs", "certificates")
+        return {
+            **{key: {} for key in (*of_no_part, "revocation_lists")},
+            "listeners": self.listeners,
+            "events_lost": self.events_lost,
+            "audit": self.audit,
+        }
 
 
 def diagnostics_of(
-    memories: Mapping[str, holdfast.Memory], engine: object | None = None
+    memories: Mapping[str, holdfast.Memory], others: StandIn | None = None, *parts: Part
 ) -> Diagnostics:
-    chosen: Engine = engine or StandIn()  # type: ignore[assignment]
-    return Diagnostics(memories, chosen, Liveness(chosen.heartbeats))
+    """Diagnostics of these parts, and of a replacement for the others."""
+    chosen: Any = others or StandIn()
+    return Diagnostics(memories, Liveness(chosen.heartbeats), [chosen, *parts], {}, list)
+
+
+def stand_in(diagnostics: Diagnostics) -> StandIn:
+    """What the diagnostics read in place of an appliance."""
+    found: Any = diagnostics._parts[0]
+    return cast("StandIn", found)
 
 
 class NoSessions:
@@ -162,7 +177,7 @@ class Service:
         audit: Audit | None = None,
         bind: str = "127.0.0.1:0",
         https: Https | None = None,
-        stop_timeout: float = STOP_TIMEOUT,
+        stop_timeout: float = STOP_TIMEOUT_S,
         **settings: Any,
     ) -> None:
         self.https = https
@@ -179,8 +194,8 @@ class Service:
         self.memory_access = MemoryAccess("rest", memories, audit)
         self.diagnostics = diagnostics_of(memories)
         self.listener = listen(self.settings.bind.host, self.settings.bind.port)
-        self.supervisor = Supervisor("rest", self.made)
-        self.diagnostics.adapters["rest"] = (self.supervisor, self.memory_access)
+        self.supervisor = Supervisor("rest", self.made, access=self.memory_access)
+        self.diagnostics.adapters["rest"] = self.supervisor
 
     def made(self) -> Rest:
         parts = (self.settings, self.memory_access, self.diagnostics)

@@ -9,7 +9,7 @@ import pytest
 from holdfast import values
 from holdfast.tags import Tag, TagError, TagList
 from holdfast.tags.decoding import Places, Undecoded, decoder, value_of
-from holdfast.tags.register_scale import Form, RegisterScale
+from holdfast.tags.scale import Form, RegisterScale
 from holdfast.tags.text import plain, text_of
 from holdfast.values import DoesNotFit
 

@@ -12,13 +12,12 @@ from urllib.parse import urlparse
 import pytest
 from nats.errors import Error
 
-from holdfast.mqtt.dialing import dial
-from holdfast.mqtt.waiting import Waiter
+from holdfast.net.mqtt.dialing import dial
+from holdfast.net.mqtt.waiting import Waiter
+from holdfast.net.nats import SafeClient, Servers
 from holdfast.net.secure_channel import TlsRefused
 from holdfast.net.tls import Tls
 from holdfast.runtime.stop import Stop
-from holdfast.scanner.nats.connection import Servers
-from holdfast.scanner.nats.tolerant_client import SafeClient
 from support import wire
 from support.certificate_cases import ACCEPTED, CASES, made
 from support.secured import context

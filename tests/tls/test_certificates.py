@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast import _core, logs, raw_ingest
+from holdfast import _core, raw_ingest
 from holdfast.client.endpoint import endpoint, receiver_endpoint
-from holdfast.client.receiver import Receiver
-from holdfast.client.url import parse
+from holdfast.client.url import Receiver, parse
+from holdfast.events import log_lines
+from holdfast.events.throttle import Throttle
 from holdfast.net.tls import Tls
 from support import native_poller, wire
 from support.certificate_cases import ACCEPTED, CASES, KEYS, OWN_KEYS, SERVED, made
@@ -59,7 +60,7 @@ OPENSSL_REFUSES_WITH_TLS_1_2 = {
 
 @pytest.fixture(autouse=True)
 def every_refusal_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+    monkeypatch.setattr(log_lines, "_REFUSALS", Throttle())
 
 
 def read(face: str, url: str) -> str:

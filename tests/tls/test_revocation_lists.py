@@ -10,11 +10,12 @@ from click.testing import CliRunner
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 
-from holdfast import logs
-from holdfast.certificates.inspection import describe
 from holdfast.cli import main
 from holdfast.cli.configuration import load_whole
 from holdfast.config import ConfigError
+from holdfast.events import log_lines
+from holdfast.events.throttle import Throttle
+from holdfast.net.certificates.inspection import describe
 from support import wire
 from support.certificates import LISTS, PAST, Certificates, named
 from support.config_folder import written
@@ -92,7 +93,7 @@ class Plant:
 
 @pytest.fixture(autouse=True)
 def every_refusal_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+    monkeypatch.setattr(log_lines, "_REFUSALS", Throttle())
 
 
 @pytest.mark.parametrize("form", FORMS)

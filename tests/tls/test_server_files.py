@@ -14,6 +14,7 @@ from holdfast import _core
 from holdfast.cli import main
 from holdfast.cli.configuration import load_whole
 from holdfast.config import ConfigError
+from holdfast.server.options import STREAM_DEFAULTS
 from support import wire
 from support.certificate_cases import CA, NAME, SIGNS, Mint
 from support.certificates import FUTURE, PAST, Certificates, named
@@ -190,8 +191,9 @@ def test_certificates_in_the_wrong_order_are_an_error(plant: Plant, mint: Mint) 
 def test_a_listener_takes_no_certificates_of_https(plant: Plant) -> None:
     own = plant.files()
     del own["ca_file"]
+    tls = _core.https_server_tls(**own)
     with pytest.raises(ValueError, match="tls is that of an HTTPS server, allowed: ServerTls"):
-        _core.Listener("secure", "127.0.0.1:0", [], tls=_core.https_server_tls(**own))
+        _core.Listener("secure", "127.0.0.1:0", [], {**STREAM_DEFAULTS, "tls": tls})
 
 
 def test_check_prints_warnings_and_succeeds(plant: Plant) -> None:

@@ -8,9 +8,9 @@ from contextlib import ExitStack, closing
 from ipaddress import ip_network
 from typing import TYPE_CHECKING, Any
 
-from holdfast.web.host import ConnectionLimits, Host
-from holdfast.web.port import listen
-from holdfast.web.requests import Request, Response
+from holdfast.net.http.host import ConnectionLimits, Host
+from holdfast.net.http.port import listen
+from holdfast.net.http.requests import Request, Response
 from support import web, wire
 
 if TYPE_CHECKING:

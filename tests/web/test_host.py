@@ -9,9 +9,9 @@ from ipaddress import ip_network
 
 import pytest
 
-from holdfast.web.host import ConnectionLimits, Host
-from holdfast.web.port import listen
-from holdfast.web.requests import Request, Response
+from holdfast.net.http.host import ConnectionLimits, Host
+from holdfast.net.http.port import listen
+from holdfast.net.http.requests import Request, Response
 from support import web
 
 

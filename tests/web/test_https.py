@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import http.client
 import shutil
 import ssl
 import warnings
@@ -12,9 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import pytest
 
 import holdfast
-from holdfast import logs
-from holdfast.certificates.pem import UnusableFile
-from holdfast.web.https import Https, HttpsFiles
+from holdfast.events import log_lines
+from holdfast.net.certificates.pem import UnusableFile
+from holdfast.net.http.https import Https, HttpsFiles
 from support import web, wire
 from support.certificates import PAST, Certificates, Issued, named
 from support.secured import Authority
@@ -74,9 +75,9 @@ def start() -> Iterator[Start]:
 @pytest.fixture
 def log() -> Iterator[web.Records]:
     records = web.Records()
-    logs.LOGGER.addHandler(records)
+    log_lines.LOGGER.addHandler(records)
     yield records
-    logs.LOGGER.removeHandler(records)
+    log_lines.LOGGER.removeHandler(records)
 
 
 def answer(service: web.Service, trust: ssl.SSLContext) -> web.Answer:
@@ -423,6 +424,30 @@ def test_an_authority_that_is_removed_is_not_trusted_any_more(
     https.adopt(Https(HttpsFiles(own.certificate, own.key, client_ca_file=other.ca)))
     assert refusal(service, files.trust(files.client), log) == "unknown_issuer"
     assert is_served(service, files.trust(other.issue("panel", CLIENT)))
+
+
+def test_connections_without_a_certificate_end_when_clients_begin_to_need_one(
+    start: Start, files: Files, log: web.Records
+) -> None:
+    own = files.server
+    https = Https(HttpsFiles(own.certificate, own.key))
+    service = start(https)
+    open_one = web.Client(service.address, tls=files.trust())
+    assert open_one.get("/api/v1/health").status == 200
+    with wire.Connection(service.address) as shaking:
+        service.until_counted("accepted", 2)
+        https.adopt(files.mutual())
+        service.until_counted("tls_failed", 2)
+        assert shaking.rest() == b""
+    assert [each["reason"] for each in log.of("tls_failed")] == ["no_certificate"] * 2
+    with pytest.raises((ConnectionError, http.client.HTTPException)):
+        open_one.get("/api/v1/health")
+    open_one.close()
+    with_certificate = web.Client(service.address, tls=files.trust(files.client))
+    assert with_certificate.get("/api/v1/health").status == 200
+    https.reload()
+    assert with_certificate.get("/api/v1/health").status == 200
+    with_certificate.close()
 
 
 def test_unusable_files_change_nothing(start: Start, files: Files, tmp_path: Path) -> None:

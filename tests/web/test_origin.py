@@ -13,15 +13,15 @@ import holdfast
 from holdfast.adapters.metrics import Metrics
 from holdfast.config import MetricsConfig
 from holdfast.gateway import Gateway, Settings
-from holdfast.web.health import Check
-from holdfast.web.port import listen
-from holdfast.web.requests import Request, Response
+from holdfast.net.http.health import Check
+from holdfast.net.http.port import listen
+from holdfast.net.http.requests import Request, Response
 from support import web
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from holdfast.web.application import Application
+    from holdfast.net.http.application import Application
 
 NAME = "plant.example"
 SECRET = "a-secret-of-the-test"
@@ -67,6 +67,7 @@ def asked(app: Application, path: str, *headers: tuple[str, str], version: str =
     async def ask() -> Response:
         sent = [(name.lower().encode(), value.encode("latin-1")) for name, value in headers]
         answer = app(Request("GET", path, b"", sent, "127.0.0.1:50000", version=version))
+        assert not callable(answer)
         response = answer if isinstance(answer, Response) else await answer
         assert response is not None
         return response

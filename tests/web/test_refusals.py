@@ -14,7 +14,8 @@ from holdfast.gateway import Settings
 from holdfast.gateway.operations import document as gateway_document
 from holdfast.gateway.refusals import FAILURE
 from holdfast.gateway.refusals import REFUSALS as OF_GATEWAY
-from holdfast.web.refusals import Refusal, Refusals, headers_with
+from holdfast.ingest import KEEPING
+from holdfast.net.http.refusals import Refusal, Refusals, headers_with
 from support.paths import ROOT
 
 if TYPE_CHECKING:
@@ -35,8 +36,8 @@ def statuses(responses: Iterable[str]) -> set[int]:
 
 
 def test_every_reason_of_a_handler_has_a_status() -> None:
-    assert raised("web", "gateway") == set(OF_GATEWAY.reasons)
-    assert raised("web", "adapters/rest", "ingest") == set(OF_REST.reasons)
+    assert raised("net/http", "gateway") == set(OF_GATEWAY.reasons)
+    assert {*raised("net/http", "adapters/rest", "ingest"), *KEEPING} == set(OF_REST.reasons)
 
 
 def test_every_reason_of_a_failure_is_named() -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.windows_service.log_file import LogFile
+from holdfast.appliance.windows_service.log_file import LogFile
 from support import fake_windows, wire
 from support.cli import invoke
 
@@ -134,7 +134,7 @@ def test_a_question_for_the_state_reports_nothing(hosting: Hosting) -> None:
 def test_the_log_file_is_rotated_and_never_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("holdfast.windows_service.log_file.SIZE", 1000)
+    monkeypatch.setattr("holdfast.appliance.windows_service.log_file.MAX_BYTES", 1000)
     file = tmp_path / "new" / "service.log"
     log = LogFile(file)
     for number in range(1000):
@@ -146,7 +146,7 @@ def test_the_log_file_is_rotated_and_never_fails(
     for one in file.parent.iterdir():
         one.unlink()
     file.parent.rmdir()
-    monkeypatch.setattr("holdfast.windows_service.log_file.SIZE", 1)
+    monkeypatch.setattr("holdfast.appliance.windows_service.log_file.MAX_BYTES", 1)
     for _ in range(100):
         log.write("dropped " * 20)
     log.close()

@@ -1,11 +1,13 @@
 //! Checks arguments from Python. Each error says what was found and what is allowed.
 
+use std::io;
 use std::net::{IpAddr, SocketAddr};
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
+use holdfast_protocol::raw_ingest::Format;
 use ipnet::IpNet;
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
 
 /// Checks that an integer is in a range.
@@ -50,6 +52,26 @@ pub fn time_to_wait(what: &str, time: f64) -> PyResult<Duration> {
 pub fn address(text: &str) -> PyResult<SocketAddr> {
     let form = "address:port as in 127.0.0.1:502 or [::1]:502";
     text.parse().map_err(|_| unknown("bind", text, form))
+}
+
+/// An `OSError`, with the number of the error if it has one: Python selects the subclass by that.
+pub fn os_error(error: &io::Error, text: String) -> PyErr {
+    match error.raw_os_error() {
+        Some(number) => PyOSError::new_err((number, text)),
+        None => PyOSError::new_err(text),
+    }
+}
+
+/// The text of an error without its number, which an `OSError` has itself.
+pub fn os_text(error: &io::Error) -> String {
+    let text = error.to_string();
+    text.split(" (os error").next().unwrap_or(&text).to_owned()
+}
+
+/// The format of Raw Ingest packets.
+pub fn packet_format(format: &str, crc: &str) -> PyResult<Format> {
+    let required = word("crc", crc, &[("required", true), ("none", false)])?;
+    word("format", format, &[("v1", Format::V1), ("crc", Format::Crc { required })])
 }
 
 /// Looks up a word in a list of allowed words and their values.

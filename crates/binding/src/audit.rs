@@ -1,19 +1,21 @@
 //! Converts writes into the dictionaries of the audit log.
 
-use holdfast_engine::server::audit::{Record, Written};
+use holdfast_engine::packet_area::of_packet;
+use holdfast_engine::server::reports::audit::{Record, Written};
 use holdfast_memory::Area;
 use holdfast_protocol::pdu::{ExceptionCode, Request};
 use holdfast_protocol::raw_ingest::{Format, Header};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
+use crate::listed::listed;
 use crate::peer;
 
 pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, PyDict>> {
     let line = PyDict::new(py);
     line.set_item("listener", &*record.listener)?;
     match &record.peer {
-        Some(from) => peer::tell(&line, from)?,
+        Some(from) => peer::add_to(&line, from)?,
         None => line.set_item("peer", py.None())?,
     }
     match &record.write {
@@ -90,17 +92,8 @@ fn packet(
     if payload.is_empty() {
         return line.set_item("count", count);
     }
-    let values = if area.is_bits() { bits(payload, count) } else { registers(payload) };
-    line.set_item("values", values)
-}
-
-fn bits(packed: &[u8], count: u16) -> Vec<u16> {
-    let bit = |index: usize| packed.get(index / 8).map(|byte| u16::from(byte >> (index % 8) & 1));
-    (0..usize::from(count)).filter_map(bit).collect()
-}
-
-fn registers(packed: &[u8]) -> Vec<u16> {
-    packed.chunks_exact(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect()
+    let count = usize::from(count);
+    line.set_item("values", listed(line.py(), of_packet(area), count, payload)?)
 }
 
 /// The name of an exception in snake case, such as `illegal_data_address`.

@@ -1,14 +1,14 @@
-//! `write_across`: writes a batch to several memories, or reports the value that was refused.
+//! `Batch`: writes to several memories in one step, or reports the value that was refused.
 //!
-//! It first consumes all iterables, then checks all values, then calls `before`, then writes. So an
-//! iterable that raises has changed nothing, and its exception takes precedence over a refused value.
+//! It first consumes all iterables, then checks all values. So the exception of an iterable takes
+//! precedence over a refused value.
 
 use holdfast_memory::{Access, Area, Memory as Core, Refusal, Refused, Write};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyList, PyString, PyTuple};
 
-use crate::memory::{Memory, Unfit, integer, is_text, item};
+use crate::memory::{Memory, Unfit, integer, is_text, item, put};
 
 pyo3::create_exception!(
     holdfast._core,
@@ -30,40 +30,76 @@ struct Pending<'py> {
 
 type Place<'py> = (Bound<'py, Memory>, Bound<'py, PyString>, Bound<'py, PyAny>);
 
-/// Writes to several memories atomically. Returns the number of values written, and the sequence of the
-/// step if a log has carried it out. `before` receives whether the writes can still be refused: by a
-/// journal, or because a memory is not sealed.
-#[pyfunction]
-#[pyo3(signature = (writes, before=None))]
-pub fn write_across(
-    py: Python<'_>,
-    writes: &Bound<'_, PyAny>,
-    before: Option<&Bound<'_, PyAny>>,
-) -> PyResult<(usize, Option<u64>)> {
-    let (mut pending, mut len) = (Vec::new(), 0);
-    for (command, write) in writes.try_iter()?.enumerate() {
-        let write = Pending::new(command, &write?)?;
-        len += write.area.byte_len(write.count);
-        pending.push(write);
+/// Writes that were checked: `write` carries them out in one step.
+#[pyclass(frozen, module = "holdfast")]
+pub struct Batch {
+    writes: Vec<Checked>,
+    /// The values of all writes.
+    bytes: Vec<u8>,
+    access: Access,
+}
+
+struct Checked {
+    memory: Py<Memory>,
+    area: Area,
+    address: u16,
+    count: usize,
+}
+
+#[pymethods]
+impl Batch {
+    #[new]
+    fn new(py: Python<'_>, writes: &Bound<'_, PyAny>) -> PyResult<Batch> {
+        let writes: Vec<Pending<'_>> = (writes.try_iter()?.enumerate())
+            .map(|(command, write)| Pending::new(command, &write?))
+            .collect::<PyResult<_>>()?;
+        let mut bytes = vec![0; writes.iter().map(Pending::byte_len).sum()];
+        let mut rest = &mut bytes[..];
+        for (command, write) in writes.iter().enumerate() {
+            let (bytes, behind) = rest.split_at_mut(write.byte_len());
+            write.pack(command, bytes)?;
+            rest = behind;
+        }
+        // A batch is one step, so one write that requires a seal requires it of all memories.
+        let restores = writes.iter().any(|write| write.restores);
+        let access = if restores { Access::Restore } else { Access::Ingest };
+        let writes = writes.into_iter().map(|Pending { memory, area, address, count, .. }| {
+            Checked { memory: memory.unbind(), area, address, count }
+        });
+        let batch = Batch { writes: writes.collect(), bytes, access };
+        holdfast_memory::check_across(access, &batch.packed())
+            .map_err(|error| refused(py, error))?;
+        Ok(batch)
     }
-    let mut bytes = vec![0; len];
-    let mut rest = &mut bytes[..];
-    let mut packed: Vec<(&Core, Write)> = Vec::with_capacity(pending.len());
-    for (command, write) in pending.iter().enumerate() {
-        let (bytes, behind) = rest.split_at_mut(write.area.byte_len(write.count));
-        rest = behind;
-        packed.push((&write.memory.get().core, write.packed(command, bytes)?));
+
+    /// Whether `write` can still refuse it: a journal, or because a memory is not sealed.
+    #[getter]
+    fn is_refusable(&self) -> bool {
+        let mut memories = self.writes.iter().map(|write| &*write.memory.get().core);
+        self.access == Access::Restore || memories.any(Core::has_journal)
     }
-    let refused = |refused: Refused| refusal(py, refused.index, None, reason(refused.refusal));
-    // A batch is one step, so one write that requires a seal requires it of all memories.
-    let restores = pending.iter().any(|write| write.restores);
-    let access = if restores { Access::Restore } else { Access::Ingest };
-    if let Some(before) = before {
-        holdfast_memory::check_across(access, &packed).map_err(refused)?;
-        before.call1((restores || packed.iter().any(|(memory, _)| memory.has_journal()),))?;
+
+    /// Writes all values atomically. Returns their number, and the sequence of the step if a log has
+    /// carried it out.
+    fn write(&self, py: Python<'_>) -> PyResult<(usize, Option<u64>)> {
+        let packed = self.packed();
+        let sequence = py.detach(|| holdfast_memory::write_across(self.access, &packed));
+        let count = self.writes.iter().map(|write| write.count).sum();
+        Ok((count, sequence.map_err(|error| refused(py, error))?))
     }
-    let sequence = py.detach(|| holdfast_memory::write_across(access, &packed));
-    Ok((pending.iter().map(|write| write.count).sum(), sequence.map_err(refused)?))
+}
+
+impl Batch {
+    fn packed(&self) -> Vec<(&Core, Write<'_>)> {
+        let mut rest = &self.bytes[..];
+        let mut packed = Vec::with_capacity(self.writes.len());
+        for &Checked { ref memory, area, address, count } in &self.writes {
+            let (bytes, behind) = rest.split_at(area.byte_len(count));
+            rest = behind;
+            packed.push((&*memory.get().core, Write { area, address, count, bytes }));
+        }
+        packed
+    }
 }
 
 impl<'py> Pending<'py> {
@@ -90,9 +126,13 @@ impl<'py> Pending<'py> {
         Ok(Pending { memory, area, address, count, values, restores })
     }
 
+    fn byte_len(&self) -> usize {
+        self.area.byte_len(self.count)
+    }
+
     /// Checks the values and packs them into `bytes`.
-    fn packed<'b>(&self, command: usize, bytes: &'b mut [u8]) -> PyResult<Write<'b>> {
-        let Pending { area, address, count, ref values, .. } = *self;
+    fn pack(&self, command: usize, bytes: &mut [u8]) -> PyResult<()> {
+        let Pending { area, count, ref values, .. } = *self;
         if values.len() != count {
             return Err(PyRuntimeError::new_err("values changed while they were read"));
         }
@@ -104,13 +144,9 @@ impl<'py> Pending<'py> {
                 };
                 refusal(values.py(), command, Some(index), reason)
             })?;
-            if area.is_bits() {
-                bytes[index / 8] |= (value as u8) << (index % 8);
-            } else {
-                bytes[index * 2..index * 2 + 2].copy_from_slice(&value.to_be_bytes());
-            }
+            put(area, bytes, index, value);
         }
-        Ok(Write { area, address, count, bytes })
+        Ok(())
     }
 }
 
@@ -135,6 +171,10 @@ fn listed<'py>(values: &Bound<'py, PyAny>) -> PyResult<Option<Bound<'py, PyList>
         list.append(item?)?;
     }
     Ok(Some(list))
+}
+
+fn refused(py: Python<'_>, Refused { index, refusal: because }: Refused) -> PyErr {
+    refusal(py, index, None, reason(because))
 }
 
 fn refusal(py: Python<'_>, command: usize, index: Option<usize>, reason: &'static str) -> PyErr {

@@ -22,9 +22,9 @@ pub(crate) struct Tls {
     /// Bytes to send.
     pub(crate) out: Vec<u8>,
     /// Whether the handshake has succeeded.
-    agreed: bool,
+    is_agreed: bool,
     /// Whether data has been received after the handshake.
-    heard: bool,
+    has_data: bool,
 }
 
 impl Tls {
@@ -33,7 +33,7 @@ impl Tls {
         let mut channel = tls.channel().map_err(|error| TlsFailure::from(&error))?;
         let mut out = Vec::new();
         channel.send(&[], &mut out);
-        Ok(Tls { channel, plain: Vec::new(), out, agreed: false, heard: false })
+        Ok(Tls { channel, plain: Vec::new(), out, is_agreed: false, has_data: false })
     }
 
     pub(crate) fn is_handshaking(&self) -> bool {
@@ -58,11 +58,11 @@ impl Tls {
     pub(crate) fn receive(&mut self, data: &[u8]) -> Result<(), Failed> {
         self.plain.clear();
         let received = self.channel.receive(data, &mut self.plain, &mut self.out);
-        self.agreed |= !self.channel.is_handshaking();
-        self.heard |= !self.plain.is_empty();
+        self.is_agreed |= !self.channel.is_handshaking();
+        self.has_data |= !self.plain.is_empty();
         received.map_err(|error| {
             let failure = TlsFailure::from(&error);
-            let maybe_sent = self.agreed && !failure.refuses_connection();
+            let maybe_sent = self.is_agreed && !failure.refuses_connection();
             (failure, maybe_sent)
         })
     }
@@ -71,7 +71,7 @@ impl Tls {
     pub(crate) fn lost(&self, is_broken: bool) -> Option<Failed> {
         if self.channel.is_handshaking() {
             Some((TlsFailure::ClosedDuringHandshake, false))
-        } else if is_broken && !self.heard {
+        } else if is_broken && !self.has_data {
             Some((TlsFailure::ClosedBeforeReply, true))
         } else {
             None
@@ -85,7 +85,7 @@ pub struct TlsChannel {
 }
 
 /// Reason, text, and whether the peer may have carried out what it was sent.
-type ToldFailure = (&'static str, String, bool);
+type FailureFields = (&'static str, String, bool);
 
 #[pymethods]
 impl TlsChannel {
@@ -128,9 +128,9 @@ impl TlsChannel {
         &self,
         py: Python<'py>,
         data: &[u8],
-    ) -> (Bound<'py, PyBytes>, Option<ToldFailure>) {
+    ) -> (Bound<'py, PyBytes>, Option<FailureFields>) {
         let mut tls = self.tls();
-        let failure = tls.receive(data).err().map(told);
+        let failure = tls.receive(data).err().map(fields_of);
         (PyBytes::new(py, &tls.plain), failure)
     }
 
@@ -140,8 +140,8 @@ impl TlsChannel {
     }
 
     /// Interprets the end of the connection; `None` if TLS has nothing to do with it.
-    fn lost(&self, broken: bool) -> Option<ToldFailure> {
-        self.tls().lost(broken).map(told)
+    fn lost(&self, broken: bool) -> Option<FailureFields> {
+        self.tls().lost(broken).map(fields_of)
     }
 }
 
@@ -151,6 +151,6 @@ impl TlsChannel {
     }
 }
 
-fn told((failure, maybe_sent): Failed) -> ToldFailure {
+fn fields_of((failure, maybe_sent): Failed) -> FailureFields {
     (failure.reason(), failure.to_string(), maybe_sent)
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use holdfast_engine::client::{
-    BlockingClient as Core, ClientError, Endpoint as CoreEndpoint, Place, exception_name,
+    BlockingClient as Core, ClientError, Endpoint as CoreEndpoint, Place,
 };
 use holdfast_engine::tls::FileError;
 use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
@@ -15,15 +15,15 @@ use holdfast_protocol::client::{AcceptUnit, Echo, Tolerance};
 use holdfast_protocol::frame::rtu;
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
-    self, Bits, Diagnostics, EncodedRequest, Function, Range, Registers, Request as CoreRequest,
-    RequestError, Response, SubFunction, limit,
+    self, Bits, Diagnostics, EncodedRequest, ExceptionCode, FileRange, FileRanges, FileRecords,
+    Function, Range, Registers, Request as CoreRequest, RequestError, Response, SubFunction, limit,
 };
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyList};
 
-use crate::arguments::{byte, seconds, within, word};
-use crate::memory::{integer, numbers};
+use crate::arguments::{byte, os_text, seconds, within, word};
+use crate::memory::{Integer, integer, numbers};
 
 pyo3::import_exception!(holdfast.errors, ModbusException);
 pyo3::import_exception!(holdfast.errors, ConnectFailed);
@@ -46,11 +46,7 @@ pub struct Request {
 #[pymethods]
 impl Request {
     #[staticmethod]
-    fn read(
-        area: &str,
-        #[pyo3(from_py_with = integer)] address: i128,
-        #[pyo3(from_py_with = integer)] count: i128,
-    ) -> PyResult<Request> {
+    fn read(area: &str, address: Integer, count: Integer) -> PyResult<Request> {
         let area = crate::memory::named(area)?;
         Ok(encoded(&match area {
             holdfast_memory::Area::Coils => CoreRequest::ReadCoils(range(address, count)?),
@@ -67,32 +63,23 @@ impl Request {
     }
 
     #[staticmethod]
-    fn write_coil(
-        #[pyo3(from_py_with = integer)] address: i128,
-        value: &Bound<'_, PyAny>,
-    ) -> PyResult<Request> {
+    fn write_coil(address: Integer, value: &Bound<'_, PyAny>) -> PyResult<Request> {
         let address = register("address", address)?;
         let value = single(holdfast_memory::Area::Coils, value)? == 1;
         Ok(encoded(&CoreRequest::WriteSingleCoil { address, value }))
     }
 
     #[staticmethod]
-    fn write_register(
-        #[pyo3(from_py_with = integer)] address: i128,
-        value: &Bound<'_, PyAny>,
-    ) -> PyResult<Request> {
+    fn write_register(address: Integer, value: &Bound<'_, PyAny>) -> PyResult<Request> {
         let address = register("address", address)?;
         let value = single(holdfast_memory::Area::HoldingRegisters, value)?;
         Ok(encoded(&CoreRequest::WriteSingleRegister { address, value }))
     }
 
     #[staticmethod]
-    fn write_coils(
-        #[pyo3(from_py_with = integer)] address: i128,
-        values: &Bound<'_, PyAny>,
-    ) -> PyResult<Request> {
+    fn write_coils(address: Integer, values: &Bound<'_, PyAny>) -> PyResult<Request> {
         let values = numbers(holdfast_memory::Area::Coils, values)?;
-        let range = range::<{ limit::WRITE_BITS }>(address, values.len() as i128)?;
+        let range = range::<{ limit::WRITE_BITS }>(address, Integer(values.len() as i128))?;
         let values: Vec<bool> = values.iter().map(|bit| *bit == 1).collect();
         let mut room = [0; pdu::MAX_LEN];
         let bits = Bits::pack(&values, &mut room).map_err(refused)?;
@@ -100,23 +87,16 @@ impl Request {
     }
 
     #[staticmethod]
-    fn write_registers(
-        #[pyo3(from_py_with = integer)] address: i128,
-        values: &Bound<'_, PyAny>,
-    ) -> PyResult<Request> {
+    fn write_registers(address: Integer, values: &Bound<'_, PyAny>) -> PyResult<Request> {
         let values = numbers(holdfast_memory::Area::HoldingRegisters, values)?;
-        let range = range::<{ limit::WRITE_REGISTERS }>(address, values.len() as i128)?;
+        let range = range::<{ limit::WRITE_REGISTERS }>(address, Integer(values.len() as i128))?;
         let mut room = [0; pdu::MAX_LEN];
         let registers = Registers::pack(&values, &mut room).map_err(refused)?;
         Ok(encoded(&CoreRequest::WriteMultipleRegisters { address: range.address(), registers }))
     }
 
     #[staticmethod]
-    fn mask_write(
-        #[pyo3(from_py_with = integer)] address: i128,
-        #[pyo3(from_py_with = integer)] and_mask: i128,
-        #[pyo3(from_py_with = integer)] or_mask: i128,
-    ) -> PyResult<Request> {
+    fn mask_write(address: Integer, and_mask: Integer, or_mask: Integer) -> PyResult<Request> {
         Ok(encoded(&CoreRequest::MaskWriteRegister {
             address: register("address", address)?,
             and_mask: register("and_mask", and_mask)?,
@@ -126,14 +106,14 @@ impl Request {
 
     #[staticmethod]
     fn read_write(
-        #[pyo3(from_py_with = integer)] read_address: i128,
-        #[pyo3(from_py_with = integer)] count: i128,
-        #[pyo3(from_py_with = integer)] write_address: i128,
+        read_address: Integer,
+        count: Integer,
+        write_address: Integer,
         values: &Bound<'_, PyAny>,
     ) -> PyResult<Request> {
         let values = numbers(holdfast_memory::Area::HoldingRegisters, values)?;
         let read = range(read_address, count)?;
-        let written = values.len() as i128;
+        let written = Integer(values.len() as i128);
         let write_address =
             range::<{ limit::READ_WRITE_REGISTERS }>(write_address, written)?.address();
         let mut room = [0; pdu::MAX_LEN];
@@ -142,10 +122,7 @@ impl Request {
     }
 
     #[staticmethod]
-    fn diagnostics(
-        #[pyo3(from_py_with = integer)] sub_function: i128,
-        data: &[u8],
-    ) -> PyResult<Request> {
+    fn diagnostics(sub_function: Integer, data: &[u8]) -> PyResult<Request> {
         let code = register("sub_function", sub_function)?;
         let sub_function = SubFunction::from_code(code).ok_or_else(|| {
             PyValueError::new_err(format!("sub_function {code} is not in the standard"))
@@ -155,6 +132,58 @@ impl Request {
             PyValueError::new_err(format!("{function} does not allow these arguments"))
         })?;
         Ok(encoded(&CoreRequest::Diagnostics(asked)))
+    }
+
+    #[staticmethod]
+    fn exception_status() -> Request {
+        encoded(&CoreRequest::ReadExceptionStatus)
+    }
+
+    #[staticmethod]
+    fn event_log() -> Request {
+        encoded(&CoreRequest::GetCommEventLog)
+    }
+
+    #[staticmethod]
+    fn read_files(ranges: Vec<(Integer, Integer, Integer)>) -> PyResult<Request> {
+        let ranges = ranges
+            .into_iter()
+            .map(|(file, record, count)| file_range(file, record, count, limit::READ_RECORDS));
+        let ranges = ranges.collect::<PyResult<Vec<_>>>()?;
+        let mut room = [0; pdu::MAX_LEN];
+        let ranges = FileRanges::pack(&ranges, &mut room).map_err(refused)?;
+        Ok(encoded(&CoreRequest::ReadFileRecord(ranges)))
+    }
+
+    #[staticmethod]
+    fn write_files(ranges: Vec<(Integer, Integer, Bound<'_, PyAny>)>) -> PyResult<Request> {
+        let ranges = ranges.into_iter().map(|(file, record, values)| {
+            let values = numbers(holdfast_memory::Area::HoldingRegisters, &values)?;
+            let count = Integer(values.len() as i128);
+            let range = file_range(file, record, count, limit::WRITE_RECORDS)?;
+            Ok((range.file(), range.record(), values))
+        });
+        let ranges = ranges.collect::<PyResult<Vec<_>>>()?;
+        let ranges: Vec<(u16, u16, &[u16])> =
+            ranges.iter().map(|(file, record, values)| (*file, *record, &values[..])).collect();
+        let mut room = [0; pdu::MAX_LEN];
+        let records = FileRecords::pack(&ranges, &mut room).map_err(refused)?;
+        Ok(encoded(&CoreRequest::WriteFileRecord(records)))
+    }
+
+    #[staticmethod]
+    fn read_queue(address: Integer) -> PyResult<Request> {
+        let address = register("address", address)?;
+        Ok(encoded(&CoreRequest::ReadFifoQueue { address }))
+    }
+
+    #[staticmethod]
+    fn of_function(code: Integer, data: &[u8]) -> PyResult<Request> {
+        let code = within("function", code.0, 1..=0x7F)? as u8;
+        within("length of data", data.len() as i128, 0..=pdu::MAX_LEN - 1)?;
+        let pdu = [&[code], data].concat();
+        let encoded = EncodedRequest::opaque(&pdu).expect("a PDU of this length and code");
+        Ok(Request { encoded })
     }
 
     #[staticmethod]
@@ -168,13 +197,10 @@ impl Request {
     }
 
     #[staticmethod]
-    fn identification(
-        #[pyo3(from_py_with = integer)] code: i128,
-        #[pyo3(from_py_with = integer)] object_id: i128,
-    ) -> PyResult<Request> {
-        let code = ReadCode::from_code(byte("code", code)?)
-            .ok_or_else(|| PyValueError::new_err(format!("code is {code}, allowed: 1 to 4")))?;
-        let object_id = byte("object id", object_id)?;
+    fn identification(code: Integer, object_id: Integer) -> PyResult<Request> {
+        let code = ReadCode::from_code(byte("code", code.0)?)
+            .ok_or_else(|| PyValueError::new_err(format!("code is {}, allowed: 1 to 4", code.0)))?;
+        let object_id = byte("object id", object_id.0)?;
         Ok(encoded(&CoreRequest::ReadDeviceIdentification { code, object_id }))
     }
 
@@ -183,12 +209,8 @@ impl Request {
         PyBytes::new(py, self.encoded.pdu())
     }
 
-    fn rtu_frame<'py>(
-        &self,
-        py: Python<'py>,
-        #[pyo3(from_py_with = integer)] unit: i128,
-    ) -> PyResult<Bound<'py, PyBytes>> {
-        let unit = byte("unit id", unit)?;
+    fn rtu_frame<'py>(&self, py: Python<'py>, unit: Integer) -> PyResult<Bound<'py, PyBytes>> {
+        let unit = byte("unit id", unit.0)?;
         let mut frame = [0; rtu::MAX_LEN];
         let len = rtu::encode(unit, self.encoded.pdu(), &mut frame).expect("a request is a PDU");
         Ok(PyBytes::new(py, &frame[..len]))
@@ -394,17 +416,11 @@ impl BlockingClient {
 fn unusable(error: TlsError) -> PyErr {
     match error {
         TlsError::File(FileError::Unreadable { file, error }) => match error.raw_os_error() {
-            Some(code) => PyOSError::new_err((code, told(&error), file)),
+            Some(code) => PyOSError::new_err((code, os_text(&error), file)),
             None => PyOSError::new_err(format!("{file}: {error}")),
         },
         other => PyValueError::new_err(other.to_string()),
     }
-}
-
-/// The system's text of an error, without its number, which Python adds.
-fn told(error: &std::io::Error) -> String {
-    let text = error.to_string();
-    text.split(" (os error").next().unwrap_or(&text).to_owned()
 }
 
 /// Checks the arguments of a serial line.
@@ -444,6 +460,9 @@ pub(crate) enum Reply {
     Written,
     Bytes(Vec<u8>),
     EventCounter(bool, u16),
+    EventLog(bool, u16, u16, Vec<u8>),
+    Status(u8),
+    Files(Vec<Vec<u8>>),
     Identification(u8, Option<u8>, Vec<(u8, Vec<u8>)>),
 }
 
@@ -451,6 +470,16 @@ impl Reply {
     pub(crate) fn new(response: Response<'_>) -> Reply {
         match response {
             Response::Bits(bits) => Reply::Bits(bits.as_bytes().to_vec(), bits.quantity().into()),
+            Response::ExceptionStatus(outputs) => Reply::Status(outputs),
+            Response::EventLog { busy, events, messages, log } => {
+                Reply::EventLog(busy, events, messages, log.to_vec())
+            }
+            Response::FileRecords(answer) => {
+                Reply::Files(answer.iter().map(<[u8]>::to_vec).collect())
+            }
+            Response::Queue(registers) => {
+                Reply::Registers(registers.map_or_else(Vec::new, |each| each.as_bytes().to_vec()))
+            }
             Response::Registers(registers) => Reply::Registers(registers.as_bytes().to_vec()),
             Response::Written => Reply::Written,
             Response::Diagnostics(data) | Response::ServerId(data) | Response::Opaque(data) => {
@@ -477,6 +506,17 @@ impl Reply {
             Reply::Written => py.None().into_bound(py),
             Reply::Bytes(data) => PyBytes::new(py, &data).into_any(),
             Reply::EventCounter(busy, events) => (busy, events).into_pyobject(py)?.into_any(),
+            Reply::Status(outputs) => outputs.into_pyobject(py)?.into_any(),
+            Reply::EventLog(busy, events, messages, log) => {
+                (busy, events, messages, PyBytes::new(py, &log)).into_pyobject(py)?.into_any()
+            }
+            Reply::Files(ranges) => {
+                let words = |records: &Vec<u8>| {
+                    let (pairs, _) = records.as_chunks::<2>();
+                    pairs.iter().map(|pair| u16::from_be_bytes(*pair)).collect::<Vec<_>>()
+                };
+                PyList::new(py, ranges.iter().map(words))?.into_any()
+            }
             Reply::Identification(conformity, next, objects) => {
                 let objects: Vec<(u8, Bound<'_, PyBytes>)> =
                     objects.iter().map(|(id, value)| (*id, PyBytes::new(py, value))).collect();
@@ -499,11 +539,15 @@ pub(crate) fn raised(error: ClientError) -> PyErr {
 fn mapped(error: &ClientError) -> PyErr {
     let text = error.to_string();
     match error {
-        ClientError::Exception(code) => ModbusException::new_err((*code, exception_name(*code))),
-        ClientError::Timeout(_)
-        | ClientError::ConnectTimeout { .. }
-        | ClientError::LookupTimeout { .. } => RequestTimeout::new_err(text),
-        ClientError::Connect { to, error } => ConnectFailed::new_err((to.clone(), told(error))),
+        ClientError::Exception(code) => {
+            let name = ExceptionCode::from_code(*code).map(ExceptionCode::name);
+            ModbusException::new_err((*code, name))
+        }
+        ClientError::Timeout(_) => RequestTimeout::new_err(text),
+        ClientError::ConnectTimeout { .. } | ClientError::LookupTimeout { .. } => {
+            RequestTimeout::new_err((text, false))
+        }
+        ClientError::Connect { to, error } => ConnectFailed::new_err((to.clone(), os_text(error))),
         ClientError::Tls { to, failure, maybe_sent } => {
             let of = (failure.reason(), to.clone(), failure.to_string(), *maybe_sent);
             TlsFailed::new_err(of)
@@ -519,7 +563,7 @@ fn encoded(request: &CoreRequest<'_>) -> Request {
     Request { encoded: EncodedRequest::new(request) }
 }
 
-fn range<const MAX: u16>(address: i128, count: i128) -> PyResult<Range<MAX>> {
+fn range<const MAX: u16>(address: Integer, Integer(count): Integer) -> PyResult<Range<MAX>> {
     let address = register("address", address)?;
     let quantity = within("count", count, 1..=usize::from(MAX))? as u16;
     if i128::from(address) + count > ADDRESSES {
@@ -529,11 +573,23 @@ fn range<const MAX: u16>(address: i128, count: i128) -> PyResult<Range<MAX>> {
     Range::new(address, quantity).map_err(refused)
 }
 
+fn file_range(file: Integer, record: Integer, count: Integer, most: u16) -> PyResult<FileRange> {
+    let last = limit::LAST_RECORD;
+    let file = within("file", file.0, 1..=usize::from(u16::MAX))? as u16;
+    let record = within("record", record.0, 0..=usize::from(last))? as u16;
+    let quantity = within("count", count.0, 1..=usize::from(most))? as u16;
+    if record + quantity - 1 > last {
+        let message = format!("{quantity} from record {record}: the last record is {last}");
+        return Err(PyValueError::new_err(message));
+    }
+    FileRange::new(file, record, quantity).map_err(refused)
+}
+
 fn refused(error: RequestError) -> PyErr {
     PyValueError::new_err(error.to_string())
 }
 
-fn register(what: &str, number: i128) -> PyResult<u16> {
+fn register(what: &str, Integer(number): Integer) -> PyResult<u16> {
     Ok(within(what, number, 0..=65_535)? as u16)
 }
 

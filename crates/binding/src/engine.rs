@@ -2,18 +2,18 @@
 
 use std::time::UNIX_EPOCH;
 
-use holdfast_engine::server::audit::Unrecordable;
-use holdfast_engine::server::counters::PacketCounters;
-use holdfast_engine::server::event::{Kind, Verbosity};
+use holdfast_engine::server::reports::audit::Unrecordable;
+use holdfast_engine::server::reports::counters::PacketCounters;
+use holdfast_engine::server::reports::event::{Event, Kind, Verbosity};
 use holdfast_engine::server::{
     Engine as Core, ListenerCounters, Listening, OpenConnection, ProtocolCounters, Settings,
     StartError,
 };
-use pyo3::exceptions::{PyOSError, PyValueError};
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::arguments::{seconds, within, word};
+use crate::arguments::{os_error, seconds, within, word};
 use crate::audit;
 use crate::heartbeat;
 use crate::listener::Listener;
@@ -109,26 +109,7 @@ impl Engine {
     ) -> PyResult<Option<(String, &'static str, Bound<'py, PyDict>)>> {
         let timeout = seconds("timeout", timeout)?;
         let Some(event) = py.detach(|| self.core.next_event(timeout)) else { return Ok(None) };
-        let fields = PyDict::new(py);
-        if let Some(peer) = &event.peer {
-            peer::tell(&fields, peer)?;
-        }
-        if let Some(subject) = event.subject {
-            fields.set_item("subject", subject.as_ref())?;
-        }
-        if event.count > 1 {
-            fields.set_item("count", event.count)?;
-        }
-        if let Some(reason) = event.kind.reason() {
-            fields.set_item("reason", reason)?;
-        }
-        if let Some(bytes) = event.kind.bytes() {
-            fields.set_item("bytes", bytes)?;
-        }
-        if let Kind::RefusedRequest(refused) = event.kind {
-            fields.set_item("unit", refused.unit_id)?;
-            fields.set_item("function", refused.function_code)?;
-        }
+        let fields = event_fields(py, &event)?;
         Ok(Some((event.listener.to_string(), event.kind.name(), fields)))
     }
 
@@ -194,7 +175,7 @@ fn shown<'py>(
     let all = PyDict::new(py);
     all.set_item("listener", listener)?;
     all.set_item("id", session.id)?;
-    peer::tell(&all, &session.peer)?;
+    peer::add_to(&all, &session.peer)?;
     let opened = session.opened.duration_since(UNIX_EPOCH).unwrap_or_default();
     all.set_item("opened", opened.as_secs_f64())?;
     all.set_item("idle", session.idle.as_secs_f64())?;
@@ -205,17 +186,9 @@ fn counted_packets<'py>(
     py: Python<'py>,
     counters: &PacketCounters,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let refused = PyDict::new(py);
-    for (refusal, count) in counters.refused() {
-        refused.set_item(refusal.name(), count)?;
-    }
-    let packets = PyDict::new(py);
-    packets.set_item("accepted", counters.accepted.get())?;
-    packets.set_item("values", counters.values.get())?;
-    packets.set_item("surplus_bytes", counters.surplus_bytes.get())?;
-    packets.set_item("dropped_bytes", counters.dropped_bytes.get())?;
-    packets.set_item("held_bytes", counters.held_bytes.get())?;
-    packets.set_item("refused", refused)?;
+    let packets = dict(py, counters.by_name())?;
+    let refused = counters.refused().map(|(refusal, count)| (refusal.name(), count));
+    packets.set_item("refused", dict(py, refused)?)?;
     Ok(packets)
 }
 
@@ -224,15 +197,10 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
     match &listener.protocol {
         ProtocolCounters::Modbus(unit_server, packets) => {
             let counters = &unit_server.counters;
-            let frames = PyDict::new(py);
-            frames.set_item("foreign", counters.frames.foreign.get())?;
-            frames.set_item("broken", counters.frames.broken.get())?;
-            frames.set_item("damaged", counters.frames.damaged.get())?;
-            frames.set_item("other_unit", counters.frames.other_unit.get())?;
-            all.set_item("requests", by_code(py, counters.requests())?)?;
-            all.set_item("exceptions", by_code(py, counters.exceptions())?)?;
+            all.set_item("requests", dict(py, counters.requests())?)?;
+            all.set_item("exceptions", dict(py, counters.exceptions())?)?;
             all.set_item("unanswered", counters.unanswered.get())?;
-            all.set_item("frames", frames)?;
+            all.set_item("frames", dict(py, counters.frames.by_name())?)?;
             if let Some(packets) = packets {
                 all.set_item("packets", counted_packets(py, packets)?)?;
             }
@@ -242,24 +210,7 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
         }
     }
     let counters = listener.connections();
-    let connections = PyDict::new(py);
-    for (key, counter) in [
-        ("accepted", &counters.accepted),
-        ("refused_source", &counters.refused_source),
-        ("refused_role", &counters.refused_role),
-        ("refused_full", &counters.refused_full),
-        ("refused_listen_only", &counters.refused_listen_only),
-        ("evicted", &counters.evicted),
-        ("evicted_handshakes", &counters.evicted_handshakes),
-        ("rights_revoked", &counters.rights_revoked),
-        ("ended", &counters.ended),
-        ("idle", &counters.idle),
-        ("request_timeout", &counters.request_timeout),
-        ("slow_reader", &counters.slow_reader),
-        ("accept_errors", &counters.accept_errors),
-    ] {
-        connections.set_item(key, counter.get())?;
-    }
+    let connections = dict(py, counters.by_name())?;
     connections.set_item("tls_failed", counters.tls_failed.total())?;
     connections.set_item("open", listener.open_connections)?;
     all.set_item("connections", connections)?;
@@ -267,26 +218,50 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
     Ok(all)
 }
 
-fn by_code<'py>(
+/// The fields of an event, for a log.
+pub(crate) fn event_fields<'py>(py: Python<'py>, event: &Event) -> PyResult<Bound<'py, PyDict>> {
+    let fields = PyDict::new(py);
+    if let Some(peer) = &event.peer {
+        peer::add_to(&fields, peer)?;
+    }
+    if let Some(subject) = &event.subject {
+        fields.set_item("subject", &**subject)?;
+    }
+    if event.count > 1 {
+        fields.set_item("count", event.count)?;
+    }
+    if let Some(reason) = event.kind.reason() {
+        fields.set_item("reason", reason)?;
+    }
+    if let Some(bytes) = event.kind.bytes() {
+        fields.set_item("bytes", bytes)?;
+    }
+    if let Kind::RefusedRequest(refused) = event.kind {
+        fields.set_item("unit", refused.unit_id)?;
+        fields.set_item("function", refused.function_code)?;
+    }
+    Ok(fields)
+}
+
+/// Counts as a dict.
+pub(crate) fn dict<'py, K: IntoPyObject<'py>>(
     py: Python<'py>,
-    counts: impl Iterator<Item = (u8, u64)>,
+    counts: impl IntoIterator<Item = (K, u64)>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let all = PyDict::new(py);
-    for (code, count) in counts {
-        all.set_item(code, count)?;
+    for (key, count) in counts {
+        all.set_item(key, count)?;
     }
     Ok(all)
 }
 
 /// Maps a failed socket to an `OSError` with its `errno`, so that Python selects the subclass.
 fn start_error(error: StartError) -> PyErr {
-    match &error {
-        StartError::Bind { error: cause, .. }
-        | StartError::Open { error: cause, .. }
-        | StartError::Worker(cause) => match cause.raw_os_error() {
-            Some(number) => PyOSError::new_err((number, error.to_string())),
-            None => PyOSError::new_err(error.to_string()),
-        },
-        StartError::Identity(_) => PyValueError::new_err(error.to_string()),
+    let text = error.to_string();
+    match error {
+        StartError::Bind { error, .. }
+        | StartError::Open { error, .. }
+        | StartError::Worker(error) => os_error(&error, text),
+        StartError::Identity(_) => PyValueError::new_err(text),
     }
 }

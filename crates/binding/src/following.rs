@@ -42,10 +42,10 @@ impl Follower {
             Refusal::Stale => Stale::new_err(refusal.to_string()),
             _ => PyOSError::new_err(refusal.to_string()),
         })?;
-        let told = changes.into_iter().map(|change| {
+        let changes = changes.into_iter().map(|change| {
             let values = listed(py, change.area, change.count, &change.bytes)?;
             Ok((change.range, change.address, values))
         });
-        Ok((writes, told.collect::<PyResult<_>>()?))
+        Ok((writes, changes.collect::<PyResult<_>>()?))
     }
 }

@@ -1,5 +1,6 @@
 //! `HttpServer` and `HttpExchange`: requests of HTTP, for an event loop.
 
+use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -10,12 +11,14 @@ use holdfast_engine::http::{
     ResponseHead, Sent, bind,
 };
 use holdfast_engine::server::{ConnectionLimits, Peer};
+use holdfast_engine::tls::server::Protocol;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::pybacked::PyBackedBytes;
 use pyo3::types::{PyBytes, PyDict, PyList, PyTuple};
 
-use crate::arguments::{address, network, time_to_wait};
+use crate::arguments::{address, network, os_error, os_text, time_to_wait};
+use crate::engine::{dict, event_fields};
 use crate::heartbeat;
 use crate::link::handle;
 use crate::listener::limits;
@@ -35,14 +38,8 @@ pub struct ListeningSocket {
 impl ListeningSocket {
     #[new]
     fn new(bind_address: &str) -> PyResult<ListeningSocket> {
-        let socket = bind(address(bind_address)?).map_err(|error| {
-            let text = error.to_string();
-            let text = text.split(" (os error").next().unwrap_or_default().to_owned();
-            match error.raw_os_error() {
-                Some(code) => PyOSError::new_err((code, text)),
-                None => PyOSError::new_err(text),
-            }
-        })?;
+        let socket =
+            bind(address(bind_address)?).map_err(|error| os_error(&error, os_text(&error)))?;
         Ok(ListeningSocket { socket: Mutex::new(Some(socket)) })
     }
 
@@ -113,7 +110,7 @@ impl HttpServer {
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
             idle_timeout: time_to_wait("idle_timeout", idle_timeout)?,
             leaving,
-            tls: tls.map(|tls| tls.of_https()).transpose()?,
+            tls: tls.map(|tls| tls.of(Protocol::Http)).transpose()?,
             refusals: bodies(&refusals)?,
         };
         Ok(HttpServer { core: CoreServer::new(settings)? })
@@ -164,20 +161,7 @@ impl HttpServer {
     fn events<'py>(&self, py: Python<'py>) -> PyResult<Vec<(&'static str, Bound<'py, PyDict>)>> {
         let mut events = Vec::new();
         while let Some(event) = self.core.event() {
-            let fields = PyDict::new(py);
-            if let Some(peer) = &event.peer {
-                peer::tell(&fields, peer)?;
-            }
-            if let Some(reason) = event.kind.reason() {
-                fields.set_item("reason", reason)?;
-            }
-            if let Some(subject) = &event.subject {
-                fields.set_item("subject", &**subject)?;
-            }
-            if event.count > 1 {
-                fields.set_item("count", event.count)?;
-            }
-            events.push((event.kind.name(), fields));
+            events.push((event.kind.name(), event_fields(py, &event)?));
         }
         Ok(events)
     }
@@ -186,8 +170,7 @@ impl HttpServer {
     fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let counters = self.core.connections();
         let evicted = counters.evicted.get() + counters.evicted_handshakes.get();
-        let all = PyDict::new(py);
-        for (name, count) in [
+        let counts = [
             ("accepted", counters.accepted.get()),
             ("refused_source", counters.refused_source.get()),
             ("refused_full", counters.refused_full.get()),
@@ -198,19 +181,12 @@ impl HttpServer {
             ("broken_request", counters.broken_request.get()),
             ("tls_failed", counters.tls_failed.total()),
             ("open", self.core.open() as u64),
-        ] {
-            all.set_item(name, count)?;
-        }
-        Ok(all)
+        ];
+        dict(py, counts)
     }
 
-    /// Failures of TLS by reason.
-    fn tls_failures<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let all = PyDict::new(py);
-        for (reason, count) in self.core.connections().tls_failed.by_reason() {
-            all.set_item(reason, count)?;
-        }
-        Ok(all)
+    fn tls_failures(&self) -> BTreeMap<&'static str, u64> {
+        self.core.connections().tls_failed.by_reason()
     }
 
     #[getter]
@@ -224,7 +200,7 @@ impl HttpServer {
     }
 
     fn set_tls(&self, tls: PyRef<'_, ServerTls>) -> PyResult<()> {
-        self.core.set_tls(tls.of_https()?);
+        self.core.set_tls(tls.of(Protocol::Http)?);
         Ok(())
     }
 

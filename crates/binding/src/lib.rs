@@ -35,7 +35,7 @@ mod _core {
     use super::{Bound, PyModule, PyModuleMethods, PyResult, limits};
 
     #[pymodule_export]
-    use super::batch::{BatchRefused, write_across};
+    use super::batch::{Batch, BatchRefused};
     #[pymodule_export]
     use super::channel::TlsChannel;
     #[pymodule_export]
@@ -63,7 +63,7 @@ mod _core {
     #[pymodule_export]
     use super::mirror_age::MirrorAge;
     #[pymodule_export]
-    use super::poller::{PolledDevice, Poller, Results, plan_blocks, tell_disabled};
+    use super::poller::{PolledDevice, Poller, Results, plan_blocks, write_disabled_status};
     #[pymodule_export]
     use super::raw_ingest::{encode_raw_ingest, pack_raw_ingest};
     #[pymodule_export]

@@ -1,12 +1,14 @@
 //! Constants of the module: areas, functions and their limits, names of exceptions, device faults,
-//! reasons of TLS failures.
+//! reasons of TLS failures, the latest replies, the usual pauses after failures.
 //! Python takes them from here and keeps no list of its own.
 
 use holdfast_engine::link::Fault;
-use holdfast_engine::server::functions::{OTHER_READS, WRITE_FILE_RECORD};
+use holdfast_engine::server::rights::functions::{OTHER_READS, WRITE_FILE_RECORD, is_served};
 use holdfast_engine::tls::TlsFailure;
 use holdfast_memory::{Area, Span};
+use holdfast_protocol::client::MAX_LATENESS;
 use holdfast_protocol::pdu::{self, ExceptionCode, Function, SubFunction, limit};
+use holdfast_runtime::Retry;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 
@@ -14,12 +16,14 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let py = module.py();
     module.add("ADDRESSES", Span::MAX_SIZE)?;
     module.add("MAX_PDU", pdu::MAX_LEN)?;
+    module.add("READ_RECORDS", limit::READ_RECORDS)?;
     module.add("AREAS", PyTuple::new(py, Area::ALL.map(Area::name))?)?;
-    let functions = (0..=u8::MAX).filter_map(Function::from_code).map(|function| {
-        let of = use_of(function);
-        let area = of.area.map(Area::name);
+    let served = (0..=u8::MAX).filter(|code| is_served(*code));
+    let functions = served.filter_map(Function::from_code).map(|function| {
+        let (area, most_read, most_written) = use_of(function);
+        let area = area.map(Area::name);
         let (code, name) = (function.code(), function.name());
-        (code, name, function.is_write(), area, of.most_read, of.most_written)
+        (code, name, function.is_write(), area, most_read, most_written)
     });
     module.add("FUNCTIONS", PyTuple::new(py, functions.collect::<Vec<_>>())?)?;
     module.add("OTHER_READS", PyTuple::new(py, OTHER_READS)?)?;
@@ -33,54 +37,18 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     }
     module.add("EXCEPTIONS", exceptions)?;
     let faults = PyDict::new(py);
-    let all = [
-        Fault::Timeout,
-        Fault::Refused,
-        Fault::Reset,
-        Fault::Invalid,
-        Fault::Unplanned,
-        Fault::Unstored,
-        Fault::Internal,
-        Fault::Flooded,
-        Fault::Standby,
-        Fault::Expired,
-        Fault::Unreachable,
-    ];
-    for fault in all {
-        if let Some(word) = word(fault) {
-            faults.set_item(word, fault.code())?;
-        }
+    for (fault, word) in Fault::NAMED {
+        faults.set_item(word, fault.code())?;
     }
     module.add("FAULTS", faults)?;
-    module.add("TLS_REASONS", PyTuple::new(py, TlsFailure::REASONS)?)
+    module.add("TLS_REASONS", PyTuple::new(py, TlsFailure::REASONS)?)?;
+    module.add("MAX_LATENESS", MAX_LATENESS.as_secs_f64())?;
+    let Retry { first, most, .. } = Retry::default();
+    module.add("RETRY_PAUSES", (first.as_secs_f64(), most.as_secs_f64()))
 }
 
-/// The name of a fault; `None` for an exception, which has a name in `EXCEPTIONS`.
-fn word(fault: Fault) -> Option<&'static str> {
-    match fault {
-        Fault::Exception(_) => None,
-        Fault::Timeout => Some("timeout"),
-        Fault::Refused => Some("refused"),
-        Fault::Reset => Some("reset"),
-        Fault::Invalid => Some("invalid reply"),
-        Fault::Unplanned => Some("no plan"),
-        Fault::Unstored => Some("not stored"),
-        Fault::Internal => Some("internal error"),
-        Fault::Flooded => Some("flooded"),
-        Fault::Standby => Some("standby"),
-        Fault::Expired => Some("expired"),
-        Fault::Unreachable => Some("unreachable"),
-    }
-}
-
-/// The area that a function reads or writes, if any, and the most items per request.
-struct Use {
-    area: Option<Area>,
-    most_read: u16,
-    most_written: u16,
-}
-
-fn use_of(function: Function) -> Use {
+/// The area that a function reads or writes, if any, and the most items per request: read, written.
+fn use_of(function: Function) -> (Option<Area>, u16, u16) {
     let (area, most_read, most_written) = match function {
         Function::ReadCoils => (Area::Coils, limit::READ_BITS, 0),
         Function::ReadDiscreteInputs => (Area::DiscreteInputs, limit::READ_BITS, 0),
@@ -95,12 +63,17 @@ fn use_of(function: Function) -> Use {
         Function::ReadWriteMultipleRegisters => {
             (Area::HoldingRegisters, limit::READ_REGISTERS, limit::READ_WRITE_REGISTERS)
         }
-        Function::Diagnostics
+        Function::ReadExceptionStatus
+        | Function::Diagnostics
         | Function::GetCommEventCounter
+        | Function::GetCommEventLog
         | Function::ReportServerId
+        | Function::ReadFileRecord
+        | Function::WriteFileRecord
+        | Function::ReadFifoQueue
         | Function::EncapsulatedInterface => {
-            return Use { area: None, most_read: 0, most_written: 0 };
+            return (None, 0, 0);
         }
     };
-    Use { area: Some(area), most_read, most_written }
+    (Some(area), most_read, most_written)
 }

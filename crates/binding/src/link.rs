@@ -11,7 +11,7 @@ use holdfast_engine::link::{
 use holdfast_engine::poller::{Passage as CorePassage, PassedRange};
 use holdfast_memory::Area;
 use holdfast_protocol::client::InvalidResponse;
-use holdfast_protocol::pdu::{Bits, Registers, Request as CoreRequest, limit, pack_bits};
+use holdfast_protocol::pdu::{self, Bits, Registers, Request as CoreRequest, limit};
 use holdfast_runtime::Retry;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
@@ -104,30 +104,18 @@ impl Link {
     }
 
     fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let counters = &self.core.counters;
         let all = PyDict::new(py);
-        for (name, counter) in [
-            ("requests", &counters.requests),
-            ("replies", &counters.replies),
-            ("exceptions", &counters.exceptions),
-            ("timeouts", &counters.timeouts),
-            ("failures", &counters.failures),
-            ("refused_full", &counters.refused_full),
-            ("refused_down", &counters.refused_down),
-            ("coalesced", &counters.coalesced),
-            ("cached", &counters.cached),
-            ("withdrawn", &counters.withdrawn),
-        ] {
-            all.set_item(name, counter.get())?;
+        for (name, count) in self.core.counters.by_name() {
+            all.set_item(name, count)?;
         }
         all.set_item("waiting", self.core.waiting())?;
-        tell_strays(&all, self.core.strays())?;
+        add_strays(&all, self.core.strays())?;
         Ok(all)
     }
 }
 
 /// What a connection has received without a request, or late.
-pub fn tell_strays(all: &Bound<'_, PyDict>, strays: Option<&StrayCounters>) -> PyResult<()> {
+pub fn add_strays(all: &Bound<'_, PyDict>, strays: Option<&StrayCounters>) -> PyResult<()> {
     let count = |of: fn(&StrayCounters) -> u64| strays.map_or(0, of);
     all.set_item("unexpected_replies", count(|strays| strays.replies.get()))?;
     all.set_item("stray_bytes", count(|strays| strays.bytes.get()))?;
@@ -209,36 +197,31 @@ impl Passage {
 
     /// Returns the code of the exception, 0 if the device has confirmed the write.
     fn write(&self, py: Python<'_>, area: &str, address: u16, values: Vec<u16>) -> PyResult<u8> {
-        let most = usize::from(if named(area)?.is_bits() {
-            limit::WRITE_BITS
-        } else {
-            limit::WRITE_REGISTERS
-        });
-        within("number of values", values.len() as i128, 1..=most)?;
-        let written = match named(area)? {
-            Area::Coils => {
-                let items: Vec<bool> = values.iter().map(|value| *value != 0).collect();
-                let mut packed = vec![0; items.len().div_ceil(8)];
-                pack_bits(&items, &mut packed);
-                let quantity = values.len() as u16;
-                let bits = Bits::new(quantity, &packed).expect("there are as many bits");
-                let request = match items[..] {
-                    [value] => CoreRequest::WriteSingleCoil { address, value },
-                    _ => CoreRequest::WriteMultipleCoils { address, bits },
-                };
-                py.detach(|| self.core.write(&request))
+        let area = named(area)?;
+        let most = if area.is_bits() { limit::WRITE_BITS } else { limit::WRITE_REGISTERS };
+        within("number of values", values.len() as i128, 1..=most.into())?;
+        let items: Vec<bool> = values.iter().map(|value| *value != 0).collect();
+        let mut room = [0; pdu::MAX_LEN];
+        let few = "there are no more values than a request has room for";
+        let request = match (area, &values[..]) {
+            (Area::Coils, [value]) => CoreRequest::WriteSingleCoil { address, value: *value != 0 },
+            (Area::Coils, _) => {
+                let bits = Bits::pack(&items, &mut room).expect(few);
+                CoreRequest::WriteMultipleCoils { address, bits }
             }
-            Area::HoldingRegisters => {
-                let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_be_bytes()).collect();
-                let registers = Registers::new(&bytes).expect("there are 1 to 123 registers");
-                let request = match values[..] {
-                    [value] => CoreRequest::WriteSingleRegister { address, value },
-                    _ => CoreRequest::WriteMultipleRegisters { address, registers },
-                };
-                py.detach(|| self.core.write(&request))
+            (Area::HoldingRegisters, [value]) => {
+                CoreRequest::WriteSingleRegister { address, value: *value }
             }
-            _ => return Err(PyValueError::new_err(format!("devices have no writable {area}"))),
+            (Area::HoldingRegisters, values) => {
+                let registers = Registers::pack(values, &mut room).expect(few);
+                CoreRequest::WriteMultipleRegisters { address, registers }
+            }
+            _ => {
+                let name = area.name();
+                return Err(PyValueError::new_err(format!("devices have no writable {name}")));
+            }
         };
+        let written = py.detach(|| self.core.write(&request));
         Ok(written.err().unwrap_or(0))
     }
 }

@@ -5,22 +5,25 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use holdfast_engine::items::Items;
-use holdfast_engine::server::functions::{AccessMode, Functions};
-use holdfast_engine::server::policy::{Elsewhere, Narrowed, Rule as CoreRule};
-use holdfast_engine::server::ranges::Ranges;
+use holdfast_engine::server::requests::unit_server::UnitSettings;
+use holdfast_engine::server::rights::functions::{AccessMode, Functions};
+use holdfast_engine::server::rights::policy::{Elsewhere, Narrowed, Rule as CoreRule};
+use holdfast_engine::server::rights::ranges::Ranges;
 use holdfast_engine::server::{
     AfterRefusal, ConnectionLimits, DatagramFraming, Flags, ListenerKind, ListenerSettings,
     PacketsPerConnection, RawRule as CoreRawRule, RawSettings, SerialSettings, StreamFraming,
     StreamSettings, UdpSettings, WhenFull,
 };
-use holdfast_memory::Memory as CoreMemory;
-use holdfast_protocol::raw_ingest::Format;
+use holdfast_engine::tls::server::Protocol;
+use holdfast_memory::{Area, Memory as CoreMemory};
 use ipnet::IpNet;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyMapping;
 
-use crate::arguments::{address, byte, network, seconds, time_to_wait, within, word};
+use crate::arguments::{
+    address, byte, network, packet_format, seconds, time_to_wait, within, word,
+};
 use crate::client::line;
 use crate::link::{Passage, Route};
 use crate::memory::{Memory, named};
@@ -29,6 +32,9 @@ use crate::server_tls::ServerTls;
 /// The access of rules.
 const ACCESS: [(&str, AccessMode); 2] =
     [("read-only", AccessMode::ReadOnly), ("read-write", AccessMode::ReadWrite)];
+
+/// The idle time of connections that may be idle for as long as they want.
+const UNLIMITED: Duration = Duration::from_secs(366 * 24 * 3600);
 
 /// Area, first address, how many items.
 type Range = (String, u16, u32);
@@ -47,7 +53,8 @@ type Narrow = (String, Option<Vec<i128>>, Option<Vec<i128>>, Limits);
 /// both. `roles`, only with TLS, are the allowed roles of the peer's certificate: "" is a
 /// certificate without a role, `None` is any role. `narrowed` are units with rights of their own:
 /// access, functions, denied functions, and the ranges that they may read and write, each an area,
-/// its first address and a count; `None` is everything.
+/// its first address and a count; `None` is everything. `exception_status` is where units have the
+/// eight bits that function 7 reads: area and address. Other units do not have the function.
 ///
 /// Raises `ValueError` for an invalid source or access.
 #[pyclass(frozen, module = "holdfast")]
@@ -58,7 +65,8 @@ pub struct Rule {
 #[pymethods]
 impl Rule {
     #[new]
-    #[pyo3(signature = (units, *, sources, access, functions=None, deny=None, roles=None, narrowed=None))]
+    #[pyo3(signature = (units, *, sources, access, functions=None, deny=None, roles=None, narrowed=None, exception_status=None))]
+    #[expect(clippy::too_many_arguments, reason = "they are keywords of Python")]
     fn new(
         units: &Bound<'_, PyMapping>,
         sources: Vec<String>,
@@ -67,6 +75,7 @@ impl Rule {
         deny: Option<Vec<i128>>,
         roles: Option<Vec<String>>,
         narrowed: Option<BTreeMap<i128, Narrow>>,
+        exception_status: Option<BTreeMap<i128, (String, i128)>>,
     ) -> PyResult<Rule> {
         let access = word("access", access, &ACCESS)?;
         let functions = self::functions(functions, deny)?;
@@ -76,10 +85,20 @@ impl Rule {
                 access: word("access", &access, &ACCESS)?,
                 functions: self::functions(functions, deny)?,
                 ranges: Ranges::new(ranges(read)?, ranges(write)?),
+                exception_status: None,
             };
             Ok((byte("unit id", unit)?, narrowed))
         });
-        let narrowed = narrowed.collect::<PyResult<_>>()?;
+        let mut narrowed = narrowed.collect::<PyResult<BTreeMap<u8, Narrowed>>>()?;
+        for (unit, (area, address)) in exception_status.unwrap_or_default() {
+            let own = narrowed.entry(byte("unit id", unit)?).or_insert_with(|| Narrowed {
+                access,
+                functions: functions.clone(),
+                ranges: Ranges::default(),
+                exception_status: None,
+            });
+            own.exception_status = Some(bits(&area, address)?);
+        }
         let (mut memories, mut elsewhere) = (Vec::new(), Vec::new());
         for item in units.items()?.iter() {
             let (unit, target): (i128, Bound<'_, PyAny>) = item.extract()?;
@@ -96,7 +115,15 @@ impl Rule {
         }
         let (sources, units) = (networks(&sources)?, memories);
         Ok(Rule {
-            core: CoreRule { sources, roles, units, elsewhere, access, functions, narrowed },
+            core: CoreRule {
+                sources,
+                roles,
+                units,
+                elsewhere,
+                access,
+                functions,
+                narrowed: narrowed.into_iter().collect(),
+            },
         })
     }
 }
@@ -130,31 +157,85 @@ pub struct Listener {
     pub core: ListenerSettings,
 }
 
+/// What a listener for connections has beside its address and rules, see `StreamOptions` in
+/// `python/holdfast/server/options.py`. Here and below, other keys of the mapping are ignored.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct StreamOptions<'py> {
+    framing: String,
+    max_connections: i128,
+    max_connections_per_source: Option<i128>,
+    when_full: String,
+    idle_timeout: f64,
+    request_timeout: f64,
+    frame_timeout: f64,
+    keepalive: i128,
+    listen_only: bool,
+    event_log: bool,
+    tls: Option<PyRef<'py, ServerTls>>,
+    max_handshakes: i128,
+    raw_ingest: Option<PyRef<'py, Listener>>,
+}
+
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct DatagramOptions {
+    framing: String,
+    listen_only: bool,
+    event_log: bool,
+}
+
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct SerialOptions {
+    mode: String,
+    baud: i128,
+    parity: String,
+    stop_bits: i128,
+    data_bits: i128,
+    silence: Option<f64>,
+    rs485: Option<String>,
+    event_log: bool,
+}
+
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct RawIngestOptions<'py> {
+    format: String,
+    crc: String,
+    flags: String,
+    max_connections: i128,
+    max_connections_per_source: Option<i128>,
+    when_full: String,
+    request_timeout: f64,
+    packets: String,
+    idle_timeout: f64,
+    after_refusal: String,
+    tls: Option<PyRef<'py, ServerTls>>,
+    max_handshakes: Option<i128>,
+}
+
 #[pymethods]
-#[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Listener {
     #[new]
-    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, frame_timeout=None, listen_only=false, tls=None, max_handshakes=256, raw_ingest=None))]
     fn new(
         name: String,
         bind: &str,
         rules: Vec<PyRef<'_, Rule>>,
-        framing: &str,
-        max_connections: i128,
-        max_connections_per_source: Option<i128>,
-        when_full: &str,
-        idle_timeout: f64,
-        request_timeout: f64,
-        frame_timeout: Option<f64>,
-        listen_only: bool,
-        tls: Option<PyRef<'_, ServerTls>>,
-        max_handshakes: i128,
-        raw_ingest: Option<PyRef<'_, Listener>>,
+        options: StreamOptions<'_>,
     ) -> PyResult<Listener> {
-        let raw_ingest = match raw_ingest.map(|listener| listener.core.kind.clone()) {
+        let framings = [
+            ("mbap", StreamFraming::Mbap),
+            ("rtu", StreamFraming::Rtu),
+            ("ascii", StreamFraming::Ascii),
+        ];
+        let framing = word("framing", &options.framing, &framings)?;
+        let raw_ingest = match options.raw_ingest.map(|listener| listener.core.kind.clone()) {
             None => None,
             Some(ListenerKind::RawIngest(settings))
-                if framing == "mbap" && tls.is_none() && settings.tls.is_none() =>
+                if framing == StreamFraming::Mbap
+                    && options.tls.is_none()
+                    && settings.tls.is_none() =>
             {
                 Some(settings)
             }
@@ -164,105 +245,92 @@ impl Listener {
                 return Err(PyValueError::new_err(message));
             }
         };
-        let idle_timeout = seconds("idle_timeout", idle_timeout)?;
-        let limits = limits(max_connections, max_connections_per_source, when_full)?;
-        let framings = [
-            ("mbap", StreamFraming::Mbap),
-            ("rtu", StreamFraming::Rtu),
-            ("ascii", StreamFraming::Ascii),
-        ];
+        let idle_timeout = seconds("idle_timeout", options.idle_timeout)?;
+        let frame_timeout = time_to_wait("frame_timeout", options.frame_timeout)?;
+        let limits = limits(
+            options.max_connections,
+            options.max_connections_per_source,
+            &options.when_full,
+        )?;
         let kind = ListenerKind::ModbusStream(StreamSettings {
             bind: address(bind)?,
-            framing: word("framing", framing, &framings)?,
+            framing,
             rules: cores(&rules),
-            limits: secure_limits(limits, tls.is_some(), max_handshakes)?,
+            limits: secure_limits(limits, options.tls.is_some(), Some(options.max_handshakes))?,
             idle_timeout: (!idle_timeout.is_zero()).then_some(idle_timeout),
-            request_timeout: time_to_wait("request_timeout", request_timeout)?,
-            frame_timeout: frame_timeout
-                .map(|time| time_to_wait("frame_timeout", time))
-                .transpose()?,
-            listen_only,
-            tls: tls.map(|tls| tls.of_listener()).transpose()?,
+            request_timeout: time_to_wait("request_timeout", options.request_timeout)?,
+            frame_timeout: (framing == StreamFraming::Rtu).then_some(frame_timeout),
+            keepalive: within("keepalive", options.keepalive, 1..=32_767)? as u16,
+            units: UnitSettings { listen_only: options.listen_only, event_log: options.event_log },
+            tls: options.tls.map(|tls| tls.of(Protocol::Modbus)).transpose()?,
             raw_ingest,
         });
         Ok(Listener { core: ListenerSettings { name, kind } })
     }
 
     #[staticmethod]
-    #[pyo3(signature = (name, bind, rules, *, framing="mbap", listen_only=false))]
     fn udp(
         name: String,
         bind: &str,
         rules: Vec<PyRef<'_, Rule>>,
-        framing: &str,
-        listen_only: bool,
+        options: DatagramOptions,
     ) -> PyResult<Listener> {
         let framings = [("mbap", DatagramFraming::Mbap), ("rtu", DatagramFraming::Rtu)];
         let udp = UdpSettings {
             bind: address(bind)?,
-            framing: word("framing", framing, &framings)?,
+            framing: word("framing", &options.framing, &framings)?,
             rules: cores(&rules),
-            listen_only,
+            units: UnitSettings { listen_only: options.listen_only, event_log: options.event_log },
         };
         Ok(Listener { core: ListenerSettings { name, kind: ListenerKind::ModbusUdp(udp) } })
     }
 
     #[staticmethod]
-    #[pyo3(signature = (name, device, rule, *, mode, baud, parity, stop_bits, data_bits, silence=None, rs485=None))]
     fn serial(
         name: String,
         device: String,
         rule: PyRef<'_, Rule>,
-        mode: &str,
-        baud: i128,
-        parity: &str,
-        stop_bits: i128,
-        data_bits: i128,
-        silence: Option<f64>,
-        rs485: Option<String>,
+        options: SerialOptions,
     ) -> PyResult<Listener> {
-        let line = line(device, mode, baud, parity, stop_bits, data_bits, silence, rs485)?;
-        let kind = ListenerKind::ModbusSerial(SerialSettings { line, rule: rule.core.clone() });
+        let SerialOptions { mode, baud, parity, stop_bits, data_bits, silence, rs485, event_log } =
+            options;
+        let line = line(device, &mode, baud, &parity, stop_bits, data_bits, silence, rs485)?;
+        let units = UnitSettings { listen_only: true, event_log };
+        let rule = rule.core.clone();
+        let kind = ListenerKind::ModbusSerial(SerialSettings { line, rule, units });
         Ok(Listener { core: ListenerSettings { name, kind } })
     }
 
     #[staticmethod]
-    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", flags="strict", max_connections=256, max_connections_per_source=None, when_full="refuse", request_timeout=10.0, packets="one", idle_timeout=300.0, after_refusal="close", tls=None, max_handshakes=256))]
     fn raw_ingest(
         name: String,
         bind: &str,
         rules: Vec<PyRef<'_, RawRule>>,
-        format: &str,
-        crc: &str,
-        flags: &str,
-        max_connections: i128,
-        max_connections_per_source: Option<i128>,
-        when_full: &str,
-        request_timeout: f64,
-        packets: &str,
-        idle_timeout: f64,
-        after_refusal: &str,
-        tls: Option<PyRef<'_, ServerTls>>,
-        max_handshakes: i128,
+        options: RawIngestOptions<'_>,
     ) -> PyResult<Listener> {
-        let idle = time_to_wait("idle_timeout", idle_timeout)?;
+        let idle = match seconds("idle_timeout", options.idle_timeout)? {
+            Duration::ZERO => UNLIMITED,
+            idle => idle,
+        };
         let refusals = [("close", AfterRefusal::Close), ("continue", AfterRefusal::Continue)];
-        let after_refusal = word("after_refusal", after_refusal, &refusals)?;
+        let after_refusal = word("after_refusal", &options.after_refusal, &refusals)?;
         let many = PacketsPerConnection::Many { idle, after_refusal };
-        let packets =
-            word("packets", packets, &[("one", PacketsPerConnection::One), ("many", many)])?;
-        let required = word("crc", crc, &[("required", true), ("none", false)])?;
-        let formats = [("v1", Format::V1), ("crc", Format::Crc { required })];
-        let limits = limits(max_connections, max_connections_per_source, when_full)?;
+        let packets = [("one", PacketsPerConnection::One), ("many", many)];
+        let flags = [("strict", Flags::Strict), ("ignore", Flags::Ignore)];
+        let limits = limits(
+            options.max_connections,
+            options.max_connections_per_source,
+            &options.when_full,
+        )?;
         let kind = ListenerKind::RawIngest(RawSettings {
             bind: address(bind)?,
-            format: word("format", format, &formats)?,
-            flags: word("flags", flags, &[("strict", Flags::Strict), ("ignore", Flags::Ignore)])?,
+            format: packet_format(&options.format, &options.crc)?,
+            flags: word("flags", &options.flags, &flags)?,
             rules: rules.iter().map(|rule| rule.core.clone()).collect(),
-            limits: secure_limits(limits, tls.is_some(), max_handshakes)?,
-            request_timeout: time_to_wait("request_timeout", request_timeout)?,
-            packets,
-            tls: tls.map(|tls| tls.of_listener()).transpose()?,
+            limits: secure_limits(limits, options.tls.is_some(), options.max_handshakes)?,
+            request_timeout: time_to_wait("request_timeout", options.request_timeout)?,
+            packets: word("packets", &options.packets, &packets)?,
+            tls: options.tls.map(|tls| tls.of(Protocol::Modbus)).transpose()?,
         });
         Ok(Listener { core: ListenerSettings { name, kind } })
     }
@@ -286,6 +354,13 @@ fn functions(only: Option<Vec<i128>>, deny: Option<Vec<i128>>) -> PyResult<Funct
 fn ranges(given: Option<Vec<Range>>) -> PyResult<Option<Vec<Items>>> {
     let items = |(area, address, count): Range| Ok(Items { area: named(&area)?, address, count });
     given.map(|given| given.into_iter().map(items).collect()).transpose()
+}
+
+/// Eight bits, from an address of an area of bits.
+fn bits(area: &str, address: i128) -> PyResult<(Area, u16)> {
+    let area =
+        word("area", area, &[Area::Coils, Area::DiscreteInputs].map(|area| (area.name(), area)))?;
+    Ok((area, within("address", address, 0..=65_528)? as u16))
 }
 
 fn cores(rules: &[PyRef<'_, Rule>]) -> Vec<CoreRule> {
@@ -328,8 +403,11 @@ pub(crate) fn limits(
 fn secure_limits(
     limits: ConnectionLimits,
     has_tls: bool,
-    max_handshakes: i128,
+    max_handshakes: Option<i128>,
 ) -> PyResult<ConnectionLimits> {
-    let most = within("max_handshakes", max_handshakes, 1..=65_535)?;
-    Ok(ConnectionLimits { max_handshakes: has_tls.then_some(most), ..limits })
+    let most = max_handshakes.map(|most| within("max_handshakes", most, 1..=65_535)).transpose()?;
+    if has_tls && most.is_none() {
+        return Err(PyValueError::new_err("max_handshakes is None, with tls it must be a number"));
+    }
+    Ok(ConnectionLimits { max_handshakes: most.filter(|_| has_tls), ..limits })
 }

@@ -42,46 +42,47 @@ pub struct Log {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Log {
     #[new]
-    #[pyo3(signature = (name, node, servers, memories, *, replicas=1, write_timeout=1.0, when_behind="serve", max_lag=5.0, snapshot_steps=100_000, snapshot_seconds=600.0, digest_steps=10_000, queue=4096, cut_off=30.0, kept_file=None, connect_timeout=2.0, user=None, password_file=None, token_file=None, credentials_file=None, tls=None))]
+    #[pyo3(signature = (name, node, servers, memories, *, replicas=None, write_timeout=None, when_behind=None, max_lag=None, digest_steps=None, cut_off=None, kept_file=None, user=None, password_file=None, token_file=None, credentials_file=None, tls=None))]
     fn new(
         name: &str,
         node: &str,
         servers: Vec<String>,
         memories: Memories<'_>,
-        replicas: i128,
-        write_timeout: f64,
-        when_behind: &str,
-        max_lag: f64,
-        snapshot_steps: i128,
-        snapshot_seconds: f64,
-        digest_steps: i128,
-        queue: i128,
-        cut_off: f64,
+        replicas: Option<i128>,
+        write_timeout: Option<f64>,
+        when_behind: Option<&str>,
+        max_lag: Option<f64>,
+        digest_steps: Option<i128>,
+        cut_off: Option<f64>,
         kept_file: Option<String>,
-        connect_timeout: f64,
         user: Option<String>,
         password_file: Option<PathBuf>,
         token_file: Option<PathBuf>,
         credentials_file: Option<PathBuf>,
         tls: Option<TlsFiles>,
     ) -> PyResult<Log> {
-        let most = u32::MAX as usize;
         let mut settings = Settings::new(name, node, servers);
-        settings.replicas = within("replicas", replicas, 1..=5)?;
-        settings.write_timeout = seconds("write_timeout", write_timeout)?;
-        settings.when_behind = word(
-            "when_behind",
-            when_behind,
-            &[("serve", WhenBehind::Serve), ("refuse", WhenBehind::Refuse)],
-        )?;
-        settings.max_lag = seconds("max_lag", max_lag)?;
-        settings.snapshot_steps = within("snapshot_steps", snapshot_steps, 1..=most)? as u64;
-        settings.snapshot_after = seconds("snapshot_seconds", snapshot_seconds)?;
-        settings.digest_every = within("digest_steps", digest_steps, 1..=most)? as u64;
-        settings.queue = within("queue", queue, 1..=1_000_000)?;
-        settings.max_cut_off = seconds("cut_off", cut_off)?;
+        if let Some(replicas) = replicas {
+            settings.replicas = within("replicas", replicas, 1..=5)?;
+        }
+        if let Some(write_timeout) = write_timeout {
+            settings.write_timeout = seconds("write_timeout", write_timeout)?;
+        }
+        if let Some(when_behind) = when_behind {
+            let allowed = [("serve", WhenBehind::Serve), ("refuse", WhenBehind::Refuse)];
+            settings.when_behind = word("when_behind", when_behind, &allowed)?;
+        }
+        if let Some(max_lag) = max_lag {
+            settings.max_lag = seconds("max_lag", max_lag)?;
+        }
+        if let Some(digest_steps) = digest_steps {
+            let most = u32::MAX as usize;
+            settings.digest_every = within("digest_steps", digest_steps, 1..=most)? as u64;
+        }
+        if let Some(cut_off) = cut_off {
+            settings.max_cut_off = seconds("cut_off", cut_off)?;
+        }
         settings.memory_file = kept_file;
-        settings.servers.connect_timeout = seconds("connect_timeout", connect_timeout)?;
         settings.servers.login = login(user, password_file, token_file, credentials_file)?;
         settings.servers.tls = tls.map(tls_of).transpose()?;
         let core = Core::new(settings, named(&memories)).map_err(raised)?;
@@ -146,9 +147,9 @@ impl Log {
         shown.set_item("digest", digest)?;
         shown.set_item("snapshot", status.snapshot)?;
         let nodes = PyList::empty(py);
-        for node in status.nodes {
+        for (name, node) in status.nodes {
             let one = PyDict::new(py);
-            one.set_item("name", node.name)?;
+            one.set_item("name", name)?;
             one.set_item("sequence", node.sequence)?;
             one.set_item("time_ns", node.stored)?;
             one.set_item("digest", node.digest)?;
@@ -186,7 +187,7 @@ pub struct LogFollower {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl LogFollower {
     #[new]
-    #[pyo3(signature = (name, servers, memories, *, sequence=None, time_ns=None, follow=false, timeout=10.0, connect_timeout=2.0, user=None, password_file=None, token_file=None, credentials_file=None, tls=None))]
+    #[pyo3(signature = (name, servers, memories, *, sequence=None, time_ns=None, follow=false, timeout=10.0, connect_timeout=None, user=None, password_file=None, token_file=None, credentials_file=None, tls=None))]
     fn new(
         py: Python<'_>,
         name: &str,
@@ -196,7 +197,7 @@ impl LogFollower {
         time_ns: Option<i64>,
         follow: bool,
         timeout: f64,
-        connect_timeout: f64,
+        connect_timeout: Option<f64>,
         user: Option<String>,
         password_file: Option<PathBuf>,
         token_file: Option<PathBuf>,
@@ -214,7 +215,9 @@ impl LogFollower {
             }
         };
         let mut settings = Settings::new(name, "replay", servers);
-        settings.servers.connect_timeout = seconds("connect_timeout", connect_timeout)?;
+        if let Some(connect_timeout) = connect_timeout {
+            settings.servers.connect_timeout = seconds("connect_timeout", connect_timeout)?;
+        }
         settings.servers.login = login(user, password_file, token_file, credentials_file)?;
         settings.servers.tls = tls.map(tls_of).transpose()?;
         let timeout = seconds("timeout", timeout)?;

@@ -237,7 +237,9 @@ impl Memory {
             return Err(PyTypeError::new_err(message));
         }
         let queue = WriteQueue { core: py.detach(|| self.core.observe(clients_only)) };
-        py.import("holdfast.write_callback")?.getattr("WriteCallback")?.call1((queue, callback))
+        py.import("holdfast.server.write_callback")?
+            .getattr("WriteCallback")?
+            .call1((queue, callback))
     }
 
     fn __repr__(&self, py: Python<'_>) -> PyResult<String> {
@@ -281,14 +283,8 @@ impl Range {
             Range::new(memory, area, address, items.len() as i128).map_err(|error| {
                 if items.is_empty() { PyValueError::new_err("values are empty") } else { error }
             })?;
-        if range.area.is_bits() {
-            for (index, bit) in items.iter().enumerate() {
-                range.bytes[index / 8] |= (*bit as u8) << (index % 8);
-            }
-        } else {
-            for (pair, register) in range.bytes.chunks_exact_mut(2).zip(&items) {
-                pair.copy_from_slice(&register.to_be_bytes());
-            }
+        for (index, item) in items.into_iter().enumerate() {
+            put(range.area, &mut range.bytes, index, item);
         }
         Ok(range)
     }
@@ -367,10 +363,33 @@ pub fn integer(value: &Bound<'_, PyAny>) -> PyResult<i128> {
     }
 }
 
+/// An argument that is an [`integer`].
+#[derive(Clone, Copy)]
+pub struct Integer(pub i128);
+
+impl<'py> FromPyObject<'_, 'py> for Integer {
+    type Error = PyErr;
+
+    fn extract(value: Borrowed<'_, 'py, PyAny>) -> PyResult<Integer> {
+        integer(&value).map(Integer)
+    }
+}
+
+/// Puts an item into the bytes of a range, whose bits are 0 so far.
+pub fn put(area: Area, bytes: &mut [u8], index: usize, item: u16) {
+    if area.is_bits() {
+        bytes[index / 8] |= (item as u8) << (index % 8);
+    } else {
+        bytes[index * 2..index * 2 + 2].copy_from_slice(&item.to_be_bytes());
+    }
+}
+
 /// Extracts and checks the integers of a Python iterable.
-pub fn numbers(area: Area, values: &Bound<'_, PyAny>) -> PyResult<Vec<u16>> {
+pub fn numbers<'py>(area: Area, values: &Bound<'py, PyAny>) -> PyResult<Vec<u16>> {
+    let whole = |value: &Bound<'py, PyAny>| value.repr().map(Bound::into_any);
     if let Ok(list) = values.cast_exact::<PyList>() {
-        return list.iter().enumerate().map(|(index, value)| number(area, index, &value)).collect();
+        let items = list.iter().enumerate();
+        return items.map(|(index, value)| number(area, index, &value, whole)).collect();
     }
     if is_text(values) {
         let found = values.get_type().name()?;
@@ -380,7 +399,7 @@ pub fn numbers(area: Area, values: &Bound<'_, PyAny>) -> PyResult<Vec<u16>> {
     }
     let mut numbers = Vec::with_capacity(values.len().unwrap_or(0).min(Span::MAX_SIZE as usize));
     for (index, value) in values.try_iter()?.enumerate() {
-        numbers.push(number(area, index, &value?)?);
+        numbers.push(number(area, index, &value?, whole)?);
     }
     Ok(numbers)
 }
@@ -426,10 +445,16 @@ fn is_numpy_bool(value: &Bound<'_, PyAny>) -> bool {
     is(kind.name(), &["bool", "bool_"]) && is(kind.module(), &["numpy"])
 }
 
-fn number(area: Area, index: usize, value: &Bound<'_, PyAny>) -> PyResult<u16> {
+/// Extracts and checks one value of many. Its error shows the value as `shown` does.
+pub fn number<'py>(
+    area: Area,
+    index: usize,
+    value: &Bound<'py, PyAny>,
+    shown: impl Fn(&Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>>,
+) -> PyResult<u16> {
     item(area, value).or_else(|unfit| {
         let allowed = if area.is_bits() { "0, 1, False, True" } else { "integers 0 to 65535" };
-        let message = format!("values[{index}] is {}, allowed: {allowed}", value.repr()?);
+        let message = format!("values[{index}] is {}, allowed: {allowed}", shown(value)?);
         Err(match unfit {
             Unfit::Value => PyValueError::new_err(message),
             Unfit::Type => PyTypeError::new_err(message),

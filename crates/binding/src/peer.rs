@@ -1,4 +1,4 @@
-//! Shows peers to the logs of Python.
+//! Peers as fields of events and audit lines.
 
 use std::net::SocketAddr;
 
@@ -12,7 +12,7 @@ pub fn text(peer: SocketAddr) -> String {
 }
 
 /// Adds the address of a peer to a dictionary, and what its certificate says.
-pub fn tell(fields: &Bound<'_, PyDict>, peer: &Peer) -> PyResult<()> {
+pub fn add_to(fields: &Bound<'_, PyDict>, peer: &Peer) -> PyResult<()> {
     fields.set_item("peer", text(peer.address))?;
     if let Some(certificate) = &peer.certificate {
         fields.set_item("role", &certificate.role)?;

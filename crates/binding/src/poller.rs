@@ -10,13 +10,12 @@ use holdfast_engine::poller::{
     self, Batch, BlockSettings, Destination, DeviceSettings, DeviceState, ForwardSettings, Poll,
     Polled, Poller as Core, PollerError, ReadSettings, StatusSettings,
 };
-use holdfast_protocol::raw_ingest::Format;
 use holdfast_runtime::Retry;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
-use crate::arguments::{byte, seconds, within, word};
+use crate::arguments::{byte, packet_format, seconds, within};
 use crate::client::{Endpoint, Request};
 use crate::fence::Fence;
 use crate::heartbeat;
@@ -309,9 +308,9 @@ fn destination((memory, area, address): Place<'_>) -> PyResult<Destination> {
 
 /// Writes the status block of a device that is not polled.
 #[pyfunction]
-pub fn tell_disabled(memory: PyRef<'_, Memory>, block: StatusBlock) -> PyResult<()> {
+pub fn write_disabled_status(memory: PyRef<'_, Memory>, block: StatusBlock) -> PyResult<()> {
     let refused = |_| PyValueError::new_err("the status block does not fit into its memory");
-    status(&memory, block)?.tell_disabled().map_err(refused)
+    status(&memory, block)?.write_disabled_status().map_err(refused)
 }
 
 fn status(memory: &Memory, of: StatusBlock) -> PyResult<StatusSettings> {
@@ -327,9 +326,7 @@ fn target((receiver, forward): (PyRef<'_, Endpoint>, Forward)) -> PyResult<Forwa
     let HostPlace::Tcp { host, port, tls } = receiver.core.place.clone() else {
         return Err(PyValueError::new_err("the endpoint of a receiver is not one of TCP or TLS"));
     };
-    let required = word("crc", &crc, &[("required", true), ("none", false)])?;
-    let formats = [("v1", Format::V1), ("crc", Format::Crc { required })];
-    let format = word("format", &format, &formats)?;
+    let format = packet_format(&format, &crc)?;
     let timeout = seconds("timeout", timeout)?;
     let offsets = offsets.into_iter().map(|(area, offset)| Ok((named(&area)?, offset)));
     let offsets = offsets.collect::<PyResult<_>>()?;
@@ -395,31 +392,18 @@ fn reported<'py>(py: Python<'py>, poll: &Poll) -> PyResult<PollResult<'py>> {
 }
 
 fn state<'py>(py: Python<'py>, state: &DeviceState) -> PyResult<Bound<'py, PyDict>> {
-    let told = PyDict::new(py);
-    let counters = &state.counters;
-    told.set_item("health", state.health().name())?;
-    told.set_item("last_error", state.last_error())?;
-    told.set_item("seconds_in_error", state.in_error().as_secs_f64())?;
-    told.set_item("age", state.age().map(|age| age.as_secs_f64()))?;
-    told.set_item("failures", state.failures())?;
-    told.set_item("round_trip", state.round_trip().as_secs_f64())?;
-    told.set_item("requests_per_poll", state.requests_per_poll())?;
-    told.set_item("plan_error", state.plan_error())?;
-    for (key, counter) in [
-        ("polls", &counters.polls),
-        ("missed", &counters.missed),
-        ("unplanned", &counters.unplanned),
-        ("requests", &counters.requests),
-        ("valid", &counters.valid),
-        ("exceptions", &counters.exceptions),
-        ("timeouts", &counters.timeouts),
-        ("transport_errors", &counters.transport_errors),
-        ("reads", &counters.reads),
-        ("values", &counters.values),
-        ("unstored", &counters.unstored),
-    ] {
-        told.set_item(key, counter.get())?;
+    let shown = PyDict::new(py);
+    shown.set_item("health", state.health().name())?;
+    shown.set_item("last_error", state.last_error())?;
+    shown.set_item("seconds_in_error", state.in_error().as_secs_f64())?;
+    shown.set_item("age", state.age().map(|age| age.as_secs_f64()))?;
+    shown.set_item("failures", state.failures())?;
+    shown.set_item("round_trip", state.round_trip().as_secs_f64())?;
+    shown.set_item("requests_per_poll", state.requests_per_poll())?;
+    shown.set_item("plan_error", state.plan_error())?;
+    for (key, count) in state.counters.by_name() {
+        shown.set_item(key, count)?;
     }
-    link::tell_strays(&told, Some(&state.strays()))?;
-    Ok(told)
+    link::add_strays(&shown, Some(&state.strays()))?;
+    Ok(shown)
 }

@@ -85,26 +85,15 @@ pub fn https_server_tls(
 }
 
 impl ServerTls {
-    /// The settings for a server of HTTP.
-    pub(crate) fn of_https(&self) -> PyResult<Arc<CoreServerTls>> {
-        match self.core.protocol() {
-            Protocol::Http => Ok(Arc::clone(&self.core)),
-            Protocol::Modbus => {
-                let message = "tls is that of a listener, allowed: https_server_tls(cert_file=…)";
-                Err(PyValueError::new_err(message))
-            }
+    /// The settings, if they are for servers of this protocol.
+    pub(crate) fn of(&self, protocol: Protocol) -> PyResult<Arc<CoreServerTls>> {
+        if self.core.protocol() == protocol {
+            return Ok(Arc::clone(&self.core));
         }
-    }
-
-    /// The settings for a listener of Modbus or Raw Ingest.
-    pub(crate) fn of_listener(&self) -> PyResult<Arc<CoreServerTls>> {
-        match self.core.protocol() {
-            Protocol::Modbus => Ok(Arc::clone(&self.core)),
-            Protocol::Http => {
-                let message = "tls is that of an HTTPS server, allowed: ServerTls(cert_file=…)";
-                Err(PyValueError::new_err(message))
-            }
-        }
+        Err(PyValueError::new_err(match protocol {
+            Protocol::Http => "tls is that of a listener, allowed: https_server_tls(cert_file=…)",
+            Protocol::Modbus => "tls is that of an HTTPS server, allowed: ServerTls(cert_file=…)",
+        }))
     }
 }
 

@@ -1,10 +1,10 @@
-//! Counters that only increase, and gauges.
+//! Counters.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-/// A counter that only increases.
+/// A counter that only increases, except where something is taken back.
 #[derive(Debug, Default)]
 pub struct Counter(AtomicU64);
 
@@ -23,20 +23,6 @@ impl Counter {
         self.0.fetch_add(count, Ordering::Relaxed);
     }
 
-    pub fn get(&self) -> u64 {
-        self.0.load(Ordering::Relaxed)
-    }
-}
-
-/// How much of something there is now.
-#[derive(Debug, Default)]
-pub struct Gauge(AtomicU64);
-
-impl Gauge {
-    pub fn add(&self, count: u64) {
-        self.0.fetch_add(count, Ordering::Relaxed);
-    }
-
     pub fn subtract(&self, count: u64) {
         self.0.fetch_sub(count, Ordering::Relaxed);
     }
@@ -45,6 +31,33 @@ impl Gauge {
         self.0.load(Ordering::Relaxed)
     }
 }
+
+/// Makes a struct of counters with a list of their names. Behind the semicolon are fields that the
+/// list leaves out.
+macro_rules! counters {
+    (
+        $(#[$meta:meta])*
+        pub struct $name:ident {
+            $($(#[$about:meta])* $counter:ident,)*
+            $(; $($(#[$other_about:meta])* $access:vis $other:ident: $type:ty,)*)?
+        }
+    ) => {
+        $(#[$meta])*
+        #[derive(Debug, Default)]
+        pub struct $name {
+            $($(#[$about])* pub $counter: $crate::counter::Counter,)*
+            $($($(#[$other_about])* $access $other: $type,)*)?
+        }
+
+        impl $name {
+            /// The names of the counters, each with its count.
+            pub fn by_name(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
+                [$((stringify!($counter), self.$counter.get())),*].into_iter()
+            }
+        }
+    };
+}
+pub(crate) use counters;
 
 /// A counter for each reason. The reasons are words of the program, so there are few.
 #[derive(Debug, Default)]

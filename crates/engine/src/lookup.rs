@@ -173,6 +173,18 @@ fn lookups() -> MutexGuard<'static, Lookups> {
     LOOKUPS.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// Begins a lookup that has no result before the sender is dropped.
+#[cfg(test)]
+pub(crate) fn hold(host: &str) -> std::sync::mpsc::Sender<()> {
+    let (sender, held) = std::sync::mpsc::channel();
+    let resolve = move |_: &str| {
+        let _ = held.recv();
+        Ok(Vec::new())
+    };
+    look_up(host, Box::new(drop), resolve);
+    sender
+}
+
 #[cfg(test)]
 mod tests {
     use std::sync::mpsc::channel;

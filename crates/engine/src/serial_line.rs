@@ -6,8 +6,9 @@ use std::time::Duration;
 use serial2_tokio::rs4xx::Rs485Config;
 use serial2_tokio::{CharSize, FlowControl, Parity, SerialPort, Settings, StopBits};
 
-/// Above 19,200 baud, the silence between RTU frames is constant (Serial Line V1.02, 2.5.1.1).
-const FAST: (u32, Duration) = (19_200, Duration::from_micros(1_750));
+/// Above this rate, the silence between RTU frames is constant (Serial Line V1.02, 2.5.1.1).
+const FAST_BAUD: u32 = 19_200;
+const SILENCE_WHEN_FAST: Duration = Duration::from_micros(1_750);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LineParity {
@@ -103,10 +104,9 @@ impl SerialLine {
 
     /// The silence that ends an RTU frame: 3.5 characters by default.
     pub(crate) fn silence(&self) -> Duration {
-        let (fast, shortest) = FAST;
         match self.mode {
             LineMode::Rtu { silence: Some(silence) } => silence,
-            _ if self.baud > fast => shortest,
+            _ if self.baud > FAST_BAUD => SILENCE_WHEN_FAST,
             _ => self.character().mul_f64(3.5),
         }
     }
@@ -137,4 +137,59 @@ fn set_mode(_: &serial2::SerialPort, _: Rs485Config) -> io::Result<()> {
 #[cfg(not(target_os = "linux"))]
 fn set_mode_of_tokio(_: &SerialPort, _: Rs485Config) -> io::Result<()> {
     Err(io::ErrorKind::Unsupported.into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(baud: u32, parity: LineParity, stop_bits: u8) -> SerialLine {
+        SerialLine {
+            device: String::new(),
+            baud,
+            parity,
+            stop_bits,
+            data_bits: 8,
+            mode: LineMode::Rtu { silence: None },
+            direction: LineDirection::Adapter,
+        }
+    }
+
+    #[test]
+    fn the_silence_between_frames_is_that_of_the_standard() {
+        let micros = |baud, parity, stop| line(baud, parity, stop).silence().as_micros();
+        // 3.5 characters of 11 bits, and of 10 bits.
+        assert_eq!(micros(1_200, LineParity::Even, 1), 32_083);
+        assert_eq!(micros(9_600, LineParity::Odd, 1), 4_010);
+        assert_eq!(micros(9_600, LineParity::None, 2), 4_010);
+        assert_eq!(micros(9_600, LineParity::None, 1), 3_645);
+        assert_eq!(micros(19_200, LineParity::Even, 1), 2_005);
+        for fast in [19_201, 38_400, 115_200] {
+            assert_eq!(micros(fast, LineParity::Even, 1), 1_750);
+        }
+    }
+
+    /// A pseudo-terminal has settings to start from, although it would not take these.
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn a_line_has_the_characters_of_its_settings() {
+        let port = serial2::SerialPort::open("/dev/ptmx", serial2::KeepSettings).unwrap();
+        let parities = [
+            (LineParity::None, Parity::None),
+            (LineParity::Even, Parity::Even),
+            (LineParity::Odd, Parity::Odd),
+        ];
+        for (parity, set) in parities {
+            for (stop_bits, stops) in [(1, StopBits::One), (2, StopBits::Two)] {
+                for (data_bits, size) in [(7, CharSize::Bits7), (8, CharSize::Bits8)] {
+                    let line = SerialLine { data_bits, ..line(9_600, parity, stop_bits) };
+                    let settings = line.set(port.get_configuration().unwrap()).unwrap();
+                    assert_eq!(settings.get_parity().unwrap(), set);
+                    assert_eq!(settings.get_stop_bits().unwrap(), stops);
+                    assert_eq!(settings.get_char_size().unwrap(), size);
+                    assert_eq!(settings.get_baud_rate().unwrap(), 9_600);
+                }
+            }
+        }
+    }
 }

@@ -7,10 +7,11 @@ use std::net::{TcpStream, UdpSocket};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 
-use holdfast_engine::server::audit::Unrecordable;
-use holdfast_engine::server::event::Verbosity;
-use holdfast_engine::server::functions::{AccessMode, Functions};
-use holdfast_engine::server::policy::Rule;
+use holdfast_engine::server::reports::audit::Unrecordable;
+use holdfast_engine::server::reports::event::Verbosity;
+use holdfast_engine::server::requests::unit_server::UnitSettings;
+use holdfast_engine::server::rights::functions::{AccessMode, Functions};
+use holdfast_engine::server::rights::policy::Rule;
 use holdfast_engine::server::{
     AfterRefusal, ConnectionLimits, DatagramFraming, Engine, Flags, ListenerKind, ListenerSettings,
     Listening, PacketsPerConnection, RawRule, RawSettings, Settings, StreamFraming, StreamSettings,
@@ -103,7 +104,8 @@ impl Setup {
             idle_timeout: None,
             request_timeout: TIMEOUT,
             frame_timeout: None,
-            listen_only: false,
+            units: UnitSettings::default(),
+            keepalive: 60,
             tls: None,
             raw_ingest: None,
         };
@@ -111,7 +113,7 @@ impl Setup {
             bind,
             framing: DatagramFraming::Mbap,
             rules: vec![rule],
-            listen_only: false,
+            units: UnitSettings::default(),
         };
         let raw = |packets| RawSettings {
             bind,

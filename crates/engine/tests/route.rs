@@ -12,9 +12,10 @@ use std::time::{Duration, Instant};
 use holdfast_engine::client::Place;
 use holdfast_engine::link::{InFlight, LinkSettings, Route, SharedLink};
 use holdfast_engine::poller::Poller;
-use holdfast_engine::server::event::Verbosity;
-use holdfast_engine::server::functions::{AccessMode, Functions};
-use holdfast_engine::server::policy::{Elsewhere, Rule};
+use holdfast_engine::server::reports::event::Verbosity;
+use holdfast_engine::server::requests::unit_server::UnitSettings;
+use holdfast_engine::server::rights::functions::{AccessMode, Functions};
+use holdfast_engine::server::rights::policy::{Elsewhere, Rule};
 use holdfast_engine::server::{
     ConnectionLimits, Engine, ListenerKind, ListenerSettings, Listening, Settings, StreamFraming,
     StreamSettings, WhenFull,
@@ -130,7 +131,8 @@ impl Setup {
             idle_timeout: None,
             request_timeout: TIMEOUT,
             frame_timeout: None,
-            listen_only: false,
+            units: UnitSettings::default(),
+            keepalive: 60,
             tls: None,
             raw_ingest: None,
         };

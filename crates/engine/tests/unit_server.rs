@@ -4,14 +4,15 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Weak};
 
 use holdfast_engine::items::Items;
-use holdfast_engine::server::counters::Bus;
-use holdfast_engine::server::functions::{AccessMode, Functions};
-use holdfast_engine::server::identity::Identity;
-use holdfast_engine::server::policy::{Narrowed, PeerRights, Rule};
-use holdfast_engine::server::ranges::Ranges;
-use holdfast_engine::server::unit_server::UnitServer;
+use holdfast_engine::server::reports::counters::Bus;
+use holdfast_engine::server::requests::identity::Identity;
+use holdfast_engine::server::requests::unit_server::{UnitServer, UnitSettings};
+use holdfast_engine::server::rights::functions::{AccessMode, Functions};
+use holdfast_engine::server::rights::policy::{Narrowed, PeerRights, Rule};
+use holdfast_engine::server::rights::ranges::Ranges;
 use holdfast_memory::{
-    Area, CarriedOut, Done, Gate, GateMode, Journal, Layout, Memory, Refusal, Refused, Span, Step,
+    Access, Area, CarriedOut, Done, Gate, GateMode, Journal, Layout, Memory, Refusal, Refused,
+    Span, Step, Write,
 };
 use holdfast_protocol::pdu;
 
@@ -53,6 +54,7 @@ fn within(memory: &Arc<Memory>, read: &[(u16, u32)], write: &[(u16, u32)]) -> Pe
         access: AccessMode::ReadWrite,
         functions: Functions::Except(vec![4]),
         ranges: Ranges::new(items(read), items(write)),
+        exception_status: None,
     };
     PeerRights::new(&Rule {
         sources: Vec::new(),
@@ -71,7 +73,10 @@ fn unit_server() -> UnitServer {
 
 fn unit_server_with(listen_only: bool) -> UnitServer {
     let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
-    UnitServer::new(Identity::new(&objects, &[]).unwrap(), listen_only)
+    UnitServer::new(
+        Identity::new(&objects, &[]).unwrap(),
+        UnitSettings { listen_only, ..UnitSettings::default() },
+    )
 }
 
 fn ask(
@@ -143,6 +148,7 @@ fn a_broadcast_reaches_a_memory_by_the_unit_that_may_write() {
         access: AccessMode::ReadOnly,
         functions: Functions::All,
         ranges: Ranges::default(),
+        exception_status: None,
     };
     let rights = PeerRights::new(&Rule {
         sources: Vec::new(),
@@ -306,4 +312,139 @@ fn a_broadcast_waits_for_journals_and_is_recorded_with_their_sequences() {
     let read_only = rights(&[(7, &kept)], AccessMode::ReadOnly);
     let refused = (vec![WRITE[0] | 0x80, 1], None, Some(()));
     assert_eq!(broadcast_if(&unit_server, &read_only, WRITE, Some(())), [refused]);
+}
+
+/// Unit 7 has function 7 with coils 4 to 11, unit 8 does not have it.
+fn with_status(memory: &Arc<Memory>, functions: Functions, read: Option<Vec<Items>>) -> PeerRights {
+    let own = Narrowed {
+        access: AccessMode::ReadOnly,
+        functions,
+        ranges: Ranges::new(read, None),
+        exception_status: Some((Area::Coils, 4)),
+    };
+    PeerRights::new(&Rule {
+        sources: Vec::new(),
+        roles: None,
+        units: vec![(7, Arc::clone(memory)), (8, Arc::clone(memory))],
+        elsewhere: Vec::new(),
+        access: AccessMode::ReadOnly,
+        functions: Functions::All,
+        narrowed: vec![(7, own)],
+    })
+}
+
+fn coils(count: u32, seal: Option<Gate>) -> Arc<Memory> {
+    let layout = Layout::default().with(Area::Coils, Span::new(0, count).unwrap());
+    Arc::new(Memory::new(layout, seal).unwrap())
+}
+
+const STATUS: &[u8] = &[7];
+const EVENT_LOG: &[u8] = &[12];
+
+#[test]
+fn function_7_reads_eight_bits_where_a_unit_has_them() {
+    let (memory, unit_server) = (coils(16, None), unit_server());
+    let bits = Write { area: Area::Coils, address: 0, count: 12, bytes: &[0b1101_1111, 0b1010] };
+    memory.write(Access::Ingest, bits).unwrap();
+    let rights = with_status(&memory, Functions::All, None);
+    assert_eq!(ask(&unit_server, &rights, 7, STATUS).unwrap(), [7, 0b1010_1101]);
+    assert_eq!(ask(&unit_server, &rights, 7, &[7, 0]).unwrap(), [0x87, 3]);
+    assert_eq!(ask(&unit_server, &rights, 8, STATUS).unwrap(), [0x87, 1]);
+    assert_eq!(ask(&unit_server, &rights, 9, STATUS).unwrap(), [0x87, 0x0B]);
+}
+
+#[test]
+fn function_7_has_the_checks_of_a_read() {
+    let unit_server = unit_server();
+    let all = coils(16, None);
+    let items = |address, count| Some(vec![Items { area: Area::Coils, address, count }]);
+    for (memory, functions, read, reply) in [
+        (&all, Functions::Except(vec![7]), None, [0x87, 1]),
+        (&all, Functions::Only(vec![7]), items(4, 8), [7, 0]),
+        (&all, Functions::All, items(5, 8), [0x87, 2]),
+        (&coils(11, None), Functions::All, None, [0x87, 2]),
+        (
+            &coils(16, Some(Gate { area: Area::Coils, address: 0, mode: GateMode::Level })),
+            Functions::All,
+            None,
+            [0x87, 6],
+        ),
+    ] {
+        let rights = with_status(memory, functions, read);
+        assert_eq!(ask(&unit_server, &rights, 7, STATUS).unwrap(), reply);
+    }
+}
+
+#[test]
+fn a_peer_learns_nothing_of_units_by_a_function_that_it_does_not_have() {
+    let (memory, unit_server) = (coils(16, None), unit_server());
+    let plain = rights(&[(7, &memory)], AccessMode::ReadWrite);
+    for function in [STATUS, EVENT_LOG] {
+        let refused = [function[0] | 0x80, 1];
+        assert_eq!(ask(&unit_server, &plain, 7, function).unwrap(), refused);
+        assert_eq!(ask(&unit_server, &plain, 9, function).unwrap(), refused);
+    }
+}
+
+fn logging() -> UnitServer {
+    let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
+    let settings = UnitSettings { listen_only: true, event_log: true };
+    UnitServer::new(Identity::new(&objects, &[]).unwrap(), settings)
+}
+
+/// Event count, message count and the events of function 12, without the request for them.
+fn event_log(unit_server: &UnitServer, rights: &PeerRights) -> (u8, u8, Vec<u8>) {
+    let reply = ask(unit_server, rights, 8, EVENT_LOG).unwrap();
+    let [12, count, 0, 0, 0, events, 0, messages, 0x80, ref log @ ..] = reply[..] else {
+        panic!("{reply:?}")
+    };
+    assert_eq!(usize::from(count), reply.len() - 2);
+    (events, messages, log.to_vec())
+}
+
+#[test]
+fn function_12_has_what_came_and_what_went() {
+    let (memory, unit_server) = (memory(1), logging());
+    let rights = rights(&[(7, &memory), (8, &memory)], AccessMode::ReadWrite);
+    assert_eq!(event_log(&unit_server, &rights), (0, 1, vec![]));
+    ask(&unit_server, &rights, 7, READ);
+    ask(&unit_server, &rights, 7, &[3, 0, 9, 0, 1]);
+    broadcast(&unit_server, &rights, WRITE);
+    let expected = vec![0x40, 0xC0, 0x41, 0x80, 0x40, 0x80, 0x40, 0x80];
+    assert_eq!(event_log(&unit_server, &rights), (3, 5, expected));
+    assert_eq!(ask(&unit_server, &rights, 8, &[12, 0]).unwrap(), [0x8C, 3]);
+}
+
+#[test]
+fn function_12_has_when_a_unit_became_silent_and_when_it_was_restarted() {
+    let (memory, unit_server) = (memory(1), logging());
+    let rights = rights(&[(7, &memory), (8, &memory)], AccessMode::ReadWrite);
+    ask(&unit_server, &rights, 7, LISTEN_ONLY);
+    ask(&unit_server, &rights, 7, READ);
+    ask(&unit_server, &rights, 7, RESTART);
+    let events = vec![0x00, 0x60, 0xA0, 0x60, 0xA0, 0x60, 0x04, 0x80];
+    assert_eq!(event_log(&unit_server, &rights).2, events);
+    // A restart that is refused is none.
+    ask(&unit_server, &rights, 7, &[8, 0, 1, 0, 1]);
+    assert_eq!(event_log(&unit_server, &rights).2[..3], [0x41, 0x80, 0x40]);
+    // The reply is before the restart, which forgets it.
+    ask(&unit_server, &rights, 7, &[8, 0, 1, 0xFF, 0]);
+    assert_eq!(event_log(&unit_server, &rights).2, [0x00]);
+}
+
+#[test]
+fn function_12_is_refused_where_a_rule_denies_it() {
+    let (memory, unit_server) = (memory(1), logging());
+    let rights = PeerRights::new(&Rule {
+        sources: Vec::new(),
+        roles: None,
+        units: vec![(7, Arc::clone(&memory))],
+        elsewhere: Vec::new(),
+        access: AccessMode::ReadOnly,
+        functions: Functions::Except(vec![12]),
+        narrowed: Vec::new(),
+    });
+    for unit_id in [7, 9] {
+        assert_eq!(ask(&unit_server, &rights, unit_id, EVENT_LOG).unwrap(), [0x8C, 1]);
+    }
 }

@@ -11,6 +11,9 @@ use thiserror::Error;
 /// The version that [`encode`] writes. Others are not decoded.
 pub const VERSION: u8 = 1;
 
+/// In the order of their numbers.
+const ACCESSES: [Access; 4] = [Access::Client, Access::Ingest, Access::Mirror, Access::Restore];
+
 /// Why bytes are not a step for some memories.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 pub enum DecodeError {
@@ -36,12 +39,8 @@ pub enum DecodeError {
 /// The number of bytes of a range does not match its count.
 pub fn encode(step: &Step, out: &mut Vec<u8>) {
     out.push(VERSION);
-    out.push(match step.access {
-        Access::Client => 0,
-        Access::Ingest => 1,
-        Access::Mirror => 2,
-        Access::Restore => 3,
-    });
+    let access = ACCESSES.iter().position(|access| *access == step.access);
+    out.push(access.expect("each access has a number") as u8);
     match &step.action {
         Action::Write(writes) => {
             out.push(0);
@@ -74,12 +73,7 @@ fn encode_write(write: &StepWrite, out: &mut Vec<u8>) {
 
 fn encode_place(member: u16, area: Area, address: u16, out: &mut Vec<u8>) {
     out.extend_from_slice(&member.to_le_bytes());
-    out.push(match area {
-        Area::Coils => 0,
-        Area::DiscreteInputs => 1,
-        Area::HoldingRegisters => 2,
-        Area::InputRegisters => 3,
-    });
+    out.push(area as u8);
     out.extend_from_slice(&address.to_le_bytes());
 }
 
@@ -97,13 +91,7 @@ pub fn decode(bytes: &[u8], members: &[Arc<Memory>]) -> Result<Step, DecodeError
     if version != VERSION {
         return Err(DecodeError::Version(version));
     }
-    let access = match rest.byte()? {
-        0 => Access::Client,
-        1 => Access::Ingest,
-        2 => Access::Mirror,
-        3 => Access::Restore,
-        found => return Err(DecodeError::Unknown { what: "the access", found }),
-    };
+    let access = rest.one_of(&ACCESSES, "the access")?;
     let action = match rest.byte()? {
         0 => {
             let mut writes = Vec::new();
@@ -162,6 +150,12 @@ impl<'a> Rest<'a> {
         self.array::<1>().map(|[byte]| byte)
     }
 
+    /// The value that a byte is the number of.
+    fn one_of<T: Copy>(&mut self, all: &[T], what: &'static str) -> Result<T, DecodeError> {
+        let found = self.byte()?;
+        all.get(usize::from(found)).copied().ok_or(DecodeError::Unknown { what, found })
+    }
+
     fn u16(&mut self) -> Result<u16, DecodeError> {
         self.array().map(u16::from_le_bytes)
     }
@@ -172,13 +166,7 @@ impl<'a> Rest<'a> {
 
     fn place(&mut self) -> Result<(u16, Area, u16), DecodeError> {
         let member = self.u16()?;
-        let area = match self.byte()? {
-            0 => Area::Coils,
-            1 => Area::DiscreteInputs,
-            2 => Area::HoldingRegisters,
-            3 => Area::InputRegisters,
-            found => return Err(DecodeError::Unknown { what: "the area", found }),
-        };
+        let area = self.one_of(&Area::ALL, "the area")?;
         Ok((member, area, self.u16()?))
     }
 

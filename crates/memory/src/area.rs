@@ -39,6 +39,19 @@ impl Area {
         if self.is_bits() { count.div_ceil(8) } else { count * 2 }
     }
 
+    /// Copies `count` items from item `at` of one range to item `to` of another.
+    pub fn copy(self, from: &[u8], at: usize, into: &mut [u8], to: usize, count: usize) {
+        if self.is_bits() {
+            for index in 0..count {
+                let (at, to) = (at + index, to + index);
+                let (bit, mask) = (from[at / 8] >> (at % 8) & 1, 1 << (to % 8));
+                into[to / 8] = into[to / 8] & !mask | bit << (to % 8);
+            }
+        } else {
+            into[to * 2..(to + count) * 2].copy_from_slice(&from[at * 2..(at + count) * 2]);
+        }
+    }
+
     pub(crate) const fn index(self) -> usize {
         self as usize
     }

@@ -5,9 +5,9 @@ use crate::area::Area;
 use crate::bits;
 use crate::operation::Write;
 
-/// Batches within both limits, in writes and in bytes, are copied without flattening.
-const FEW: usize = 16;
-const SHORT: usize = 16 * 1024;
+/// Limits of batches that are copied without flattening: allocating an image costs more than copying them.
+const MAX_DIRECT_WRITES: usize = 16;
+const MAX_DIRECT_BYTES: usize = 16 * 1024;
 
 /// Adjacent items of one area, each with the value of the last write to it.
 #[derive(Debug)]
@@ -25,8 +25,9 @@ impl Run {
 
 /// Whether flattening these writes saves more time than it costs.
 pub(crate) fn is_large<'w>(writes: impl ExactSizeIterator<Item = &'w Write<'w>>) -> bool {
-    writes.len() > FEW
-        || (writes.len() > 1 && writes.map(|write| write.bytes.len()).sum::<usize>() > SHORT)
+    writes.len() > MAX_DIRECT_WRITES
+        || (writes.len() > 1
+            && writes.map(|write| write.bytes.len()).sum::<usize>() > MAX_DIRECT_BYTES)
 }
 
 /// Merges writes to one area into runs, sorted by address. The writes must have been checked.
@@ -50,9 +51,9 @@ pub(crate) fn flatten<'w>(writes: impl Iterator<Item = &'w Write<'w>> + Clone) -
     }
     let mut runs: Vec<Run> = Vec::new();
     let mut at = 0;
-    for stretch in written.chunk_by(|a, b| a == b) {
-        let count = stretch.len();
-        if stretch[0] {
+    for chunk in written.chunk_by(|a, b| a == b) {
+        let count = chunk.len();
+        if chunk[0] {
             let mut bytes = vec![0; area.byte_len(count)];
             if area.is_bits() {
                 bits::copy_out(&image, at, count, &mut bytes);

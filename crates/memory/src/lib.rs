@@ -11,10 +11,8 @@
 //! * Memory is allocated once. No operation allocates, except a write to several memories: it
 //!   keeps a list of locks, and flattens a large batch before it takes them. A write to a memory
 //!   with observers is copied into their queues.
-//!
 //! * If a memory has a journal, the journal alone changes it: every write becomes a step, which the
 //!   journal carries out when it has kept it.
-//!
 //! * Ranges that mirror a device can have a [`Freshness`], which knows a clock: while a range is stale,
 //!   only the mirror uses it.
 //!
@@ -31,15 +29,17 @@ mod error;
 mod follower;
 mod memory;
 mod mirrored;
-mod observer;
 mod operation;
+mod seal;
 mod step;
+mod write_queue;
 
 pub use area::{Area, Layout, Span};
 pub use error::{LayoutError, Refusal, Refused};
 pub use follower::{Change, Follower};
-pub use memory::{Contents, Gate, GateMode, Memory, check_across, write_across};
+pub use memory::{Contents, Memory, check_across, write_across};
 pub use mirrored::{Freshness, Mirrored};
-pub use observer::{WriteQueue, Written};
 pub use operation::{Access, Read, Write};
+pub use seal::{Gate, GateMode};
 pub use step::{Action, CarriedOut, Done, Journal, Operation, Outcome, Step, StepWrite};
+pub use write_queue::{WriteQueue, Written};

@@ -1,4 +1,4 @@
-//! The memory: reads and writes under one lock, and the seal.
+//! The memory: reads and writes under one lock.
 
 use std::ptr;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -10,18 +10,10 @@ use crate::batch::{self, Run};
 use crate::bits;
 use crate::error::{LayoutError, Refusal, Refused};
 use crate::mirrored::{Mirrored, MirroredRanges};
-use crate::observer::{Observers, WriteQueue};
 use crate::operation::{Access, Read, Write};
+use crate::seal::{self, Gate};
 use crate::step::{Action, Done, Journal, Operation, Step, StepWrite, wait};
-
-/// When the gate bit opens the seal.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum GateMode {
-    /// The first ingest that leaves the gate bit at 1 opens the memory permanently.
-    Once,
-    /// The memory is sealed whenever the gate bit is 0.
-    Level,
-}
+use crate::write_queue::{Observers, WriteQueue};
 
 /// Which ranges may be used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -30,21 +22,6 @@ enum Ranges {
     Unreserved,
     /// All: where a step was checked before.
     All,
-}
-
-/// The bit that opens a sealed memory.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Gate {
-    pub area: Area,
-    pub address: u16,
-    pub mode: GateMode,
-}
-
-impl Gate {
-    fn is_in(self, write: &Write<'_>) -> bool {
-        let start = usize::from(write.address);
-        self.area == write.area && (start..start + write.count).contains(&usize::from(self.address))
-    }
 }
 
 /// Four areas of fixed size behind one lock.
@@ -130,6 +107,10 @@ impl Memory {
 
     pub const fn span(&self, area: Area) -> Span {
         self.layout.span(area)
+    }
+
+    pub const fn layout(&self) -> Layout {
+        self.layout
     }
 
     pub const fn gate(&self) -> Option<Gate> {
@@ -630,7 +611,7 @@ impl Memory {
         {
             self.renew(age, writes);
         }
-        self.settle(access, content);
+        self.update_seal(access, content);
     }
 
     fn copy_in(&self, content: &mut Content, write: &Write<'_>) {
@@ -645,23 +626,21 @@ impl Memory {
         }
     }
 
-    /// Updates the seal from the gate bit. Called once, after all writes of an ingest.
-    fn settle(&self, access: Access, content: &mut Content) {
+    /// Updates the seal from the gate bit. Called once, after all writes of an access.
+    fn update_seal(&self, access: Access, content: &mut Content) {
         if access != Access::Client
             && let Some(gate) = self.gate
         {
             let offset = usize::from(gate.address - self.span(gate.area).start());
-            let open = bits::get(&content.areas[gate.area.index()], offset);
-            let sealed = match gate.mode {
-                GateMode::Once => content.sealed() && !open,
-                GateMode::Level => !open,
-            };
-            match (content.sealed(), sealed) {
+            let bit = bits::get(&content.areas[gate.area.index()], offset);
+            let was_sealed = content.sealed();
+            let is_sealed = gate.seals(was_sealed, bit);
+            match (was_sealed, is_sealed) {
                 (true, false) => content.seal_changes.0 += 1,
                 (false, true) => content.seal_changes.1 += 1,
                 _ => {}
             }
-            content.seal(sealed);
+            content.seal(is_sealed);
         }
     }
 
@@ -693,18 +672,14 @@ impl Content {
     /// Whether the seal admits an access. Called with the lock under which the write is carried out, so
     /// no write is judged by a seal that has changed since.
     fn admit(&self, access: Access) -> Result<(), Refusal> {
-        match (access, self.sealed()) {
-            (Access::Client, true) => Err(Refusal::Sealed),
-            (Access::Restore, false) => Err(Refusal::Unsealed),
-            _ => Ok(()),
-        }
+        seal::admit(access, self.sealed())
     }
 
     /// Counts a write that was carried out, and passes it to the observers.
     fn written<'w>(&mut self, access: Access, writes: impl IntoIterator<Item = &'w Write<'w>>) {
         self.writes += 1;
         if self.observers.is_any() {
-            self.observers.tell(access, writes);
+            self.observers.notify(access, writes);
         }
     }
 
@@ -870,6 +845,7 @@ mod tests {
     use super::*;
     use crate::follower::Follower;
     use crate::mirrored::Freshness;
+    use crate::seal::GateMode;
 
     const REGISTERS: Area = Area::HoldingRegisters;
 

@@ -71,6 +71,9 @@ fn outcome(
     format!("{results:?} {closed:?} {strays:?} late {late}")
 }
 
+const READ_FILES: [u8; 16] = [20, 14, 6, 0, 4, 0, 1, 0, 2, 6, 0, 3, 0, 9, 0, 1];
+const WRITE_FILE: [u8; 11] = [21, 9, 6, 0, 4, 0, 7, 0, 1, 6, 0xAF];
+
 /// Requests, and replies to them.
 fn exchanges() -> Vec<(Request<'static>, Vec<u8>)> {
     let range = |quantity| Range::new(3, quantity).unwrap();
@@ -82,6 +85,11 @@ fn exchanges() -> Vec<(Request<'static>, Vec<u8>)> {
         (Request::ReadInputRegisters(range(125)), [&[4, 250][..], &[0x07; 250]].concat()),
         (Request::WriteSingleRegister { address: 3, value: 7 }, vec![6, 0, 3, 0, 7]),
         (Request::WriteSingleCoil { address: 3, value: true }, vec![5, 0, 3, 0xFF, 0]),
+        (Request::ReadExceptionStatus, vec![7, 0x6D]),
+        (Request::GetCommEventLog, vec![12, 8, 0, 0, 1, 8, 1, 0x21, 0x20, 0]),
+        (Request::ReadFifoQueue { address: 3 }, vec![24, 0, 6, 0, 2, 1, 0xB8, 0x12, 0x84]),
+        (Request::parse(&READ_FILES).unwrap(), vec![20, 10, 5, 6, 1, 2, 3, 4, 3, 6, 0x3A, 0x0D]),
+        (Request::parse(&WRITE_FILE).unwrap(), WRITE_FILE.to_vec()),
         (Request::ReportServerId, vec![17, 3, b'a', b'b', 0xFF]),
     ]
 }

@@ -4,8 +4,8 @@ mod support;
 
 use holdfast_protocol::frame::{ascii, mbap, rtu};
 use holdfast_protocol::pdu::{
-    self, BitRange, Bits, Diagnostics, ExceptionCode, Function, Range, RegisterRange, Registers,
-    Request, RequestError, SubFunction, limit,
+    self, BitRange, Bits, Diagnostics, ExceptionCode, FileRange, FileRanges, FileRecords, Function,
+    Range, RegisterRange, Registers, Request, RequestError, SubFunction, limit,
 };
 use proptest::prelude::*;
 use support::{a_request, bytes_like_a_pdu};
@@ -55,7 +55,9 @@ proptest! {
                 let known = Function::from_code(bytes[0]).is_some();
                 let sub_function = bytes[0] == 8 || bytes[0] == 43;
                 prop_assert!(known || code == ExceptionCode::IllegalFunction);
-                prop_assert!(!known || sub_function || code == ExceptionCode::IllegalDataValue);
+                let of_file = code == ExceptionCode::IllegalDataAddress && [20, 21].contains(&bytes[0]);
+                let form = of_file || code == ExceptionCode::IllegalDataValue;
+                prop_assert!(!known || sub_function || form);
             }
         }
     }
@@ -196,6 +198,58 @@ fn a_data_field_that_diagnostics_does_not_allow_is_refused() {
             assert_eq!(Diagnostics::new(sub_function, &[0x80, 0]), refused);
             assert_eq!(Diagnostics::new(sub_function, &[0; 4]), refused);
         }
+    }
+}
+
+#[test]
+fn ranges_of_files_are_limited_to_what_a_pdu_holds() {
+    let mut room = [0; pdu::MAX_LEN];
+    let range = |quantity| FileRange::new(4, 9, quantity).unwrap();
+    let space = |found, max| RequestError::Space { found, max };
+    assert!(FileRanges::pack(&[range(limit::READ_RECORDS)], &mut room).is_ok());
+    assert!(FileRanges::pack(&[range(1); 35], &mut room).is_ok());
+    for (ranges, found) in
+        [(vec![], 0), (vec![range(122)], 246), (vec![range(1); 36], 252), (vec![range(40); 4], 328)]
+    {
+        let packed = FileRanges::pack(&ranges, &mut room);
+        assert_eq!(packed, Err(space(found, limit::READ_FILE_BYTES)));
+    }
+    let most = [7; limit::WRITE_RECORDS as usize];
+    assert!(FileRecords::pack(&[(4, 9, &most)], &mut room).is_ok());
+    assert!(FileRecords::pack(&[(4, 9, &[7][..]); 27], &mut room).is_ok());
+    assert_eq!(FileRecords::pack(&[], &mut room), Err(space(0, limit::WRITE_FILE_BYTES)));
+    let two = FileRecords::pack(&[(4, 9, &most[..]), (4, 9, &most[..1])], &mut room);
+    assert_eq!(two, Err(space(260, limit::WRITE_FILE_BYTES)));
+    let quantity = |found| RequestError::Quantity { found, max: limit::WRITE_RECORDS };
+    assert_eq!(FileRecords::pack(&[(4, 9, &[])], &mut room), Err(quantity(0)));
+    assert_eq!(FileRecords::pack(&[(4, 9, &[7; 123])], &mut room), Err(quantity(123)));
+    assert_eq!(FileRecords::pack(&[(0, 9, &[7])], &mut room), Err(RequestError::File));
+    assert_eq!(
+        FileRecords::pack(&[(4, 10_000, &[7])], &mut room),
+        Err(RequestError::Record(10_000))
+    );
+}
+
+#[test]
+fn a_file_that_no_device_can_have_is_an_address_and_a_wrong_count_is_a_value() {
+    let (address, value) = (ExceptionCode::IllegalDataAddress, ExceptionCode::IllegalDataValue);
+    for (pdu, code) in [
+        (&[20, 7, 5, 0, 4, 0, 1, 0, 2][..], address),
+        (&[20, 7, 6, 0, 0, 0, 1, 0, 2], address),
+        (&[20, 7, 6, 0, 4, 0x27, 0x10, 0, 2], address),
+        (&[20, 7, 6, 0, 4, 0, 1, 0, 0], address),
+        (&[20, 7, 6, 0, 4, 0, 1, 0, 122], value),
+        (&[20, 8, 6, 0, 4, 0, 1, 0, 2, 0], value),
+        (&[20, 8, 6, 0, 4, 0, 1, 0, 2], value),
+        (&[20, 0], value),
+        (&[21, 9, 5, 0, 4, 0, 1, 0, 1, 0, 7], address),
+        (&[21, 9, 6, 0, 0, 0, 1, 0, 1, 0, 7], address),
+        (&[21, 7, 6, 0, 4, 0, 1, 0, 0], address),
+        (&[21, 9, 6, 0, 4, 0, 1, 0, 2, 0, 7], value),
+        (&[21, 10, 6, 0, 4, 0, 1, 0, 1, 0, 7, 6], value),
+        (&[21, 0], value),
+    ] {
+        assert_eq!(Request::parse(pdu), Err(code), "{pdu:?}");
     }
 }
 

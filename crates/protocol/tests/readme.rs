@@ -29,6 +29,9 @@ fn the_table_gives_the_limits_of_each_function() {
         (8, format!("{} sub-functions: 0-4, 10-18, 20", SubFunction::ALL.len())),
         (15, format!("1-{}", limit::WRITE_BITS)),
         (16, format!("1-{}", limit::WRITE_REGISTERS)),
+        (20, format!("1-{} in one range", limit::READ_RECORDS)),
+        (21, format!("1-{} in one range", limit::WRITE_RECORDS)),
+        (24, format!("a reply has 0-{}", limit::QUEUE_REGISTERS)),
         (23, format!("read 1-{}, write 1-{}", limit::READ_REGISTERS, limit::READ_WRITE_REGISTERS)),
     ];
     for (code, quantity) in limits {

@@ -3,8 +3,8 @@
 mod support;
 
 use holdfast_protocol::pdu::{
-    self, ExceptionCode, Function, RegisterRange, Request, Response, ResponseError, SubFunction,
-    reply,
+    self, ExceptionCode, FileRange, FileRanges, FileRecords, Function, RegisterRange, Request,
+    Response, ResponseError, SubFunction, reply,
 };
 use proptest::prelude::*;
 use support::a_request;
@@ -42,6 +42,21 @@ fn a_reply(request: &Request<'_>, byte: u8) -> Option<Vec<u8>> {
         }
         Request::MaskWriteRegister { address, and_mask, or_mask } => {
             reply::mask_write_register(address, and_mask, or_mask, &mut pdu)
+        }
+        Request::ReadExceptionStatus => reply::exception_status(byte, &mut pdu),
+        Request::GetCommEventLog => {
+            let log = [byte; 64];
+            let log = &log[..usize::from(byte) % 65];
+            let (events, messages) = (byte.into(), u16::from(byte) + 1);
+            reply::event_log(byte.is_multiple_of(2), events, messages, log, &mut pdu).unwrap()
+        }
+        Request::ReadFileRecord(ranges) => {
+            reply::read_file_record(ranges, |_, records| records.fill(byte), &mut pdu)
+        }
+        Request::WriteFileRecord(records) => reply::write_file_record(records, &mut pdu),
+        Request::ReadFifoQueue { .. } => {
+            let registers = [u16::from_be_bytes([byte; 2]); 31];
+            reply::read_fifo_queue(&registers[..usize::from(byte) % 32], &mut pdu).unwrap()
         }
         Request::Diagnostics(asked) if asked.data().len() > 2 || byte.is_multiple_of(2) => {
             reply::diagnostics_echo(asked, &mut pdu)
@@ -85,6 +100,21 @@ proptest! {
             Response::Diagnostics(data) => prop_assert_eq!(data, &reply[3..]),
             Response::EventCounter { busy, events } => {
                 prop_assert_eq!((busy, events), (byte.is_multiple_of(2), u16::from(byte)));
+            }
+            Response::ExceptionStatus(outputs) => prop_assert_eq!(outputs, byte),
+            Response::EventLog { busy, events, messages, log } => {
+                prop_assert_eq!((busy, events), (byte.is_multiple_of(2), u16::from(byte)));
+                prop_assert_eq!((messages, log), (u16::from(byte) + 1, &reply[8..]));
+            }
+            Response::FileRecords(answer) => {
+                let Request::ReadFileRecord(ranges) = request else { panic!("{request:?}") };
+                let lengths = ranges.iter().map(|range| usize::from(range.quantity()) * 2);
+                prop_assert!(answer.iter().map(<[u8]>::len).eq(lengths));
+                prop_assert!(answer.iter().flatten().all(|each| *each == byte));
+            }
+            Response::Queue(registers) => {
+                let found = registers.map_or(0, |registers| registers.quantity());
+                prop_assert_eq!(found, u16::from(byte) % 32);
             }
             Response::ServerId(id) => prop_assert_eq!(&id[..2], [7, 0xFF]),
             other => panic!("{other:?} from {request:?}"),
@@ -191,4 +221,59 @@ fn a_server_id_that_does_not_fit_is_not_written() {
     let longest = [9; reply::MAX_SERVER_ID_LEN - 2];
     assert_eq!(reply::server_id(&[1], false, &longest, &mut pdu), Some(pdu::MAX_LEN));
     assert_eq!(reply::server_id(&[1, 2], false, &longest, &mut pdu), None);
+}
+
+#[test]
+fn records_of_other_ranges_are_refused() {
+    let ranges = [FileRange::new(4, 1, 2).unwrap(), FileRange::new(3, 9, 1).unwrap()];
+    let mut room = [0; pdu::MAX_LEN];
+    let request = Request::ReadFileRecord(FileRanges::pack(&ranges, &mut room).unwrap());
+    let reply = [20, 10, 5, 6, 1, 2, 3, 4, 3, 6, 5, 6];
+    let Ok(Response::FileRecords(answer)) = request.response(&reply) else { panic!() };
+    assert!(answer.iter().eq([&[1, 2, 3, 4][..], &[5, 6]]));
+    for wrong in [
+        [20, 10, 3, 6, 5, 6, 5, 6, 1, 2, 3, 4],
+        [20, 10, 5, 7, 1, 2, 3, 4, 3, 6, 5, 6],
+        [20, 10, 5, 6, 1, 2, 3, 4, 4, 6, 5, 6],
+        [20, 10, 9, 6, 1, 2, 3, 4, 3, 6, 5, 6],
+        [20, 10, 0, 6, 1, 2, 3, 4, 3, 6, 5, 6],
+    ] {
+        assert_eq!(request.response(&wrong), Err(ResponseError::Length), "{wrong:?}");
+    }
+}
+
+#[test]
+fn an_echo_of_other_records_is_refused() {
+    let mut room = [0; pdu::MAX_LEN];
+    let records = FileRecords::pack(&[(4, 7, &[1, 2])], &mut room).unwrap();
+    let request = Request::WriteFileRecord(records);
+    let reply = [21, 11, 6, 0, 4, 0, 7, 0, 2, 0, 1, 0, 2];
+    assert_eq!(request.response(&reply), Ok(Response::Written));
+    for at in 2..reply.len() {
+        let mut wrong = reply;
+        wrong[at] ^= 1;
+        assert_eq!(request.response(&wrong), Err(ResponseError::Echo), "byte {at}");
+    }
+}
+
+#[test]
+fn a_queue_of_more_than_31_registers_or_with_a_wrong_count_is_refused() {
+    let request = Request::ReadFifoQueue { address: 1246 };
+    let longest = [&[24, 0, 64, 0, 31][..], &[7; 62]].concat();
+    assert!(request.response(&longest).is_ok());
+    for wrong in [
+        [&[24, 0, 66, 0, 32][..], &[7; 64]].concat(),
+        [&[24, 0, 64, 0, 30][..], &[7; 62]].concat(),
+        [&[24, 0, 62, 0, 31][..], &[7; 62]].concat(),
+        vec![24, 0, 3, 0, 0, 7],
+    ] {
+        assert_eq!(request.response(&wrong), Err(ResponseError::Length), "{wrong:?}");
+    }
+}
+
+#[test]
+fn a_log_of_more_than_64_events_is_refused() {
+    let reply = |events: usize| [&[12, 6 + events as u8][..], &vec![0; 6 + events]].concat();
+    assert!(Request::GetCommEventLog.response(&reply(64)).is_ok());
+    assert_eq!(Request::GetCommEventLog.response(&reply(65)), Err(ResponseError::Length));
 }

@@ -75,7 +75,8 @@ fn frames_encode_and_decode_as_the_vectors_say() {
 
 #[test]
 fn requests_parse_encode_and_answer_as_the_vectors_say() {
-    for case in cases::<PduCase>("pdu.json") {
+    let served = cases::<PduCase>("pdu.json");
+    for case in served.into_iter().chain(cases("device_pdu.json")) {
         let (request, response) = (unhex(&case.request), unhex(&case.response));
         let parsed = Request::parse(&request);
         match (response[0] & 0x80 != 0).then(|| ExceptionCode::from_code(response[1]).unwrap()) {

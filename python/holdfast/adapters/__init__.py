@@ -11,7 +11,6 @@ the entry point group `holdfast.adapters`, see docs/adapters.md.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -64,13 +63,3 @@ class Context:
     """The permissions that the configuration grants."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """The adapter's own options in the configuration."""
-
-    @property
-    def door(self) -> MemoryAccess:
-        """The former name of `memory_access`. Deprecated: the next release removes it."""
-        warnings.warn(
-            "Context.door is deprecated: use Context.memory_access",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return self.memory_access

@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 
     Handler = Callable[..., Mapping[str, Any]]
 
-MAX_REQUEST = 64 * 1024
-MAX_ANSWER = 64 * 1024 * 1024
+MAX_REQUEST_BYTES = 64 * 1024
+MAX_ANSWER_BYTES = 64 * 1024 * 1024
 """Bytes of a message."""
 
-TIMEOUT = 5.0
+TIMEOUT_S = 5.0
 """Seconds in which a request must arrive."""
 
-ANSWERING = 3.0
+ANSWER_S = 3.0
 """Seconds in which an appliance must answer, unless what it was asked takes longer."""
 
-RELOADING = 60.0
+RELOAD_TIMEOUT_S = 60.0
 """Seconds in which it must have reloaded."""
 
 MODE = 0o700
@@ -59,7 +59,7 @@ class Control:
         self._closed = True
         with contextlib.suppress(OSError, EOFError), Client(self.address):
             pass  # Wakes the thread.
-        self._thread.join(TIMEOUT)
+        self._thread.join(TIMEOUT_S)
         self._listener.close()
 
     def _accept(self) -> None:
@@ -74,9 +74,9 @@ class Control:
 
     def _serve(self, connection: Connection) -> None:
         with contextlib.suppress(OSError, EOFError), connection:
-            if not connection.poll(TIMEOUT):
+            if not connection.poll(TIMEOUT_S):
                 return
-            answer = self._answer(connection.recv_bytes(MAX_REQUEST))
+            answer = self._answer(connection.recv_bytes(MAX_REQUEST_BYTES))
             connection.send_bytes(json.dumps(answer).encode())
 
     def _answer(self, body: bytes) -> Mapping[str, Any]:
@@ -89,7 +89,12 @@ class Control:
 
 
 def ask(
-    file: Path, do: str, *, within_s: float = ANSWERING, ping_s: float = ANSWERING, **fields: object
+    file: Path,
+    do: str,
+    *,
+    within_s: float = ANSWER_S,
+    ping_s: float = ANSWER_S,
+    **fields: object,
 ) -> dict[str, Any]:
     """Sends a request to the appliance that runs this configuration. Raises `NotRunning`.
 
@@ -120,7 +125,7 @@ def _answered(file: Path, request: bytes) -> dict[str, Any] | NotRunning:
         with connection:
             try:
                 connection.send_bytes(request)
-                answer: dict[str, Any] = json.loads(connection.recv_bytes(MAX_ANSWER))
+                answer: dict[str, Any] = json.loads(connection.recv_bytes(MAX_ANSWER_BYTES))
             except (OSError, EOFError):
                 return NotRunning(f"{file}: the appliance ended the connection")
         return answer

@@ -2,44 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from holdfast.web.health import Check
+from holdfast.net.http.health import Check
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from holdfast.appliance.liveness import Liveness
-    from holdfast.appliance.shared_logs import SharedLogs
-    from holdfast.appliance.supervision import Supervisor
+    from holdfast.appliance.parts.shared_logs import SharedLogs
+    from holdfast.appliance.services.supervision import Supervisor
 
 NAMED = 5
 """The most names in the detail of a check."""
 
 
+@dataclass(eq=False)
 class Health:
-    """The health of one running appliance. Thread-safe, and never waits for any of its parts.
+    """The health of one running appliance. Thread-safe, and never waits for any of its parts."""
 
-    `devices` returns the health of each polled device, as the main thread saw it last.
-    """
-
-    def __init__(
-        self,
-        liveness: Liveness,
-        logs: SharedLogs,
-        supervisors: Mapping[str, Supervisor],
-        devices: Callable[[], Mapping[str, str]],
-        listeners: Callable[[], int],
-    ) -> None:
-        self._liveness = liveness
-        self._logs = logs
-        self._supervisors = supervisors
-        self._devices = devices
-        self._listeners = listeners
-        self._polled: set[str] = set()
-        """Devices that were polled. They stay so if a reload changes their settings."""
-        self.stopping = False
-        """Whether the appliance has begun to stop. It is live then, but never ready."""
+    _liveness: Liveness
+    _logs: SharedLogs
+    _adapters: Mapping[str, Supervisor]
+    _devices: Callable[[], Mapping[str, str]]
+    """Returns the health of each polled device, as the main thread saw it last."""
+    _listeners: Callable[[], int]
+    """Returns how many listeners there are."""
+    _polled: set[str] = field(default_factory=set)
+    """Devices that were polled. They stay so if a reload changes their settings."""
+    stopping: bool = False
+    """Whether the appliance has begun to stop. It is live then, but never ready."""
 
     @property
     def is_live(self) -> bool:
@@ -71,12 +64,12 @@ class Health:
 
     def _services(self) -> Check:
         """The HTTP services: their ports are bound, and they run."""
-        states = {name: each.serves() for name, each in dict(self._supervisors).items()}
-        asked = {name: serves for name, serves in states.items() if serves is not None}
-        failed = [name for name, serves in asked.items() if not serves]
+        states = {name: each.serves() for name, each in dict(self._adapters).items()}
+        with_port = {name: serves for name, serves in states.items() if serves is not None}
+        failed = [name for name, serves in with_port.items() if not serves]
         if failed:
             return Check(False, f"not serving: {_named(failed)}")
-        return Check(True, f"{len(asked)} serving" if asked else "none")
+        return Check(True, f"{len(with_port)} serving" if with_port else "none")
 
     def _started(self) -> Check:
         """Each device was polled once, or the attempt has failed, or another node polls it."""

@@ -13,12 +13,12 @@ import socket
 import time
 from typing import TYPE_CHECKING
 
-from holdfast import logs
+from holdfast.events import log_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-TIMEOUT = 1.0
+TIMEOUT_S = 1.0
 """Seconds to wait for room in the queue of the service manager."""
 
 
@@ -67,7 +67,7 @@ class ServiceManager:
             self._socket.send(text.encode())
         except OSError as error:
             if not self._failed:
-                logs.write(logging.WARNING, "notify_failed", reason=str(error))
+                _log_failure(str(error))
             self._failed = True
         else:
             self._failed = False
@@ -78,19 +78,21 @@ def _connected(address: str) -> socket.socket | None:
     if not address:
         return None
     if address[0] not in "/@" or not hasattr(socket, "AF_UNIX"):
-        logs.write(
-            logging.WARNING, "notify_failed", reason=f"NOTIFY_SOCKET={address} is not supported"
-        )
+        _log_failure(f"NOTIFY_SOCKET={address} is not supported")
         return None
     made = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    made.settimeout(TIMEOUT)
+    made.settimeout(TIMEOUT_S)
     try:
         made.connect(f"\0{address[1:]}" if address[0] == "@" else address)
     except OSError as error:
         made.close()
-        logs.write(logging.WARNING, "notify_failed", reason=f"NOTIFY_SOCKET={address}: {error}")
+        _log_failure(f"NOTIFY_SOCKET={address}: {error}")
         return None
     return made
+
+
+def _log_failure(reason: str) -> None:
+    log_lines.write(logging.WARNING, "notify_failed", reason=reason)
 
 
 def _interval(environment: Mapping[str, str]) -> float:

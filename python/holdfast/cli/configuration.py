@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast.appliance import assembly, configured_certificates
-from holdfast.bounded_files import NotAnswered, answered
+from holdfast.appliance.parts import certificate_expiry
+from holdfast.appliance.parts.native_listeners import server_tls
+from holdfast.appliance.services.services import https
+from holdfast.cli.exit_codes import ExitCode
+from holdfast.cli.terminal_text import show_problems
 from holdfast.client.endpoint import check_files, endpoint, receiver_endpoint
 from holdfast.config import HTTP_SERVICES, ConfigError, tls_of
-from holdfast.config.load import loaded, unanswered
-from holdfast.config.report import Report
+from holdfast.config.loader import loaded, unanswered
+from holdfast.config.text.report import Report
+from holdfast.runtime.bounded_files import NotAnswered, answered
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
-    from holdfast.client.url import Target
-    from holdfast.config import Config
-    from holdfast.config.source import KeyPath
-
-WRONG = 2
-"""The exit code for wrong usage or an invalid configuration."""
+    from holdfast.config import Config, HttpsConfig, ServerTlsConfig
+    from holdfast.config.text.source import KeyPath
+    from holdfast.net.tls import Tls
 
 
 def load_whole(path: Path | str) -> Config:
@@ -38,68 +41,68 @@ def load_whole(path: Path | str) -> Config:
 
 def _load_whole(path: Path | str) -> Config:
     config, document = loaded(path)
-    file = str(path)
     problems: dict[KeyPath, str] = {}
     doubts: list[tuple[KeyPath, str]] = []
-    for name, listener in config.listeners.items():
-        tls = tls_of(listener)
-        if tls is not None:
-            place: KeyPath = ("listeners", name, "tls")
-            try:
-                checked = assembly.server_tls(tls)
-            except ValueError as error:
-                problems[place] = str(error)
-            else:
-                doubts += [(place, warning) for warning in checked.warnings]
-    targets: list[tuple[KeyPath, Target]] = [
-        (("devices", name), device.target) for name, device in config.devices.items()
-    ]
-    targets += [(("links", name), link.target) for name, link in config.links.items()]
-    for where, target in targets:
+    for place, check in _checks(config):
         try:
-            endpoint(target)
+            doubts += [(place, warning) for warning in check()]
         except (OSError, ValueError) as error:
-            problems[*where, "url"] = str(error)
+            problems[place] = str(error)
+    if not problems:
+        doubts += certificate_expiry.doubts(config)
+    report = Report(document)
+    for place, message in problems.items():
+        report.add(place, message)
+    if problems:
+        raise ConfigError(str(path), report.problems)
+    for place, message in doubts:
+        report.warn(place, message)
+    return config.with_warnings([*config.warnings, *report.warnings]) if doubts else config
+
+
+def _checks(config: Config) -> Iterator[tuple[KeyPath, Callable[[], Iterable[str]]]]:
+    """Checks of files: the place in the configuration, and what returns warnings or raises."""
+    for name, listener in config.listeners.items():
+        if (tls := tls_of(listener)) is not None:
+            yield ("listeners", name, "tls"), partial(_server_warnings, tls)
+    for name, device in config.devices.items():
+        yield ("devices", name, "url"), partial(_usable, endpoint, device.target)
+    for name, link in config.links.items():
+        yield ("links", name, "url"), partial(_usable, endpoint, link.target)
     for name, device in config.devices.items():
         for index, forward in enumerate(device.forward):
-            try:
-                receiver_endpoint(forward.receiver)
-            except (OSError, ValueError) as error:
-                problems["devices", name, "forward", index, "url"] = str(error)
+            place = "devices", name, "forward", index, "url"
+            yield place, partial(_usable, receiver_endpoint, forward.receiver)
     if config.nats is not None and config.nats.device_tls is not None:
-        from holdfast.scanner.polling import device_tls
-
-        try:
-            device_tls.check(assembly.scanner(config.nats).device_tls)
-        except OSError as error:
-            problems["nats", "device_tls"] = str(error)
+        yield ("nats", "device_tls"), partial(_usable, _check_scanner, config.nats.device_tls.files)
     if config.gateway is not None and config.gateway.device_tls is not None:
-        try:
-            check_files(assembly.gateway_tls(config.gateway))
-        except (OSError, ValueError) as error:
-            problems["gateway", "device_tls"] = str(error)
+        files = config.gateway.device_tls.files
+        yield ("gateway", "device_tls"), partial(_usable, check_files, files)
     for service in HTTP_SERVICES:
         settings = getattr(config, service)
         if settings is not None and settings.tls is not None:
-            place = (service, "tls")
-            try:
-                warnings = assembly.https(settings.tls).core.warnings
-            except ValueError as error:
-                problems[place] = str(error)
-            else:
-                doubts += [(place, warning) for warning in warnings]
-    if not problems:
-        doubts += configured_certificates.doubts(config)
-    if not problems and not doubts:
-        return config
-    report = Report(document)
-    for where, message in problems.items():
-        report.add(where, message)
-    if problems:
-        raise ConfigError(file, report.problems)
-    for where, message in doubts:
-        report.doubt(where, message)
-    return config.with_warnings([*config.warnings, *report.doubts])
+            yield (service, "tls"), partial(_https_warnings, settings.tls)
+
+
+def _server_warnings(tls: ServerTlsConfig) -> Iterable[str]:
+    return server_tls(tls).warnings
+
+
+def _https_warnings(tls: HttpsConfig) -> Iterable[str]:
+    return https(tls).core.warnings
+
+
+def _usable(check: Callable[[Any], object], checked: object) -> Iterable[str]:
+    """No warnings: the check raises or not."""
+    check(checked)
+    return ()
+
+
+def _check_scanner(files: Tls) -> None:
+    # The scanner takes long to import.
+    from holdfast.scanner.polling import device_tls
+
+    device_tls.check(files)
 
 
 def load_or_exit(path: Path | str) -> Config:
@@ -111,15 +114,7 @@ def load_or_exit(path: Path | str) -> Config:
         config = load_whole(path)
     except ConfigError as error:
         show_problems(error)
-        sys.exit(WRONG)
+        sys.exit(ExitCode.WRONG)
     for warning in config.warnings:
         click.echo(f"warning: {warning}", err=True)
     return config
-
-
-def show_problems(error: ConfigError) -> None:
-    """Prints each problem as a line on standard error, and their number."""
-    for problem in error.problems:
-        click.echo(str(problem), err=True)
-    count = len(error.problems)
-    click.echo("1 problem" if count == 1 else f"{count} problems", err=True)

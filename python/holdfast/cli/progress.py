@@ -13,16 +13,16 @@ import click
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-ROOMY = 80
-TIGHT = 36
-"""Columns of a terminal from which the bar has an estimate; and a label and a note."""
+ESTIMATE_COLUMNS = 80
+LABEL_COLUMNS = 36
+"""The bar has an estimate, or a label and a note, if the terminal has so many columns."""
 
-WIDTH = 30
-OTHERS = 27
+BAR_COLUMNS = 30
+OTHER_COLUMNS = 27
 """The columns of the bar; those of spaces, percentage and note."""
 
-BETWEEN = 0.1
-"""Seconds between updates of the bar."""
+REDRAW_INTERVAL_S = 0.1
+"""Between two updates of the bar."""
 
 
 @final
@@ -33,13 +33,13 @@ class Bar:
         self._shown = shown
         self._length = length
         self._columns = columns
-        self._seen = 0.0
+        self._drawn = 0.0
 
     def __call__(self, at: int) -> None:
         """Sets the progress, from 0 to the length."""
         now = time.monotonic()
-        if now - self._seen >= BETWEEN:
-            self._seen = now
+        if now - self._drawn >= REDRAW_INTERVAL_S:
+            self._drawn = now
             self._shown.update(min(at, self._length) - self._shown.pos)
             self._shown.render_progress()
 
@@ -47,7 +47,7 @@ class Bar:
         """Clears the line of the bar, for a line of output there. The bar comes back below it."""
         if sys.stdout.isatty():
             click.echo(f"\r{' ' * (self._columns - 1)}\r", file=sys.stderr, nl=False)
-            self._seen = 0.0
+            self._drawn = 0.0
 
 
 @contextlib.contextmanager
@@ -57,14 +57,14 @@ def bar(label: str, length: int, note: Callable[[], str]) -> Iterator[Bar | None
         yield None
         return
     columns = os.get_terminal_size(sys.stderr.fileno()).columns or 80
-    has_room = columns >= ROOMY
+    has_room = columns >= ESTIMATE_COLUMNS
     shown = click.progressbar(
         range(length),
-        label=label if columns >= TIGHT else None,
+        label=label if columns >= LABEL_COLUMNS else None,
         file=sys.stderr,
-        item_show_func=(lambda _: note()) if columns >= TIGHT else None,
+        item_show_func=(lambda _: note()) if columns >= LABEL_COLUMNS else None,
         show_eta=has_room,
-        width=WIDTH if has_room else max(3, columns - len(label) - OTHERS),
+        width=BAR_COLUMNS if has_room else max(3, columns - len(label) - OTHER_COLUMNS),
     )
     with shown:
         yield Bar(shown, length, columns)

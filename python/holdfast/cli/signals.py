@@ -107,7 +107,7 @@ class Signals:
 
 @contextmanager
 def interruptions() -> Iterator[Signals]:
-    """The signals that end a command which prints what it has found so far.
+    """The signals that end a search, which then prints its findings so far.
 
     The first ends what is inside `interrupting`; the second ends the process at once.
     """

@@ -9,7 +9,17 @@ calls fail, and the next call reconnects. No call is retried.
 
 from __future__ import annotations
 
-from holdfast.client.async_client import Client
-from holdfast.client.sync_client import SyncClient
+from typing import TYPE_CHECKING
+
+from holdfast.runtime.lazy_names import imported_on_use
+
+if TYPE_CHECKING:
+    from holdfast.client.client import Client
+    from holdfast.client.sync_client import SyncClient
+else:
+    __getattr__ = imported_on_use(
+        __name__,
+        {"Client": "holdfast.client.client", "SyncClient": "holdfast.client.sync_client"},
+    )
 
 __all__ = ["Client", "SyncClient"]

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from holdfast._core import Request
-from holdfast.client.url import SerialTarget, parse
-from holdfast.integers import as_integer
-from holdfast.protocol import BROADCAST_CODES, MAX_UNIT
+from typing import TYPE_CHECKING
 
-MAX_TIMEOUT = 86_400.0
+from holdfast.client.url import SerialTarget, parse
+from holdfast.protocol import BROADCAST_CODES, MAX_UNIT
+from holdfast.values.integers import as_integer
+
+if TYPE_CHECKING:
+    from holdfast._core import Request
+
+DEFAULT_TIMEOUT_S = 1.0
+"""Seconds for a request and its reply, of clients and of devices that are polled."""
+
+MAX_TIMEOUT_S = 86_400.0
 
 
 class BaseClient:
@@ -16,7 +23,9 @@ class BaseClient:
     def __init__(self, url: str, unit: int, timeout: float) -> None:
         self.target = parse(url)
         self.unit = _unit(unit)
-        self.timeout = _timeout(timeout)
+        if not 0 < timeout <= MAX_TIMEOUT_S:
+            raise ValueError(f"timeout is {timeout!r}, allowed: more than 0, up to 86400 seconds")
+        self.timeout = float(timeout)
 
     def unit_for(self, request: Request, unit: int | None) -> int:
         """The unit id of a call. Raises `ValueError` for a function that can't be broadcast."""
@@ -35,9 +44,3 @@ def _unit(unit: int) -> int:
     if number is None or not 0 <= number <= MAX_UNIT:
         raise ValueError(f"unit is {unit!r}, allowed: 0 to {MAX_UNIT}")
     return number
-
-
-def _timeout(seconds: float) -> float:
-    if not 0 < seconds <= MAX_TIMEOUT:
-        raise ValueError(f"timeout is {seconds!r}, allowed: more than 0, up to 86400 seconds")
-    return float(seconds)

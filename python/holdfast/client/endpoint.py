@@ -6,14 +6,12 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from holdfast._core import BlockingClient, Endpoint
-from holdfast.bounded_files import require_stored
-from holdfast.client.tolerance import STRICT
-from holdfast.client.url import NetworkTarget, SerialTarget
+from holdfast.client.url import STRICT, NetworkTarget, SerialTarget
 from holdfast.protocol import TLS_PORT
+from holdfast.runtime.bounded_files import require_stored
 
 if TYPE_CHECKING:
-    from holdfast.client.receiver import Receiver
-    from holdfast.client.url import Target, Tls
+    from holdfast.client.url import Receiver, Target, Tls
 
 
 def blocking(target: Target) -> BlockingClient:
@@ -31,16 +29,7 @@ def endpoint(target: Target) -> Endpoint:
 
 def _place(target: Target) -> Endpoint:
     if isinstance(target, SerialTarget):
-        return Endpoint.serial(
-            target.device,
-            mode=target.mode,
-            baud=target.baud,
-            parity=target.parity,
-            stop_bits=target.stop_bits,
-            data_bits=target.data_bits,
-            silence=target.silence,
-            rs485=target.rs485,
-        )
+        return Endpoint.serial(target.device, **target.settings)
     if target.transport == "tls":
         return _secure(target.host, target.port, target.tls)
     return Endpoint.network(target.transport, target.host, target.port)
@@ -56,9 +45,9 @@ def receiver_endpoint(receiver: Receiver) -> Endpoint:
 def _secure(host: str, port: int, of: Tls) -> Endpoint:
     unlocked: bytes | None = None
     if of.key is not None and of.key_passphrase_file is not None:
-        from holdfast.certificates import pem
+        from holdfast.net.certificates import own
 
-        unlocked = pem.unlocked(of.key, of.key_passphrase_file)
+        unlocked = own.unlocked(of.key, of.key_passphrase_file)
     require_stored(of.ca, of.cert, of.key)
     return Endpoint.tls(host, port, of.ca, of.cert, of.key, of.name, unlocked)
 

@@ -6,14 +6,13 @@ built, before anything is sent.
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Awaitable, Callable, Generator
 from dataclasses import dataclass
 from operator import index
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from holdfast._core import Request
-from holdfast.errors import InvalidResponse, ModbusException
-from holdfast.integers import as_integer
+from holdfast.errors import InvalidResponse, ModbusError, ModbusException
 from holdfast.protocol import (
     ADDRESSES,
     ILLEGAL_ADDRESS,
@@ -21,20 +20,59 @@ from holdfast.protocol import (
     LAST_ADDRESS,
     MAX_WORD,
     READ_LIMITS,
+    READ_RECORDS,
     WRITE_LIMITS,
 )
 from holdfast.types import BIT_AREAS
 from holdfast.values.codec import codec_for
+from holdfast.values.errors import UnknownType
+from holdfast.values.integers import as_integer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from holdfast.types import Area
 
+Sent = TypeVar("Sent")
 Result = TypeVar("Result")
 Steps: TypeAlias = Generator[Request, Any, Result]
 Plan: TypeAlias = Request | Steps[Result]
 """One request whose result is the result of the operation, or steps."""
+
+
+def carry_out(steps: Generator[Sent, Any, Result], answer: Callable[[Sent], Any]) -> Result:
+    """Carries out steps: what they yield gets its answer, or the `ModbusError` of it."""
+    try:
+        request = next(steps)
+        while True:
+            try:
+                reply = answer(request)
+            except ModbusError as error:
+                request = steps.throw(error)
+            else:
+                request = steps.send(reply)
+    except StopIteration as end:
+        result: Result = end.value
+        return result
+
+
+async def carry_out_async(
+    steps: Generator[Sent, Any, Result], answer: Callable[[Sent], Awaitable[Any]]
+) -> Result:
+    """As `carry_out`, and waits for each answer."""
+    try:
+        request = next(steps)
+        while True:
+            try:
+                reply = await answer(request)
+            except ModbusError as error:
+                request = steps.throw(error)
+            else:
+                request = steps.send(reply)
+    except StopIteration as end:
+        result: Result = end.value
+        return result
+
 
 OBJECT_NAMES = (
     "vendor_name",
@@ -93,6 +131,20 @@ class ServerId:
         return self.data[2:]
 
 
+@dataclass(frozen=True)
+class EventLog:
+    """The answer to function 12."""
+
+    busy: bool
+    """Whether the device still processes a program command."""
+    events: int
+    """Requests that the device has carried out, as function 11 counts them."""
+    messages: int
+    """Messages that the device has received."""
+    log: bytes
+    """One byte for each event, the latest first (V1.1b3, 6.10)."""
+
+
 def read_range(area: Area, address: int, count: int) -> Plan[list[Any]]:
     """Reads `count` bits or registers, in several requests if necessary."""
     address, count = index(address), index(count)
@@ -114,6 +166,37 @@ def _in_turn(reads: list[Request]) -> Steps[list[Any]]:
     return whole
 
 
+def read_file_requests(file: int, record: int, count: int) -> list[Request]:
+    """The requests that read records of a file. Raises `ValueError` for records that can't be."""
+    first, count = index(record), index(count)
+    starts = range(first, first + count, READ_RECORDS) or (first,)
+    return [
+        Request.read_files([(file, start, min(READ_RECORDS, first + count - start))])
+        for start in starts
+    ]
+
+
+def read_file(file: int, record: int, count: int) -> Steps[list[int]]:
+    """Reads records of a file, in several requests if necessary."""
+    whole: list[int] = []
+    for read in read_file_requests(file, record, count):
+        [records] = yield read
+        whole += records
+    return whole
+
+
+class TooManyValues(ValueError):
+    """A write does not fit in one request, and `split` is not set."""
+
+    def __init__(self, count: int, limit: int) -> None:
+        super().__init__(
+            f"{count} values, one request writes at most {limit}; use split=True for several "
+            "requests, which the device does not execute in one step"
+        )
+        self.count = count
+        self.limit = limit
+
+
 def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) -> Steps[None]:
     """Writes bits or registers in one request, or with `split` in several."""
     limit = WRITE_LIMITS[area]
@@ -121,10 +204,7 @@ def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) 
     make = Request.write_coils if area == "coils" else Request.write_registers
     if len(items) <= limit or not split:
         if len(items) > limit:
-            raise ValueError(
-                f"{len(items)} values, one request writes at most {limit}; use split=True for "
-                "several requests, which the device does not execute in one step"
-            )
+            raise TooManyValues(len(items), limit)
         yield make(address, items)
         return
     requests = [
@@ -136,6 +216,11 @@ def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) 
 
 def read_typed(area: Area, address: int, kind: str, order: str, encoding: str | None) -> Steps[Any]:
     """Reads a typed value, or an array of values."""
+    if str(kind).isdigit() and area in READ_LIMITS:  # As other libraries are called, with a count.
+        raise UnknownType(
+            f"type is {kind}, allowed: the name of a type, as in 'uint16[{kind}]'; for {kind} "
+            f"{'bits' if area in BIT_AREAS else 'registers'}, use read_{area}({address}, {kind})"
+        )
     codec = codec_for(area, kind, order, encoding)
     plan = read_range(area, address, codec.type.registers)
     raw = (yield plan) if isinstance(plan, Request) else (yield from plan)
@@ -206,11 +291,11 @@ def _stream(code: int, objects: dict[int, bytes]) -> Steps[int]:
     following: int | None = 0
     conformity = 0
     while following is not None:
-        asked = following
-        conformity, following, found = yield Request.identification(code, asked)
+        first = following
+        conformity, following, found = yield Request.identification(code, first)
         objects.update(found)
-        if following is not None and (following <= asked or not found):
-            raise InvalidResponse(f"object {following} can't follow object {asked}")
+        if following is not None and (following <= first or not found):
+            raise InvalidResponse(f"object {following} can't follow object {first}")
     return conformity
 
 
@@ -222,8 +307,8 @@ def diagnostics(sub_function: int, data: Sequence[int]) -> Steps[list[int]]:
         if number is None or not 0 <= number <= MAX_WORD:
             raise ValueError(f"data contains {word!r}, allowed: words 0 to {MAX_WORD}")
         sent += number.to_bytes(2, "big")
-    came: bytes = yield Request.diagnostics(sub_function, sent)
-    return [int.from_bytes(came[at : at + 2], "big") for at in range(0, len(came), 2)]
+    reply: bytes = yield Request.diagnostics(sub_function, sent)
+    return [int.from_bytes(reply[at : at + 2], "big") for at in range(0, len(reply), 2)]
 
 
 def _starts(address: int, count: int, limit: int) -> range:

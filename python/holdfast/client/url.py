@@ -1,23 +1,17 @@
-"""Parses the URL of a device."""
+"""Parses the URLs of devices, and of receivers of Raw Ingest packets."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from holdfast.client.tolerance import (
-    MAX_CLOSE_AFTER,
-    MAX_PAUSE,
-    MAX_RETRIES,
-    STRICT,
-    Tolerance,
-)
 from holdfast.net.addresses import LAST_PORT, address_in, joined
 from holdfast.net.tls import NO_FILES
 from holdfast.net.tls import Tls as Tls
 from holdfast.protocol import MAX_UNIT, usual_port
+from holdfast.runtime.text import listing, suggestion
 from holdfast.types import SERIAL_FRAMES, TRANSPORTS
 
 if TYPE_CHECKING:
@@ -34,7 +28,7 @@ SERIAL = ("rtu", "ascii")
 ALL = (*TRANSPORTS, *SERIAL)
 MBAP = tuple(each for each in TRANSPORTS if each not in SERIAL_FRAMES)
 
-MAX_SILENCE = 10.0
+MAX_SILENCE_S = 10.0
 """Seconds."""
 
 SECURE = ("tls", "raw+tls")
@@ -50,6 +44,50 @@ FORMS = (
     "tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502, "
     "rtu+udp://host:502, ascii+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
 )
+
+
+MAX_PAUSE_S = 60
+MAX_RETRIES = 10
+MAX_CLOSE_AFTER = 65_535
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """How to treat a device that deviates from the standard. The default follows the standard."""
+
+    accept_unit: int | Literal["any"] | None = None
+    """A unit id that replies may carry besides that of the request, or any."""
+    pad: bool = False
+    """Whether surplus bytes at the end of a reply are ignored. Over TCP and UDP, an exception reply
+    ends after its exception code whatever length its header has.
+    """
+    echo: bool | Literal["auto"] = "auto"
+    """Whether the adapter repeats what is sent; `auto` detects it at reads."""
+    pause: float = 0.0
+    """Seconds between the end of a request and the next; one request is in flight then."""
+    pause_after_connect: float = 0.0
+    """Seconds between connecting and the first request."""
+    retries: int = 0
+    """How often a read is sent again after a timeout, an invalid reply or a lost connection."""
+    retry_busy: bool = False
+    """Whether `retries` covers exceptions 05 and 06 too."""
+    close_after: int = 0
+    """Requests after which the connection is closed, 0 for never; one is in flight then."""
+    reconnect: float = 0.0
+    """Seconds between the end of a connection and the next attempt to connect."""
+
+    @property
+    def is_one_at_a_time(self) -> bool:
+        """Whether at most one request is in flight, whatever the transport can carry."""
+        return self.pause > 0 or self.close_after > 0
+
+    @property
+    def has_pauses(self) -> bool:
+        """Whether a request may have to wait before it is sent."""
+        return self.pause > 0 or self.pause_after_connect > 0
+
+
+STRICT = Tolerance()
 
 
 @dataclass(frozen=True)
@@ -86,8 +124,19 @@ class SerialTarget:
     def __str__(self) -> str:
         return f"{self.mode}://{self.device}"
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The settings of the line, as the native core has them."""
+        known = asdict(self)
+        return {key: known[key] for key in known if key not in ("device", "tolerance")}
+
 
 Target: TypeAlias = NetworkTarget | SerialTarget
+
+
+def stop_bits(parity: Parity) -> Literal[1, 2]:
+    """The usual stop bits: characters with and without a parity bit have the same length."""
+    return 2 if parity == "none" else 1
 
 
 def connection_of(target: Target) -> str:
@@ -118,16 +167,17 @@ def parse(url: str) -> Target:
         if port == 0:
             raise ValueError(f"{url!r}: port 0, allowed: 1 to {LAST_PORT}")
         port = usual_port(scheme) if port is None else port
-        chosen = options_of(url, scheme, parts.query)
-        tolerance = _taken(Tolerance, chosen)
+        options = options_of(url, scheme, parts.query)
+        tolerance = _pop_fields(Tolerance, options)
         try:
-            tls = Tls(**chosen)
+            tls = Tls(**options)
         except ValueError as error:
             raise ValueError(f"{url!r}: {error}") from None
         return NetworkTarget(scheme, unquote(parts.hostname), port, tls, tolerance)
     if scheme in ("rtu", "ascii"):
         return _serial(url, cast("Mode", scheme), parts.netloc + parts.path, parts.query)
-    raise ValueError(f"{url!r} is not the URL of a device, allowed: {FORMS}")
+    near = suggestion(scheme, (*TRANSPORTS, *SERIAL)) if scheme else ""
+    raise ValueError(f"{url!r} is not the URL of a device, allowed: {FORMS}{near}")
 
 
 def in_folder(url: str, folder: Path) -> str:
@@ -144,8 +194,8 @@ def with_tls_in_folder(url: str, tls: Tls, folder: Path) -> str:
     if resolved == tls:
         return url
     location, _, query = url.partition("?")
-    kept = [each for each in query.split("&") if unquote(each.partition("=")[0]) not in TLS_KEYS]
-    return f"{location}?{'&'.join([resolved.query, *kept])}"
+    others = [each for each in query.split("&") if unquote(each.partition("=")[0]) not in TLS_KEYS]
+    return f"{location}?{'&'.join([resolved.query, *others])}"
 
 
 @dataclass(frozen=True)
@@ -158,12 +208,12 @@ class _Option:
 
 
 def _one_of(*words: str, read: Callable[[str], Any] = str) -> _Option:
-    def chosen(text: str) -> Any:
+    def word(text: str) -> Any:
         if text not in words:
             raise ValueError(text)
         return read(text)
 
-    return _Option(", ".join(words), chosen)
+    return _Option(", ".join(words), word)
 
 
 def _baud(text: str) -> int:
@@ -174,13 +224,13 @@ def _baud(text: str) -> int:
 
 def _seconds(text: str) -> float:
     seconds = _pause(text)
-    if not 0 < seconds <= MAX_SILENCE:
+    if not 0 < seconds <= MAX_SILENCE_S:
         raise ValueError(text)
     return seconds
 
 
 def _pause(text: str) -> float:
-    if not re.fullmatch(r"[0-9]*\.?[0-9]+", text) or not float(text) <= MAX_PAUSE:
+    if not re.fullmatch(r"[0-9]*\.?[0-9]+", text) or not float(text) <= MAX_PAUSE_S:
         raise ValueError(text)
     return float(text)
 
@@ -222,16 +272,15 @@ OPTIONS: Mapping[str, _Option] = {
     "accept_unit": _Option(f"any, 0 to {MAX_UNIT}", _unit, ALL),
     "pad": _flag(ALL),
     "echo": _Option("0, 1, auto", _echo, tuple(each for each in ALL if each not in MBAP)),
-    "pause": _Option(f"seconds, up to {MAX_PAUSE}", _pause, ALL),
-    "pause_after_connect": _Option(f"seconds, up to {MAX_PAUSE}", _pause, ALL),
+    "pause": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, ALL),
+    "pause_after_connect": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, ALL),
     "retries": _Option(f"0 to {MAX_RETRIES}", _up_to(MAX_RETRIES), ALL),
     "retry_busy": _flag(ALL),
     "close_after": _Option(f"0 to {MAX_CLOSE_AFTER}", _up_to(MAX_CLOSE_AFTER), ALL),
-    "reconnect": _Option(f"seconds, up to {MAX_PAUSE}", _pause, ALL),
-    "ca": _Option("paths of files", _text, SECURE),
-    "cert": _Option("paths of files", _text, SECURE),
-    "key": _Option("paths of files", _text, SECURE),
-    "key_passphrase_file": _Option("paths of files", _text, SECURE),
+    "reconnect": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, ALL),
+    **dict.fromkeys(
+        ("ca", "cert", "key", "key_passphrase_file"), _Option("paths of files", _text, SECURE)
+    ),
     "name": _Option("host names and IP addresses", _text, SECURE),
 }
 
@@ -239,29 +288,30 @@ OPTIONS: Mapping[str, _Option] = {
 TLS_KEYS = tuple(name for name, each in OPTIONS.items() if each.schemes == SECURE)
 
 
-def _taken(kind: type[Any], chosen: dict[str, Any]) -> Any:
+def _pop_fields(kind: type[Any], options: dict[str, Any]) -> Any:
     """A dataclass of the keys that are its fields, which are taken out."""
     return kind(
-        **{each.name: chosen.pop(each.name) for each in fields(kind) if each.name in chosen}
+        **{each.name: options.pop(each.name) for each in fields(kind) if each.name in options}
     )
 
 
 def options_of(url: str, scheme: str, query: str) -> dict[str, Any]:
     """Parses a query with the options of a scheme."""
-    chosen: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     # `+` is a literal in a URL; `parse_qsl` would read it as a space, as in HTML forms.
     for key, text in parse_qsl(query.replace("+", "%2B"), keep_blank_values=True):
         option = OPTIONS.get(key)
         if option is None or scheme not in option.schemes:
-            known = ", ".join(name for name, each in OPTIONS.items() if scheme in each.schemes)
-            raise ValueError(f"{url!r}: unknown option {key!r}, allowed: {known}")
-        if key in chosen:
-            raise ValueError(f"{url!r}: duplicate option {key}")
+            known = [name for name, each in OPTIONS.items() if scheme in each.schemes]
+            words = f"{listing(known)}{suggestion(key, known)}"
+            raise ValueError(f"{url!r}: unknown option {key!r}, allowed: {words}")
+        if key in options:
+            raise ValueError(f"{url!r}: option {key!r} is given twice")
         try:
-            chosen[key] = option.read(text)
+            options[key] = option.read(text)
         except ValueError:
             raise ValueError(f"{url!r}: {key} is {text!r}, allowed: {option.allowed}") from None
-    return chosen
+    return options
 
 
 def _serial(url: str, mode: Mode, path: str, query: str) -> SerialTarget:
@@ -270,10 +320,58 @@ def _serial(url: str, mode: Mode, path: str, query: str) -> SerialTarget:
         device = device[1:]  # Ports of Windows have no leading slash.
     if device in ("", "/"):
         raise ValueError(f"{url!r} has no device, allowed: {FORMS}")
-    chosen = options_of(url, mode, query)
-    if mode == "rtu" and chosen.get("data_bits", 8) != 8:
+    options = options_of(url, mode, query)
+    if mode == "rtu" and options.get("data_bits", 8) != 8:
         raise ValueError(f"{url!r}: data_bits is 7, allowed with rtu: 8")
-    chosen.setdefault("data_bits", 8 if mode == "rtu" else 7)
-    chosen.setdefault("stop_bits", 2 if chosen.get("parity") == "none" else 1)
-    tolerance = _taken(Tolerance, chosen)
-    return SerialTarget(mode, device, tolerance=tolerance, **chosen)
+    options.setdefault("data_bits", 8 if mode == "rtu" else 7)
+    options.setdefault("stop_bits", stop_bits(options.get("parity", SerialTarget.parity)))
+    tolerance = _pop_fields(Tolerance, options)
+    return SerialTarget(mode, device, tolerance=tolerance, **options)
+
+
+RECEIVER_TIMEOUT_S = 5.0
+"""Seconds to send a packet: for connection, packet and reply together."""
+
+RECEIVER_FORM = "raw://10.0.2.9:9000 or raw+tls://10.0.2.9:9000?ca=ca.pem"
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """A receiver of Raw Ingest packets."""
+
+    host: str
+    port: int
+    tls: Tls | None = None
+    """`None` for plain TCP."""
+
+    def __str__(self) -> str:
+        scheme = "raw" if self.tls is None else "raw+tls"
+        return f"{scheme}://{joined(self.host, self.port)}"
+
+
+def parse_receiver(url: str) -> Receiver:
+    """Parses `raw://host:port` and `raw+tls://host:port`. Raises `ValueError` for anything else."""
+    wrong = f"found {url!r}, allowed: {RECEIVER_FORM}"
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        raise ValueError(wrong) from None
+    bare = url.partition("?")[0] == f"{parts.scheme}://{parts.netloc}"
+    if parts.scheme not in ("raw", "raw+tls") or not bare or set(parts.netloc) & set(" @"):
+        raise ValueError(wrong)
+    if not host or not port:
+        raise ValueError(wrong)
+    options = options_of(url, parts.scheme, parts.query)
+    if parts.scheme == "raw":
+        return Receiver(host, port)
+    try:
+        return Receiver(host, port, Tls(**options))
+    except ValueError as error:
+        raise ValueError(f"{url!r}: {error}") from None
+
+
+def receiver_in_folder(url: str, folder: Path) -> str:
+    """The URL, with paths of files resolved relative to this folder."""
+    tls = parse_receiver(url).tls
+    return url if tls is None else with_tls_in_folder(url, tls, folder)

@@ -7,91 +7,127 @@ native core.
 
 from __future__ import annotations
 
-from holdfast.config.devices import (
-    CostConfig,
-    DestinationConfig,
-    DeviceConfig,
-    ForwardConfig,
-    RangeConfig,
-    ReadConfig,
-    StatusConfig,
-)
-from holdfast.config.initial import InitialRun
-from holdfast.config.ip_addresses import Bind
-from holdfast.config.links import LinkConfig
-from holdfast.config.listeners import (
-    AsciiSerialConfig,
-    Listener,
-    ModbusAsciiListener,
-    ModbusAsciiOverTcpListener,
-    ModbusRtuListener,
-    ModbusRtuOverTcpListener,
-    ModbusRtuOverUdpListener,
-    ModbusTcpListener,
-    ModbusTlsListener,
-    ModbusUdpListener,
-    RawIngestListener,
-    RawRuleConfig,
-    RouteConfig,
-    RtuSerialConfig,
-    RuleConfig,
-    SecureRawRuleConfig,
-    SerialConfig,
-    SerialRuleConfig,
-    TlsRuleConfig,
-    UnitMemoryConfig,
-    tls_of,
-)
-from holdfast.config.load import load
-from holdfast.config.memories import MemoryConfig, Seal, Span
-from holdfast.config.model import Config, IdentityConfig, LogConfig, MappedTag
-from holdfast.config.problems import ConfigError, Problem
-from holdfast.config.schema import json_schema
-from holdfast.config.server_tls import HttpsConfig, ServerTlsConfig
-from holdfast.config.services import (
-    HTTP_SERVICES,
-    AdapterConfig,
-    AuditConfig,
-    BrokerConfig,
-    ClientTlsConfig,
-    GatewayConfig,
-    GatewayTokenConfig,
-    MappingConfig,
-    MetricsConfig,
-    MqttConfig,
-    NatsConfig,
-    NatsDefaultsConfig,
-    NatsLimitsConfig,
-    NatsPingConfig,
-    RestConfig,
-    SubscriptionConfig,
-    SyslogConfig,
-    TokenConfig,
-)
-from holdfast.net.addresses import Network
+from typing import TYPE_CHECKING
+
+from holdfast.runtime.lazy_names import imported_on_use
+
+if TYPE_CHECKING:
+    from holdfast.config.initial_values import InitialRun
+    from holdfast.config.loader import load
+    from holdfast.config.models.devices import (
+        DestinationConfig,
+        DeviceConfig,
+        RangeConfig,
+        ReadConfig,
+    )
+    from holdfast.config.models.links import LinkConfig
+    from holdfast.config.models.listeners import (
+        Listener,
+        ModbusAsciiListener,
+        ModbusAsciiOverTcpListener,
+        ModbusRtuListener,
+        ModbusRtuOverTcpListener,
+        ModbusRtuOverUdpListener,
+        ModbusTcpListener,
+        ModbusTlsListener,
+        ModbusUdpListener,
+        RawIngestListener,
+        RawRuleConfig,
+        RouteConfig,
+        RtuSerialConfig,
+        RuleConfig,
+        SecureRawRuleConfig,
+        SerialRuleConfig,
+        UnitMemoryConfig,
+        tls_of,
+    )
+    from holdfast.config.models.memories import MemoryConfig, Seal, Span
+    from holdfast.config.models.root import Config, IdentityConfig, MappedTag
+    from holdfast.config.models.server_tls import HttpsConfig, ServerTlsConfig
+    from holdfast.config.models.services import (
+        HTTP_SERVICES,
+        AdapterConfig,
+        AuditConfig,
+        BrokerConfig,
+        ClientTlsConfig,
+        GatewayConfig,
+        MappingConfig,
+        MetricsConfig,
+        MqttConfig,
+        NatsConfig,
+        RestConfig,
+        SubscriptionConfig,
+        TokenConfig,
+    )
+    from holdfast.config.schema import json_schema
+    from holdfast.config.text.problems import ConfigError, Problem
+else:
+    _NAMES = {
+        "initial_values": ("InitialRun",),
+        "loader": ("load",),
+        "models.devices": ("DestinationConfig", "DeviceConfig", "RangeConfig", "ReadConfig"),
+        "models.links": ("LinkConfig",),
+        "models.listeners": (
+            "Listener",
+            "ModbusAsciiListener",
+            "ModbusAsciiOverTcpListener",
+            "ModbusRtuListener",
+            "ModbusRtuOverTcpListener",
+            "ModbusRtuOverUdpListener",
+            "ModbusTcpListener",
+            "ModbusTlsListener",
+            "ModbusUdpListener",
+            "RawIngestListener",
+            "RawRuleConfig",
+            "RouteConfig",
+            "RtuSerialConfig",
+            "RuleConfig",
+            "SecureRawRuleConfig",
+            "SerialRuleConfig",
+            "UnitMemoryConfig",
+            "tls_of",
+        ),
+        "models.memories": ("MemoryConfig", "Seal", "Span"),
+        "models.root": ("Config", "IdentityConfig", "MappedTag"),
+        "models.server_tls": ("HttpsConfig", "ServerTlsConfig"),
+        "models.services": (
+            "HTTP_SERVICES",
+            "AdapterConfig",
+            "AuditConfig",
+            "BrokerConfig",
+            "ClientTlsConfig",
+            "GatewayConfig",
+            "MappingConfig",
+            "MetricsConfig",
+            "MqttConfig",
+            "NatsConfig",
+            "RestConfig",
+            "SubscriptionConfig",
+            "TokenConfig",
+        ),
+        "schema": ("json_schema",),
+        "text.problems": ("ConfigError", "Problem"),
+    }
+    __getattr__ = imported_on_use(
+        __name__, {name: f"{__name__}.{home}" for home, names in _NAMES.items() for name in names}
+    )
 
 __all__ = [
     "HTTP_SERVICES",
     "AdapterConfig",
-    "AsciiSerialConfig",
     "AuditConfig",
-    "Bind",
     "BrokerConfig",
     "ClientTlsConfig",
     "Config",
     "ConfigError",
-    "CostConfig",
     "DestinationConfig",
     "DeviceConfig",
-    "ForwardConfig",
     "GatewayConfig",
-    "GatewayTokenConfig",
     "HttpsConfig",
     "IdentityConfig",
     "InitialRun",
     "LinkConfig",
     "Listener",
-    "LogConfig",
     "MappedTag",
     "MappingConfig",
     "MemoryConfig",
@@ -106,10 +142,6 @@ __all__ = [
     "ModbusUdpListener",
     "MqttConfig",
     "NatsConfig",
-    "NatsDefaultsConfig",
-    "NatsLimitsConfig",
-    "NatsPingConfig",
-    "Network",
     "Problem",
     "RangeConfig",
     "RawIngestListener",
@@ -121,14 +153,10 @@ __all__ = [
     "RuleConfig",
     "Seal",
     "SecureRawRuleConfig",
-    "SerialConfig",
     "SerialRuleConfig",
     "ServerTlsConfig",
     "Span",
-    "StatusConfig",
     "SubscriptionConfig",
-    "SyslogConfig",
-    "TlsRuleConfig",
     "TokenConfig",
     "UnitMemoryConfig",
     "json_schema",

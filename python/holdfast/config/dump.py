@@ -18,7 +18,7 @@ from ruamel.yaml.nodes import ScalarNode
 from ruamel.yaml.representer import RoundTripRepresenter
 from ruamel.yaml.scalarstring import DoubleQuotedScalarString
 
-from holdfast.config.source import scalar
+from holdfast.config.text.source import scalar
 
 NULL_IS_SAID = frozenset({"max_connections_per_source"})
 """Keys whose `None` is written as null; other keys without a value are omitted."""

@@ -6,13 +6,13 @@ import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from holdfast import bounded_files
-from holdfast.config.base import Model
+from holdfast.config.models.base import Model
+from holdfast.runtime import bounded_files
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from holdfast.config.model import Config
+    from holdfast.config.models.root import Config
     from holdfast.net.tls import Tls
 
 

@@ -5,20 +5,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast import __version__
+from holdfast.client.client import connection
 from holdfast.gateway.app import App, rejection
 from holdfast.gateway.operations import document, operations
-from holdfast.gateway.pool import dial
 from holdfast.gateway.settings import GatewayLimits, Settings
 from holdfast.net.allow_list import AllowedNetwork
-from holdfast.web.host import ConnectionLimits, Host, address_of
+from holdfast.net.http.host import ConnectionLimits, Host, address_of
 
 if TYPE_CHECKING:
     from holdfast._core import ListeningSocket, Poller
     from holdfast.gateway.pool import Dial
+    from holdfast.net.http.health import HealthSource
+    from holdfast.net.http.https import Https
     from holdfast.net.resolver import Resolve
     from holdfast.runtime.stop import Stop
-    from holdfast.web.health import HealthSource
-    from holdfast.web.https import Https
 
 __all__ = ["AllowedNetwork", "Gateway", "GatewayLimits", "Settings"]
 
@@ -26,7 +26,7 @@ __all__ = ["AllowedNetwork", "Gateway", "GatewayLimits", "Settings"]
 class Gateway:
     """A gateway on a listening socket.
 
-    `resolve` resolves names, `dial` creates the client for an address. Devices that `poller` uses
+    `resolve` resolves names, `dial` creates connections to addresses. Devices that `poller` uses
     are asked over its connections. With `health`, probes are answered, without a token.
     """
 
@@ -36,7 +36,7 @@ class Gateway:
         listener: ListeningSocket,
         *,
         resolve: Resolve | None = None,
-        dial: Dial = dial,
+        dial: Dial = connection,
         poller: Poller | None = None,
         https: Https | None = None,
         health: HealthSource | None = None,

@@ -9,24 +9,28 @@ import asyncio
 import contextlib
 import logging
 from collections import Counter
+from math import inf
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from holdfast import __version__, logs
+from holdfast import __version__
+from holdfast.client.client import connection
 from holdfast.errors import ModbusException
-from holdfast.gateway import assets, port_of_call, surveying, viewing, watching
-from holdfast.gateway.broadcasting import NOTE
+from holdfast.events import log_lines
+from holdfast.gateway import assets, port_of_call
+from holdfast.gateway.broadcast import NOTE
 from holdfast.gateway.device import Failed, RequestedDevice
-from holdfast.gateway.egress import Egress
-from holdfast.gateway.pool import Pool, dial
-from holdfast.gateway.refusals import FAILURE, REFUSALS
+from holdfast.gateway.device_route import Egress
+from holdfast.gateway.endpoints import address_map
+from holdfast.gateway.pool import Pool
+from holdfast.gateway.refusals import EXCEPTION_STATUS, FAILURE, REFUSALS
 from holdfast.gateway.sharing import Shared
+from holdfast.gateway.streams import views, watch
 from holdfast.net.allow_list import AllowList
-from holdfast.net.resolver import Resolver
-from holdfast.web import health as probes
-from holdfast.web.application import Application, json_response
-from holdfast.web.events import Stream
-from holdfast.web.origin import Origins, is_direct
-from holdfast.web.requests import (
+from holdfast.net.http import health as probes
+from holdfast.net.http.application import Application, json_response
+from holdfast.net.http.events import Stream
+from holdfast.net.http.origin import Origins, is_direct
+from holdfast.net.http.requests import (
     BadRequest,
     BrokenBody,
     ClientDisconnected,
@@ -34,18 +38,20 @@ from holdfast.web.requests import (
     Response,
     response,
 )
+from holdfast.net.resolver import Resolver
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
+    from contextlib import AbstractContextManager
 
     from holdfast._core import Poller
     from holdfast.gateway.endpoint import Answer, Endpoint, Given
     from holdfast.gateway.pool import Dial
     from holdfast.gateway.settings import Settings
+    from holdfast.net.http.health import HealthSource
+    from holdfast.net.http.operations import Later, Operation
     from holdfast.net.resolver import Resolve
     from holdfast.tags import TagList
-    from holdfast.web.health import HealthSource
-    from holdfast.web.operations import Operation
 
     Check: TypeAlias = Callable[[Given, Mapping[str, TagList]], Awaitable[Answer]]
 
@@ -56,8 +62,8 @@ FORM = b"application/x-www-form-urlencoded"
 """The default Content-Type of `curl -d`. The gateway treats it as JSON."""
 
 STOPPING = "the gateway is stopping; a pending write may have been carried out"
-HOSTS = "--hosts, or hosts in the configuration"
-WRITES_ON = "enable them with --writes, or with access: read-write in the configuration"
+HOSTS = "--host, or hosts in the configuration"
+WRITES_ON = "enable them with --access read-write, or with access: read-write in the configuration"
 
 
 class App(Application):
@@ -69,7 +75,7 @@ class App(Application):
         settings: Settings,
         *,
         resolve: Resolve | None = None,
-        dial: Dial = dial,
+        dial: Dial = connection,
         poller: Poller | None = None,
         health: HealthSource | None = None,
         is_https: bool = False,
@@ -86,7 +92,8 @@ class App(Application):
         self._health = health
         self._settings = settings
         # A lookup never needs more time than the longest request.
-        self._egress = Egress(AllowList(settings.allow), resolve or Resolver(limits.timeout))
+        resolve = resolve or Resolver(limits.timeout)
+        self._egress = Egress(AllowList(settings.allow), resolve, settings.tls)
         self._pool = Pool(
             most=limits.devices,
             in_flight=limits.in_flight,
@@ -96,16 +103,14 @@ class App(Application):
             dial=dial,
             shared=None if poller is None else Shared(poller),
         )
-        self._running = {"requests": 0, "streams": 0}
-        self._streams: Counter[str] = Counter()
-        """The number of streams by the address of the client."""
-        self._shares: dict[tuple[str, int], int] = {}
-        """The number of pending requests by host and port."""
+        self._active: Counter[object] = Counter()
+        """The number of pending `requests` and `streams`, of requests by host and port of the
+        device, and of streams by address of the client."""
         self._requests = self._failed = self._writes = 0
         self._refused: dict[str, int] = {}
         self._ending = asyncio.Event()
-        self._enders: dict[Callable[[], None], float] = {}
-        """What ends requests, and how many seconds after a stop."""
+        self._cancels: dict[Callable[[], None], float] = {}
+        """What cancels the pending requests, and how many seconds after a stop."""
         self._lenient = port_of_call.PATHS if settings.compat == "port-of-call" else frozenset()
         """The paths of endpoints that take requests as Port of Call does."""
 
@@ -129,10 +134,10 @@ class App(Application):
 
     def _end_soon(self) -> None:
         self._ending.set()
-        for end, grace in self._enders.items():
-            asyncio.get_running_loop().call_later(grace, end)
+        for cancel, grace in self._cancels.items():
+            asyncio.get_running_loop().call_later(grace, cancel)
 
-    def __call__(self, request: Request) -> Response | Coroutine[Any, Any, Response | None]:
+    def __call__(self, request: Request) -> Response | Later:
         """Counts and answers one request."""
         self._requests += 1
         return super().__call__(request)
@@ -159,57 +164,45 @@ class App(Application):
         if isinstance(error, Failed):
             self._failed += 1
             return rejection(FAILURE.status, error.reason, error.detail)
-        logs.problem("request_failed", listener="gateway", peer=request.peer)
+        log_lines.problem("request_failed", listener="gateway", peer=request.peer)
         return rejection(FAILURE.status, "internal_error", "internal error, see the log")
 
-    def _refused_by(self, request: Request, unfit: BadRequest) -> Response:
-        self._refused[unfit.reason] = self._refused.get(unfit.reason, 0) + 1
-        logs.refused(
+    def _refused_by(self, request: Request, error: BadRequest) -> Response:
+        self._refused[error.reason] = self._refused.get(error.reason, 0) + 1
+        log_lines.refused(
             "gateway_refused",
-            kind=unfit.reason,
+            kind=error.reason,
             peer=request.peer,
             who=request.who,
             path=request.path[:100],
-            reason=unfit.reason,
+            reason=error.reason,
             # The detail may contain values to be written, which are never logged.
-            detail="-" if unfit.reason == "malformed" else unfit.detail,
+            detail="-" if error.reason == "malformed" else error.detail,
         )
-        answer = rejection(REFUSALS.status(unfit.reason), unfit.reason, unfit.detail)
-        if isinstance(unfit, port_of_call.Rejected):
-            answer.body, answer.status = unfit.body, unfit.status
+        answer = rejection(REFUSALS.status(error.reason), error.reason, error.detail)
+        if isinstance(error, port_of_call.Rejected):
+            answer.body, answer.status = error.body, error.status
         return answer
 
     # Limits.
 
     @contextlib.contextmanager
-    def _place(self, kind: str, most: int) -> Iterator[None]:
-        """Limits how many `kind` run at once. Raises `BadRequest` above the limit."""
-        if self._running[kind] >= most:
-            raise BadRequest("busy", f"too many {kind}: {most} are active, which is the limit")
-        self._running[kind] += 1
+    def _place(self, key: object, most: float, what: str) -> Iterator[None]:
+        """Limits how many of one key are active at once. Raises `BadRequest` above the limit."""
+        if self._active[key] >= most:
+            raise BadRequest("busy", f"too many {what}: {most} are active, which is the limit")
+        self._active[key] += 1
         try:
             yield
         finally:
-            self._running[kind] -= 1
+            self._active[key] -= 1
+            if not self._active[key]:
+                del self._active[key]
 
-    @contextlib.contextmanager
-    def _share(self, device: RequestedDevice) -> Iterator[None]:
-        """Limits the pending requests to one device. Raises `BadRequest` above the limit."""
-        key, most = (device.host.lower(), device.port), self._limits.requests_of_device
-        if self._shares.get(key, 0) >= most:
-            where = f"{device.host}:{device.port}"
-            raise BadRequest(
-                "busy", f"too many requests to {where}: {most} are active, which is the limit"
-            )
-        self._shares[key] = self._shares.get(key, 0) + 1
-        try:
-            yield
-        finally:
-            self._shares[key] -= 1
-            if not self._shares[key]:
-                del self._shares[key]
+    def _request(self) -> AbstractContextManager[None]:
+        return self._place("requests", self._limits.requests, "requests")
 
-    async def _while_there(
+    async def _until_disconnect(
         self, request: Request, work: Coroutine[Any, Any, Result], *, grace: float
     ) -> Result:
         """Runs work. Cancels it when the client disconnects, or `grace` seconds after a stop.
@@ -218,90 +211,89 @@ class App(Application):
         """
         task = asyncio.current_task()
         assert task is not None
-        ends = False
+        is_cancelled = False
 
-        def end() -> None:
-            nonlocal ends
-            ends = True
+        def cancel() -> None:
+            nonlocal is_cancelled
+            is_cancelled = True
             task.cancel()
 
-        request.when_gone(end)
-        self._enders[end] = grace
+        request.when_gone(cancel)
+        self._cancels[cancel] = grace
         if self._ending.is_set():
-            asyncio.get_running_loop().call_later(grace, end)
+            asyncio.get_running_loop().call_later(grace, cancel)
         try:
             return await work
         except asyncio.CancelledError:
-            if ends and not task.uncancel():
+            # The host cancels the task too, when it ends: then the cancellation goes on.
+            if is_cancelled and not task.uncancel():
                 raise ClientDisconnected from None
             raise
         finally:
-            del self._enders[end]
+            del self._cancels[cancel]
             request.when_gone(None)
 
     # Requests to devices.
 
     async def carry_out(self, request: Request, endpoint: Endpoint, given: Given) -> Response:
         """Carries out one operation on a device."""
-        with self._place("requests", self._limits.requests):
-            changes = endpoint.writes(given)
-            if changes and not self._settings.writes:
+        with self._request():
+            is_write = endpoint.writes(given)
+            if is_write and not self._settings.writes:
                 raise BadRequest("writes_off", f"writes are disabled: {WRITES_ON}")
             device = RequestedDevice(self._egress, self._pool, given, broadcast=endpoint.broadcast)
-            with self._share(device):
-                work = self._asked(request, endpoint, given, device, changes)
-                return await self._while_there_or_told(request, work)
+            where = device.host.lower(), device.port
+            most, what = self._limits.requests_of_device, f"requests to {device.host}:{device.port}"
+            with self._place(where, most, what):
+                work = self._reply(request, endpoint, given, device, is_write)
+                try:
+                    return await self._until_disconnect(request, work, grace=self._limits.ending)
+                except ClientDisconnected:
+                    if self._ending.is_set():  # The client is there, and gets an answer.
+                        raise BadRequest("stopping", STOPPING) from None
+                    raise
 
-    async def _while_there_or_told(
-        self, request: Request, work: Coroutine[Any, Any, Result]
-    ) -> Result:
-        """As `_while_there`, but a request that a stop cancels is answered with `stopping`."""
-        try:
-            return await self._while_there(request, work, grace=self._limits.ending)
-        except ClientDisconnected:
-            if self._ending.is_set():
-                raise BadRequest("stopping", STOPPING) from None
-            raise
-
-    async def _asked(
+    async def _reply(
         self,
         request: Request,
         endpoint: Endpoint,
         given: Given,
         device: RequestedDevice,
-        changes: bool,
+        is_write: bool,
     ) -> Response:
+        """Returns what the device replies."""
         outcome = "failed"
         try:
-            answer = await endpoint.carry_out(given, device)
+            reply = await endpoint.carry_out(given, device)
+            # An answer that names the device itself has the order of Port of Call.
+            named = {} if "host" in reply else device.target_fields
+            answer = {"success": True, **named, **reply}
+            if endpoint.has_rtt:
+                answer["rtt"] = device.rtt
             outcome = "sent" if device.is_broadcast else "done"
             if device.is_broadcast:
                 answer["note"] = NOTE
         except ModbusException as error:
             outcome = f"exception {error.code:02X}"
-            answer = endpoint.on_exception(given, device, error)
+            return json_response(
+                endpoint.on_exception(given, device, error), status=EXCEPTION_STATUS
+            )
         except BadRequest:
             outcome = "refused"
             raise
         finally:
-            if changes:
-                sent = device.asked and outcome != "refused"
-                told = outcome if sent or outcome == "refused" else "not sent"
-                self._note_write(request, given, device, told, sent=sent)
+            if is_write:
+                self._log_write(request, given, device, outcome)
         return json_response(answer)
 
-    def _note_write(
-        self,
-        request: Request,
-        given: Given,
-        device: RequestedDevice,
-        outcome: str,
-        *,
-        sent: bool,
+    def _log_write(
+        self, request: Request, given: Given, device: RequestedDevice, outcome: str
     ) -> None:
-        """Counts a write that was sent, and logs it without the values."""
-        self._writes += sent
-        logs.write(
+        """Counts a write that may have been sent, and logs it without the values."""
+        if outcome != "refused":
+            self._writes += device.maybe_sent
+            outcome = outcome if device.maybe_sent else "not sent"
+        log_lines.write(
             logging.INFO,
             "gateway_write",
             peer=request.peer,
@@ -320,80 +312,72 @@ class App(Application):
         with self._stream(request):
             self._require_stream(request, given["maxStreams"])
             device = RequestedDevice(self._egress, self._pool, given)
-            survey = surveying.planned(given)
-            stream = Stream(request, self._limits.heartbeat)
-            work = surveying.survey(
-                survey, device, stream, step=given["step"], longest=self._limits.discovery
+            longest = self._limits.discovery
+            await self._while_streaming(
+                request, lambda stream: address_map.survey(given, device, stream, longest)
             )
-            await self._while_streaming(request, stream, work)
 
     async def watch(self, request: Request, given: Given) -> None:
         """Watches a range of a device."""
         if not self._settings.tokens and not is_direct(request):
             # The only GET that asks a device. Over HTTP and to a name, browsers send neither Origin
             # nor Sec-Fetch-Site with the GET of a page.
-            detail = (
-                f"Host is a name, allowed without tokens for GET {watching.PATH}: an IP address"
-            )
-            raise BadRequest("foreign_page", f"{detail}, localhost; or use POST {viewing.PATH}")
+            detail = f"Host is a name, allowed without tokens for GET {watch.PATH}: an IP address"
+            raise BadRequest("foreign_page", f"{detail}, localhost; or use POST {views.PATH}")
         with self._stream(request):
             device = RequestedDevice(self._egress, self._pool, given)
-            stream = Stream(request, self._limits.heartbeat)
-            await self._while_streaming(request, stream, watching.watch(given, device, stream))
+            await self._while_streaming(request, lambda stream: watch.watch(given, device, stream))
 
     async def view(self, request: Request, given: Given) -> None:
         """Follows several ranges and tag lists of a device."""
-        with self._place("requests", self._limits.requests):
-            parts = await viewing.parts_of(given, self._settings.profiles)
+        with self._request():
+            parts = await views.parts_of(given, self._settings.profiles)
         device = RequestedDevice(self._egress, self._pool, given)
         streaming = not given["once"] and self._has_stream(request, given["maxStreams"])
-        once = self._place("requests", self._limits.requests)
+        once = self._request()
         with self._stream(request) if streaming else once:
-            stream = Stream(request, self._limits.heartbeat)
-            work = viewing.follow(given, viewing.View(parts, device), stream, streaming=streaming)
-            await self._while_streaming(request, stream, work)
+            view = views.View(parts, device)
+            await self._while_streaming(
+                request, lambda stream: views.follow(given, view, stream, streaming=streaming)
+            )
 
     @contextlib.contextmanager
     def _stream(self, request: Request) -> Iterator[None]:
         """Counts a stream. Raises `BadRequest` above the limit."""
-        host = host_of(request.peer)
-        with self._place("streams", self._limits.streams):
-            self._streams[host] += 1
-            try:
-                yield
-            finally:
-                self._streams[host] -= 1
-                if not self._streams[host]:
-                    del self._streams[host]
+        of_client = self._place(host_of(request.peer), inf, "streams")
+        with self._place("streams", self._limits.streams, "streams"), of_client:
+            yield
 
     def _has_stream(self, request: Request, most: int | None) -> bool:
         """Whether a client that asks for at most `most` streams can have one more."""
         if most is None:
             return True
-        full = self._running["streams"] >= self._limits.streams
-        return not full and self._streams[host_of(request.peer)] < most
+        full = self._active["streams"] >= self._limits.streams
+        return not full and self._active[host_of(request.peer)] < most
 
     def _require_stream(self, request: Request, most: int | None) -> None:
         """Raises `BadRequest` if the client has more than `most` streams, with the newest."""
-        if most is not None and self._streams[host_of(request.peer)] > most:
+        if most is not None and self._active[host_of(request.peer)] > most:
             raise BadRequest("busy", f"streams of this address: {most}, which is maxStreams")
 
     async def _while_streaming(
-        self, request: Request, stream: Stream, work: Coroutine[Any, Any, None]
+        self, request: Request, work: Callable[[Stream], Coroutine[Any, Any, None]]
     ) -> None:
+        stream = Stream(request, self._limits.heartbeat)
         try:
-            await self._while_there(request, work, grace=0)
+            await self._until_disconnect(request, work(stream), grace=0)
         except ClientDisconnected:
-            if self._ending.is_set() and not stream.began:
+            if not self._ending.is_set():
+                return  # The client is gone: nobody gets an answer.
+            if not stream.began:
                 raise BadRequest("stopping", STOPPING) from None
-            if self._ending.is_set():
-                await stream.end()
+            await stream.end()
 
     # Answers without a device.
 
     async def check(self, check: Check, given: Given) -> Response:
         """Checks tags or values."""
-        with self._place("requests", self._limits.requests):
+        with self._request():
             return json_response(await check(given, self._settings.profiles))
 
     def profiles(self) -> Response:

@@ -1,13 +1,31 @@
-"""The static files of the console at `/`. They need no build step."""
+"""The static files of the console at `/`. They need no build step.
+
+The limits of the standard and the types of values have placeholders, so that the page repeats none.
+"""
 
 from __future__ import annotations
 
 import functools
+import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from holdfast.net.addresses import LAST_PORT
+from holdfast.protocol import (
+    LAST_ADDRESS,
+    MAX_UNIT,
+    MAX_WORD,
+    PORT,
+    READ_FUNCTIONS,
+    READ_REGISTERS,
+    WRITE_LIMITS,
+)
+from holdfast.values.numeric import INTEGERS
+from holdfast.values.numeric import MAX as MAX_OF_FLOATS
+from holdfast.values.types import FIXED
 
 if TYPE_CHECKING:
-    from holdfast.web.requests import Headers
+    from holdfast.net.http.requests import Headers
 
 FOLDER = Path(__file__).parent / "console"
 
@@ -29,6 +47,9 @@ FILES = {
 }
 """The files by URL path. Only these are served."""
 
+WITH_PLACEHOLDERS = ("index.html", "standard.js")
+"""The files with placeholders such as `$PORT`."""
+
 HEADERS: Headers = [
     (
         b"content-security-policy",
@@ -45,4 +66,46 @@ HEADERS: Headers = [
 def read(path: str) -> tuple[bytes, bytes]:
     """Returns the content type and the content of a file."""
     file = FILES[path]
-    return KINDS[file.suffix], file.read_bytes()
+    content = file.read_bytes()
+    if file.name in WITH_PLACEHOLDERS:
+        for name, value in _placeholders().items():
+            content = content.replace(f"${name}".encode(), json.dumps(value).encode())
+    return KINDS[file.suffix], content
+
+
+def _placeholders() -> dict[str, Any]:
+    areas = {
+        area: {
+            "title": area.replace("_", " ").capitalize(),
+            "code": function.code,
+            "most": function.most_read,
+            "mostWritten": WRITE_LIMITS.get(area),
+        }
+        for area, function in READ_FUNCTIONS.items()
+    }
+    types = {name: {"width": size // 2, "ends": _ends(name, size)} for name, size in FIXED.items()}
+    return {
+        "STANDARD": {
+            "AREAS": areas,
+            "LAST_ADDRESS": LAST_ADDRESS,
+            "MAX_WORD": MAX_WORD,
+            "TYPES": types,
+        },
+        "LAST_ADDRESS": LAST_ADDRESS,
+        "LAST_PORT": LAST_PORT,
+        "MAX_UNIT": MAX_UNIT,
+        "PORT": PORT,
+        "READ_REGISTERS": READ_REGISTERS,
+    }
+
+
+def _ends(name: str, size: int) -> tuple[float | str, ...]:
+    """The least and the greatest number. Integers are text: JavaScript rounds large ones."""
+    if name in MAX_OF_FLOATS:
+        return -MAX_OF_FLOATS[name], MAX_OF_FLOATS[name]
+    if name.startswith("bcd"):
+        return "0", str(10 ** (2 * size) - 1)
+    if name not in INTEGERS:
+        return ()
+    least = 0 if name.startswith("u") else -(1 << 8 * size - 1)
+    return str(least), str(least + (1 << 8 * size) - 1)

@@ -6,7 +6,7 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from holdfast import logs
+from holdfast.client import Client
 from holdfast.errors import (
     ConnectFailed,
     ConnectionLost,
@@ -16,22 +16,23 @@ from holdfast.errors import (
     RequestTimeout,
     TlsFailed,
 )
-from holdfast.gateway.broadcasting import broadcast
-from holdfast.gateway.egress import Refused
-from holdfast.gateway.pool import Full, Unusable
-from holdfast.gateway.sharing import QueueFull, SharedClient
+from holdfast.events import log_lines
+from holdfast.gateway.broadcast import is_broadcast
+from holdfast.gateway.pool import Unusable
+from holdfast.gateway.sharing import QueueFull
+from holdfast.net.http.fields import malformed
+from holdfast.net.http.requests import BadRequest
 from holdfast.net.resolver import NoSuchName
 from holdfast.protocol import BROADCAST_CODES, usual_port
+from holdfast.runtime.text import all_of
 from holdfast.types import SERIAL_FRAMES
-from holdfast.web.fields import listed, malformed
-from holdfast.web.requests import BadRequest
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from holdfast.client import Client
-    from holdfast.gateway.egress import Egress
+    from holdfast.gateway.device_route import Egress
     from holdfast.gateway.pool import Pool
+    from holdfast.gateway.sharing import Turns
     from holdfast.types import Transport
 
 Result = TypeVar("Result")
@@ -41,7 +42,7 @@ TOO_MANY_BEFORE = (
 )
 NO_BROADCAST = (
     "unitId 0 is the broadcast of a serial line, which has no response; with transport "
-    f"{listed(SERIAL_FRAMES)} it allows only writes with functions {listed(BROADCAST_CODES)}"
+    f"{all_of(SERIAL_FRAMES)} it allows only writes with functions {all_of(BROADCAST_CODES)}"
 )
 UNIT_0 = "unit id 0 is the broadcast of serial lines, which has no response"
 
@@ -53,6 +54,15 @@ class Failed(Exception):
         self.reason = reason
         self.detail = detail
         super().__init__(f"{reason}: {detail}")
+
+
+class _RequestClient(Client):
+    """A client for the calls of one HTTP request, on a connection with other users."""
+
+    def __init__(self, turns: Turns, timeout: float) -> None:
+        # It has no connection of its own, which the constructor of its base would create.
+        self.target, self.unit, self.timeout = turns.target, 1, timeout
+        self._transport = turns
 
 
 class RequestedDevice:
@@ -68,21 +78,22 @@ class RequestedDevice:
         self.host: str = given["host"]
         self.port: int = given["port"] or usual_port(self.transport)
         self.unit: int = given["unitId"]
-        self.is_broadcast = self.unit == 0 and self.transport in SERIAL_FRAMES
+        self.is_broadcast = is_broadcast(self.transport, self.unit)
         if self.is_broadcast and not broadcast:
             raise malformed(NO_BROADCAST)
         self._name: str | None = given["serverName"]
         self.timeout: float = given["timeout"] / 1000
         self.rtt = 0
         """The duration of the last call, in milliseconds."""
-        self.asked = False
+        self.maybe_sent = False
         """Whether a call was started, so that the device may have received a request."""
-        self._waits = False
+        self._is_waiting = False
+        """Whether the last call has waited until its end for its turn."""
         self._egress = egress
         self._pool = pool
 
     @property
-    def told(self) -> dict[str, Any]:
+    def target_fields(self) -> dict[str, Any]:
         """The address of the device, for answers."""
         return {"host": self.host, "port": self.port, "unitId": self.unit}
 
@@ -91,8 +102,6 @@ class RequestedDevice:
 
         Raises `Failed`, `BadRequest`, and `ModbusException` for exception responses.
         """
-        if self.is_broadcast:
-            call = broadcast(call)
         try:
             return await self.attempt(call)
         except ModbusException:
@@ -104,40 +113,36 @@ class RequestedDevice:
         """Returns the failure for an error of `attempt` other than a Modbus exception."""
         if isinstance(error, RequestTimeout):
             return Failed("timeout", self._timed_out())
-        if isinstance(error, ConnectionLost):
-            if not error.maybe_sent:
-                self.asked = False
-            return Failed(self._reason(error), self._explained(error))
-        return Failed("invalid_reply", str(error))
+        if not isinstance(error, ConnectionLost):
+            return Failed("invalid_reply", str(error))
+        reason, detail = "connection_lost", str(error)
+        if not error.maybe_sent:
+            self.maybe_sent, reason = False, "no_connection"
+            if isinstance(error, ConnectFailed | TlsFailed):  # With the host as requested.
+                detail = f"can't connect to {self.host}:{self.port}: {error.detail}"
+        return Failed("tls_failed" if isinstance(error, TlsFailed) else reason, detail)
 
     async def attempt(self, call: Callable[[Client], Awaitable[Result]]) -> Result:
         """As `ask`, but connection errors, timeouts and invalid responses raise `ModbusError`."""
         began = time.monotonic()
-        asked_before, shared, route = self.asked, None, None
+        turns, route = None, None
 
-        def turn(client: Client) -> Awaitable[Result]:
-            nonlocal shared
-            shared = client if isinstance(client, SharedClient) else None
-            self.asked, self._waits = True, False
-            return call(client)
+        def run(given: Turns) -> Awaitable[Result]:
+            nonlocal turns
+            turns = given
+            return call(_RequestClient(turns, self.timeout))
 
-        self._waits = False
         try:
             async with asyncio.timeout(self.timeout):
                 route = await self._egress.route(self.transport, self.host, self.port, self._name)
-                self._waits = True
-                return await self._pool.run(route, self.timeout, turn)
-        except Refused as error:
-            raise BadRequest("refused_target", str(error)) from None
+                return await self._pool.run(route, self.timeout, run)
         except NoSuchName as error:
             raise Failed("no_such_name", str(error)) from None
-        except Full:
-            raise BadRequest("busy", "too many devices are in use, try again later") from None
         except QueueFull:
             detail = f"too many requests wait for {self.host}:{self.port}, try again later"
             raise BadRequest("busy", detail) from None
         except Unusable as error:
-            logs.refused("tls_unusable", kind="gateway", listener="gateway", error=str(error))
+            log_lines.refused("tls_unusable", kind="gateway", listener="gateway", error=str(error))
             detail = "the gateway's TLS files can't be used, see the log of the gateway"
             raise Failed("internal_error", detail) from None
         except TimeoutError:
@@ -148,26 +153,15 @@ class RequestedDevice:
         except ValueError as error:  # A check of the client, before anything is sent.
             raise malformed(str(error)) from None
         finally:
-            if shared is not None and not shared.is_sent:
-                self.asked, self._waits = asked_before, True
+            is_sent = turns is not None and turns.is_sent
+            self.maybe_sent |= is_sent
+            self._is_waiting = not is_sent
             self.rtt = round(1000 * (time.monotonic() - began))
 
     def _timed_out(self) -> str:
-        if self._waits:
+        if self._is_waiting:
             return TOO_MANY_BEFORE
         return "Connection timeout" if self.unit else f"Connection timeout: {UNIT_0}"
-
-    def _reason(self, error: ConnectionLost) -> str:
-        """Returns the word for a failed or lost connection."""
-        if isinstance(error, TlsFailed):
-            return "tls_failed"
-        return "connection_lost" if error.maybe_sent else "no_connection"
-
-    def _explained(self, error: ConnectionLost) -> str:
-        """Returns the message for a failed or lost connection, with the host as requested."""
-        if isinstance(error, ConnectFailed | TlsFailed) and not error.maybe_sent:
-            return f"can't connect to {self.host}:{self.port}: {error.detail}"
-        return str(error)
 
 
 def exception_name(error: ModbusException) -> str:

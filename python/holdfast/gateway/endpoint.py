@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.gateway.device import exception_text
 from holdfast.gateway.fields import HOST, PORT, REGISTER, SERVER_NAME, TRANSPORT, UNIT
-from holdfast.web.fields import Field
-from holdfast.web.schemas import Schema, array_of
+from holdfast.net.http.fields import Field
+from holdfast.net.http.schemas import Schema, array_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 TARGET: tuple[Field, ...] = (HOST, PORT, UNIT, TRANSPORT, SERVER_NAME)
 """The fields that name a device."""
 
-MILLISECONDS: Schema = {"type": "integer", "minimum": 0}
-
 EXAMPLE: dict[str, Any] = {"host": "plc.factory.local", "port": 502, "unitId": 1}
 """The device in examples."""
 
@@ -31,7 +29,7 @@ EXAMPLE: dict[str, Any] = {"host": "plc.factory.local", "port": 502, "unitId": 1
 def exception_answer(given: Given, device: RequestedDevice, error: ModbusException) -> Answer:
     """Returns the answer for a Modbus exception."""
     about = {"address": given["address"]} if "address" in given else {}
-    return {"success": False, "error": exception_text(error), **device.told, **about}
+    return {"success": False, "error": exception_text(error), **device.target_fields, **about}
 
 
 def always(_: Given) -> bool:
@@ -44,30 +42,32 @@ def never(_: Given) -> bool:
     return False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Endpoint:
-    """One operation on a device."""
+    """One operation on a device, without the fields that all requests and answers have."""
 
     path: str
     name: str
     summary: str
-    fields: tuple[Field, ...]
+    description: str
+    fields: tuple[Field, ...] = ()
     carry_out: Callable[[Given, RequestedDevice], Awaitable[Answer]]
     properties: dict[str, Schema]
-    """The schemas of the answer's fields, except the fields that all answers have."""
+    """The schemas of the answer's fields."""
+    optional: tuple[str, ...] = ()
+    """Optional fields of the answer."""
     examples: dict[str, dict[str, Any]]
     """Example requests by title."""
     answer: dict[str, Any]
-    """The answer to the first example, without the fields that all answers have."""
-    description: str = ""
+    """The answer to the first example."""
     writes: Callable[[Given], bool] = never
     """Returns whether a request is a write."""
+    has_rtt: bool = True
+    """Whether the answer has the duration of the last call to the device, in milliseconds."""
     broadcast: bool = False
     """Whether the request may be a broadcast; the answer then has a `note`."""
-    timeout: int = 10_000
-    """The default timeout in milliseconds."""
-    optional: tuple[str, ...] = ()
-    """Optional fields of the answer."""
+    timeout_ms: int = 10_000
+    """The default timeout."""
     on_exception: Callable[[Given, RequestedDevice, ModbusException], Answer] = exception_answer
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 
 from holdfast.net.addresses import LAST_PORT, address_in
+from holdfast.net.http.fields import Field
+from holdfast.net.http.schemas import Schema, integer
 from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, MAX_WORD, TLS_PORT
 from holdfast.protocol import PORT as STANDARD_PORT
 from holdfast.types import AREAS, TRANSPORTS
-from holdfast.web.fields import Field
-from holdfast.web.schemas import Schema, integer
+from holdfast.values.orders import DEFAULT_ORDER
 
 _HOST = r"^(\[[0-9A-Fa-f:.]{2,45}\]|[0-9A-Fa-f:.]{2,45}|[A-Za-z0-9_]([A-Za-z0-9._-]{0,252}))$"
 
@@ -81,7 +82,7 @@ BYTE_ORDER = Field(
     "byteOrder",
     ORDER,
     "Byte order: `ABCD`, `CDAB`, `BADC`, `DCBA`, or eight letters for eight bytes",
-    "ABCD",
+    DEFAULT_ORDER,
     allowed="ABCD, CDAB, BADC, DCBA, or eight letters A to H",
 )
 AREA_LIST = Field(

@@ -5,35 +5,33 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from holdfast.gateway import (
-    assets,
-    identifying,
-    listing,
-    port_of_call,
-    reading,
-    surveying,
-    viewing,
-    watching,
-    writing,
-)
+from holdfast.gateway import assets, port_of_call
 from holdfast.gateway.app import App
-from holdfast.gateway.endpoint import EXAMPLE, never
+from holdfast.gateway.endpoint import EXAMPLE, TARGET, never
+from holdfast.gateway.endpoints import address_map, diagnostics, identify, read, tag_lists, write
 from holdfast.gateway.fields import timeout
 from holdfast.gateway.refusals import DEVICE, FAILURE, REFUSALS
-from holdfast.gateway.schemas import SCHEMAS, TARGET
+from holdfast.gateway.schemas import SCHEMAS
+from holdfast.gateway.schemas import TARGET as TARGET_SCHEMAS
+from holdfast.gateway.streams import views, watch
+from holdfast.net.http import health, openapi
+from holdfast.net.http.application import DOCUMENTS
+from holdfast.net.http.openapi import Api, html_answer, json_answer, stream_answer
+from holdfast.net.http.operations import Operation, body_of
+from holdfast.net.http.schemas import COUNT, object_of, ref
 from holdfast.types import AREAS
-from holdfast.web import health, openapi
-from holdfast.web.application import DOCUMENTS
-from holdfast.web.openapi import Api, html_answer, json_answer, stream_answer
-from holdfast.web.operations import Operation, body_of
-from holdfast.web.schemas import object_of, ref
 
 if TYPE_CHECKING:
     from holdfast.gateway.endpoint import Endpoint
     from holdfast.gateway.settings import GatewayLimits, Settings
-    from holdfast.web.refusals import Refusal
+    from holdfast.net.http.refusals import Refusal
 
-ENDPOINTS: tuple[Endpoint, ...] = (*reading.ENDPOINTS, *writing.ENDPOINTS, *identifying.ENDPOINTS)
+ENDPOINTS: tuple[Endpoint, ...] = (
+    *read.ENDPOINTS,
+    *write.ENDPOINTS,
+    *diagnostics.ENDPOINTS,
+    *identify.ENDPOINTS,
+)
 
 
 def operations(settings: Settings) -> tuple[Operation[App], ...]:
@@ -42,7 +40,7 @@ def operations(settings: Settings) -> tuple[Operation[App], ...]:
         *(_of_device(each, settings) for each in ENDPOINTS),
         *_streams(settings.limits),
         _STATUS,
-        *listing.OPERATIONS,
+        *tag_lists.OPERATIONS,
         *DOCUMENTS,
         *(_asset(path) for path in assets.FILES),
         *(Operation("GET", path, "health", "", App.probe, is_open=True) for path in health.PATHS),
@@ -51,8 +49,11 @@ def operations(settings: Settings) -> tuple[Operation[App], ...]:
 
 def _of_device(endpoint: Endpoint, settings: Settings) -> Operation[App]:
     longest = round(1000 * settings.limits.timeout)
-    fields = (*endpoint.fields, timeout(min(endpoint.timeout, longest), longest))
-    answer = {"success": {"const": True}, **TARGET, **endpoint.properties}
+    fields = (*TARGET, *endpoint.fields, timeout(min(endpoint.timeout_ms, longest), longest))
+    answer = {"success": {"const": True}, **TARGET_SCHEMAS, **endpoint.properties}
+    example = {"success": True, **EXAMPLE, **endpoint.answer}
+    if endpoint.has_rtt:
+        answer["rtt"], example["rtt"] = COUNT, 12
     if endpoint.broadcast:
         answer["note"] = {"type": "string", "description": "Only for a broadcast"}
     whole = object_of(answer, optional=(*endpoint.optional, "note"))
@@ -64,11 +65,7 @@ def _of_device(endpoint: Endpoint, settings: Settings) -> Operation[App]:
         endpoint.name,
         endpoint.summary,
         lambda app, request, given: app.carry_out(request, endpoint, given),
-        json_answer(
-            "The device responded",
-            {"oneOf": [whole, ref("ModbusException")]},
-            {"success": True, **endpoint.answer},
-        ),
+        json_answer("The device responded", {"oneOf": [whole, ref("ModbusException")]}, example),
         DEVICE if endpoint.writes is never else (*DEVICE, "writes_off"),
         endpoint.description,
         body=body(fields, endpoint.examples),
@@ -80,7 +77,7 @@ def _streams(limits: GatewayLimits) -> tuple[Operation[App], ...]:
     return (
         Operation(
             "POST",
-            surveying.PATH,
+            address_map.PATH,
             "map",
             "Find the valid addresses of a device",
             App.map,
@@ -89,14 +86,14 @@ def _streams(limits: GatewayLimits) -> tuple[Operation[App], ...]:
             "Reads samples, and follows each range to both ends; with `exact` it reads every "
             "address. Nothing is written. Events: `progress` repeatedly, then `result`.",
             body=body_of(
-                surveying.fields(limits),
+                address_map.fields(limits),
                 {"Registers below 1000": {**EXAMPLE, "areas": list(AREAS[2:]), "last": 999}},
             ),
             failures=(FAILURE,),
         ),
         Operation(
             "POST",
-            viewing.PATH,
+            views.PATH,
             "view",
             "Poll several ranges and tag lists in one stream",
             App.view,
@@ -105,14 +102,12 @@ def _streams(limits: GatewayLimits) -> tuple[Operation[App], ...]:
             "Events: `view` with all values, then `change` for each poll with the changed values, "
             "as pairs of index and value. A part that can't be read has an `error` until it can. "
             "Comments are heartbeats.",
-            body=body_of(
-                viewing.fields(limits), {"A range and tags": {**EXAMPLE, "parts": _PARTS}}
-            ),
+            body=body_of(views.fields(limits), {"A range and tags": {**EXAMPLE, "parts": _PARTS}}),
             failures=(FAILURE,),
         ),
         Operation(
             "GET",
-            watching.PATH,
+            watch.PATH,
             "watch",
             "Poll a range and stream changes",
             App.watch,
@@ -120,7 +115,7 @@ def _streams(limits: GatewayLimits) -> tuple[Operation[App], ...]:
             DEVICE,
             "Events: `values` with all values, `change` with the changed values, `problem` for a "
             "Modbus exception or no response. Comments are heartbeats.",
-            watching.fields(limits),
+            watch.fields(limits),
             has_head=False,
             failures=(FAILURE,),
         ),

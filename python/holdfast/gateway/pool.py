@@ -1,4 +1,4 @@
-"""A pool of connections to devices. All requests to one device share one connection.
+"""A pool of connections to devices. All requests to one device share one connection, in turns.
 
 In an appliance, devices that it uses itself are asked over its own connections (`sharing`).
 
@@ -6,84 +6,164 @@ A connection is opened when it is needed. It is closed when it is idle for some 
 last request on it had no response, because the state of the connection is then unknown. Where
 replies have no transaction ids, its client stays: it knows which ones may come on the next
 connection.
+
+Equal reads that wait for their turn are sent as one. A read never joins one that is sent already,
+nor one that waits before a later write: its value could be older than the read.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import copy
 import time
-from dataclasses import dataclass, field, replace
+from collections import deque
+from dataclasses import dataclass, field
 from math import inf
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from holdfast.client import Client
+from holdfast._core import MAX_LATENESS
+from holdfast.client.client import connection
 from holdfast.client.endpoint import check_files
 from holdfast.client.url import IN_FLIGHT, NetworkTarget
 from holdfast.errors import ConnectionLost, ModbusException
+from holdfast.gateway.broadcast import is_broadcast, send
+from holdfast.gateway.sharing import Turns
+from holdfast.net.http.requests import BadRequest
 from holdfast.net.tls import NO_FILES
+from holdfast.protocol import READ_FUNCTIONS
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
-    from typing import Protocol
 
-    from holdfast.gateway.egress import Route
+    from holdfast._core import Request
+    from holdfast.client.async_transports import AsyncTransport
+    from holdfast.gateway.device_route import Route
     from holdfast.gateway.sharing import Shared
     from holdfast.net.tls import Tls
 
-    class Dial(Protocol):
-        """Creates clients. A client connects when it is first used."""
-
-        def __call__(self, target: NetworkTarget, *, timeout: float, in_flight: int) -> Client:
-            """Returns a client for an address.
-
-            Raises `OSError` and `ValueError` for TLS files that can't be used.
-            """
-            ...
-
-
 Result = TypeVar("Result")
 
-CHECK_INTERVAL = 0.5
-"""Seconds between checks for idle connections."""
+Dial: TypeAlias = "Callable[[NetworkTarget, int], AsyncTransport]"
+"""Creates the connection to an address, for a number of requests in flight. It connects when it is
+first used. Raises `OSError` and `ValueError` for TLS files that can't be used."""
 
-MAX_LATENESS = 10.0
-"""Seconds after its timeout in which a late reply may come."""
+CHECK_INTERVAL_S = 0.5
+"""Between checks for idle connections."""
 
-
-class Full(Exception):
-    """All connections of the pool are in use."""
+READS = frozenset(each.code for each in READ_FUNCTIONS.values())
+"""The functions of which equal requests can share a reply."""
 
 
 class Unusable(Exception):
     """The TLS files, which were valid at the start, can't be used any more."""
 
 
-def dial(target: NetworkTarget, *, timeout: float, in_flight: int) -> Client:
-    """Returns a client for an address.
+@dataclass(eq=False)
+class _Waiting:
+    """A request that waits for its turn, or has it, and the callers that wait for its reply."""
 
-    Raises `OSError` and `ValueError` for TLS files that can't be used.
-    """
-    query = f"?{target.tls.query}" if target.transport == "tls" else ""
-    return Client(f"{target}{query}", timeout=timeout, max_in_flight=in_flight)
-
-
-@dataclass
-class _Entry:
-    """A client and its users."""
-
-    client: Client
+    request: Request
+    unit: int
     timeout: float
-    turns: asyncio.Semaphore
+    """The longest timeout of its callers."""
+    callers: list[asyncio.Future[Any]] = field(default_factory=list)
+    worker: asyncio.Task[None] | None = None
+    """Sends it; `None` before its turn, and after its end."""
+    is_sent: bool = False
+
+    def end(self, outcome: Any) -> None:
+        """Gives all callers the result or the error."""
+        self.worker = None
+        for caller in self.callers:
+            if caller.done():
+                continue
+            # Each has an own one, because callers may change what they get.
+            own = outcome if caller is self.callers[0] else copy.copy(outcome)
+            if isinstance(own, Exception):
+                caller.set_exception(own)
+            else:
+                caller.set_result(own)
+
+
+@dataclass(eq=False)
+class _Device:
+    """A connection, its users, and the requests that wait for it."""
+
+    key: NetworkTarget
+    transport: AsyncTransport
+    timeout: float
+    most: int
+    """The most requests in flight."""
+    in_flight: int = 0
+    waiting: deque[_Waiting] = field(default_factory=deque)
+    reads: dict[tuple[int, bytes], _Waiting] = field(default_factory=dict)
+    """Waiting reads that equal ones can join, by unit id and PDU."""
+    workers: set[asyncio.Task[None]] = field(default_factory=set)
     users: int = 0
-    """The number of requests that use the client or wait for it."""
-    active: int = 0
-    """The number of requests that use the client."""
+    """The number of calls that use the connection or wait for it."""
     used: float = field(default_factory=time.monotonic)
     doubtful: bool = False
     """Whether the last request had no response."""
     needed: float = -inf
     """Until then, late replies may come that only this client knows."""
+
+    def join(self, request: Request, unit: int, timeout: float) -> _Waiting:
+        """Queues a request, or returns an equal read that waits."""
+        read = unit, request.pdu
+        is_read = request.pdu[0] in READS
+        if not is_read:
+            # Reads after it must see what it changes.
+            self.reads.clear()
+        elif read in self.reads:
+            equal = self.reads[read]
+            equal.timeout = max(equal.timeout, timeout)
+            return equal
+        new = _Waiting(request, unit, timeout)
+        self.waiting.append(new)
+        if is_read:
+            self.reads[read] = new
+        return new
+
+    def leave_queue(self, one: _Waiting) -> None:
+        """Removes a request, because it is sent now or has no callers any more."""
+        self.waiting.remove(one)
+        read = one.unit, one.request.pdu
+        if self.reads.get(read) is one:
+            del self.reads[read]
+
+
+class _PoolTurns(Turns):
+    """Turns on a connection of the pool."""
+
+    def __init__(self, pool: Pool, device: _Device) -> None:
+        super().__init__(device.key)
+        self._pool = pool
+        self._device = device
+
+    async def call(self, request: Request, unit: int, timeout: float) -> Any:
+        """Sends a request when its turn comes. Raises the errors of a client, and `Unusable`."""
+        device = self._device
+        if device.in_flight < device.most:
+            device.in_flight += 1
+            self.is_sent = True
+            try:
+                return await self._pool.send(device, request, unit, timeout)
+            finally:
+                self._pool.pass_on(device)
+        waiting = device.join(request, unit, timeout)
+        caller = asyncio.get_running_loop().create_future()
+        waiting.callers.append(caller)
+        try:
+            return await caller
+        finally:
+            self.is_sent |= waiting.is_sent
+            waiting.callers.remove(caller)
+            if not waiting.callers:
+                if waiting.worker is not None:
+                    waiting.worker.cancel()
+                elif not waiting.is_sent:
+                    device.leave_queue(waiting)
 
 
 class Pool:
@@ -101,7 +181,7 @@ class Pool:
         idle: float,
         longest: float,
         tls: Tls = NO_FILES,
-        dial: Dial = dial,
+        dial: Dial = connection,
         shared: Shared | None = None,
     ) -> None:
         self._most = most
@@ -111,7 +191,7 @@ class Pool:
         self._tls = tls
         self._dial = dial
         self._shared = shared
-        self._entries: dict[NetworkTarget, _Entry] = {}
+        self._entries: dict[NetworkTarget, _Device] = {}
         self._keeper: asyncio.Task[None] | None = None
 
     def __len__(self) -> int:
@@ -121,106 +201,135 @@ class Pool:
         self,
         route: Route,
         timeout: float,
-        call: Callable[[Client], Awaitable[Result]],
+        call: Callable[[Turns], Awaitable[Result]],
     ) -> Result:
         """Runs a call on the connection to a device, trying its addresses in turn.
 
         The connection is that of the appliance, if it uses the host or one of the addresses.
 
-        `timeout` is in seconds; the caller must cancel the call when it expires. Raises `Full`,
-        `Unusable`, `ValueError` for an invalid certificate name, and the exceptions of the call.
+        `timeout` is in seconds; the caller must cancel the call when it expires. Raises
+        `BadRequest` if all connections are in use, `Unusable`, `ValueError` for an invalid
+        certificate name, and the exceptions of the call.
         """
         if self._keeper is None:
             self._keeper = asyncio.create_task(self._keep())
-        tls = NO_FILES if route.name is None else replace(self._tls, name=route.name)
-        keys = [NetworkTarget(route.transport, each, route.port, tls) for each in route.addresses]
         if self._shared is not None:
-            hosts = dict.fromkeys((route.host, *route.addresses))
-            for target in (NetworkTarget(route.transport, host, route.port, tls) for host in hosts):
-                client = await self._shared.client(target, timeout)
-                if client is not None:
-                    return await call(client)
-        keys.sort(key=lambda key: key not in self._entries)
-        for key in keys[:-1]:
+            for target in dict.fromkeys((route.named, *route.allowed)):
+                turns = await self._shared.turns(target, timeout)
+                if turns is not None:
+                    return await call(turns)
+        addresses = route.allowed
+        if len(addresses) > 1:
+            addresses = tuple(sorted(addresses, key=lambda each: each not in self._entries))
+        for target in addresses[:-1]:
             try:
-                return await self._run(key, timeout, call)
+                return await self._run(target, call)
             except ConnectionLost as error:
                 if error.maybe_sent:
                     raise
-        return await self._run(keys[-1], timeout, call)
+        return await self._run(addresses[-1], call)
 
-    async def _run(
-        self,
-        key: NetworkTarget,
-        timeout: float,
-        call: Callable[[Client], Awaitable[Result]],
-    ) -> Result:
-        entry = await self._entry(key, timeout)
-        entry.users += 1
+    async def _run(self, key: NetworkTarget, call: Callable[[Turns], Awaitable[Result]]) -> Result:
+        device = self._entries.get(key) or await self._new_entry(key)
+        device.users += 1
         try:
-            async with entry.turns:
-                entry.active += 1
-                try:
-                    await self._refresh(key, entry, timeout)
-                    return await self._call(entry, call)
-                finally:
-                    entry.active -= 1
+            return await call(_PoolTurns(self, device))
         finally:
-            entry.users -= 1
-            entry.used = time.monotonic()
-            if entry.doubtful:
-                entry.needed = entry.used + entry.timeout + MAX_LATENESS
+            device.users -= 1
 
-    async def _call(self, entry: _Entry, call: Callable[[Client], Awaitable[Result]]) -> Result:
-        """Runs a call, and updates the state of the connection."""
-        entry.doubtful = True
+    async def send(self, device: _Device, request: Request, unit: int, timeout: float) -> Any:
+        """Sends a request whose turn has come, and returns the result."""
+        key = device.key
         try:
-            result = await call(entry.client)
+            if device.doubtful and device.in_flight == 1:
+                await self._refresh(device)
+            # Calls over TCP and TLS end when they are cancelled, others only at their timeout.
+            device.timeout = self._longest if key.transport in IN_FLIGHT else timeout
+            device.doubtful = True
+            result = None
+            if is_broadcast(key.transport, unit):
+                await device.transport.close()  # The peer may accept only one connection.
+                await send(key, request)
+            else:
+                result = await device.transport.call(request, unit, device.timeout)
+            device.doubtful = False
+            return result
         except ModbusException:
-            entry.doubtful = False
+            device.doubtful = False
             raise
-        entry.doubtful = False
-        return result
+        finally:
+            device.used = time.monotonic()
+            if device.doubtful:
+                device.needed = device.used + device.timeout + MAX_LATENESS
 
-    async def _close_doubtful(self, entry: _Entry) -> None:
-        """Closes the connection of a client that stays."""
-        async with entry.turns:
-            if entry.doubtful:
-                entry.doubtful = False
-                await entry.client.close()
+    def pass_on(self, device: _Device) -> None:
+        """Gives the place of a request that has ended to those that wait."""
+        if device.waiting:
+            self._start(device)
+        else:
+            device.in_flight -= 1
 
-    async def _entry(self, key: NetworkTarget, timeout: float) -> _Entry:
-        if key not in self._entries:
-            made = await self._client(key, timeout)
-        entry = self._entries.get(key)  # Another request may have created it meanwhile.
-        if entry is None:
-            gone = self._pushed_out() if len(self._entries) >= self._most else None
-            in_flight = self._in_flight if key.transport in IN_FLIGHT else 1
-            entry = _Entry(*made, asyncio.Semaphore(in_flight))
-            self._entries[key] = entry
-            if gone is not None:
-                entry.users += 1
-                try:
-                    await gone.client.close()
-                finally:
-                    entry.users -= 1
-        return entry
+    def _start(self, device: _Device, *, close: bool = False) -> None:
+        worker = asyncio.create_task(self._work(device, close=close))
+        device.workers.add(worker)  # The event loop has only weak references.
 
-    async def _client(self, key: NetworkTarget, timeout: float) -> tuple[Client, float]:
-        """Returns a client and its timeout.
+    async def _work(self, device: _Device, *, close: bool) -> None:
+        """Sends the requests that wait, each as soon as the one before it has ended.
 
-        Calls over TCP and TLS can be cancelled, so their client has the longest timeout. Other
-        calls can't, so their client has the timeout of the request.
+        The callers would send theirs later, after the work with the reply before it.
         """
-        timeout = self._longest if key.transport in IN_FLIGHT else timeout
-        if key.transport != "tls":
-            return self._dial(key, timeout=timeout, in_flight=self._in_flight), timeout
-        return await asyncio.to_thread(self._dial_tls, key, timeout), timeout
-
-    def _dial_tls(self, key: NetworkTarget, timeout: float) -> Client:
-        """Returns a client with TLS. Blocks, because it reads the TLS files."""
+        worker = asyncio.current_task()
+        assert worker is not None
         try:
-            return self._dial(key, timeout=timeout, in_flight=self._in_flight)
+            if close:
+                device.doubtful = False
+                await device.transport.close()
+            while device.waiting:
+                now = device.waiting[0]
+                if all(caller.done() for caller in now.callers):
+                    await asyncio.sleep(0)  # They have given up, and leave the queue next.
+                    continue
+                device.leave_queue(now)
+                now.is_sent, now.worker = True, worker
+                outcome: Any
+                try:
+                    outcome = await self.send(device, now.request, now.unit, now.timeout)
+                except asyncio.CancelledError:
+                    if now.callers:  # The pool ends.
+                        raise
+                    worker.uncancel()
+                    continue
+                except Exception as error:
+                    outcome = error
+                now.end(outcome)
+        finally:
+            device.in_flight -= 1
+            device.workers.discard(worker)
+
+    async def _new_entry(self, key: NetworkTarget) -> _Device:
+        transport = await self._dialed(key)
+        device = self._entries.get(key)  # Another request may have created it meanwhile.
+        if device is None:
+            gone = self._pushed_out() if len(self._entries) >= self._most else None
+            most = self._in_flight if key.transport in IN_FLIGHT else 1
+            device = self._entries[key] = _Device(key, transport, self._longest, most)
+            if gone is not None:
+                device.users += 1
+                try:
+                    await gone.transport.close()
+                finally:
+                    device.users -= 1
+        return device
+
+    async def _dialed(self, key: NetworkTarget) -> AsyncTransport:
+        if key.transport != "tls":
+            return self._dial(key, self._in_flight)
+        return await asyncio.to_thread(self._dial_tls, key)
+
+    def _dial_tls(self, key: NetworkTarget) -> AsyncTransport:
+        """Returns a connection with TLS. Blocks, because it reads the TLS files."""
+        try:
+            return self._dial(key, self._in_flight)
         except (OSError, ValueError):
             try:
                 check_files(self._tls)
@@ -228,38 +337,34 @@ class Pool:
                 raise Unusable(str(error)) from None
             raise
 
-    async def _refresh(self, key: NetworkTarget, entry: _Entry, timeout: float) -> None:
-        """Closes a connection that is in doubt, and sets the timeout; reads TLS files again."""
-        if key.transport not in IN_FLIGHT:
-            entry.client.timeout = entry.timeout = timeout
-        if entry.active > 1 or not entry.doubtful:
+    async def _refresh(self, device: _Device) -> None:
+        """Closes a connection that is in doubt; reads TLS files again."""
+        made = device.transport
+        if device.key.transport == "tls":
+            made = await self._dialed(device.key)
+        if device.in_flight > 1:  # Another request uses it meanwhile.
             return
-        made = entry.client
-        if key.transport == "tls":
-            made, _ = await self._client(key, timeout)
-        if entry.active > 1:  # Another request uses it meanwhile.
-            return
-        old, entry.client = entry.client, made
-        entry.doubtful = False
+        old, device.transport = device.transport, made
+        device.doubtful = False
         await old.close()
 
-    def _pushed_out(self) -> _Entry:
-        """Removes the least recently used idle entry. Raises `Full` if all are in use."""
-        free = [key for key, entry in self._entries.items() if entry.users == 0]
+    def _pushed_out(self) -> _Device:
+        """Removes the least recently used idle entry. Raises `BadRequest` if all are in use."""
+        free = [each for each in self._entries.values() if each.users == 0]
         if not free:
-            raise Full
-        return self._entries.pop(min(free, key=lambda key: self._entries[key].used))
+            raise BadRequest("busy", "too many devices are in use, try again later")
+        return self._entries.pop(min(free, key=lambda each: each.used).key)
 
     async def _keep(self) -> None:
         """Closes idle connections, and all connections at the end."""
         try:
             while True:
-                await asyncio.sleep(CHECK_INTERVAL)
+                await asyncio.sleep(CHECK_INTERVAL_S)
                 await self._close_unused()
         finally:
             for entry in self._entries.values():
                 with contextlib.suppress(Exception):
-                    await entry.client.close()
+                    await entry.transport.close()
             if self._shared is not None:
                 self._shared.close()
 
@@ -268,14 +373,16 @@ class Pool:
         if self._shared is not None:
             self._shared.forget_unused(latest)
         for key, entry in list(self._entries.items()):
-            if entry.users > 0:
+            if entry.users or entry.in_flight:
                 continue
             is_needed = key.transport not in IN_FLIGHT and time.monotonic() < entry.needed
             if is_needed and not self._is_shared(key):
-                await self._close_doubtful(entry)
+                if entry.doubtful:
+                    entry.in_flight += 1
+                    self._start(entry, close=True)
             elif entry.doubtful or entry.used < latest or self._is_shared(key):
                 del self._entries[key]
-                await entry.client.close()
+                await entry.transport.close()
 
     def _is_shared(self, key: NetworkTarget) -> bool:
         """Returns whether the appliance has begun to use the device, which may accept no more."""

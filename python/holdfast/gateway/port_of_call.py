@@ -11,21 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast import logs
-from holdfast.gateway.reading import AREAS_READ, not_a_read_function
+from holdfast.events import log_lines
+from holdfast.gateway.endpoints.read import AREAS_READ, not_a_read_function
 from holdfast.net.addresses import LAST_PORT
+from holdfast.net.http.fields import NotJson, decoded, filled, object_with
+from holdfast.net.http.operations import Body
+from holdfast.net.http.origin import is_from_page
+from holdfast.net.http.requests import BadRequest, shown
 from holdfast.protocol import LAST_ADDRESS, MAX_WORD, READ_LIMITS, WRITE_REGISTERS
-from holdfast.web.fields import NotJson, decoded, filled, object_with
-from holdfast.web.operations import Body
-from holdfast.web.origin import is_from_page
-from holdfast.web.requests import BadRequest, shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from holdfast.gateway.endpoint import Given
-    from holdfast.web.fields import Field
-    from holdfast.web.requests import Request
+    from holdfast.net.http.fields import Field
+    from holdfast.net.http.requests import Request
 
 MAX_IGNORED = 4
 """The most ignored keys of a request in the log."""
@@ -136,7 +136,7 @@ def body(path: str, fields: Sequence[Field], examples: Mapping[str, Any]) -> Bod
     def parse(request: Request, body: bytes) -> dict[str, Any]:
         given, ignored = parsed(path, body, fields)
         if ignored:
-            logs.refused(
+            log_lines.refused(
                 "keys_ignored",
                 kind="gateway",
                 listener="gateway",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from holdfast.web.refusals import COMMON, Refusal, Refusals
+from holdfast.net.http.refusals import COMMON, Refusal, Refusals
+
+EXCEPTION_STATUS = 200
+"""The status of an exception of the device: the request itself succeeded."""
 
 REFUSALS = Refusals(
     *COMMON,

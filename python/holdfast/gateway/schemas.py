@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import get_args
 
-from holdfast.gateway import listing
+from holdfast.discovery.address_search import State
+from holdfast.gateway.endpoints import tag_lists
+from holdfast.gateway.endpoints.read import FUNCTION_SCHEMA, RANGE_PROPERTIES, TYPED
 from holdfast.gateway.fields import ADDRESS_SCHEMA, UNIT_SCHEMA
-from holdfast.gateway.reading import FUNCTION_SCHEMA, TYPED
 from holdfast.net.addresses import LAST_PORT
-from holdfast.protocol import READ_BITS
-from holdfast.tools.discovery import State
-from holdfast.types import AREAS
-from holdfast.web.schemas import (
+from holdfast.net.http.schemas import (
     BOOLEAN,
     COUNT,
     NUMBER,
@@ -23,6 +21,8 @@ from holdfast.web.schemas import (
     map_of,
     object_of,
 )
+from holdfast.protocol import READ_BITS
+from holdfast.types import AREAS
 
 TARGET: dict[str, Schema] = {
     "host": TEXT,
@@ -66,17 +66,7 @@ _STATUS = object_of(
 )
 _TYPED_CHANGE = object_of({"index": COUNT, "value": {}, "text": TEXT})
 _WATCHES: dict[str, Schema] = {
-    "Values": object_of(
-        {
-            **_NOW,
-            "address": ADDRESS_SCHEMA,
-            "quantity": _QUANTITY,
-            "format": _FORMAT,
-            "values": array_of(_VALUE),
-            **TYPED,
-        },
-        optional=tuple(TYPED),
-    ),
+    "Values": object_of({**_NOW, **RANGE_PROPERTIES}, optional=tuple(TYPED)),
     "Change": object_of(
         {
             **_NOW,
@@ -103,7 +93,7 @@ _RANGE = object_of(
     {"kind": {"const": "range"}, **_ASKED, "format": _FORMAT, **_STATES}, optional=tuple(_STATES)
 )
 _TAGS = object_of(
-    {"kind": {"const": "tags"}, "tags": array_of(listing.TAG), **_STATES},
+    {"kind": {"const": "tags"}, "tags": array_of(tag_lists.TAG), **_STATES},
     optional=(*_STATES, "tags"),
 )
 _CHANGES = {name: array_of(_PAIR) for name in ("values", "texts", "errors")}

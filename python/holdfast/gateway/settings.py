@@ -11,7 +11,7 @@ from holdfast.net.tls import NO_FILES
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from holdfast.config.services import Compat
+    from holdfast.config.models.services import Compat
     from holdfast.gateway.tokens import Token
     from holdfast.net.addresses import Network
     from holdfast.net.allow_list import AllowedNetwork

@@ -10,33 +10,28 @@ import asyncio
 import contextlib
 import socket
 import time
-from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from holdfast._core import Caller
-from holdfast.client import Client
 from holdfast.client.endpoint import endpoint
 from holdfast.errors import ConnectionLost, InvalidResponse, ModbusError, ModbusException
+from holdfast.gateway.broadcast import is_broadcast
 
 if TYPE_CHECKING:
     from holdfast._core import Endpoint, Link, Poller, Request
     from holdfast.client.url import NetworkTarget
 
 
-SHORTEST = 0.001
-"""The shortest timeout of a request, in seconds."""
+MAX_ENDPOINTS = 256
+"""The endpoints that are kept."""
+
+MIN_TIMEOUT_S = 0.001
+"""The shortest timeout of a request."""
 
 
 class QueueFull(Exception):
     """Too many requests wait for the connection."""
-
-
-@dataclass
-class _Held:
-    """A link that the gateway has used. While it is held, its connection stays open."""
-
-    link: Link
-    used: float = field(default_factory=time.monotonic)
 
 
 class Shared:
@@ -44,14 +39,15 @@ class Shared:
 
     def __init__(self, poller: Poller) -> None:
         self._poller = poller
-        self._held: dict[NetworkTarget, _Held] = {}
+        self._held: dict[NetworkTarget, tuple[Link, float]] = {}
+        """Links, and when they were used. While one is held, its connection stays open."""
         self._endpoints: dict[NetworkTarget, tuple[Endpoint, float]] = {}
         """Endpoints with TLS, and when their files were read."""
         self._calls: _Calls | None = None
         self._opening = asyncio.Lock()
 
-    async def client(self, target: NetworkTarget, timeout: float) -> SharedClient | None:
-        """Returns a client for requests within `timeout` seconds from now.
+    async def turns(self, target: NetworkTarget, timeout: float) -> Turns | None:
+        """Returns the turns of requests within `timeout` seconds from now.
 
         Returns `None` if the appliance does not use the address, or with other certificates.
         """
@@ -66,17 +62,16 @@ class Shared:
         if self._calls is None:
             async with self._opening:
                 self._calls = self._calls or await _Calls.opened()
-        return SharedClient(target, _Turns(self._calls, link, timeout), timeout)
+        return _LinkTurns(target, self._calls, link, timeout)
 
     def knows(self, target: NetworkTarget) -> bool:
         """Returns whether the appliance uses this address."""
-        known = self._endpoint(target)
-        return known is not None and self._poller.known_link(str(target), known) is not None
+        return self._known_link(target) is not None
 
     def forget_unused(self, latest: float) -> None:
         """Releases the links that were last used before `latest`."""
-        for target, held in list(self._held.items()):
-            if held.used < latest:
+        for target, (_, used) in list(self._held.items()):
+            if used < latest:
                 del self._held[target]
         for target, (_, read_at) in list(self._endpoints.items()):
             if read_at < latest:
@@ -90,62 +85,57 @@ class Shared:
 
     def _link(self, target: NetworkTarget) -> Link | None:
         held = self._held.get(target)
-        if held is None:
-            known = self._endpoint(target)
-            link = None if known is None else self._poller.known_link(str(target), known)
-            if link is None:
-                return None
-            held = self._held[target] = _Held(link)
-        held.used = time.monotonic()
-        return held.link
+        link = self._known_link(target) if held is None else held[0]
+        if link is not None:
+            self._held[target] = link, time.monotonic()
+        return link
 
-    def _endpoint(self, target: NetworkTarget) -> Endpoint | None:
+    def _known_link(self, target: NetworkTarget) -> Link | None:
+        """Returns the link to a target that the appliance uses now."""
         if target.transport != "tls":
-            return endpoint(target)
+            return self._poller.known_link(*_plain_endpoint(target))
         known = self._endpoints.get(target)
-        return None if known is None else known[0]
+        return None if known is None else self._poller.known_link(str(target), known[0])
 
 
-class SharedClient(Client):
-    """A client whose connection belongs to the appliance.
+@lru_cache(MAX_ENDPOINTS)
+def _plain_endpoint(target: NetworkTarget) -> tuple[str, Endpoint]:
+    """The name and the endpoint of a target without TLS. Each request asks for its link."""
+    return str(target), endpoint(target)
 
-    Its timeout covers all of its calls, with the waits for their turns.
-    """
 
-    def __init__(self, target: NetworkTarget, turns: _Turns, timeout: float) -> None:
-        # It has no connection of its own, which the constructor of its base would create.
+class Turns:
+    """Sends the requests of one caller to a device, each when its turn comes."""
+
+    late, longest_late = 0, 0.0
+    """Late replies are counted where the connection is."""
+
+    def __init__(self, target: NetworkTarget) -> None:
         self.target = target
-        self.unit = 1
-        self.timeout = timeout
-        self._turns = turns
-        self._transport = turns
-
-    @property
-    def is_sent(self) -> bool:
-        """Whether the turn of a request has come, so that the device may have received it."""
-        return self._turns.is_sent
-
-    def broadcasts(self) -> None:
-        """Makes calls end without a reply."""
-        self._turns.broadcasts = True
-
-
-class _Turns:
-    """A link, for the calls of one client."""
-
-    def __init__(self, calls: _Calls, link: Link, timeout: float) -> None:
-        self._calls = calls
-        self._link = link
-        self._deadline = time.monotonic() + timeout
         self.is_sent = False
-        self.broadcasts = False
-        self.late, self.longest_late = 0, 0.0
-        """The link drops late replies."""
+        """Whether the turn of a request has come, so that the device may have received it."""
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
         """Sends a request when its turn comes. Raises `QueueFull` and the errors of a client."""
-        left = max(min(self._deadline - time.monotonic(), timeout), SHORTEST)
-        ticket = self._link.call(self._calls.caller, request, unit, left, broadcast=self.broadcasts)
+        raise NotImplementedError
+
+    async def close(self) -> None:
+        """Does nothing: the connection has other users."""
+
+
+class _LinkTurns(Turns):
+    """Turns on a link of the appliance, within `timeout` seconds from now."""
+
+    def __init__(self, target: NetworkTarget, calls: _Calls, link: Link, timeout: float) -> None:
+        super().__init__(target)
+        self._calls = calls
+        self._link = link
+        self._deadline = time.monotonic() + timeout
+
+    async def call(self, request: Request, unit: int, timeout: float) -> Any:
+        left = max(min(self._deadline - time.monotonic(), timeout), MIN_TIMEOUT_S)
+        broadcast = is_broadcast(self.target.transport, unit)
+        ticket = self._link.call(self._calls.caller, request, unit, left, broadcast=broadcast)
         if ticket is None:
             raise QueueFull
         try:
@@ -158,12 +148,9 @@ class _Turns:
             return result
         if isinstance(result, ConnectionLost) and not sent:
             result.maybe_sent = False
-        if isinstance(result, ModbusException) and self.broadcasts:
+        if isinstance(result, ModbusException) and broadcast:
             raise InvalidResponse(f"the peer answered a broadcast with {result}")
         raise result
-
-    async def close(self) -> None:
-        """Does nothing: the connection belongs to the appliance."""
 
 
 class _Calls(asyncio.Protocol):

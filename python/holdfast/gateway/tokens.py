@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, TypeAlias
 
-from holdfast.bounded_files import MAX_SECRETS, read
-from holdfast.config.scalars import NAME_FORM, is_name
+from holdfast.config.values.scalars import NAME_FORM, is_name
+from holdfast.runtime.bounded_files import MAX_SECRETS_BYTES, read
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,7 +26,7 @@ class WrongTokens(Exception):
 def load(file: Path) -> list[Token]:
     """Reads a token file; `#` starts a comment. Raises `OSError` and `WrongTokens`."""
     try:
-        lines = read(file, MAX_SECRETS).decode().splitlines()
+        lines = read(file, MAX_SECRETS_BYTES).decode().splitlines()
     except UnicodeDecodeError:
         raise WrongTokens(f"{file}: not UTF-8") from None
     tokens: list[Token] = []

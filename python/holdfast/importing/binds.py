@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.config.ip_addresses import Bind, parse_bind
-from holdfast.config.words import show
+from holdfast.config.text.messages import show
+from holdfast.config.values.ip_addresses import Bind, parse_bind
 
 if TYPE_CHECKING:
-    from holdfast.config.source import KeyPath
-    from holdfast.importing.choices import Choices
-    from holdfast.importing.notes import Desk
+    from holdfast.config.text.source import KeyPath
+    from holdfast.importing.notes import Choices, Desk
 
 FORM = "a port, :port or address:port with an IP address"
 
@@ -50,11 +49,11 @@ class Binds:
             return None
         if host in ("", "*"):
             other = f"without IPv6 on the machine, write 0.0.0.0:{port}"
-            self._desk.note("check", path, f"listens on all addresses, {bind}; {other}")
+            self._desk.check(path, f"listens on all addresses, {bind}; {other}")
         elif host == "0.0.0.0":
             ran, meant = f"IPv4 and IPv6, [::]:{port}", "IPv4 only"
             self._choices.note(self._desk, path, ran=ran, meant=meant)
             return bind if self._choices.as_meant else parse_bind(f"[::]:{port}")
         elif host != numeric:
-            self._desk.note("changed", path, f"listens on {bind}: host names are not allowed")
+            self._desk.changed(path, f"listens on {bind}: host names are not allowed")
         return bind

@@ -10,6 +10,9 @@ from holdfast.types import AREAS
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
+    from holdfast.importing.binds import Binds
+    from holdfast.importing.notes import Choices, Desk
+    from holdfast.importing.peers import Peers
     from holdfast.types import Area
 
 INGESTED = {"discrete_inputs", "input_registers"}
@@ -71,3 +74,15 @@ class Draft:
     def written_by_raw_ingest(self) -> list[str]:
         """The memories with an id, which Raw Ingest packets with memory ids can write."""
         return [name for name, memory in self.memories.items() if "id" in memory]
+
+
+@dataclass
+class Reader:
+    """What every reader of a part of the source has."""
+
+    desk: Desk
+    draft: Draft
+    binds: Binds
+    admitted: Peers | None
+    """The peers that the filter of the whole file admits, `None` without a filter."""
+    choices: Choices

@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from holdfast.config import source
 from holdfast.config.dump import to_yaml
-from holdfast.config.problems import ConfigError
-from holdfast.config.words import show
+from holdfast.config.text import source
+from holdfast.config.text.messages import show
+from holdfast.config.text.problems import ConfigError
 from holdfast.importing.notes import Desk, Note
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.config.problems import Problem
+    from holdfast.config.text.problems import Problem
 
 Generation: TypeAlias = Literal[1, 2]
 ORDINALS: dict[Generation, str] = {1: "first", 2: "second"}

@@ -10,7 +10,7 @@ from holdfast.runtime.text import listing
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
-    from holdfast.config.source import KeyPath
+    from holdfast.config.text.source import KeyPath
     from holdfast.importing.notes import Desk
     from holdfast.importing.sections import Section
 
@@ -34,7 +34,7 @@ def read_areas(memory: Section, size_key: str) -> dict[str, Any]:
             areas[area] = extent
     if not areas and len(memory.desk.report.problems) == wrong:
         message = f"no area, allowed: at least one of {listing(AREAS)}"
-        memory.desk.problem(memory.path, message, of_key=True)
+        memory.desk.problem_of_key(memory.path, message)
     return areas
 
 
@@ -50,7 +50,7 @@ def _long_form(memory: Section, area: str, size_key: str) -> dict[str, int] | in
 
 def _extent(memory: Section, area: str, start: int, size: int) -> dict[str, int] | int | None:
     if size == 0:
-        memory.desk.note("left out", memory.at(area), "the area has no addresses")
+        memory.desk.left_out(memory.at(area), "the area has no addresses")
         return None
     if start + size > ADDRESSES:
         message = f"found start {start} and size {size}, allowed: a sum up to {ADDRESSES}"

@@ -8,13 +8,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.importing.binds import Binds
-from holdfast.importing.choices import Choices
 from holdfast.importing.draft import Draft
-from holdfast.importing.filters import read_filter
 from holdfast.importing.imported import Generation, Imported, Source
 from holdfast.importing.mma_adapters import Adapters
 from holdfast.importing.mma_first import FirstGeneration
 from holdfast.importing.mma_second import TOP_REASONS, SecondGeneration
+from holdfast.importing.notes import Choices
+from holdfast.importing.peers import read_filter
 from holdfast.importing.sections import Section
 
 if TYPE_CHECKING:

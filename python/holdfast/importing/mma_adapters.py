@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import re
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.broker import parse_broker, parse_topic_filter
-from holdfast.config.words import show
-from holdfast.importing.draft import ADMISSION, INGESTED
-from holdfast.importing.filters import ALL
+from holdfast.config.text.messages import show
+from holdfast.config.values.topics import parse_topic_filter
+from holdfast.config.values.urls import parse_broker
+from holdfast.importing.draft import ADMISSION, INGESTED, Reader
 from holdfast.importing.names import free_name, unique_names
-from holdfast.importing.peers import Peers, written
+from holdfast.importing.peers import ALL, written
 from holdfast.importing.sections import seconds, section
 from holdfast.net.addresses import LOOPBACK
 from holdfast.protocol import MAX_WORD
@@ -21,12 +20,8 @@ from holdfast.runtime.text import all_of, listing
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from holdfast.config.ip_addresses import Bind
-    from holdfast.config.source import KeyPath
-    from holdfast.importing.binds import Binds
-    from holdfast.importing.choices import Choices
-    from holdfast.importing.draft import Draft
-    from holdfast.importing.notes import Desk
+    from holdfast.config.text.source import KeyPath
+    from holdfast.config.values.ip_addresses import Bind
     from holdfast.importing.sections import Section
     from holdfast.types import Area
 
@@ -48,15 +43,8 @@ PUBLISHED = (INGEST_TOKEN, "CHANGE_ME_LONG_RANDOM")
 """Tokens in the documentation of the source."""
 
 
-@dataclass
-class Adapters:
+class Adapters(Reader):
     """Reads `rest`, `mqtt` and `raw_ingest` into a draft that already has the memories."""
-
-    desk: Desk
-    draft: Draft
-    binds: Binds
-    admitted: Peers | None
-    choices: Choices
 
     def read(self, root: Section) -> None:
         """Reads the sections that exist and are enabled."""
@@ -69,20 +57,20 @@ class Adapters:
         if mqtt is not None:
             self._mqtt(mqtt)
         for name, path in self.draft.seals.items():
-            self._tell_who_opens(name, path)
+            self._note_sealed(name, path)
 
     def _enabled(self, root: Section, key: str) -> Section | None:
         found = root.mapping(key)
         if found is None or found.flag("enabled"):
             return found
-        self.desk.note("left out", found.path, "not enabled")
+        self.desk.left_out(found.path, "not enabled")
         return None
 
-    def _tell_who_opens(self, name: str, path: KeyPath) -> None:
+    def _note_sealed(self, name: str, path: KeyPath) -> None:
         if self.draft.rest or self.draft.mqtt or self.draft.raw_ingest_may_open(name):
             return
         message = f"nothing can open {name}: REST, MQTT and Raw Ingest write gate bits"
-        self.desk.note("check", path, f"{message}, and none of them can access it")
+        self.desk.check(path, f"{message}, and none of them can access it")
 
     def _rest(self, rest: Section) -> None:
         address = rest.get("address")
@@ -90,7 +78,7 @@ class Adapters:
         tokens = self._tokens(rest)
         rest.close()
         if address is None:
-            self.desk.note("left out", rest.path, "REST is left out: it has no address")
+            self.desk.left_out(rest.path, "REST is left out: it has no address")
         if bind is None:
             return
         self._rest_at(rest, bind, tokens)
@@ -103,12 +91,12 @@ class Adapters:
         sources = self._rest_sources(rest, bind)
         if not tokens and not bind.address.is_loopback:
             message = "REST is left out: without auth it requires a loopback address; bind it to"
-            told = f"{message} 127.0.0.1 with tokens: none, or create tokens with `holdfast token`"
-            self.desk.note("left out", rest.path, told)
+            text = f"{message} 127.0.0.1 with tokens: none, or create tokens with `holdfast token`"
+            self.desk.left_out(rest.path, text)
         elif sources:
             if not tokens:
                 message = "without tokens, every client on this machine may write all areas"
-                self.desk.note("check", rest.path, message)
+                self.desk.check(rest.path, message)
             found = {"bind": str(bind), "sources": sources, "tokens": tokens or "none"}
             self.draft.rest = found
 
@@ -121,14 +109,12 @@ class Adapters:
         """The sources that the file's filter admits, although it did not apply here before."""
         if self.admitted is None:
             message = "sources are all addresses; list only the networks that need it"
-            self.desk.note("check", parent.path, message)
+            self.desk.check(parent.path, message)
             return ALL.written()
         if not self.admitted:
-            message = f"{what} is left out: ip_filter admits nobody"
-            self.desk.note("left out", parent.path, message)
+            self.desk.left_out(parent.path, f"{what} is left out: ip_filter admits nobody")
             return []
-        message = "sources are from ip_filter, which did not apply here before"
-        self.desk.note("check", parent.path, message)
+        self.desk.check(parent.path, "sources are from ip_filter, which did not apply here before")
         return self.admitted.written()
 
     def _tokens(self, rest: Section) -> list[dict[str, Any]] | None:
@@ -144,32 +130,31 @@ class Adapters:
             bearer.close()
         auth.close()
         if not enabled:
-            self.desk.note("left out", auth.path, "not enabled")
+            self.desk.left_out(auth.path, "not enabled")
             return self._published(rest)
         tokens = self._token_list(rest, entries)
         if not tokens:
-            self.desk.note("left out", rest.path, "REST is left out: it has no usable token")
+            self.desk.left_out(rest.path, "REST is left out: it has no usable token")
             return None
-        self._tell_grant(auth.path)
+        self._note_grant(auth.path)
         ran = "these tokens had no effect: one published token wrote, and reads failed"
-        self.desk.note("check", auth.path, f"as it ran: {ran}; as it was meant: each has access")
+        self.desk.check(auth.path, f"as it ran: {ran}; as it was meant: each has access")
         return tokens
 
     def _published(self, rest: Section) -> list[dict[str, Any]]:
         """The only token that the source accepted, if it is to be kept."""
         tokens = self._token_list(rest, []) if self._keeps_ingest_token else []
         if tokens:
-            self._tell_grant(rest.path)
+            self._note_grant(rest.path)
         return tokens
 
-    def _tell_grant(self, path: KeyPath) -> None:
+    def _note_grant(self, path: KeyPath) -> None:
         if grant := self.draft.ingest_grant(self.choices.grant_rest):
-            told = f"each token {_written('rest', grant['areas'])}. To read other areas,"
-            message = f"{told} create another token with `holdfast token`"
-            self.desk.note("check", path, message)
+            text = f"each token {_written('rest', grant['areas'])}. To read other areas,"
+            self.desk.check(path, f"{text} create another token with `holdfast token`")
         else:
             message = "no memory has discrete inputs or input registers, so each token only reads"
-            self.desk.note("check", path, message)
+            self.desk.check(path, message)
 
     @property
     def _keeps_ingest_token(self) -> bool:
@@ -187,24 +172,23 @@ class Adapters:
             token.close()
             digest = hashlib.sha256(secret.encode()).hexdigest()
             if not secret:
-                self.desk.note("left out", path, "the token is empty")
+                self.desk.left_out(path, "the token is empty")
             elif secret in PUBLISHED and not self.choices.keep_published_tokens:
                 message = "everybody knows this token from the documentation of the source;"
-                self.desk.note("left out", path, f"{message} --keep-published-tokens keeps it")
+                self.desk.left_out(path, f"{message} --keep-published-tokens keeps it")
             elif digest in found:
-                message = "the token repeats an earlier one"
-                self.desk.note("left out", path, message)
+                self.desk.left_out(path, "the token repeats an earlier one")
             else:
                 found[digest] = (token.at("name"), name or f"token-{len(found) + 1}")
                 if len(secret) < SHORT:
                     message = f"the token has fewer than {SHORT} characters and can be guessed"
-                    told = f"{message}; create one with `holdfast token`"
-                    self.desk.note("check", token.at("token"), told)
+                    text = f"{message}; create one with `holdfast token`"
+                    self.desk.check(token.at("token"), text)
         digest = hashlib.sha256(INGEST_TOKEN.encode()).hexdigest()
         if self._keeps_ingest_token and digest not in found:
             found[digest] = (rest.path, "published")
             message = "the token of the documentation that the source always accepted is kept"
-            self.desk.note("check", rest.path, f"{message}, as published; everybody knows it")
+            self.desk.check(rest.path, f"{message}, as published; everybody knows it")
         names = unique_names(self.desk, list(found.values()))
         grant: dict[str, Any] = {
             **self.draft.ingest_grant(self.choices.grant_rest),
@@ -224,7 +208,7 @@ class Adapters:
         password = mqtt.secret("password")
         mqtt.close()
         if topic is None:
-            self.desk.note("left out", mqtt.path, "MQTT is left out: it has no topic")
+            self.desk.left_out(mqtt.path, "MQTT is left out: it has no topic")
         if url is None or topic is None or not self._is_topic(mqtt.at("topic"), topic):
             return
         found: dict[str, Any] = {"url": url, "version": "3.1.1"}
@@ -234,21 +218,19 @@ class Adapters:
             found |= self._password(mqtt, username)
         if client_id is None:
             message = f"no client_id: set to {CLIENT_ID}, which must be unique at the broker"
-            self.desk.note("changed", mqtt.path, message)
+            self.desk.changed(mqtt.path, message)
         found["client_id"] = client_id or CLIENT_ID
         grant = self.draft.ingest_grant(self.choices.grant_mqtt)
         if not grant:
             message = "MQTT is left out: no memory has discrete inputs or input registers, and"
-            self.desk.note("left out", mqtt.path, f"{message} it could write nothing else")
+            self.desk.left_out(mqtt.path, f"{message} it could write nothing else")
             return
         if restored := self.draft.restored(grant["areas"]):
             grant["while_sealed"] = restored
-            told = f"as it ran, messages may also write {_areas(restored)} while their memory"
-            message = f"{told} is sealed, to restore it: while_sealed"
-            self.desk.note("check", mqtt.at("topic"), message)
+            text = f"as it ran, messages may also write {_areas(restored)} while their memory"
+            self.desk.check(mqtt.at("topic"), f"{text} is sealed, to restore it: while_sealed")
         found["subscriptions"] = [{"topic": topic, "qos": QOS, **grant}]
-        message = f"the topic {_written('mqtt', grant['areas'])}"
-        self.desk.note("check", mqtt.at("topic"), message)
+        self.desk.check(mqtt.at("topic"), f"the topic {_written('mqtt', grant['areas'])}")
         self.draft.mqtt = found
 
     def _is_topic(self, path: KeyPath, topic: str) -> bool:
@@ -262,24 +244,23 @@ class Adapters:
     def _password(self, mqtt: Section, username: str | None) -> dict[str, Any]:
         path = mqtt.at("password")
         if username is None:
-            message = "no username: the source did not send the password"
-            self.desk.note("left out", path, message)
+            self.desk.left_out(path, "no username: the source did not send the password")
             return {}
         message = f"write the password into the file {PASSWORD_FILE} next to the configuration"
-        self.desk.note("check", path, f"{message}, and let nobody else read it")
+        self.desk.check(path, f"{message}, and let nobody else read it")
         return {"password_file": PASSWORD_FILE}
 
     def _broker(self, mqtt: Section) -> str | None:
         """The URL of the broker; messages never show a user or password."""
         path, text = mqtt.at("broker"), mqtt.text("broker")
         if text is None:
-            self.desk.note("left out", mqtt.path, "MQTT is left out: it has no broker")
+            self.desk.left_out(mqtt.path, "MQTT is left out: it has no broker")
             return None
         match = _BROKER.fullmatch(text)
         scheme = (match["scheme"] or "tcp").lower() if match else ""
         if match and scheme not in _SCHEMES:
             message = f"MQTT is left out: {show(scheme)} is not supported, only {listing(_SCHEMES)}"
-            self.desk.note("left out", path, message)
+            self.desk.left_out(path, message)
             return None
         url = f"{_SCHEMES[scheme]}://{match['host']}" if match else ""
         try:
@@ -288,17 +269,15 @@ class Adapters:
             self.desk.problem(path, "not a broker URL (value hidden), allowed: tcp://host:port")
             return None
         if match and match["user"]:
-            message = "user and password in the URL: set username and password_file"
-            self.desk.note("left out", path, message)
+            self.desk.left_out(path, "user and password in the URL: set username and password_file")
         if match and match["more"].strip("/"):
-            self.desk.note("left out", path, "everything after host and port")
+            self.desk.left_out(path, "everything after host and port")
         return url
 
     def _raw_ingest(self, raw: Section) -> None:
         listen = raw.get("listen")
         if listen is None:
-            message = "missing, allowed: :port or address:port"
-            self.desk.problem(raw.at("listen"), message, of_key=True)
+            self.desk.problem_of_key(raw.at("listen"), "missing, allowed: :port or address:port")
         bind = None if listen is None else self.binds.read(raw.at("listen"), listen)
         timeout = raw.integer("read_timeout_ms", 1, 31_622_400_000)
         raw.close({"max_packet_bytes": "a packet is as long as its count says, up to a whole area"})
@@ -306,10 +285,10 @@ class Adapters:
         for name in self.draft.memories:
             if name not in memories:
                 message = f"could not write {name}, whose name is not a memory id"
-                self.desk.note("check", raw.path, f"{message}; give it an id to allow that")
+                self.desk.check(raw.path, f"{message}; give it an id to allow that")
         if not memories:
             message = f"Raw Ingest is left out: no memory has a number from 0 to {MAX_WORD} as name"
-            self.desk.note("left out", raw.path, message)
+            self.desk.left_out(raw.path, message)
             return
         sources = self._sources(raw, "Raw Ingest")
         if bind is None or not sources:

@@ -3,42 +3,28 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.scalars import MAX_CONNECTIONS
-from holdfast.config.words import show
-from holdfast.importing import functions
-from holdfast.importing.draft import ADMISSION
-from holdfast.importing.filters import ALL, read_filter
+from holdfast.config.text.messages import show
+from holdfast.config.values.scalars import MAX_CONNECTIONS
+from holdfast.importing import function_rights as functions
+from holdfast.importing.draft import ADMISSION, Reader
 from holdfast.importing.memories import check_gate, read_areas, read_id
 from holdfast.importing.names import unique_names
+from holdfast.importing.peers import ALL, read_filter
 from holdfast.importing.sections import Section, section
-from holdfast.protocol import LAST_ADDRESS, WRITING_CODES
-from holdfast.runtime.text import guess, listing
+from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, WRITING_CODES
+from holdfast.runtime.text import listing, suggestion
 
 if TYPE_CHECKING:
-    from holdfast.config.ip_addresses import Bind
-    from holdfast.config.source import KeyPath
-    from holdfast.importing.binds import Binds
-    from holdfast.importing.choices import Choices
-    from holdfast.importing.draft import Draft
-    from holdfast.importing.notes import Desk
-    from holdfast.importing.peers import Peers
+    from holdfast.config.text.source import KeyPath
+    from holdfast.config.values.ip_addresses import Bind
 
 DEFAULT_CONNECTIONS = 32
 
 
-@dataclass
-class FirstGeneration:
+class FirstGeneration(Reader):
     """Reads `memory`, `routing` and `ports` into a draft."""
-
-    desk: Desk
-    draft: Draft
-    binds: Binds
-    admitted: Peers | None
-    """The peers that the filter of the whole file admits, `None` without a filter."""
-    choices: Choices
 
     def read(self, root: Section) -> None:
         """Reads all sections."""
@@ -56,8 +42,7 @@ class FirstGeneration:
             self._ports(ports)
         if routing is not None:
             for unit in self.units.keys() - self.served:
-                message = "no port serves this unit id"
-                self.desk.note("left out", routing.at("unit_id_map", unit), message)
+                self.desk.left_out(routing.at("unit_id_map", unit), "no port serves this unit id")
 
     def _memories(self, memory: Section) -> None:
         memories = memory.mapping("memories", required=True)
@@ -66,8 +51,7 @@ class FirstGeneration:
         wanted = [(memories.at(key), str(key)) for key in memories.data]
         for index, (path, text) in enumerate(wanted):
             if text in (earlier for _, earlier in wanted[:index]):
-                message = f"duplicate name {text}, as text and as a number"
-                self.desk.problem(path, message, of_key=True)
+                self.desk.problem_of_key(path, f"duplicate name {text}, as text and as a number")
         self.names = {
             text: name
             for (_, text), name in zip(wanted, unique_names(self.desk, wanted), strict=True)
@@ -118,7 +102,7 @@ class FirstGeneration:
         gate = sealing.mapping("gate", required=bool(enabled))
         sealing.close()
         if not enabled:
-            self.desk.note("left out", sealing.path, "not enabled")
+            self.desk.left_out(sealing.path, "not enabled")
         if gate is None:
             return None
         gate.word("area", ["discrete_inputs"], required=bool(enabled))
@@ -132,9 +116,9 @@ class FirstGeneration:
         for unit in units.data if units else ():
             path = routing.at("unit_id_map", unit)
             name = self._known(path, units.get(unit)) if units else None
-            if type(unit) is not int or not 0 <= unit <= 255:
-                message = f"found {show(unit)}, allowed: a unit id from 0 to 255"
-                self.desk.problem(path, message, of_key=True)
+            if type(unit) is not int or not 0 <= unit <= MAX_UNIT:
+                message = f"found {show(unit)}, allowed: a unit id from 0 to {MAX_UNIT}"
+                self.desk.problem_of_key(path, message)
             elif name is not None:
                 self.units[unit] = name
 
@@ -143,7 +127,7 @@ class FirstGeneration:
         text = str(value) if type(value) is int else value
         if isinstance(text, str) and text in self.names:
             return self.names[text]
-        close = guess(text, self.names) if isinstance(text, str) else ""
+        close = suggestion(text, self.names) if isinstance(text, str) else ""
         known = listing(self.names) or "a memory"
         self.desk.problem(path, f"found {show(value)}, allowed: {known}{close}")
         return None
@@ -151,7 +135,7 @@ class FirstGeneration:
     def _ports(self, ports: Section) -> None:
         if ports.data:
             message = "a function that is not allowed now returns 0x01, an unmapped unit id 0x0B"
-            self.desk.note("check", ports.path, f"{message}; both returned 0x02 before")
+            self.desk.check(ports.path, f"{message}; both returned 0x02 before")
         for key in ports.data:
             bind = self.binds.read(ports.at(key), key, of_key=True)
             policy = section(self.desk, ports.at(key), ports.get(key))
@@ -182,11 +166,10 @@ class FirstGeneration:
         own = read_filter(policy)
         if own is None and self.admitted is None:
             message = "no ip_filter: sources are all addresses; list only networks that need it"
-            self.desk.note("check", policy.path, message)
+            self.desk.check(policy.path, message)
         peers = (ALL if own is None else own) & (ALL if self.admitted is None else self.admitted)
         if not peers:
-            message = "the port is left out: its ip_filter admits nobody"
-            self.desk.note("left out", policy.path, message)
+            self.desk.left_out(policy.path, "the port is left out: its ip_filter admits nobody")
             return None
         return peers.written()
 
@@ -200,7 +183,7 @@ class FirstGeneration:
         }
         if not units:
             message = "the port is left out: it allows no unit id with a memory that it allows"
-            self.desk.note("left out", policy.path, message)
+            self.desk.left_out(policy.path, message)
         self.served |= units.keys()
         return units
 
@@ -212,12 +195,12 @@ class FirstGeneration:
             return None
         found: set[int] = set()
         for path, unit in entries:
-            if type(unit) is not int or not 0 <= unit <= 255:
-                message = f"found {show(unit)}, allowed: a unit id from 0 to 255"
+            if type(unit) is not int or not 0 <= unit <= MAX_UNIT:
+                message = f"found {show(unit)}, allowed: a unit id from 0 to {MAX_UNIT}"
                 self.desk.problem(path, message)
             elif unit not in self.units:
                 message = f"unit id {unit} is not in routing.unit_id_map, so it was not served"
-                self.desk.note("left out", path, message)
+                self.desk.left_out(path, message)
             else:
                 found.add(unit)
         return found
@@ -236,7 +219,10 @@ class FirstGeneration:
         codes = policy.mapping("function_codes")
         allow = deny = None
         if codes is not None:
-            allow, deny = functions.read_codes(codes, "allow"), functions.read_codes(codes, "deny")
+            allow, deny = (
+                functions.read_codes(codes, "allow"),
+                functions.read_codes(codes, "deny"),
+            )
             listed = bool(codes.get("allow"))
             codes.close()
             if listed and allow is not None:
@@ -252,16 +238,15 @@ class FirstGeneration:
         path = codes.at("allow")
         if both := [code for code in allow if code in deny]:
             message = f"without {functions.spelled(both)}: also denied, and denied wins"
-            self.desk.note("changed", path, message)
+            self.desk.changed(path, message)
         left = [code for code in allow if code not in deny]
         writing = [code for code in left if code in WRITING_CODES]
         if access == "read-only" and writing:
             message = f"without {functions.spelled(writing)}: it writes, and access is read-only"
-            self.desk.note("changed", path, message)
+            self.desk.changed(path, message)
             left = [code for code in left if code not in writing]
         if not left:
-            message = "the port is left out: it allows no function"
-            self.desk.note("left out", path, message)
+            self.desk.left_out(path, "the port is left out: it allows no function")
             return None
         return None if access is None else {"access": access, "functions": left}
 
@@ -272,7 +257,7 @@ class FirstGeneration:
         more = functions.with_same_effect(deny) if access == "read-write" else []
         if more:
             message = f"also denies {functions.spelled(more)}, with the same effect as denied ones"
-            self.desk.note("changed", codes.at("deny"), f"{message}; the source had none of them")
+            self.desk.changed(codes.at("deny"), f"{message}; the source had none of them")
         return {"deny": [*deny, *more]}
 
     def _max_connections(self, policy: Section) -> int:
@@ -283,7 +268,7 @@ class FirstGeneration:
         if allowed != most:
             integer = f"an integer from 1 to {MAX_CONNECTIONS}"
             message = f"set to {allowed}, found {most}, allowed: {integer}"
-            self.desk.note("changed", policy.at("max_connections"), message)
+            self.desk.changed(policy.at("max_connections"), message)
         return allowed
 
 

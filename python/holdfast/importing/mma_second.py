@@ -5,21 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.importing import functions
-from holdfast.importing.draft import ADMISSION
-from holdfast.importing.filters import ALL, read_networks
+from holdfast.importing import function_rights as functions
+from holdfast.importing.draft import ADMISSION, Reader
 from holdfast.importing.memories import check_gate, read_areas, read_id
 from holdfast.importing.names import unique_names
+from holdfast.importing.peers import ALL, read_networks
 from holdfast.importing.policies import Policy, merged, unserved
 from holdfast.importing.sections import Section, section
-from holdfast.protocol import LAST_ADDRESS
+from holdfast.protocol import LAST_ADDRESS, MAX_UNIT
 
 if TYPE_CHECKING:
-    from holdfast.config.source import KeyPath
-    from holdfast.importing.binds import Binds
-    from holdfast.importing.choices import Choices
-    from holdfast.importing.draft import Draft
-    from holdfast.importing.notes import Desk
+    from holdfast.config.text.source import KeyPath
     from holdfast.importing.peers import Peers
     from holdfast.net.addresses import Network
 
@@ -40,7 +36,11 @@ _MEMORY_REASONS = {
     "rbe": TOP_REASONS["rbe"],
     "persistence": TOP_REASONS["persistence"],
 }
-_ALLOW = {"ro": functions.READING, "rw": functions.ALL, "wo": functions.WRITING_ONLY}
+_ALLOW = {
+    "ro": functions.READING,
+    "rw": functions.ALL,
+    "wo": functions.WRITING_ONLY,
+}
 _MEANT = {
     "ro": "its peers may read",
     "rw": "its peers may read and write",
@@ -58,23 +58,13 @@ class _Memory:
     name: str = ""
 
 
-@dataclass
-class SecondGeneration:
+class SecondGeneration(Reader):
     """Reads `listeners` into a draft."""
-
-    desk: Desk
-    draft: Draft
-    binds: Binds
-    admitted: Peers | None
-    """The peers that the filter of the whole file admits, `None` without a filter."""
-    choices: Choices
 
     def read(self, root: Section) -> None:
         """Reads all sections."""
         self.rules_have_ids = False
-        entries = root.entries("listeners", required=True) or []
-        found = [section(self.desk, path, value) for path, value in entries]
-        listeners = [listener for listener in found if listener is not None]
+        listeners = root.sections("listeners", required=True)
         wanted = [
             (one.at("id"), one.name("id", required=True) or f"listener-{number}")
             for number, one in enumerate(listeners, 1)
@@ -85,29 +75,26 @@ class SecondGeneration:
         for name, listener, own in zip(names, listeners, memories, strict=True):
             self._listener(name, listener, own)
         if listeners:
-            self._tell_all(root.at("listeners"))
+            self._note_changes(root.at("listeners"))
 
-    def _tell_all(self, path: KeyPath) -> None:
+    def _note_changes(self, path: KeyPath) -> None:
         message = "a function that is not allowed returns 0x01, an unmapped unit id 0x0B"
         closed = "a peer that neither rules nor raw_ingest name is disconnected at once"
-        self.desk.note("check", path, f"{message}; {closed}")
+        self.desk.check(path, f"{message}; {closed}")
         if self.rules_have_ids:
-            self.desk.note("left out", path, "the ids of policy rules: rules have no names")
+            self.desk.left_out(path, "the ids of policy rules: rules have no names")
 
     def _memories(self, listener: Section) -> list[_Memory]:
         read = []
         first: dict[int, KeyPath] = {}
-        for path, value in listener.entries("memory") or ():
-            memory = section(self.desk, path, value)
-            if memory is None:
-                continue
-            unit = memory.integer("unit_id", 0, 255, required=True, what="a unit id")
+        for memory in listener.sections("memory"):
+            unit = memory.integer("unit_id", 0, MAX_UNIT, required=True, what="a unit id")
             if unit is not None and unit in first:
                 other = self.desk.document.spell(first[unit])
                 message = f"found {unit}, which is the unit id of {other}, allowed: a different one"
                 self.desk.problem(memory.at("unit_id"), message)
             elif unit is not None:
-                first[unit] = path
+                first[unit] = memory.path
             read.append(_Memory(memory, unit))
         return read
 
@@ -125,7 +112,7 @@ class SecondGeneration:
         listen = listener.get("listen")
         if listen is None:
             message = "missing, allowed: :port or address:port"
-            self.desk.problem(listener.at("listen"), message, of_key=True)
+            self.desk.problem_of_key(listener.at("listen"), message)
         bind = None if listen is None else self.binds.read(listener.at("listen"), listen)
         listener.close()
         policies = [self._memory(memory) for memory in memories]
@@ -136,16 +123,16 @@ class SecondGeneration:
         common = {"bind": str(bind), **ADMISSION, "idle_timeout": 0}
         if not raw:
             message = "the listener is left out: nobody may read or write its memories"
-            self.desk.note("left out", listener.path, message)
+            self.desk.left_out(listener.path, message)
             return
         if not rules:
             message = "no policy allows a function for its areas, so only Raw Ingest is served"
-            self.desk.note("changed", listener.path, message)
+            self.desk.changed(listener.path, message)
             self.draft.listeners[name] = {"type": "raw-ingest", **common, **raw}
             return
         for policy in unserved(known, rules):
             message = f"no rule serves unit {policy.unit}: it allows no function for its areas"
-            self.desk.note("check", listener.path, message)
+            self.desk.check(listener.path, message)
         listen = {"type": "modbus-tcp", **common}
         self.draft.listeners[name] = {**listen, "rules": rules, "raw_ingest": raw}
 
@@ -161,8 +148,8 @@ class SecondGeneration:
         if not units or not admitted or not areas:
             return {}
         message = "every address may write all areas of all its units by Raw Ingest, as it ran:"
-        told = f"{message} policies are for Modbus only. List only the senders in the sources of"
-        self.desk.note("check", listener.path, f"{told} raw_ingest, or remove raw_ingest")
+        text = f"{message} policies are for Modbus only. List only the senders in the sources of"
+        self.desk.check(listener.path, f"{text} raw_ingest, or remove raw_ingest")
         rule = {"sources": admitted.written(), "units": units, "areas": areas}
         compat = {"packets": "many", "after_refusal": "continue"}
         return {"compat": compat, "rules": [rule]}
@@ -192,16 +179,16 @@ class SecondGeneration:
         exception = sealing.integer("exception", 1, 255)
         sealing.close()
         if not enabled:
-            self.desk.note("left out", sealing.path, "not enabled")
+            self.desk.left_out(sealing.path, "not enabled")
             return None
         if exception not in (None, BUSY):
             message = f"a sealed memory always returns 0x{BUSY:02X}"
-            self.desk.note("left out", sealing.at("exception"), message)
+            self.desk.left_out(sealing.at("exception"), message)
         path = sealing.at("address")
         if address is None or not check_gate(self.desk, path, name, areas, "coils", address):
             return None
         message = "sealed whenever the coil is 0; Modbus can't write that coil (0x02)"
-        self.desk.note("check", sealing.path, message)
+        self.desk.check(sealing.path, message)
         return {"area": "coils", "address": address, "mode": "level"}
 
     def _policy(self, one: Section) -> list[tuple[tuple[Network, ...], frozenset[int]]] | None:
@@ -211,7 +198,7 @@ class SecondGeneration:
             policy.close()
         if not entries:
             message = "no policy, so all peers are refused; add its unit id to a rule to serve it"
-            self.desk.note("check", one.path, message)
+            self.desk.check(one.path, message)
             return None
         found = [section(self.desk, path, value) for path, value in entries]
         return [self._rule(rule) for rule in found if rule is not None]
@@ -220,7 +207,7 @@ class SecondGeneration:
         self.rules_have_ids |= rule.get("id") is not None
         networks = tuple(read_networks(rule, "source_ip", required=True))
         if rule.get("source_ip") == []:
-            self.desk.note("left out", rule.path, "source_ip is empty: the rule matches nobody")
+            self.desk.left_out(rule.path, "source_ip is empty: the rule matches nobody")
         allowed = self._allowed(rule)
         rule.close()
         return networks, allowed
@@ -231,8 +218,7 @@ class SecondGeneration:
             meant = self._allow(rule, codes)
             return meant if self.choices.as_meant else frozenset(codes or ())
         if codes is None:
-            message = "neither allow_fc nor allow: the rule allows nothing"
-            self.desk.note("check", rule.path, message)
+            self.desk.check(rule.path, "neither allow_fc nor allow: the rule allows nothing")
         return frozenset(codes or ())
 
     def _allow(self, rule: Section, codes: list[int] | None) -> frozenset[int]:
@@ -247,13 +233,13 @@ class SecondGeneration:
         word = rule.word("allow", list(_ALLOW))
         if codes is not None:
             message = "found together with allow_fc, allowed: only one of them"
-            self.desk.problem(path, message, of_key=True)
+            self.desk.problem_of_key(path, message)
         if word is None:
             return frozenset()
         ran = "it had no effect: the rule allowed no function, and refused its peers"
         self.choices.note(self.desk, path, ran=ran, meant=_MEANT[word])
         if word == "wo":
             message = f"only functions {functions.spelled(_ALLOW[word])}, which write; 22 and 23"
-            told = f"{message} also read. A rule has no other way to forbid reading"
-            self.desk.note("changed", path, told)
+            text = f"{message} also read. A rule has no other way to forbid reading"
+            self.desk.changed(path, text)
         return _ALLOW[word]

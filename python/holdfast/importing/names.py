@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from holdfast.config.scalars import NAME_FORM
+from holdfast.config.values.scalars import NAME_FORM
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from holdfast.config.source import KeyPath
+    from holdfast.config.text.source import KeyPath
     from holdfast.importing.notes import Desk
 
 MAX_LENGTH = 64
@@ -27,7 +27,7 @@ def unique_names(desk: Desk, wanted: Sequence[tuple[KeyPath, str]]) -> list[str]
             name = free_name(_allowed(text), taken)
             taken.add(name)
             reason = "the name is in use" if text in texts[:index] else f"a name has {NAME_FORM}"
-            desk.note("changed", path, f"renamed to {name}: {reason}")
+            desk.changed(path, f"renamed to {name}: {reason}")
         given.append(name)
     return given
 

@@ -1,4 +1,4 @@
-"""The results of an import that people must read: notes, and problems.
+"""What people read of an import, notes and problems, and what its caller chooses.
 
 Messages show found values, but never a secret.
 """
@@ -8,10 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from holdfast.config.report import Report
+from holdfast.config.text.report import Report
 
 if TYPE_CHECKING:
-    from holdfast.config.source import Document, KeyPath
+    from collections.abc import Sequence
+
+    from holdfast.config.text.source import Document, KeyPath
+    from holdfast.types import Area
+
 
 Kind: TypeAlias = Literal["left out", "changed", "check"]
 """`left out`: not in the result; `changed`: converted differently; `check`: a person must check."""
@@ -54,6 +58,18 @@ class Desk:
         key = self.document.spell(path)
         self.noted[Note(kind, self.document.file, place.line, place.column, key, message)] = None
 
+    def left_out(self, path: KeyPath, message: str) -> None:
+        """Notes that the result does not have the key at `path`."""
+        self.note("left out", path, message)
+
+    def changed(self, path: KeyPath, message: str) -> None:
+        """Notes that the key at `path` is converted differently."""
+        self.note("changed", path, message)
+
+    def check(self, path: KeyPath, message: str) -> None:
+        """Notes that a person must check the key at `path`."""
+        self.note("check", path, message)
+
     def withdraw(self, path: KeyPath) -> None:
         """Removes the notes about the key at `path`: it has no effect."""
         key = self.document.spell(path)
@@ -62,3 +78,26 @@ class Desk:
     def problem(self, path: KeyPath, message: str, *, of_key: bool = False) -> None:
         """Adds a problem, which makes the import impossible."""
         self.report.add(path, message, of_key=of_key)
+
+    def problem_of_key(self, path: KeyPath, message: str) -> None:
+        """Adds a problem with the key at `path` itself, such as a missing one."""
+        self.problem(path, message, of_key=True)
+
+
+@dataclass(frozen=True)
+class Choices:
+    """How keys that the source ignored are converted, and what is granted beyond what it did."""
+
+    as_meant: bool = False
+    keep_published_tokens: bool = False
+    grant_rest: Sequence[Area] = ()
+    """Areas that REST may write, in addition to those that it could."""
+    grant_mqtt: Sequence[Area] = ()
+    """The same for MQTT."""
+
+    def note(self, desk: Desk, path: KeyPath, *, ran: str, meant: str) -> None:
+        """Adds a note about a key with two meanings, which says the one that is used."""
+        used, other = ("it was meant", "it ran") if self.as_meant else ("it ran", "it was meant")
+        effect, otherwise = (meant, ran) if self.as_meant else (ran, meant)
+        message = f"as {used}: {effect}; as {other}: {otherwise} (--as-{other.replace(' ', '-')})"
+        desk.note("changed" if self.as_meant else "left out", path, message)

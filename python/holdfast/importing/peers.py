@@ -1,4 +1,4 @@
-"""Exact sets of addresses: allowed networks without denied networks.
+"""Sets of addresses: allowed networks without denied networks, from the filters of the source.
 
 Both families share one number line, with IPv4 after IPv6. A set is a list of intervals on it. An
 IPv4-mapped IPv6 address counts as its IPv4 address: no other peer ever has it.
@@ -12,16 +12,21 @@ from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network
 from typing import TYPE_CHECKING, TypeAlias
 
-from holdfast.config.ip_addresses import SOURCE_FORM
-from holdfast.config.words import show
+from holdfast.config.text.messages import show
+from holdfast.config.values.ip_addresses import SOURCE_FORM
 from holdfast.net.addresses import MAPPED, Network, unmapped
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from holdfast.importing.sections import Section
+    from holdfast.net.addresses import Network
+
+
 Stretch: TypeAlias = tuple[int, int]
 
 _FOUR = 1 << 129
+_END = _FOUR << 1
 EVERYBODY = (IPv4Network("0.0.0.0/0"), IPv6Network("::/0"))
 
 
@@ -46,23 +51,15 @@ class Peers:
     def __and__(self, other: Peers) -> Peers:
         return self - (self - other)
 
+    def __invert__(self) -> Peers:
+        """All other places of the number line; some of them are no addresses."""
+        lasts = (-1, *(last for _, last in self.stretches))
+        firsts = (*(first for first, _ in self.stretches), _END)
+        gaps = ((last + 1, first - 1) for last, first in zip(lasts, firsts, strict=True))
+        return Peers(tuple((first, last) for first, last in gaps if first <= last))
+
     def __sub__(self, other: Peers) -> Peers:
-        left: list[Stretch] = []
-        cuts = iter((*other.stretches, (_FOUR * 2, _FOUR * 2)))
-        cut = next(cuts)
-        for first, last in self.stretches:
-            while cut[1] < first:
-                cut = next(cuts)
-            while cut[0] <= last:
-                if first < cut[0]:
-                    left.append((first, cut[0] - 1))
-                first = cut[1] + 1
-                if first > last:
-                    break
-                cut = next(cuts)
-            if first <= last:
-                left.append((first, last))
-        return Peers(tuple(left))
+        return ~(~self | other)
 
     def networks(self) -> list[Network]:
         """The smallest list of networks that equals this set, IPv4 first."""
@@ -118,3 +115,32 @@ def _joined(stretches: Iterable[Stretch]) -> tuple[Stretch, ...]:
         else:
             joined.append((first, last))
     return tuple(joined)
+
+
+ALL = Peers.of(EVERYBODY)
+
+
+def read_filter(parent: Section) -> Peers | None:
+    """The peers that `ip_filter` admits, `None` without a filter. Denied networks win."""
+    filters = parent.mapping("ip_filter")
+    if filters is None:
+        return None
+    allow, deny = read_networks(filters, "allow"), read_networks(filters, "deny")
+    filters.close()
+    if not allow and not deny:
+        return None
+    return (Peers.of(allow) if allow else ALL) - Peers.of(deny)
+
+
+def read_networks(section: Section, key: str, *, required: bool = False) -> list[Network]:
+    """The networks of a list; empty entries are ignored, with a note."""
+    networks = []
+    for path, text in section.entries(key, required=required) or ():
+        if text is None or text == "":
+            section.desk.left_out(path, "the entry is empty")
+            continue
+        try:
+            networks.append(parse_network(text))
+        except ValueError as error:
+            section.desk.problem(path, str(error))
+    return networks

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.importing import functions
+from holdfast.importing import function_rights as functions
 from holdfast.importing.peers import Peers
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from holdfast.config.devices import LAST_SLOT, MIN_INTERVAL
-from holdfast.config.words import show
+from holdfast.config.models.devices import LAST_SLOT, MIN_INTERVAL
+from holdfast.config.text.messages import show
 from holdfast.importing.imported import Imported, Source
 from holdfast.importing.names import unique_names
 from holdfast.importing.sections import Section, seconds, section
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from holdfast.config.source import KeyPath
+    from holdfast.config.text.source import KeyPath
     from holdfast.importing.notes import Desk
 
 MAX_MS = 86_400_000
 
-DEVICE_TIMEOUT = 5
+DEVICE_TIMEOUT_S = 5
 """Seconds for a device without a timeout. The source waited for it without an end."""
 
-TARGET_TIMEOUT = 2
+TARGET_TIMEOUT_S = 2
 """Seconds for a target of a device without a timeout, as in the source."""
 
 _AREAS: dict[int, Area] = dict(enumerate(AREAS, 1))
@@ -84,12 +84,10 @@ class _Units:
         root.close(_TOP_REASONS)
         if replicator is None:
             return {}
-        entries = replicator.entries("units", required=True)
+        sections = replicator.sections("units", required=True)
         replicator.close(_TOP_REASONS)
-        if entries == []:
+        if replicator.get("units") == []:
             self.desk.problem(replicator.at("units"), "no unit, allowed: at least one")
-        found = [section(self.desk, path, value) for path, value in entries or ()]
-        sections = [each for each in found if each is not None]
         wanted = [(each.at("id"), self._id(each)) for each in sections]
         units = [self._unit(each) for each in sections]
         self._retry(units)
@@ -98,7 +96,8 @@ class _Units:
         if sections and not kept and not self.desk.report.problems:
             self.desk.problem(replicator.at("units"), "no unit has a target that is written")
         if kept:
-            self._tell_all(replicator.at("units"))
+            partly = "if a read of a device fails, the others are written; the source wrote none"
+            self.desk.check(replicator.at("units"), partly)
         return {name: unit.device for name, unit in kept}
 
     def _id(self, unit: Section) -> str:
@@ -106,10 +105,6 @@ class _Units:
         if name is None and isinstance(unit.get("id"), str):
             self.desk.problem(unit.at("id"), "found an empty text, allowed: text")
         return name or "unit"
-
-    def _tell_all(self, path: KeyPath) -> None:
-        partly = "if a read of a device fails, the others are written; the source wrote none"
-        self.desk.note("check", path, partly)
 
     def _unit(self, one: Section) -> _Unit:
         unit = _Unit()
@@ -134,13 +129,13 @@ class _Units:
             for each in self._forwards(target, reads, block, timeout)
         ]
         if not forward:
-            self.desk.note("left out", one.path, "no target is written, so it is not polled")
+            self.desk.left_out(one.path, "no target is written, so it is not polled")
         elif unit.endpoint is not None and interval is not None:
             unit.device = {
                 "url": f"tcp://{unit.endpoint}",
                 "unit": number or 0,
                 "interval": interval,
-                "timeout": timeout or DEVICE_TIMEOUT,
+                "timeout": timeout or DEVICE_TIMEOUT_S,
                 "reads": [read.plain() for read in reads],
                 "forward": forward,
             }
@@ -152,7 +147,7 @@ class _Units:
         poll.close()
         if given is not None and given < MIN_INTERVAL * 1000:
             message = f"raised to {MIN_INTERVAL * 1000:g} ms, the shortest interval"
-            self.desk.note("changed", poll.at("interval_ms"), message)
+            self.desk.changed(poll.at("interval_ms"), message)
             return MIN_INTERVAL
         return None if given is None else seconds(given)
 
@@ -161,8 +156,8 @@ class _Units:
         given = source.integer("timeout_ms", -MAX_MS, MAX_MS, what="milliseconds")
         if given is not None and given > 0:
             return seconds(given)
-        message = f"no timeout_ms: {DEVICE_TIMEOUT} s; the source waited without an end"
-        self.desk.note("check", source.path, message)
+        message = f"no timeout_ms: {DEVICE_TIMEOUT_S} s; the source waited without an end"
+        self.desk.check(source.path, message)
         return None
 
     def _endpoint(self, one: Section) -> str | None:
@@ -192,18 +187,14 @@ class _Units:
             return None
         if not has_targets:
             message = "found without targets, allowed: only with targets"
-            self.desk.problem(source.at("status_slot"), message, of_key=True)
+            self.desk.problem_of_key(source.at("status_slot"), message)
         shown = "".join(each if " " <= each <= "~" else "?" for each in name[:16])
         return {"area": "holding_registers", "slot": slot, "name": shown}
 
     def _reads(self, one: Section) -> Iterator[_Read]:
-        entries = one.entries("reads", required=True)
-        if entries == []:
+        if one.get("reads") == []:
             self.desk.problem(one.at("reads"), "no read, allowed: at least one")
-        for path, value in entries or ():
-            read = section(self.desk, path, value)
-            if read is None:
-                continue
+        for read in one.sections("reads", required=True):
             function = read.integer("fc", 1, 4, required=True, what="a function")
             address = read.integer("address", 0, LAST_ADDRESS) or 0
             count = read.integer("quantity", 1, LAST_ADDRESS, required=True)
@@ -233,7 +224,7 @@ class _Units:
         target.close()
         if block is not None and status_unit is None:
             message = f"missing with status_slot, allowed: a unit id from 0 to {MAX_UNIT}"
-            self.desk.problem(target.at("status_unit_id"), message, of_key=True)
+            self.desk.problem_of_key(target.at("status_unit_id"), message)
         if number is None or endpoint is None:
             return
         if number > MAX_UNIT:
@@ -245,8 +236,8 @@ class _Units:
             return
         if unit is not None and unit != number:
             message = f"packets go to unit {number}, the id of the target, as before"
-            self.desk.note("left out", target.at("unit_id"), message)
-        wait = TARGET_TIMEOUT if timeout is None else timeout
+            self.desk.left_out(target.at("unit_id"), message)
+        wait = TARGET_TIMEOUT_S if timeout is None else timeout
         for index, added in enumerate(offsets):
             forward: dict[str, Any] = {"url": f"raw://{endpoint}", "unit": number, "timeout": wait}
             if added:
@@ -258,7 +249,7 @@ class _Units:
     def _leave_out(self, target: Section, reason: str, block: dict[str, Any] | None) -> None:
         """Notes that a target receives nothing, also not the status block that it received."""
         lost = "" if block is None else ". It received the status block, which requires values here"
-        self.desk.note("left out", target.path, f"{reason}{lost}")
+        self.desk.left_out(target.path, f"{reason}{lost}")
 
     def _offsets(self, path: KeyPath, value: object, reads: list[_Read]) -> dict[Area, int]:
         """What is added to addresses, by area; the source has it by function."""
@@ -273,8 +264,7 @@ class _Units:
             return found
         for function in list(given.data):
             if function not in _AREAS:
-                message = "no read has this function, allowed: 1 to 4"
-                self.desk.note("left out", given.at(function), message)
+                self.desk.left_out(given.at(function), "no read has this function, allowed: 1 to 4")
                 continue
             area = _AREAS[function]
             most = ADDRESSES - max(

@@ -8,13 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.words import show
-from holdfast.runtime.text import either, guess
+from holdfast.config.text.messages import show
+from holdfast.runtime.text import either, suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from holdfast.config.source import KeyPath
+    from holdfast.config.text.source import KeyPath
     from holdfast.importing.notes import Desk
 
 _TRUE = ("yes", "Yes", "YES", "on", "On", "ON")
@@ -54,6 +54,12 @@ class Section:
             return [(self.at(key, index), entry) for index, entry in enumerate(value)]
         self._wrong(key, value, "a list")
         return None
+
+    def sections(self, key: str, *, required: bool = False) -> list[Section]:
+        """The mappings in the list at a key; adds a problem for any other entry."""
+        entries = self.entries(key, required=required) or []
+        found = [section(self.desk, path, value) for path, value in entries]
+        return [each for each in found if each is not None]
 
     def integer(
         self, key: str, least: int, most: int, *, required: bool = False, what: str = "an integer"
@@ -113,15 +119,15 @@ class Section:
                 continue
             if key == "<<":
                 message = "found a merge key, allowed: the keys themselves"
-                self.desk.problem(self.at(key), message, of_key=True)
+                self.desk.problem_of_key(self.at(key), message)
                 continue
-            message = (reasons or {}).get(key) or f"unknown key{guess(key, known)}"
-            self.desk.note("left out", self.at(key), message)
+            message = (reasons or {}).get(key) or f"unknown key{suggestion(key, known)}"
+            self.desk.left_out(self.at(key), message)
 
     def _present(self, key: str | int, allowed: str, required: bool) -> Any:
         value = self.get(key)
         if value is None and required:
-            self.desk.problem(self.at(key), f"missing, allowed: {allowed}", of_key=True)
+            self.desk.problem_of_key(self.at(key), f"missing, allowed: {allowed}")
         return value
 
     def _wrong(self, key: str | int, value: object, allowed: str) -> None:

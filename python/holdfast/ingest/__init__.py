@@ -6,15 +6,9 @@ This package does not know HTTP or MQTT.
 from __future__ import annotations
 
 from holdfast._core import Follower
-from holdfast.ingest.memory_access import (
-    KEEPING,
-    Counts,
-    Grant,
-    MemoryAccess,
-    Refused,
-    Written,
-    unreadable,
-)
+from holdfast.ingest.counts import Counts
+from holdfast.ingest.memory_access import Grant, MemoryAccess, Written
+from holdfast.ingest.refusals import KEEPING, Refused, unreadable
 
 __all__ = [
     "KEEPING",

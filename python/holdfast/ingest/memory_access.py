@@ -9,58 +9,42 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
 
-from holdfast import _core, logs
-from holdfast.audit import Unrecorded
-from holdfast.ingest.recording import Recording
-from holdfast.protocol import EXCEPTIONS
-from holdfast.runtime.text import clip
+from holdfast import _core
+from holdfast.events import log_lines
+from holdfast.events.audit import Unrecorded
+from holdfast.ingest.counts import Counts
+from holdfast.ingest.recording import Recording, values_of
+from holdfast.ingest.refusals import (
+    KEEPING,
+    Refused,
+    malformed,
+    place_of,
+    prefix,
+    shown,
+    unreadable,
+    unrecorded,
+)
+from holdfast.protocol import EXCEPTIONS, MAX_WORD
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from holdfast._core import Follower, Memory, Passage
-    from holdfast.audit import Audit
-
-MAX_SHOWN = 40
+    from holdfast.events.audit import Audit
+    from holdfast.events.throttle import Throttle
 
 _KEYS = {"memory", "area", "address", "values"}
 _BOOLS_KEYS = {"memory", "area", "address", "bools"}
 
 Write: TypeAlias = "tuple[Memory, str, int, list[Any]] | tuple[Memory, str, int, list[Any], bool]"
 """A write; the last item says that it is granted only while the memory is sealed."""
-
-
-class Refused(Exception):
-    """A command was refused; nothing has changed.
-
-    `reason` is a word for programs, `detail` a message for people. `where` locates the error:
-    `command` is the index of the command in a batch, `index` the index of the value in the command.
-    `memory`, `area`, `address` and `value` are from the command, as far as they could be parsed.
-    `is_recorded` tells whether the audit log has it already.
-    """
-
-    is_recorded = False
-
-    def __init__(self, reason: str, detail: str, **where: Any) -> None:
-        super().__init__(detail)
-        self.reason = reason
-        self.detail = detail
-        self.where = where
-
-    def answer(self) -> dict[str, object]:
-        """Returns the answer for the source."""
-        places: dict[str, object] = {
-            key: self.where[key] for key in ("command", "index") if key in self.where
-        }
-        return {"status": "rejected", "reason": self.reason, **places, "detail": self.detail}
 
 
 @dataclass(frozen=True)
@@ -76,8 +60,7 @@ class Grant:
     """Areas that may also be written while the memory is sealed, such as to restore them."""
 
 
-@dataclass(frozen=True)
-class Written:
+class Written(NamedTuple):
     """The result of a write of one command or a batch."""
 
     commands: int
@@ -92,42 +75,23 @@ class Written:
         return {"status": "accepted", "commands": self.commands, "written": self.values}
 
 
-MAX_REASONS = 64
-"""The most reasons that are counted apart: adapters of other packages have their own."""
+@dataclass(slots=True)
+class Begun:
+    """Commands that have been checked."""
 
-KEEPING = {
-    "not_stored": "the file of the memory can't be written; nothing has changed",
-    "log_unavailable": "the log of the memory can't be reached; nothing has changed",
-    "not_confirmed": "the log did not confirm the write in time; it may still be carried out",
-}
-"""Why memories that are kept refuse writes."""
+    batch: Sequence[Mapping[str, Any]]
+    single: bool
+    """Whether the batch is one command, sent alone."""
+    grant: Grant
+    writes: _core.Batch | None = None
+    device: str | None = None
+    """The device that takes the write, in place of a memory."""
+    recording: Recording | None = None
 
-OTHER = "other"
-"""The reason under which all others are counted."""
-
-
-@dataclass
-class Counts:
-    """Counters of one memory access: accepted messages, values written, reads, refusals."""
-
-    accepted: int = 0
-    values: int = 0
-    reads: int = 0
-    refused: Counter[str] = field(default_factory=Counter)
-
-    def refuse(self, reason: str) -> None:
-        """Counts a refusal. Reasons beyond `MAX_REASONS` are counted together."""
-        known = reason in self.refused or len(self.refused) < MAX_REASONS
-        self.refused[reason if known else OTHER] += 1
-
-    def snapshot(self) -> dict[str, object]:
-        """Returns a copy of the counters."""
-        return {
-            "accepted": self.accepted,
-            "values": self.values,
-            "reads": self.reads,
-            "refused": dict(self.refused),
-        }
+    @property
+    def command(self) -> Mapping[str, Any] | None:
+        """The only command; `None` for a batch."""
+        return self.batch[0] if self.single else None
 
 
 class MemoryAccess:
@@ -155,22 +119,23 @@ class MemoryAccess:
 
     def ingest(self, body: bytes | bytearray | memoryview, grant: Grant, peer: str) -> Written:
         """Carries out JSON: one command, or an array of commands. Raises `Refused`."""
-        try:
-            return self._written(_decoded(body), grant, peer)
-        except Refused as refused:
-            self.refuse(refused, grant.name, peer)
-            raise
+        return self.begin(body, grant, peer)()
 
     def write(self, commands: Sequence[Mapping[str, object]], grant: Grant, peer: str) -> Written:
         """Carries out commands atomically, each with memory, area, address and values.
 
         Raises `Refused`.
         """
-        try:
-            return self._written(list(commands), grant, peer)
-        except Refused as refused:
-            self.refuse(refused, grant.name, peer)
-            raise
+        return self._begin(lambda: list(commands), grant, peer)()
+
+    def begin(
+        self, body: bytes | bytearray | memoryview, grant: Grant, peer: str
+    ) -> Callable[[], Written]:
+        """Checks JSON, and returns the function that carries it out. Both raise `Refused`.
+
+        Writes that begin before others are carried out get into the audit log together.
+        """
+        return self._begin(partial(_decoded, body), grant, peer)
 
     def read(
         self, memory: str, area: str, address: int, count: int, grant: Grant, peer: str
@@ -183,7 +148,7 @@ class MemoryAccess:
             except (_core.OutOfRange, ValueError):  # A count below 1 is a `ValueError`.
                 raise self._out_of_range(memory, area, address, count) from None
             except OSError as error:
-                where = _where(None, memory, area, address)
+                where = place_of(None, memory, area, address)
                 raise Refused(unreadable(error), str(error), **where) from None
         except Refused as refused:
             self.note(refused, grant.name, peer)
@@ -212,7 +177,7 @@ class MemoryAccess:
         return follower
 
     def refuse(
-        self, refused: Refused, who: str, peer: str, *, throttle: logs.Throttle | None = None
+        self, refused: Refused, who: str, peer: str, *, throttle: Throttle | None = None
     ) -> None:
         """Counts, logs and audits a refused write. Adapters call it for writes they refuse.
 
@@ -243,7 +208,7 @@ class MemoryAccess:
         peer: str,
         *,
         observed: bool,
-        throttle: logs.Throttle | None = None,
+        throttle: Throttle | None = None,
     ) -> None:
         fields = {
             "adapter": self.name,
@@ -253,7 +218,7 @@ class MemoryAccess:
             "reason": refused.reason,
         }
         kind = (self.name, refused.reason)
-        logs.count(
+        log_lines.count(
             logging.WARNING,
             "ingest_refused",
             fields,
@@ -269,122 +234,136 @@ class MemoryAccess:
         with self._lock:
             return self._counts.snapshot()
 
-    def _written(self, document: object, grant: Grant, peer: str) -> Written:
-        if isinstance(document, list):
-            if not document:
-                raise Refused("malformed", "the batch is empty")
-            batch = document
-        else:
-            batch = [document]
-        single = batch is not document
-        recording = None
+    def _begin(self, read: Callable[[], object], grant: Grant, peer: str) -> Callable[[], Written]:
+        try:
+            begun = self._begun(read(), grant, peer)
+        except Refused as refused:
+            self.refuse(refused, grant.name, peer)
+            raise
+        return partial(self._finish, begun, peer)
+
+    def _finish(self, begun: Begun, peer: str) -> Written:
+        try:
+            return self._finished(begun)
+        except Refused as refused:
+            self.refuse(refused, begun.grant.name, peer)
+            raise
+
+    def _begun(self, document: object, grant: Grant, peer: str) -> Begun:
+        single = not isinstance(document, list)
+        batch: Any = [document] if single else document
+        if not batch:
+            raise Refused("malformed", "the batch is empty")
+        begun = Begun(batch, single, grant)
         if self._audit is not None:
-            recording = Recording(self._audit, partial(self._lines, batch, grant, peer))
+            origin = {"listener": self.name, "peer": peer, "source": grant.name}
+            begun.recording = Recording(self._audit, origin, batch)
         try:
             # Commands are checked one by one: native code stops at the first refused command.
-            values, sequence = _core.write_across(
-                (
-                    self._checked(command, grant, None if single else index)  # type: ignore[misc]
-                    for index, command in enumerate(batch)
-                ),
-                None if recording is None else recording.begin,
+            begun.writes = _core.Batch(
+                self._checked(command, grant, None if single else index)  # type: ignore[misc]
+                for index, command in enumerate(batch)
             )
-            if recording is not None:
-                recording.done(sequence)
+            if begun.recording is not None:
+                begun.recording.begin(begun.writes.is_refusable)
         except Unrecorded:
-            raise _unrecorded(batch[0] if single else None) from None
+            raise unrecorded(begun.command) from None
         except _core.BatchRefused as refused:
-            command = batch[refused.command]
-            device = None
-            if single and refused.reason == "mirrored" and command["area"] in grant.areas:
-                device = self._device(command)
-            if device is None:
-                error = self._refused(command, refused, grant, None if single else refused.command)
-                if refused.reason == "not_confirmed" and recording is not None:
-                    recording.not_confirmed()
-                    error.is_recorded = True
-                raise error from None
-            values = self._pass(command, device, grant, peer)
+            begun.device = self._device(begun, refused)
+        return begun
+
+    def _finished(self, begun: Begun) -> Written:
+        if begun.device is None:
+            values = self._stored(begun)
+        if begun.device is not None:
+            values = self._pass(begun)
         with self._lock:
             self._counts.accepted += 1
             self._counts.values += values
-        return Written(len(batch), values, batch[0]["memory"] if single else None)
+        return Written(len(begun.batch), values, begun.batch[0]["memory"] if begun.single else None)
 
-    def _lines(
-        self,
-        batch: Sequence[Mapping[str, Any]],
-        grant: Grant,
-        peer: str,
-        outcome: Mapping[str, object],
-    ) -> Iterator[dict[str, object]]:
-        return ({**self._line(command, grant, peer), **outcome} for command in batch)
+    def _stored(self, begun: Begun) -> int:
+        """Writes to memory. Returns the number of values: 0 if a device must take them."""
+        recording = begun.recording
+        assert begun.writes is not None
+        try:
+            if recording is not None:
+                recording.write()
+            values, sequence = begun.writes.write()
+            if recording is not None:
+                recording.done(sequence)
+        except Unrecorded:
+            raise unrecorded(begun.command) from None
+        except _core.BatchRefused as refused:
+            begun.device = self._device(begun, refused)
+            return 0
+        return values
 
-    def _line(self, command: Mapping[str, Any], grant: Grant, peer: str) -> dict[str, object]:
-        return {
-            "listener": self.name,
-            "peer": peer,
-            "source": grant.name,
-            "function": "write",
-            "memory": command["memory"],
-            "area": command["area"],
-            "address": command["address"],
-            "values": [int(item) for item in _values(command)],
-        }
+    def _device(self, begun: Begun, refused: _core.BatchRefused) -> str:
+        """The device that takes a write in place of a memory. Raises `Refused` if there is none."""
+        command = begun.batch[refused.command]
+        if begun.single and refused.reason == "mirrored" and command["area"] in begun.grant.areas:
+            passage = self._passages.get(command["memory"])
+            count = len(values_of(command))
+            device = passage and passage.device_of(command["area"], command["address"], count)
+            if device is not None:
+                return device
+        index = None if begun.single else refused.command
+        error = self._refused(command, refused, begun.grant, index)
+        if refused.reason == "not_confirmed" and begun.recording is not None:
+            begun.recording.not_confirmed()
+            error.is_recorded = True
+        raise error from None
 
-    def _device(self, command: Mapping[str, Any]) -> str | None:
-        """The device that takes a write, if its range is written through to one."""
-        passage = self._passages.get(command["memory"])
-        count = len(_values(command))
-        return passage and passage.device_of(command["area"], command["address"], count)
-
-    def _pass(self, command: Mapping[str, Any], device: str, grant: Grant, peer: str) -> int:
+    def _pass(self, begun: Begun) -> int:
         """Writes to a device. Returns the number of values. Raises `Refused`."""
+        [command] = begun.batch
         memory, area, address = command["memory"], command["area"], command["address"]
-        where = _where(None, memory, area, address)
-        values = [int(value) for value in _values(command)]
+        where = place_of(None, memory, area, address)
+        values = [int(value) for value in values_of(command)]
         if self._audit is not None:
             try:
                 self._audit.require()
             except Unrecorded:
-                raise _unrecorded(command) from None
+                raise unrecorded(begun.command) from None
         try:
             code = self._passages[memory].write(area, address, values)
         except ValueError as error:
-            raise Refused("out_of_range", f"{error}, in one write to {device}", **where) from None
+            detail = f"{error}, in one write to {begun.device}"
+            raise Refused("out_of_range", detail, **where) from None
         if code == 0:
-            if self._audit is not None:
-                lines = self._lines([command], grant, peer, {"outcome": "done"})
-                self._audit.write_all(lines, done=True)
+            if begun.recording is not None:
+                begun.recording.done()
             return len(values)
         name = EXCEPTIONS.get(code, "unknown")
-        detail = f"{device} did not take the write: exception {code:02X} ({name})"
+        detail = f"{begun.device} did not take the write: exception {code:02X} ({name})"
         raise Refused("device_refused", detail, **where)
 
     def _checked(self, command: object, grant: Grant, index: int | None) -> Write:
         """Checks a command, except its range and its values, which native code checks."""
         if not isinstance(command, dict):
-            raise _malformed(index, f"is {_shown(command)}, not an object")
+            raise malformed(index, f"is {shown(command)}, not an object")
         keys = command.keys()
         if keys != _KEYS and keys != _BOOLS_KEYS:
-            raise _malformed(index, _keys_wrong(command))
+            raise malformed(index, _keys_wrong(command))
         memory, area, address = command["memory"], command["area"], command["address"]
         if type(memory) is not str or type(area) is not str or type(address) is not int:
-            raise _malformed(index, _type_wrong(command))
+            raise malformed(index, _type_wrong(command))
         restores = bool(grant.while_sealed) and self._restores(memory, area, grant)
         if restores:
             target = self.memories[memory]
         else:
             target = self._granted(memory, area, address, grant, index)
         if not grant.writes:
-            where = _where(index, memory, area, address)
+            where = place_of(index, memory, area, address)
             raise Refused("not_granted", f"{grant.name} may not write", **where)
         if "bools" in command and area not in BIT_AREAS:
-            where = _where(index, memory, area, address)
-            raise _malformed(index, f"bools are only for bits; {area} has registers", where)
-        values = _values(command)
+            where = place_of(index, memory, area, address)
+            raise malformed(index, f"bools are only for bits; {area} has registers", where)
+        values = values_of(command)
         if type(values) is not list:
-            where = _where(index, memory, area, address)
-            raise _malformed(index, f"values are {_shown(values)}, not an array", where)
+            where = place_of(index, memory, area, address)
+            raise malformed(index, f"values are {shown(values)}, not an array", where)
         write = (target, area, address, values)
         return (*write, True) if restores else write
 
@@ -404,13 +383,13 @@ class MemoryAccess:
         target = self.memories.get(memory)
         if target is not None and memory in grant.memories and area in grant.areas:
             return target
-        of, where = _of(index), _where(index, memory, area, address)
+        of, where = prefix(index), place_of(index, memory, area, address)
         if target is None:
-            raise Refused("unknown_memory", f"{of}no memory {_shown(memory)}", **where)
+            raise Refused("unknown_memory", f"{of}no memory {shown(memory)}", **where)
         if memory not in grant.memories:
             detail = f"memory {memory} is not granted to {grant.name}"
         elif area not in AREAS:
-            detail = f"area is {_shown(area)}, allowed: {', '.join(AREAS)}"
+            detail = f"area is {shown(area)}, allowed: {', '.join(AREAS)}"
             raise Refused("invalid_area", f"{of}{detail}", **where)
         else:
             detail = f"area {area} is not granted to {grant.name}"
@@ -425,38 +404,35 @@ class MemoryAccess:
     ) -> Refused:
         """Converts a refusal of native code. Raises it again if no command can cause it."""
         memory, area, address = command["memory"], command["area"], command["address"]
-        values, where = _values(command), _where(index, memory, area, address)
+        values, where = values_of(command), place_of(index, memory, area, address)
         match refused.reason:
             case "empty":
-                return _malformed(index, "values are empty", where)
+                return malformed(index, "values are empty", where)
             case "out_of_range":
                 return self._out_of_range(memory, area, address, len(values), index)
             case "mirrored":
-                found = f"{_of(index)}{len(values)} from address {_shown(address)} of {area}"
+                found = f"{prefix(index)}{len(values)} from address {shown(address)} of {area}"
                 detail = f"{found} overlap a range that mirrors a device"
                 return Refused("mirrored", detail, **where)
             case "unsealed":
-                return Refused("not_granted", f"{_of(index)}{_not_sealed(command, grant)}", **where)
+                detail = f"{prefix(index)}{_not_sealed(command, grant)}"
+                return Refused("not_granted", detail, **where)
             case "stale":
-                detail = f"{_of(index)}a range mirrors a device, and its values are too old"
+                detail = f"{prefix(index)}a range mirrors a device, and its values are too old"
                 return Refused("stale", detail, **where)
             case "not_one_step":
-                detail = f"{_of(index)}{memory} and the memories before it are not kept together"
+                detail = f"{prefix(index)}{memory} and the memories before it are not kept together"
                 return Refused("not_one_step", f"{detail}, so no step writes all of them", **where)
-            case "not_stored":
-                return Refused("not_stored", KEEPING["not_stored"], **where)
-            case "log_unavailable":
-                return Refused("log_unavailable", KEEPING["log_unavailable"], **where)
-            case "not_confirmed":
-                return Refused("not_confirmed", KEEPING["not_confirmed"], **where)
+            case reason if reason in KEEPING:
+                return Refused(reason, KEEPING[reason], **where)
             case "invalid_value" | "invalid_type" if refused.index is not None:
-                shown = _shown(values[refused.index])
+                value = shown(values[refused.index])
                 wrong = "outside" if refused.reason == "invalid_value" else "not"
-                allowed = f"{wrong} 0..65535"
+                allowed = f"{wrong} 0..{MAX_WORD}"
                 if area in BIT_AREAS:
                     allowed = "not 0, 1, false or true"
-                detail = f"{_of(index)}values[{refused.index}] is {shown}, {allowed}"
-                return Refused("invalid_value", detail, index=refused.index, value=shown, **where)
+                detail = f"{prefix(index)}values[{refused.index}] is {value}, {allowed}"
+                return Refused("invalid_value", detail, index=refused.index, value=value, **where)
             case _:
                 raise refused
 
@@ -470,19 +446,22 @@ class MemoryAccess:
             allowed = f"allowed: 1 to {addresses.stop - address}"
         else:
             allowed = f"allowed: addresses {addresses.start} to {addresses.stop - 1}"
-        found = f"{_of(index)}{count} from address {_shown(address)} of {area}"
-        where = _where(index, memory, area, address)
+        found = f"{prefix(index)}{count} from address {shown(address)} of {area}"
+        where = place_of(index, memory, area, address)
         return Refused("out_of_range", f"{found}, {allowed}", **where)
 
 
-def unreadable(error: OSError) -> str:
-    """The reason why a memory can't be read."""
-    return "stale" if isinstance(error, _core.Stale) else "log_unavailable"
+_SCALAR: Any = bool | int | float | str | None
+_VALUE: Any = _SCALAR | list[msgspec.Raw] | dict[str, msgspec.Raw]
+_FIELD: Any = _SCALAR | list[_VALUE] | dict[str, msgspec.Raw]
+_COMMAND: Any = _SCALAR | list[msgspec.Raw] | dict[str, _FIELD]
+_DOCUMENT = msgspec.json.Decoder(_SCALAR | list[_COMMAND] | dict[str, _FIELD])
+"""JSON as deep as a batch of commands. What is nested deeper is not built, however deep it is."""
 
 
 def _decoded(body: bytes | bytearray | memoryview) -> object:
     try:
-        return msgspec.json.decode(body)
+        return _DOCUMENT.decode(body)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise Refused("malformed", f"not JSON: {error}") from None
 
@@ -490,7 +469,7 @@ def _decoded(body: bytes | bytearray | memoryview) -> object:
 def _keys_wrong(command: Mapping[str, object]) -> str:
     unknown = [key for key in command if key not in _KEYS | _BOOLS_KEYS]
     if unknown:
-        return f"has the unknown key {_shown(unknown[0])}"
+        return f"has the unknown key {shown(unknown[0])}"
     if "values" in command and "bools" in command:
         return "has both values and bools, allowed: only one"
     missing = [key for key in ("memory", "area", "address", "values") if key not in command]
@@ -501,26 +480,8 @@ def _type_wrong(command: Mapping[str, object]) -> str:
     """Describes the first of memory, area and address that has the wrong type."""
     for key in ("memory", "area"):
         if type(command[key]) is not str:
-            return f"{key} is {_shown(command[key])}, not text"
-    return f"address is {_shown(command['address'])}, not an integer"
-
-
-def _values(command: Mapping[str, Any]) -> Any:
-    return command["values"] if "values" in command else command["bools"]
-
-
-def _of(index: int | None) -> str:
-    return "" if index is None else f"commands[{index}]: "
-
-
-def _where(index: int | None, memory: str, area: str, address: int) -> dict[str, Any]:
-    """Returns the target of a command for logs, with limited lengths."""
-    return {
-        **({} if index is None else {"command": index}),
-        "memory": memory[:MAX_SHOWN],
-        "area": area[:MAX_SHOWN],
-        "address": address if -(2**63) < address < 2**63 else _shown(address),
-    }
+            return f"{key} is {shown(command[key])}, not text"
+    return f"address is {shown(command['address'])}, not an integer"
 
 
 def _not_sealed(command: Mapping[str, Any], grant: Grant) -> str:
@@ -528,26 +489,3 @@ def _not_sealed(command: Mapping[str, Any], grant: Grant) -> str:
     if area in grant.areas:
         return f"{memory} is not sealed, which another command of the batch requires of all"
     return f"area {area} is granted to {grant.name} only while {memory} is sealed"
-
-
-def _unrecorded(command: Mapping[str, Any] | None) -> Refused:
-    """A refusal of one command, or of a batch."""
-    where = {}
-    if command is not None:
-        where = _where(None, command["memory"], command["area"], command["address"])
-    detail = "the audit log can't be written, and no write is carried out without a record"
-    return Refused("unrecorded", detail, **where)
-
-
-def _malformed(index: int | None, detail: str, where: Mapping[str, Any] | None = None) -> Refused:
-    if where is None:
-        where = {} if index is None else {"command": index}
-    return Refused("malformed", f"{_of(index)}{detail}", **where)
-
-
-def _shown(value: object) -> str:
-    """Formats an untrusted value for logs: as JSON, cut to a limited length."""
-    if isinstance(value, dict | list):
-        return "an object" if isinstance(value, dict) else "an array"
-    text = msgspec.json.encode(value, enc_hook=repr).decode()
-    return clip(text, MAX_SHOWN)

@@ -114,11 +114,22 @@ class AllowList:
         IPv4 is first, because devices with both families seldom answer Modbus on IPv6.
         Raises `NotAllowed`, and the exceptions of `resolve`.
         """
-        literal = address_in(host)
-        named = [] if literal is not None else await resolve(host)
-        found = [literal] if literal is not None else list(map(parse_address, named))
+        literal = self.literal(host, port, transport)
+        if literal is not None:
+            return (literal,)
+        named = await resolve(host)
+        found = map(parse_address, named)
         allowed = [each for each in found if self.allows(each, port, transport)]
         if not allowed:
             raise NotAllowed(host, tuple(named))
         allowed.sort(key=lambda each: each.version)
         return tuple(dict.fromkeys(map(str, allowed)))
+
+    def literal(self, host: str, port: int, transport: Transport) -> str | None:
+        """Returns the address that a host is; `None` for a name. Raises `NotAllowed`."""
+        address = address_in(host)
+        if address is None:
+            return None
+        if not self.allows(address, port, transport):
+            raise NotAllowed(host, ())
+        return str(address)

@@ -44,10 +44,10 @@ class EventLoop(_Usual):
                 host, port, family=family, type=type, proto=proto, flags=flags
             )
         found = await asyncio.wrap_future(CONFIGURED.look_up(host, port))
-        kept = [each for each in found if family in (0, each[0])]
-        if not kept:
+        addresses = [each for each in found if family in (0, each[0])]
+        if not addresses:
             raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
-        return [(each, type, socket.IPPROTO_TCP, "", address) for each, address in kept]
+        return [(each, type, socket.IPPROTO_TCP, "", address) for each, address in addresses]
 
 
 def run(

@@ -33,7 +33,7 @@ Place: TypeAlias = tuple[str, int | None]
 MAX_LOOKUPS = 32
 """Limit of concurrent lookups; further ones are queued."""
 
-LOOKUP_TIMEOUT = 5.0
+LOOKUP_TIMEOUT_S = 5.0
 """Seconds after which a lookup fails."""
 
 
@@ -57,7 +57,7 @@ class Resolver:
     Calling it is asynchronous and returns the addresses of a name within `timeout` seconds.
     """
 
-    def __init__(self, timeout: float = LOOKUP_TIMEOUT, *, most: int = MAX_LOOKUPS) -> None:
+    def __init__(self, timeout: float = LOOKUP_TIMEOUT_S, *, most: int = MAX_LOOKUPS) -> None:
         self._timeout = timeout
         self._most = most
         self._lock = threading.Lock()
@@ -82,23 +82,23 @@ class Resolver:
 
     def wait_for(self, host: str, port: int, timeout: float) -> list[SocketAddress]:
         """Returns the result of `look_up`, waiting at most `timeout` seconds. Raises `OSError`."""
-        asked = self.look_up(host, port)
+        lookup = self.look_up(host, port)
         try:
-            return asked.result(timeout)
+            return lookup.result(timeout)
         finally:
-            asked.cancel()
+            lookup.cancel()
 
     def look_up(self, host: str, port: int | None = None) -> Lookup:
         """Starts a lookup. The future holds the addresses in the system's order, or `OSError`.
 
         Cancelling the future removes a queued lookup.
         """
-        asked: Lookup = Future()
+        lookup: Lookup = Future()
         if address_in(host) is not None:  # Needs no name server, so it returns at once.
-            _end([asked], _outcome(unbracketed(host), port))
-            return asked
+            _end([lookup], _outcome(unbracketed(host), port))
+            return lookup
         place = host, port
-        asked.add_done_callback(partial(self._forget, place))
+        lookup.add_done_callback(partial(self._forget, place))
         with self._lock:
             if self._process != os.getpid():  # A forked process does not have the threads.
                 self._process, self._threads = os.getpid(), 0
@@ -106,18 +106,18 @@ class Resolver:
                 self._queue.clear()
             if place not in self._waiting:
                 self._queue[place] = None
-            self._waiting.setdefault(place, []).append(asked)
+            self._waiting.setdefault(place, []).append(lookup)
             begins = place in self._queue and self._threads < self._most
             self._threads += begins
         if begins:
             self._begin()
-        return asked
+        return lookup
 
-    def _forget(self, place: Place, asked: Lookup) -> None:
+    def _forget(self, place: Place, lookup: Lookup) -> None:
         with self._lock:
             waiting = self._waiting.get(place, [])
-            if asked in waiting:
-                waiting.remove(asked)
+            if lookup in waiting:
+                waiting.remove(lookup)
             if not waiting and place in self._queue:
                 del self._queue[place], self._waiting[place]
 
@@ -128,7 +128,7 @@ class Resolver:
             with self._lock:
                 self._threads -= 1
                 places = [] if self._threads else list(self._queue)
-                left = [asked for place in places for asked in self._waiting.pop(place)]
+                left = [lookup for place in places for lookup in self._waiting.pop(place)]
                 for place in places:
                     del self._queue[place]
             _end(left, OSError("can't start a thread to look up the name"))
@@ -144,8 +144,8 @@ class Resolver:
                 del self._queue[place]
             outcome = _outcome(*place)
             with self._lock:
-                asked = self._waiting.pop(place)
-            _end(asked, outcome)
+                lookups = self._waiting.pop(place)
+            _end(lookups, outcome)
 
 
 CONFIGURED = Resolver()
@@ -168,9 +168,9 @@ def _outcome(host: str, port: int | None) -> list[SocketAddress] | OSError:
 
 def _end(waiting: Iterable[Lookup], outcome: list[SocketAddress] | OSError) -> None:
     """Hands an outcome to all who still wait for it."""
-    for asked in waiting:
-        if asked.set_running_or_notify_cancel():
+    for lookup in waiting:
+        if lookup.set_running_or_notify_cancel():
             if isinstance(outcome, OSError):
-                asked.set_exception(copy.copy(outcome))
+                lookup.set_exception(copy.copy(outcome))
             else:
-                asked.set_result(list(outcome))
+                lookup.set_result(list(outcome))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast._core import Endpoint, TlsChannel
-from holdfast.bounded_files import require_stored
 from holdfast.protocol import TLS_PORT
+from holdfast.runtime.bounded_files import require_stored
 
 if TYPE_CHECKING:
     from holdfast.net.tls import Tls

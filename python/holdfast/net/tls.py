@@ -5,14 +5,14 @@ Devices and brokers share this form. A URL, a configuration or a command line na
 
 from __future__ import annotations
 
-import ssl
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-from holdfast.bounded_files import require_stored
+from holdfast.runtime.bounded_files import require_stored
 
 if TYPE_CHECKING:
+    import ssl
     from collections.abc import Iterator
     from os import PathLike
     from pathlib import Path
@@ -60,8 +60,8 @@ class Tls:
     @property
     def query(self) -> str:
         """The query of a URL, without the question mark."""
-        given = {key: value for key, value in asdict(self).items() if value is not None}
-        return "&".join(f"{key}={quote(value)}" for key, value in given.items())
+        paths = {key: value for key, value in asdict(self).items() if value is not None}
+        return "&".join(f"{key}={quote(value)}" for key, value in paths.items())
 
     def files(self) -> Iterator[tuple[str, str]]:
         """Yields the key and the path of each given file."""
@@ -85,6 +85,9 @@ def https_context(tls: Tls) -> ssl.SSLContext:
     The files are read at each call, so renewed certificates need no restart. Raises `OSError` for
     an unusable file.
     """
+    # Modbus needs only the names of the files: the core does its TLS.
+    import ssl
+
     require_stored(tls.ca, tls.cert, tls.key)
     made = ssl.create_default_context(cafile=tls.ca)
     made.minimum_version = ssl.TLSVersion.TLSv1_2

@@ -1,10 +1,12 @@
-"""The readings that an output has not sent yet: in memory, and with a file beyond outages."""
+"""The readings that an output has not sent yet: in memory, and in a file if it has one."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
 from typing import TYPE_CHECKING
+
+from holdfast.config.models.outputs import MAX_VALUES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -20,71 +22,74 @@ class Buffer:
     with a file, those that can't be sent go there.
     """
 
-    def __init__(self, most: int = 1_000_000) -> None:
+    def __init__(self, most: int = MAX_VALUES) -> None:
         self.most = most
         self._waiting: deque[Reading] = deque()
-        self._taken: list[Reading] = []
-        self._of_file = False
-        self._come = threading.Condition()
+        self._batch: list[Reading] = []
+        self._is_batch_stored = False
+        self._changed = threading.Condition()
         self._is_woken = False
         self.stored: Stored | None = None
         self.dropped = 0
         """Readings that were lost because there was no room."""
 
     def offer(self, readings: Iterable[Reading]) -> None:
-        """Adds readings. If there is no room, the oldest go, and are counted."""
-        with self._come:
+        """Adds readings. If there is no room, the oldest are dropped and counted."""
+        with self._changed:
             self._waiting.extend(readings)
             while len(self._waiting) > self.most:
                 self._waiting.popleft()
                 self.dropped += 1
-            self._come.notify_all()
+            self._changed.notify_all()
 
     def __len__(self) -> int:
         stored = 0 if self.stored is None else self.stored.count
-        with self._come:
-            return len(self._waiting) + (0 if self._of_file else len(self._taken)) + stored
+        with self._changed:
+            return len(self._waiting) + (0 if self._is_batch_stored else len(self._batch)) + stored
 
-    def take(self, most: int, timeout: float) -> list[Reading]:
-        """The oldest readings; waits for the first, up to `timeout` seconds.
+    def take(self, max_readings: int, timeout: float) -> list[Reading]:
+        """Returns the oldest readings. Waits for the first up to `timeout` seconds.
 
-        They stay until `done`. Until then, it returns the same. Raises `OSError` for the file.
+        Returns the same readings again until `done` is called. Raises `OSError` if the file fails.
         """
-        if self._taken:
-            return self._taken
+        if self._batch:
+            return self._batch
+        # The readings in the file are older than those in memory.
         if self.stored is not None and self.stored.count:
-            self._taken, self._of_file = self.stored.first(), True
-            return self._taken
-        with self._come:
-            self._come.wait_for(lambda: self._waiting or self._is_woken, timeout)
+            self._batch, self._is_batch_stored = self.stored.first(), True
+            return self._batch
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._is_woken, timeout)
             self._is_woken = False
-            count = min(most, len(self._waiting))
-            self._taken = [self._waiting.popleft() for _ in range(count)]
-        return self._taken
+            count = min(max_readings, len(self._waiting))
+            self._batch = [self._waiting.popleft() for _ in range(count)]
+        return self._batch
 
     def done(self) -> None:
-        """Removes what was taken. Raises `OSError` for the file."""
-        if self._of_file and self.stored is not None:
+        """Removes the readings that `take` returned. Raises `OSError` if the file fails."""
+        if self._is_batch_stored and self.stored is not None:
             self.stored.remove_first()
-        self._taken, self._of_file = [], False
+        self._batch, self._is_batch_stored = [], False
 
     def wake(self) -> None:
         """Ends the current or the next wait of `take`. Thread-safe."""
-        with self._come:
+        with self._changed:
             self._is_woken = True
-            self._come.notify_all()
+            self._changed.notify_all()
 
     def keep(self, step: int = 1000) -> None:
-        """Moves what is in memory to the file, if there is one. Raises `OSError`; nothing is lost
-        then.
+        """Moves the readings in memory to the file, if there is one, `step` at a time.
+
+        Raises `OSError` if the file fails. No reading is lost then.
         """
         if self.stored is None:
             return
         while True:
-            if self._taken and not self._of_file:
-                moved = self._taken
+            # The batch goes first: it is older than the readings that wait.
+            if self._batch and not self._is_batch_stored:
+                moved = self._batch
             else:
-                with self._come:
+                with self._changed:
                     moved = [self._waiting.popleft() for _ in range(min(step, len(self._waiting)))]
             if not moved:
                 return
@@ -93,21 +98,21 @@ class Buffer:
             except OSError:
                 self._put_back(moved)
                 raise
-            if moved is self._taken:
-                self._taken = []
+            if moved is self._batch:
+                self._batch = []
 
     def _put_back(self, readings: list[Reading]) -> None:
-        if readings is self._taken:
+        if readings is self._batch:
             return
-        with self._come:
+        with self._changed:
             self._waiting.extendleft(reversed(readings))
 
     def detach(self) -> None:
-        """Closes the file, and forgets what was taken from it."""
-        if not self._of_file:
-            with self._come:
-                self._waiting.extendleft(reversed(self._taken))
-        self._taken, self._of_file = [], False
+        """Closes the file. A batch from memory waits again; one from the file stays there."""
+        if not self._is_batch_stored:
+            with self._changed:
+                self._waiting.extendleft(reversed(self._batch))
+        self._batch, self._is_batch_stored = [], False
         if self.stored is not None:
             self.stored.close()
             self.stored = None

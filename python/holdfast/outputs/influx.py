@@ -14,20 +14,20 @@ from holdfast.net.addresses import joined
 from holdfast.net.secret_file import read_secret
 from holdfast.net.tls import NO_FILES, https_context
 from holdfast.outputs.line_protocol import lines
-from holdfast.outputs.sending import Refused, soon_after
+from holdfast.outputs.sending import Receiver, Refused, soon_after
 
 if TYPE_CHECKING:
-    from holdfast.config.outputs import InfluxConfig
+    from holdfast.config.models.outputs import InfluxConfig
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
 
-CONNECTING = 3.0
+CONNECT_TIMEOUT_S = 3.0
 """Seconds to connect, at most."""
 
-MAX_ANSWER = 65_536
+MAX_RESPONSE_BYTES = 65_536
 """The bytes of an answer that are read."""
 
-SHOWN = 200
+MAX_SHOWN_CHARS = 200
 """The characters of an error message of the receiver that are shown."""
 
 UNWANTED = (400, 413, 422)
@@ -35,7 +35,7 @@ UNWANTED = (400, 413, 422)
 bucket can be put right."""
 
 
-class Influx:
+class Influx(Receiver):
     """One connection, kept open between requests."""
 
     def __init__(self, settings: InfluxConfig) -> None:
@@ -61,14 +61,11 @@ class Influx:
         status, answer = self._answer(body)
         if 200 <= status < 300:
             return
-        text = answer.decode("utf-8", "replace").strip()[:SHOWN]
+        text = answer.decode("utf-8", "replace").strip()[:MAX_SHOWN_CHARS]
         message = f"{self._at}: HTTP {status}{': ' if text else ''}{text}"
         if status in UNWANTED:
             raise Refused(message)
         raise OSError(message)
-
-    def idle(self) -> None:
-        """Nothing to do."""
 
     def close(self) -> None:
         """Closes the connection."""
@@ -104,7 +101,7 @@ class Influx:
         try:
             self._connection.request("POST", self._path, body, headers)
             answer = self._connection.getresponse()
-            text = answer.read(MAX_ANSWER)
+            text = answer.read(MAX_RESPONSE_BYTES)
             if not answer.isclosed():
                 self.close()
         except http.client.HTTPException as error:
@@ -128,7 +125,7 @@ class Influx:
     def _opened(self) -> http.client.HTTPConnection:
         if self._has_ended:
             raise OSError("stopped")
-        connection = self._created(min(CONNECTING, self._settings.timeout))
+        connection = self._created(min(CONNECT_TIMEOUT_S, self._settings.timeout))
         connection.connect()
         connection.sock.settimeout(self._settings.timeout)
         return connection

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from holdfast.polling import Reading
-    from holdfast.tags import Tag
 
 MIN_INTEGER, MAX_INTEGER = -(2**63), 2**63 - 1
 """Integers of the protocol have 64 bits. Others become floats."""
@@ -30,7 +29,9 @@ def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]
     for device, tag, value, time, _, _ in readings:
         at = round(time * 1_000_000) * 1000
         fields = points.setdefault((device, at), [])
-        shown = plain(tag, float(value) if _is_wide(tag) and value is not None else value)
+        # Some integers of this type do not fit, so that all are floats: a field has one kind.
+        is_wide = tag.type == "uint64" and value is not None
+        shown = plain(tag, float(value) if is_wide else value)
         fields += [f"{key.translate(_KEY)}={written}" for key, written in _fields(tag.name, shown)]
     name = measurement.translate(_NAME)
     more = "".join(f",{key.translate(_KEY)}={_tag(value)}" for key, value in tags.items())
@@ -39,11 +40,6 @@ def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]
         for (device, at), fields in points.items()
         if fields
     ).encode()
-
-
-def _is_wide(tag: Tag) -> bool:
-    """Whether some integers of a tag do not fit, so that all are floats: a field has one kind."""
-    return tag.type == "uint64"
 
 
 def _tag(value: str) -> str:

@@ -1,43 +1,48 @@
-"""Sends what is in a buffer, in order, and again after an outage."""
+"""Sends the readings of a buffer in order, and retries them after an outage."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol
 
-from holdfast import logs
+from holdfast.events import log_lines
 from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from holdfast.outputs.buffer import Buffer
     from holdfast.outputs.stored import Stored
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
 
-FIRST_PAUSE = 1.0
-MAX_PAUSE = 10.0
+FIRST_PAUSE_S = 1.0
+MAX_PAUSE_S = 10.0
 """Seconds between attempts to send. Each failure doubles the pause, up to the maximum."""
 
 MAX_READINGS = 1000
-"""The most readings that are sent in one step."""
+"""Limit of readings in one call of `Receiver.send`."""
 
-TICK = 1.0
-"""Seconds between two looks at the buffer during an outage."""
+CHECK_INTERVAL_S = 1.0
+"""Interval of moving readings to the file during an outage."""
 
-LAST = 2.0
-"""Seconds that an output has for what is left when it is stopped."""
+STOP_TIMEOUT_S = 2.0
+"""Time in which a stopped output sends the remaining readings."""
 
 
 class Refused(Exception):
-    """A receiver does not want these readings, and never will. They are dropped and counted."""
+    """The receiver refused readings for good. They are dropped and counted."""
 
 
 class Receiver(Protocol):
     """Where the readings of an output go. For the thread of the output."""
+
+    def until(self, _stop: Stop, /) -> None:
+        """Takes the stop of the output, to end waits with it. Called before all else."""
+        return
 
     def send(self, readings: list[Reading]) -> None:
         """Sends readings, and returns when the receiver has confirmed them.
@@ -47,6 +52,7 @@ class Receiver(Protocol):
 
     def idle(self) -> None:
         """Called once a second while nothing is sent."""
+        return
 
     def close(self) -> None:
         """Ends the connection, if there is one."""
@@ -55,19 +61,11 @@ class Receiver(Protocol):
         """Plain data for diagnostics, without secrets. Called from any thread."""
 
 
-@runtime_checkable
-class Interruptible(Protocol):
-    """A receiver whose waiting ends with the output."""
-
-    def until(self, stop: Stop) -> None:
-        """Takes the stop of the output. Called before all else."""
-
-
 def soon_after(stop: Stop, end: Callable[[], None]) -> None:
-    """Calls `end` in a thread of its own, `LAST` seconds after the stop: what waits must end."""
+    """Calls `end` in a thread of its own, `STOP_TIMEOUT_S` after the stop, to end a wait."""
 
     def begin() -> None:
-        timer = threading.Timer(LAST, end)
+        timer = threading.Timer(STOP_TIMEOUT_S, end)
         timer.daemon = True
         timer.start()
 
@@ -87,17 +85,16 @@ class Sending:
         self._name, self._receiver, self._buffer = name, receiver, buffer
         self._open_file = open_file
         self._sent = self._refused = 0
-        self._backoff = Backoff(FIRST_PAUSE, MAX_PAUSE, jitter=True)
+        self._backoff = Backoff(FIRST_PAUSE_S, MAX_PAUSE_S, jitter=True)
         self._pause = 0.0
         self._last_error: str | None = None
         self._is_failing = False
         self._file_error: str | None = None
 
     def run(self, stop: Stop) -> None:
-        """Sends until `stop` is set. What is left is sent too if that is quick, or kept."""
+        """Sends until `stop` is set. Then sends the rest for `STOP_TIMEOUT_S`, or keeps it."""
         stop.then(self._buffer.wake)
-        if isinstance(self._receiver, Interruptible):
-            self._receiver.until(stop)
+        self._receiver.until(stop)
         try:
             while not stop.is_set():
                 self._use_file()
@@ -109,7 +106,7 @@ class Sending:
             self._buffer.detach()
 
     def status(self) -> dict[str, object]:
-        """What was sent, what waits, and why."""
+        """The counters of readings, and the last errors."""
         return {
             **self._receiver.status(),
             "connected": not self._is_failing,
@@ -127,7 +124,7 @@ class Sending:
     def _step(self, stop: Stop) -> bool:
         """Sends once. Returns whether to go on at once."""
         try:
-            readings = self._buffer.take(MAX_READINGS, 0.0 if stop.is_set() else TICK)
+            readings = self._buffer.take(MAX_READINGS, 0.0 if stop.is_set() else CHECK_INTERVAL_S)
             if not readings:
                 self._receiver.idle()
                 return True
@@ -137,7 +134,7 @@ class Sending:
             self._receiver.send(readings)
         except Refused as error:
             self._refused += len(readings)
-            logs.refused(
+            log_lines.refused(
                 "output_refused",
                 kind=self._name,
                 output=self._name,
@@ -150,7 +147,7 @@ class Sending:
             self._sent += len(readings)
             if self._is_failing:
                 waiting = len(self._buffer) - len(readings)
-                logs.write(logging.INFO, "output_back", output=self._name, waiting=waiting)
+                log_lines.write(logging.INFO, "output_back", output=self._name, waiting=waiting)
         self._is_failing = False
         self._backoff.succeeded()
         try:
@@ -164,19 +161,21 @@ class Sending:
         self._pause = self._backoff.failed()
         if not self._is_failing:
             self._is_failing = True
-            logs.write(logging.WARNING, "output_failed", output=self._name, error=self._last_error)
+            log_lines.write(
+                logging.WARNING, "output_failed", output=self._name, error=self._last_error
+            )
         return False
 
     def _wait(self, stop: Stop) -> None:
-        """Waits for the next attempt, and keeps what comes meanwhile."""
+        """Waits for the next attempt, and moves new readings to the file meanwhile."""
         end = time.monotonic() + self._pause
         while not stop.is_set() and (left := end - time.monotonic()) > 0:
             self._keep()
-            stop.wait(min(TICK, left))
+            stop.wait(min(CHECK_INTERVAL_S, left))
 
     def _finish(self) -> None:
-        """Sends what is left for a while, and keeps the rest."""
-        end = time.monotonic() + LAST
+        """Sends remaining readings for `STOP_TIMEOUT_S`, and moves the rest to the file."""
+        end = time.monotonic() + STOP_TIMEOUT_S
         if not self._is_failing:
             while len(self._buffer) and time.monotonic() < end:
                 try:
@@ -185,31 +184,32 @@ class Sending:
                 except (OSError, Refused):
                     break
         self._keep()
-        lost = len(self._buffer) - (self._buffer.stored.count if self._buffer.stored else 0)
-        if lost > 0:
-            logs.write(logging.WARNING, "output_unsent", output=self._name, count=lost)
+        unsent = len(self._buffer) - (self._buffer.stored.count if self._buffer.stored else 0)
+        if unsent > 0:
+            log_lines.write(logging.WARNING, "output_unsent", output=self._name, count=unsent)
 
     def _use_file(self) -> None:
         """Opens the file, or tries again after an error."""
         if self._open_file is None or self._buffer.stored is not None:
             return
-        try:
+        with self._using_file():
             self._buffer.stored = self._open_file()
-        except OSError as error:
-            self._tell_file(error)
-        else:
-            self._file_error = None
 
     def _keep(self) -> None:
-        try:
+        with self._using_file():
             self._buffer.keep()
+
+    @contextlib.contextmanager
+    def _using_file(self) -> Iterator[None]:
+        # No error of the file stops the output. Each new one is logged once.
+        try:
+            yield
         except OSError as error:
-            self._tell_file(error)
+            message = str(error)
+            if message != self._file_error:
+                log_lines.write(
+                    logging.ERROR, "output_file_failed", output=self._name, error=message
+                )
+            self._file_error = message
         else:
             self._file_error = None
-
-    def _tell_file(self, error: OSError) -> None:
-        told = str(error)
-        if told != self._file_error:
-            logs.write(logging.ERROR, "output_file_failed", output=self._name, error=told)
-        self._file_error = told

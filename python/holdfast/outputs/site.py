@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+import logging
+import threading
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from holdfast.events import log_lines
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -22,12 +26,24 @@ class NotWritten(Exception):
         self.reason, self.detail = reason, detail
 
 
+class DeviceInfo(NamedTuple):
+    """What is known of a device besides its values."""
+
+    address: str
+    """Its URL without options, and its unit id."""
+    host: str | None
+    """Its host; `None` on a serial line."""
+    maker: str | None
+    model: str | None
+    version: str | None
+
+
 class Site(Protocol):
     """The devices that an output publishes. Thread-safe."""
 
     @property
     def revision(self) -> int:
-        """Changes with the tags of any device."""
+        """Changes with the tags of any device, and with `devices`."""
 
     @property
     def answers(self) -> int:
@@ -35,6 +51,9 @@ class Site(Protocol):
 
     def tags(self) -> Mapping[str, Sequence[Tag]]:
         """The tags of each device."""
+
+    def devices(self) -> Mapping[str, DeviceInfo]:
+        """What is known of each device."""
 
     def answering(self) -> Mapping[str, bool]:
         """Whether each device answers, as far as it is known."""
@@ -58,3 +77,32 @@ class Site(Protocol):
         `done` is called with the outcome, by another thread. Raises `NotWritten` if nothing was
         sent. `peer` is where the command came from, for the audit log.
         """
+
+
+class CommandOutcomes:
+    """Logs and counts the outcomes of commands of an output. Thread-safe."""
+
+    def __init__(self, output: str) -> None:
+        self._output = output
+        self._lock = threading.Lock()
+        self.written = self.refused = self.ignored = 0
+
+    def ended(self, device: str, tag: str, refused: NotWritten | None) -> None:
+        """Notes that a command was carried out, or refused."""
+        fields = {"output": self._output, "device": device, "tag": tag}
+        with self._lock:
+            self.written += refused is None
+            self.refused += refused is not None
+        if refused is None:
+            log_lines.write(logging.INFO, "output_command_written", **fields)
+        else:
+            log_lines.refused(
+                "output_command_refused", kind=self._output, **fields, reason=refused.reason
+            )
+
+    def ignore(self, topic: str, reason: str) -> None:
+        """Notes a message that is no valid command."""
+        with self._lock:
+            self.ignored += 1
+        fields = {"output": self._output, "topic": topic, "reason": reason}
+        log_lines.refused("output_command_ignored", kind=self._output, **fields)

@@ -16,12 +16,12 @@ from holdfast.polling import Reading
 from holdfast.tags import Tag
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     FindTag = Callable[[str, str], Tag | None]
 
-LOCK_TIMEOUT = 1.0
+LOCK_TIMEOUT_S = 1.0
 """Seconds to wait for a file that is in use, by default."""
 
 _CREATE = """
@@ -37,67 +37,57 @@ class Stored:
     """
 
     def __init__(
-        self, file: Path, max_bytes: int, find: FindTag, lock_timeout: float = LOCK_TIMEOUT
+        self, file: Path, max_bytes: int, find: FindTag, lock_timeout: float = LOCK_TIMEOUT_S
     ) -> None:
         self.file = file
         self.count = 0
         """How many readings there are."""
         self._max_bytes, self._find = max_bytes, find
         self._bytes = 0
-        with contextlib.ExitStack() as failing:
-            try:
-                self._db = sqlite3.connect(
-                    file, timeout=lock_timeout, isolation_level=None, check_same_thread=False
-                )
-                failing.callback(self._db.close)
-                self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
-                self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
-                self._db.execute(_CREATE)
-                self._recount()
-            except sqlite3.Error as error:
-                raise OSError(f"{file}: {error}") from error
-            failing.pop_all()
+        with file_errors(file):
+            self._db = sqlite3.connect(
+                file, timeout=lock_timeout, isolation_level=None, check_same_thread=False
+            )
+        with file_errors(file, self.close):
+            # Two processes with one file would each send the readings of the other.
+            self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
+            self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
+            self._db.execute(_CREATE)
+            self._recount()
 
     def add(self, readings: Sequence[Reading]) -> int:
-        """Stores readings durably. Returns how many old ones had to go for them."""
+        """Stores readings durably. Returns how many old readings were dropped for them."""
         data = msgspec.msgpack.encode([_plain(reading) for reading in readings])
         dropped = 0
-        try:
-            with _Step(self._db):
-                while self._bytes + len(data) > self._max_bytes and self.count:
-                    dropped += self._remove_first()
-                if len(data) > self._max_bytes:
-                    return dropped + len(readings)
-                self._db.execute(
-                    "INSERT INTO readings (count, data) VALUES (?, ?)", (len(readings), data)
-                )
-        except sqlite3.Error as error:
-            with contextlib.suppress(sqlite3.Error):
-                self._recount()
-            raise OSError(f"{self.file}: {error}") from error
+        # The rollback may undo removals that `_remove_first` has counted.
+        with file_errors(self.file, self._recount), self._db:
+            self._db.execute("BEGIN")
+            while self._bytes + len(data) > self._max_bytes and self.count:
+                dropped += self._remove_first()
+            if len(data) > self._max_bytes:
+                return dropped + len(readings)
+            self._db.execute(
+                "INSERT INTO readings (count, data) VALUES (?, ?)", (len(readings), data)
+            )
         self.count += len(readings)
         self._bytes += len(data)
         return dropped
 
     def first(self) -> list[Reading]:
         """The oldest readings that were stored together; empty if there are none."""
-        try:
+        with file_errors(self.file):
             row = self._db.execute("SELECT data FROM readings ORDER BY id LIMIT 1").fetchone()
-        except sqlite3.Error as error:
-            raise OSError(f"{self.file}: {error}") from error
         if row is None:
             return []
         return [self._reading(*plain) for plain in msgspec.msgpack.decode(row[0])]
 
     def remove_first(self) -> None:
         """Removes what `first` returns."""
-        try:
-            with _Step(self._db):
-                self._remove_first()
-                if not self.count:
-                    self._db.execute("PRAGMA incremental_vacuum")
-        except sqlite3.Error as error:
-            raise OSError(f"{self.file}: {error}") from error
+        with file_errors(self.file), self._db:
+            self._db.execute("BEGIN")
+            self._remove_first()
+            if not self.count:
+                self._db.execute("PRAGMA incremental_vacuum")
 
     def close(self) -> None:
         """Closes the file."""
@@ -125,20 +115,15 @@ class Stored:
         return Reading(device, tag, value, time, fault, undecoded)
 
 
-class _Step:
-    """A transaction."""
-
-    def __init__(self, db: sqlite3.Connection) -> None:
-        self._db = db
-
-    def __enter__(self) -> None:
-        self._db.execute("BEGIN")
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        if kind is None:
-            self._db.execute("COMMIT")
-        elif self._db.in_transaction:  # SQLite has already undone it after some errors.
-            self._db.execute("ROLLBACK")
+@contextlib.contextmanager
+def file_errors(file: Path, undo: Callable[[], object] = lambda: None) -> Iterator[None]:
+    """Raises `OSError` for errors of SQLite, after `undo`, whose own errors do not count."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        with contextlib.suppress(sqlite3.Error):
+            undo()
+        raise OSError(f"{file}: {error}") from error
 
 
 def _plain(reading: Reading) -> tuple[Any, ...]:

@@ -9,24 +9,26 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
 from holdfast import _core
+from holdfast.client.base import DEFAULT_TIMEOUT_S
 from holdfast.client.endpoint import endpoint
 from holdfast.client.requests import write_typed
 from holdfast.client.url import parse
-from holdfast.faults import fault_text
-from holdfast.polling.reader import Reader
-from holdfast.polling.readings import Batch
+from holdfast.polling.faults import fault_text
+from holdfast.polling.readings import Batch, Reader
+from holdfast.protocol import READ_BITS, READ_REGISTERS
 from holdfast.tags import Tag, TagList
+from holdfast.tags.base import DEFAULT_MAX_GAP
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator, Mapping
 
     from holdfast.polling.readings import DevicePoll
 
-SLICE = 0.1
+SIGNAL_CHECK_S = 0.1
 """Seconds of one wait, between which signal handlers run."""
 
 
-TIMEOUT = 1.0
+ABANDON_CHECK_S = 1.0
 """Seconds that a thread waits for a batch, for a task that may not want it any more."""
 
 
@@ -36,7 +38,7 @@ class WriteFailed(Exception):
     def __init__(self, device: str, tag: str, fault: int) -> None:
         super().__init__(f"{device}.{tag}: {fault_text(fault)}")
         self.fault = fault
-        """The code in `holdfast.faults`: an exception code, or why there was no valid reply."""
+        """The code, see `holdfast.polling.faults`."""
 
 
 class Poller:
@@ -69,10 +71,10 @@ class Poller:
         name: str | None = None,
         unit: int = 1,
         interval: float = 1.0,
-        timeout: float = 1.0,
-        max_gap: int = 10,
-        max_registers: int = 125,
-        max_bits: int = 2000,
+        timeout: float = DEFAULT_TIMEOUT_S,
+        max_gap: int = DEFAULT_MAX_GAP,
+        max_registers: int = READ_REGISTERS,
+        max_bits: int = READ_BITS,
         in_flight: int | None = 1,
     ) -> str:
         """Polls the tags of a device every `interval` seconds. Returns its name.
@@ -105,7 +107,7 @@ class Poller:
                 max_registers=max_registers,
                 max_bits=max_bits,
                 in_flight=in_flight,
-                start_within=min(interval, SLICE * len(self._readers)),
+                start_within=min(interval, SIGNAL_CHECK_S * len(self._readers)),
             )
         )
         self._readers[name] = reader
@@ -138,10 +140,10 @@ class Poller:
         writing = self._poller.receiver()
         number = self._poller.write(name, request, writing)
         while True:
-            taken = writing.take(SLICE)
-            if taken is None:
+            results = writing.take(SIGNAL_CHECK_S)
+            if results is None:
                 raise RuntimeError("the poller has been closed")
-            for done, fault in taken[1]:
+            for done, fault in results[1]:
                 if done == number and fault:
                     raise WriteFailed(name, tag, fault)
                 if done == number:
@@ -160,12 +162,12 @@ class Poller:
         """The next batch; `None` if none comes within `timeout` seconds, or after `close`."""
         end = None if timeout is None else time.monotonic() + timeout
         while True:
-            left = SLICE if end is None else min(SLICE, end - time.monotonic())
-            taken = self._results.take(max(0.0, left))
-            if taken is None:
+            left = SIGNAL_CHECK_S if end is None else min(SIGNAL_CHECK_S, end - time.monotonic())
+            results = self._results.take(max(0.0, left))
+            if results is None:
                 self._has_ended = True
                 return None
-            polls = self._polls(taken[0])
+            polls = self._polls(results[0])
             if polls:
                 return Batch(polls)
             if end is not None and time.monotonic() >= end:
@@ -191,7 +193,7 @@ class Poller:
         while True:
             if self._pending is None:
                 loop = asyncio.get_running_loop()
-                self._pending = loop.run_in_executor(None, self.take, TIMEOUT)
+                self._pending = loop.run_in_executor(None, self.take, ABANDON_CHECK_S)
             # A batch that nobody waits for any more is the first of the next iteration.
             batch = await asyncio.shield(self._pending)
             self._pending = None
@@ -217,8 +219,8 @@ def _tags(tags: Mapping[str, Tag | tuple[Any, ...]]) -> Iterator[Tag]:
             yield tag
         elif isinstance(tag, tuple) and 2 <= len(tag) <= 4:
             # Only a tag list says what may not be written.
-            made = Tag(name, *tag)
-            yield made if made.unwritable else replace(made, writable=True)
+            tuple_tag = Tag(name, *tag)
+            yield tuple_tag if tuple_tag.unwritable else replace(tuple_tag, writable=True)
         else:
             found = f"the tag {name} is {tag!r}"
             raise ValueError(f"{found}, allowed: a Tag, or (area, address, type, order)")

@@ -1,15 +1,18 @@
-"""What polls bring: the values of tags."""
+"""What polls bring: the values of tags, and how they are read from the blocks of a poll."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from holdfast.faults import fault_text, is_exception
+from holdfast.polling.faults import fault_text, is_exception
+from holdfast.tags.decoding import Places, Undecoded, assembled, decoder, value_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from holdfast.tags import Tag
+    from holdfast.tags.decoding import Decoder
+    from holdfast.types import Area, PolledBlock
 
 
 class Reading(NamedTuple):
@@ -22,7 +25,7 @@ class Reading(NamedTuple):
     time: float
     """When the device answered, in seconds since 1970."""
     fault: int = 0
-    """0 if the device answered; otherwise the code in `holdfast.faults`."""
+    """0 if the device answered; otherwise the code in `holdfast.polling.faults`."""
     undecoded: str | None = None
     """Why the registers can't be converted to a value, if they can't."""
 
@@ -75,3 +78,81 @@ class Batch:
             }
             for reading in self
         ]
+
+
+MAX_BLOCKS = 4096
+"""Blocks whose decoders are kept. A device has few, but a plan that changes makes others."""
+
+
+class Reader:
+    """Reads the tags of one device from the blocks of its polls."""
+
+    def __init__(self, device: str, tags: Iterable[Tag]) -> None:
+        self.device = device
+        self.tags = tuple(tags)
+        self.named = {tag.name: tag for tag in self.tags}
+        """The tags, by name."""
+        self._places = Places(self.tags)
+        self._blocks: dict[tuple[Area, int, int], tuple[Sequence[Tag], Decoder | None]] = {}
+
+    @property
+    def fields(self) -> list[tuple[Area, int, int]]:
+        """What has to be read: areas, addresses and counts, each once."""
+        places = ((tag.area, tag.span.start, len(tag.span)) for tag in self.tags)
+        return list(dict.fromkeys(places))
+
+    def poll(self, blocks: Sequence[PolledBlock]) -> DevicePoll:
+        """The readings of one poll, one for each tag, in the order of the tags.
+
+        A poll ends with the first request that is not answered: its fault is that of all tags that
+        are missing.
+        """
+        found: dict[str, Reading] = {}
+        for area, address, count, data, fault, time in blocks:
+            tags, decode = self._inside(area, address, count)
+            if data is None or decode is None:
+                found.update({tag.name: self._none(tag, time, fault) for tag in tags})
+                continue
+            for tag, raw in zip(tags, decode(data), strict=True):
+                found[tag.name] = self._reading(tag, raw, time)
+        if len(found) < len(self.tags):
+            found.update(self._others(found, blocks))
+        return DevicePoll(self.device, [found[tag.name] for tag in self.tags if tag.name in found])
+
+    def _others(
+        self, found: Mapping[str, Reading], blocks: Sequence[PolledBlock]
+    ) -> Iterator[tuple[str, Reading]]:
+        """The readings of tags that no block has whole."""
+        for tag in self.tags:
+            if tag.name in found:
+                continue
+            pieces = [block for block in blocks if block[0] == tag.area and _overlap(tag, block)]
+            parts = [(piece[1], piece[3]) for piece in pieces if piece[3] is not None]
+            data = assembled(tag, parts) if tag.source is None else None
+            faulty = [block for block in [*pieces, *blocks[-1:]] if block[4]]
+            if data is not None:
+                yield tag.name, self._reading(tag, value_of(tag, data, tag.address), pieces[-1][5])
+            elif faulty:
+                yield tag.name, self._none(tag, faulty[0][5], faulty[0][4])
+
+    def _inside(self, area: Area, address: int, count: int) -> tuple[Sequence[Tag], Decoder | None]:
+        key = (area, address, count)
+        known = self._blocks.get(key)
+        if known is None:
+            if len(self._blocks) >= MAX_BLOCKS:
+                self._blocks.clear()
+            tags = self._places.inside(*key)
+            known = self._blocks[key] = (tags, decoder(tags, address, count) if tags else None)
+        return known
+
+    def _reading(self, tag: Tag, raw: Any, time: float) -> Reading:
+        if type(raw) is Undecoded:
+            return Reading(self.device, tag, None, time, 0, raw.error)
+        return Reading(self.device, tag, tag.value(raw), time)
+
+    def _none(self, tag: Tag, time: float, fault: int) -> Reading:
+        return Reading(self.device, tag, None, time, fault)
+
+
+def _overlap(tag: Tag, block: PolledBlock) -> bool:
+    return block[1] < tag.span.stop and tag.span.start < block[1] + block[2]

@@ -11,7 +11,7 @@ from __future__ import annotations
 from holdfast.net.tls import Tls
 from holdfast.raw_ingest.encoding import encode
 from holdfast.raw_ingest.outcome import RawError, RawRefused, RawTimeout, RawTlsFailed
-from holdfast.raw_ingest.sending import TIMEOUT as TIMEOUT
+from holdfast.raw_ingest.sending import TIMEOUT_S as TIMEOUT_S
 from holdfast.raw_ingest.sending import send, send_packet, send_packet_sync, send_sync
 
 __all__ = [

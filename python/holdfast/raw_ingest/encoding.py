@@ -6,9 +6,9 @@ import reprlib
 from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict
 
 from holdfast._core import encode_raw_ingest, pack_raw_ingest
-from holdfast.integers import as_integer
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD
 from holdfast.types import AREAS, BIT_AREAS
+from holdfast.values.integers import as_integer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

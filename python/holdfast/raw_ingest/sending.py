@@ -7,13 +7,17 @@ import time
 from typing import TYPE_CHECKING
 
 from holdfast._core import TlsChannel
-from holdfast.client.connecting import addresses, connected, connected_sync
 from holdfast.client.endpoint import receiver_endpoint
-from holdfast.client.receiver import Receiver
+from holdfast.client.tcp_connect import addresses, connected, connected_sync
+from holdfast.client.url import RECEIVER_TIMEOUT_S, Receiver
 from holdfast.raw_ingest.encoding import encode
+from holdfast.raw_ingest.exchange import (
+    exchange,
+    exchange_sync,
+    secure_exchange,
+    secure_exchange_sync,
+)
 from holdfast.raw_ingest.outcome import Attempt
-from holdfast.raw_ingest.plain import exchange, exchange_sync
-from holdfast.raw_ingest.secure import secure_exchange, secure_exchange_sync
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -23,7 +27,7 @@ if TYPE_CHECKING:
     from holdfast.raw_ingest.encoding import Options
     from holdfast.types import Area
 
-TIMEOUT = 5.0
+TIMEOUT_S = RECEIVER_TIMEOUT_S
 
 
 async def send(
@@ -33,7 +37,7 @@ async def send(
     address: int,
     values: Iterable[int] | None = None,
     *,
-    timeout: float = TIMEOUT,
+    timeout: float = TIMEOUT_S,
     tls: Tls | None = None,
     **options: Unpack[Options],
 ) -> None:
@@ -52,7 +56,7 @@ def send_sync(
     address: int,
     values: Iterable[int] | None = None,
     *,
-    timeout: float = TIMEOUT,
+    timeout: float = TIMEOUT_S,
     tls: Tls | None = None,
     **options: Unpack[Options],
 ) -> None:
@@ -61,7 +65,7 @@ def send_sync(
 
 
 async def send_packet(
-    host: str, port: int, packet: bytes, *, timeout: float = TIMEOUT, tls: Tls | None = None
+    host: str, port: int, packet: bytes, *, timeout: float = TIMEOUT_S, tls: Tls | None = None
 ) -> None:
     """Sends an encoded packet. Returns when the receiver has written it.
 
@@ -90,7 +94,7 @@ async def send_packet(
 
 
 def send_packet_sync(
-    host: str, port: int, packet: bytes, *, timeout: float = TIMEOUT, tls: Tls | None = None
+    host: str, port: int, packet: bytes, *, timeout: float = TIMEOUT_S, tls: Tls | None = None
 ) -> None:
     """Like `send_packet`, without an event loop."""
     attempt = Attempt(host, port, timeout)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 STOP_TIMEOUT_S = 10.0
 """Seconds that the program has to end, before it is killed."""
 
-MAX_LINE = 1000
+MAX_LINE_CHARACTERS = 1000
 """A longer line of output is passed on in parts."""
 
 
@@ -144,15 +144,15 @@ class ChildProcess:
             process = self._process = self._started()
         assert process.stdout is not None
         with process.stdout as lines:
-            while line := lines.readline(MAX_LINE):
+            while line := lines.readline(MAX_LINE_CHARACTERS):
                 self._output.take(line.rstrip())
                 if self._output.is_ready:
                     self._ready.set()
         code = process.wait()
         with self._lock:
             self._process = None
-        told = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
-        return self._output.error or told
+        ending = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
+        return self._output.error or ending
 
     def _started(self) -> subprocess.Popen[str]:
         command, inherited = self._command, self._inherited

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-PERIOD = 1.0
+PERIOD_S = 1.0
 """Seconds between two beats."""
 
 
@@ -21,7 +21,7 @@ class Heartbeat:
         self._last = time.monotonic()
 
     def beat(self) -> None:
-        """Notes that the thread or event loop runs. Call it at least every `PERIOD` seconds."""
+        """Notes that the thread or event loop runs. Call it at least every `PERIOD_S` seconds."""
         self._last = time.monotonic()
 
     @property
@@ -30,7 +30,7 @@ class Heartbeat:
         return time.monotonic() - self._last
 
     @contextlib.asynccontextmanager
-    async def kept(self) -> AsyncIterator[None]:
+    async def beating(self) -> AsyncIterator[None]:
         """Beats in this event loop until the block ends."""
         task = asyncio.create_task(self._keep())
         try:
@@ -41,4 +41,4 @@ class Heartbeat:
     async def _keep(self) -> None:
         while True:
             self.beat()
-            await asyncio.sleep(PERIOD)
+            await asyncio.sleep(PERIOD_S)

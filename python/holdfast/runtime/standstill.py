@@ -9,13 +9,13 @@ import logging
 import math
 import time
 
-from holdfast import logs
+from holdfast.events import log_lines
 
-LONG = 2.0
+STANDSTILL_S = 2.0
 """Seconds between two looks that are a standstill. As long as a node of a fleet may use a device
 after it has renewed its lease."""
 
-LOOK = LONG / 4
+MAX_LOOK_INTERVAL_S = STANDSTILL_S / 4
 """Seconds between two looks, at most, while the thread or event loop runs."""
 
 _CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", None)
@@ -29,11 +29,11 @@ def now() -> float:
 class Standstill:
     """The last standstill of a thread or event loop. Not thread-safe."""
 
-    def __init__(self, part: str, long_s: float = LONG) -> None:
+    def __init__(self, part: str, long_s: float = STANDSTILL_S) -> None:
         """`part` is what the log calls it. `long_s` is the shortest standstill."""
         self._part = part
         self._long_s = long_s
-        self.look_interval_s = min(long_s / 4, LOOK)
+        self.look_interval_s = min(long_s / 4, MAX_LOOK_INTERVAL_S)
         self._looked: float | None = None
         self.ended = -math.inf
         """When the last standstill was detected, by `now`."""
@@ -49,14 +49,14 @@ class Standstill:
         if before is not None and self._looked - before > self._long_s:
             self.ended, self.lasted = self._looked, self._looked - before
             seconds = round(self.lasted, 1)
-            logs.write(logging.WARNING, "stood_still", part=self._part, seconds=seconds)
+            log_lines.write(logging.WARNING, "stood_still", part=self._part, seconds=seconds)
 
 
-STEP = 2.0
+MIN_STEP_S = 2.0
 """The shortest step of the wall clock, in seconds. Without steps, NTP corrects less than 0.001 s in
 a second."""
 
-_PROMPT = 0.1
+_MAX_READING_S = 0.1
 """Seconds in which both clocks must be read, to be compared."""
 
 
@@ -70,14 +70,14 @@ class WallClock:
         """Logs a step since the last look. Returns its seconds, negative if set back, or `None`."""
         before, ahead = self._ahead, self._compare()
         self._ahead = before if ahead is None else ahead
-        if before is None or ahead is None or abs(ahead - before) < STEP:
+        if before is None or ahead is None or abs(ahead - before) < MIN_STEP_S:
             return None
         step = round(ahead - before, 3)
-        logs.write(logging.WARNING, "clock_stepped", step=step)
+        log_lines.write(logging.WARNING, "clock_stepped", step=step)
         return step
 
     @staticmethod
     def _compare() -> float | None:
         """How far the wall clock is ahead; `None` if the process stopped meanwhile."""
         began, wall, ended = now(), time.time(), now()
-        return wall - ended if ended - began < _PROMPT else None
+        return wall - ended if ended - began < _MAX_READING_S else None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-AGAIN = 2.0
+CANCEL_INTERVAL_S = 2.0
 """Seconds after which a task that has not ended is cancelled again."""
 
 
@@ -32,7 +32,7 @@ async def end(tasks: Iterable[asyncio.Task[Any]]) -> None:
     while left:
         for task in left:
             task.cancel()
-        done, left = await asyncio.wait(left, timeout=AGAIN)
+        done, left = await asyncio.wait(left, timeout=CANCEL_INTERVAL_S)
         for task in done:
             if not task.cancelled():
                 task.exception()  # Marks it retrieved.

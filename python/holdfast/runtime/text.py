@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -17,9 +16,9 @@ def clip(text: str, most: int = MAX_CHARACTERS) -> str:
     return text if len(text) <= most else f"{text[:most]}…"
 
 
-def quote(text: str) -> str:
-    """The beginning of a text, in quotes, without control characters."""
-    return repr(clip(text))
+def quote(value: str | bytes) -> str:
+    """The beginning of a text or of bytes, in quotes, without control characters."""
+    return f"{value[:MAX_CHARACTERS]!r}{'…' if len(value) > MAX_CHARACTERS else ''}"
 
 
 def either(values: Iterable[object]) -> str:
@@ -37,12 +36,26 @@ def listing(values: Iterable[object]) -> str:
     return ", ".join(str(value) for value in values)
 
 
-def guess(word: object, known: Iterable[str]) -> str:
-    """`; did you mean 'x'?` if a known word is close, else ""."""
-    close = difflib.get_close_matches(str(word), list(known), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+def extent(numbers: range) -> str:
+    """`5 to 9`."""
+    return f"{numbers.start} to {numbers.stop - 1}"
+
+
+def sentence(text: str) -> str:
+    """A text with a full stop, unless it has an end of its own, such as that of `suggestion`."""
+    return text if not text or text.endswith((".", "?", "!")) else f"{text}."
 
 
 def _listed(values: Iterable[object], word: str) -> str:
     *most, last = dict.fromkeys(str(value) for value in values)
     return f"{', '.join(most)} {word} {last}" if most else last
+
+
+def suggestion(word: object, known: Iterable[str]) -> str:
+    """`; did you mean 'x'?` if a known word is close, in any case, else ""."""
+    import difflib
+
+    words, text = list(known), str(word)
+    close = difflib.get_close_matches(text, words, 1)
+    close = close or difflib.get_close_matches(text.lower(), words, 1)
+    return f"; did you mean {close[0]!r}?" if close else ""

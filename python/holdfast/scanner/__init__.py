@@ -7,7 +7,8 @@ and disconnects after the last one ends. It keeps subscriptions over a restart i
 `commands` writes, `reports` answers questions. `placement` is what differs between a scanner that
 is alone and a node of a fleet.
 
-* `messages`: the messages, and what the programs of each dialect send and expect
+* `dialects`: what the programs of each generation send and expect
+* `messages`: the messages
 * `subscriptions`: devices and tags, who has subscribed to them, and at what rate
 * `polling`: the devices in use: their addresses, and how polls and writes reach them
 * `publish`: from polls to messages
@@ -18,12 +19,11 @@ is alone and a node of a fleet.
 
 from __future__ import annotations
 
+from holdfast.net.nats.connection import Ping, Servers
 from holdfast.scanner.fleet.agreement import FleetRefused
-from holdfast.scanner.nats.connection import Ping, Servers
 from holdfast.scanner.service import Scanner
 from holdfast.scanner.settings import FleetSettings, Settings
-from holdfast.scanner.subscriptions.limits import ScannerLimits
-from holdfast.scanner.subscriptions.rules import Defaults
+from holdfast.scanner.subscriptions.rules import Defaults, ScannerLimits
 
 __all__ = [
     "Defaults",

@@ -13,7 +13,7 @@ from holdfast.scanner.service import Scanner
 
 if TYPE_CHECKING:
     from holdfast._core import Poller
-    from holdfast.leases import StartThread
+    from holdfast.replication.leases import StartThread
     from holdfast.runtime.stop import Stop
     from holdfast.scanner.settings import Settings
 
@@ -51,7 +51,7 @@ class ScannerAdapter:
                 loop.call_soon_threadsafe(self._scanner.end)
 
         stop.then(end)
-        async with self.heartbeat.kept():
+        async with self.heartbeat.beating():
             await self._scanner.run()
 
     def status(self) -> dict[str, object]:

@@ -1,18 +1,23 @@
-"""Commands: a value, given as text, is written to coils or holding registers of a device."""
+"""Commands: a value, given as text, is written to coils or holding registers of a device.
+
+`fleet.nodes` says how long it waits for a node of a fleet.
+"""
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from holdfast import logs
 from holdfast.client.requests import write_typed
-from holdfast.faults import EXPIRED, STANDBY, fault_text
+from holdfast.events import log_lines
+from holdfast.polling.faults import EXPIRED, STANDBY, fault_text
 from holdfast.scanner.errors import Moved, Refused
-from holdfast.scanner.lateness import SEND_AGAIN, Lateness
+from holdfast.scanner.late_commands import SEND_AGAIN, Lateness
 from holdfast.scanner.messages.types import Answer
-from holdfast.scanner.subscriptions.health import is_unwritten
+from holdfast.scanner.subscriptions.health import NOT_WRITTEN_FAULTS
+from holdfast.scanner.subscriptions.write_access import unwritable
 from holdfast.tags.text import value_from
 from holdfast.tags.writing import from_text
 from holdfast.values import ConversionError, encode
@@ -24,7 +29,7 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast import tags
-    from holdfast.scanner.messages.dialect import Dialect
+    from holdfast.scanner.dialects import Dialect
     from holdfast.scanner.placement import Placement
     from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.responder import Responder
@@ -32,6 +37,8 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.tag import Tag
+
+MOVED = f"not written: {fault_text(STANDBY)}"
 
 
 def value(text: str, tag: Tag) -> Any:
@@ -60,33 +67,27 @@ def _checked(made: Any, tag: Tag) -> Any:
     return made
 
 
+@dataclass(eq=False)
 class Commands:
     """Handles the commands of callers, and those that other nodes of a fleet have received."""
 
-    def __init__(
-        self,
-        settings: Settings,
-        dialect: Dialect,
-        registry: Registry,
-        polling: Polling,
-        placement: Placement,
-        responder: Responder,
-    ) -> None:
-        self._prefix = settings.prefix
-        self._max_bytes = settings.limits.command
-        self._dialect = dialect
-        self._registry = registry
-        self._polling = polling
-        self._placement = placement
-        self._responder = responder
-        self.lateness = Lateness(settings.standstill_s)
+    _settings: Settings
+    _dialect: Dialect
+    _registry: Registry
+    _polling: Polling
+    _placement: Placement
+    _responder: Responder
+
+    def __post_init__(self) -> None:
+        self.lateness = Lateness(self._settings.standstill_s)
 
     async def command(self, message: Msg) -> Answer:
         """Writes to a device of the scanner, or of its fleet. Raises `Refused`."""
-        name = message.subject.removeprefix(f"{self._prefix}.")
+        name = message.subject.removeprefix(f"{self._settings.prefix}.")
         name = name.removeprefix("module.").removeprefix("command.")
-        if len(message.data) > self._max_bytes:
-            raise Refused(f"the value has {len(message.data)} bytes, allowed: {self._max_bytes}")
+        max_bytes = self._settings.limits.command
+        if len(message.data) > max_bytes:
+            raise Refused(f"the value has {len(message.data)} bytes, allowed: {max_bytes}")
         text = self._dialect.command_text(message.data)
         async with self._responder.in_order(message):
             device, tag = self._registry.commanded(name)
@@ -101,19 +102,15 @@ class Commands:
 
     async def write(
         self, device_id: str, tag_id: str, text: str, remaining_s: Callable[[], float]
-    ) -> bool:
-        """Writes to a device. Returns whether this scanner polls it. Raises `Refused`."""
+    ) -> None:
+        """Writes to a device. Raises `Refused`; `Moved` if this scanner does not poll it."""
         # Looked up again: the device may have been replaced while the command waited.
         device = self._registry.devices.get(device_id)
         if device is None or tag_id not in device.tags:
             raise Refused(f"no tag {tag_id!r} of {device_id}")
         if not self._placement.takes_writes(device):
-            return False
-        try:
-            await write_tag(self._polling, device, device.tags[tag_id], text, remaining_s)
-        except Moved:
-            return False
-        return True
+            raise Moved(MOVED)
+        await write_tag(self._polling, device, device.tags[tag_id], text, remaining_s)
 
 
 async def write_tag(
@@ -125,7 +122,7 @@ async def write_tag(
     seconds the write may wait for the device. Raises `Refused`, and `Moved` if another node has
     the device.
     """
-    if (flaw := device.unwritable(tag)) is not None:
+    if (flaw := unwritable(device, tag)) is not None:
         raise Refused(f"tag {tag.id!r} of {device.id} is not writable: {flaw}")
     made = value(text, tag) if tag.meaning is None else _of_profile(text, tag, tag.meaning)
     try:
@@ -136,9 +133,9 @@ async def write_tag(
         raise Refused(f"not written: {error}") from None
     fault = await polling.write(device, request, within=remaining_s())
     if fault == STANDBY:  # Its fence is closed, so nothing was sent.
-        raise Moved(f"not written: {fault_text(fault)}")
+        raise Moved(MOVED)
     if fault:
-        outcome = "not written" if is_unwritten(fault) else "not confirmed"
+        outcome = "not written" if fault in NOT_WRITTEN_FAULTS else "not confirmed"
         again = f"; {SEND_AGAIN}" if fault == EXPIRED else ""
         raise Refused(f"{outcome}: {fault_text(fault)}{again}")
-    logs.write(logging.INFO, "tag_written", device=device.id, tag=tag.id)
+    log_lines.write(logging.INFO, "tag_written", device=device.id, tag=tag.id)

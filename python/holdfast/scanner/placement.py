@@ -1,21 +1,26 @@
 """Which scanner polls a device, and where its subscriptions are stored.
 
-A scanner polls all devices itself (`alone`), or shares them with the other nodes of its fleet
-(`fleet.placement`). Everything in which the two differ is behind this interface.
+A scanner polls all devices itself, and may keep their subscriptions in JetStream
+(`jetstream.restore`); or it shares devices with the other nodes of its fleet (`fleet.placement`).
+Everything in which these differ is here.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+import asyncio
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+from holdfast.net.nats.outbox import Outbox
 
 if TYPE_CHECKING:
-    import asyncio
     from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 
     from nats.aio.client import Client
     from nats.aio.msg import Msg
 
     from holdfast import _core
+    from holdfast.net.nats.connection import Handler
+    from holdfast.scanner.messages.decoding import Decoded
     from holdfast.scanner.messages.types import (
         BrowseAnswer,
         BrowseRequest,
@@ -24,13 +29,13 @@ if TYPE_CHECKING:
         SubscribeRequest,
         UnsubscribeRequest,
         Variable,
-        VariablesRequest,
     )
-    from holdfast.scanner.nats.connection import Handler
-    from holdfast.scanner.nats.outbox import Outbox
     from holdfast.scanner.responder import Handle
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.tag import Tag
+
+Changed = TypeVar("Changed")
+"""What a change of subscriptions returns."""
 
 
 class DeviceHost(Protocol):
@@ -56,7 +61,7 @@ class SubscriptionHost(Protocol):
         """Carries out a stored request. Raises `Refused`."""
 
     async def adopt(
-        self, device: str, wanted: Mapping[str, Sequence[SubscribeRequest]], renewed: set[str]
+        self, device: str, desired: Mapping[str, Sequence[SubscribeRequest]], renewed: set[str]
     ) -> None:
         """Makes the subscriptions of a device those of the fleet, by subscriber.
 
@@ -72,8 +77,8 @@ class CommandHost(Protocol):
 
     async def write(
         self, device_id: str, tag_id: str, text: str, remaining_s: Callable[[], float]
-    ) -> bool:
-        """Writes to a device. Returns whether this scanner polls it. Raises `Refused`."""
+    ) -> None:
+        """Writes to a device. Raises `Refused`; `Moved` if this scanner does not poll it."""
 
 
 class ReportHandlers(Protocol):
@@ -89,10 +94,7 @@ class ReportHandlers(Protocol):
 class ReportHost(ReportHandlers, Protocol):
     """Reports of what this scanner knows."""
 
-    def browse_request(self, message: Msg) -> BrowseRequest:
-        """Parses a request. Raises `Refused`."""
-
-    def variables_request(self, message: Msg) -> VariablesRequest:
+    def request(self, message: Msg, kind: type[Decoded]) -> Decoded:
         """Parses a request. Raises `Refused`."""
 
     def browsed(self, request: BrowseRequest, ids: Iterable[str]) -> BrowseAnswer:
@@ -112,29 +114,34 @@ class ReportHost(ReportHandlers, Protocol):
         """The size limit of an answer."""
 
 
-class Placement(Protocol):
-    """See the module."""
+class Placement:
+    """That of a scanner without a fleet, which keeps nothing. Others override what differs."""
 
-    fleet: str | None
-    """The name of the fleet; `None` without one."""
-    queue: str
+    fleet_name: str | None = None
+    queue = ""
     """The queue group of subjects of which only one node gets each message; empty without one."""
-    shared: Sequence[str]
+    shared: Sequence[str] = ()
     """These subjects."""
 
-    def outbox(self, repeat_values: Callable[[], None], /) -> Outbox:
-        """Returns the queue of messages. It calls `repeat_values` when it had to drop some."""
+    def outbox(self, _repeat_values: Callable[[], None], /) -> Outbox:
+        """Returns the queue of messages. It calls `repeat_values` when it had to drop some.
+
+        It keeps the newest message of each tag while NATS is away.
+        """
+        return Outbox()
 
     def connected(self, client: Client | None) -> None:
         """Sets the client; `None` while there is no connection."""
 
     async def run(
-        self, devices: DeviceHost, subscriptions: SubscriptionHost, ready: asyncio.Event, /
+        self, _devices: DeviceHost, _subscriptions: SubscriptionHost, ready: asyncio.Event, /
     ) -> None:
         """Restores subscriptions and stores changes until it is cancelled.
 
         Sets `ready` when requests may be carried out. Raises `FleetRefused`.
         """
+        ready.set()
+        await asyncio.Event().wait()
 
     async def leave(self) -> None:
         """Hands all devices over to other nodes, if there are any."""
@@ -142,39 +149,44 @@ class Placement(Protocol):
     async def close(self) -> None:
         """Removes the states of devices, which would be out of date."""
 
-    def added(self, device: ScannedDevice) -> None:
-        """Notes that a device is known from now on."""
+    def subscribed(self, _device: ScannedDevice, _subscriber: str | None, /) -> None:
+        """Notes that a device is known from now on.
+
+        The subscription of `subscriber` must be stored. `None`: it is stored already.
+        """
 
     def dropped(self, device: ScannedDevice) -> None:
         """Notes that a device is known no more."""
 
-    def is_own(self, device: ScannedDevice, /) -> bool:
+    def is_own(self, _device: ScannedDevice, /) -> bool:
         """Whether this scanner polls a device and publishes its values, now."""
+        return True
 
-    def takes_writes(self, device: ScannedDevice, /) -> bool:
+    def takes_writes(self, _device: ScannedDevice, /) -> bool:
         """Whether this scanner can write to a device, now."""
+        return True
 
-    def fence(self, device: ScannedDevice, /) -> _core.Fence | None:
+    def fence(self, _device: ScannedDevice, /) -> _core.Fence | None:
         """Returns what closes when another node may poll a device; `None` if none ever may."""
+        return None
 
-    def lease(self, device: ScannedDevice, /) -> int | None:
+    def lease(self, _device: ScannedDevice, /) -> int | None:
         """Returns the number for the header of messages about a device; `None` without a fleet."""
+        return None
 
     async def store(
         self,
-        device: str,
-        change: Callable[[], Awaitable[object]],
-        subscriber: str | None = None,
+        _device: str,
+        change: Callable[[], Awaitable[Changed]],
+        _subscriber: str | None = None,
         /,
-    ) -> None:
+    ) -> Changed:
         """Makes a change of the subscriptions of a device, here and wherever else it must be.
 
         The lock of the device is held. `subscriber` has renewed its subscription. Raises `Refused`;
-        then nothing has changed.
+        then nothing has changed. Returns what `change` returns.
         """
-
-    def subscribed(self, device: str, subscriber: str) -> None:
-        """Notes that a subscription has changed."""
+        return await change()
 
     def unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Notes that tags of a subscription are removed."""
@@ -187,42 +199,49 @@ class Placement(Protocol):
 
     async def write(
         self,
-        device: ScannedDevice,
-        tag: Tag,
-        text: str,
-        own: Callable[[], Awaitable[bool]],
-        remaining_s: Callable[[], float],
+        _device: ScannedDevice,
+        _tag: Tag,
+        _text: str,
+        own: Callable[[], Awaitable[None]],
+        _remaining_s: Callable[[], float],
         /,
     ) -> None:
         """Has a command carried out by the scanner that polls the device. Raises `Refused`.
 
-        `own` carries it out here. It returns false, and writes nothing, if the device has moved.
+        `own` carries it out here. It raises `Moved`, and writes nothing, if the device has moved.
         `remaining_s` refuses it if it is too late, and returns how many seconds it may wait.
         """
+        await own()
 
-    def is_addressed(self, payload: bytes, /) -> bool:
+    def is_addressed(self, _payload: bytes, /) -> bool:
         """Whether a shutdown message is for this scanner, and not for another node."""
+        return True
 
     @property
     def writes_heartbeat(self) -> bool:
         """Whether this scanner writes the heartbeat, which all nodes share."""
+        return True
 
     @property
     def has_others(self) -> bool:
         """Whether other nodes go on when this one ends."""
+        return False
 
     def report(self) -> FleetReport | None:
         """Returns what `browse` reports of the fleet."""
+        return None
 
     def reports(self, own: ReportHost) -> ReportHandlers:
         """Returns what answers requests for reports, from those of this scanner."""
+        return own
 
     def handlers(
         self,
-        commands: CommandHost,
-        reports: ReportHost,
-        answering: Callable[[str, Handle], Handler],
-        end: Callable[[], None],
+        _commands: CommandHost,
+        _reports: ReportHost,
+        _answering: Callable[[str, Handle], Handler],
+        _end: Callable[[], None],
         /,
     ) -> Mapping[str, Handler]:
         """Returns the handlers of what other nodes ask, by subject. `end` ends this scanner."""
+        return {}

@@ -1,19 +1,26 @@
-"""Shows that the scanner runs, and notices other scanners on the same subjects."""
+"""Shows that the scanner runs, and notices other scanners on the same subjects.
+
+Each request reaches all of them, and each polls the device. A scanner announces itself on
+`PREFIX.scanner`. tentacle-modbus does not; it is noticed because it writes the same heartbeat.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
+import time
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import msgspec
 
 from holdfast import _core
+from holdfast.events import log_lines
+from holdfast.net.nats import batch
 from holdfast.runtime import tasks
-from holdfast.scanner.jetstream.heartbeat import HeartbeatKey
-from holdfast.scanner.messages.types import Announcement, HeartbeatMetadata
-from holdfast.scanner.nats import wire
-from holdfast.scanner.other_scanners import OtherScanners
+from holdfast.scanner.jetstream.heartbeat import HEARTBEAT_INTERVAL_S, HeartbeatKey
+from holdfast.scanner.messages.types import Announcement, HeartbeatMetadata, OtherScanner
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,42 +28,73 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
     from nats.aio.msg import Msg
 
+    from holdfast.net.nats.outbox import Outbox
     from holdfast.scanner.jetstream.buckets import Buckets
-    from holdfast.scanner.nats.outbox import Outbox
     from holdfast.scanner.placement import Placement
     from holdfast.scanner.subscriptions.registry import Registry
 
-HEARTBEAT_INTERVAL_S = 10.0
+FORGET_AFTER_S = 3 * HEARTBEAT_INTERVAL_S
+"""Time after the last sign of another scanner until it is forgotten."""
+
+MAX_SCANNERS = 100
+"""Limit of other scanners that are remembered."""
 
 
+class OtherScanners:
+    """The other scanners, by the time of their start."""
+
+    def __init__(self, started: int) -> None:
+        self._started = started
+        self._seen: dict[int, float] = {}
+
+    def saw(self, started: int) -> bool:
+        """Records a sign of another scanner. Returns whether it is a new one, and then logs it."""
+        if started == self._started:
+            return False
+        now = time.monotonic()
+        self._expire(now)
+        known = started in self._seen
+        if known or len(self._seen) < MAX_SCANNERS:
+            self._seen[started] = now
+        if not known:
+            todo = "stop one of them, or give it another --prefix"
+            log_lines.write(
+                logging.WARNING,
+                "another_scanner",
+                started=log_lines.timestamp(started / 1000),
+                todo=todo,
+            )
+        return not known
+
+    def current(self) -> list[OtherScanner]:
+        """Returns the other scanners that are running."""
+        self._expire(time.monotonic())
+        return [OtherScanner(started_at=started) for started in sorted(self._seen)]
+
+    def _expire(self, now: float) -> None:
+        self._seen = {
+            started: seen for started, seen in self._seen.items() if now - seen < FORGET_AFTER_S
+        }
+
+
+@dataclass(eq=False)
 class Presence:
     """Announces the scanner on `PREFIX.scanner`, and writes its heartbeat."""
 
-    def __init__(
-        self,
-        prefix: str,
-        registry: Registry,
-        buckets: Buckets,
-        placement: Placement,
-        outbox: Outbox,
-        client: Callable[[], Client | None],
-    ) -> None:
-        """`client` returns the client while there is a connection."""
-        self._subject = f"{prefix}.scanner"
-        self._registry = registry
-        self._buckets = buckets
-        self._placement = placement
-        self._outbox = outbox
-        self._client = client
-        self._is_due = asyncio.Event()
-        """Set when the next heartbeat is due immediately."""
-        self.heartbeat = HeartbeatKey(prefix, self._metadata, self._saw)
-        self.other_scanners = OtherScanners(self.heartbeat.started)
+    _prefix: str
+    _registry: Registry
+    _buckets: Buckets
+    _placement: Placement
+    _outbox: Outbox
+    _client: Callable[[], Client | None]
+    """Returns the client while there is a connection."""
+    _is_due: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set when the next heartbeat is due immediately."""
 
-    @property
-    def started(self) -> int:
-        """When the scanner was started, in milliseconds since 1970."""
-        return self.heartbeat.started
+    def __post_init__(self) -> None:
+        self._subject = f"{self._prefix}.scanner"
+        self.heartbeat = HeartbeatKey(self._prefix, self._metadata, self._saw)
+        self.other_scanners = OtherScanners(self.heartbeat.started)
 
     def beat_soon(self) -> None:
         """Makes the next heartbeat due immediately."""
@@ -84,7 +122,7 @@ class Presence:
         with contextlib.suppress(msgspec.DecodeError):
             other = msgspec.json.decode(message.data, type=Announcement)
             # The nodes of a fleet share their devices: they are no competitors.
-            if other.fleet is None or other.fleet != self._placement.fleet:
+            if other.fleet is None or other.fleet != self._placement.fleet_name:
                 self._saw(other.started_at)
 
     def _saw(self, started: int) -> None:
@@ -92,9 +130,9 @@ class Presence:
             self._announce()  # The other one may have been started later, and not know this one.
 
     def _announce(self) -> None:
-        content = Announcement(started_at=self.started, fleet=self._placement.fleet)
+        content = Announcement(started_at=self.heartbeat.started, fleet=self._placement.fleet_name)
         if self._client() is not None:
-            self._outbox.put([((self._subject,), wire.message(self._subject, content))])
+            self._outbox.put([((self._subject,), batch.message(self._subject, content))])
 
     def _metadata(self) -> HeartbeatMetadata:
         return HeartbeatMetadata(

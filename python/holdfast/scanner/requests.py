@@ -1,26 +1,26 @@
-"""Carries out subscribe and unsubscribe requests: of callers, of entries, stored ones."""
+"""Carries out subscribe and unsubscribe requests from callers, bucket entries and storage."""
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
-from holdfast import logs
+from holdfast.events import log_lines
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.entry_subscriptions import check_entry
-from holdfast.scanner.messages.decoding import decode_lenient
-from holdfast.scanner.messages.leniency import Adjustments
+from holdfast.scanner.messages.decoding import Adjustments, decode_lenient
 from holdfast.scanner.messages.types import Answer, SubscribeRequest, UnsubscribeRequest
-from holdfast.scanner.request_log import RequestLog
 from holdfast.scanner.subscriptions.subscription import subscription_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from nats.aio.msg import Msg
 
     from holdfast.scanner.jetstream.buckets import Buckets
+    from holdfast.scanner.messages.decoding import Lenient, Normalize
     from holdfast.scanner.placement import Placement
     from holdfast.scanner.polling.devices import Devices
     from holdfast.scanner.responder import Responder
@@ -30,62 +30,105 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.subscription import Subscription
 
 RETRY_EXPIRY_S = 1
-"""Time until a subscription is ended again that a fleet could not remove from its bucket."""
+"""Delay before an expired subscription is removed again after JetStream has failed."""
+
+MAX_REMEMBERED = 10_000
+"""Limit of remembered subscribers whose requests were adjusted."""
 
 
+class RequestLog:
+    """Writes each kind of adjustment once for each subscriber: callers repeat their requests."""
+
+    def __init__(self) -> None:
+        self._written: set[tuple[str, str]] = set()
+        """The subscribers, and the kinds of adjustments, that are already logged."""
+
+    def adjusted(self, subscriber: str, device: str, adjustments: Adjustments) -> None:
+        """Logs what was changed in a request."""
+        for kind, found in adjustments.summary():
+            if (subscriber, kind) in self._written:
+                continue
+            if len(self._written) >= MAX_REMEMBERED:
+                # Logging an adjustment twice is harmless; memory without limit is not.
+                self._written.clear()
+            self._written.add((subscriber, kind))
+            log_lines.write(
+                logging.WARNING, kind, subscriber=subscriber, device=device, found=found
+            )
+
+    def byte_orders(
+        self, subscription: Subscription, adjustments: Adjustments, new: Collection[str]
+    ) -> None:
+        """Logs what callers must know of the tags that they had not subscribed to before."""
+        about = {"subscriber": subscription.subscriber, "device": subscription.device}
+        for tag, note in adjustments.byte_orders:
+            if tag in new:
+                log_lines.write(logging.WARNING, "byte_order_differs", **about, tag=tag, note=note)
+
+    def subscribed(self, subscription: Subscription) -> None:
+        """Logs a subscription."""
+        log_lines.write(
+            logging.INFO,
+            "subscribed",
+            device=subscription.device,
+            subscriber=subscription.subscriber,
+            tags=len(subscription.tags),
+            scan_rate=subscription.rate,
+        )
+
+    def unsubscribed(self, request: UnsubscribeRequest) -> None:
+        """Logs the end of a subscription, or of some of its tags."""
+        log_lines.write(
+            logging.INFO,
+            "unsubscribed",
+            device=request.device_id,
+            subscriber=request.subscriber_id,
+            tags="all" if request.ids is None else len(request.ids),
+        )
+
+
+@dataclass(eq=False)
 class Requests:
     """Adds and removes subscriptions."""
 
-    def __init__(
-        self,
-        rules: Rules,
-        registry: Registry,
-        devices: Devices,
-        placement: Placement,
-        buckets: Buckets,
-        responder: Responder,
-        enable: Callable[[bool], None],
-    ) -> None:
-        """`enable` is called with what programs have written to a bucket."""
-        self._rules = rules
-        self._registry = registry
-        self._devices = devices
-        self._placement = placement
-        self._buckets = buckets
-        self._responder = responder
-        self.enable = enable
-        self._log = RequestLog()
+    _rules: Rules
+    _registry: Registry
+    _devices: Devices
+    _placement: Placement
+    _buckets: Buckets
+    _responder: Responder
+    enable: Callable[[bool], None]
+    """Called with the value of the `enabled` key when a program writes it."""
+    _log: RequestLog = field(default_factory=RequestLog)
 
     async def subscribe(self, message: Msg) -> Answer:
         """Adds the subscription of a request. Raises `Refused`."""
         async with self._responder.in_order(message):
-            rules, adjustments = self._rules, Adjustments(not self._rules.strict)
-            max_bytes, normalize = rules.limits.request, rules.dialect.normalize
-            request = decode_lenient(
-                message.data, SubscribeRequest, max_bytes, adjustments, normalize
-            )
-            asked = subscription_of(request, rules, adjustments)
-            self._buckets.check_not_entry(asked.device, asked.subscriber)
-        async with self._devices.lock(asked.device):
-            fresh = self._registry.fresh(asked)  # Before the change, after which no tag is fresh.
-            add = partial(self._devices.add, asked)
-            await self._placement.store(asked.device, add, asked.subscriber)
-            if rules.dialect.replaces_subscription:
-                self._devices.keep_only(asked.device, asked.subscriber, asked.tags)
-        await self._placement.settled(asked.device, asked.subscriber)
-        self._log.adjusted(asked.subscriber, asked.device, adjustments)
-        self._log.byte_orders(asked, adjustments, fresh)
-        self._log.subscribed(asked)
-        count = len(request.tags) if request.profile is None else len(asked.tags)
+            normalize = self._rules.dialect.normalize
+            request, adjustments = self._decoded(message.data, SubscribeRequest, normalize)
+            subscription = subscription_of(request, self._rules, adjustments)
+            # The program that owns the entry would overwrite this request at its next change.
+            self._buckets.check_not_entry(subscription.device, subscription.subscriber)
+        async with self._devices.lock(subscription.device):
+            add = partial(self._devices.add, subscription)
+            new = await self._placement.store(subscription.device, add, subscription.subscriber)
+            if self._rules.dialect.replaces_subscription:
+                self._devices.keep_only(
+                    subscription.device, subscription.subscriber, subscription.tags
+                )
+        # Outside the lock: storing can take seconds, and other requests need not wait for it.
+        await self._placement.settled(subscription.device, subscription.subscriber)
+        self._log.adjusted(subscription.subscriber, subscription.device, adjustments)
+        self._log.byte_orders(subscription, adjustments, new)
+        self._log.subscribed(subscription)
+        count = len(request.tags) if request.profile is None else len(subscription.tags)
         return Answer(success=True, count=count)
 
     async def unsubscribe(self, message: Msg) -> Answer:
         """Removes tags of a subscription. Raises `Refused`."""
         async with self._responder.in_order(message):
-            rules, adjustments = self._rules, Adjustments(not self._rules.strict)
-            max_bytes = rules.limits.request
-            request = decode_lenient(message.data, UnsubscribeRequest, max_bytes, adjustments)
-            rules.dialect.check_unsubscribe(request)
+            request, adjustments = self._decoded(message.data, UnsubscribeRequest)
+            self._rules.dialect.check_unsubscribe(request)
             self._buckets.check_not_entry(request.device_id, request.subscriber_id)
         async with self._devices.lock(request.device_id):
             await self._remove_stored(request)
@@ -93,6 +136,13 @@ class Requests:
         self._log.adjusted(request.subscriber_id, request.device_id, adjustments)
         self._log.unsubscribed(request)
         return Answer(success=True)
+
+    def _decoded(
+        self, data: bytes, kind: type[Lenient], normalize: Normalize | None = None
+    ) -> tuple[Lenient, Adjustments]:
+        adjustments = Adjustments(not self._rules.strict)
+        max_bytes = self._rules.limits.request
+        return decode_lenient(data, kind, max_bytes, adjustments, normalize), adjustments
 
     async def _remove_stored(self, request: UnsubscribeRequest) -> None:
         """Removes tags of a subscription wherever it is stored. Raises `Refused`."""
@@ -124,7 +174,7 @@ class Requests:
             except Refused:  # JetStream fails: the subscription must not stay for ever.
                 ttls.renew(device_id, subscriber_id, RETRY_EXPIRY_S)
                 return
-        logs.write(logging.INFO, "expired", device=device_id, subscriber=subscriber_id)
+        log_lines.write(logging.INFO, "expired", device=device_id, subscriber=subscriber_id)
 
     def is_entry(self, device: str, subscriber: str | None) -> bool:
         """Whether a subscription is from an entry of a bucket."""
@@ -132,20 +182,19 @@ class Requests:
 
     def check_entry(self, key: str, value: bytes) -> Subscription:
         """Returns the subscription of an entry. Raises `Refused`."""
-        rules, adjustments = self._rules, Adjustments(not self._rules.strict)
-        max_bytes, normalize = rules.limits.request, rules.dialect.normalize
-        request = decode_lenient(value, SubscribeRequest, max_bytes, adjustments, normalize)
+        normalize = self._rules.dialect.normalize
+        request, adjustments = self._decoded(value, SubscribeRequest, normalize)
         check_entry(key, request)
-        asked = subscription_of(request, rules, adjustments)
-        self._log.adjusted(asked.subscriber, asked.device, adjustments)
-        return asked
+        subscription = subscription_of(request, self._rules, adjustments)
+        self._log.adjusted(subscription.subscriber, subscription.device, adjustments)
+        return subscription
 
-    async def carry_out_entry(self, asked: Subscription) -> None:
-        """Makes a subscription that of its entry. Raises `Refused`."""
-        async with self._devices.lock(asked.device):
-            await self._devices.add(asked)
-            self._devices.keep_only(asked.device, asked.subscriber, asked.tags)
-        self._log.subscribed(asked)
+    async def carry_out_entry(self, subscription: Subscription) -> None:
+        """Replaces a subscription by the one of its entry. Raises `Refused`."""
+        async with self._devices.lock(subscription.device):
+            await self._devices.add(subscription)
+            self._devices.keep_only(subscription.device, subscription.subscriber, subscription.tags)
+        self._log.subscribed(subscription)
 
     async def end_entry(self, subscription: SubscriptionKey) -> None:
         """Ends the subscription of an entry."""
@@ -160,27 +209,28 @@ class Requests:
         if self.is_entry(request.device_id, request.subscriber_id):
             return
         adjustments = Adjustments()
-        asked = subscription_of(request, self._rules, adjustments)
-        async with self._devices.lock(asked.device):
-            await self._devices.add(asked, is_stored=True)
-        self._log.byte_orders(asked, adjustments, asked.tags)
+        subscription = subscription_of(request, self._rules, adjustments)
+        async with self._devices.lock(subscription.device):
+            await self._devices.add(subscription, is_stored=True)
+        self._log.byte_orders(subscription, adjustments, subscription.tags)
 
     async def adopt(
-        self, device: str, wanted: Mapping[str, Sequence[SubscribeRequest]], renewed: set[str]
+        self, device: str, desired: Mapping[str, Sequence[SubscribeRequest]], renewed: set[str]
     ) -> None:
-        """Makes the subscriptions of a device those of the fleet, by subscriber.
+        """Replaces the subscriptions of a device by those that the fleet has stored.
 
-        The `ttl` of `renewed` subscribers starts again. Raises `Refused`.
+        `desired` has the requests of each subscriber; other subscribers are removed. The `ttl` of
+        `renewed` subscribers starts again. Raises `Refused`.
         """
         known = self._registry.devices.get(device)
         for subscriber in [] if known is None else list(known.subscribers):
-            if subscriber not in wanted:
+            if subscriber not in desired:
                 self._devices.remove(UnsubscribeRequest(device, subscriber))
-        for subscriber, requests in wanted.items():
+        for subscriber, requests in desired.items():
             tags: set[str] = set()
             for request in requests:
-                asked = subscription_of(request, self._rules)
+                subscription = subscription_of(request, self._rules)
                 # A large subscription is stored as several requests.
-                await self._devices.add(asked, renewed=subscriber in renewed)
-                tags |= asked.tags.keys()
+                await self._devices.add(subscription, renewed=subscriber in renewed)
+                tags |= subscription.tags.keys()
             self._devices.keep_only(device, subscriber, tags)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
 
-from holdfast import logs
+from holdfast.events import log_lines
+from holdfast.net.nats import batch
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.types import Answer, BrowseAnswer
-from holdfast.scanner.nats import wire
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from nats.aio.msg import Msg
 
-    from holdfast.scanner.nats.outbox import Outbox
+    from holdfast.net.nats.outbox import Outbox
 
 Handle: TypeAlias = "Callable[[Msg], Awaitable[Answer | BrowseAnswer | bytes]]"
 """Carries out a message. Returns the answer, or its JSON."""
@@ -33,9 +33,9 @@ class Responder:
     """Runs requests as tasks, up to a limit."""
 
     def __init__(
-        self, max_pending: int, outbox: Outbox, until_ready: Callable[[], Awaitable[None]]
+        self, max_pending: int, outbox: Outbox, *until_ready: Callable[[], Awaitable[object]]
     ) -> None:
-        """Requests wait for `until_ready`."""
+        """Requests wait for each of `until_ready`."""
         self._max_pending = max_pending
         self._outbox = outbox
         self._until_ready = until_ready
@@ -50,7 +50,7 @@ class Responder:
             answer = await self._answer(kind, handle, message)
             if message.reply:
                 payload = answer if isinstance(answer, bytes) else msgspec.json.encode(answer)
-                await self._outbox.answer(message.reply, wire.text(message.reply, payload))
+                await self._outbox.answer(message.reply, batch.text(message.reply, payload))
 
         async def begin(message: Msg) -> None:
             self.begin(carry_out(message))
@@ -65,13 +65,16 @@ class Responder:
             if len(self._tasks) > self._max_pending:
                 limit = f"{self._max_pending} are pending, which is the limit"
                 raise Refused(f"too many requests: {limit}")
-            await self._until_ready()
+            for wait in self._until_ready:
+                await wait()
             return await handle(message)
         except Refused as refused:
-            logs.refused("request_refused", kind=kind, subject=message.subject, reason=str(refused))
+            log_lines.refused(
+                "request_refused", kind=kind, subject=message.subject, reason=str(refused)
+            )
             return Answer(success=False, error=str(refused))
         except Exception as error:  # An error in one request must not stop the service.
-            logs.problem("request_failed", subject=message.subject)
+            log_lines.problem("request_failed", subject=message.subject)
             return Answer(success=False, error=f"internal error: {type(error).__name__}")
 
     def begin(self, work: Coroutine[Any, Any, None]) -> None:

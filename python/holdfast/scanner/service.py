@@ -8,24 +8,23 @@ import logging
 import threading
 from typing import TYPE_CHECKING
 
-from holdfast import logs
+from holdfast.events import log_lines
+from holdfast.net.nats.connection import Broker
 from holdfast.runtime import tasks
-from holdfast.scanner.alone import Alone
 from holdfast.scanner.commands import Commands
+from holdfast.scanner.dialects import DIALECTS, Dialect
 from holdfast.scanner.fleet.placement import FleetPlacement
-from holdfast.scanner.jetstream.buckets import NoBuckets, TentacleNextBuckets
-from holdfast.scanner.messages.dialects import DIALECTS
-from holdfast.scanner.nats.connection import Broker
+from holdfast.scanner.jetstream.buckets import Buckets, TentacleNextBuckets
+from holdfast.scanner.jetstream.restore import StoredSubscriptions
+from holdfast.scanner.placement import Placement
 from holdfast.scanner.polling import device_tls
 from holdfast.scanner.polling.allowed_devices import AllowedDevices
-from holdfast.scanner.polling.device_address import DeviceAddresses
 from holdfast.scanner.polling.devices import Devices
 from holdfast.scanner.polling.poller import Polling
 from holdfast.scanner.presence import Presence
 from holdfast.scanner.publish.log_mirror import LogMirror
 from holdfast.scanner.publish.publishers import Publishers
 from holdfast.scanner.reports.reports import Reports
-from holdfast.scanner.reports.service_status import ServiceStatus
 from holdfast.scanner.requests import Requests
 from holdfast.scanner.responder import Responder
 from holdfast.scanner.subscriptions.registry import Registry
@@ -37,12 +36,9 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast._core import Poller
-    from holdfast.leases import StartThread
-    from holdfast.scanner.jetstream.buckets import Buckets
-    from holdfast.scanner.messages.dialect import Dialect
-    from holdfast.scanner.nats.connection import Handler
-    from holdfast.scanner.nats.tolerant_client import SafeClient
-    from holdfast.scanner.placement import Placement
+    from holdfast.net.nats.connection import Handler
+    from holdfast.net.nats.tolerant_client import SafeClient
+    from holdfast.replication.leases import StartThread
     from holdfast.scanner.settings import Settings
 
 STOP_STEP_TIMEOUT_S = 2.0
@@ -76,13 +72,15 @@ class Scanner:
         self._polling = Polling(
             poller,
             self._placement.fence,
-            settings.exact_pauses_s if dialect.has_exact_pauses else None,
+            settings.exact_pauses_s or dialect.reconnect_pauses_s,
         )
-        self._responder = Responder(settings.limits.pending, self.outbox, self._until_ready)
-        self._allowed = AllowedDevices(settings.allow)
+        self._responder = Responder(
+            settings.limits.pending, self.outbox, self._ready.wait, self._buckets.read
+        )
+        self._allowed = AllowedDevices(settings.allow, settings.device_tls, poller)
         self._devices = Devices(
             self._registry,
-            DeviceAddresses(self._allowed, settings.device_tls, poller),
+            self._allowed,
             self._polling,
             self._publishers,
             self._placement,
@@ -109,10 +107,9 @@ class Scanner:
             self._polling,
             self._publishers,
             self.outbox,
-            ServiceStatus(
-                self._presence, self.outbox, self._polling, self._buckets, self._placement
-            ),
+            self._presence,
             self._buckets,
+            self._placement,
             self._responder,
             self._client,
         )
@@ -146,14 +143,14 @@ class Scanner:
         running: list[asyncio.Task[object]] = [asyncio.create_task(work) for work in works]
         log_mirror = LogMirror(self._settings.prefix, self._publish_log)
         if self._settings.publish_logs:
-            logs.LOGGER.addHandler(log_mirror)
+            log_lines.LOGGER.addHandler(log_mirror)
         try:
             done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()  # Raises the error with which a part has ended, if it has.
         finally:
             await self._stop(running)
-            logs.LOGGER.removeHandler(log_mirror)
+            log_lines.LOGGER.removeHandler(log_mirror)
 
     @property
     def serves(self) -> bool:
@@ -183,19 +180,15 @@ class Scanner:
             return
         if not self._has_logged_access:
             self._has_logged_access = True
-            logs.write(logging.INFO, "write_access", **self._settings.write_access)
+            log_lines.write(logging.INFO, "write_access", **self._settings.write_access)
         # What was sent just before the connection was lost may not have arrived.
         for device in self._registry.devices.values():
             self._publishers.repeat(device)
 
-    async def _until_ready(self) -> None:
-        await self._ready.wait()
-        await self._buckets.read()
-
     def _enable(self, is_enabled: bool) -> None:
-        """Begins or stops polling, as programs have it."""
+        """Begins or stops polling when the `enabled` key changes."""
         if is_enabled:
-            self._devices.resume()
+            self._polling.resume()
         else:
             self._devices.pause()
         self._presence.beat_soon()
@@ -210,7 +203,7 @@ class Scanner:
 
         async def shutdown(message: Msg) -> None:
             if self._placement.is_addressed(message.data):
-                logs.write(logging.INFO, "shutdown_asked")
+                log_lines.write(logging.INFO, "shutdown_asked")
                 self.end()
 
         # Who gets an answer may send anything: what is not answered is subscribed to before.
@@ -249,14 +242,15 @@ class Scanner:
 def _placement(settings: Settings, registry: Registry, start_thread: StartThread) -> Placement:
     if settings.fleet is not None:
         return FleetPlacement(settings, settings.fleet, registry, start_thread)
-    keeps = settings.keep_subscriptions
-    return Alone(settings.prefix, registry, keeps_subscriptions=keeps)
+    if settings.keep_subscriptions:
+        return StoredSubscriptions(settings.prefix, registry)
+    return Placement()
 
 
 def _buckets(settings: Settings) -> Buckets:
     if settings.dialect == "tentacle-next":
         return TentacleNextBuckets(settings.prefix, settings.watch_times)
-    return NoBuckets()
+    return Buckets()
 
 
 async def _within(step: Awaitable[object]) -> None:

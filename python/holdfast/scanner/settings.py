@@ -5,24 +5,27 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from holdfast.config.scanning import PARTITIONS
-from holdfast.leases import LEASE_TIMES, LeaseTimes
+from holdfast.config.values.scanning import PARTITIONS, written_pollable
+from holdfast.net.nats.connection import MAX_PAUSE, Ping, Servers
 from holdfast.net.tls import NO_FILES, Tls
-from holdfast.runtime.standstill import LONG
-from holdfast.scanner import write_access
+from holdfast.replication.leases import LEASE_TIMES, LeaseTimes
+from holdfast.runtime.standstill import STANDSTILL_S
+from holdfast.scanner.dialects import DIALECTS
 from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
-from holdfast.scanner.messages.dialects import DIALECTS
-from holdfast.scanner.messages.tentacle import PAUSES_S
-from holdfast.scanner.nats.connection import MAX_PAUSE, Ping, Servers
-from holdfast.scanner.subscriptions.limits import ScannerLimits
-from holdfast.scanner.subscriptions.rules import Defaults
+from holdfast.scanner.subscriptions.rules import Defaults, ScannerLimits
+from holdfast.scanner.subscriptions.write_access import described
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
-    from holdfast.config import scanning
+    from holdfast.config.values import scanning
     from holdfast.net.allow_list import AllowEntry
     from holdfast.tags import TagList
+
+
+def places(allow: Iterable[AllowEntry]) -> str:
+    """Where devices may be."""
+    return ", ".join(map(written_pollable, allow)) or "at private and loopback addresses"
 
 
 @dataclass(frozen=True)
@@ -71,15 +74,16 @@ class Settings:
     """The tags that requests can name by their profile."""
     fleet: FleetSettings | None = None
     """The fleet of scanners that it is a node of."""
-    exact_pauses_s: tuple[float, float] = PAUSES_S
-    """The first and the longest pause after failures of a device; only with dialect `tentacle`."""
+    exact_pauses_s: tuple[float, float] | None = None
+    """Instead of `reconnect_pauses_s` of the dialect."""
     watch_times: WatchTimes = WATCH_TIMES
     """Those of the buckets of tentacle-next."""
-    standstill_s: float = LONG
+    standstill_s: float = STANDSTILL_S
     """The shortest time without the event loop after which commands that waited are refused."""
 
     @property
     def write_access(self) -> dict[str, str]:
         """What may be written, where, by whom, and what narrows it, in words."""
-        dialect = DIALECTS[self.dialect]
-        return write_access.described(self.writes, self.allow, self.prefix, dialect)
+        commands = DIALECTS[self.dialect].command_subjects
+        subjects = [f"{self.prefix}.{each}" for each in ("subscribe", *commands)]
+        return described(self.writes, places(self.allow), subjects)

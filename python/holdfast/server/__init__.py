@@ -7,6 +7,7 @@ The server is one listener of the native engine, whose threads serve it outside 
 from __future__ import annotations
 
 from holdfast.server.identity import Identity
+from holdfast.server.options import ServerOptions
 from holdfast.server.server import Server
 
-__all__ = ["Identity", "Server"]
+__all__ = ["Identity", "Server", "ServerOptions"]

@@ -28,7 +28,7 @@ _bound: set[Bound] = set()
 
 _FOLDER = Path("/proc/self/fd" if sys.platform == "linux" else "/dev/fd")
 _UNSPECIFIED = {socket.AF_INET: "0.0.0.0", socket.AF_INET6: "::"}
-_MOST = 65_536
+_MAX_DESCRIPTORS = 65_536
 """File descriptors that are tried where the system does not list them."""
 
 
@@ -56,7 +56,7 @@ def _descriptors() -> Iterable[int]:
     try:
         return sorted(int(each.name) for each in _FOLDER.iterdir())
     except OSError:
-        return range(min(os.sysconf("SC_OPEN_MAX"), _MOST))
+        return range(min(os.sysconf("SC_OPEN_MAX"), _MAX_DESCRIPTORS))
 
 
 def _own(number: int) -> set[Bound]:

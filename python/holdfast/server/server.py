@@ -1,21 +1,48 @@
-"""`Server`: one listener of the native engine."""
+"""`Server`: one listener of the native engine, whose transport `bind` names."""
 
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Self, cast
+from typing import TYPE_CHECKING, Literal, Self, TypeAlias, Unpack, cast
+from urllib.parse import urlsplit
 
 from holdfast import _core
+from holdfast.client.url import SERIAL, STRICT, SerialTarget, parse
 from holdfast.net.addresses import LOOPBACK
 from holdfast.server.fork import close_in_children
 from holdfast.server.identity import Identity
-from holdfast.server.listening import NAME, TransportOptions, listener
+from holdfast.server.options import DEFAULTS, STREAM_DEFAULTS
+from holdfast.types import TRANSPORTS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from holdfast._core import Memory, Rule, ServerTls
-    from holdfast.types import Access, ModbusCounters, WhenFull
+    from holdfast._core import Memory, Rule
+    from holdfast.server.options import (
+        DatagramOptions,
+        SerialOptions,
+        ServerOptions,
+        StreamOptions,
+    )
+    from holdfast.types import Access, ModbusCounters
+
+NAME = "server"
+
+Framing: TypeAlias = Literal["mbap", "rtu", "ascii"]
+
+_CONNECTIONS: dict[str, Framing] = {
+    "tcp": "mbap",
+    "tls": "mbap",
+    "rtu+tcp": "rtu",
+    "ascii+tcp": "ascii",
+}
+_DATAGRAMS: dict[str, Literal["mbap", "rtu"]] = {"udp": "mbap", "rtu+udp": "rtu"}
+
+FORMS = (
+    "127.0.0.1:5020, tcp://127.0.0.1:5020, tls://127.0.0.1:5020, udp://127.0.0.1:5020, "
+    "rtu+tcp://127.0.0.1:5020, rtu+udp://127.0.0.1:5020, ascii+tcp://127.0.0.1:5020, "
+    "rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
+)
 
 MAX_WORKERS = 64
 SOURCES = tuple(map(str, LOOPBACK))
@@ -30,15 +57,10 @@ class Server:
     `bind` is `address:port` for Modbus TCP, or a URL with the schemes of clients: `tcp`, `tls`,
     `udp`, `rtu+tcp`, `rtu+udp` and `ascii+tcp` with an IP address and a port, `rtu` and `ascii`
     with a serial line, as in `rtu:///dev/ttyUSB0?baud=19200&parity=even`. Port 0 lets the system
-    pick a port. `tls` requires `tls`, the certificates. An option that the transport does not have
-    is refused.
+    pick a port. `tls` requires `tls`, the certificates. `workers` is the number of native threads.
 
-    Times are in seconds. `idle_timeout` is the time without a request; 0 is unlimited.
-    `request_timeout` is the time from the first byte of a request to its last, and the time for a
-    peer to read its replies. `frame_timeout`, for `rtu+tcp`, is the time without a byte after which
-    an incomplete request is discarded. With `listen_only`, a peer that may write can set
-    a unit to listen only mode for all peers (function 8, sub-function 4). `workers` is the number
-    of native threads.
+    `options` are those of `holdfast.server.ServerOptions`: limits on connections, and times in
+    seconds. An option that the transport does not have is refused.
 
     Raises `ValueError` or `TypeError` at once for invalid arguments.
 
@@ -57,17 +79,9 @@ class Server:
         functions: Collection[int] | None = None,
         deny: Collection[int] | None = None,
         rules: Sequence[Rule] | None = None,
-        max_connections: int = 256,
-        max_connections_per_source: int | None = None,
-        when_full: WhenFull = "refuse",
-        idle_timeout: float = 300.0,
-        request_timeout: float = 10.0,
-        frame_timeout: float = 0.05,
-        listen_only: bool = False,
-        tls: ServerTls | None = None,
-        max_handshakes: int = 256,
         identity: Identity | None = None,
         workers: int = 1,
+        **options: Unpack[ServerOptions],
     ) -> None:
         if rules is None:
             if units is None or access is None:
@@ -84,18 +98,7 @@ class Server:
             raise TypeError("a server requires units and access, or rules, not both")
         if not 1 <= workers <= MAX_WORKERS:
             raise ValueError(f"workers is {workers}, allowed: 1 to {MAX_WORKERS}")
-        options = TransportOptions(
-            max_connections=max_connections,
-            max_connections_per_source=max_connections_per_source,
-            when_full=when_full,
-            idle_timeout=idle_timeout,
-            request_timeout=request_timeout,
-            frame_timeout=frame_timeout,
-            listen_only=listen_only,
-            tls=tls,
-            max_handshakes=max_handshakes,
-        )
-        self._listener = listener(bind, list(rules), options)
+        self._listener = _listener(bind, list(rules), options)
         self._identity = identity or Identity()
         self._workers = workers
         self._engine: _core.Engine | None = None
@@ -152,3 +155,59 @@ class Server:
 
     def __exit__(self, *_: object) -> None:
         self.stop()
+
+
+def _listener(bind: str, rules: Sequence[Rule], options: ServerOptions) -> _core.Listener:
+    """Returns the listener for `bind`. Raises `ValueError` for what it can't be or have."""
+    scheme, address = _split(bind)
+    _check(scheme, options)
+    if scheme in SERIAL:
+        return _serial(bind, rules, options)
+    if scheme in _DATAGRAMS:
+        datagrams = {**DEFAULTS, **options, "framing": _DATAGRAMS[scheme]}
+        return _core.Listener.udp(NAME, address, rules, cast("DatagramOptions", datagrams))
+    if scheme == "tls" and options.get("tls") is None:
+        raise ValueError("tls:// requires tls, the certificates: holdfast.ServerTls(cert_file=…)")
+    stream: StreamOptions = {**STREAM_DEFAULTS, **options, "framing": _CONNECTIONS[scheme]}
+    return _core.Listener(NAME, address, rules, stream)
+
+
+def _check(scheme: str, options: ServerOptions) -> None:
+    """Raises `ValueError` for an option that is set and has no effect with this scheme."""
+    if scheme in SERIAL:
+        allowed = {"event_log"}
+    elif scheme in _DATAGRAMS:
+        allowed = {"listen_only", "event_log"}
+    else:
+        special = {"frame_timeout": "rtu+tcp", "tls": "tls", "max_handshakes": "tls"}
+        allowed = {name for name in DEFAULTS if special.get(name, scheme) == scheme}
+    for name, value in options.items():
+        if name not in DEFAULTS:
+            raise TypeError(f"found the option {name!r}, allowed: {', '.join(DEFAULTS)}")
+        if name not in allowed and value != cast("dict[str, object]", DEFAULTS)[name]:
+            raise ValueError(f"{name} has no effect with {scheme}: omit it")
+
+
+def _split(bind: str) -> tuple[str, str]:
+    """Returns the scheme and the address; without a scheme, Modbus TCP."""
+    if not isinstance(bind, str):
+        raise TypeError(f"bind is {bind!r}, allowed: {FORMS}")
+    scheme, separator, address = bind.partition("://")
+    if not separator:
+        return "tcp", bind
+    if scheme in SERIAL:
+        return scheme, bind
+    if scheme not in TRANSPORTS or urlsplit(bind).netloc != address:
+        raise ValueError(f"bind is {bind!r}, allowed: {FORMS}")
+    return scheme, address
+
+
+def _serial(bind: str, rules: Sequence[Rule], options: ServerOptions) -> _core.Listener:
+    line = parse(bind)
+    assert isinstance(line, SerialTarget)
+    if line.tolerance != STRICT:
+        raise ValueError(f"bind is {bind!r}, which has options of clients, allowed: {FORMS}")
+    if len(rules) != 1:
+        raise ValueError(f"found {len(rules)} rules, a serial line has exactly one")
+    settings = {**DEFAULTS, **options, **line.settings}
+    return _core.Listener.serial(NAME, line.device, rules[0], cast("SerialOptions", settings))

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from holdfast import values
 from holdfast._core import Memory, Rule
 from holdfast.simulation import generators
-from holdfast.simulation.raw import Capacity, nearest
+from holdfast.simulation.capacity import Capacity, nearest
 from holdfast.simulation.scales import Scales
-from holdfast.tags.register_scale import RegisterScale
+from holdfast.tags.scale import RegisterScale
 from holdfast.types import AREAS
 from holdfast.values import DoesNotFit
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from holdfast.simulation.generators import Generator, Series
     from holdfast.tags import Tag, TagList
-    from holdfast.tags.register_scale import Form
+    from holdfast.tags.scale import Form
     from holdfast.types import Area
 
 
@@ -61,13 +61,7 @@ class SimulatedDevice:
         chosen = {**_of_scales(everything), **chosen}
         writable = [tag for tag in tags if tag.writable]
         kept = {place for tag in writable for place in _places(tag)}
-        extents = _extents(everything)
-        self.memory = Memory(
-            coils=extents.get("coils"),
-            discrete_inputs=extents.get("discrete_inputs"),
-            holding_registers=extents.get("holding_registers"),
-            input_registers=extents.get("input_registers"),
-        )
+        self.memory = Memory(**_extents(everything), seal=None)
         self._registers: dict[Area, dict[int, int]] = {area: {} for area in AREAS}
         self._written = _spans((tag.area, range(tag.address, tag.end)) for tag in writable)
         self._readable = _spans((tag.area, tag.span) for tag in everything)

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
     from holdfast.net.addresses import Network
 
-HEADER = 7
-MAX_LENGTH = 254
+HEADER_BYTES = 7
+MAX_LENGTH_FIELD = 254
 MAX_CONNECTIONS = 64
-IDLE = 300.0
-REPLY = 5.0
+IDLE_TIMEOUT_S = 300.0
+REPLY_TIMEOUT_S = 5.0
 """Seconds for which the device behind the front may take."""
 
 
@@ -46,6 +46,7 @@ class Faults:
         return self.latency[1] > 0 or self.drop > 0 or self.refuse > 0
 
 
+@dataclass(eq=False)
 class FaultProxy:
     """Serves Modbus TCP at `address`, and asks the device at `behind`, from `start` to `stop`.
 
@@ -53,19 +54,13 @@ class FaultProxy:
     are answered one after another.
     """
 
-    def __init__(
-        self,
-        address: tuple[str, int],
-        behind: tuple[str, int],
-        faults: Faults,
-        random: Random,
-        sources: Sequence[Network],
-    ) -> None:
-        self.address = address
-        self._behind = behind
-        self._faults = faults
-        self._random = random
-        self._sources = sources
+    address: tuple[str, int]
+    behind: tuple[str, int]
+    faults: Faults
+    random: Random
+    sources: Sequence[Network]
+
+    def __post_init__(self) -> None:
         self._loop = asyncio.new_event_loop()
         self._server: asyncio.Server | None = None
         self._connections: dict[asyncio.StreamWriter, asyncio.Task[None]] = {}
@@ -116,7 +111,7 @@ class FaultProxy:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             peer = parse_address(writer.get_extra_info("peername")[0].partition("%")[0])
-            if holds(self._sources, peer) and len(self._connections) <= MAX_CONNECTIONS:
+            if holds(self.sources, peer) and len(self._connections) <= MAX_CONNECTIONS:
                 with contextlib.suppress(OSError, EOFError, TimeoutError):
                     await self._pass_on(reader, writer)
         finally:
@@ -125,14 +120,14 @@ class FaultProxy:
                 await writer.wait_closed()
 
     async def _pass_on(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        behind, to_behind = await asyncio.open_connection(*self._behind)
+        behind, to_behind = await asyncio.open_connection(*self.behind)
         try:
             while True:
-                request = await asyncio.wait_for(_frame(reader), IDLE)
+                request = await asyncio.wait_for(_frame(reader), IDLE_TIMEOUT_S)
                 reply = await self._reply(request, behind, to_behind)
                 if reply is not None:
                     writer.write(reply)
-                    await asyncio.wait_for(writer.drain(), IDLE)
+                    await asyncio.wait_for(writer.drain(), IDLE_TIMEOUT_S)
         finally:
             to_behind.transport.abort()
 
@@ -140,23 +135,23 @@ class FaultProxy:
         self, request: bytes, behind: asyncio.StreamReader, to_behind: asyncio.StreamWriter
     ) -> bytes | None:
         """The reply to a request; `None` if it is dropped."""
-        faults, chance = self._faults, self._random.random()
+        faults, chance = self.faults, self.random.random()
         least, most = faults.latency
-        await asyncio.sleep(self._random.uniform(least, most))
+        await asyncio.sleep(self.random.uniform(least, most))
         if chance < faults.drop:
             return None
         if chance < faults.drop + faults.refuse:
             length = struct.pack(">H", 3)
-            code = bytes([request[HEADER] | 0x80, faults.code])
+            code = bytes([request[HEADER_BYTES] | 0x80, faults.code])
             return request[:4] + length + request[6:7] + code
         to_behind.write(request)
-        return await asyncio.wait_for(_frame(behind), REPLY)
+        return await asyncio.wait_for(_frame(behind), REPLY_TIMEOUT_S)
 
 
 async def _frame(reader: asyncio.StreamReader) -> bytes:
     """The next frame. Raises `EOFError` at the end, and for bytes that are no frame."""
-    head = await reader.readexactly(HEADER)
+    head = await reader.readexactly(HEADER_BYTES)
     protocol, length = struct.unpack(">HH", head[2:6])
-    if protocol != 0 or not 2 <= length <= MAX_LENGTH:
+    if protocol != 0 or not 2 <= length <= MAX_LENGTH_FIELD:
         raise EOFError
     return head + await reader.readexactly(length - 1)

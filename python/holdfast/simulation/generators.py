@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast.simulation.raw import Capacity, extremes
+from holdfast.simulation.capacity import Capacity, extremes
 from holdfast.tags.text import value_from
 from holdfast.values import DoesNotFit
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from random import Random
 
     from holdfast.tags import Tag
-    from holdfast.tags.register_scale import Form
+    from holdfast.tags.scale import Form
 
 Series: TypeAlias = "Iterator[Any]"
 
@@ -200,7 +200,7 @@ USUAL: tuple[tuple[Sequence[str], Generator], ...] = (
 """What values with these units do."""
 
 OTHER = Generator("sine", (0, 100, 60))
-CYCLE = 10.0
+STATE_TIME_S = 10.0
 """Seconds for which a tag stays in a state."""
 
 
@@ -212,9 +212,9 @@ def usual(tag: Tag, low: float, high: float) -> Generator:
     if base == "bytes":
         return constant(None)
     if base in ("bool", "bit"):
-        return Generator("cycle", (CYCLE,), (False, True))
+        return Generator("cycle", (STATE_TIME_S,), (False, True))
     if states := _states(tag):
-        return Generator("cycle", (CYCLE,), states)
+        return Generator("cycle", (STATE_TIME_S,), states)
     if tag.min is not None and tag.max is not None:
         least, most = max(low, tag.min), min(high, tag.max)
         if least < most:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from typing import TYPE_CHECKING, Any
 
-from holdfast.simulation.raw import Capacity
+from holdfast.simulation.capacity import Capacity
 from holdfast.tags.text import value_from
 from holdfast.values import DoesNotFit
 

@@ -7,8 +7,8 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from holdfast import values
-from holdfast.simulation.raw import Capacity, extremes, nearest
-from holdfast.tags.register_scale import RegisterScale
+from holdfast.simulation.capacity import Capacity, extremes, nearest
+from holdfast.tags.scale import RegisterScale
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

@@ -6,7 +6,7 @@ console, the scanner, outputs and `holdfast.Poller`.
 
 from __future__ import annotations
 
-from holdfast.tags.tag import Tag, TagError
-from holdfast.tags.tag_list import TagList
+from holdfast.tags.base import TagError
+from holdfast.tags.tag import Tag, TagList
 
 __all__ = ["Tag", "TagError", "TagList"]

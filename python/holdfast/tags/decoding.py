@@ -9,46 +9,26 @@ from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from itertools import chain
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar
 
-from holdfast.tags.register_scale import PlacedRegisters, Scaled
+from holdfast.tags.base import BaseTag, Scaled
 from holdfast.values import ConversionError, Field, Layout, decode
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.tags.register_scale import Source
     from holdfast.types import Area
 
 Decoder: TypeAlias = Callable[[bytes], Sequence[Any]]
 
-LAYOUTS = 1024
+MAX_CACHED_LAYOUTS = 1024
 """The size of the cache of layouts."""
 
 _BITS = [tuple(bool(byte >> bit & 1) for bit in range(8)) for byte in range(256)]
 
 
-class PlacedTag(PlacedRegisters, Protocol):
-    """What is needed of a tag to decode it."""
-
-    @property
-    def of_bits(self) -> bool:
-        """Whether the tag is in an area of bits."""
-
-    @property
-    def span(self) -> range:
-        """The addresses that one request must read: those of the value and of its scale."""
-
-    @property
-    def source(self) -> Source | None:
-        """The register that contains the scale, if one does."""
-
-    def scaled(self, raw: Any, content: Any) -> Scaled:
-        """The value, from the contents of its registers and of that of its scale."""
-
-
-T = TypeVar("T", bound=PlacedTag)
+T = TypeVar("T", bound=BaseTag)
 
 
 class Places(Generic[T]):
@@ -77,7 +57,7 @@ class Undecoded:
         self.error = error
 
 
-def decoder(tags: Sequence[PlacedTag], address: int, count: int) -> Decoder:
+def decoder(tags: Sequence[BaseTag], address: int, count: int) -> Decoder:
     """Returns a decoder for tags of one area, which must all be inside the block."""
     if tags[0].of_bits:
         return _bits(tags, address)
@@ -86,9 +66,9 @@ def decoder(tags: Sequence[PlacedTag], address: int, count: int) -> Decoder:
     return _registers(tags, address, count)
 
 
-def _with_scales(tags: Sequence[PlacedTag], address: int, count: int) -> Decoder:
+def _with_scales(tags: Sequence[BaseTag], address: int, count: int) -> Decoder:
     """A decoder for tags of which some have their scale in the same block."""
-    sources: dict[tuple[int, str, str], Source] = {}
+    sources: dict[tuple[int, str, str], BaseTag] = {}
     for tag in tags:
         if tag.source is not None:
             sources.setdefault(_place(tag.source), tag.source)
@@ -106,11 +86,11 @@ def _with_scales(tags: Sequence[PlacedTag], address: int, count: int) -> Decoder
     return decoded
 
 
-def _place(source: Source) -> tuple[int, str, str]:
+def _place(source: BaseTag) -> tuple[int, str, str]:
     return source.address, source.type, source.order
 
 
-def _scaled(tag: PlacedTag, raw: Any, content: Any) -> Scaled | Undecoded:
+def _scaled(tag: BaseTag, raw: Any, content: Any) -> Scaled | Undecoded:
     if type(raw) is Undecoded:
         return raw
     if type(content) is Undecoded:
@@ -121,7 +101,7 @@ def _scaled(tag: PlacedTag, raw: Any, content: Any) -> Scaled | Undecoded:
         return Undecoded(str(error))
 
 
-def _registers(tags: Sequence[PlacedRegisters], address: int, count: int) -> Decoder:
+def _registers(tags: Sequence[BaseTag], address: int, count: int) -> Decoder:
     """A decoder for registers that are all inside the block."""
     layout = _layout(
         count, *((tag.type, tag.address - address, tag.order, tag.encoding) for tag in tags)
@@ -136,14 +116,14 @@ def _registers(tags: Sequence[PlacedRegisters], address: int, count: int) -> Dec
     return decoded
 
 
-@lru_cache(LAYOUTS)
+@lru_cache(MAX_CACHED_LAYOUTS)
 def _layout(count: int, *fields: tuple[str, int, str, str | None]) -> Layout:
     """Returns the layout of a block. Cached, because devices of one kind share their layouts."""
     named = [Field(f"{at}", *field) for at, field in enumerate(fields)]
     return Layout(named, size=count)
 
 
-def value_of(tag: PlacedTag, data: bytes, address: int) -> Any:
+def value_of(tag: BaseTag, data: bytes, address: int) -> Any:
     """Decodes one tag of a block that begins at `address`."""
     if tag.of_bits:
         return _bits([tag], address)(data)[0]
@@ -152,7 +132,7 @@ def value_of(tag: PlacedTag, data: bytes, address: int) -> Any:
     return raw if source is None else _scaled(tag, raw, _alone(source, data, address))
 
 
-def assembled(tag: PlacedTag, pieces: Sequence[tuple[int, bytes]]) -> bytes | None:
+def assembled(tag: BaseTag, pieces: Sequence[tuple[int, bytes]]) -> bytes | None:
     """The bytes of a tag that several requests have read; `None` if something is missing.
 
     `pieces` are addresses and bytes. A scale in a register is only valid in the request that has
@@ -165,16 +145,16 @@ def assembled(tag: PlacedTag, pieces: Sequence[tuple[int, bytes]]) -> bytes | No
             _unpacked(data) if tag.of_bits else [data[at : at + 2] for at in range(0, len(data), 2)]
         )
         units.update(enumerate(of_piece, address))
-    wanted = [units.get(address) for address in range(tag.address, tag.end)]
-    if None in wanted:
+    content = [units.get(address) for address in range(tag.address, tag.end)]
+    if None in content:
         return None
     if not tag.of_bits:
-        return b"".join(unit for unit in wanted if isinstance(unit, bytes))
-    packed = sum(1 << at for at, bit in enumerate(wanted) if bit)
-    return packed.to_bytes((len(wanted) + 7) // 8, "little")
+        return b"".join(unit for unit in content if isinstance(unit, bytes))
+    packed = sum(1 << at for at, bit in enumerate(content) if bit)
+    return packed.to_bytes((len(content) + 7) // 8, "little")
 
 
-def _alone(tag: PlacedRegisters, data: bytes, address: int) -> Any:
+def _alone(tag: BaseTag, data: bytes, address: int) -> Any:
     """Decodes one tag, independently of the others."""
     start = 2 * (tag.address - address)
     try:
@@ -185,14 +165,12 @@ def _alone(tag: PlacedRegisters, data: bytes, address: int) -> Any:
         return Undecoded(str(error))
 
 
-def _bits(tags: Sequence[PlacedTag], address: int) -> Decoder:
-    places = [tag.address - address for tag in tags]
-    if any(parsed(tag.type).count is not None for tag in tags):
-        spans = [
-            slice(place, place + tag.count) if parsed(tag.type).count is not None else place
-            for place, tag in zip(places, tags, strict=True)
-        ]
-        return lambda data: [_unpacked(data)[span] for span in spans]
+def _bits(tags: Sequence[BaseTag], address: int) -> Decoder:
+    starts = [tag.address - address for tag in tags]
+    places = [
+        start if parsed(tag.type).count is None else slice(start, start + tag.count)
+        for start, tag in zip(starts, tags, strict=True)
+    ]
 
     def decoded(data: bytes) -> Sequence[Any]:
         bits = _unpacked(data)

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Literal, TypeAlias
 
-from holdfast.integers import as_integer
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_LIMITS, WRITE_LIMITS
-from holdfast.tags.linear import Linear
-from holdfast.tags.markers import FLOATS, Marker, as_decoded
-from holdfast.tags.register_scale import RegisterScale, Scaled
+from holdfast.tags.base import BaseTag, Marker, Scaled, TagError
+from holdfast.tags.scale import Linear, RegisterScale
 from holdfast.tags.writing import unwritable
 from holdfast.types import AREAS, BIT_AREAS, Area
-from holdfast.values import ConversionError, DoesNotFit, codec_for
-from holdfast.values.digits import shortest
+from holdfast.values import (
+    ConversionError,
+    DoesNotFit,
+    UnknownEncoding,
+    UnknownOrder,
+    codec_for,
+    decode,
+    encode,
+)
+from holdfast.values.digits import FLOATS, shortest
+from holdfast.values.integers import as_integer
+from holdfast.values.orders import DEFAULT_ORDER
 from holdfast.values.types import Type, parsed
 
 Rounding: TypeAlias = Literal["nearest", "exact"]
@@ -26,21 +34,13 @@ INTEGERS = ("int", "uint", "bcd")
 """What the names of integer types begin with."""
 
 
-class TagError(ValueError):
-    """A tag that can't be: `key` is the wrong part, such as `scale`."""
-
-    def __init__(self, key: str, message: str) -> None:
-        super().__init__(message)
-        self.key = key
-
-
 def default_type(area: Area) -> str:
     """The type of a tag that names none."""
     return "bool" if area in BIT_AREAS else "uint16"
 
 
 @dataclass(frozen=True)
-class Tag:
+class Tag(BaseTag):
     """A tag. Raises `TagError`.
 
     A value is scale × number + offset, where the number is what the registers hold.
@@ -52,7 +52,7 @@ class Tag:
     """Counted from 0, as in the protocol."""
     type: str = ""
     """As in `holdfast.values`. Default: `bool` in an area of bits, else `uint16`."""
-    order: str = "ABCD"
+    order: str = DEFAULT_ORDER
     encoding: str | None = None
     """The encoding of text; `None` for ASCII."""
     scale: float | RegisterScale = 1
@@ -87,10 +87,10 @@ class Tag:
             self._put("type", default_type(self.area))
         try:
             if parsed(self.type).base == "bool":
-                self._put("order", "ABCD")
+                self._put("order", DEFAULT_ORDER)
             codec_for(self.area, self.type, self.order, self.encoding)
         except ConversionError as error:
-            raise TagError(_key_of(error), str(error)) from None
+            raise TagError(_KEYS.get(type(error), "type"), str(error)) from None
         self._put("of_type", parsed(self.type))
         last = self.address + self.count - 1
         if last > LAST_ADDRESS:
@@ -114,10 +114,7 @@ class Tag:
 
     def _check_number(self) -> None:
         scale = 1 if isinstance(self.scale, RegisterScale) else self.scale
-        try:
-            self._put("_linear", Linear(scale, self.offset))
-        except ValueError as error:
-            raise TagError(str(error).split()[0], str(error)) from None
+        self._put("_linear", Linear(scale, self.offset))
         if not self.is_number:
             for key in ("scale", "offset", "min", "max", "deadband"):
                 if (given := getattr(self, key)) != getattr(Tag, key):
@@ -166,34 +163,11 @@ class Tag:
             raise TagError("writable", f"found true, {flaw}")
 
     @property
-    def count(self) -> int:
-        """The number of bits or registers."""
-        return self.of_type.registers
-
-    @property
-    def end(self) -> int:
-        """The address after the last one."""
-        return self.address + self.count
-
-    @property
     def source(self) -> Tag | None:
         """The register that contains the scale, if one does."""
         source = self.scale.source if isinstance(self.scale, RegisterScale) else None
         assert source is None or isinstance(source, Tag)
         return source
-
-    @property
-    def span(self) -> range:
-        """The addresses that one request must read: those of the value and of its scale."""
-        of = self.source
-        if of is None:
-            return range(self.address, self.end)
-        return range(min(self.address, of.address), max(self.end, of.end))
-
-    @property
-    def of_bits(self) -> bool:
-        """Whether the tag is in an area of bits."""
-        return self.area in BIT_AREAS
 
     @property
     def is_float(self) -> bool:
@@ -234,7 +208,7 @@ class Tag:
         Raises `ValueError` if there is a number, but no scale.
         """
         assert isinstance(self.scale, RegisterScale), "only such tags have a register for it"
-        if self._is_null(raw):
+        if self._has_no_value(raw):
             return Scaled(self._value(raw, self._linear))
         return Scaled(self._value(self._as_written(raw), self.scale.linear(content, self.offset)))
 
@@ -257,10 +231,8 @@ class Tag:
         assert isinstance(self.scale, RegisterScale)
         return f"the scale is in {self.scale.where}, which has to be read first"
 
-    def _is_null(self, raw: Any) -> bool:
-        if type(raw) is list:
-            return all(map(self._is_null, raw))
-        return bool(raw != raw or raw in self.null)
+    def _has_no_value(self, raw: Any) -> bool:
+        return all(map(self.is_null, raw)) if type(raw) is list else self.is_null(raw)
 
     def _as_written(self, raw: Any) -> Any:
         """Floats as the shortest decimals that they stand for: 0.1 of a `float32` is 0.1."""
@@ -273,7 +245,7 @@ class Tag:
     def _value(self, raw: Any, linear: Linear) -> Any:
         if type(raw) is list:
             return [self._value(item, linear) for item in raw]
-        if raw != raw or (self.null and raw in self.null):
+        if self.is_null(raw):
             return None
         if linear.is_identity or not self.is_number:
             return float(raw) if isinstance(raw, Fraction) else raw
@@ -331,6 +303,58 @@ class Tag:
         raise DoesNotFit(f"{name!r} is no state, allowed: {', '.join(self.states.values())}")
 
 
-def _key_of(error: ConversionError) -> str:
-    kind = type(error).__name__
-    return {"UnknownOrder": "order", "UnknownEncoding": "encoding"}.get(kind, "type")
+_KEYS = {UnknownOrder: "order", UnknownEncoding: "encoding"}
+"""The keys that errors of conversions are about; all others are about the type."""
+
+
+def as_decoded(marker: Marker, type: Type, encoding: str | None) -> Marker:
+    """Converts a marker to the value that is decoded from the registers.
+
+    Raises `ValueError` for a marker that the registers can't hold.
+    """
+    if type.base == "bytes":
+        raise ValueError(f"not supported for {type.name}")
+    if marker == "nan" and type.base in FLOATS:
+        return math.nan
+    try:
+        registers = encode(marker, type.element, encoding=encoding)
+        made: Marker = decode(registers, type.element, encoding=encoding)
+    except (ConversionError, TypeError) as error:
+        raise ValueError(str(error)) from None
+    return made
+
+
+class TagList:
+    """The tags of a device, in their order.
+
+    Raises `TagError` for two tags of one name, and for a scale that no tag of the list has.
+    """
+
+    def __init__(self, tags: Iterable[Tag] = ()) -> None:
+        self._tags: dict[str, Tag] = {}
+        for tag in tags:
+            if tag.name in self._tags:
+                raise TagError("name", f"two tags have the name {tag.name!r}")
+            self._tags[tag.name] = tag
+        for name, tag in self._tags.items():
+            self._tags[name] = tag.resolved(self._tags)
+
+    def __iter__(self) -> Iterator[Tag]:
+        return iter(self._tags.values())
+
+    def __len__(self) -> int:
+        return len(self._tags)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._tags
+
+    def __getitem__(self, name: str) -> Tag:
+        return self._tags[name]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, TagList) and list(self) == list(other)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"TagList({list(self)!r})"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.runtime.text import quote
-from holdfast.tags.register_scale import RegisterScale, linear_of
+from holdfast.tags.scale import RegisterScale, linear_of
 from holdfast.tags.writing import BOOLEANS, from_text
 from holdfast.values import DoesNotFit
 from holdfast.values.digits import shortest

@@ -13,8 +13,8 @@ import msgspec
 
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.runtime.text import quote
-from holdfast.tags.markers import FLOATS
 from holdfast.types import BIT_AREAS
+from holdfast.values.digits import FLOATS
 
 if TYPE_CHECKING:
     from holdfast.types import Area

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from holdfast.integers import as_boolean, as_integer
 from holdfast.protocol import MAX_WORD
 from holdfast.values.errors import DoesNotFit, shown
+from holdfast.values.integers import as_boolean, as_integer
 from holdfast.values.kinds import Kind
 
 if TYPE_CHECKING:

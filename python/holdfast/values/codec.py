@@ -7,7 +7,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, overload
 
 from holdfast.types import BIT_AREAS
-from holdfast.values.bcd import Bcd
 from holdfast.values.bits import Bit, Bool
 from holdfast.values.errors import (
     DoesNotFit,
@@ -17,8 +16,8 @@ from holdfast.values.errors import (
     counted,
     shown,
 )
-from holdfast.values.numeric import INTEGERS, Float, Integer
-from holdfast.values.orders import FOUR, order_of, swap_registers
+from holdfast.values.numeric import INTEGERS, Bcd, Float, Integer
+from holdfast.values.orders import DEFAULT_ORDER, FOUR, order_of, swap_registers
 from holdfast.values.registers import RegisterBlock
 from holdfast.values.text import Bytes, Text
 from holdfast.values.types import parsed
@@ -151,7 +150,9 @@ def codec_of(name: str, order: str, encoding: str | None) -> Codec:
     )
 
 
-def codec_for(area: Area, name: str, order: str = "ABCD", encoding: str | None = None) -> Codec:
+def codec_for(
+    area: Area, name: str, order: str = DEFAULT_ORDER, encoding: str | None = None
+) -> Codec:
     """The codec of a type in an area, with all parameters of a typed value checked together.
 
     Raises the errors of `codec_of`, and `WrongArea`.

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-from holdfast.integers import as_integer
+from holdfast.runtime.text import quote
 
-MAX_CHARACTERS = 40
 MAX_INTEGER = 1 << 128
 
 
@@ -71,16 +70,10 @@ def shown(value: object) -> str:
     if isinstance(value, int) and not -MAX_INTEGER < value < MAX_INTEGER:
         return f"an integer of {value.bit_length()} bits"
     if isinstance(value, str | bytes):
-        cut = len(value) > MAX_CHARACTERS
-        return f"{value[:MAX_CHARACTERS]!r}{'…' if cut else ''}"
+        return quote(value)
     if value is None or isinstance(value, int | float):
         return repr(value)
     return f"a {type(value).__name__}"
-
-
-def is_integer(value: object) -> bool:
-    """Whether a value is an integer of any library, but not a bool."""
-    return as_integer(value) is not None
 
 
 def counted(number: int, noun: str) -> str:

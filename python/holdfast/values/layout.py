@@ -1,20 +1,28 @@
-"""Layouts: the named fields of a block of registers, compiled once, converted in one call."""
+"""Layouts: the named fields of a block of registers, compiled once, converted in one call.
+
+One `struct` call reads all fields of one order and skips the bytes between them; overlapping fields
+take another call. Bits, strings, BCD and arrays are then finished field by field.
+"""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast.integers import as_integer
 from holdfast.values.bits import Bit, merge
 from holdfast.values.codec import Codec, codec_of
 from holdfast.values.errors import ConversionError, DoesNotFit, InvalidLayout, at, shown
-from holdfast.values.reading import Reading
+from holdfast.values.integers import as_integer
+from holdfast.values.orders import DEFAULT_ORDER, swap_registers
 from holdfast.values.registers import RegisterBlock
 from holdfast.values.types import MAX_REGISTERS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from holdfast.values.registers import Registers
 
 
@@ -25,7 +33,7 @@ class Field:
     name: str
     type: str
     offset: int
-    order: str = "ABCD"
+    order: str = DEFAULT_ORDER
     encoding: str | None = None
 
 
@@ -54,7 +62,7 @@ class Layout:
         bits = all(codec.type.base == "bool" for codec in self._codecs)
         self._block = RegisterBlock(self.size, "the layout", bits=bits)
         offsets = [entry.offset for entry in self.fields]
-        self._values = Reading(self.names, self._codecs, offsets, self.size).values
+        self._values = _Reading(self.names, self._codecs, offsets, self.size).values
         self._overlap = _overlap(self.fields, self._codecs)
 
     def decode(self, registers: Registers) -> dict[str, Any]:
@@ -170,3 +178,92 @@ def _extents(offset: int, codec: Codec) -> Iterator[tuple[int, int]]:
     bit = codec.kind.bit ^ 8 if codec.swapped != codec.kind.order.reversed else codec.kind.bit
     for register in range(offset, offset + registers):
         yield 16 * register + bit, 16 * register + bit + 1
+
+
+class _Reading:
+    """Reads all fields of a block of `size` registers, each at its offset in registers."""
+
+    def __init__(
+        self, names: Sequence[str], codecs: Sequence[Codec], offsets: Sequence[int], size: int
+    ) -> None:
+        self._names = names
+        passes: list[_Pass] = []
+        taken: dict[int, tuple[_Pass, int]] = {}
+        for index in sorted(range(len(names)), key=offsets.__getitem__):
+            taken[index] = _placed(passes, codecs[index], 2 * offsets[index])
+        sources = _sources(passes, [taken[index] for index in range(len(names))])
+        self._pick = None if sources == list(range(len(sources))) else itemgetter(*sources)
+        self._calls = [(one.swapped, one.compiled(2 * size)) for one in passes]
+        self._finishing = [
+            (index, codec.finish) for index, codec in enumerate(codecs) if codec.finish is not None
+        ]
+
+    def values(self, data: bytes) -> Sequence[Any]:
+        """The values in the order of the names. Raises `ConversionError` with the field's name."""
+        found: tuple[Any, ...] = ()
+        swapped = b""
+        for is_swapped, unpack in self._calls:
+            if is_swapped and not swapped:
+                swapped = swap_registers(data)
+            found += unpack(swapped if is_swapped else data)
+        if self._pick is not None:
+            found = self._pick(found)
+        return self._finished(list(found)) if self._finishing else found
+
+    def _finished(self, values: list[Any]) -> list[Any]:
+        index = 0
+        try:
+            for index, finish in self._finishing:
+                values[index] = finish(values[index])
+        except ConversionError as error:
+            raise at(self._names[index], error, self._names[index]) from None
+        return values
+
+
+class _Pass:
+    """One `struct` call over the block, for fields of one order that do not overlap."""
+
+    def __init__(self, codec: Codec) -> None:
+        self.swapped = codec.swapped
+        self._mark = self._form = codec.kind.mark
+        self._places: dict[tuple[int, str], int] = {}
+        self._end = 0
+
+    @property
+    def items(self) -> int:
+        """How many items the call returns."""
+        return len(self._places)
+
+    def place(self, codec: Codec, start: int) -> int | None:
+        """The index of a field at byte `start` in the result, `None` if this call can't read it."""
+        if codec.swapped is not self.swapped or codec.kind.mark != self._mark:
+            return None
+        key = start, codec.item
+        if key not in self._places and start >= self._end:
+            self._form += f"{start - self._end}x{codec.item}"
+            self._end = start + 2 * codec.type.registers
+            self._places[key] = len(self._places)
+        return self._places.get(key)
+
+    def compiled(self, size: int) -> Callable[[bytes], tuple[Any, ...]]:
+        """The compiled call, for a block of `size` bytes."""
+        return struct.Struct(f"{self._form}{size - self._end}x").unpack
+
+
+def _placed(passes: list[_Pass], codec: Codec, start: int) -> tuple[_Pass, int]:
+    """The first pass that can read a field, and the index of the field in that pass."""
+    for one in passes:
+        place = one.place(codec, start)
+        if place is not None:
+            return one, place
+    passes.append(_Pass(codec))
+    return _placed(passes[-1:], codec, start)
+
+
+def _sources(passes: list[_Pass], places: list[tuple[_Pass, int]]) -> list[int]:
+    """The index of each field among the items of all passes."""
+    firsts, first = {}, 0
+    for one in passes:
+        firsts[one] = first
+        first += one.items
+    return [firsts[one] + place for one, place in places]

@@ -1,15 +1,16 @@
-"""Integers and floats, which `struct` converts, including whole arrays in one call."""
+"""Numbers: integers and floats, which `struct` converts, also whole arrays in one call, and BCD."""
 
 from __future__ import annotations
 
-import operator
 import struct
 from abc import abstractmethod
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
-from holdfast.values.errors import DoesNotFit, is_integer, shown
-from holdfast.values.kinds import Kind
+from holdfast.values.digits import FLOATS
+from holdfast.values.errors import DoesNotFit, Undecodable, shown
+from holdfast.values.integers import as_integer
+from holdfast.values.kinds import Bytewise, Kind
 from holdfast.values.orders import move
 
 if TYPE_CHECKING:
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from holdfast.values.types import Type
 
 INTEGERS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q"}
-FLOATS = {"float16": "e", "float32": "f", "float64": "d"}
 MAX = {
     "float16": 65504.0,
     "float32": 3.4028234663852886e38,
@@ -95,9 +95,7 @@ class Integer(Number):
         self._most = self._least + (1 << bits) - 1
 
     def _number(self, value: Any) -> int:
-        if not is_integer(value):
-            raise DoesNotFit(f"{shown(value)} is not an integer, which {self.name} requires")
-        return operator.index(value)
+        return _required_integer(value, self.name)
 
     def _too_large(self, value: Any) -> DoesNotFit:
         allowed = f"{self._least} to {self._most} of {self.name}"
@@ -121,3 +119,31 @@ class Float(Number):
     def _too_large(self, value: Any) -> DoesNotFit:
         allowed = f"{-self._most} to {self._most} of {self.name}"
         return DoesNotFit(f"{shown(value)} is outside {allowed}")
+
+
+class Bcd(Bytewise):
+    """`bcd16` and `bcd32`: four and eight digits, no sign."""
+
+    def unpack_one(self, data: bytes) -> int:
+        """The number. Raises `Undecodable` for a digit above 9."""
+        digits = self.arrange(data).hex()
+        try:
+            return int(digits)
+        except ValueError:
+            found = f"digits 0x{digits.upper()}"
+            raise Undecodable(f"{found} are not {self.name}, allowed: 0 to 9") from None
+
+    def pack_one(self, value: Any) -> bytes:
+        """The digits of an integer. Raises `DoesNotFit`."""
+        number = _required_integer(value, self.name)
+        most = 10 ** (2 * self.width) - 1
+        if not 0 <= number <= most:
+            raise DoesNotFit(f"{shown(value)} is outside 0 to {most} of {self.name}")
+        return self.arrange(bytes.fromhex(f"{number:0{2 * self.width}d}"))
+
+
+def _required_integer(value: Any, name: str) -> int:
+    number = as_integer(value)
+    if number is None:
+        raise DoesNotFit(f"{shown(value)} is not an integer, which {name} requires")
+    return number

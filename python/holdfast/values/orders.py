@@ -45,6 +45,9 @@ EIGHT = {
     "BADCFEHG": FOUR["BADC"],
     "GHEFCDAB": FOUR["CDAB"],
 }
+DEFAULT_ORDER = "ABCD"
+"""The order of a field for which nobody names one."""
+
 ALLOWED = f"{', '.join(FOUR)}, and eight letters such as GHEFCDAB for eight bytes"
 
 

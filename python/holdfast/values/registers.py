@@ -7,9 +7,9 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-from holdfast.integers import as_boolean
 from holdfast.protocol import MAX_WORD
-from holdfast.values.errors import InvalidRegister, WrongLength, counted, is_integer, shown
+from holdfast.values.errors import InvalidRegister, WrongLength, counted, shown
+from holdfast.values.integers import as_boolean, as_integer
 from holdfast.values.orders import swap_registers
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class RegisterBlock:
             return self._wrong_length(str(len(registers)))
         for index, register in enumerate(registers):
             found = f"registers[{index}]: {shown(register)}"
-            if not is_integer(register) and not (self._bits and isinstance(register, bool)):
+            if as_integer(register) is None and not (self._bits and isinstance(register, bool)):
                 return InvalidRegister(f"{found} is not an integer")
             if not 0 <= register <= MAX_WORD:
                 return InvalidRegister(f"{found} is outside 0 to {MAX_WORD}")

@@ -65,11 +65,11 @@ def parsed(name: str) -> Type:
     width = _width(base, None if parameter is None else int(parameter))
     if width is None:
         raise _unknown(name)
-    made = Type(name, element, base, int(parameter or 0), width, int(count) if count else None)
-    if not 1 <= made.registers <= MAX_REGISTERS:
+    type_ = Type(name, element, base, int(parameter or 0), width, int(count) if count else None)
+    if not 1 <= type_.registers <= MAX_REGISTERS:
         allowed = f"allowed: 1 to {MAX_REGISTERS}"
-        raise UnknownType(f"type {shown(name)} would take {made.registers} registers, {allowed}")
-    return made
+        raise UnknownType(f"type {shown(name)} would take {type_.registers} registers, {allowed}")
+    return type_
 
 
 def _width(base: str, parameter: int | None) -> int | None:
@@ -82,5 +82,39 @@ def _width(base: str, parameter: int | None) -> int | None:
     return None
 
 
+USUAL_NAMES = {
+    "bit": "bit:0",
+    "boolean": "bool",
+    "bytes": "bytes:8",
+    "char": "string:8",
+    "double": "float64",
+    "dint": "int32",
+    "dword": "uint32",
+    "float": "float32",
+    "int": "int16",
+    "long": "int32",
+    "real": "float32",
+    "short": "int16",
+    "string": "string:8",
+    "udint": "uint32",
+    "uint": "uint16",
+    "word": "uint16",
+}
+"""What other programs call these types, to suggest ours."""
+
+
 def _unknown(name: object) -> UnknownType:
-    return UnknownType(f"type {shown(name)} is unknown, allowed: {ALLOWED}")
+    word = str(name).lower()
+    short = re.fullmatch("([uif])(16|32|64)", word)
+    if short:
+        word = {"u": "uint", "i": "int", "f": "float"}[short[1]] + short[2]
+    base, bracket, count = word.partition("[")
+    near = ""
+    # Imported here, for a fast start: few words are wrong.
+    import difflib
+
+    for close in difflib.get_close_matches(base, (*FIXED, *USUAL_NAMES), 1):
+        meant = USUAL_NAMES.get(close, close)
+        array = meant + bracket + count
+        near = f"; did you mean {array if _NAME.fullmatch(array) else meant!r}?"
+    return UnknownType(f"type {shown(name)} is unknown, allowed: {ALLOWED}{near}")

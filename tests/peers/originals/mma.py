@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 from holdfast.appliance import Appliance
 from holdfast.config import load
 from holdfast.config.dump import to_yaml
-from holdfast.importing import read_mma
 from peers.originals.comparison import Difference, Original, Reason, is_open
 from support import wire
 from support.brokers import Mosquitto
 from support.exchanges import play
+from support.imported import imported
 from support.paths import TESTS
 from support.running import endpoint
 
@@ -99,16 +99,13 @@ def theirs(command: Command, folder: Path) -> Answers:
 def ours(folder: Path) -> Answers:
     @contextmanager
     def started(text: str) -> Iterator[Addresses]:
-        (folder / "mma.yaml").write_text(text)
-        imported = read_mma(folder / "mma.yaml", keep_published_tokens=True).data
-        imported["identity"] = {"vendor_name": "V", "product_code": "P", "revision": "1"}
-        for settings in (*imported["listeners"].values(), imported.get("rest", {})):
-            settings["bind"] = "127.0.0.1:0"
-        (folder / "holdfast.yaml").write_text(to_yaml(imported))
+        data = imported(text, folder, keep_published_tokens=True)
+        data["identity"] = {"vendor_name": "V", "product_code": "P", "revision": "1"}
+        (folder / "holdfast.yaml").write_text(to_yaml(data))
         with Appliance(load(folder / "holdfast.yaml")) as appliance:
-            names = {name.removeprefix("port-"): name for name in imported["listeners"]}
+            names = {name.removeprefix("port-"): name for name in data["listeners"]}
             names = {short.removesuffix("-ingest"): name for short, name in names.items()}
-            names |= {"rest": "rest"} if "rest" in imported else {}
+            names |= {"rest": "rest"} if "rest" in data else {}
             yield {short: endpoint(appliance, name) for short, name in names.items()}
 
     return answers(started, folder)

@@ -191,7 +191,7 @@ def ours(folder: Path) -> Answers:
     with device() as server:
 
         def configure(ports: Sequence[int]) -> Launch:
-            options = ["--allow", "127.0.0.1:*", "--writes"]
+            options = ["--allow", "127.0.0.1:*", "--access", "read-write"]
             return [*options, "--bind", f"127.0.0.1:{ports[0]}", "--compat", "port-of-call"], {}
 
         with command.serving(folder, 1, configure) as [port]:

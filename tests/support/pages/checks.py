@@ -16,10 +16,10 @@ import jsonschema_rs
 from ruamel.yaml import YAML
 
 import holdfast
+from holdfast.net.http import health as probes
 from holdfast.outputs.text_file import COLUMNS
 from holdfast.scanner.messages.schema import json_schema
 from holdfast.values import encode
-from holdfast.web import health as probes
 from support import wire
 from support.log_events import logged
 from support.pages import commands, comparing, configurations

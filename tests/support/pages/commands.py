@@ -33,14 +33,16 @@ SERVING = {"run", "proxy", "simulate", "scan", "gateway"}
 PORT_OPTIONS = {
     "gateway": ("--bind", "127.0.0.1:8090"),
     "scan": ("--nats", "nats://127.0.0.1:4222"),
-    "simulate": ("--port", "5020"),
+    "simulate": ("--bind", "127.0.0.1:5020"),
 }
 """The options for another port than the default one, which the pages show."""
 
 
 COMPARED: dict[str, Callable[[str], str]] = {
     "describe": lambda text: re.sub(r"^(?:(?:co|di|hr|ir)_|Byte order).*\n", "", text, flags=re.M),
-    "guess": lambda text: "\n".join(re.findall(r"^ *[01]\.\d\d +(\d.*?[A-D]{4})", text, re.M)[:1]),
+    "describe guess": lambda text: "\n".join(
+        re.findall(r"^ *[01]\.\d\d +(\d.*?[A-D]{4})", text, re.M)[:1]
+    ),
     "bench": lambda text: re.sub(r"^under .*\n", "", text, flags=re.M).replace(" ms", " µs"),
 }
 """What is compared of an output: the best guess; no histogram; nothing that depends on samples."""
@@ -70,16 +72,17 @@ def parsed(command: Command) -> None:
 
 
 def made(arguments: list[str]) -> None:
-    """Checks that a target of the Makefile exists, and the benchmark with its options."""
+    """Checks that a target and its settings are of the Makefile, and the options of a benchmark."""
     target, *settings = arguments
-    assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE), target
+    makefile = (ROOT / "Makefile").read_text()
+    assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
     given = dict(each.split("=", 1) for each in settings)
+    assert [name for name in given if f"$({name})" not in makefile] == []
     benchmark = ROOT / "benches" / f"{given.pop('NAME', 'server')}.py"
     assert benchmark.exists(), benchmark
     options = [word for word in given.pop("BENCH", "").split() if word.startswith("--")]
     texts = benchmark.read_text() + (ROOT / "benches" / "common.py").read_text()
     assert [option for option in options if f'"{option}"' not in texts] == []
-    assert not given
 
 
 def run_all(block: Block, stage: Stage, left_out: Callable[[Command], bool]) -> None:
@@ -162,7 +165,8 @@ def run(command: Command, stage: Stage) -> str:
         shown, code = done.stdout, done.returncode
     shown = stage.there(shown)
     if command.output:
-        compared = COMPARED.get(here.programs[-1][1], str)
+        words = here.programs[-1][1:3]
+        compared = COMPARED.get(" ".join(word for word in words if word.isalpha()), str)
         alike(compared(shown), compared(command.output))
     else:
         assert code == 0, f"exit code {code}: {shown}"
@@ -200,8 +204,11 @@ def served(command: Command, arguments: list[str], stage: Stage) -> str:
     """Starts a command that serves, and compares its greeting."""
     option, default = PORT_OPTIONS.get(arguments[0], ("", ""))
     if option and option not in arguments:
-        port = str(stage.port(default)) if default.isdigit() else stage.here(default)
-        arguments = [*arguments, option, port]
+        place = stage.here(default)
+        if place in stage.served:  # As if the first one had been ended.
+            place = "127.0.0.1:0"
+        stage.served.add(place)
+        arguments = [*arguments, option, place]
     shown = stage.there(stage.serve(*arguments).greeting)
     if command.output:
         greeting = command.output.split("Ctrl-C stops it.")[0]

@@ -33,6 +33,8 @@ class Stage(contextlib.ExitStack):
         """What stands in place of words of the text."""
         self.names: dict[str, Any] = {}
         """The names of the Python examples."""
+        self.served: set[str] = set()
+        """The addresses at which a command of the page serves."""
         self.output = ""
         """What the commands of the last block printed."""
         self.environment = {**os.environ, "NO_COLOR": "1"}

@@ -8,6 +8,8 @@ import math
 import re
 import shutil
 import subprocess
+import sys
+import threading
 import urllib.error
 import urllib.request
 from typing import TYPE_CHECKING, Any
@@ -20,6 +22,8 @@ from support import wire
 from support.brokers import Mosquitto, NatsServer
 from support.cli import done, invoke
 from support.config_folder import written
+from support.fake_device import Serial
+from support.lines import RTU
 from support.machine import tool
 from support.pages.configurations import put_certificates
 from support.paths import DOCS, EXAMPLES, ROOT
@@ -27,6 +31,7 @@ from support.paths import DOCS, EXAMPLES, ROOT
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from support.fake_device import Asked
     from support.pages.stage import Stage
 
 HEATER = "examples/tags/heater.yaml"
@@ -53,9 +58,9 @@ def everywhere(stage: Stage) -> None:
 
 
 def plant(stage: Stage) -> None:
-    """`make run`, with a client that changes some registers."""
-    stage.names["plant"] = stage.serve("run", "examples/plant.yaml")
-    client = stage.enter_context(holdfast.SyncClient(stage.here("tcp://127.0.0.1:5020")))
+    """The appliance of `make run`, with a client that changes some registers."""
+    stage.serve("run", "examples/plant.yaml")
+    client = stage.enter_context(holdfast.SyncClient(stage.here("tcp://127.0.0.1:5010")))
     client.write("holding_registers", 20, "PUMP-01", "string:8")
     numbers = itertools.count()
 
@@ -71,7 +76,7 @@ def plant(stage: Stage) -> None:
 
 def heater(stage: Stage, port: str = "5020") -> None:
     """`holdfast simulate examples/tags/heater.yaml`."""
-    stage.serve("simulate", HEATER, "--every", "0.1", "--port", str(stage.port(port)))
+    stage.serve("simulate", HEATER, "--every", "0.1", "--bind", f":{stage.port(port)}")
 
 
 def own_plant(page: str) -> Callable[[Stage], None]:
@@ -80,7 +85,7 @@ def own_plant(page: str) -> Callable[[Stage], None]:
     def put(stage: Stage) -> None:
         [text, *_] = re.findall(r"^```yaml\n(.*?)^```", (ROOT / page).read_text(), re.M | re.S)
         stage.file("plant.yaml", stage.here(text))
-        stage.replaced["watch tcp"] = "watch --count 2 tcp"
+        stage.replaced["watch tcp"] = "watch --times 2 tcp"
         # Which types `describe` infers depends on when it looks, and so on the load of the machine.
         floats = {"area": "input_registers", "type": "float32", "order": "CDAB"}
         tags = {name: {**floats, "address": at} for name, at in (("ir_0", 0), ("ir_2", 2))}
@@ -91,7 +96,14 @@ def own_plant(page: str) -> Callable[[Stage], None]:
 
 
 def tour(stage: Stage) -> None:
-    plant(stage)
+    """`make run`."""
+    process = subprocess.Popen(
+        [sys.executable, str(ROOT / "tools" / "tour.py")], stdout=subprocess.PIPE, text=True
+    )
+    stage.callback(process.communicate)
+    stage.callback(process.terminate)
+    assert process.stdout is not None
+    stage.names["greeting"] = "".join(iter(process.stdout.readline, "Ctrl-C stops it.\n"))
     stage.file(
         "plant.yaml",
         """\
@@ -172,29 +184,23 @@ def post(stage: Stage, path: str, body: Any, secret: str = SECRET) -> None:
 
 
 def command_line(stage: Stage) -> None:
-    """The plant; the heater for commands with its tags or addresses."""
+    """The plant, and the heater."""
     stage.replaced |= {
         "--every 0.5": "--every 0.1",
+        "--every 500ms": "--every 100ms",
         "--every 1": "--every 0.1",
-        "--seconds 3": "--seconds 0.3",
+        "--duration 3s": "--duration 300ms",
         "--times 3 --json": "--times 3 --json --every 0.1",
         "--times 4": "--times 4 --every 0.1",
     }
     plant(stage)
-    plants = stage.replaced.pop("5020")
     heater(stage)
-    heaters = stage.replaced["5020"]
     for folder in (
         ".local/share/bash-completion/completions",
         ".zfunc",
         ".config/fish/completions",
     ):
         (stage.folder / folder).mkdir(parents=True)
-
-    def choose(text: str) -> None:
-        stage.replaced["5020"] = heaters if re.search(r"heater\.yaml|\bir:\d", text) else plants
-
-    stage.before = choose
 
 
 WRONG = """\
@@ -418,9 +424,29 @@ def mosquitto(stage: Stage) -> Mosquitto:
     broker = Mosquitto(folder)
     stage.callback(broker.kill)
     stage.keep(broker.port)
-    for program in ("mosquitto_pub", "mosquitto_rr"):
+    for program in ("mosquitto_pub", "mosquitto_rr", "mosquitto_sub"):
         stage.replaced[program] = f"{program} -p {broker.port}"
     return broker
+
+
+def home_assistant(stage: Stage) -> None:
+    """A broker in place of 127.0.0.1:1883."""
+    stage.replaced["1883"] = str(mosquitto(stage).port)
+    own_plant("docs/home-assistant.md")(stage)
+    del stage.replaced["heater.yaml --only"]
+
+
+def serial_line(stage: Stage) -> None:
+    """A device on a pseudo-terminal in place of /dev/ttyUSB0."""
+
+    def slow_as_a_line(asked: Asked) -> None:
+        threading.Event().wait(0.03)
+        asked.answer()
+
+    device = stage.folder / "ttyUSB0"
+    stage.enter_context(Serial(RTU, device, then=slow_as_a_line))
+    stage.replaced["/dev/ttyUSB0"] = str(device.resolve())
+    own_plant("docs/raspberry-pi.md")(stage)
 
 
 def troubles(stage: Stage) -> None:
@@ -616,6 +642,7 @@ STAGES: dict[str, Callable[[Stage], None]] = {
     "docs/durability.md": durability,
     "docs/fleet.md": fleet,
     "docs/gateway.md": gateway,
+    "docs/home-assistant.md": home_assistant,
     "docs/just-the-memory.md": own_plant("docs/just-the-memory.md"),
     "docs/library.md": library,
     "docs/metrics.md": metrics,
@@ -626,9 +653,11 @@ STAGES: dict[str, Callable[[Stage], None]] = {
     "docs/mqtt.md": mqtt,
     "docs/operations.md": operations,
     "docs/outputs.md": outputs,
+    "docs/raspberry-pi.md": serial_line,
     "docs/raw-ingest.md": raw_ingest,
     "docs/rest.md": rest,
     "docs/routes.md": audit,
+    "docs/rs485.md": serial_line,
     "docs/start.md": own_plant("docs/start.md"),
     "docs/tags.md": tags,
     "docs/tour.md": tour,

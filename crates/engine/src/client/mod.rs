@@ -20,7 +20,6 @@ use std::io;
 use std::time::Duration;
 
 use holdfast_protocol::client::{Closed, Failure, InvalidResponse};
-use holdfast_protocol::pdu::ExceptionCode;
 use thiserror::Error;
 
 use crate::tls::TlsFailure;
@@ -80,9 +79,4 @@ impl ClientError {
             _ => unreachable!("unknown failure: {failure}"),
         }
     }
-}
-
-/// The name of an exception code in the standard.
-pub fn exception_name(code: u8) -> Option<&'static str> {
-    ExceptionCode::from_code(code).map(ExceptionCode::name)
 }

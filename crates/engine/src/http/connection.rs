@@ -25,20 +25,21 @@ use super::line::{SharedLine, Verdict, Wire};
 use super::output::Output;
 use super::refusal::{Refusal, RefusalBody};
 use crate::server::Peer;
-use crate::server::admission::Ticket;
-use crate::server::event::Kind;
-use crate::server::listener::{Admitted, drain_for, set_options};
-use crate::server::secure::secured;
-use crate::server::stream::Stream;
+use crate::server::connections::admission::Ticket;
+use crate::server::connections::closing::drain_for;
+use crate::server::connections::listener::{Admitted, KEEPALIVE, set_options};
+use crate::server::reports::event::Kind;
+use crate::server::transports::secure::secured;
+use crate::server::transports::stream::Stream;
 
 /// The largest header of a request, in bytes.
-const MAX_HEADER: usize = 65_536;
+const MAX_HEADER_BYTES: usize = 65_536;
 
 /// How long a peer is read after its last response.
 const LINGER: Duration = Duration::from_secs(2);
 
-/// Bytes of a body that nobody wants, which are forgotten at once.
-const SKIPPED: usize = 65_536;
+/// So many bytes of a body that nobody wants are read, then dropped, then the next.
+const SKIPPED_CHUNK_BYTES: usize = 65_536;
 
 /// The type of a TLS record that begins a handshake (RFC 8446, 5.1).
 const HANDSHAKE: u8 = 22;
@@ -64,7 +65,7 @@ pub(super) async fn serve(
     stop: watch::Receiver<bool>,
 ) {
     let Admitted { stream, peer, ticket, .. } = connection;
-    set_options(&stream);
+    set_options(&stream, KEEPALIVE);
     // One time for the handshake and the first request.
     let due = Instant::now() + front.request_timeout;
     let begun = begin(&front, (stream, peer), &ticket, due, stop.clone()).await;
@@ -140,52 +141,60 @@ async fn refuse_plain(
 /// Serves the requests of a connection.
 pub(super) async fn converse(
     front: &Arc<Front>,
-    line: &SharedLine,
+    shared: &SharedLine,
     mut stop: watch::Receiver<bool>,
 ) -> End {
     let mut stopped = pin!(stop.wait_for(|stop| *stop));
     let mut alarm = pin!(sleep_until((Instant::now() + NEVER).into()));
-    // hyper takes memory for each connection, so it begins with the first bytes.
-    let begun = poll_fn(|context| {
-        if stopped.as_mut().poll(context).is_ready() {
-            return Poll::Ready(Some(End::Idle));
-        }
-        let mut line = line.lock();
-        if let Poll::Ready(read) = line.poll_fill(context) {
-            let has_begun = read.is_ok_and(|len| len > 0);
-            return Poll::Ready((!has_begun).then_some(End::Dropped));
-        }
-        line.poll_deadlines(context, alarm.as_mut()).map(Some)
-    });
-    if let Some(end) = begun.await {
-        return end;
-    }
-    let service = service_fn(|request| answered(Arc::clone(front), line.clone(), request));
-    let connection = http1::Builder::new()
-        .half_close(true)
-        .max_header_size(MAX_HEADER)
-        .max_buf_size(MAX_HEADER + 8192)
-        .header_read_timeout(None)
-        .serve_connection(Wire(line.clone()), service);
-    let mut connection = pin!(connection);
+    let begun = || {
+        let service = service_fn(|request| answered(Arc::clone(front), shared.clone(), request));
+        http1::Builder::new()
+            .half_close(true)
+            .max_header_size(MAX_HEADER_BYTES)
+            .max_buf_size(MAX_HEADER_BYTES + 8192)
+            .header_read_timeout(None)
+            .serve_connection(Wire(shared.clone()), service)
+    };
     let mut is_stopping = false;
+    // hyper takes memory for each connection, so it has only those with a request.
+    let mut serving = None;
     poll_fn(|context| {
-        if !is_stopping && stopped.as_mut().poll(context).is_ready() {
-            is_stopping = true;
-            if !line.lock().is_busy() {
-                return Poll::Ready(End::Idle);
+        loop {
+            let stops_now = !is_stopping && stopped.as_mut().poll(context).is_ready();
+            is_stopping |= stops_now;
+            let Some(connection) = &mut serving else {
+                if is_stopping {
+                    return Poll::Ready(End::Idle);
+                }
+                let mut line = shared.lock();
+                match line.poll_fill(context) {
+                    Poll::Ready(Ok(0)) if line.is_used() => return Poll::Ready(End::Idle),
+                    Poll::Ready(Ok(0) | Err(_)) => return Poll::Ready(End::Dropped),
+                    Poll::Ready(Ok(_)) => serving = Some(Box::pin(begun())),
+                    Poll::Pending => return line.poll_deadlines(context, alarm.as_mut()),
+                }
+                continue;
+            };
+            if stops_now {
+                if !shared.lock().is_busy() {
+                    return Poll::Ready(End::Idle);
+                }
+                connection.as_mut().graceful_shutdown();
             }
-            connection.as_mut().graceful_shutdown();
+            if let Poll::Ready(ended) = connection.as_mut().poll(context) {
+                let has_response = ended.is_ok() || shared.lock().refused.is_some();
+                return Poll::Ready(if has_response { End::Answered } else { End::Dropped });
+            }
+            let mut line = shared.lock();
+            if line.poll_ahead(context) || line.is_left() {
+                return Poll::Ready(End::Dropped);
+            }
+            if !line.is_idle() {
+                return line.poll_deadlines(context, alarm.as_mut());
+            }
+            drop(line);
+            serving = None;
         }
-        if let Poll::Ready(ended) = connection.as_mut().poll(context) {
-            let is_said = ended.is_ok() || line.lock().refused.is_some();
-            return Poll::Ready(if is_said { End::Answered } else { End::Dropped });
-        }
-        let mut line = line.lock();
-        if line.poll_ahead(context) || line.is_left() {
-            return Poll::Ready(End::Dropped);
-        }
-        line.poll_deadlines(context, alarm.as_mut())
     })
     .await
 }
@@ -280,7 +289,7 @@ async fn handled(
         _ => None,
     };
     let head = Box::new(RequestHead { parts, peer });
-    exchange.tell(Event::Request { exchange: Arc::clone(&exchange), head, body: whole });
+    exchange.notify(Event::Request { exchange: Arc::clone(&exchange), head, body: whole });
     let parts = (Arc::clone(&exchange), line.clone());
     let response = match upload.ordered(&front, &exchange).await {
         Answered::Whole { head, body, mut closes } => {
@@ -388,7 +397,7 @@ impl Upload {
                     order = exchange.next() => order,
                     received = self.receive(most) => {
                         wanted = None;
-                        exchange.tell(match received {
+                        exchange.notify(match received {
                             Ok(body) => Event::Body { number, body },
                             Err(NoBody::TooLarge) => Event::TooLarge { number },
                             Err(NoBody::Broken) => {
@@ -408,7 +417,7 @@ impl Upload {
                 }
                 Order::Late => {
                     wanted = None;
-                    exchange.tell(Event::Late { number, received: self.received.len() });
+                    exchange.notify(Event::Late { number, received: self.received.len() });
                 }
                 Order::Respond { head, body, closes } => {
                     return Answered::Whole { head, body, closes };
@@ -431,7 +440,7 @@ impl Upload {
                         return false;
                     }
                 }
-                received = self.receive(SKIPPED) => match received {
+                received = self.receive(SKIPPED_CHUNK_BYTES) => match received {
                     Ok(_) | Err(NoBody::TooLarge) => {}
                     Err(NoBody::Broken) => {
                         front.ended(Kind::BrokenRequest, self.line.lock().peer.clone());

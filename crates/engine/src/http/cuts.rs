@@ -18,9 +18,9 @@ use super::front::{Front, HttpSettings};
 use super::inbox::Inbox;
 use super::line::SharedLine;
 use super::refusal::{Refusal, RefusalBody};
-use crate::server::admission::ConnectionLimits;
-use crate::server::event::{self, Kind, Verbosity};
-use crate::server::stream::{End, Stream};
+use crate::server::connections::admission::ConnectionLimits;
+use crate::server::reports::event::{self, Kind, Verbosity};
+use crate::server::transports::stream::{End, Stream};
 use crate::server::{Peer, WhenFull};
 
 /// How often everything else may run between two pieces.

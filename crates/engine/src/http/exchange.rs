@@ -197,7 +197,7 @@ impl Exchange {
         .await
     }
 
-    pub(super) fn tell(&self, event: Event) {
+    pub(super) fn notify(&self, event: Event) {
         self.inbox.push(event);
     }
 
@@ -208,7 +208,7 @@ impl Exchange {
         if state.is_awaited && state.data.is_none() {
             state.is_awaited = false;
             drop(state);
-            self.tell(Event::Room { number: self.number });
+            self.notify(Event::Room { number: self.number });
         }
     }
 
@@ -217,7 +217,7 @@ impl Exchange {
         let mut state = self.state();
         if !std::mem::replace(&mut state.is_over, true) && !is_complete {
             drop(state);
-            self.tell(Event::Gone { number: self.number });
+            self.notify(Event::Gone { number: self.number });
         }
     }
 

@@ -12,10 +12,10 @@ use super::exchange::{Event, Exchange};
 use super::inbox::Inbox;
 use super::refusal::{Refusal, RefusalBody};
 use crate::server::Peer;
-use crate::server::admission::ConnectionLimits;
-use crate::server::event::{Kind, Reporter};
-use crate::server::listener::ListenerContext;
-use crate::server::live::Live;
+use crate::server::connections::admission::ConnectionLimits;
+use crate::server::connections::listener::ListenerContext;
+use crate::server::connections::live::Live;
+use crate::server::reports::event::{Kind, Reporter};
 use crate::tls::server::ServerTls;
 
 #[derive(Debug)]
@@ -78,11 +78,9 @@ impl Front {
         self.sources.iter().any(|network| network.contains(&peer))
     }
 
-    /// Uses these certificates for new connections.
-    pub(super) fn set_tls(&self, tls: Arc<ServerTls>) {
-        if let Some(live) = &self.tls {
-            live.replace(tls);
-        }
+    /// Uses these certificates for new connections. Returns those before.
+    pub(super) fn set_tls(&self, tls: Arc<ServerTls>) -> Option<Arc<ServerTls>> {
+        self.tls.as_ref().map(|live| live.replace(tls))
     }
 
     pub(super) fn tls(&self) -> Option<Arc<ServerTls>> {

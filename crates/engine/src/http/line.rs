@@ -14,9 +14,9 @@ use super::front::Front;
 use super::portion::{ChunksEnd, HeadEnd, Portion};
 use super::refusal::{self, Refusal};
 use crate::server::Peer;
-use crate::server::admission::{Ticket, WaitingFor};
-use crate::server::event::Kind;
-use crate::server::stream::{self, End, Stream};
+use crate::server::connections::admission::{Ticket, WaitingFor};
+use crate::server::reports::event::Kind;
+use crate::server::transports::stream::{self, End, Stream};
 
 /// Bytes per read of the socket, and the most that a connection holds of requests that were sent ahead.
 const CHUNK: usize = 16 * 1024;
@@ -177,6 +177,15 @@ impl Line {
         matches!(self.answer, Answer::Awaited | Answer::Begun)
     }
 
+    /// Whether it waits for the next request, and nothing else is left to do.
+    pub(super) fn is_idle(&self) -> bool {
+        self.idle_due.is_some() && self.unsent.is_empty()
+    }
+
+    pub(super) fn is_used(&self) -> bool {
+        self.is_used
+    }
+
     /// Whether the peer may still send what nobody reads. Closing the socket then could destroy the
     /// response on its way.
     pub(super) fn has_unread(&self) -> bool {
@@ -221,8 +230,10 @@ impl Line {
         let waiting = if self.is_busy() && is_taken && (self.answer == Answer::Begun || has_arrived)
         {
             WaitingFor::Handler
-        } else if is_taken && (self.idle_due.is_some() || !self.is_used) {
-            WaitingFor::Request
+        } else if is_taken && self.idle_due.is_some() {
+            WaitingFor::NextRequest
+        } else if is_taken && !self.is_used {
+            WaitingFor::FirstRequest
         } else {
             WaitingFor::Rest
         };

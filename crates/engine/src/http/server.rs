@@ -17,14 +17,15 @@ use super::inbox::Inbox;
 use crate::heartbeat::Heartbeat;
 use crate::own_threads::OwnThreads;
 use crate::server::Peer;
-use crate::server::counters::ConnectionCounters;
-use crate::server::event::{self, Events, Kind, Verbosity};
-use crate::server::listener::{Admitted, ListenerContext, Service, accept};
-use crate::server::live::Live;
+use crate::server::connections::listener::{Admitted, ListenerContext, Service, accept};
+use crate::server::connections::live::Live;
+use crate::server::reports::counters::ConnectionCounters;
+use crate::server::reports::event::{self, Events, Kind, Verbosity};
+use crate::tls::TlsFailure;
 use crate::tls::server::ServerTls;
 use crate::wake::Wakes;
 
-pub use crate::server::listener::bind_tcp as bind;
+pub use crate::server::connections::listener::bind_tcp as bind;
 
 /// How often the end of the last connection is looked for when the server ends.
 const ENDING_PERIOD: Duration = Duration::from_millis(5);
@@ -151,17 +152,26 @@ impl HttpServer {
         &self.heartbeat
     }
 
-    /// Uses these certificates for new connections, and judges open ones by them.
+    /// Uses these certificates for new connections, and judges open ones by them. If clients need a
+    /// certificate from now on, connections without one end, also those within the handshake.
     pub fn set_tls(&self, tls: Arc<ServerTls>) {
-        self.front.set_tls(tls);
-        self.review();
+        let requires = tls.requires_certificate();
+        let before = self.front.set_tls(tls);
+        self.judge(requires && before.is_some_and(|before| !before.requires_certificate()));
     }
 
     /// Judges the certificates of open connections again. Those that fail are ended.
     pub fn review(&self) {
+        self.judge(false);
+    }
+
+    fn judge(&self, requires_certificate: bool) {
         let Some(tls) = self.front.tls() else { return };
         let fails = |peer: &Peer| {
-            let failure = tls.judge(peer.certificate.as_ref()?).err()?;
+            let failure = match &peer.certificate {
+                Some(certificate) => tls.judge(certificate).err()?,
+                None => requires_certificate.then_some(TlsFailure::NoCertificate)?,
+            };
             Some(Kind::TlsFailed(failure.reason()))
         };
         for (peer, kind) in self.front.context.admission.review(fails) {

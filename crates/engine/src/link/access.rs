@@ -1,4 +1,4 @@
-//! Access to a link, in turns.
+//! A link as the poller uses it: its requests, in turns with those of others.
 
 use std::cell::Cell;
 use std::rc::Rc;
@@ -9,13 +9,13 @@ use holdfast_protocol::pdu::EncodedRequest;
 use holdfast_runtime::Retry;
 use tokio::time::Instant;
 
-use super::blocking::BlockingLink;
 use super::fault::{Answer, Exchanged, Fault, fault};
-use super::pace::{Alone, InFlight, Pace, Place as Turn};
-use super::permit::Permit;
-use super::queue::Priority;
-use super::tcp::TcpLink;
 use crate::client::{Endpoint, Place, StrayCounters};
+use crate::link::limits::permit::Permit;
+use crate::link::scheduling::pace::{Alone, InFlight, Pace, Place as Turn};
+use crate::link::scheduling::queue::Priority;
+use crate::link::sockets::blocking_link::BlockingLink;
+use crate::link::sockets::tcp::TcpLink;
 
 /// Requests of the poller, as one source beside the clients of listeners.
 const POLLER: u64 = 0;
@@ -147,5 +147,41 @@ impl Link {
             Wire::Tcp(link) => link.release(),
             Wire::Blocking(link) => link.release(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use holdfast_protocol::pdu::{Range, Request};
+    use tokio::runtime::Builder;
+    use tokio::task::LocalSet;
+
+    use super::*;
+    use crate::lookup;
+
+    #[test]
+    fn a_name_that_is_not_resolved_in_time_is_a_failed_connect_on_every_transport() {
+        let read = EncodedRequest::new(&Request::ReadHoldingRegisters(Range::new(0, 1).unwrap()));
+        let (host, port) = (String::from("unanswered.test"), 502);
+        let _unanswered = lookup::hold(&host);
+        let places = [
+            Place::Tcp { host: host.clone(), port, tls: None },
+            Place::Udp { host: host.clone(), port },
+            Place::RtuOverTcp { host: host.clone(), port },
+            Place::AsciiOverTcp { host: host.clone(), port },
+            Place::RtuOverUdp { host, port },
+        ];
+        let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            for place in places {
+                let endpoint = Endpoint::from(place);
+                let told = endpoint.to_string();
+                let link = Link::new(endpoint, InFlight::Fixed(1), Retry::default());
+                let (priority, permit) = (Priority::Usual, Permit::default());
+                let answer = link.call(1, &read, Duration::from_millis(1), priority, &permit).await;
+                assert_eq!(answer, Err(Fault::Timeout), "{told}");
+                assert!(link.retry_at().is_some(), "{told}");
+            }
+        });
     }
 }

@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 use holdfast_protocol::client::Closed;
 use holdfast_protocol::pdu::EncodedRequest;
 
-use super::queue::source;
 use crate::client::{ClientError, Lost};
+use crate::link::scheduling::queue::source;
 use crate::wake::{Wakes, pair};
 
 /// How long a link waits after a broadcast, which has no reply: the time to connect, if it is not

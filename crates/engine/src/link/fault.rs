@@ -4,35 +4,56 @@ use std::io::ErrorKind;
 use std::sync::Arc;
 
 use holdfast_protocol::client::InvalidResponse;
-use holdfast_protocol::pdu::ExceptionCode;
+use holdfast_protocol::pdu::{ExceptionCode, Function};
 
 use crate::client::ClientError;
 
 /// Errors from this code on are not exceptions.
 const NO_EXCEPTION: u16 = 0x8000;
 
-/// Why a request or a poll failed, as in the status block.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Fault {
-    Exception(u8),
-    Timeout,
-    Refused,
-    /// There is no way to the host, or nothing has its name. Nothing was sent.
-    Unreachable,
-    Reset,
-    Invalid,
+/// Makes `Fault`: what is no exception has a number, and a word for people.
+macro_rules! faults {
+    ($($(#[$about:meta])* $fault:ident = $number:literal, $word:literal;)*) => {
+        /// Why a request or a poll failed, as in the status block.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+        pub enum Fault {
+            Exception(u8),
+            $($(#[$about])* $fault,)*
+        }
+
+        impl Fault {
+            /// All but exceptions, each with its word.
+            pub const NAMED: &[(Fault, &str)] = &[$((Fault::$fault, $word)),*];
+
+            pub const fn code(self) -> u16 {
+                match self {
+                    Fault::Exception(code) => code as u16,
+                    $(Fault::$fault => NO_EXCEPTION + $number,)*
+                }
+            }
+        }
+    };
+}
+
+faults! {
+    Timeout = 1, "timeout";
+    Refused = 2, "refused";
+    Reset = 3, "reset";
+    Invalid = 4, "invalid reply";
     /// The device has no plan, so no request is sent.
-    Unplanned,
+    Unplanned = 5, "no plan";
     /// Memory refused the read or the status block.
-    Unstored,
+    Unstored = 6, "not stored";
     /// A task of the device has panicked.
-    Internal,
+    Internal = 7, "internal error";
     /// The device sends so much without a request that it is left alone for a while.
-    Flooded,
+    Flooded = 8, "flooded";
     /// Another node uses the device. Nothing was sent.
-    Standby,
+    Standby = 9, "standby";
     /// A write that waited too long: its caller no longer expects it. Nothing was sent.
-    Expired,
+    Expired = 10, "expired";
+    /// There is no way to the host, or nothing has its name. Nothing was sent.
+    Unreachable = 11, "unreachable";
 }
 
 /// Exceptions of a gateway that could not reach the unit.
@@ -54,28 +75,20 @@ impl Fault {
             _ => ExceptionCode::GatewayTargetFailedToRespond.code(),
         }
     }
-
-    pub const fn code(self) -> u16 {
-        match self {
-            Fault::Exception(code) => code as u16,
-            Fault::Timeout => NO_EXCEPTION + 1,
-            Fault::Refused => NO_EXCEPTION + 2,
-            Fault::Reset => NO_EXCEPTION + 3,
-            Fault::Invalid => NO_EXCEPTION + 4,
-            Fault::Unplanned => NO_EXCEPTION + 5,
-            Fault::Unstored => NO_EXCEPTION + 6,
-            Fault::Internal => NO_EXCEPTION + 7,
-            Fault::Flooded => NO_EXCEPTION + 8,
-            Fault::Standby => NO_EXCEPTION + 9,
-            Fault::Expired => NO_EXCEPTION + 10,
-            Fault::Unreachable => NO_EXCEPTION + 11,
-        }
-    }
 }
 
 /// The PDU of an exception that answers a request.
 pub(crate) fn exception(request: &[u8], code: u8) -> Vec<u8> {
     vec![request.first().copied().unwrap_or_default() | 0x80, code]
+}
+
+/// The PDU that confirms a write: it repeats the request, but not its values if it may have several
+/// (V1.1b3, 6.11 and 6.12).
+pub(crate) fn confirmation(request: &[u8]) -> &[u8] {
+    match Function::from_pdu(request) {
+        Some(Function::WriteMultipleCoils | Function::WriteMultipleRegisters) => &request[..5],
+        _ => request,
+    }
 }
 
 /// The PDU of a reply, empty after a broadcast; or the fault.

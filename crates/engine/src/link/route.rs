@@ -10,12 +10,12 @@ use holdfast_runtime::Retry;
 use tokio::sync::mpsc;
 
 use super::caller::{Caller, Waiting};
-use super::order::InOrder;
-use super::pace::InFlight;
-use super::pending_reply::{PendingReply, ReplyTo, pending_reply};
-use super::queue::Priority;
 use crate::client::{ClientError, Endpoint, StrayCounters};
-use crate::counter::Counter;
+use crate::counter::counters;
+use crate::link::scheduling::pace::InFlight;
+use crate::link::scheduling::pending_reply::{PendingReply, ReplyTo, pending_reply};
+use crate::link::scheduling::queue::Priority;
+use crate::link::scheduling::write_barrier::InOrder;
 
 /// Settings of a link that listeners or event loops use.
 #[derive(Debug, Clone)]
@@ -35,28 +35,29 @@ pub struct LinkSettings {
     pub preferred: Vec<IpAddr>,
 }
 
-/// Requests since the start, without those of the poller.
-#[derive(Debug, Default)]
-pub struct LinkCounters {
-    /// All, however they ended.
-    pub requests: Counter,
-    /// Answered by the device, with exceptions too.
-    pub replies: Counter,
-    pub exceptions: Counter,
-    /// Sent, and not answered in time.
-    pub timeouts: Counter,
-    /// Invalid replies and lost connections.
-    pub failures: Counter,
-    /// Refused because the queue was full.
-    pub refused_full: Counter,
-    /// Refused without a try: the address could not be reached, or the unit was silent.
-    pub refused_down: Counter,
-    /// Answered by the reply to an equal read.
-    pub coalesced: Counter,
-    /// Answered by an earlier reply.
-    pub cached: Counter,
-    /// Not sent, because the client had gone.
-    pub withdrawn: Counter,
+counters! {
+    /// Requests since the start, without those of the poller.
+    pub struct LinkCounters {
+        /// All, however they ended.
+        requests,
+        /// Answered by the device, with exceptions too.
+        replies,
+        exceptions,
+        /// Sent, and not answered in time.
+        timeouts,
+        /// Invalid replies and lost connections.
+        failures,
+        /// Refused because the queue was full.
+        refused_full,
+        /// Refused without a try: the address could not be reached, or the unit was silent.
+        refused_down,
+        /// Answered by the reply to an equal read.
+        coalesced,
+        /// Answered by an earlier reply.
+        cached,
+        /// Not sent, because the client had gone.
+        withdrawn,
+    }
 }
 
 /// The sending side of a link.
@@ -154,15 +155,6 @@ impl SharedLink {
         self.waiting.load(Ordering::Relaxed)
     }
 
-    fn priority(&self, request: &EncodedRequest, peer: Option<IpAddr>) -> Priority {
-        let preferred = |peer: IpAddr| self.preferred.contains(&peer.to_canonical());
-        match peer {
-            _ if !request.is_read() => Priority::Urgent,
-            Some(peer) if !self.preferred.is_empty() && preferred(peer) => Priority::Preferred,
-            _ => Priority::Usual,
-        }
-    }
-
     /// Sends a request of an event loop on its way. `timeout` includes the wait for the turn. A
     /// broadcast ends without a reply. Returns the ticket of the call; `None` when the queue is full.
     /// Event loops together may fill no more of the queue than they leave to others.
@@ -177,7 +169,7 @@ impl SharedLink {
         self.counters.requests.add();
         let called = self.called.load(Ordering::Relaxed);
         let place = self.place(called, true)?;
-        let priority = self.priority(request, None);
+        let priority = Priority::of(request, None, &self.preferred);
         let (ticket, waiting) = caller.begin(request, timeout, is_broadcast);
         let (request, source) = (request.clone(), caller.source);
         let reply = Reply { to: Receiver::EventLoop(waiting), in_order: None, _place: place };
@@ -215,7 +207,7 @@ impl Route {
         link.counters.requests.add();
         let request = EncodedRequest::opaque(pdu).ok_or(ExceptionCode::IllegalFunction)?;
         let place = link.place(asker.waiting, false).ok_or(ExceptionCode::ServerDeviceBusy)?;
-        let priority = link.priority(&request, asker.peer);
+        let priority = Priority::of(&request, asker.peer, &link.preferred);
         let (to, pending) = pending_reply();
         let call = Call {
             unit_id: self.unit_id.unwrap_or(unit_id),

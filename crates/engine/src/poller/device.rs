@@ -1,13 +1,11 @@
 //! One device: its schedule, plan and results.
 //!
-//! The schedule does not drift: polls are due at whole intervals from the start. A poll that cannot
-//! begin in time is skipped and counted. A silent unit is polled less and less often, with one
-//! request, until it answers. While an address cannot be reached, nothing is sent before the next
-//! attempt. A poll begins after the block at which the previous one failed, so that a block that is
-//! never answered does not block the others.
+//! A poll is due by its schedule ([`super::schedule`]); a silent unit is polled less and less often,
+//! with one request, until it answers ([`super::unanswered_polls`]). A poll begins after the block at which the
+//! previous one failed, so that a block that is never answered does not block the others.
 //!
 //! When settings change, a new device replaces the old one between two polls. It keeps the schedule
-//! and what the old one learned. On demand, it also reads once outside the schedule.
+//! and what the old one learned.
 
 use std::cell::{Cell, RefCell, RefMut};
 use std::collections::HashMap;
@@ -26,28 +24,23 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
 use super::cost::Samples;
+use super::destination::Destination;
+use super::forwarding::{Forward, ForwardSettings};
 use super::learned::{Learned, Unreadable};
 use super::panic_guard::{Panicked, catch};
 use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
-use super::raw_ingest::{Forward, ForwardSettings};
 use super::results::{BlockResult, Poll, Results};
+use super::schedule::Schedule;
 use super::search;
-use super::sink::Destination;
 use super::state::DeviceState;
 use super::status::StatusSettings;
 use super::turn::Turn;
+use super::unanswered_polls::UnansweredPolls;
 use crate::client::Endpoint;
 use crate::link::{Fault, Fence, InFlight, Link, Permit, Priority, Stage};
 
 /// The longest interval between writes of the status block.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
-
-/// The number of consecutive polls without an answer after which a unit counts as dead.
-const DEAD_AFTER_POLLS: u32 = 3;
-
-/// The shortest interval between polls outside the schedule, unless the interval of the device is
-/// shorter.
-const OFF_SCHEDULE_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Settings of a device.
 #[derive(Debug, Clone)]
@@ -111,15 +104,8 @@ pub(super) struct Device {
     first: Cell<usize>,
     strategy: Cell<Strategy>,
     samples: Cell<Samples>,
-    /// Consecutive polls without an answer.
-    unanswered_polls: Cell<u32>,
-    /// The due time of the next poll.
-    due: Cell<Instant>,
-    /// Whether the next poll is delayed because the device does not answer.
-    backing_off: Cell<bool>,
-    /// The due time of a poll outside the schedule, and the time of the last one.
-    off_schedule: Cell<Option<Instant>>,
-    last_off_schedule: Cell<Option<Instant>>,
+    unanswered_polls: UnansweredPolls,
+    schedule: Schedule,
 }
 
 /// Messages to a device that waits for its next poll.
@@ -218,11 +204,8 @@ impl Device {
             first: Cell::new(0),
             strategy: Cell::new(settings.strategy),
             samples: Cell::default(),
-            unanswered_polls: Cell::new(0),
-            due: Cell::new(Instant::now()),
-            backing_off: Cell::new(false),
-            off_schedule: Cell::new(None),
-            last_off_schedule: Cell::new(None),
+            unanswered_polls: UnansweredPolls::default(),
+            schedule: Schedule::new(settings.interval),
             settings,
             state,
             link,
@@ -235,7 +218,7 @@ impl Device {
 
     /// Polls forever, first after `phase`, and keeps the status block up to date.
     pub(super) async fn run(mut self, phase: Duration, inbox: Rc<Inbox>) {
-        self.due.set(Instant::now() + phase);
+        self.schedule.begin_at(Instant::now() + phase);
         self.state.begun();
         loop {
             self.publish_status();
@@ -247,7 +230,7 @@ impl Device {
             }))
             .await;
             self = match polled {
-                Ok(successor) => {
+                Ok(mut successor) => {
                     successor.follow(self);
                     *successor
                 }
@@ -272,13 +255,10 @@ impl Device {
     }
 
     async fn poll_until_replaced(&self, inbox: &Inbox) -> Box<Device> {
-        let interval = self.settings.interval;
         loop {
             if let Some(successor) = self.stand_by(inbox).await {
                 return successor;
             }
-            let (mut due, off_schedule) = (self.due.get(), self.off_schedule.get());
-            let at = off_schedule.map_or(due, |off_schedule| off_schedule.min(due));
             tokio::select! {
                 biased;
                 message = inbox.next() => match message {
@@ -289,19 +269,12 @@ impl Device {
                     }
                 },
                 () = self.fenced() => continue,
-                () = sleep_until(at) => {}
+                () = sleep_until(self.schedule.next()) => {}
             }
-            self.off_schedule.set(None);
-            let mut began = due;
-            if at < due {
-                began = Instant::now();
-                self.last_off_schedule.set(Some(began));
-            } else {
-                due += interval;
-            }
+            let due = self.schedule.begin_poll();
             self.turn.polls(true);
             // In a box: a device takes the memory of a poll only while it polls.
-            let poll = Box::pin(self.poll(began));
+            let poll = Box::pin(self.poll(due));
             match &self.settings.fence {
                 None => poll.await,
                 Some(fence) => {
@@ -315,18 +288,19 @@ impl Device {
             }
             self.turn.polls(false);
             self.publish_status();
-            let (mut due, missed) = first_from(Instant::now(), due, interval);
-            self.state.counters.missed.add_many(missed);
-            let rest = self.rest();
-            if let Some(until) = rest {
+            self.state.counters.missed.add_many(self.schedule.skip_until(Instant::now()));
+            if let Some(until) =
+                self.unanswered_polls.after_poll(self.link.retry_at(), self.link.retry)
+            {
                 // Polls that are skipped on purpose do not count as missed. An exact pause ends when it
                 // ends, and the schedule begins anew then.
-                due =
-                    if self.link.retry.jitter { first_from(until, due, interval).0 } else { until };
+                if self.link.retry.jitter {
+                    self.schedule.skip_until(until);
+                } else {
+                    self.schedule.begin_at(until);
+                }
             }
-            self.backing_off.set(rest.is_some());
-            self.due.set(due);
-            if interval.is_zero() {
+            if self.settings.interval.is_zero() {
                 tokio::task::yield_now().await;
             }
         }
@@ -353,10 +327,8 @@ impl Device {
         // The device before this one may have stood by, with another fence.
         if self.state.stands_by() {
             self.state.set_standby(false);
-            self.unanswered_polls.set(0);
-            self.backing_off.set(false);
-            self.off_schedule.set(None);
-            self.due.set(Instant::now());
+            self.unanswered_polls.end();
+            self.schedule.begin_now();
         }
         None
     }
@@ -386,41 +358,27 @@ impl Device {
         }
     }
 
-    /// Ends a backoff.
+    /// Ends the pause of a device that does not answer.
     fn wake(&self) {
-        if self.backing_off.take() {
-            self.unanswered_polls.set(0);
-            self.due.set(Instant::now());
+        if self.unanswered_polls.is_delaying() {
+            self.unanswered_polls.end();
+            self.schedule.begin_at(Instant::now());
         }
     }
 
     /// Requests a poll soon, outside the schedule.
     pub(super) fn want_soon(&self) {
-        self.off_schedule.set(Some(Instant::now()));
+        self.schedule.want_soon();
     }
 
     /// Takes over the state of the device before it.
-    fn follow(&self, before: Device) {
-        let now = Instant::now();
+    fn follow(&mut self, before: Device) {
         let (old, new) = (&before.settings, &self.settings);
         if !Rc::ptr_eq(&before.link, &self.link) || old.unit_id != new.unit_id {
-            self.off_schedule.set(None);
-            return self.due.set(now);
+            return self.schedule.begin_now();
         }
-        let apart = new.interval.min(OFF_SCHEDULE_INTERVAL);
-        self.last_off_schedule.set(before.last_off_schedule.get());
-        let not_before = before.last_off_schedule.get().map(|last| last + apart);
-        let wanted = self.off_schedule.get().or(before.off_schedule.get());
-        self.off_schedule
-            .set(wanted.map(|wanted| not_before.map_or(wanted, |time| time.max(wanted))));
-        self.unanswered_polls.set(before.unanswered_polls.get());
-        self.backing_off.set(before.backing_off.get());
-        if before.backing_off.get() {
-            self.off_schedule.set(None);
-            self.due.set(before.due.get());
-        } else {
-            self.due.set(before.due.get().min(now + new.interval));
-        }
+        self.schedule.follow(&before.schedule, before.unanswered_polls.is_delaying());
+        self.unanswered_polls = before.unanswered_polls;
         if old.limits == new.limits {
             self.learned.replace(before.learned.take());
             self.learned().keep(&self.fields);
@@ -438,15 +396,6 @@ impl Device {
             sleep(STATUS_INTERVAL).await;
             self.publish_status();
         }
-    }
-
-    /// The end of a backoff, if the address cannot be reached or the unit counts as dead.
-    fn rest(&self) -> Option<Instant> {
-        let unanswered = self.unanswered_polls.get();
-        self.link.retry_at().or_else(|| {
-            (unanswered >= DEAD_AFTER_POLLS)
-                .then(|| Instant::now() + self.link.retry.pause(unanswered - DEAD_AFTER_POLLS + 1))
-        })
     }
 
     /// Plans the readable fields within the learned limits.
@@ -536,12 +485,7 @@ impl Device {
         if self.settings.release {
             self.link.release();
         }
-        let silent = fault.is_some() && !answered;
-        self.unanswered_polls.set(if silent {
-            self.unanswered_polls.get().saturating_add(1)
-        } else {
-            0
-        });
+        self.unanswered_polls.note(fault.is_some() && !answered);
         let unstored = self.state.take_unstored().then_some(Fault::Unstored);
         match fault.or(unstored) {
             None => self.state.good(),
@@ -638,7 +582,7 @@ impl Device {
         counters.requests.add();
         let began = Instant::now();
         let priority =
-            if self.unanswered_polls.get() > 0 { Priority::Doubtful } else { Priority::Usual };
+            if self.unanswered_polls.is_doubtful() { Priority::Doubtful } else { Priority::Usual };
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
         let fence = self.settings.fence.as_ref();
         let permit = Permit { fence: fence.cloned(), until: None };
@@ -746,14 +690,6 @@ fn data(mut pdu: Vec<u8>) -> Vec<u8> {
     pdu
 }
 
-/// The first due time that is not before `now`, and the number of due times before it.
-fn first_from(now: Instant, due: Instant, interval: Duration) -> (Instant, u64) {
-    let late = now.saturating_duration_since(due).as_nanos();
-    let passed = late.div_ceil(interval.as_nanos().max(1));
-    let skipped = interval.as_nanos() * passed;
-    (due + Duration::from_nanos(skipped as u64), if interval.is_zero() { 0 } else { passed as u64 })
-}
-
 /// The data of one poll: reads with several parts, with the number of missing items; and all
 /// blocks, if they are reported.
 #[derive(Default)]
@@ -800,16 +736,7 @@ impl Gathered {
         // What was written since the fields before were read is not in them.
         partial.known_changes = turn.amend(partial.known_changes, (area, address, all), whole);
         let (count, at) = (usize::from(field.count), at as usize);
-        if field.area.is_bits() {
-            for index in 0..count {
-                let bit = block[(offset + index) / 8] >> ((offset + index) % 8) & 1;
-                let (byte, to) = ((at + index) / 8, (at + index) % 8);
-                whole[byte] = whole[byte] & !(1 << to) | bit << to;
-            }
-        } else {
-            whole[at * 2..(at + count) * 2]
-                .copy_from_slice(&block[offset * 2..(offset + count) * 2]);
-        }
+        area.copy(block, offset, whole, at, count);
         let missing = partial.missing.checked_sub(field.count.into());
         partial.missing = missing.expect("each field of a read arrives once per poll");
         if partial.missing > 0 {

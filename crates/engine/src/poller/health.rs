@@ -36,36 +36,35 @@ impl Health {
     /// # Panics
     /// For a code that no health has.
     pub(super) fn from_code(code: u16) -> Health {
-        match code {
-            0 => Health::Unknown,
-            1 => Health::Ok,
-            2 => Health::Error,
-            3 => Health::Stale,
-            4 => Health::Disabled,
-            5 => Health::Standby,
-            _ => unreachable!("no health has the code {code}"),
-        }
+        NAMES[usize::from(code)].0
     }
 
     pub const fn code(self) -> u16 {
-        match self {
-            Health::Unknown => 0,
-            Health::Ok => 1,
-            Health::Error => 2,
-            Health::Stale => 3,
-            Health::Disabled => 4,
-            Health::Standby => 5,
-        }
+        self as u16
     }
 
     pub const fn name(self) -> &'static str {
-        match self {
-            Health::Unknown => "unknown",
-            Health::Ok => "ok",
-            Health::Error => "error",
-            Health::Stale => "stale",
-            Health::Disabled => "disabled",
-            Health::Standby => "standby",
-        }
+        NAMES[self as usize].1
+    }
+}
+
+/// In the order of the codes.
+const NAMES: [(Health, &str); 6] = [
+    (Health::Unknown, "unknown"),
+    (Health::Ok, "ok"),
+    (Health::Error, "error"),
+    (Health::Stale, "stale"),
+    (Health::Disabled, "disabled"),
+    (Health::Standby, "standby"),
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_in_the_order_of_the_codes() {
+        assert!((0..).zip(NAMES).all(|(code, (health, _))| health.code() == code));
+        assert_eq!(NAMES.len(), usize::from(Health::Standby.code()) + 1);
     }
 }

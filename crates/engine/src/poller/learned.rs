@@ -9,8 +9,8 @@ use tokio::time::Instant;
 use super::plan::{Block, Cut, Field, PlanLimits};
 use crate::link::Fault;
 
-/// How long the limits are remembered.
-const MEMORY_TIME: Duration = Duration::from_secs(600);
+/// The limits are forgotten after this time, and the device is searched again.
+const FORGET_AFTER: Duration = Duration::from_secs(600);
 
 /// The interval between attempts to read an unreadable range.
 const RETRY_INTERVAL: Duration = Duration::from_secs(60);
@@ -145,6 +145,6 @@ impl Learned {
     }
 
     fn remember(&mut self) {
-        self.until.get_or_insert_with(|| Instant::now() + MEMORY_TIME);
+        self.until.get_or_insert_with(|| Instant::now() + FORGET_AFTER);
     }
 }

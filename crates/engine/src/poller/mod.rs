@@ -2,33 +2,35 @@
 //!
 //! * A device is a task with its schedule, plan, counters and status ([`device`]).
 //! * Devices behind the same address share a link. A link does not know its devices ([`crate::link`]).
-//! * A read is written to memory unchanged and atomically. A failed read writes nothing ([`sink`]).
+//! * A read is written to memory unchanged and atomically. A failed read writes nothing ([`destination`]).
 //!
 //! All tasks of a poller run on one thread, so that they share state without locks.
 
 mod cost;
+mod destination;
 mod device;
+mod forwarding;
 mod health;
 mod learned;
 mod mirror_age;
 mod panic_guard;
 pub mod plan;
-mod raw_ingest;
 mod results;
 mod roster;
+mod schedule;
 mod search;
-mod sink;
 mod state;
 mod status;
 mod thread;
 mod turn;
+mod unanswered_polls;
 mod write_through;
 
+pub use destination::Destination;
 pub use device::{DeviceSettings, ReadSettings};
+pub use forwarding::{ForwardCounters, ForwardFailure, ForwardSettings};
 pub use mirror_age::MirrorAge;
-pub use raw_ingest::{ForwardCounters, ForwardFailure, ForwardSettings};
 pub use results::{Batch, BlockResult, Poll, Results, Written};
-pub use sink::Destination;
 pub use state::{DeviceCounters, DeviceState};
 pub use status::{BlockSettings, StatusSettings};
 pub use thread::{Polled, Poller, PollerError};

@@ -1,8 +1,8 @@
 //! Results of polls and writes, for receivers in other threads. A receiver is woken once per batch,
 //! not once per block.
 //!
-//! Each receiver has a bounded queue of its own, so a slow one loses nothing of the others. When it is full, the oldest polls are dropped and counted. Results of
-//! writes are never dropped.
+//! Each receiver has a bounded queue of its own, so a slow one loses nothing of the others. When it is
+//! full, the oldest polls are dropped and counted. Results of writes are never dropped.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};

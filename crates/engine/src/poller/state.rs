@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use super::health::Health;
 use super::status::Status;
 use crate::client::StrayCounters;
-use crate::counter::Counter;
+use crate::counter::{Counter, counters};
 use crate::link::Fault;
 
 /// Counters and health of a device.
@@ -41,25 +41,27 @@ struct Times {
     error_since: Option<Instant>,
 }
 
-#[derive(Debug, Default)]
-pub struct DeviceCounters {
-    pub requests: Counter,
-    pub valid: Counter,
-    pub exceptions: Counter,
-    pub timeouts: Counter,
-    pub transport_errors: Counter,
-    /// Polls carried out, and those of them that read everything.
-    pub polls: Counter,
-    pub good_polls: Counter,
-    /// Polls that could not begin in time.
-    pub missed: Counter,
-    /// Polls not carried out because the device has no plan.
-    pub unplanned: Counter,
-    /// Complete reads that were stored, or have no destination; and the values in them.
-    pub reads: Counter,
-    pub values: Counter,
-    /// Reads and status blocks that memory refused.
-    pub unstored: Counter,
+counters! {
+    pub struct DeviceCounters {
+        polls,
+        /// Polls that could not begin in time.
+        missed,
+        /// Polls not carried out because the device has no plan.
+        unplanned,
+        requests,
+        valid,
+        exceptions,
+        timeouts,
+        transport_errors,
+        /// Complete reads that were stored, or have no destination; and the values in them.
+        reads,
+        values,
+        /// Reads and status blocks that memory refused.
+        unstored,
+        ;
+        /// Polls that read everything.
+        pub good_polls: Counter,
+    }
 }
 
 impl DeviceState {

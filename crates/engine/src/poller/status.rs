@@ -48,7 +48,7 @@ impl StatusSettings {
     ///
     /// # Errors
     /// As [`Status::write`].
-    pub fn tell_disabled(&self) -> Result<(), Refusal> {
+    pub fn write_disabled_status(&self) -> Result<(), Refusal> {
         Status { health: Health::Disabled, ..Status::default() }.write(self)
     }
 

@@ -18,11 +18,12 @@ use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
 use super::device::{Device, DeviceSettings, Inbox, Planned};
+use super::forwarding::{Forward, ForwardCounters, ForwardSettings};
 use super::panic_guard::spawn_guarded;
 use super::plan::{PlanError, PlanLimits};
-use super::raw_ingest::{Forward, ForwardCounters, ForwardSettings};
 use super::results::{Receivers, Results, Written};
 use super::roster::Roster;
+use super::schedule;
 use super::state::DeviceState;
 use super::turn::Turn;
 use super::write_through::{Passage, PassedRange, PassedWrite};
@@ -415,7 +416,7 @@ async fn run_commands(
                 links.retain(|_, link| link.strong_count() > 0);
             }
             Command::Add(planned, polled) => {
-                let phase = spread(planned.settings.start_within, started);
+                let phase = schedule::first_poll(planned.settings.start_within, started);
                 started += 1;
                 fences.watch(planned.settings.fence.as_ref());
                 let name = planned.settings.name.clone();
@@ -599,11 +600,6 @@ fn link_to(
         *known = Rc::downgrade(&link);
         link
     })
-}
-
-/// The phase of the device with this number: the golden ratio spreads any number of devices evenly.
-fn spread(within: Duration, number: u32) -> Duration {
-    within.mul_f64((f64::from(number) * 0.618_033_988_749_895).fract())
 }
 
 /// The key of a shared link: its address, and its TLS identity.

@@ -66,15 +66,10 @@ impl Turn {
         let changes = self.changes.borrow();
         for change in changes.iter().skip(known).filter(|change| change.area == area) {
             let start = u32::from(change.address);
-            for item in start.max(first)..(start + change.count).min(first + count) {
-                let (from, to) = ((item - start) as usize, (item - first) as usize);
-                if area.is_bits() {
-                    let bit = change.bytes[from / 8] >> (from % 8) & 1;
-                    bytes[to / 8] = bytes[to / 8] & !(1 << (to % 8)) | bit << (to % 8);
-                } else {
-                    bytes[to * 2..to * 2 + 2]
-                        .copy_from_slice(&change.bytes[from * 2..from * 2 + 2]);
-                }
+            let (at, end) = (start.max(first), (start + change.count).min(first + count));
+            if at < end {
+                let (from, to) = ((at - start) as usize, (at - first) as usize);
+                area.copy(&change.bytes, from, bytes, to, (end - at) as usize);
             }
         }
         changes.len()

@@ -9,13 +9,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use holdfast_memory::{Access, Area, Memory, Operation, Outcome, Refusal, Write};
-use holdfast_protocol::pdu::{
-    self, EncodedRequest, ExceptionCode, Function, Range, Request, reply,
-};
+use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, Function, Range, Request};
 use tokio::sync::{mpsc, oneshot};
 
 use crate::items::{Items, touched};
-use crate::link::{Fault, Link, PendingReply, Permit, Priority, ReplyTo, exception, pending_reply};
+use crate::link::{
+    Fault, Link, PendingReply, Permit, Priority, ReplyTo, confirmation, exception, pending_reply,
+};
 
 /// The most writes into one memory that wait for devices.
 const MAX_WAITING: usize = 256;
@@ -90,8 +90,7 @@ impl Passage {
 
     /// Whether a request writes into one of the ranges.
     pub(crate) fn accepts(&self, pdu: &[u8]) -> bool {
-        let function = pdu.first().copied().and_then(Function::from_code);
-        function.is_some_and(Function::is_write)
+        Function::from_pdu(pdu).is_some_and(Function::is_write)
             && Request::parse(pdu).is_ok_and(|request| {
                 let (_, written) = touched(&request);
                 written.is_some_and(|written| {
@@ -268,19 +267,9 @@ impl PassedWrite {
         for change in &changes {
             self.store(change).await;
         }
-        let mut buffer = [0; pdu::MAX_LEN];
-        let reply = match Request::parse(&self.pdu) {
-            Ok(Request::ReadWriteMultipleRegisters { .. }) => answer,
-            Ok(Request::WriteMultipleCoils { address, bits }) => {
-                let len = reply::write_multiple_coils(address, bits, &mut buffer);
-                &buffer[..len]
-            }
-            Ok(Request::WriteMultipleRegisters { address, registers }) => {
-                let len = reply::write_multiple_registers(address, registers, &mut buffer);
-                &buffer[..len]
-            }
-            // The reply repeats the request.
-            _ => &self.pdu,
+        let reply = match Function::from_pdu(&self.pdu) {
+            Some(Function::ReadWriteMultipleRegisters) => answer,
+            _ => confirmation(&self.pdu),
         };
         self.reply.send(reply.to_vec());
         changes

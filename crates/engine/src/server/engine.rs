@@ -2,7 +2,7 @@
 
 use std::io;
 use std::mem;
-use std::net::SocketAddr;
+use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread;
@@ -14,22 +14,24 @@ use tokio::runtime::{Builder, Handle, Runtime};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
-use super::admission::{ConnectionLimits, OpenConnection};
-use super::audit::{Auditor, Record, Records, Unrecordable, auditing};
-use super::counters::{ConnectionCounters, PacketCounters};
-use super::event::{Event, Events, Kind, Reporter, Verbosity, channel as event_channel};
-use super::identity::Identity;
-use super::listener::{ListenerContext, Service, accept, bind_tcp, bind_udp};
-use super::live::Live;
-use super::policy::{PeerRights, Policy};
-use super::raw_ingest::{RawIngest, RawSettings};
-use super::serial::{ModbusSerial, SerialSettings};
-use super::tcp::{ModbusStream, StreamSettings};
-use super::udp::{DatagramFraming, ModbusUdp, UdpSettings};
-use super::unit_server::UnitServer;
 use crate::heartbeat::Heartbeat;
 use crate::own_threads::OwnThreads;
 use crate::serial_line::SerialLine;
+use crate::server::connections::admission::{ConnectionLimits, OpenConnection};
+use crate::server::connections::listener::{ListenerContext, Service, accept, bind_tcp, bind_udp};
+use crate::server::connections::live::Live;
+use crate::server::reports::audit::{Auditor, Record, Records, Unrecordable, auditing};
+use crate::server::reports::counters::{ConnectionCounters, PacketCounters};
+use crate::server::reports::event::{
+    Event, Events, Kind, Reporter, Verbosity, channel as event_channel,
+};
+use crate::server::requests::identity::Identity;
+use crate::server::requests::unit_server::UnitServer;
+use crate::server::rights::policy::{PeerRights, Policy};
+use crate::server::transports::raw_ingest::{RawIngest, RawSettings};
+use crate::server::transports::serial::{ModbusSerial, SerialSettings};
+use crate::server::transports::tcp::{ModbusStream, StreamSettings};
+use crate::server::transports::udp::{DatagramFraming, ModbusUdp, UdpSettings};
 
 /// The time that connections have to end when the engine stops.
 const STOP_TIMEOUT: Duration = Duration::from_millis(500);
@@ -253,13 +255,14 @@ impl Engine {
             let (reporter, auditor) = (self.reporter.clone(), self.auditor.clone());
             Arc::new(ListenerContext::new(name, limits, reporter, auditor))
         };
-        let unit_server = |listen_only| Arc::new(UnitServer::new(identity, listen_only));
+        let unit_server = |settings| Arc::new(UnitServer::new(identity, settings));
         let (workers, stopping) = (self.handles.clone(), self.stop.subscribe());
         let (context, bind, address, served, task): (_, _, _, _, Task) = match kind {
             ListenerKind::ModbusStream(stream) => {
-                let (socket, address) = bound(name, stream.bind, bind_tcp)?;
+                let (socket, address) =
+                    bound(name, stream.bind, bind_tcp, TcpListener::local_addr)?;
                 let context = context(Some(stream.limits));
-                let unit_server = unit_server(stream.listen_only);
+                let unit_server = unit_server(stream.units);
                 let service = ModbusStream::new(&stream, Arc::clone(&unit_server), None);
                 let live = Arc::new(Live::new(service));
                 let served = Served::Stream(Arc::clone(&live), unit_server);
@@ -267,7 +270,7 @@ impl Engine {
                 (context, Some(stream.bind), Some(address), served, Box::pin(task))
             }
             ListenerKind::RawIngest(raw) => {
-                let (socket, address) = bound(name, raw.bind, bind_tcp)?;
+                let (socket, address) = bound(name, raw.bind, bind_tcp, TcpListener::local_addr)?;
                 let context = context(Some(raw.limits));
                 let live = Arc::new(Live::new(RawIngest::new(&raw, Arc::default())));
                 let served = Served::Packets(Arc::clone(&live));
@@ -275,8 +278,8 @@ impl Engine {
                 (context, Some(raw.bind), Some(address), served, Box::pin(task))
             }
             ListenerKind::ModbusUdp(udp) => {
-                let (socket, address) = bound(name, udp.bind, bind_udp)?;
-                let (context, unit_server) = (context(None), unit_server(udp.listen_only));
+                let (socket, address) = bound(name, udp.bind, bind_udp, UdpSocket::local_addr)?;
+                let (context, unit_server) = (context(None), unit_server(udp.units));
                 let policy = Arc::new(Live::new(Policy::of(&udp.rules)));
                 let (rules, units) = (Arc::clone(&policy), Arc::clone(&unit_server));
                 let service = ModbusUdp::new(udp.framing, rules, units);
@@ -284,14 +287,14 @@ impl Engine {
                 let task = service.serve(Arc::clone(&context), socket, stopping);
                 (context, Some(udp.bind), Some(address), served, Box::pin(task))
             }
-            ListenerKind::ModbusSerial(SerialSettings { line, rule }) => {
+            ListenerKind::ModbusSerial(SerialSettings { line, rule, units }) => {
                 let _context = self.handles[0].enter();
                 let port = line.open().map_err(|error| StartError::Open {
                     listener: name.to_owned(),
                     device: line.device.clone(),
                     error,
                 })?;
-                let (context, unit_server) = (context(None), unit_server(true));
+                let (context, unit_server) = (context(None), unit_server(units));
                 let rights = Arc::new(Live::new(PeerRights::new(&rule)));
                 let (own, units) = (Arc::clone(&rights), Arc::clone(&unit_server));
                 let service = ModbusSerial::new(line.clone(), own, units);
@@ -468,9 +471,9 @@ impl Listener {
             {
                 let service = ModbusStream::new(new, Arc::clone(units), live.get().packets());
                 let (live, units) = (Arc::clone(live), Arc::clone(units));
-                let (limits, listen_only) = (new.limits, new.listen_only);
+                let (limits, settings) = (new.limits, new.units);
                 Some(Box::new(move |listener| {
-                    units.update(identity, listen_only);
+                    units.update(identity, settings);
                     listener.take_over(&live, service, limits);
                 }))
             }
@@ -486,9 +489,9 @@ impl Listener {
             {
                 let policy = Arc::new(Policy::of(&new.rules));
                 let (live, units) = (Arc::clone(live), Arc::clone(units));
-                let listen_only = new.listen_only;
+                let settings = new.units;
                 Some(Box::new(move |_| {
-                    units.update(identity, listen_only);
+                    units.update(identity, settings);
                     live.replace(policy);
                 }))
             }
@@ -497,8 +500,9 @@ impl Listener {
             {
                 let rights = Arc::new(PeerRights::new(&new.rule));
                 let (live, units) = (Arc::clone(live), Arc::clone(units));
+                let settings = new.units;
                 Some(Box::new(move |_| {
-                    units.update(identity, true);
+                    units.update(identity, settings);
                     live.replace(rights);
                 }))
             }
@@ -530,34 +534,19 @@ impl Listener {
 }
 
 /// Binds a socket and returns its address.
-fn bound<S: BoundSocket>(
+fn bound<S>(
     listener: &str,
     address: SocketAddr,
     bind: impl Fn(SocketAddr) -> io::Result<S>,
+    local: impl Fn(&S) -> io::Result<SocketAddr>,
 ) -> Result<(S, SocketAddr), StartError> {
-    let socket = bind(address).and_then(|socket| Ok((socket.address()?, socket)));
+    let socket = bind(address).and_then(|socket| Ok((local(&socket)?, socket)));
     let (address, socket) = socket.map_err(|error| StartError::Bind {
         listener: listener.to_owned(),
         address,
         error,
     })?;
     Ok((socket, address))
-}
-
-trait BoundSocket {
-    fn address(&self) -> io::Result<SocketAddr>;
-}
-
-impl BoundSocket for std::net::TcpListener {
-    fn address(&self) -> io::Result<SocketAddr> {
-        self.local_addr()
-    }
-}
-
-impl BoundSocket for std::net::UdpSocket {
-    fn address(&self) -> io::Result<SocketAddr> {
-        self.local_addr()
-    }
 }
 
 impl Drop for Engine {

@@ -8,20 +8,20 @@ use std::ffi::OsString;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use rustls::client::danger::{ServerCertVerified, ServerCertVerifier};
 use rustls::client::{Resumption, verify_server_name};
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::server::ParsedCertificate;
 use rustls::sign::SingleCertAndKey;
-use rustls::{ClientConfig, ClientConnection, DigitallySignedStruct, Error, SignatureScheme};
+use rustls::{ClientConfig, ClientConnection, Error};
 use thiserror::Error as ThisError;
 
 use super::certificate::Purpose;
 use super::files::FileError;
 use super::own::own;
-use super::provider::{ALGORITHMS, provider, verify_tls12, verify_tls13};
+use super::provider::{handshake_signatures, provider};
 use super::revocation::Lists;
-use super::trust::{Listed, Trust};
+use super::verification::{Listed, Trust};
 use super::{Channel, TlsFailure};
 
 /// The TLS settings of a client.
@@ -75,12 +75,12 @@ impl ClientTls {
         })?;
         let trusted = match settings.ca {
             Some(file) => Listed::of_file(file)?,
-            None => of_system()?,
+            None => system_authorities()?,
         };
         let own =
             settings.own.map(|(file, key_file)| own(file, key_file, settings.key)).transpose()?;
-        let shown = own.as_ref().map_or_else(Vec::new, |own| own.cert.clone());
-        let verifier = Arc::new(Servers(Trust::new(Arc::clone(&trusted), Lists::default())));
+        let own_chain = own.as_ref().map_or_else(Vec::new, |own| own.cert.clone());
+        let verifier = Arc::new(ServerVerifier(Trust::new(Arc::clone(&trusted), Lists::default())));
         let builder = ClientConfig::builder_with_provider(provider())
             .with_safe_default_protocol_versions()
             .map_err(|error| TlsError::Other(TlsFailure::from(error).to_string()))?
@@ -90,8 +90,9 @@ impl ClientTls {
             None => builder.with_no_client_auth(),
             Some(own) => builder.with_client_cert_resolver(Arc::new(SingleCertAndKey::from(own))),
         };
+        // A resumed session would skip the check of the certificate.
         config.resumption = Resumption::disabled();
-        let identity = Arc::new(Identity { trusted, own: shown, name });
+        let identity = Arc::new(Identity { trusted, own: own_chain, name });
         Ok(ClientTls { config: Arc::new(config), identity })
     }
 
@@ -119,11 +120,11 @@ impl Eq for ClientTls {}
 
 /// The authorities of the system. They are read once, and again when one of the environment
 /// variables that name them changes.
-fn of_system() -> Result<Arc<[Listed]>, TlsError> {
+fn system_authorities() -> Result<Arc<[Listed]>, TlsError> {
     type Variables = [Option<OsString>; 2];
-    static FOUND: Mutex<Option<(Variables, Arc<[Listed]>)>> = Mutex::new(None);
+    static CACHE: Mutex<Option<(Variables, Arc<[Listed]>)>> = Mutex::new(None);
     let variables = ["SSL_CERT_FILE", "SSL_CERT_DIR"].map(std::env::var_os);
-    let mut known = FOUND.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut known = CACHE.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some((of, found)) = &*known
         && *of == variables
     {
@@ -144,9 +145,9 @@ fn of_system() -> Result<Arc<[Listed]>, TlsError> {
 
 /// Verifies the certificates of servers.
 #[derive(Debug)]
-struct Servers(Trust);
+struct ServerVerifier(Trust);
 
-impl ServerCertVerifier for Servers {
+impl ServerCertVerifier for ServerVerifier {
     fn verify_server_cert(
         &self,
         end_entity: &CertificateDer<'_>,
@@ -160,27 +161,7 @@ impl ServerCertVerifier for Servers {
         Ok(ServerCertVerified::assertion())
     }
 
-    fn verify_tls12_signature(
-        &self,
-        message: &[u8],
-        certificate: &CertificateDer<'_>,
-        signed: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        verify_tls12(message, certificate, signed)
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        message: &[u8],
-        certificate: &CertificateDer<'_>,
-        signed: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        verify_tls13(message, certificate, signed)
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        ALGORITHMS.supported_schemes()
-    }
+    handshake_signatures!();
 }
 
 #[cfg(test)]
@@ -319,16 +300,16 @@ mod tests {
         Err("no end".into())
     }
 
-    fn told(ca: &str, name: &str, peer: &Owner) -> String {
-        let told = VERSIONS.map(|version| {
+    fn outcome(ca: &str, name: &str, peer: &Owner) -> String {
+        let outcome = VERSIONS.map(|version| {
             match talk(&client(ca, None, name), &mut server(peer, version, None), usize::MAX) {
                 Ok(_) => "pong".to_owned(),
                 Err(why) => why,
             }
         });
-        assert_eq!(told[0], told[1]);
-        let [told, _] = told;
-        told
+        assert_eq!(outcome[0], outcome[1]);
+        let [outcome, _] = outcome;
+        outcome
     }
 
     #[test]
@@ -352,19 +333,19 @@ mod tests {
         let address = Owner::new("10.0.0.5", IsCa::NoCa, Some(&authority));
         let both = authority.pem() + &stranger.pem();
 
-        assert_eq!(told(&both, "plc", &plc), "pong");
-        assert_eq!(told(&both, "10.0.0.5", &address), "pong");
+        assert_eq!(outcome(&both, "plc", &plc), "pong");
+        assert_eq!(outcome(&both, "10.0.0.5", &address), "pong");
         assert_eq!(
-            told(&stranger.pem(), "plc", &plc),
+            outcome(&stranger.pem(), "plc", &plc),
             "the issuer of the certificate is unknown: neither the certificate nor an authority \
              above it is trusted"
         );
         assert_eq!(
-            told(&both, "10.0.0.5", &plc),
+            outcome(&both, "10.0.0.5", &plc),
             "the certificate is for 'plc', not for '10.0.0.5'"
         );
         assert_eq!(
-            told(&both, "plc", &address),
+            outcome(&both, "plc", &address),
             "the certificate is for '10.0.0.5', not for 'plc'"
         );
     }
@@ -378,14 +359,14 @@ mod tests {
         let authority = Owner::new("authority", CA, None);
         let late = Owner::made("plc", Some(&authority), expired);
         let own = Owner::made("plc", None, expired);
-        for told in [told(&authority.pem(), "plc", &late), told(&own.pem(), "plc", &own)] {
-            assert!(told.starts_with("the certificate expired "), "{told}");
+        for outcome in [outcome(&authority.pem(), "plc", &late), outcome(&own.pem(), "plc", &own)] {
+            assert!(outcome.starts_with("the certificate expired "), "{outcome}");
         }
 
         let early = Owner::made("plc", Some(&authority), |params| {
             params.not_before = date_time_ymd(3000, 1, 1);
         });
-        let told_early = told(&authority.pem(), "plc", &early);
+        let told_early = outcome(&authority.pem(), "plc", &early);
         assert!(
             told_early.starts_with("the certificate is not valid yet: its validity begins in "),
             "{told_early}"
@@ -396,11 +377,11 @@ mod tests {
             expired(params);
         });
         let plc = Owner::new("plc", IsCa::NoCa, Some(&former));
-        let why = told(&former.pem(), "plc", &plc);
+        let why = outcome(&former.pem(), "plc", &plc);
         assert!(why.starts_with("an authority above the certificate expired "), "{why}");
         // An expired authority does not affect the others.
         let third = Owner::new("plc", IsCa::NoCa, Some(&authority));
-        assert_eq!(told(&(former.pem() + &authority.pem()), "plc", &third), "pong");
+        assert_eq!(outcome(&(former.pem() + &authority.pem()), "plc", &third), "pong");
     }
 
     #[test]
@@ -413,16 +394,16 @@ mod tests {
             (IsCa::NoCa, Some(&unknown)),
         ] {
             let plc = Owner::new("plc", is_ca, by);
-            assert_eq!(told(&plc.pem(), "plc", &plc), "pong");
-            assert!(told(&plc.pem(), "plc8", &plc).contains("for 'plc', not for 'plc8'"));
+            assert_eq!(outcome(&plc.pem(), "plc", &plc), "pong");
+            assert!(outcome(&plc.pem(), "plc8", &plc).contains("for 'plc', not for 'plc8'"));
             let twin = Owner::new("plc", is_ca, by);
-            assert!(told(&plc.pem(), "plc", &twin) != "pong");
+            assert!(outcome(&plc.pem(), "plc", &twin) != "pong");
         }
         let of_client = Owner::made("plc", None, |params| {
             params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
         });
         assert_eq!(
-            told(&of_client.pem(), "plc", &of_client),
+            outcome(&of_client.pem(), "plc", &of_client),
             "the certificate is for other purposes: its extendedKeyUsage lacks serverAuth"
         );
     }
@@ -432,8 +413,8 @@ mod tests {
         for is_ca in [IsCa::NoCa, IsCa::ExplicitNoCa] {
             let device = Owner::new("plc1", is_ca, None);
             let forged = Owner::new("plc2", IsCa::NoCa, Some(&device));
-            let told = told(&device.pem(), "plc2", &forged);
-            assert!(told.starts_with("the issuer of the certificate is unknown"), "{told}");
+            let outcome = outcome(&device.pem(), "plc2", &forged);
+            assert!(outcome.starts_with("the issuer of the certificate is unknown"), "{outcome}");
         }
     }
 
@@ -445,14 +426,14 @@ mod tests {
         let panel = Owner::new("panel", IsCa::NoCa, Some(&authority));
         let foreign = Owner::new("foreign", IsCa::NoCa, Some(&stranger));
         for version in VERSIONS {
-            let told = |own| {
+            let outcome = |own| {
                 let client = client(&authority.pem(), own, "plc");
                 talk(&client, &mut server(&plc, version, Some(&authority)), usize::MAX)
             };
-            assert_eq!(told(Some(&panel)).unwrap(), b"pong");
-            assert_eq!(told(None).unwrap_err(), "the peer requires a certificate");
+            assert_eq!(outcome(Some(&panel)).unwrap(), b"pong");
+            assert_eq!(outcome(None).unwrap_err(), "the peer requires a certificate");
             assert_eq!(
-                told(Some(&foreign)).unwrap_err(),
+                outcome(Some(&foreign)).unwrap_err(),
                 "the peer refused the certificate: unknown issuer"
             );
         }
@@ -474,7 +455,7 @@ mod tests {
     fn unusable_files_are_reported() {
         let [plc, other] = ["plc", "other"].map(|name| Owner::new(name, IsCa::NoCa, None));
         let (certificate, key) = (plc.pem(), plc.key.serialize_pem());
-        let told = |certificate: &str, key: &[u8]| {
+        let outcome = |certificate: &str, key: &[u8]| {
             let (ca, file, key) = (File::new(plc.pem()), File::new(certificate), File::new(key));
             let own = Some((file.0.as_path(), key.0.as_path()));
             let settings = ClientSettings { ca: Some(&ca.0), own, key: None, name: "plc" };
@@ -483,29 +464,32 @@ mod tests {
             error.to_string().replace(&file, "CERT").replace(&key, "KEY")
         };
         assert_eq!(
-            told(&certificate, other.key.serialize_pem().as_bytes()),
+            outcome(&certificate, other.key.serialize_pem().as_bytes()),
             "KEY: it is not the key of the certificate in CERT"
         );
         assert_eq!(
-            told(&key, key.as_bytes()),
+            outcome(&key, key.as_bytes()),
             "CERT: found no certificate, allowed: a certificate in PEM"
         );
         assert_eq!(
-            told(&certificate, certificate.as_bytes()),
+            outcome(&certificate, certificate.as_bytes()),
             "KEY: found no key, allowed: a key in PEM"
         );
         assert_eq!(
-            told(&certificate, &plc.key.serialize_der()),
+            outcome(&certificate, &plc.key.serialize_der()),
             "KEY: found DER, allowed: a key in PEM"
         );
-        assert_eq!(told(&certificate, b""), "KEY: found no key, allowed: a key in PEM");
+        assert_eq!(outcome(&certificate, b""), "KEY: found no key, allowed: a key in PEM");
         assert_eq!(
-            told(&certificate, b"-----BEGIN ENCRYPTED PRIVATE KEY-----\n"),
+            outcome(&certificate, b"-----BEGIN ENCRYPTED PRIVATE KEY-----\n"),
             "KEY: the key is encrypted; use a key without a passphrase"
         );
-        assert!(told(&certificate[..100], key.as_bytes()).starts_with("CERT: "));
+        assert!(outcome(&certificate[..100], key.as_bytes()).starts_with("CERT: "));
         assert_eq!(
-            told("-----BEGIN CERTIFICATE-----\nMAA=\n-----END CERTIFICATE-----\n", key.as_bytes()),
+            outcome(
+                "-----BEGIN CERTIFICATE-----\nMAA=\n-----END CERTIFICATE-----\n",
+                key.as_bytes()
+            ),
             "CERT: certificate 1 can't be read, allowed: X.509 version 3"
         );
         let missing = Path::new("/nonexistent/ca.pem");

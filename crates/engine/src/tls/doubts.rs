@@ -9,7 +9,7 @@ use super::certificate::{Parsed, name_text};
 use super::failure::{between, span};
 use super::revocation::List;
 use super::server_files::{ExpiredLists, ServerFiles};
-use super::trust::Listed;
+use super::verification::Listed;
 
 /// Finds what is doubtful.
 pub(super) struct Doubts<'f> {

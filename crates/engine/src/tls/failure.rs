@@ -14,176 +14,141 @@ const MAX_NAMES: usize = 4;
 
 const DAY: u64 = 24 * 60 * 60;
 
-/// Why TLS failed, during the handshake or later.
-///
-/// Texts from a certificate are escaped in messages, so that they cannot harm a terminal or a log.
-///
-/// ```
-/// use holdfast_engine::tls::TlsFailure;
-/// use rustls::{AlertDescription, Error};
-///
-/// let failure = TlsFailure::from(&Error::AlertReceived(AlertDescription::UnknownCA));
-/// assert_eq!(failure.reason(), "peer_refused_certificate");
-/// assert_eq!(
-///     failure.to_string(),
-///     "the peer refused the certificate: unknown issuer"
-/// );
-/// ```
-#[derive(Debug, Clone, PartialEq, Eq, ThisError)]
-#[non_exhaustive]
-pub enum TlsFailure {
+/// Makes `TlsFailure`: its causes with their words, and the list of all words.
+macro_rules! failures {
+    ($($(#[$about:meta])* $cause:ident $({ $($field:ident: $type:ty),+ })? => $word:literal,)+) => {
+        /// Why TLS failed, during the handshake or later.
+        ///
+        /// Texts from a certificate are escaped in messages, so that they cannot harm a terminal or a log.
+        ///
+        /// ```
+        /// use holdfast_engine::tls::TlsFailure;
+        /// use rustls::{AlertDescription, Error};
+        ///
+        /// let failure = TlsFailure::from(&Error::AlertReceived(AlertDescription::UnknownCA));
+        /// assert_eq!(failure.reason(), "peer_refused_certificate");
+        /// assert_eq!(
+        ///     failure.to_string(),
+        ///     "the peer refused the certificate: unknown issuer"
+        /// );
+        /// ```
+        #[derive(Debug, Clone, PartialEq, Eq, ThisError)]
+        #[non_exhaustive]
+        pub enum TlsFailure {
+            $($(#[$about])* $cause $({ $($field: $type),+ })?,)+
+        }
+
+        impl TlsFailure {
+            /// All words of [`reason`](TlsFailure::reason).
+            pub const REASONS: &[&str] = &[$($word),+];
+
+            /// The cause as a word for programs, for errors and log events. It does not change when
+            /// messages change.
+            pub const fn reason(&self) -> &'static str {
+                match self { $(TlsFailure::$cause { .. } => $word,)+ }
+            }
+        }
+    };
+}
+
+failures! {
     /// Neither the certificate nor an authority above it is trusted.
     #[error(
         "the issuer of the certificate is unknown: neither the certificate nor an authority above \
          it is trusted"
     )]
-    UnknownIssuer,
+    UnknownIssuer => "unknown_issuer",
     #[error("the certificate expired {} ago", span(*.ago))]
-    Expired { ago: Duration },
+    Expired { ago: Duration } => "expired",
     #[error("the certificate is not valid yet: its validity begins in {}", span(*.begins_in))]
-    NotYetValid { begins_in: Duration },
+    NotYetValid { begins_in: Duration } => "not_yet_valid",
     /// An authority above the certificate, trusted or sent by the peer, has expired.
     #[error("an authority above the certificate expired {} ago", span(*.ago))]
-    IssuerExpired { ago: Duration },
+    IssuerExpired { ago: Duration } => "issuer_expired",
     #[error(
         "an authority above the certificate is not valid yet: its validity begins in {}",
         span(*.begins_in)
     )]
-    IssuerNotYetValid { begins_in: Duration },
+    IssuerNotYetValid { begins_in: Duration } => "issuer_not_yet_valid",
     /// The names are not escaped.
     #[error("{}", wrong_name(.expected, .presented))]
-    WrongName { expected: String, presented: Vec<String> },
+    WrongName { expected: String, presented: Vec<String> } => "wrong_name",
     /// `required` is `serverAuth` or `clientAuth`.
     #[error("the certificate is for other purposes: its extendedKeyUsage lacks {required}")]
-    WrongPurpose { required: &'static str },
+    WrongPurpose { required: &'static str } => "wrong_purpose",
     #[error("the certificate, or an authority above it, is revoked")]
-    Revoked,
+    Revoked => "revoked",
     #[error("an authority above the certificate has no valid revocation list")]
-    UnknownRevocation,
+    UnknownRevocation => "unknown_revocation",
     /// The `nextUpdate` of a revocation list has passed.
     #[error("a revocation list of an authority above the certificate expired {} ago", span(*.ago))]
-    ExpiredRevocationList { ago: Duration },
+    ExpiredRevocationList { ago: Duration } => "expired_revocation_list",
     /// The signature of a certificate is invalid; or that of the handshake, when the peer does not
     /// hold the key of its certificate.
     #[error("the signature of the certificate, or of the handshake, is invalid")]
-    BadSignature,
+    BadSignature => "bad_signature",
     /// It is not an X.509 certificate.
     #[error("the certificate can't be read")]
-    BadCertificate,
+    BadCertificate => "bad_certificate",
     #[error("the certificate has more than one role")]
-    TwoRoles,
+    TwoRoles => "two_roles",
     #[error("the role of the certificate is not a UTF8String")]
-    RoleType,
+    RoleType => "role_type",
     /// It is not among the allowed roles.
     #[error("the role {role:?} of the certificate is not allowed")]
-    WrongRole { role: String },
+    WrongRole { role: String } => "wrong_role",
     /// The key of the certificate is for other purposes than signing handshakes.
     #[error("the keyUsage of the certificate lacks digitalSignature")]
-    WrongKeyUsage,
+    WrongKeyUsage => "wrong_key_usage",
     #[error("the certificate has a critical extension that is not supported")]
-    UnsupportedExtension,
+    UnsupportedExtension => "unsupported_extension",
     /// Its version, key or signature is not supported.
     #[error("the certificate is not supported: {flaw}")]
-    UnsupportedCertificate { flaw: String },
+    UnsupportedCertificate { flaw: String } => "unsupported_certificate",
     /// The certificate has `CA:TRUE` and is not listed itself.
     #[error(
         "the peer presented a CA certificate (CA:TRUE); list that exact certificate in `ca`, or \
          issue one with CA:FALSE"
     )]
-    CaAsEndEntity,
+    CaAsEndEntity => "ca_as_end_entity",
     /// A certificate above that of the peer cannot sign others.
     #[error("a certificate above that of the peer is not an authority (CA:TRUE, keyCertSign)")]
-    IssuerNotAuthority,
+    IssuerNotAuthority => "issuer_not_authority",
     /// The certificate violates a constraint of an authority, such as `pathLenConstraint`.
     #[error("the certificate violates a constraint of an authority above it: {constraint}")]
-    ConstraintViolated { constraint: &'static str },
+    ConstraintViolated { constraint: &'static str } => "constraint_violated",
     #[error("the certificate is not accepted: {flaw}")]
-    UntrustedCertificate { flaw: String },
+    UntrustedCertificate { flaw: String } => "untrusted_certificate",
     #[error("the peer presented no certificate")]
-    NoCertificate,
+    NoCertificate => "no_certificate",
     #[error("the peer requires a certificate")]
-    PeerRequiresCertificate,
+    PeerRequiresCertificate => "peer_requires_certificate",
     #[error("the peer refused the certificate: {}", refusal(*.alert))]
-    PeerRefusedCertificate { alert: AlertDescription },
+    PeerRefusedCertificate { alert: AlertDescription } => "peer_refused_certificate",
     /// The alert has several causes.
     #[error(
         "the peer refused the handshake: it may require a certificate, or have no cipher suite in \
          common"
     )]
-    PeerRefusedHandshake,
+    PeerRefusedHandshake => "peer_refused_handshake",
     #[error("the peer ended TLS with alert {alert:?}")]
-    PeerEnded { alert: AlertDescription },
+    PeerEnded { alert: AlertDescription } => "peer_ended",
     /// With `by_peer`, the peer reported it by an alert.
     #[error("no TLS version or cipher suite in common; supported: TLS 1.2 and 1.3")]
-    NoCommonVersionOrCipher { by_peer: bool },
+    NoCommonVersionOrCipher { by_peer: bool } => "no_common_version_or_cipher",
     #[error("the peer does not speak TLS")]
-    NotTls,
+    NotTls => "not_tls",
     #[error("a malformed TLS message: {flaw}")]
-    MalformedMessage { flaw: String },
+    MalformedMessage { flaw: String } => "malformed_message",
     #[error("the peer closed the connection during the TLS handshake")]
-    ClosedDuringHandshake,
+    ClosedDuringHandshake => "closed_during_handshake",
     /// When a peer refuses a certificate and resets the connection, its alert is lost.
     #[error("the peer closed the connection before any reply; it may have refused the certificate")]
-    ClosedBeforeReply,
+    ClosedBeforeReply => "closed_before_reply",
     #[error("a TLS record was modified in transit")]
-    BadRecord,
+    BadRecord => "bad_record",
     #[error("{text}")]
-    Other { text: String },
-}
-
-/// Makes the words of the causes, and the list of all words.
-macro_rules! reasons {
-    (match self { $($cause:pat => $word:literal,)+ }) => {
-        /// All words of [`reason`](TlsFailure::reason).
-        pub const REASONS: &[&str] = &[$($word),+];
-
-        /// The cause as a word for programs, for errors and log events. It does not change when
-        /// messages change.
-        pub const fn reason(&self) -> &'static str {
-            match self { $($cause => $word,)+ }
-        }
-    };
-}
-
-impl TlsFailure {
-    reasons! {
-        match self {
-            TlsFailure::UnknownIssuer => "unknown_issuer",
-            TlsFailure::Expired { .. } => "expired",
-            TlsFailure::NotYetValid { .. } => "not_yet_valid",
-            TlsFailure::IssuerExpired { .. } => "issuer_expired",
-            TlsFailure::IssuerNotYetValid { .. } => "issuer_not_yet_valid",
-            TlsFailure::WrongName { .. } => "wrong_name",
-            TlsFailure::WrongPurpose { .. } => "wrong_purpose",
-            TlsFailure::Revoked => "revoked",
-            TlsFailure::UnknownRevocation => "unknown_revocation",
-            TlsFailure::ExpiredRevocationList { .. } => "expired_revocation_list",
-            TlsFailure::BadSignature => "bad_signature",
-            TlsFailure::BadCertificate => "bad_certificate",
-            TlsFailure::TwoRoles => "two_roles",
-            TlsFailure::RoleType => "role_type",
-            TlsFailure::WrongRole { .. } => "wrong_role",
-            TlsFailure::WrongKeyUsage => "wrong_key_usage",
-            TlsFailure::UnsupportedExtension => "unsupported_extension",
-            TlsFailure::UnsupportedCertificate { .. } => "unsupported_certificate",
-            TlsFailure::CaAsEndEntity => "ca_as_end_entity",
-            TlsFailure::IssuerNotAuthority => "issuer_not_authority",
-            TlsFailure::ConstraintViolated { .. } => "constraint_violated",
-            TlsFailure::UntrustedCertificate { .. } => "untrusted_certificate",
-            TlsFailure::NoCertificate => "no_certificate",
-            TlsFailure::PeerRequiresCertificate => "peer_requires_certificate",
-            TlsFailure::PeerRefusedCertificate { .. } => "peer_refused_certificate",
-            TlsFailure::PeerRefusedHandshake => "peer_refused_handshake",
-            TlsFailure::PeerEnded { .. } => "peer_ended",
-            TlsFailure::NoCommonVersionOrCipher { .. } => "no_common_version_or_cipher",
-            TlsFailure::NotTls => "not_tls",
-            TlsFailure::MalformedMessage { .. } => "malformed_message",
-            TlsFailure::ClosedDuringHandshake => "closed_during_handshake",
-            TlsFailure::ClosedBeforeReply => "closed_before_reply",
-            TlsFailure::BadRecord => "bad_record",
-            TlsFailure::Other { .. } => "other",
-        }
-    }
+    Other { text: String } => "other",
 }
 
 impl TlsFailure {
@@ -204,16 +169,16 @@ impl TlsFailure {
 impl From<&Error> for TlsFailure {
     fn from(error: &Error) -> TlsFailure {
         match error {
-            Error::InvalidCertificate(flaw) => of_certificate(flaw),
+            Error::InvalidCertificate(flaw) => from_certificate_error(flaw),
             Error::NoCertificatesPresented => TlsFailure::NoCertificate,
-            Error::AlertReceived(alert) => of_alert(*alert),
+            Error::AlertReceived(alert) => from_alert(*alert),
             Error::InvalidMessage(
                 InvalidMessage::InvalidContentType
                 | InvalidMessage::UnknownProtocolVersion
                 | InvalidMessage::MessageTooLarge,
             ) => TlsFailure::NotTls,
             Error::InvalidMessage(flaw) => {
-                TlsFailure::MalformedMessage { flaw: plain(&format!("{flaw:?}")) }
+                TlsFailure::MalformedMessage { flaw: escaped(&format!("{flaw:?}")) }
             }
             Error::PeerIncompatible(_) => TlsFailure::NoCommonVersionOrCipher { by_peer: false },
             Error::PeerMisbehaved(PeerMisbehaved::SignedKxWithWrongAlgorithm) => {
@@ -222,7 +187,7 @@ impl From<&Error> for TlsFailure {
                 TlsFailure::UnsupportedCertificate { flaw: flaw.into() }
             }
             Error::DecryptError => TlsFailure::BadRecord,
-            other => TlsFailure::Other { text: plain(&other.to_string()) },
+            other => TlsFailure::Other { text: escaped(&other.to_string()) },
         }
     }
 }
@@ -233,7 +198,7 @@ impl From<Error> for TlsFailure {
     }
 }
 
-fn of_certificate(flaw: &CertificateError) -> TlsFailure {
+fn from_certificate_error(flaw: &CertificateError) -> TlsFailure {
     match flaw {
         CertificateError::UnknownIssuer => TlsFailure::UnknownIssuer,
         CertificateError::ExpiredContext { time, not_after } => {
@@ -243,7 +208,7 @@ fn of_certificate(flaw: &CertificateError) -> TlsFailure {
             TlsFailure::NotYetValid { begins_in: between(*time, *not_before) }
         }
         CertificateError::NotValidForNameContext { expected, presented } => {
-            let presented = presented.iter().map(|name| bare(name).to_owned()).collect();
+            let presented = presented.iter().map(|name| without_kind(name).to_owned()).collect();
             TlsFailure::WrongName { expected: expected.to_str().into_owned(), presented }
         }
         CertificateError::InvalidPurposeContext {
@@ -268,10 +233,10 @@ fn of_certificate(flaw: &CertificateError) -> TlsFailure {
 }
 
 fn untrusted(flaw: &CertificateError) -> TlsFailure {
-    TlsFailure::UntrustedCertificate { flaw: plain(&flaw.to_string()) }
+    TlsFailure::UntrustedCertificate { flaw: escaped(&flaw.to_string()) }
 }
 
-fn of_alert(alert: AlertDescription) -> TlsFailure {
+fn from_alert(alert: AlertDescription) -> TlsFailure {
     match alert {
         AlertDescription::CertificateRequired => TlsFailure::PeerRequiresCertificate,
         AlertDescription::HandshakeFailure => TlsFailure::PeerRefusedHandshake,
@@ -302,20 +267,20 @@ fn refusal(alert: AlertDescription) -> &'static str {
 }
 
 fn wrong_name(expected: &str, presented: &[String]) -> String {
-    let expected = plain(expected);
+    let expected = escaped(expected);
     if presented.is_empty() {
         return format!("the certificate has no alternative name: it is not for '{expected}'");
     }
     let mut listed: Vec<String> =
-        presented.iter().take(MAX_NAMES).map(|name| format!("'{}'", plain(name))).collect();
+        presented.iter().take(MAX_NAMES).map(|name| format!("'{}'", escaped(name))).collect();
     if presented.len() > MAX_NAMES {
         listed.push(format!("{} more", presented.len() - MAX_NAMES));
     }
     format!("the certificate is for {}, not for '{expected}'", listed.join(", "))
 }
 
-/// Removes the kind of name that webpki adds.
-fn bare(name: &str) -> &str {
+/// Removes the wrapper that webpki adds, as in `DnsName("plc7")`.
+fn without_kind(name: &str) -> &str {
     let text = name.strip_prefix("DnsName(\"").and_then(|rest| rest.strip_suffix("\")"));
     let text =
         text.or_else(|| name.strip_prefix("IpAddress(").and_then(|rest| rest.strip_suffix(')')));
@@ -323,7 +288,7 @@ fn bare(name: &str) -> &str {
 }
 
 /// Escapes control characters.
-fn plain(text: &str) -> String {
+fn escaped(text: &str) -> String {
     text.escape_debug().to_string()
 }
 
@@ -346,7 +311,7 @@ mod tests {
 
     use super::*;
 
-    fn of_names(presented: &[&str]) -> TlsFailure {
+    fn wrong_names(presented: &[&str]) -> TlsFailure {
         TlsFailure::from(Error::from(CertificateError::NotValidForNameContext {
             expected: ServerName::try_from("10.0.0.5").unwrap(),
             presented: presented.iter().map(|name| (*name).to_owned()).collect(),
@@ -355,21 +320,24 @@ mod tests {
 
     #[test]
     fn names_are_listed_with_control_characters_escaped() {
-        let told = |presented: &[&str]| of_names(presented).to_string();
+        let message = |presented: &[&str]| wrong_names(presented).to_string();
         assert_eq!(
-            told(&["DnsName(\"plc7\")", "IpAddress(10.0.0.7)"]),
+            message(&["DnsName(\"plc7\")", "IpAddress(10.0.0.7)"]),
             "the certificate is for 'plc7', '10.0.0.7', not for '10.0.0.5'"
         );
         assert_eq!(
-            told(&["DnsName(\"\x1b[2J\n\")"]),
+            message(&["DnsName(\"\x1b[2J\n\")"]),
             "the certificate is for '\\u{1b}[2J\\n', not for '10.0.0.5'"
         );
         assert_eq!(
-            told(&["DnsName(\"a\")"; 6]),
+            message(&["DnsName(\"a\")"; 6]),
             "the certificate is for 'a', 'a', 'a', 'a', 2 more, not for '10.0.0.5'"
         );
-        assert_eq!(told(&[]), "the certificate has no alternative name: it is not for '10.0.0.5'");
-        let names = of_names(&["DnsName(\"plc7\")"]);
+        assert_eq!(
+            message(&[]),
+            "the certificate has no alternative name: it is not for '10.0.0.5'"
+        );
+        let names = wrong_names(&["DnsName(\"plc7\")"]);
         let TlsFailure::WrongName { expected, presented } = names else { panic!("{names:?}") };
         assert_eq!((expected.as_str(), presented), ("10.0.0.5", vec!["plc7".to_owned()]));
     }
@@ -437,13 +405,13 @@ mod tests {
 
     #[test]
     fn alerts_of_the_peer_and_failures_found_here_have_reasons() {
-        let told = |error: Error| TlsFailure::from(error).reason();
+        let message = |error: Error| TlsFailure::from(error).reason();
         let required = Error::AlertReceived(AlertDescription::CertificateRequired);
-        assert_eq!(told(required), "peer_requires_certificate");
-        assert_eq!(told(InvalidMessage::InvalidContentType.into()), "not_tls");
-        assert_eq!(told(InvalidMessage::UnexpectedMessage("hello").into()), "malformed_message");
-        assert_eq!(told(Error::DecryptError), "bad_record");
-        assert_eq!(told(Error::HandshakeNotComplete), "other");
+        assert_eq!(message(required), "peer_requires_certificate");
+        assert_eq!(message(InvalidMessage::InvalidContentType.into()), "not_tls");
+        assert_eq!(message(InvalidMessage::UnexpectedMessage("hello").into()), "malformed_message");
+        assert_eq!(message(Error::DecryptError), "bad_record");
+        assert_eq!(message(Error::HandshakeNotComplete), "other");
         let [here, there] = [
             TlsFailure::from(Error::from(rustls::PeerIncompatible::NoCipherSuitesInCommon)),
             TlsFailure::from(Error::AlertReceived(AlertDescription::ProtocolVersion)),

@@ -5,7 +5,7 @@
 
 mod certificate;
 pub mod client;
-mod clients;
+mod client_verifier;
 mod doubts;
 mod failure;
 mod files;
@@ -21,7 +21,7 @@ mod server_files;
 mod sessions;
 #[cfg(test)]
 pub(crate) mod test_party;
-mod trust;
+mod verification;
 
 use std::io::{Read, Write};
 

@@ -78,7 +78,7 @@ impl List {
         let usable = match &parsed.tbs_cert_list.crl_extensions {
             Some(_) => OwnedCertRevocationList::from_der(der),
             None => {
-                let complete = completed(&parsed).map_err(|error| error.to_string())?;
+                let complete = with_extensions(&parsed).map_err(|error| error.to_string())?;
                 OwnedCertRevocationList::from_der(&complete)
             }
         };
@@ -95,12 +95,12 @@ impl List {
     }
 
     pub(super) fn begins(&self) -> UnixTime {
-        moment(&self.parsed.tbs_cert_list.this_update)
+        unix_time(&self.parsed.tbs_cert_list.this_update)
     }
 
-    /// When the next list was due.
+    /// The `nextUpdate`: when the list expires. `None` if it never does.
     pub(super) fn ends(&self) -> Option<UnixTime> {
-        self.parsed.tbs_cert_list.next_update.as_ref().map(moment)
+        self.parsed.tbs_cert_list.next_update.as_ref().map(unix_time)
     }
 
     /// The required extensions that it lacks, in words.
@@ -129,12 +129,13 @@ impl List {
         if self.usable.issuer() != certificate.issuer() {
             return false;
         }
+        // Without an issuing distribution point, a list is for all certificates of its issuer.
         let Some(scope) = &self.scope else { return true };
-        let is_of_others = match is_end_entity {
+        let is_out_of_scope = match is_end_entity {
             true => scope.only_contains_ca_certs,
             false => scope.only_contains_user_certs,
         };
-        if is_of_others {
+        if is_out_of_scope {
             return false;
         }
         let own = scope.distribution_point.as_ref();
@@ -144,6 +145,7 @@ impl List {
             Ok(Some(points)) => points
                 .0
                 .iter()
+                // Indirect lists and lists for some reasons only are not supported.
                 .filter(|point| point.crl_issuer.is_none() && point.reasons.is_none())
                 .filter_map(|point| point.distribution_point.as_ref())
                 .flat_map(uris)
@@ -179,16 +181,16 @@ impl Lists {
         let mut presented = None;
         for each in path.intermediate_certificates().rev() {
             let own = parsed(each)?;
-            let list = self.list_of(each, &own, false)?;
-            self.judge_one(each, list, presented.as_ref(), listed, now)?;
+            let list = self.find_list(each, &own, false)?;
+            self.check_certificate(each, list, presented.as_ref(), listed, now)?;
             presented = Some(own);
         }
         let end_entity: &Cert<'_> = path.end_entity();
-        let list = self.list_of(end_entity, &parsed(end_entity)?, true)?;
-        self.judge_one(end_entity, list, presented.as_ref(), listed, now)
+        let list = self.find_list(end_entity, &parsed(end_entity)?, true)?;
+        self.check_certificate(end_entity, list, presented.as_ref(), listed, now)
     }
 
-    fn list_of(
+    fn find_list(
         &self,
         certificate: &Cert<'_>,
         parsed: &Parsed,
@@ -200,7 +202,7 @@ impl Lists {
 
     /// Judges a certificate by its list. Its issuer was presented, or is the listed authority, whose
     /// `keyUsage` does not matter.
-    fn judge_one(
+    fn check_certificate(
         &self,
         certificate: &Cert<'_>,
         list: &List,
@@ -256,7 +258,7 @@ fn read(der: &[u8]) -> der::Result<(&[u8], CertificateList<AnySerial>)> {
 
 /// A list without extensions as webpki requires it: of version 2, and with an extension that does
 /// not change its meaning.
-fn completed(list: &CertificateList<AnySerial>) -> der::Result<Vec<u8>> {
+fn with_extensions(list: &CertificateList<AnySerial>) -> der::Result<Vec<u8>> {
     let mut list = list.clone();
     list.tbs_cert_list.version = Version::V2;
     let number = OctetString::new(0u8.to_der()?)?;
@@ -275,7 +277,7 @@ fn uris(name: &DistributionPointName) -> Vec<&str> {
     found.flatten().collect()
 }
 
-fn moment(time: &Time) -> UnixTime {
+fn unix_time(time: &Time) -> UnixTime {
     UnixTime::since_unix_epoch(time.to_unix_duration())
 }
 
@@ -294,7 +296,7 @@ mod tests {
     use crate::tls::TlsFailure;
     use crate::tls::certificate::Purpose;
     use crate::tls::test_party::Owner;
-    use crate::tls::trust::{Listed, Trust};
+    use crate::tls::verification::{Listed, Trust};
 
     /// Within the dates of every certificate and list.
     const NOW: UnixTime = UnixTime::since_unix_epoch(Duration::from_secs(1_800_000_000));
@@ -382,13 +384,13 @@ mod tests {
         for write in [version_1, |by: &Owner, revoked: &[&Owner]| list(by, revoked, None)] {
             let (root_has, between_has) = (write(&root, &[]), write(&between, &[]));
             let revoked = [write(&root, &[&between]), write(&between, &[&leaf])];
-            let told = |lists: &[Vec<u8>]| judged(&root, lists, &chain);
-            assert_eq!(told(&[]), "");
-            assert_eq!(told(&[root_has.clone(), between_has.clone()]), "");
-            assert_eq!(told(std::slice::from_ref(&root_has)), "unknown_revocation");
-            assert_eq!(told(std::slice::from_ref(&between_has)), "unknown_revocation");
-            assert_eq!(told(&[revoked[0].clone(), between_has]), "revoked");
-            assert_eq!(told(&[root_has, revoked[1].clone()]), "revoked");
+            let reason = |lists: &[Vec<u8>]| judged(&root, lists, &chain);
+            assert_eq!(reason(&[]), "");
+            assert_eq!(reason(&[root_has.clone(), between_has.clone()]), "");
+            assert_eq!(reason(std::slice::from_ref(&root_has)), "unknown_revocation");
+            assert_eq!(reason(std::slice::from_ref(&between_has)), "unknown_revocation");
+            assert_eq!(reason(&[revoked[0].clone(), between_has]), "revoked");
+            assert_eq!(reason(&[root_has, revoked[1].clone()]), "revoked");
         }
     }
 
@@ -416,17 +418,20 @@ mod tests {
                 }
             })
         };
-        let told = |points: &[&str], scope, uri| {
+        let reason = |points: &[&str], scope, uri| {
             let leaf = leaf(points);
             let lists = [list(&root, &[&leaf], Some((scope, uri)))];
             judged(&root, &lists, &[&leaf])
         };
-        assert_eq!(told(&[], CrlScope::UserCertsOnly, "http://a"), "revoked");
-        assert_eq!(told(&["http://a"], CrlScope::UserCertsOnly, "http://a"), "revoked");
-        assert_eq!(told(&["http://b", "http://a"], CrlScope::UserCertsOnly, "http://a"), "revoked");
+        assert_eq!(reason(&[], CrlScope::UserCertsOnly, "http://a"), "revoked");
+        assert_eq!(reason(&["http://a"], CrlScope::UserCertsOnly, "http://a"), "revoked");
+        assert_eq!(
+            reason(&["http://b", "http://a"], CrlScope::UserCertsOnly, "http://a"),
+            "revoked"
+        );
         let unknown = "unknown_revocation";
-        assert_eq!(told(&["http://b"], CrlScope::UserCertsOnly, "http://a"), unknown);
-        assert_eq!(told(&[], CrlScope::CaCertsOnly, "http://a"), unknown);
+        assert_eq!(reason(&["http://b"], CrlScope::UserCertsOnly, "http://a"), unknown);
+        assert_eq!(reason(&[], CrlScope::CaCertsOnly, "http://a"), unknown);
     }
 
     #[test]

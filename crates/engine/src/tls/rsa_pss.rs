@@ -27,36 +27,25 @@ pub(super) const SCHEME_SHA256: SignatureScheme = SignatureScheme::Unknown(0x080
 pub(super) const SCHEME_SHA384: SignatureScheme = SignatureScheme::Unknown(0x080a);
 pub(super) const SCHEME_SHA512: SignatureScheme = SignatureScheme::Unknown(0x080b);
 
-/// Verifiers of signatures with SHA-256, one for each encoding of the key parameters.
-pub(super) const SHA256: [&dyn SignatureVerificationAlgorithm; 3] = {
-    const VERIFY: &RsaParameters = &signature::RSA_PSS_2048_8192_SHA256;
-    const SIGNATURE: AlgorithmIdentifier = alg_id::RSA_PSS_SHA256;
-    [
-        &Verify { key: ANY_HASH, signature: SIGNATURE, verify: VERIFY },
-        &Verify { key: ANY_SALT_SHA256, signature: SIGNATURE, verify: VERIFY },
-        &Verify { key: alg_id::RSA_PSS_SHA256, signature: SIGNATURE, verify: VERIFY },
-    ]
-};
+/// The verifiers of signatures with a hash, one for each encoding of the key parameters.
+macro_rules! verifiers {
+    ($any_salt:ident, $signature:ident, $verify:ident) => {{
+        const VERIFY: &RsaParameters = &signature::$verify;
+        const SIGNATURE: AlgorithmIdentifier = alg_id::$signature;
+        [
+            &Verify { key: ANY_HASH, signature: SIGNATURE, verify: VERIFY },
+            &Verify { key: $any_salt, signature: SIGNATURE, verify: VERIFY },
+            &Verify { key: SIGNATURE, signature: SIGNATURE, verify: VERIFY },
+        ]
+    }};
+}
 
-pub(super) const SHA384: [&dyn SignatureVerificationAlgorithm; 3] = {
-    const VERIFY: &RsaParameters = &signature::RSA_PSS_2048_8192_SHA384;
-    const SIGNATURE: AlgorithmIdentifier = alg_id::RSA_PSS_SHA384;
-    [
-        &Verify { key: ANY_HASH, signature: SIGNATURE, verify: VERIFY },
-        &Verify { key: ANY_SALT_SHA384, signature: SIGNATURE, verify: VERIFY },
-        &Verify { key: alg_id::RSA_PSS_SHA384, signature: SIGNATURE, verify: VERIFY },
-    ]
-};
-
-pub(super) const SHA512: [&dyn SignatureVerificationAlgorithm; 3] = {
-    const VERIFY: &RsaParameters = &signature::RSA_PSS_2048_8192_SHA512;
-    const SIGNATURE: AlgorithmIdentifier = alg_id::RSA_PSS_SHA512;
-    [
-        &Verify { key: ANY_HASH, signature: SIGNATURE, verify: VERIFY },
-        &Verify { key: ANY_SALT_SHA512, signature: SIGNATURE, verify: VERIFY },
-        &Verify { key: alg_id::RSA_PSS_SHA512, signature: SIGNATURE, verify: VERIFY },
-    ]
-};
+pub(super) const SHA256: [&dyn SignatureVerificationAlgorithm; 3] =
+    verifiers!(ANY_SALT_SHA256, RSA_PSS_SHA256, RSA_PSS_2048_8192_SHA256);
+pub(super) const SHA384: [&dyn SignatureVerificationAlgorithm; 3] =
+    verifiers!(ANY_SALT_SHA384, RSA_PSS_SHA384, RSA_PSS_2048_8192_SHA384);
+pub(super) const SHA512: [&dyn SignatureVerificationAlgorithm; 3] =
+    verifiers!(ANY_SALT_SHA512, RSA_PSS_SHA512, RSA_PSS_2048_8192_SHA512);
 
 /// A key without parameters: any hash.
 const ANY_HASH: AlgorithmIdentifier =

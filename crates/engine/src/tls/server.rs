@@ -13,7 +13,7 @@ use rustls::time_provider::{DefaultTimeProvider, TimeProvider};
 use rustls::{AlertDescription, Error, ProtocolVersion, ServerConfig, ServerConnection};
 
 use super::certificate::Parsed;
-use super::clients::Clients;
+use super::client_verifier::Clients;
 use super::doubts::Doubts;
 use super::files::FileError;
 use super::hello::{Hello, LENGTHS, RECORD_HEADER_LEN};

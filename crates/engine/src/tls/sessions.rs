@@ -15,7 +15,7 @@ use rustls::pki_types::UnixTime;
 use rustls::server::StoresServerSessions;
 use rustls::time_provider::TimeProvider;
 
-use super::clients::Clients;
+use super::client_verifier::Clients;
 use super::notes::{Chain, noted};
 
 /// The most sessions. The oldest gives way.

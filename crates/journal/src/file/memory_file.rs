@@ -11,13 +11,14 @@ use std::time::Duration;
 
 use holdfast_memory::{Contents, GateMode, Memory};
 
+use super::before_reply::BeforeReply;
 use super::disk::Disk;
 use super::error::FileError;
-use super::image::{Changes, Image, SET_ASIDE, StoredMemory, layout_of};
+use super::image::{Changes, Image, StoredMemory};
 use super::periodic::{Periodic, Source, writes};
 use super::queue::{Queue, QueueLimits};
+use super::set_aside::SET_ASIDE;
 use super::status::Status;
-use super::steps::Steps;
 use super::store::Store;
 
 /// A memory, and its name in the file.
@@ -42,6 +43,11 @@ pub struct Options {
 impl Options {
     pub const fn new(sync: Duration) -> Options {
         Options { sync, max_steps: 4096, max_bytes: 16 << 20, retry: Duration::from_secs(1) }
+    }
+
+    /// Whether a write is stored before it is answered.
+    const fn stores_before_reply(&self) -> bool {
+        self.sync.is_zero()
     }
 }
 
@@ -95,7 +101,7 @@ impl MemoryFile {
         options: Options,
     ) -> Result<MemoryFile, FileError> {
         // A memory has one journal, and that is the log.
-        if options.sync.is_zero() {
+        if options.stores_before_reply() {
             return Err(FileError::Memories("sync is 0, but the log confirms writes".to_owned()));
         }
         members.sort_by(|one, other| one.name.cmp(&other.name));
@@ -120,7 +126,7 @@ impl MemoryFile {
                 memory.restore(&Contents { areas, sealed: memory.sealed() });
             } else {
                 let set_aside = store.image().set_aside_of(name);
-                warnings.extend(stored.resizings(set_aside, layout_of(memory)));
+                warnings.extend(stored.resizings(set_aside, memory.layout()));
                 memory.restore(&sealed_again(&stored.with(set_aside), memory));
             }
             loaded.push(name.clone());
@@ -136,7 +142,7 @@ impl MemoryFile {
         let memories: Vec<_> = members.iter().map(|member| Arc::clone(&member.memory)).collect();
         let limits = QueueLimits { steps: options.max_steps, bytes: options.max_bytes };
         let queue = Arc::new(Queue::new(memories, limits, Arc::clone(&status)));
-        if options.sync.is_zero() {
+        if options.stores_before_reply() {
             for (number, member) in (0..).zip(&members) {
                 member.memory.keep_in(Arc::clone(&queue) as _, number);
             }
@@ -214,9 +220,9 @@ impl MemoryFile {
         };
         let (queue, retry) = (Arc::clone(&self.queue), self.options.retry);
         let keeping: Box<dyn FnOnce() -> Result<(), FileError> + Send> =
-            if self.options.sync.is_zero() {
-                let steps = Steps::new(*store, memories, ids, queue, retry);
-                Box::new(|| steps.run())
+            if self.options.stores_before_reply() {
+                let before_reply = BeforeReply::new(*store, memories, ids, queue, retry);
+                Box::new(|| before_reply.run())
             } else {
                 let (sync, stored_writes) = (self.options.sync, Arc::clone(&self.stored_writes));
                 let periodic =
@@ -257,7 +263,7 @@ impl MemoryFile {
     }
 
     pub fn status(&self) -> Status {
-        let pending = if self.options.sync.is_zero() {
+        let pending = if self.options.stores_before_reply() {
             self.queue.waiting() as u64
         } else {
             let written: u64 = self.members.iter().map(|member| member.memory.writes()).sum();
@@ -310,7 +316,7 @@ fn check(members: &[Member]) -> Result<(), FileError> {
 /// The contents of a memory from the file. Their age is unknown: a memory with a gate that
 /// opens once is sealed again, and its gate bit is 0, because the next write would open it otherwise.
 fn sealed_again(stored: &StoredMemory, memory: &Memory) -> Contents {
-    let mut areas = stored.resized(layout_of(memory));
+    let mut areas = stored.resized(memory.layout());
     let Some(gate) = memory.gate() else { return Contents { areas, sealed: false } };
     let bit = usize::from(gate.address - memory.span(gate.area).start());
     let (byte, mask) = (&mut areas[gate.area as usize][bit / 8], 1 << (bit % 8));
@@ -336,7 +342,7 @@ fn note_of(image: &Image, members: &[Member]) -> Result<Option<Vec<u8>>, FileErr
         return Err(FileError::OfLog(text));
     };
     for (Member { name, memory }, stored) in all() {
-        if stored.is_none_or(|stored| stored.layout != layout_of(memory)) {
+        if stored.is_none_or(|stored| stored.layout != memory.layout()) {
             let text = format!("the file has other areas of memory {name}: {advice}");
             return Err(FileError::OfLog(text));
         }
@@ -353,7 +359,7 @@ fn first_changes(
     let (mut changes, mut ids) = (Changes::default(), Vec::new());
     let mut free = image.free_ids();
     for (Member { name, memory }, contents) in members.iter().zip(contents) {
-        let (stored, layout) = (image.named(name), layout_of(memory));
+        let (stored, layout) = (image.named(name), memory.layout());
         let mut id_of = |stored: Option<&StoredMemory>| {
             stored.map(|stored| stored.id).or_else(|| free.next()).ok_or_else(|| {
                 let text = format!("no place for memory {name}: the file has 65536 memories");

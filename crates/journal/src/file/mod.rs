@@ -15,6 +15,7 @@
 //! * A file that is not entirely as it was stored is refused, and not changed. It is never replaced by
 //!   an empty one.
 
+mod before_reply;
 mod disk;
 mod error;
 mod image;
@@ -22,12 +23,11 @@ mod memory_file;
 mod overlay;
 mod periodic;
 mod queue;
+mod set_aside;
 mod status;
-mod steps;
 mod store;
 
 use std::path::Path;
-use std::sync::Arc;
 
 pub use disk::{Disk, FileOnDisk};
 pub use error::FileError;
@@ -35,6 +35,7 @@ pub use image::StoredMemory;
 pub use memory_file::{Member, MemoryFile, Options};
 pub use overlay::Overlay;
 pub use periodic::Source;
+pub use set_aside::release;
 pub use status::Status;
 pub use store::VERSION;
 
@@ -56,22 +57,4 @@ pub fn read_from(disk: &dyn Disk) -> Result<Vec<StoredMemory>, FileError> {
         Some(len) => Ok(store::inspect(disk, len)?.into_memories()),
         None => Err(FileError::Io(std::io::ErrorKind::NotFound.into())),
     }
-}
-
-/// Deletes what was cut from a memory and set aside in the file. Returns whether there was anything.
-///
-/// # Errors
-/// As [`read`].
-pub fn release(disk: Arc<dyn Disk>, memory: &str) -> Result<bool, FileError> {
-    if disk.size()?.is_none() {
-        return Err(FileError::Io(std::io::ErrorKind::NotFound.into()));
-    }
-    let mut store = store::Store::open(disk, Arc::default())?;
-    let set_aside = store.image().set_aside_of(memory);
-    let removed: Vec<_> =
-        set_aside.map(|stored| (stored.name.clone(), stored.id)).into_iter().collect();
-    let was = !removed.is_empty();
-    store.store(image::Changes { removed, ..image::Changes::default() })?;
-    store.close()?;
-    Ok(was)
 }

@@ -1,4 +1,4 @@
-//! Storing every few seconds what has changed.
+//! With another `sync`: what has changed is stored every so many seconds.
 
 use std::fmt;
 use std::sync::Arc;

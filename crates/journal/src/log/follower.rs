@@ -7,15 +7,15 @@ use async_nats::jetstream;
 use futures_util::StreamExt;
 use holdfast_memory::{Memory, Step};
 
-use super::connection::connect;
 use super::error::{End, LogError};
 use super::layout::fingerprint;
-use super::message::{self, Origin};
-use super::messages::{Fetched, fetched};
-use super::raw_message::Received;
 use super::settings::Settings;
 use super::state::{Place, State, digest_of};
-use super::store::{Pointer, Snapshot, Store};
+use crate::log::stream::connection::connect;
+use crate::log::stream::message::{self, Origin};
+use crate::log::stream::messages::{Fetched, fetched};
+use crate::log::stream::raw_message::Received;
+use crate::log::stream::store::{Pointer, Snapshot, Store};
 
 /// Where to end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -85,7 +85,7 @@ impl Follower {
             .build()
             .map_err(|error| LogError::Thread(error.to_string()))?;
         let opening = async {
-            let name = format!("holdfast replay {}", settings.name);
+            let name = format!("holdfast log replay {}", settings.name);
             let connected = connect(&settings.servers, name).await?;
             let context = jetstream::new(connected.client);
             let store = Store::open(&context, settings, &fingerprint(&members), false).await?;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use holdfast_memory::{Area, Gate, GateMode, Layout as Spans, LayoutError, Memory};
+use holdfast_memory::{Area, Gate, GateMode, LayoutError, Memory};
 
 /// A line for each memory, in the order of their names: name, areas with first address and size,
 /// seal.
@@ -56,12 +56,7 @@ pub(super) fn difference(log: &str, here: &str) -> Option<String> {
 /// # Errors
 /// Never for the layout of a memory that exists.
 pub(super) fn copies(members: &[Arc<Memory>]) -> Result<Vec<Arc<Memory>>, LayoutError> {
-    let copy = |memory: &Arc<Memory>| {
-        let spans = Area::ALL.into_iter();
-        let layout =
-            spans.fold(Spans::default(), |layout, area| layout.with(area, memory.span(area)));
-        Memory::new(layout, memory.gate()).map(Arc::new)
-    };
+    let copy = |memory: &Arc<Memory>| Memory::new(memory.layout(), memory.gate()).map(Arc::new);
     members.iter().map(copy).collect()
 }
 

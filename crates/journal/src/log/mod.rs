@@ -11,37 +11,22 @@
 //! done   ◄─ in_flight.rs  the outcome of the step
 //! ```
 //!
-//! `thread.rs` runs sessions, and `session.rs` joins the parts of a node (`node.rs`): `applier.rs`, `sender.rs`,
-//! `snapshotter.rs`, `comparer.rs`, and `recovery.rs` for a node whose contents were wrong. `join.rs` is for the
-//! beginning of a session, `messages.rs` reads the stream, and `note.rs` is for a node with a file.
+//! In `parts`, `thread.rs` runs sessions, and `session.rs` joins the parts of a node (`node.rs`): `applier.rs`,
+//! `sender.rs`, `snapshotter.rs`, `comparer.rs`, and `recovery.rs` for a node whose contents were wrong. `join.rs` is for
+//! the beginning of a session, and `note.rs` for a node with a file. `stream/messages.rs` reads the stream.
 
-mod applier;
-mod background;
 mod clock;
-mod comparer;
-mod connection;
+mod defaults;
 mod digests;
 mod error;
 mod follower;
-mod in_flight;
-mod join;
 mod layout;
-mod message;
-mod messages;
-mod node;
-mod note;
-mod raw_message;
-mod recovery;
-mod sender;
-mod server_lag;
-mod session;
+mod parts;
 mod settings;
 mod shared;
-mod snapshotter;
 mod state;
 mod status;
-mod store;
-mod thread;
+mod stream;
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -53,13 +38,13 @@ use holdfast_memory::{Journal, Memory};
 pub use clock::time_since_boot;
 pub use error::LogError;
 pub use follower::{Follower, Next, Record, Until};
-pub use message::Origin;
 pub use settings::{Login, Servers, Settings, Tls, WhenBehind};
 pub use shared::Checkpoint;
 pub use status::{Digest, Event, Node, Phase, Status};
+pub use stream::message::Origin;
 
-use node::Node as Running;
-use note::Note;
+use parts::node::Node as Running;
+use parts::note::Note;
 use shared::Shared;
 
 /// The journal of memories that several nodes share.
@@ -140,7 +125,8 @@ impl Log {
             node.resume(note)?;
         }
         let name = format!("log {}", self.settings.name);
-        let started = std::thread::Builder::new().name(name).spawn(move || thread::run(node));
+        let started =
+            std::thread::Builder::new().name(name).spawn(move || parts::thread::run(node));
         *thread = Some(started.map_err(|error| LogError::Thread(error.to_string()))?);
         Ok(())
     }
@@ -185,12 +171,6 @@ impl Log {
     pub fn status(&self) -> Status {
         let (view, counters) = (self.shared.view(), &self.shared.counters);
         let sequence = counters.sequence.get();
-        let nodes = view.nodes.into_iter().map(|(name, node)| Node {
-            name,
-            sequence: node.sequence,
-            stored: node.stored,
-            digest: node.digest,
-        });
         Status {
             phase: view.phase,
             server: view.server,
@@ -208,7 +188,7 @@ impl Log {
             replicas: view.replicas,
             digest: view.digest,
             snapshot: view.snapshot,
-            nodes: nodes.collect(),
+            nodes: view.nodes,
         }
     }
 

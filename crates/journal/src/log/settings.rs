@@ -83,31 +83,6 @@ pub struct Settings {
 }
 
 impl Settings {
-    pub fn new(name: &str, node: &str, urls: Vec<String>) -> Settings {
-        Settings {
-            name: name.to_owned(),
-            node: node.to_owned(),
-            servers: Servers {
-                urls,
-                login: Login::None,
-                tls: None,
-                connect_timeout: Duration::from_secs(2),
-            },
-            replicas: 1,
-            write_timeout: Duration::from_secs(1),
-            when_behind: WhenBehind::Serve,
-            max_lag: Duration::from_secs(5),
-            snapshot_steps: 100_000,
-            snapshot_after: Duration::from_secs(600),
-            digest_every: 10_000,
-            queue: 4096,
-            rejoin_after: Some(Duration::from_secs(24 * 3600)),
-            memory_file: None,
-            max_cut_off: Duration::from_secs(30),
-            answers_early: false,
-        }
-    }
-
     /// # Errors
     /// [`LogError::Settings`], which names the setting.
     pub fn check(&self) -> Result<(), LogError> {

@@ -12,10 +12,11 @@ use tokio::sync::Notify;
 use super::clock::{Clock, Moment};
 use super::error::LogError;
 use super::settings::{Settings, WhenBehind};
-use super::status::{Counters, Event, NodeView, Phase, View};
+use super::status::{Counter, Counters, Event, Node, Phase, View};
 use crate::encoding;
 
-/// The most bytes of steps that wait to be sent.
+/// The most steps that wait to be sent, and their bytes.
+pub(super) const MAX_QUEUE_STEPS: usize = 4096;
 const MAX_QUEUE_BYTES: usize = 64 << 20;
 
 /// The most events that wait to be taken. Then the oldest are dropped.
@@ -196,10 +197,8 @@ impl Shared {
         queue.bytes = 0;
         let steps = std::mem::take(&mut queue.steps);
         drop(queue);
-        self.counters.unavailable.add(steps.len() as u64);
-        for waiting in steps {
-            refuse(waiting.done, Refusal::Unavailable);
-        }
+        let steps = steps.into_iter().map(|waiting| waiting.done).collect();
+        refuse_all(steps, Refusal::Unavailable, &self.counters.unavailable);
     }
 
     /// Refuses steps that have waited too long and were not sent.
@@ -213,10 +212,7 @@ impl Shared {
             }
         }
         drop(queue);
-        self.counters.unavailable.add(late.len() as u64);
-        for done in late {
-            refuse(done, Refusal::Unavailable);
-        }
+        refuse_all(late, Refusal::Unavailable, &self.counters.unavailable);
     }
 
     /// Takes steps for one message: as many as `room` has bytes for, and at least one.
@@ -336,7 +332,7 @@ impl Shared {
     }
 
     /// Changes what is known of a node. No call waits for that, so none is woken.
-    pub(super) fn update_node(&self, node: &str, change: impl FnOnce(&mut NodeView)) {
+    pub(super) fn update_node(&self, node: &str, change: impl FnOnce(&mut Node)) {
         let nodes = &mut lock(&self.progress).view.nodes;
         match nodes.get_mut(node) {
             Some(known) => change(known),
@@ -367,8 +363,14 @@ impl Shared {
     }
 }
 
-pub(super) fn refuse(done: Done, refusal: Refusal) {
+fn refuse(done: Done, refusal: Refusal) {
     done(Err(Refused { index: 0, refusal }));
+}
+
+/// Refuses and counts steps.
+pub(super) fn refuse_all(steps: Vec<Done>, refusal: Refusal, counted: &Counter) {
+    counted.add(steps.len() as u64);
+    steps.into_iter().for_each(|done| refuse(done, refusal));
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

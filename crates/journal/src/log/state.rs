@@ -12,8 +12,8 @@ use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
 
 use super::error::LogError;
-use super::message::{self, MAX_NODES, Message, MessageError, Origin, VERSION};
 use super::settings::is_word;
+use crate::log::stream::message::{self, MAX_NODES, Message, MessageError, Origin, VERSION};
 
 /// An encoded state begins with it.
 const MARK: [u8; 3] = *b"HFS";
@@ -153,11 +153,11 @@ impl State {
         out
     }
 
-    /// Puts an encoded state in place of this one, if it fits the memories.
+    /// Puts an encoded state in place of this one, if it fits the memories and is of this place.
     ///
     /// # Errors
     /// [`LogError::Version`], or [`LogError::Snapshot`]. Nothing has changed then.
-    pub(super) fn load(&mut self, bytes: &[u8]) -> Result<(), LogError> {
+    pub(super) fn load(&mut self, bytes: &[u8], expected: Place) -> Result<(), LogError> {
         let malformed = || LogError::Snapshot("the snapshot of the log is malformed".to_owned());
         let bytes = bytes.strip_prefix(&MARK).ok_or_else(malformed)?;
         let (&found, bytes) = bytes.split_first().ok_or_else(malformed)?;
@@ -168,6 +168,11 @@ impl State {
         let mut rest = Rest(bytes);
         let loaded = rest.state(&self.members).filter(|_| rest.0.is_empty());
         let (place, steps, origins, contents) = loaded.ok_or_else(malformed)?;
+        if place != expected {
+            let sequence = expected.sequence;
+            let text = format!("the snapshot at sequence {sequence}: it has another sequence");
+            return Err(LogError::Snapshot(text));
+        }
         for (memory, contents) in self.members.iter().zip(&contents) {
             memory.restore(contents);
         }
@@ -242,7 +247,31 @@ impl<'a> Rest<'a> {
 
 #[cfg(test)]
 mod tests {
+    use holdfast_memory::{Layout, Span};
+
     use super::*;
+
+    fn member() -> Arc<Memory> {
+        let layout = Layout::default().with(Area::Coils, Span::new(0, 8).unwrap());
+        Arc::new(Memory::new(layout, None).unwrap())
+    }
+
+    #[test]
+    fn a_state_of_another_place_changes_nothing() {
+        let (from, into) = (member(), member());
+        let mut contents = Memory::contents(std::slice::from_ref(&from)).remove(0);
+        contents.areas[0][0] = 1;
+        from.restore(&contents);
+        let place = Place { sequence: 7, stored: 1 };
+        let saved = State { place, ..State::new(vec![from]) }.encode();
+        let mut state = State::new(vec![into]);
+        let before = state.encode();
+        let error = state.load(&saved, Place { sequence: 8, stored: 1 }).unwrap_err();
+        assert!(error.to_string().contains("sequence 8: it has another sequence"));
+        assert_eq!(state.encode(), before);
+        state.load(&saved, place).unwrap();
+        assert_eq!(state.encode(), saved);
+    }
 
     #[test]
     fn a_place_is_shown_with_its_time() {

@@ -58,7 +58,7 @@ pub(super) struct View {
     pub(super) replicas: usize,
     pub(super) digest: Option<Digest>,
     pub(super) snapshot: Option<u64>,
-    pub(super) nodes: BTreeMap<String, NodeView>,
+    pub(super) nodes: BTreeMap<String, Node>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -69,18 +69,9 @@ pub struct Digest {
     pub agrees: Option<bool>,
 }
 
+/// What is known of a node of the log.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(super) struct NodeView {
-    /// The sequence of its last message, and when the stream stored it.
-    pub(super) sequence: u64,
-    pub(super) stored: i64,
-    pub(super) digest: Option<(u64, String)>,
-}
-
-/// A node of the log.
-#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Node {
-    pub name: String,
     /// The sequence of its last message.
     pub sequence: u64,
     /// When the stream stored that, in nanoseconds of Unix time.
@@ -117,7 +108,7 @@ pub struct Status {
     pub digest: Option<Digest>,
     /// The sequence of the newest snapshot.
     pub snapshot: Option<u64>,
-    pub nodes: Vec<Node>,
+    pub nodes: BTreeMap<String, Node>,
 }
 
 /// Something that happened, for the log of the program.

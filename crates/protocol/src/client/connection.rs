@@ -5,11 +5,11 @@ use alloc::vec::Vec;
 use core::mem::take;
 use core::time::Duration;
 
-use super::earlier::Earlier;
 use super::flights::{Call, Done, Flights, Strays, Ticket};
-use super::lateness::Lateness;
+use super::late_replies::LateReplies;
 use super::mbap_datagrams::Datagrams;
 use super::mbap_stream::Stream;
+use super::raised_timeouts::Lateness;
 use super::rtu_and_ascii::{Framing, OneAtATime};
 use super::{Attempt, Closed, Time, Tolerance, Transport};
 use crate::pdu::EncodedRequest;
@@ -60,7 +60,7 @@ enum Left {
     Ids(u16, Vec<u16>, Lateness),
     /// How late replies are.
     Lateness(Lateness),
-    Earlier(Earlier),
+    LateReplies(LateReplies),
 }
 
 #[derive(Debug)]
@@ -130,7 +130,9 @@ impl Connection {
                 Past(Left::Ids(next_id, given_up, take(&mut stream.lateness)))
             }
             Wire::Datagrams(datagrams) => Past(Left::Lateness(take(&mut datagrams.lateness))),
-            Wire::OneAtATime(line) => Past(Left::Earlier(line.take_earlier(&self.flights, now))),
+            Wire::OneAtATime(line) => {
+                Past(Left::LateReplies(line.take_late_replies(&self.flights, now)))
+            }
         }
     }
 
@@ -142,7 +144,9 @@ impl Connection {
                 stream.lateness = lateness;
             }
             (Wire::Datagrams(datagrams), Left::Lateness(lateness)) => datagrams.lateness = lateness,
-            (Wire::OneAtATime(line), Left::Earlier(earlier)) => line.earlier = earlier,
+            (Wire::OneAtATime(line), Left::LateReplies(late_replies)) => {
+                line.late_replies = late_replies;
+            }
             _ => {}
         }
     }

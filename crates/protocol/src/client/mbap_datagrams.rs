@@ -4,13 +4,13 @@ use alloc::collections::VecDeque;
 use core::time::Duration;
 
 use super::flights::{Call, Done, Flights, Ticket};
-use super::lateness::{Lateness, MAX_RAISED};
 use super::mbap_stream;
+use super::raised_timeouts::{Lateness, MAX_RAISED_FACTOR};
 use super::{Closed, Failure, InvalidResponse, MAX_STRAY_DATAGRAMS, Time, Tolerance, UDP_ATTEMPTS};
 use crate::frame::mbap::{self, Next};
 
 /// The number of requests whose late replies are recognized.
-const RECENT: usize = 16;
+const MAX_RECENT_REQUESTS: usize = 16;
 
 #[derive(Debug, Default)]
 pub(super) struct Datagrams {
@@ -79,7 +79,7 @@ impl Datagrams {
     fn late(&mut self, flights: &mut Flights, request: Recent, now: Time) {
         let Recent { unit_id, sent, within, is_answered, .. } = request;
         let took = if is_answered { Duration::ZERO } else { now.saturating_sub(sent) };
-        let took = took.min(within * MAX_RAISED);
+        let took = took.min(within * MAX_RAISED_FACTOR);
         flights.came_late(took);
         if took > within {
             self.lateness.late(unit_id, took);
@@ -92,7 +92,7 @@ impl Datagrams {
         let every = within / UDP_ATTEMPTS;
         let left = if call.request.is_read() { UDP_ATTEMPTS - 1 } else { 0 };
         self.repeat = (left > 0).then_some(Repeat { at: now + every, every, left });
-        self.recent.truncate(RECENT - 1);
+        self.recent.truncate(MAX_RECENT_REQUESTS - 1);
         let (left, is_answered) = (left + 1, false);
         let sent = now;
         let recent = Recent { transaction_id: id, unit_id, sent, within, left, is_answered };

@@ -6,7 +6,7 @@ use alloc::vec::Vec;
 use core::time::Duration;
 
 use super::flights::{Call, Done, Flight, Flights, Ticket};
-use super::lateness::{Lateness, MAX_RAISED};
+use super::raised_timeouts::{Lateness, MAX_RAISED_FACTOR};
 use super::{Closed, Failure, InvalidResponse, MAX_CONSECUTIVE_TIMEOUTS, Time};
 use crate::frame::mbap::{self, Next};
 
@@ -14,7 +14,7 @@ use crate::frame::mbap::{self, Next};
 const EXCEPTION_LEN: usize = mbap::HEADER_LEN + 2;
 
 /// The number of transaction ids.
-const IDS: usize = 65_536;
+const TRANSACTION_IDS: usize = 65_536;
 
 #[derive(Debug, Default)]
 pub(super) struct Stream {
@@ -49,7 +49,7 @@ impl GivenUp {
 }
 
 /// Given up requests whose transaction ids the next connection knows.
-const REMEMBERED: u16 = 4096;
+const MAX_REMEMBERED_IDS: u16 = 4096;
 
 impl Stream {
     pub(super) fn randomize(&mut self, seed: u64) {
@@ -60,7 +60,7 @@ impl Stream {
     pub(super) fn take_ids(&mut self, flights: &Flights) -> (u16, Vec<u16>) {
         let given_up = core::mem::take(&mut self.given_up).into_keys();
         let mut ids: Vec<u16> = given_up.chain(flights.unanswered.iter().copied()).collect();
-        ids.retain(|id| self.next_id.wrapping_sub(*id) <= REMEMBERED);
+        ids.retain(|id| self.next_id.wrapping_sub(*id) <= MAX_REMEMBERED_IDS);
         (self.next_id, ids)
     }
 
@@ -76,7 +76,7 @@ impl Stream {
         call: Call<'_>,
         now: Time,
     ) -> Option<Ticket> {
-        if flights.len() + self.given_up.len() >= IDS {
+        if flights.len() + self.given_up.len() >= TRANSACTION_IDS {
             return None;
         }
         let mut id = self.next_id;
@@ -212,7 +212,7 @@ impl Stream {
             return flights.came_late(Duration::ZERO);
         };
         // The owner of the socket may not have read for a while.
-        let took = now.saturating_sub(began).min(within * MAX_RAISED);
+        let took = now.saturating_sub(began).min(within * MAX_RAISED_FACTOR);
         flights.came_late(took);
         flights.restart_after(ticket, now);
         // A device that handles one request at a time can't have begun those after it before.

@@ -26,16 +26,17 @@
 //! An ended connection cannot be used again: the driver creates a new one.
 
 mod connection;
-mod earlier;
 mod flights;
-mod lateness;
+mod late_replies;
 mod mbap_datagrams;
 mod mbap_stream;
+mod raised_timeouts;
 mod rtu_and_ascii;
 mod tolerance;
 
 pub use connection::{Connection, Past};
 pub use flights::{Done, Strays, Ticket};
+pub use late_replies::MAX_LATENESS;
 pub use tolerance::{AcceptUnit, Attempt, BUSY_PAUSE, Echo, Tolerance};
 
 use core::time::Duration;
@@ -65,9 +66,6 @@ pub const TURNAROUND: Duration = Duration::from_millis(100);
 /// The time after a reply in which the same one may come again, on lines and streams without transaction
 /// ids. It passes before the next request until enough replies have come once.
 pub const GUARD: Duration = Duration::from_millis(25);
-
-/// How long after its timeout a late reply may come at most, where there are no transaction ids.
-pub const MAX_LATENESS: Duration = Duration::from_secs(10);
 
 /// The transport of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

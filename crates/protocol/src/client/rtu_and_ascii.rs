@@ -2,13 +2,13 @@
 //! transaction ids. On a serial line, silence separates replies: unrequested bytes are discarded,
 //! and a request waits until the line is silent. A stream has no silence: there, unrequested bytes
 //! or a timeout end the connection. A request also waits until no reply to an earlier one can come that
-//! could be taken for its own ([`Earlier`]), on the next connection too.
+//! could be taken for its own ([`LateReplies`]), on the next connection too.
 
 use alloc::vec::Vec;
 use core::time::Duration;
 
-use super::earlier::{Earlier, Ended};
 use super::flights::{Call, Done, Flight, Flights, Ticket};
+use super::late_replies::{Ended, LateReplies};
 use super::tolerance::{Attempt, Echo};
 use super::{Closed, Failure, GUARD, InvalidResponse, TURNAROUND, Time};
 use crate::frame::{FrameError, ascii, rtu};
@@ -21,13 +21,13 @@ pub(super) enum Framing {
 }
 
 /// Reads in a row whose echo came before their reply, after which an echo is expected of writes too.
-const ECHOES: u8 = 3;
+const MIN_ECHOES: u8 = 3;
 
 /// The exception of a gateway that has no reply yet: that of the device may follow.
-const NO_REPLY: u8 = ExceptionCode::GatewayTargetFailedToRespond as u8;
+const GATEWAY_NO_REPLY: u8 = ExceptionCode::GatewayTargetFailedToRespond as u8;
 
 /// Bytes behind a reply that are no sign of another one: lines have some when a driver is switched off.
-const NOISE: usize = 2;
+const MAX_NOISE_BYTES: usize = 2;
 
 #[derive(Debug)]
 pub(super) struct OneAtATime {
@@ -35,7 +35,7 @@ pub(super) struct OneAtATime {
     /// The silence between frames on a serial line; `None` for a stream.
     silence: Option<Duration>,
     echo: Echo,
-    pub(super) earlier: Earlier,
+    pub(super) late_replies: LateReplies,
     /// The time of a character on a serial line; 0 elsewhere.
     pub(super) character: Duration,
     /// The timeout that the request was given: its own may be longer.
@@ -95,7 +95,7 @@ impl OneAtATime {
             framing,
             silence,
             echo,
-            earlier: Earlier::default(),
+            late_replies: LateReplies::default(),
             character: Duration::ZERO,
             timeout: Duration::ZERO,
             start: Time::ZERO,
@@ -142,8 +142,9 @@ impl OneAtATime {
         self.repeats = attempt != Attempt::default();
         let may_begin = start.max(self.clear_at(flights, (unit_id, request), now));
         let ticket = flights.push(call, 0, may_begin);
-        let until =
-            self.silence.map_or(may_begin, |silence| may_begin.max(self.earlier.used + silence));
+        let until = self
+            .silence
+            .map_or(may_begin, |silence| may_begin.max(self.late_replies.used + silence));
         self.state = State::Quieting { until };
         self.transmit(flights, now);
         ticket
@@ -160,9 +161,9 @@ impl OneAtATime {
         if self.repeats || is_broadcast {
             return Time::ZERO;
         }
-        let clear = self.earlier.until(unit_id, request, &flights.tolerance, now);
-        let used = self.earlier.used;
-        let guarded = if used.is_zero() { used } else { used + self.earlier.guard() };
+        let clear = self.late_replies.until(unit_id, request, &flights.tolerance, now);
+        let used = self.late_replies.used;
+        let guarded = if used.is_zero() { used } else { used + self.late_replies.guard() };
         clear.unwrap_or_default().max(guarded)
     }
 
@@ -182,8 +183,8 @@ impl OneAtATime {
         {
             flights.out.extend_from_slice(&self.frame);
             let unit_id = flights.first().map_or(0, |flight| flight.unit_id);
-            flights.transmitted(self.earlier.timeout(unit_id, self.timeout), now);
-            self.earlier.expire(now);
+            flights.transmitted(self.late_replies.timeout(unit_id, self.timeout), now);
+            self.late_replies.expire(now);
             self.received.clear();
             let broadcast = flights.first().is_some_and(|flight| flight.unit_id == 0);
             self.state = if broadcast && self.silence.is_some() {
@@ -253,9 +254,9 @@ impl OneAtATime {
         }
         if late == 0 && self.is_reply() {
             self.received.clear();
-            self.earlier.stray(now.saturating_sub(self.earlier.used));
+            self.late_replies.stray(now.saturating_sub(self.late_replies.used));
         }
-        self.earlier.used = now;
+        self.late_replies.used = now;
         let Some(silence) = self.silence else {
             if is_idle && late == 0 && !may_be_surplus {
                 flights.close(Closed::Invalid(InvalidResponse::Unrequested), sink);
@@ -278,7 +279,7 @@ impl OneAtATime {
     fn take_late(&mut self, flights: &mut Flights, now: Time) -> usize {
         let mut taken = 0;
         while let Some((place, at, len)) = self.late_reply(flights.tolerance.pad) {
-            let took = self.earlier.late(place, now);
+            let took = self.late_replies.late(place, now);
             self.received.drain(at..at + len);
             flights.came_late(took);
             taken += len;
@@ -288,8 +289,8 @@ impl OneAtATime {
 
     /// The place of an earlier request whose reply was received, and where it is.
     fn late_reply(&self, pads: bool) -> Option<(usize, usize, usize)> {
-        let mut earlier = self.earlier.unanswered().enumerate();
-        earlier.find_map(|(place, earlier)| {
+        let mut unanswered = self.late_replies.unanswered().enumerate();
+        unanswered.find_map(|(place, earlier)| {
             let (unit_id, request) = (earlier.unit_id, &earlier.request);
             (0..self.received.len()).find_map(|at| {
                 let len = self.reply_to(unit_id, request, pads, &self.received[at..])?;
@@ -343,20 +344,20 @@ impl OneAtATime {
         now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
-        if self.is_too_fast(flights, pdu.len(), now) && !self.earlier.shows_fast_line(&pdu) {
+        if self.is_too_fast(flights, pdu.len(), now) && !self.late_replies.shows_fast_line(&pdu) {
             flights.strays.replies += 1;
             flights.strays.bytes += self.received.len() as u64;
             self.received.clear();
-            return self.earlier.came_too_fast();
+            return self.late_replies.came_too_fast();
         }
         let behind = core::mem::replace(&mut self.behind, Behind::NoFrame);
         let is_like_echo = self.is_like_echo(flights, &pdu);
         if is_like_echo && behind == Behind::Same {
-            self.earlier.echoes = self.earlier.echoes.saturating_add(1);
+            self.late_replies.echoes = self.late_replies.echoes.saturating_add(1);
             return self.replied(flights, unit_id, &pdu, now, sink);
         }
         if behind != Behind::NoFrame && !flights.tolerance.pad {
-            self.earlier.stray(Duration::ZERO);
+            self.late_replies.stray(Duration::ZERO);
         }
         if behind == Behind::Another && !flights.tolerance.pad {
             return self.contradicted(flights, now, sink);
@@ -365,7 +366,7 @@ impl OneAtATime {
         let is_doubtful = flights.first().is_some_and(|flight| {
             let request = (flight.unit_id, flight.request.pdu());
             let is_its = accepted.accepts(flight.unit_id, unit_id);
-            is_its && !self.repeats && self.earlier.is_doubtful(request, &pdu, now)
+            is_its && !self.repeats && self.late_replies.is_doubtful(request, &pdu, now)
         });
         if is_doubtful || is_like_echo {
             if let (State::Sent { .. }, Some(flight)) = (self.state, flights.first()) {
@@ -375,7 +376,7 @@ impl OneAtATime {
                 // An echo is no reply, however long that takes.
                 true => flight.deadline,
                 // The unit may take as long as usual.
-                false => flight.sent + self.earlier.longest(flight.unit_id) * 2,
+                false => flight.sent + self.late_replies.longest(flight.unit_id) * 2,
             });
             (self.doubted, self.is_maybe_echo) = (Some((unit_id, pdu)), is_like_echo);
             self.received.clear();
@@ -393,7 +394,7 @@ impl OneAtATime {
             Framing::Ascii => 2 * pdu_len + 7,
         };
         let least = self.character * (self.frame.len() + reply_len) as u32;
-        now.saturating_sub(flight.sent) < least && !self.earlier.is_fast_line()
+        now.saturating_sub(flight.sent) < least && !self.late_replies.is_fast_line()
     }
 
     /// Whether this reply may be an echo: it equals the request, and the last reads had one, but too few to
@@ -401,7 +402,7 @@ impl OneAtATime {
     fn is_like_echo(&self, flights: &Flights, pdu: &[u8]) -> bool {
         let State::Sent { echoed: false } = self.state else { return false };
         let equals = flights.first().is_some_and(|flight| flight.request.pdu() == pdu);
-        equals && self.echo == Echo::Auto && (1..ECHOES).contains(&self.earlier.echoes)
+        equals && self.echo == Echo::Auto && (1..MIN_ECHOES).contains(&self.late_replies.echoes)
     }
 
     /// Handles bytes after a reply that is doubted.
@@ -415,21 +416,21 @@ impl OneAtATime {
         let room = self.max_received() - self.received.len();
         self.received.extend_from_slice(&bytes[..bytes.len().min(room)]);
         if self.is_maybe_echo && self.frame == self.received {
-            self.earlier.echoes = self.earlier.echoes.saturating_add(1);
+            self.late_replies.echoes = self.late_replies.echoes.saturating_add(1);
             return self.believe_doubted(flights, now, sink);
         }
         if self.is_maybe_echo && self.frame.starts_with(&self.received) {
             return;
         }
         flights.strays.bytes += bytes.len() as u64;
-        if self.received.len() > NOISE {
+        if self.received.len() > MAX_NOISE_BYTES {
             self.contradicted(flights, now, sink);
         }
     }
 
     /// Nothing followed what may have been an echo, so it is no reply. If it was one, the next is believed.
     fn was_echo(&mut self) {
-        self.earlier.echoes = self.earlier.echoes.saturating_sub(1);
+        self.late_replies.echoes = self.late_replies.echoes.saturating_sub(1);
         self.doubted = None;
         self.state = State::Sent { echoed: true };
     }
@@ -455,7 +456,7 @@ impl OneAtATime {
 
     /// Two replies came to one request: nothing shows which one is its own.
     fn contradicted(&mut self, flights: &mut Flights, now: Time, sink: &mut impl FnMut(Done<'_>)) {
-        self.earlier.stray(Duration::ZERO);
+        self.late_replies.stray(Duration::ZERO);
         self.doubted = None;
         self.state = State::Sent { echoed: true };
         self.invalid(flights, InvalidResponse::Unrequested, now, sink);
@@ -477,15 +478,17 @@ impl OneAtATime {
         let doubted = matches!(self.state, State::Doubting { .. });
         if let Some(flight) = flights.first() {
             let request = (flight.unit_id, flight.request.pdu());
-            self.earlier.believed(request, pdu, doubted, now);
+            self.late_replies.believed(request, pdu, doubted, now);
             let took = now.saturating_sub(flight.sent);
-            self.earlier.answered(flight.unit_id, took, self.timeout);
+            self.late_replies.answered(flight.unit_id, took, self.timeout);
             let (request, times) = ((flight.unit_id, &flight.request), (flight.sent, self.timeout));
             if self.repeats {
-                self.earlier.repeated(request, flight.sent, now);
+                self.late_replies.repeated(request, flight.sent, now);
             }
-            if pdu.first().is_some_and(|code| code & 0x80 != 0) && pdu.get(1) == Some(&NO_REPLY) {
-                self.earlier.ended(request, times, Ended::Other, now);
+            if pdu.first().is_some_and(|code| code & 0x80 != 0)
+                && pdu.get(1) == Some(&GATEWAY_NO_REPLY)
+            {
+                self.late_replies.ended(request, times, Ended::Other, now);
             }
             self.learn_echo(is_no_reply(flight));
         }
@@ -495,7 +498,7 @@ impl OneAtATime {
         let Some(invalid) = flights.answer(0, pdu, now, sink) else { return };
         if let Some((unit_id, request)) = unanswered {
             let times = (sent, self.timeout);
-            self.earlier.ended((unit_id, &request), times, Ended::Other, now);
+            self.late_replies.ended((unit_id, &request), times, Ended::Other, now);
         }
         if self.silence.is_none() {
             flights.close(Closed::Invalid(invalid), sink);
@@ -522,23 +525,28 @@ impl OneAtATime {
     }
 
     /// Takes what the next connection has to know of earlier requests.
-    pub(super) fn take_earlier(&mut self, flights: &Flights, now: Time) -> Earlier {
+    pub(super) fn take_late_replies(&mut self, flights: &Flights, now: Time) -> LateReplies {
         if let (State::Sent { .. }, Some(cut_off)) = (self.state, &flights.cut_off) {
             let (unit_id, request, sent, timeout) = cut_off;
-            self.earlier.ended((*unit_id, request), (*sent, *timeout), Ended::WithConnection, now);
+            self.late_replies.ended(
+                (*unit_id, request),
+                (*sent, *timeout),
+                Ended::WithConnection,
+                now,
+            );
         }
-        core::mem::take(&mut self.earlier)
+        core::mem::take(&mut self.late_replies)
     }
 
     /// Notes that the request ends without its reply, if it was sent.
     fn note_ended(&mut self, flights: &Flights, how: Ended, now: Time) {
         if let (State::Sent { echoed }, Some(flight)) = (self.state, flights.first()) {
             let times = (flight.sent, self.timeout);
-            self.earlier.ended((flight.unit_id, &flight.request), times, how, now);
+            self.late_replies.ended((flight.unit_id, &flight.request), times, how, now);
             // A reply came without the echo that was expected.
             let is_mute = self.received.is_empty();
             if how == Ended::TimedOut && !echoed && !is_mute && !is_no_reply(flight) {
-                self.earlier.echoes = 0;
+                self.late_replies.echoes = 0;
             }
         }
     }
@@ -546,7 +554,8 @@ impl OneAtATime {
     /// An echo before the reply to a read shows that the adapter echoes, and no echo that it does not.
     fn learn_echo(&mut self, is_unmistakable: bool) {
         if let (State::Sent { echoed }, true) = (self.state, is_unmistakable) {
-            self.earlier.echoes = if echoed { self.earlier.echoes.saturating_add(1) } else { 0 };
+            self.late_replies.echoes =
+                if echoed { self.late_replies.echoes.saturating_add(1) } else { 0 };
         }
     }
 
@@ -555,7 +564,7 @@ impl OneAtATime {
         match self.echo {
             Echo::Always => true,
             Echo::Never => false,
-            Echo::Auto => self.earlier.echoes >= ECHOES && !is_no_reply(flight),
+            Echo::Auto => self.late_replies.echoes >= MIN_ECHOES && !is_no_reply(flight),
         }
     }
 
@@ -568,7 +577,7 @@ impl OneAtATime {
     fn rest(&mut self, now: Time) {
         self.state = State::Idle;
         self.received.clear();
-        self.earlier.used = now;
+        self.late_replies.used = now;
     }
 
     pub(super) fn advance(

@@ -33,8 +33,8 @@ pub const HEADER_LEN: usize = 7;
 /// The longest frame, in bytes.
 pub const MAX_LEN: usize = HEADER_LEN + pdu::MAX_LEN;
 
-/// Bytes that the length field does not count.
-const UNCOUNTED: usize = 6;
+/// Transaction id, protocol id and the length field itself: the length counts the bytes behind them.
+const LEN_OF_UNCOUNTED_FIELDS: usize = 6;
 
 /// What is at the start of received bytes. A caller must handle each case, so this enum is
 /// exhaustive.
@@ -80,7 +80,7 @@ pub fn next(bytes: &[u8]) -> Next<'_> {
     let Some((unit_id, pdu)) = rest.get(..usize::from(length)).and_then(<[u8]>::split_first) else {
         return Next::Incomplete;
     };
-    let len = UNCOUNTED + usize::from(length);
+    let len = LEN_OF_UNCOUNTED_FIELDS + usize::from(length);
     match u16::from_be_bytes([p0, p1]) {
         0 => {
             let transaction_id = u16::from_be_bytes([t0, t1]);

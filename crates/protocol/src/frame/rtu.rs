@@ -334,10 +334,12 @@ pub(crate) fn response_pdu_len(
     let Some((function_code, data)) = bytes.split_first() else { return Ok(None) };
     let data_len = match *function_code {
         0x80.. => Some(1),
-        1..=4 | 17 | 23 => data.first().map(|count| 1 + usize::from(*count)),
+        1..=4 | 12 | 17 | 20 | 21 | 23 => data.first().map(|count| 1 + usize::from(*count)),
+        7 => Some(1),
         5 | 6 | 11 | 15 | 16 => Some(4),
         8 => Some(request_len.saturating_sub(1)),
         22 => Some(6),
+        24 => data.first_chunk().map(|count| 2 + usize::from(u16::from_be_bytes(*count))),
         43 => identification_len(data),
         _ => return Err(FrameError::Length),
     };

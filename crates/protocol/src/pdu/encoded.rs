@@ -9,6 +9,8 @@ use super::{Buffer, ExceptionCode, MAX_LEN, Request, Response, ResponseError};
 pub struct EncodedRequest {
     pdu: Buffer,
     len: u8,
+    /// Whether its response is [`Response::Opaque`].
+    is_opaque: bool,
 }
 
 impl EncodedRequest {
@@ -16,7 +18,7 @@ impl EncodedRequest {
     pub fn new(request: &Request<'_>) -> EncodedRequest {
         let mut pdu = [0; MAX_LEN];
         let len = request.encode(&mut pdu);
-        EncodedRequest { pdu, len: len as u8 }
+        EncodedRequest { pdu, len: len as u8, is_opaque: false }
     }
 
     /// Checks and copies a PDU that was encoded elsewhere.
@@ -25,11 +27,13 @@ impl EncodedRequest {
     /// As [`Request::parse`].
     pub fn parse(encoded: &[u8]) -> Result<EncodedRequest, ExceptionCode> {
         Request::parse(encoded)?;
-        EncodedRequest::opaque(encoded).ok_or(ExceptionCode::IllegalDataValue)
+        let opaque = EncodedRequest::opaque(encoded).ok_or(ExceptionCode::IllegalDataValue)?;
+        Ok(EncodedRequest { is_opaque: false, ..opaque })
     }
 
-    /// Copies a PDU of any function and form, for a gateway that leaves the judgement to the device.
-    /// `None` unless it has 1 to [`MAX_LEN`] bytes, and its function code is below 128.
+    /// Copies a PDU of any function and form, for a gateway that leaves the judgement to the device,
+    /// or for a function of a device's own. Its response is [`Response::Opaque`]. `None` unless the PDU
+    /// has 1 to [`MAX_LEN`] bytes, and its function code is below 128.
     ///
     /// ```
     /// use holdfast_protocol::pdu::{EncodedRequest, Response};
@@ -37,6 +41,10 @@ impl EncodedRequest {
     /// let vendor = EncodedRequest::opaque(&[66, 1, 2]).unwrap();
     /// assert_eq!(vendor.request(), None);
     /// assert_eq!(vendor.response(&[66, 7]), Ok(Response::Opaque(&[7])));
+    ///
+    /// let known = EncodedRequest::opaque(&[3, 0, 9, 0, 1]).unwrap();
+    /// assert_eq!(known.response(&[3, 2, 0, 7]), Ok(Response::Opaque(&[2, 0, 7])));
+    /// assert!(known.response(&[3, 4, 0, 7, 0, 8]).is_err());
     /// ```
     pub fn opaque(pdu: &[u8]) -> Option<EncodedRequest> {
         if pdu.first().is_none_or(|code| code & 0x80 != 0) {
@@ -44,7 +52,7 @@ impl EncodedRequest {
         }
         let mut copy = [0; MAX_LEN];
         copy.get_mut(..pdu.len())?.copy_from_slice(pdu);
-        Some(EncodedRequest { pdu: copy, len: pdu.len() as u8 })
+        Some(EncodedRequest { pdu: copy, len: pdu.len() as u8, is_opaque: true })
     }
 
     /// The PDU, 1 to [`MAX_LEN`] bytes.
@@ -65,14 +73,15 @@ impl EncodedRequest {
         self.request().is_some_and(|request| request.is_read())
     }
 
-    /// Parses the PDU that answers this request. Of the answer to a request that is passed on as it
-    /// came, only the function code is judged.
+    /// Parses the PDU that answers this request. Of the answer to a request that a server would refuse,
+    /// only the function code is judged.
     ///
     /// # Errors
     /// As [`Request::response`].
     pub fn response<'p>(&self, pdu: &'p [u8]) -> Result<Response<'p>, ResponseError> {
         if let Some(request) = self.request() {
-            return request.response(pdu);
+            let response = request.response(pdu)?;
+            return Ok(if self.is_opaque { Response::Opaque(&pdu[1..]) } else { response });
         }
         let expected = self.pdu()[0];
         match pdu {

@@ -22,20 +22,31 @@ codes! {
         ReadInputRegisters = 4, "Read Input Registers";
         WriteSingleCoil = 5, "Write Single Coil";
         WriteSingleRegister = 6, "Write Single Register";
+        ReadExceptionStatus = 7, "Read Exception Status";
         Diagnostics = 8, "Diagnostics";
         GetCommEventCounter = 11, "Get Comm Event Counter";
+        GetCommEventLog = 12, "Get Comm Event Log";
         WriteMultipleCoils = 15, "Write Multiple Coils";
         WriteMultipleRegisters = 16, "Write Multiple Registers";
         ReportServerId = 17, "Report Server ID";
+        ReadFileRecord = 20, "Read File Record";
+        WriteFileRecord = 21, "Write File Record";
         MaskWriteRegister = 22, "Mask Write Register";
         ReadWriteMultipleRegisters = 23, "Read/Write Multiple Registers";
+        ReadFifoQueue = 24, "Read FIFO Queue";
         /// Only MEI type 14, Read Device Identification.
         EncapsulatedInterface = 43, "Encapsulated Interface Transport";
     }
 }
 
 impl Function {
-    /// Whether the function changes coils or registers.
+    /// The function of a PDU; `None` if it is empty, or of another function.
+    #[inline]
+    pub fn from_pdu(pdu: &[u8]) -> Option<Function> {
+        Function::from_code(*pdu.first()?)
+    }
+
+    /// Whether the function changes coils, registers or files.
     pub const fn is_write(self) -> bool {
         matches!(
             self,
@@ -43,6 +54,7 @@ impl Function {
                 | Function::WriteSingleRegister
                 | Function::WriteMultipleCoils
                 | Function::WriteMultipleRegisters
+                | Function::WriteFileRecord
                 | Function::MaskWriteRegister
                 | Function::ReadWriteMultipleRegisters
         )

@@ -8,6 +8,7 @@
 mod data;
 mod diagnostics;
 mod encoded;
+mod file;
 mod function;
 pub mod identification;
 pub mod limit;
@@ -21,6 +22,7 @@ mod sub_function;
 pub use data::{Bits, Registers, pack_bits, pack_registers};
 pub use diagnostics::Diagnostics;
 pub use encoded::EncodedRequest;
+pub use file::{FileAnswer, FileRange, FileRanges, FileRecords};
 pub use function::{ExceptionCode, Function};
 pub use range::{BitRange, Range, RegisterRange};
 pub use request::Request;

@@ -3,8 +3,8 @@
 
 use super::request::{coil, put_words};
 use super::{
-    BitRange, Bits, Buffer, Diagnostics, ExceptionCode, Function, MAX_LEN, RegisterRange,
-    Registers, Request, SubFunction, limit,
+    BitRange, Bits, Buffer, Diagnostics, ExceptionCode, FileRange, FileRanges, FileRecords,
+    Function, MAX_LEN, RegisterRange, Registers, Request, SubFunction, limit, pack_registers,
 };
 
 /// The most bytes of a [`server_id`].
@@ -57,7 +57,7 @@ pub fn read_discrete_inputs(range: BitRange, pdu: &mut Buffer) -> (&mut [u8], us
 /// length of the reply.
 ///
 /// The place has [`RegisterRange::byte_len`] bytes, two for each register, the high byte first. The
-/// bytes have no defined value: write all of them. [`pack_registers`](super::pack_registers) does
+/// bytes have no defined value: write all of them. [`pack_registers`] does
 /// that.
 ///
 /// ```
@@ -188,6 +188,96 @@ pub fn diagnostics(sub_function: SubFunction, data: u16, pdu: &mut Buffer) -> us
 /// ```
 pub fn event_counter(busy: bool, events: u16, pdu: &mut Buffer) -> usize {
     words(Function::GetCommEventCounter, [if busy { 0xFFFF } else { 0 }, events], pdu)
+}
+
+/// Answers function 7: eight outputs, the lowest bit first.
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, reply};
+///
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let len = reply::exception_status(0b0110_1101, &mut pdu);
+/// assert_eq!(pdu[..len], [7, 0x6D]);
+/// ```
+pub fn exception_status(outputs: u8, pdu: &mut Buffer) -> usize {
+    pdu[0] = Function::ReadExceptionStatus.code();
+    pdu[1] = outputs;
+    2
+}
+
+/// Answers function 12: status, event count, message count and one byte for each event, the latest
+/// first. `None` for more than [`limit::LOG_EVENTS`] events.
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, reply};
+///
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let len = reply::event_log(false, 264, 289, &[0x20, 0x00], &mut pdu).unwrap();
+/// assert_eq!(pdu[..len], [12, 8, 0, 0, 0x01, 0x08, 0x01, 0x21, 0x20, 0x00]);
+/// assert_eq!(reply::event_log(false, 264, 289, &[0; 65], &mut pdu), None);
+/// ```
+pub fn event_log(
+    busy: bool,
+    events: u16,
+    messages: u16,
+    log: &[u8],
+    pdu: &mut Buffer,
+) -> Option<usize> {
+    if log.len() > usize::from(limit::LOG_EVENTS) {
+        return None;
+    }
+    let (room, len) = counted(Function::GetCommEventLog, 6 + log.len(), pdu);
+    let (counts, rest) = room.split_at_mut(6);
+    pack_registers(&[if busy { 0xFFFF } else { 0 }, events, messages], counts);
+    rest.copy_from_slice(log);
+    Some(len)
+}
+
+/// Answers function 20. `fill` writes the records of each range, two bytes each, the high byte first.
+/// The bytes have no defined value before: write all of them.
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, Request, pack_registers, reply};
+///
+/// let request = [20, 7, 6, 0, 4, 0, 1, 0, 2];
+/// let Ok(Request::ReadFileRecord(ranges)) = Request::parse(&request) else { unreachable!() };
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let fill = |_, records: &mut [u8]| pack_registers(&[0x0DFE, 0x0020], records);
+/// let len = reply::read_file_record(ranges, fill, &mut pdu);
+/// assert_eq!(pdu[..len], [20, 6, 5, 6, 0x0D, 0xFE, 0x00, 0x20]);
+/// ```
+pub fn read_file_record(
+    ranges: FileRanges<'_>,
+    fill: impl FnMut(FileRange, &mut [u8]),
+    pdu: &mut Buffer,
+) -> usize {
+    let (room, len) = counted(Function::ReadFileRecord, ranges.reply_len(), pdu);
+    ranges.reply(room, fill);
+    len
+}
+
+/// Answers function 21 with the whole request.
+pub fn write_file_record(records: FileRecords<'_>, pdu: &mut Buffer) -> usize {
+    Request::WriteFileRecord(records).encode(pdu)
+}
+
+/// Answers function 24 with the registers of the queue, in its order. `None` for more than
+/// [`limit::QUEUE_REGISTERS`]: exception 03 is the answer then.
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, reply};
+///
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let len = reply::read_fifo_queue(&[0x01B8, 0x1284], &mut pdu).unwrap();
+/// assert_eq!(pdu[..len], [24, 0, 6, 0, 2, 0x01, 0xB8, 0x12, 0x84]);
+/// assert_eq!(reply::read_fifo_queue(&[0; 32], &mut pdu), None);
+/// ```
+pub fn read_fifo_queue(registers: &[u16], pdu: &mut Buffer) -> Option<usize> {
+    let quantity = u16::try_from(registers.len()).ok().filter(|n| *n <= limit::QUEUE_REGISTERS)?;
+    let head = words(Function::ReadFifoQueue, [2 + 2 * quantity, quantity], pdu);
+    let len = head + registers.len() * 2;
+    pack_registers(registers, &mut pdu[head..len]);
+    Some(len)
 }
 
 /// Answers function 17: server id, run indicator and additional data. `None` when `id` and `additional`

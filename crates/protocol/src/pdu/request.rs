@@ -6,8 +6,8 @@
 
 use super::identification::{self, ReadCode};
 use super::{
-    BitRange, Bits, Buffer, Diagnostics, ExceptionCode, Function, Range, RegisterRange, Registers,
-    limit,
+    BitRange, Bits, Buffer, Diagnostics, ExceptionCode, FileRanges, FileRecords, Function, Range,
+    RegisterRange, Registers, limit,
 };
 
 /// One request. Registers are big-endian bytes, bits packed least significant bit first.
@@ -48,10 +48,14 @@ pub enum Request<'a> {
         /// Its new value.
         value: u16,
     },
+    /// Function 7.
+    ReadExceptionStatus,
     /// Function 8.
     Diagnostics(Diagnostics<'a>),
     /// Function 11.
     GetCommEventCounter,
+    /// Function 12.
+    GetCommEventLog,
     /// Function 15.
     WriteMultipleCoils {
         /// The first coil to write.
@@ -68,6 +72,10 @@ pub enum Request<'a> {
     },
     /// Function 17.
     ReportServerId,
+    /// Function 20.
+    ReadFileRecord(FileRanges<'a>),
+    /// Function 21.
+    WriteFileRecord(FileRecords<'a>),
     /// Function 22: the register becomes `(value & and_mask) | (or_mask & !and_mask)`.
     MaskWriteRegister {
         /// The register to change.
@@ -86,6 +94,11 @@ pub enum Request<'a> {
         /// New values of this register and those after it.
         registers: Registers<'a, { limit::READ_WRITE_REGISTERS }>,
     },
+    /// Function 24. It does not empty the queue.
+    ReadFifoQueue {
+        /// The register of the queue.
+        address: u16,
+    },
     /// Function 43 with MEI type 14.
     ReadDeviceIdentification {
         /// The objects to read.
@@ -101,8 +114,9 @@ impl<'a> Request<'a> {
     /// # Errors
     /// [`ExceptionCode::IllegalFunction`] for an unknown function, sub-function or MEI type.
     /// [`ExceptionCode::IllegalDataValue`] for a PDU that is too short or too long, a quantity out
-    /// of its limits, a byte count that does not agree with it, or a value that is not allowed. A
-    /// server sends the code as it is, see [`reply::exception`](super::reply::exception).
+    /// of its limits, a byte count that does not agree with it, or a value that is not allowed.
+    /// [`ExceptionCode::IllegalDataAddress`] for a file or record that no file can have. A server
+    /// sends the code as it is, see [`reply::exception`](super::reply::exception).
     #[inline]
     pub fn parse(pdu: &'a [u8]) -> Result<Request<'a>, ExceptionCode> {
         let (&code, body) = pdu.split_first().ok_or(ExceptionCode::IllegalDataValue)?;
@@ -125,10 +139,18 @@ impl<'a> Request<'a> {
                 let [address, value] = words(body)?;
                 Request::WriteSingleRegister { address, value }
             }
+            Function::ReadExceptionStatus => {
+                empty(body)?;
+                Request::ReadExceptionStatus
+            }
             Function::Diagnostics => Request::Diagnostics(Diagnostics::parse(body)?),
             Function::GetCommEventCounter => {
                 empty(body)?;
                 Request::GetCommEventCounter
+            }
+            Function::GetCommEventLog => {
+                empty(body)?;
+                Request::GetCommEventLog
             }
             Function::WriteMultipleCoils => {
                 let ([address, quantity], data) = counted(body)?;
@@ -143,6 +165,8 @@ impl<'a> Request<'a> {
                 empty(body)?;
                 Request::ReportServerId
             }
+            Function::ReadFileRecord => Request::ReadFileRecord(FileRanges::parse(body)?),
+            Function::WriteFileRecord => Request::WriteFileRecord(FileRecords::parse(body)?),
             Function::MaskWriteRegister => {
                 let [address, and_mask, or_mask] = words(body)?;
                 Request::MaskWriteRegister { address, and_mask, or_mask }
@@ -154,6 +178,10 @@ impl<'a> Request<'a> {
                 let ([write_address, quantity], data) = counted(rest)?;
                 let registers = registers(quantity, data)?;
                 Request::ReadWriteMultipleRegisters { read, write_address, registers }
+            }
+            Function::ReadFifoQueue => {
+                let [address] = words(body)?;
+                Request::ReadFifoQueue { address }
             }
             Function::EncapsulatedInterface => {
                 let (code, object_id) = identification::parse_request(body)?;
@@ -191,7 +219,10 @@ impl<'a> Request<'a> {
                 let head = put_words(pdu, [asked.sub_function().code()]);
                 put(pdu, head, asked.data())
             }
-            Request::GetCommEventCounter | Request::ReportServerId => 1,
+            Request::ReadExceptionStatus
+            | Request::GetCommEventCounter
+            | Request::GetCommEventLog
+            | Request::ReportServerId => 1,
             Request::WriteMultipleCoils { address, bits } => {
                 let head = put_words(pdu, [address, bits.quantity()]);
                 put_counted(pdu, head, bits.as_bytes())
@@ -200,6 +231,8 @@ impl<'a> Request<'a> {
                 let head = put_words(pdu, [address, registers.quantity()]);
                 put_counted(pdu, head, registers.as_bytes())
             }
+            Request::ReadFileRecord(ranges) => put_counted(pdu, 1, ranges.as_bytes()),
+            Request::WriteFileRecord(records) => put_counted(pdu, 1, records.as_bytes()),
             Request::MaskWriteRegister { address, and_mask, or_mask } => {
                 put_words(pdu, [address, and_mask, or_mask])
             }
@@ -208,6 +241,7 @@ impl<'a> Request<'a> {
                 let head = put_words(pdu, words);
                 put_counted(pdu, head, registers.as_bytes())
             }
+            Request::ReadFifoQueue { address } => put_words(pdu, [address]),
             Request::ReadDeviceIdentification { code, object_id } => {
                 put(pdu, 1, &[identification::MEI_TYPE, code.code(), object_id])
             }
@@ -233,13 +267,18 @@ impl<'a> Request<'a> {
             Request::ReadInputRegisters(_) => Function::ReadInputRegisters,
             Request::WriteSingleCoil { .. } => Function::WriteSingleCoil,
             Request::WriteSingleRegister { .. } => Function::WriteSingleRegister,
+            Request::ReadExceptionStatus => Function::ReadExceptionStatus,
             Request::Diagnostics(_) => Function::Diagnostics,
             Request::GetCommEventCounter => Function::GetCommEventCounter,
+            Request::GetCommEventLog => Function::GetCommEventLog,
             Request::WriteMultipleCoils { .. } => Function::WriteMultipleCoils,
             Request::WriteMultipleRegisters { .. } => Function::WriteMultipleRegisters,
             Request::ReportServerId => Function::ReportServerId,
+            Request::ReadFileRecord(_) => Function::ReadFileRecord,
+            Request::WriteFileRecord(_) => Function::WriteFileRecord,
             Request::MaskWriteRegister { .. } => Function::MaskWriteRegister,
             Request::ReadWriteMultipleRegisters { .. } => Function::ReadWriteMultipleRegisters,
+            Request::ReadFifoQueue { .. } => Function::ReadFifoQueue,
             Request::ReadDeviceIdentification { .. } => Function::EncapsulatedInterface,
         }
     }

@@ -2,7 +2,7 @@
 
 use thiserror::Error;
 
-use super::SubFunction;
+use super::{SubFunction, limit};
 
 /// Why a request is invalid.
 ///
@@ -30,6 +30,20 @@ pub enum RequestError {
         found: usize,
         /// The length that is required, in bytes.
         expected: usize,
+    },
+    /// The file is 0.
+    #[error("file is 0, allowed: 1 to 65535")]
+    File,
+    /// The record is above [`limit::LAST_RECORD`].
+    #[error("record is {0}, allowed: 0 to {max}", max = limit::LAST_RECORD)]
+    Record(u16),
+    /// Ranges of files take no space, or more than a request or its reply has.
+    #[error("the ranges take {found} bytes of a request or its reply, allowed: 1 to {max}")]
+    Space {
+        /// The bytes that they take.
+        found: usize,
+        /// The bytes that a request or its reply has for them.
+        max: usize,
     },
     /// The sub-function of Diagnostics does not allow this data field.
     #[error("{} does not allow this data field", .0.name())]

@@ -4,7 +4,7 @@ use thiserror::Error;
 
 use super::identification::Answer;
 use super::request::coil;
-use super::{Bits, ExceptionCode, Registers, Request, limit};
+use super::{Bits, ExceptionCode, FileAnswer, Registers, Request, limit};
 
 /// A response. Bits and registers are exactly as many as the request asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -15,8 +15,10 @@ pub enum Response<'a> {
     /// Registers (functions 3, 4 and 23).
     Registers(Registers<'a, { limit::READ_REGISTERS }>),
     /// The write was carried out: the response repeats what the standard requires (functions 5, 6,
-    /// 15, 16 and 22).
+    /// 15, 16, 21 and 22).
     Written,
+    /// Eight outputs, the lowest bit first, whose meaning depends on the device (function 7).
+    ExceptionStatus(u8),
     /// The data field of Diagnostics (function 8).
     Diagnostics(&'a [u8]),
     /// Status and event count (function 11).
@@ -26,12 +28,27 @@ pub enum Response<'a> {
         /// Requests that the server has carried out.
         events: u16,
     },
+    /// The same, the message count and the log of events (function 12).
+    EventLog {
+        /// Whether the server still processes a program command.
+        busy: bool,
+        /// Requests that the server has carried out.
+        events: u16,
+        /// Messages that the server has received.
+        messages: u16,
+        /// One byte for each event, the latest first, at most [`limit::LOG_EVENTS`].
+        log: &'a [u8],
+    },
+    /// The records of each range (function 20).
+    FileRecords(FileAnswer<'a>),
+    /// The registers of a FIFO queue, in its order (function 24); `None` if it is empty.
+    Queue(Option<Registers<'a, { limit::QUEUE_REGISTERS }>>),
     /// Server id, run indicator and additional data (function 17). Their layout depends on the
     /// device.
     ServerId(&'a [u8]),
     /// Identification objects (function 43 with MEI type 14).
     Identification(Answer<'a>),
-    /// What follows the function code, in the answer to a request that was passed on as it came.
+    /// What follows the function code, in the answer to a request that was encoded elsewhere.
     Opaque(&'a [u8]),
 }
 
@@ -121,6 +138,10 @@ impl Request<'_> {
             Request::MaskWriteRegister { address, and_mask, or_mask } => {
                 echoed(body, &[address, and_mask, or_mask])
             }
+            Request::ReadExceptionStatus => match *body {
+                [status] => Ok(Response::ExceptionStatus(status)),
+                _ => Err(ResponseError::Length),
+            },
             Request::Diagnostics(asked) => match body {
                 [high, low, data @ ..] if data.len() == asked.data().len() => {
                     if u16::from_be_bytes([*high, *low]) == asked.sub_function().code() {
@@ -138,6 +159,42 @@ impl Request<'_> {
                 }),
                 _ => Err(ResponseError::Length),
             },
+            Request::GetCommEventLog => match *body {
+                [count, a, b, c, d, e, f, ref log @ ..]
+                    if usize::from(count) == 6 + log.len()
+                        && log.len() <= usize::from(limit::LOG_EVENTS) =>
+                {
+                    Ok(Response::EventLog {
+                        busy: [a, b] == [0xFF, 0xFF],
+                        events: u16::from_be_bytes([c, d]),
+                        messages: u16::from_be_bytes([e, f]),
+                        log,
+                    })
+                }
+                _ => Err(ResponseError::Length),
+            },
+            Request::ReadFileRecord(ranges) => {
+                let data = counted(body, ranges.reply_len())?;
+                if ranges.are_answered_by(data) {
+                    Ok(Response::FileRecords(FileAnswer::new(data)))
+                } else {
+                    Err(ResponseError::Length)
+                }
+            }
+            Request::WriteFileRecord(records) => match body {
+                [count, data @ ..]
+                    if usize::from(*count) == data.len()
+                        && data.len() == records.as_bytes().len() =>
+                {
+                    if data == records.as_bytes() {
+                        Ok(Response::Written)
+                    } else {
+                        Err(ResponseError::Echo)
+                    }
+                }
+                _ => Err(ResponseError::Length),
+            },
+            Request::ReadFifoQueue { .. } => queue(body),
             Request::ReportServerId => match body {
                 [count, data @ ..] if usize::from(*count) == data.len() => {
                     Ok(Response::ServerId(data))
@@ -155,6 +212,23 @@ impl Request<'_> {
 fn counted(body: &[u8], len: usize) -> Result<&[u8], ResponseError> {
     match body {
         [count, data @ ..] if usize::from(*count) == len && data.len() == len => Ok(data),
+        _ => Err(ResponseError::Length),
+    }
+}
+
+/// Parses the byte count, which covers what follows it, the number of registers, and these.
+fn queue(body: &[u8]) -> Result<Response<'_>, ResponseError> {
+    match *body {
+        [a, b, c, d, ref data @ ..]
+            if usize::from(u16::from_be_bytes([a, b])) == 2 + data.len()
+                && usize::from(u16::from_be_bytes([c, d])) * 2 == data.len() =>
+        {
+            if data.is_empty() {
+                return Ok(Response::Queue(None));
+            }
+            let registers = Registers::new(data).or(Err(ResponseError::Length))?;
+            Ok(Response::Queue(Some(registers)))
+        }
         _ => Err(ResponseError::Length),
     }
 }

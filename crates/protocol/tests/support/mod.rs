@@ -3,7 +3,8 @@
 
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
-    Bits, Diagnostics, Function, Range, Registers, Request, SubFunction, limit,
+    self, Bits, Diagnostics, FileRange, FileRanges, FileRecords, Function, Range, Registers,
+    Request, SubFunction, limit,
 };
 use proptest::prelude::*;
 
@@ -15,6 +16,8 @@ pub enum Parts {
     Registers(u16, Vec<u8>),
     ReadWrite(Range<{ limit::READ_REGISTERS }>, u16, Vec<u8>),
     Diagnostics(SubFunction, Vec<u8>),
+    /// A PDU that parses.
+    Encoded(Vec<u8>),
 }
 
 impl Parts {
@@ -37,6 +40,7 @@ impl Parts {
             Parts::Diagnostics(sub_function, data) => {
                 Request::Diagnostics(Diagnostics::new(*sub_function, data).unwrap())
             }
+            Parts::Encoded(pdu) => Request::parse(pdu).unwrap(),
         }
     }
 }
@@ -69,6 +73,34 @@ fn a_sub_function() -> impl Strategy<Value = Parts> {
     })
 }
 
+/// Reads and writes of 1 to 8 ranges of files, or of one that takes the whole PDU.
+fn of_files() -> impl Strategy<Value = Parts> {
+    let heads = prop::collection::vec((1..=u16::MAX, 0..=limit::LAST_RECORD), 1..=8);
+    (heads, 1..=limit::WRITE_RECORDS, any::<bool>(), any::<u16>()).prop_map(
+        |(heads, most, writes, value)| {
+            let (mut room, mut out) = ([0; pdu::MAX_LEN], [0; pdu::MAX_LEN]);
+            let all = if writes { limit::WRITE_RECORDS } else { limit::READ_RECORDS };
+            let quantity = match heads.len() {
+                1 => most.min(all),
+                several => 1 + most % (limit::WRITE_RECORDS / several as u16 - 4),
+            };
+            let len = if writes {
+                let records = vec![value; usize::from(quantity)];
+                let ranges: Vec<_> =
+                    heads.iter().map(|(file, record)| (*file, *record, &records[..])).collect();
+                let records = FileRecords::pack(&ranges, &mut room).unwrap();
+                Request::WriteFileRecord(records).encode(&mut out)
+            } else {
+                let range = |(file, record)| FileRange::new(file, record, quantity).unwrap();
+                let ranges: Vec<_> = heads.into_iter().map(range).collect();
+                let ranges = FileRanges::pack(&ranges, &mut room).unwrap();
+                Request::ReadFileRecord(ranges).encode(&mut out)
+            };
+            Parts::Encoded(out[..len].to_vec())
+        },
+    )
+}
+
 /// Requests of every function, with all values that they can have.
 pub fn a_request() -> impl Strategy<Value = Parts> {
     let code = prop::sample::select(ReadCode::ALL);
@@ -86,7 +118,10 @@ pub fn a_request() -> impl Strategy<Value = Parts> {
         }),
         (code, any::<u8>())
             .prop_map(|(code, object_id)| Request::ReadDeviceIdentification { code, object_id }),
+        Just(Request::ReadExceptionStatus),
         Just(Request::GetCommEventCounter),
+        Just(Request::GetCommEventLog),
+        any::<u16>().prop_map(|address| Request::ReadFifoQueue { address }),
         Just(Request::ReportServerId),
     ];
     prop_oneof![
@@ -100,6 +135,7 @@ pub fn a_request() -> impl Strategy<Value = Parts> {
         1 => (a_range(), any::<u16>(), registers(limit::READ_WRITE_REGISTERS))
             .prop_map(|(read, address, bytes)| Parts::ReadWrite(read, address, bytes)),
         1 => a_sub_function(),
+        1 => of_files(),
     ]
 }
 

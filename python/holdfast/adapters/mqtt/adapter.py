@@ -7,16 +7,14 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
-from holdfast import logs
 from holdfast.adapters.mqtt.answers import Answers
-from holdfast.adapters.mqtt.filters import Filters
-from holdfast.adapters.mqtt.inbox import Inbox
-from holdfast.adapters.mqtt.link import BrokerConnection
-from holdfast.adapters.mqtt.values import Values
-from holdfast.mqtt.dialing import dial
-from holdfast.mqtt.password import read_password
-from holdfast.mqtt.waiting import Ended, Waiter
+from holdfast.adapters.mqtt.connection import BrokerConnection
+from holdfast.adapters.mqtt.inbox import Filters, Inbox, Values
+from holdfast.events import log_lines
 from holdfast.net.addresses import joined
+from holdfast.net.mqtt.dialing import CONNACK_TIMEOUT_S, dial
+from holdfast.net.mqtt.waiting import Ended, Waiter
+from holdfast.net.secret_file import read_password
 from holdfast.net.secure_channel import failure_text
 from holdfast.runtime.backoff import Backoff
 
@@ -29,16 +27,13 @@ if TYPE_CHECKING:
 
     from holdfast.config import MappedTag, MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.ingest import MemoryAccess
-    from holdfast.mqtt.stream import BrokerSocket
+    from holdfast.net.mqtt.stream import BrokerSocket
     from holdfast.runtime.stop import Stop
 
-WELCOME = 10.0
-"""Seconds to wait for the broker's CONNACK."""
-
-SILENCE = 600.0
+LOG_INTERVAL_S = 600.0
 """Seconds before a failure to connect with the same reason is logged again."""
 
-_TICK = 1.0
+_CHECK_INTERVAL_S = 1.0
 """Seconds between checks of the keep-alive."""
 
 _UNRELEASED: dict[tuple[str, str], set[int]] = {}
@@ -46,11 +41,11 @@ _UNRELEASED: dict[tuple[str, str], set[int]] = {}
 adapter is replaced by another one, after a reload or a failure."""
 
 
-FIRST_PAUSE = 1.0
-MAX_PAUSE = 10.0
+FIRST_PAUSE_S = 1.0
+MAX_PAUSE_S = 10.0
 """Seconds between attempts to connect. Each failure doubles the pause, up to the maximum."""
 
-PROVEN = 10.0
+RESET_BACKOFF_AFTER_S = 10.0
 """After a connection of at least this many seconds, the pauses start from the first again."""
 
 
@@ -63,8 +58,8 @@ class Mqtt:
         memory_access: MemoryAccess,
         mapped: Mapping[str, MappedTag] | None = None,
         *,
-        first_pause: float = FIRST_PAUSE,
-        max_pause: float = MAX_PAUSE,
+        first_pause: float = FIRST_PAUSE_S,
+        max_pause: float = MAX_PAUSE_S,
     ) -> None:
         """`mapped` are the tags of topics with plain values. For the pauses, see `Backoff`."""
         self._settings = settings
@@ -76,7 +71,7 @@ class Mqtt:
         self._answers = Answers(filters, values)
         self._topics = [_Topic(entry) for entry in settings.subscriptions]
         self._topics += [_Topic(entry) for entry in settings.map]
-        self._asked: dict[int, _Topic] = {}
+        self._subscribing: dict[int, _Topic] = {}
         self._unreleased = _UNRELEASED.setdefault((self._broker, settings.client_id), set())
         self._failures = _Failures(self._broker)
         self._connected_at: float | None = None
@@ -86,7 +81,7 @@ class Mqtt:
 
     def run(self, stop: Stop) -> None:
         """Stays connected until `stop` is set; reconnects when the connection ends."""
-        backoff = Backoff(*self._pauses, jitter=True, proven_s=PROVEN)
+        backoff = Backoff(*self._pauses, jitter=True, proven_s=RESET_BACKOFF_AFTER_S)
         with Waiter(stop) as waiter, contextlib.suppress(Ended):
             while not stop.wait(backoff.failed(self._connection(waiter))):
                 pass
@@ -124,7 +119,7 @@ class Mqtt:
         except (OSError, ValueError) as error:
             self._ending = failure_text(error)
         except Exception as error:  # Nothing that a broker sends may end the adapter.
-            logs.problem("mqtt_failed", broker=self._broker)
+            log_lines.problem("mqtt_failed", broker=self._broker)
             self._ending = type(error).__name__
         finally:
             if link is not None:
@@ -149,11 +144,11 @@ class Mqtt:
 
     def _serve(self, link: BrokerConnection, waiter: Waiter) -> None:
         """Reads and writes until the connection ends."""
-        welcome = time.monotonic() + WELCOME
-        tick = min(_TICK, self._settings.keep_alive / 2)
+        welcome = time.monotonic() + CONNACK_TIMEOUT_S
+        tick = min(_CHECK_INTERVAL_S, self._settings.keep_alive / 2)
         while link.is_open:
             if self._connected_at is None and time.monotonic() > welcome:
-                raise TimeoutError(f"the broker did not answer within {WELCOME:g} s")
+                raise TimeoutError(f"the broker did not answer within {CONNACK_TIMEOUT_S:g} s")
             pending = link.pending
             readable, writable = waiter.wait(
                 link.connection.connection,
@@ -178,7 +173,7 @@ class Mqtt:
             self._last_error = reason
         if began is not None:
             level = logging.INFO if reason == "stopped" else logging.WARNING
-            logs.write(level, "mqtt_disconnected", broker=self._broker, reason=reason)
+            log_lines.write(level, "mqtt_disconnected", broker=self._broker, reason=reason)
             return time.monotonic() - began
         if reason != "stopped":
             self._failures.tell(reason)
@@ -203,14 +198,14 @@ class Mqtt:
             self._unreleased.clear()
             for topic in self._topics:
                 topic.known = None
-        logs.write(
+        log_lines.write(
             logging.INFO,
             "mqtt_connected",
             broker=self._broker,
             version=self._settings.version,
             session="resumed" if resumed else "new",
         )
-        self._asked.clear()
+        self._subscribing.clear()
         for topic in self._topics:
             self._subscribe(link, topic, resumed=resumed)
         self._connects += 1
@@ -229,7 +224,7 @@ class Mqtt:
             return
         identifier = link.ask_for(topic.entry, again=again)
         if identifier is not None:
-            self._asked[identifier] = topic
+            self._subscribing[identifier] = topic
 
     def _on_subscribe(
         self,
@@ -239,7 +234,7 @@ class Mqtt:
         reasons: list[ReasonCode],
         _properties: Properties | None,
     ) -> None:
-        topic = self._asked.pop(identifier, None)
+        topic = self._subscribing.pop(identifier, None)
         if topic is None or not reasons:
             return
         reason = reasons[0]
@@ -248,7 +243,7 @@ class Mqtt:
             return
         topic.granted = topic.known = None
         self._last_error = f"subscription {topic.entry.topic} refused: {reason}"
-        logs.write(
+        log_lines.write(
             logging.ERROR,
             "mqtt_subscription_refused",
             broker=self._broker,
@@ -298,10 +293,10 @@ class _Failures:
         """Records a failed attempt."""
         self._attempts += 1
         now = time.monotonic()
-        if reason == self._reason and now - self._logged < SILENCE:
+        if reason == self._reason and now - self._logged < LOG_INTERVAL_S:
             return
         self._reason, self._logged = reason, now
-        logs.write(
+        log_lines.write(
             logging.WARNING,
             "mqtt_connect_failed",
             broker=self._broker,

@@ -13,15 +13,14 @@ import msgspec
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from holdfast.adapters.mqtt.link import MAX_WAITING
+from holdfast.adapters.mqtt.connection import MAX_WAITING_PACKETS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from holdfast.adapters.mqtt.filters import Filters
-    from holdfast.adapters.mqtt.link import BrokerConnection
-    from holdfast.adapters.mqtt.values import Values
-    from holdfast.mqtt.packets import Publish
+    from holdfast.adapters.mqtt.connection import BrokerConnection
+    from holdfast.adapters.mqtt.inbox import Filters, Values
+    from holdfast.net.mqtt.packets import Publish
 
 
 class Answers:
@@ -60,7 +59,7 @@ class Answers:
             return False
         payload = msgspec.json.encode(answer)
         size = len(payload) + len(response_topic) + len(message.correlation or b"")
-        if link.connection.unsent >= MAX_WAITING or not link.takes(size):
+        if link.connection.unsent >= MAX_WAITING_PACKETS or not link.takes(size):
             return False
         properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
         properties.ContentType = "application/json"

@@ -1,26 +1,101 @@
-"""Handles a message: the memory access writes it, or it is refused."""
+"""Handles a message: the memory access writes it, or it is refused.
+
+Its grant is that of the first subscription whose filter matches the topic, or of the topic itself
+if it has plain values, such as 21.5. Only the topic decides, not the subscription identifier that a
+broker may send. So the result is the same with every MQTT version, and with brokers that deliver a
+message once for each matching filter.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from holdfast import logs
-from holdfast.adapters.mqtt.values import BadValue
+from paho.mqtt.matcher import MQTTMatcher
+
+from holdfast.events import log_lines
+from holdfast.events.throttle import Throttle
 from holdfast.ingest import Grant, Refused
+from holdfast.ingest.refusals import MAX_SHOWN
+from holdfast.runtime.text import clip
+from holdfast.tags.text import value_from
+from holdfast.values import ConversionError, codec_for
 
 if TYPE_CHECKING:
-    from holdfast.adapters.mqtt.filters import Filters
-    from holdfast.adapters.mqtt.values import Values
-    from holdfast.ingest import MemoryAccess
-    from holdfast.mqtt.packets import Publish
+    from collections.abc import Mapping, Sequence
 
-MAX_BYTES = 8 * 2**20
+    from holdfast.config import MappedTag, SubscriptionConfig
+    from holdfast.ingest import MemoryAccess
+    from holdfast.net.mqtt.packets import Publish
+
+MAX_BYTES = 4096
+"""The largest accepted payload: more than the text of any tag has."""
+
+
+class BadValue(Exception):
+    """A payload that is no value of its tag.
+
+    `where` is the place in memory, the tag, the payload as text with a limited length, and the
+    cause.
+    """
+
+    def __init__(self, detail: str, where: dict[str, Any]) -> None:
+        super().__init__(detail)
+        self.where = where
+
+
+class Value:
+    """What the messages of one topic write."""
+
+    def __init__(self, topic: str, memory: str, mapped: MappedTag) -> None:
+        tag = self._tag = mapped.tag
+        self._where = {"memory": memory, "area": tag.area, "address": tag.address}
+        self._codec = codec_for(tag.area, tag.type, tag.order, tag.encoding)
+        self.grant = Grant(topic, frozenset({memory}), frozenset({tag.area}))
+
+    def command(self, payload: memoryview) -> dict[str, Any]:
+        """The command that writes a payload. Raises `BadValue`."""
+        try:
+            if len(payload) > MAX_BYTES:
+                raise ValueError(f"{len(payload)} bytes, allowed: {MAX_BYTES}")
+            text = bytes(payload).decode()
+            value = value_from(self._tag, text)
+            values = self._codec.encode(self._tag.raw(value, default_round="nearest"))
+        except UnicodeDecodeError:
+            raise self._bad(payload, "the payload is not UTF-8") from None
+        except (ConversionError, ValueError, TypeError, OverflowError) as error:
+            raise self._bad(payload, str(error)) from None
+        return {**self._where, "values": list(values)}
+
+    def _bad(self, payload: memoryview, cause: str) -> BadValue:
+        shown = clip(bytes(payload[: 4 * MAX_SHOWN]).decode(errors="replace"), MAX_SHOWN)
+        scale = self._tag.scale
+        assert isinstance(scale, int | float), "a map has no tag whose scale is in a register"
+        step = {"step": abs(scale)} if self._tag.is_stepped else {}
+        where = {**self._where, "tag": self._tag.name, "value": shown, **step, "cause": cause}
+        return BadValue(f"{self._tag.name}: {cause}", where)
+
+
+class Values:
+    """What is written by the messages of each topic with plain values."""
+
+    def __init__(self, mapped: Mapping[str, MappedTag]) -> None:
+        self._values = {topic: Value(topic, each.memory, each) for topic, each in mapped.items()}
+
+    def __contains__(self, topic: str) -> bool:
+        return topic in self._values
+
+    def get(self, topic: str) -> Value | None:
+        """What the messages of a topic write; `None` if it has no plain values."""
+        return self._values.get(topic)
+
+
+MAX_PAYLOAD_BYTES = 8 * 2**20
 """The largest accepted payload, in bytes."""
 
-MAX_TOPIC = 200
+MAX_LOGGED_TOPIC_CHARS = 200
 """Characters of a topic that are logged."""
 
-BAD_VALUE_SILENCE = 600.0
+BAD_VALUE_LOG_INTERVAL_S = 600.0
 """Seconds before another bad value of the same topic is logged."""
 
 _NOBODY = Grant("no subscription", (), (), writes=False)
@@ -35,14 +110,14 @@ class Inbox:
         self._memory_access = memory_access
         self._filters, self._values = filters, values
         self._broker = broker
-        self._bad_values = logs.Throttle(burst=0, window=BAD_VALUE_SILENCE)
+        self._bad_values = Throttle(burst=0, window=BAD_VALUE_LOG_INTERVAL_S)
         self.received = 0
 
     def take(self, message: Publish) -> dict[str, object]:
         """Carries out a message. Returns the answer for its sender."""
         self.received += 1
         topic = message.topic
-        shown = topic if len(topic) <= MAX_TOPIC else f"{topic[:MAX_TOPIC]}…"
+        shown = clip(topic, MAX_LOGGED_TOPIC_CHARS)
         peer = f"{self._broker} {shown}"
         value = self._values.get(topic)
         grant = value.grant if value else self._filters.grant(topic) or _NOBODY
@@ -60,7 +135,7 @@ class Inbox:
         except Refused as error:
             refused = error
         except Exception:  # An error in one message must not stop the adapter.
-            logs.problem("mqtt_message_failed", broker=self._broker, topic=shown)
+            log_lines.problem("mqtt_message_failed", broker=self._broker, topic=shown)
             refused = Refused("internal_error", "the message could not be carried out")
             self._memory_access.refuse(refused, grant.name, peer)
         return refused.answer()
@@ -69,8 +144,39 @@ class Inbox:
 def _refused_unread(message: Publish, grant: Grant) -> Refused | None:
     if grant is _NOBODY:
         return Refused("not_granted", "no configured subscription matches this topic")
-    if message.size > MAX_BYTES:
-        return Refused("too_large", f"{message.size} bytes, allowed: {MAX_BYTES}")
+    if message.size > MAX_PAYLOAD_BYTES:
+        return Refused("too_large", f"{message.size} bytes, allowed: {MAX_PAYLOAD_BYTES}")
     if message.problem is not None:
         return Refused("malformed", message.problem)
     return None
+
+
+class Filters:
+    """The topic filters of the subscriptions, in the order of the configuration."""
+
+    def __init__(self, subscriptions: Sequence[SubscriptionConfig]) -> None:
+        self._grants = [
+            Grant(
+                entry.topic,
+                frozenset(entry.memories),
+                frozenset(entry.areas),
+                while_sealed=frozenset(entry.while_sealed or ()),
+            )
+            for entry in subscriptions
+        ]
+        self._matcher = MQTTMatcher()  # type: ignore[no-untyped-call]
+        for place, entry in reversed(list(enumerate(subscriptions))):
+            self._matcher[_without_share(entry.topic)] = place
+
+    def grant(self, topic: str) -> Grant | None:
+        """Returns the grant for messages of this topic; `None` when no filter matches."""
+        places = self._matcher.iter_match(topic)  # type: ignore[no-untyped-call]
+        first: int | None = min(places, default=None)
+        return None if first is None else self._grants[first]
+
+
+def _without_share(topic: str) -> str:
+    """Returns the filter of a shared subscription, `$share/group/filter`; other filters as is."""
+    share, _, rest = topic.partition("/")
+    group, _, shared = rest.partition("/")
+    return shared if share == "$share" and group and shared else topic

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 from holdfast import __version__
 from holdfast.adapters.rest.app import App
 from holdfast.adapters.rest.operations import OPERATIONS, document
-from holdfast.web.host import STOP_TIMEOUT, ConnectionLimits, Host
+from holdfast.net.http.host import STOP_TIMEOUT_S, ConnectionLimits, Host
 
 if TYPE_CHECKING:
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.sessions import SessionControl
     from holdfast.config import RestConfig
     from holdfast.ingest import MemoryAccess
+    from holdfast.net.http.https import Https
+    from holdfast.net.http.port import ListeningSocket
     from holdfast.runtime.stop import Stop
-    from holdfast.web.https import Https
-    from holdfast.web.port import ListeningSocket
 
 __all__ = ["Rest"]
 
@@ -33,7 +33,7 @@ class Rest:
         listener: ListeningSocket,
         *,
         https: Https | None = None,
-        stop_timeout: float = STOP_TIMEOUT,
+        stop_timeout: float = STOP_TIMEOUT_S,
     ) -> None:
         is_https = https is not None
         self._app = App(

@@ -15,12 +15,12 @@ from holdfast.adapters.rest.changes import MAX_VALUES, ChangeStreams
 from holdfast.adapters.rest.refusals import REFUSALS
 from holdfast.adapters.sessions import parse_session_id
 from holdfast.ingest import Grant, Refused
+from holdfast.net.http import events
+from holdfast.net.http.application import Application, json_response
+from holdfast.net.http.fields import malformed
+from holdfast.net.http.origin import Origins
+from holdfast.net.http.requests import BadRequest, Request, Response, shown
 from holdfast.types import AREAS
-from holdfast.web import events
-from holdfast.web.application import Application, json_response
-from holdfast.web.fields import malformed
-from holdfast.web.origin import Origins
-from holdfast.web.requests import BadRequest, Request, Response, shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from holdfast.adapters.sessions import SessionControl
     from holdfast.config import RestConfig
     from holdfast.ingest import MemoryAccess, Written
-    from holdfast.web.operations import Later, Operation
+    from holdfast.net.http.operations import Later, Operation
 
     Given: TypeAlias = Mapping[str, Any]
 
@@ -110,11 +110,11 @@ class App(Application):
 
     def ingest(self, request: Request, body: bytes) -> Response | Later:
         """Writes one command or a batch."""
-        grant = self._grants[request.who]
-        ingest = partial(self._memory_access.ingest, body, grant, request.peer)
-        if self._memory_access.may_wait:
-            return _written(ingest)
-        return json_response(ingest().answer())
+        access, grant = self._memory_access, self._grants[request.who]
+        if access.may_wait:
+            return _written(partial(access.ingest, body, grant, request.peer))
+        finish = access.begin(body, grant, request.peer)
+        return lambda: json_response(finish().answer())
 
     def read(self, request: Request, given: Given) -> Response:
         """Reads a range."""
@@ -166,14 +166,14 @@ class App(Application):
         """Ends a connection of a listener."""
         self._check_manager(request)
         try:
-            asked = msgspec.json.decode(body, type=EndSession)
-            listener, number = parse_session_id(asked.id)
+            request_body = msgspec.json.decode(body, type=EndSession)
+            listener, number = parse_session_id(request_body.id)
         except ValueError as error:
             raise malformed(str(error)) from None
         by = {"listener": "rest", "peer": request.peer, "source": request.who}
         if not await asyncio.to_thread(self._sessions.end_session, listener, number, by):
-            raise BadRequest("unknown_session", f"no session {shown(asked.id)}")
-        return json_response({"status": "ended", "id": asked.id})
+            raise BadRequest("unknown_session", f"no session {shown(request_body.id)}")
+        return json_response({"status": "ended", "id": request_body.id})
 
     def _check_manager(self, request: Request) -> None:
         """Raises `BadRequest` for a client that may not manage the appliance."""

@@ -12,22 +12,30 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from holdfast.ingest import unreadable
-from holdfast.web.events import Stream
-from holdfast.web.requests import BadRequest
+from holdfast.net.http.events import Stream
+from holdfast.net.http.requests import BadRequest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from holdfast.ingest import Follower
-    from holdfast.web.requests import Request
+    from holdfast.net.http.requests import Request
 
 MAX_STREAMS = 32
 """The most open streams. At most half of the connections of the server are streams."""
 
+MAX_RANGES = 16
+"""The most ranges of one stream."""
+
 MAX_VALUES = 65_536
 """The most values in all ranges of one stream."""
 
-HEARTBEAT = 15.0
+MIN_INTERVAL_S = 0.05
+MAX_INTERVAL_S = 3600
+DEFAULT_INTERVAL_S = 0.1
+"""The limits of `min_interval`, and what it is if a request has none."""
+
+HEARTBEAT_INTERVAL_S = 15.0
 """The longest time in seconds between two events or comments of a stream."""
 
 EVENT = "values"
@@ -64,12 +72,11 @@ class ChangeStreams:
         `ranges` are the memory and the area of each range of the follower.
         """
         self.open += 1
-        ends = [
-            asyncio.create_task(request.gone()),
-            asyncio.create_task(self._ending.wait()),
-        ]
+        gone = asyncio.Event()
+        request.when_gone(gone.set)
+        ends = [asyncio.create_task(event.wait()) for event in (gone, self._ending)]
         try:
-            stream = Stream(request, HEARTBEAT)
+            stream = Stream(request, HEARTBEAT_INTERVAL_S)
             await stream.begin()
             await _follow(stream, follower, ranges, min_interval, ends)
             await stream.end()
@@ -101,12 +108,12 @@ async def _follow(
                 changes, refusal, reason = [], str(error), unreadable(error)
             if refusal and refusal != before:
                 memory, _ = ranges[0]
-                told = {"memory": memory, "reason": reason, "detail": refusal}
-                await stream.event(UNAVAILABLE, told)
+                notice = {"memory": memory, "reason": reason, "detail": refusal}
+                await stream.event(UNAVAILABLE, notice)
             for index, address, values in changes:
                 memory, area = ranges[index]
                 data = {"memory": memory, "area": area, "address": address, "values": values}
                 await stream.event(EVENT, data, sequence)
         await stream.beat()
-        pause = max(0.0, min(due - loop.time(), HEARTBEAT))
+        pause = max(0.0, min(due - loop.time(), HEARTBEAT_INTERVAL_S))
         await asyncio.wait(ends, timeout=pause, return_when=asyncio.FIRST_COMPLETED)

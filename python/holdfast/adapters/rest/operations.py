@@ -7,25 +7,28 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from holdfast.adapters.rest.app import INGEST, App
+from holdfast.adapters.rest.changes import (
+    DEFAULT_INTERVAL_S,
+    MAX_INTERVAL_S,
+    MAX_RANGES,
+    MIN_INTERVAL_S,
+)
 from holdfast.adapters.rest.refusals import MEMORY, REFUSALS, VALUES
 from holdfast.adapters.rest.schemas import ADDRESS, SCHEMAS
+from holdfast.net.http import openapi
+from holdfast.net.http.application import DOCUMENTS
+from holdfast.net.http.fields import Field, malformed
+from holdfast.net.http.openapi import Api, json_answer, stream_answer
+from holdfast.net.http.operations import Body, Operation
+from holdfast.net.http.requests import shown
+from holdfast.net.http.schemas import TEXT, integer, ref
 from holdfast.protocol import ADDRESSES
-from holdfast.web import openapi
-from holdfast.web.application import DOCUMENTS
-from holdfast.web.fields import Field, malformed
-from holdfast.web.openapi import Api, json_answer, stream_answer
-from holdfast.web.operations import Body, Operation
-from holdfast.web.requests import shown
-from holdfast.web.schemas import TEXT, integer, ref
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from holdfast.web.refusals import Refusal
-    from holdfast.web.schemas import Schema
-
-MAX_RANGES = 16
-"""The most ranges of a change stream."""
+    from holdfast.net.http.refusals import Refusal
+    from holdfast.net.http.schemas import Schema
 
 _NUMBERS: dict[str, tuple[Callable[[str], float], str, str]] = {
     "integer": (int, "[0-9]{1,10}", "an integer"),
@@ -184,9 +187,9 @@ OPERATIONS: tuple[Operation[App], ...] = (
             *_range(MAX_RANGES),
             Parameter(
                 "min_interval",
-                {"type": "number", "minimum": 0.05, "maximum": 3600},
+                {"type": "number", "minimum": MIN_INTERVAL_S, "maximum": MAX_INTERVAL_S},
                 "The shortest time in seconds between two events of a range",
-                0.1,
+                DEFAULT_INTERVAL_S,
                 example=0.5,
             ),
         ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from holdfast.web.refusals import COMMON, Refusal, Refusals
+from holdfast.net.http.refusals import COMMON, Refusal, Refusals
 
 REFUSALS = Refusals(
     *COMMON,

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from holdfast.adapters.rest.refusals import REFUSALS
-from holdfast.protocol import LAST_ADDRESS, MAX_WORD
-from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS
-from holdfast.web.schemas import (
+from holdfast.net.http.schemas import (
     COUNT,
     NUMBER,
     TEXT,
@@ -17,6 +15,8 @@ from holdfast.web.schemas import (
     object_of,
     ref,
 )
+from holdfast.protocol import LAST_ADDRESS, MAX_WORD
+from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS
 
 AT_LEAST_ONE: Schema = {"type": "integer", "minimum": 1}
 TEXT_OR_NULL: Schema = {"type": ["string", "null"]}

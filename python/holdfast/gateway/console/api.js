@@ -179,7 +179,7 @@ const WORDS = {
     "Networks and ports are allowed with --allow, or with allow in the gateway's configuration.",
     "Is the port in that list too? The default is 502, and 802 with TLS.",
   ]],
-  writes_off: ["Writes are disabled.", ["Enable them with --writes, or with access: read-write in the gateway's configuration."]],
+  writes_off: ["Writes are disabled.", ["Enable them with --access read-write, or with access: read-write in the gateway's configuration."]],
   unauthorized: ["This gateway requires a token.", ["Create one with `holdfast token --line` for the token file, or with `holdfast token --gateway` for the configuration."]],
   busy: ["The gateway is busy.", ["Try again in a moment."]],
   stopping: ["The gateway is stopping.", ["Reload the page when it runs again."]],

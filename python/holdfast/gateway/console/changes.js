@@ -3,9 +3,7 @@
 import { failure, post, stream } from "./api.js";
 import { bit, literal, register, separated, swapsBytes } from "./numbers.js";
 import { same } from "./parts.js";
-import { areaOf } from "./standard.js";
-
-const WORD = 0xffff;
+import { areaOf, MAX_WORD } from "./standard.js";
 
 /** Returns whether the values of a range are the registers as they are. */
 export const isPlain = ({ type, order }) => type.kind === "uint16" && !swapsBytes(order);
@@ -27,7 +25,7 @@ class Change {
   after(before) {
     if (!this.mask) return this.words;
     const [and, or] = this.mask;
-    return [before === null ? null : (before[0] & and) | (or & ~and & WORD)];
+    return [before === null ? null : (before[0] & and) | (or & ~and & MAX_WORD)];
   }
 
   /** Returns whether words that were read back are those after the write. */
@@ -120,7 +118,7 @@ export async function ofType(target, text) {
 function ofBit(target, literal, typed) {
   const { part: { type, order }, address } = target;
   const bits = 1 << (type.size ^ (swapsBytes(order) ? 8 : 0));
-  const mask = [WORD ^ bits, literal === "true" ? bits : 0];
+  const mask = [MAX_WORD ^ bits, literal === "true" ? bits : 0];
   return new Change(target, { mask, values: [{ name: String(address), text: literal }], typed });
 }
 

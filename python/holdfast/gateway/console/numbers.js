@@ -1,19 +1,14 @@
-// Converts registers to numbers and text, and parses what people type.
+// Formats registers and addresses, and parses what people type. The gateway converts registers to values.
+
+import { MAX_WORD, TYPES } from "./standard.js";
 
 export const hex = (register) => register.toString(16).toUpperCase().padStart(4, "0");
 export const binary = (register) => register.toString(2).padStart(16, "0").replace(/(....)(?=.)/g, "$1 ");
 
-const WIDTHS = {
-  bool: 1, bit: 1,
-  int16: 1, uint16: 1, bcd16: 1, float16: 1,
-  int32: 2, uint32: 2, bcd32: 2, float32: 2,
-  int64: 4, uint64: 4, float64: 4,
-};
-
 /** Returns a type. `size` is the bit number, or the number of bytes; `width` is in registers. */
 export function typeOf(kind, size) {
   const ofBytes = kind === "string" || kind === "bytes";
-  const width = ofBytes ? Math.ceil(size / 2) : WIDTHS[kind];
+  const width = ofBytes ? Math.ceil(size / 2) : kind === "bit" ? 1 : TYPES[kind].width;
   const name = ofBytes || kind === "bit" ? `${kind}:${size}` : kind;
   return { name, kind, size, width, bytes: ofBytes ? size : 2 * width };
 }
@@ -36,14 +31,14 @@ export const modicon = (area, address) =>
   DIGITS[area] + String(address + 1).padStart(address > 9998 ? 5 : 4, "0");
 
 /** What can be typed for a register. */
-export const REGISTER_FORMS = "0 to 65535, 0x0000 to 0xFFFF, or bits such as 0b1010";
+export const REGISTER_FORMS = `0 to ${MAX_WORD}, 0x0000 to 0x${hex(MAX_WORD)}, or bits such as 0b1010`;
 
 /** Parses a register: decimal, 0x or 0b. Throws an error for other text. */
 export function register(text) {
   const plain = text.trim().replaceAll("_", "");
   const form = /^(\d{1,5}|0[xX][0-9a-fA-F]{1,4}|0[bB][01]{1,16})$/;
   const value = form.test(plain) ? Number(plain) : NaN;
-  if (!(value <= 65535)) {
+  if (!(value <= MAX_WORD)) {
     const negative = /^[-−]/.test(plain) ? ". For negative values, choose the type int16" : "";
     throw new Error(`“${text.trim()}” is not a register value: ${REGISTER_FORMS}${negative}`);
   }
@@ -91,25 +86,17 @@ function octets(text, type) {
   return JSON.stringify(plain);
 }
 
-/** The minimum and the maximum of integer types. */
-const EXTENTS = {
-  int16: [-(2n ** 15n), 2n ** 15n - 1n], uint16: [0n, 2n ** 16n - 1n], bcd16: [0n, 9999n],
-  int32: [-(2n ** 31n), 2n ** 31n - 1n], uint32: [0n, 2n ** 32n - 1n], bcd32: [0n, 99999999n],
-  int64: [-(2n ** 63n), 2n ** 63n - 1n], uint64: [0n, 2n ** 64n - 1n],
-};
-
-/** The greatest number of floating-point types, and what a number becomes in their registers. */
-const FLOATS = {
-  float16: [65504, (number) => rounded(number, 10, -14)],
-  float32: [3.4028234663852886e38, Math.fround],
-  float64: [Number.MAX_VALUE, (number) => number],
+/** What a number becomes in the registers of a floating-point type. */
+const ROUNDINGS = {
+  float16: (number) => rounded(number, 10, -14),
+  float32: Math.fround,
+  float64: (number) => number,
 };
 
 /** Returns the range of a numeric type as text, or "" for other types. */
 export function extent(kind) {
-  const most = FLOATS[kind]?.[0].toPrecision(6);
-  const ends = EXTENTS[kind] ?? (most ? [`-${most}`, most] : []);
-  return ends.join(" to ").replace("-", "−");
+  const ends = TYPES[kind]?.ends ?? [];
+  return (kind in ROUNDINGS ? ends.map((end) => end.toPrecision(6)) : ends).join(" to ").replace("-", "−");
 }
 
 /** Rounds a number to a significand of some bits, as `Math.fround` does. */
@@ -122,9 +109,8 @@ function rounded(number, bits, least) {
 
 /** Parses a number of a floating-point type. */
 function floating(text, plain, type) {
-  const [most, fit] = FLOATS[type];
-  const found = fit(Number(plain));
-  if (!(Math.abs(found) <= most)) throw new Error(`“${text.trim()}” does not fit ${type}: ${extent(type)}`);
+  const found = ROUNDINGS[type](Number(plain));
+  if (!(Math.abs(found) <= TYPES[type].ends[1])) throw new Error(`“${text.trim()}” does not fit ${type}: ${extent(type)}`);
   if (found === 0 && /[1-9]/.test(plain.split(/e/i)[0])) throw new Error(`“${text.trim()}” is too small for ${type}, which would be 0`);
   return plain;
 }
@@ -132,89 +118,14 @@ function floating(text, plain, type) {
 /** Parses a number of a type. Returns JSON text with the same digits. Throws an error for other text. */
 export function numeral(text, type) {
   const plain = text.trim().replace(/^\+/, "");
-  const ends = EXTENTS[type];
-  if (!ends && /^-?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?$/.test(plain)) return floating(text, plain, type);
-  if (ends && /^-?(0|[1-9]\d{0,19})$/.test(plain)) {
-    const whole = BigInt(plain);
-    if (whole >= ends[0] && whole <= ends[1]) return plain;
+  const isFloat = type in ROUNDINGS;
+  if (isFloat && /^-?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?$/.test(plain)) return floating(text, plain, type);
+  if (!isFloat && /^-?(0|[1-9]\d{0,19})$/.test(plain)) {
+    const [least, most] = TYPES[type].ends.map(BigInt);
+    if (BigInt(plain) >= least && BigInt(plain) <= most) return plain;
   }
   throw new Error(`“${text.trim()}” is not a valid ${type}: ${extent(type)}`);
 }
 
-const READERS = {
-  int16: [2, (view) => view.getInt16(0)],
-  uint16: [2, (view) => view.getUint16(0)],
-  float16: [2, (view) => Number(half(view.getUint16(0)).toPrecision(4))],
-  bcd16: [2, (view) => digits(view.getUint16(0), 4)],
-  int32: [4, (view) => view.getInt32(0)],
-  uint32: [4, (view) => view.getUint32(0)],
-  float32: [4, (view) => Number(view.getFloat32(0).toPrecision(7))],
-  bcd32: [4, (view) => digits(view.getUint32(0), 8)],
-  int64: [8, (view) => view.getBigInt64(0)],
-  uint64: [8, (view) => view.getBigUint64(0)],
-  float64: [8, (view) => Number(view.getFloat64(0).toPrecision(12))],
-};
-
-function half(bits) {
-  const [sign, exponent, fraction] = [bits >> 15 ? -1 : 1, (bits >> 10) & 31, bits & 1023];
-  if (exponent === 31) return fraction ? NaN : sign * Infinity;
-  return sign * (exponent ? (1 + fraction / 1024) * 2 ** (exponent - 15) : fraction * 2 ** -24);
-}
-
-/** Converts binary coded decimals; "–" for a digit above 9. */
-function digits(number, count) {
-  const text = number.toString(16).padStart(count, "0");
-  return /^\d+$/.test(text) ? Number(text) : "–";
-}
-
-const ORDERS = {
-  ABCD: (bytes) => bytes,
-  CDAB: (bytes) => pairs(bytes).reverse().flat(),
-  BADC: (bytes) => pairs(bytes).flatMap(([a, b]) => [b, a]),
-  DCBA: (bytes) => [...bytes].reverse(),
-};
-
 /** Returns whether a byte order swaps the bytes of each register. */
 export const swapsBytes = (order) => ["BADC", "DCBA"].includes(order);
-
-const SPELLED = ["CDABGHEF", "EFGHABCD", "FEHGBADC", "DCBAHGFE"];
-
-const pairs = (bytes) => bytes.filter((_, at) => at % 2 === 0).map((byte, at) => [byte, bytes[2 * at + 1]]);
-const spelled = (letters) => (bytes) => [...letters].map((letter) => bytes[letter.charCodeAt(0) - 65]);
-
-function rows(bytes, arrangements, fits) {
-  return Object.entries(READERS).filter(([, [size]]) => fits(size) && size <= bytes.length).map(([type, [size, read]]) => {
-    const own = bytes.slice(0, size);
-    return [type, arrangements.map((arrange) => String(read(new DataView(Uint8Array.from(arrange(own)).buffer))))];
-  });
-}
-
-/** Lists the bits of a register that are on: "0 3–5", or "none". */
-function bitsOn(register) {
-  const runs = [];
-  for (let at = 0; at < 16; at += 1) {
-    if (!(register & (1 << at))) continue;
-    if (runs.at(-1)?.[1] === at - 1) runs.at(-1)[1] = at;
-    else runs.push([at, at]);
-  }
-  return runs.map(([from, to]) => (from === to ? from : `${from}–${to}`)).join(" ") || "none";
-}
-
-/** Converts registers to every type and byte order. Returns tables: the orders, and a row for each type. */
-export function everyType(registers) {
-  const bytes = registers.flatMap((each) => [each >> 8, each & 255]);
-  const arrangements = Object.values(ORDERS);
-  const letters = (each) => each.map((byte) => (byte >= 32 && byte < 127 ? String.fromCharCode(byte) : "·")).join("");
-  const octet = (byte) => byte.toString(16).padStart(2, "0");
-  const first = (arrange) => arrange(bytes.slice(0, 2)).reduce((high, low) => 256 * high + low);
-  const four = [
-    ...rows(bytes, arrangements, () => true),
-    ["text", arrangements.map((arrange) => letters(arrange(bytes)))],
-    ["bytes", arrangements.map((arrange) => arrange(bytes).map(octet).join(""))],
-    ["bits on", arrangements.map((arrange) => bitsOn(first(arrange)))],
-    ["bool", [String(registers[0] !== 0), "", "", ""]],
-  ];
-  const tables = [[Object.keys(ORDERS), four]];
-  if (bytes.length >= 8) tables.push([SPELLED, rows(bytes, SPELLED.map(spelled), (size) => size === 8)]);
-  return tables;
-}

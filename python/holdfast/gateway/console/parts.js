@@ -2,7 +2,7 @@
 
 import { packed, unpacked } from "./link.js";
 import { modicon, typeOf } from "./numbers.js";
-import { areaOf, LAST } from "./standard.js";
+import { areaOf, LAST_ADDRESS } from "./standard.js";
 
 /** Returns a range. `type` is one of `typeOf`. */
 export function range(area, address, quantity, type, order) {
@@ -55,7 +55,7 @@ export async function read(text) {
   const [kind, size] = (rest[2] ?? "").split(":");
   const type = typeOf(kind, Number(size));
   const whole = [area, address, quantity].every(Number.isInteger) && type.width > 0;
-  if (!whole || !areaOf(area) || address < 0 || quantity < 1 || address + quantity > LAST + 1 || quantity > areaOf(area).most) {
+  if (!whole || !areaOf(area) || address < 0 || quantity < 1 || address + quantity > LAST_ADDRESS + 1 || quantity > areaOf(area).most) {
     throw new Error(`“${text}” is not a range`);
   }
   return range(area, address, quantity, type, rest[3] ?? "ABCD");

@@ -1,13 +1,10 @@
-// The areas of the Modbus standard: their read functions, and the limits of one read and of one write.
+// The areas and limits of the Modbus standard, and the types of values. The gateway fills them in.
 
-export const AREAS = {
-  coils: { title: "Coils", code: 1, most: 2000, mostWritten: 1968 },
-  discrete_inputs: { title: "Discrete inputs", code: 2, most: 2000 },
-  holding_registers: { title: "Holding registers", code: 3, most: 125, mostWritten: 123 },
-  input_registers: { title: "Input registers", code: 4, most: 125 },
-};
+/**
+ * By the name of an area: its title, its read function, and the limits of one read and of one write.
+ * By the name of a type: its width in registers, and its least and its greatest number.
+ */
+export const { AREAS, LAST_ADDRESS, MAX_WORD, TYPES } = $STANDARD;
 
 /** Returns the area that a function code reads. */
 export const areaOf = (code) => Object.values(AREAS).find((area) => area.code === code);
-
-export const LAST = 65535;

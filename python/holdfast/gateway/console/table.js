@@ -1,7 +1,8 @@
 // The table of registers, or the grid of bits, with marks for changes.
 
+import { notice, post } from "./api.js";
 import { $, h } from "./dom.js";
-import { binary, everyType, hex, modicon } from "./numbers.js";
+import { binary, hex, modicon } from "./numbers.js";
 import { Panel } from "./panel.js";
 import { AREAS, areaOf } from "./standard.js";
 
@@ -162,13 +163,20 @@ export class Table extends Panel {
   }
 
   /** Shows up to four registers in every type and byte order. */
-  showTypes(at) {
-    const own = this.values.slice(at, at + 4);
-    $("types-title").textContent = `All types from ${this.part.address + at}: ${own.map(hex).join(" ")}`;
-    $("types-table").replaceChildren(...everyType(own).map(([orders, rows]) => h("table", { class: "review" },
-      h("thead", {}, h("tr", {}, ["Type", ...orders].map((each) => h("th", { scope: "col" }, each)))),
-      h("tbody", {}, rows.map(([type, texts]) =>
-        h("tr", {}, h("th", { scope: "row" }, type), texts.map((text) => h("td", {}, text))))))));
+  async showTypes(at) {
+    const registers = this.values.slice(at, at + 4);
+    const title = `All types from ${this.part.address + at}: ${registers.map(hex).join(" ")}`;
+    $("types-title").textContent = title;
+    $("types-table").replaceChildren();
     $("types-dialog").showModal();
+    const shown = await post("/api/gateway/types", { registers }).then(({ tables }) => tables.map(tableOf), (error) => [notice(error)]);
+    // Another dialog may be open meanwhile.
+    if ($("types-title").textContent === title) $("types-table").replaceChildren(...shown);
   }
 }
+
+/** Shows the texts of registers by type and byte order. */
+const tableOf = ({ orders, rows }) => h("table", { class: "review" },
+  h("thead", {}, h("tr", {}, ["Type", ...orders].map((each) => h("th", { scope: "col" }, each)))),
+  h("tbody", {}, rows.map(({ type, texts }) =>
+    h("tr", {}, h("th", { scope: "row" }, type), texts.map((text) => h("td", {}, text))))));

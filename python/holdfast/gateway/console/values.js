@@ -8,7 +8,7 @@ import * as link from "./link.js";
 import { flaw, modicon, typeOf } from "./numbers.js";
 import * as parts from "./parts.js";
 import { Plots } from "./plots.js";
-import { areaOf, LAST } from "./standard.js";
+import { areaOf, LAST_ADDRESS } from "./standard.js";
 import { Table } from "./table.js";
 import { TagTable } from "./tags.js";
 import { Writer } from "./writing.js";
@@ -134,8 +134,8 @@ export class Values {
     $("quantity").max = areaOf(area).most;
     const address = Number($("address").value);
     $("modicon").textContent = Number.isInteger(address) && address >= 0 ? `= ${modicon(area, address)}` : "";
-    const past = address + whole(Number($("quantity").value), this.type().width) > LAST + 1;
-    $("quantity").setCustomValidity(past ? `The last address is ${LAST}: at most ${LAST + 1 - address} from ${address}.` : "");
+    const past = address + whole(Number($("quantity").value), this.type().width) > LAST_ADDRESS + 1;
+    $("quantity").setCustomValidity(past ? `The last address is ${LAST_ADDRESS}: at most ${LAST_ADDRESS + 1 - address} from ${address}.` : "");
     $("letters").setCustomValidity(ofLetters ? flaw(this.order(), this.type()) : "");
   }
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import threading
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -11,16 +9,15 @@ import msgspec
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from holdfast import logs
-from holdfast.config.topics import REPLY
+from holdfast.config.values.topics import REPLY
 from holdfast.outputs.mqtt.messages import NO_PROPERTIES, Message, packed_topic
-from holdfast.outputs.site import NotWritten
+from holdfast.outputs.site import CommandOutcomes, NotWritten
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from holdfast.config.topics import TopicNames
-    from holdfast.mqtt.packets import Publish
+    from holdfast.config.values.topics import TopicNames
+    from holdfast.net.mqtt.packets import Publish
     from holdfast.outputs.mqtt.messages import Delivery
     from holdfast.outputs.mqtt.session import Session
     from holdfast.outputs.site import Site
@@ -30,18 +27,17 @@ MAX_REPLIES = 1000
 """The most replies that the broker has not confirmed; more are dropped and counted."""
 
 
-class Commands:
+class Commands(CommandOutcomes):
     """The set topics of writable tags. A stale command must never be carried out: retained
     messages are ignored, and the broker keeps no session.
     """
 
     def __init__(self, output: str, broker: str, names: TopicNames, site: Site) -> None:
-        self._output, self._broker = output, broker
-        self._names, self._site = names, site
+        super().__init__(output)
+        self._broker, self._names, self._site = broker, names, site
         self._tags: dict[str, tuple[str, str]] = {}
-        self._lock = threading.Lock()
         self._replies: list[Delivery] = []
-        self.written = self.refused = self.ignored = self.replies_dropped = 0
+        self.replies_dropped = 0
 
     def counts(self) -> dict[str, int]:
         """The outcomes of commands, and the replies that could not be sent."""
@@ -68,14 +64,7 @@ class Commands:
         if found is None:
             return False
         if is_retained:
-            self.ignored += 1
-            logs.refused(
-                "output_command_ignored",
-                kind=self._output,
-                output=self._output,
-                topic=message.topic,
-                reason="retained",
-            )
+            self.ignore(message.topic, "retained")
         elif message.payload:
             self._write(message, session, *found)
         return True
@@ -102,20 +91,11 @@ class Commands:
         tag: str,
         refused: NotWritten | None,
     ) -> None:
-        """Logs and counts an outcome, and replies. Called by any thread."""
-        fields = {"output": self._output, "device": device, "tag": tag}
-        with self._lock:
-            self.written += refused is None
-            self.refused += refused is not None
-        if refused is None:
-            logs.write(logging.INFO, "output_command_written", **fields)
-            reply = {"status": "accepted", "device": device, "tag": tag}
-        else:
-            logs.refused(
-                "output_command_refused", kind=self._output, **fields, reason=refused.reason
-            )
-            reply = {"status": "rejected", "device": device, "tag": tag}
-            reply |= {"reason": refused.reason, "detail": refused.detail}
+        """Notes an outcome, and replies. Called by any thread."""
+        self.ended(device, tag, refused)
+        reply = {"status": "accepted", "device": device, "tag": tag}
+        if refused is not None:
+            reply |= {"status": "rejected", "reason": refused.reason, "detail": refused.detail}
         answer = self._answer(message, msgspec.json.encode(reply))
         with self._lock:
             self._replies = [each for each in self._replies if not each.is_done]

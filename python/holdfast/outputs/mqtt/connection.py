@@ -20,11 +20,11 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from holdfast import logs
-from holdfast.mqtt.client import BrokerClient
-from holdfast.mqtt.packets import parse_publish
-from holdfast.mqtt.stream import Packets, acknowledgement
+from holdfast.events import log_lines
 from holdfast.net.addresses import joined
+from holdfast.net.mqtt.client import BrokerClient
+from holdfast.net.mqtt.packets import acknowledgement, parse_publish
+from holdfast.net.mqtt.stream import Packets
 from holdfast.outputs.mqtt.messages import Message, packed, size_of
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from paho.mqtt.properties import Properties
 
     from holdfast.config import BrokerConfig
-    from holdfast.mqtt.packets import Publish
-    from holdfast.mqtt.stream import BrokerSocket
+    from holdfast.net.mqtt.packets import Publish
+    from holdfast.net.mqtt.stream import BrokerSocket
     from holdfast.outputs.mqtt.messages import Delivery
 
 WINDOW = {"5": 1000, "3.1.1": 100}
@@ -45,16 +45,16 @@ to tell."""
 FIRST_IDENTIFIER, LAST_IDENTIFIER = 5000, 65535
 """Packet identifiers of messages. paho counts those of subscriptions from 1."""
 
-MAX_PACKET = 65_536
+MAX_PACKET_BYTES = 65_536
 """Bytes of a packet. A larger one is skipped: commands are short."""
 
-TOPICS = 100
+MAX_TOPICS_PER_SUBSCRIBE = 100
 """Topics in one SUBSCRIBE packet."""
 
 PUBLISH, PUBACK, PINGRESP = 0x30, 0x40, 0xD0
 _PING = bytes((0xC0, 0))
 QUOTA_EXCEEDED = 0x97
-READ = 262_144
+READ_BYTES = 262_144
 QUICK_ACK: int | None = getattr(socket, "TCP_QUICKACK", None)
 """An option that only Linux has, and that holds for a short time."""
 
@@ -82,18 +82,14 @@ class Connection(BrokerClient):
         self._window = WINDOW[settings.version]
         self._largest: int | None = None
         self._retains = True
-        self._packets = Packets(MAX_PACKET)
-        self._asked: dict[int, Sequence[str]] = {}
-        self.on_subscribe = self._tell_subscribed
+        self._packets = Packets(MAX_PACKET_BYTES)
+        self._subscribing: dict[int, Sequence[str]] = {}
+        self.on_subscribe = self._on_subscribed
         self._waiting: deque[Delivery] = deque()
         self._in_flight: dict[int, tuple[Delivery, int]] = {}
         self._written: list[Delivery] = []
         self._pinged: list[Delivery] = []
         self._next = FIRST_IDENTIFIER
-
-    def greet(self) -> None:
-        """Dials and sends CONNECT."""
-        self.open(MaximumPacketSize=MAX_PACKET)
 
     def accepted(self, properties: Properties | None) -> None:
         """Applies the limits from the broker's CONNACK."""
@@ -123,13 +119,13 @@ class Connection(BrokerClient):
         )
         options = SubscribeOptions(qos=1, noLocal=True, retainHandling=handling)
         how: Any = options if self._five else 1
-        for at in range(0, len(topics), TOPICS):
-            some = topics[at : at + TOPICS]
+        for at in range(0, len(topics), MAX_TOPICS_PER_SUBSCRIBE):
+            some = topics[at : at + MAX_TOPICS_PER_SUBSCRIBE]
             identifier = self.subscribe([(topic, how) for topic in some])[1]
             if identifier is not None:
-                self._asked[identifier] = some
+                self._subscribing[identifier] = some
 
-    def _tell_subscribed(
+    def _on_subscribed(
         self,
         _client: Client,
         _data: object,
@@ -138,9 +134,9 @@ class Connection(BrokerClient):
         _properties: Properties | None,
     ) -> None:
         """Logs which subscriptions the broker refused."""
-        for topic, reason in zip(self._asked.pop(identifier, ()), reasons, strict=False):
+        for topic, reason in zip(self._subscribing.pop(identifier, ()), reasons, strict=False):
             if reason.is_failure:
-                logs.write(
+                log_lines.write(
                     logging.ERROR,
                     "mqtt_subscription_refused",
                     broker=joined(self._settings.host, self._settings.port),
@@ -213,7 +209,7 @@ class Connection(BrokerClient):
     def read_more(self) -> bool:
         """Reads what has arrived. Returns whether some deliveries are done."""
         connection = self.connection
-        data = connection.read(READ)
+        data = connection.read(READ_BYTES)
         if connection.failure is not None:
             is_closed = isinstance(connection.failure, EOFError)
             lost = "" if is_closed else "the connection was lost: "

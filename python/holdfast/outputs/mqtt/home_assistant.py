@@ -1,4 +1,8 @@
-"""Discovery messages for Home Assistant: one device for each device, one entity for each tag."""
+"""Discovery messages for Home Assistant: one device for each device, one entity for each tag.
+
+Units that stand for several quantities, such as % and m³, have no device class.
+Each device also has diagnostic entities, and all are behind one device for the output.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +11,47 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast._core import __version__
-from holdfast.outputs.mqtt.quantities import classes
-from holdfast.tags.register_scale import RegisterScale
+from holdfast.net.addresses import address_in
+from holdfast.tags.scale import RegisterScale
 from holdfast.tags.text import text_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from holdfast.config.outputs import MqttOutputConfig
+    from holdfast.config.models.outputs import MqttOutputConfig
+    from holdfast.outputs.site import DeviceInfo
     from holdfast.tags import Tag
+
+MEASUREMENT, TOTAL = "measurement", "total_increasing"
+
+_DEVICE_CLASSES = {
+    "apparent_power": ("VA",),
+    "current": ("A", "mA"),
+    "data_rate": ("bit/s", "kbit/s", "Mbit/s"),
+    "energy": ("Wh", "kWh", "MWh", "GWh", "J", "kJ", "MJ", "GJ"),
+    "frequency": ("Hz", "kHz", "MHz", "GHz"),
+    "illuminance": ("lx",),
+    "irradiance": ("W/m²",),
+    "power": ("W", "kW", "MW", "GW"),
+    "pressure": ("Pa", "hPa", "kPa", "bar", "mbar", "psi"),
+    "reactive_power": ("var",),
+    "speed": ("m/s", "km/h", "mm/s"),
+    "temperature": ("°C", "°F", "K"),
+    "voltage": ("V", "mV", "kV"),
+    "volume_flow_rate": ("m³/h", "L/min"),
+    "weight": ("kg", "g"),
+}
+_OF_UNIT = {unit: name for name, units in _DEVICE_CLASSES.items() for unit in units}
+
+
+def classes(unit: str) -> tuple[str | None, str]:
+    """The device class and the state class of a unit.
+
+    Energy is what a meter counts: it only falls when the meter begins again.
+    """
+    device_class = _OF_UNIT.get(unit)
+    return device_class, TOTAL if device_class == "energy" else MEASUREMENT
+
 
 MIN_STEP = 0.001
 """The smallest step that Home Assistant accepts."""
@@ -26,6 +62,8 @@ MAX_NUMBER = 1e9
 NONE = "None"
 """What Home Assistant takes as no value."""
 
+ORIGIN = {"name": "Holdfast", "sw_version": __version__}
+
 _NOT_SHOWN = ("bytes",)
 
 
@@ -33,7 +71,7 @@ class Discovery:
     """The discovery messages of an output."""
 
     def __init__(self, output: str, settings: MqttOutputConfig) -> None:
-        self._settings, self._names = settings, settings.topics
+        self._output, self._settings, self._names = output, settings, settings.topics
         self._prefix = settings.discovery_prefix
         self._node = f"holdfast_{_escaped(output)}"
 
@@ -52,36 +90,107 @@ class Discovery:
         first, _, rest = topic.removeprefix(f"{self._prefix}/").partition(f"/{self._node}/")
         return topic.startswith(f"{self._prefix}/") and bool(first) and rest.endswith("/config")
 
-    def entities(self, tags: Mapping[str, Sequence[Tag]]) -> dict[str, bytes]:
-        """The message of each entity, by its topic."""
-        return dict(self._all(tags))
+    def entities(
+        self, tags: Mapping[str, Sequence[Tag]], devices: Mapping[str, DeviceInfo]
+    ) -> dict[str, bytes]:
+        """The message of each entity, by its topic.
 
-    def _all(self, tags: Mapping[str, Sequence[Tag]]) -> Iterator[tuple[str, bytes]]:
-        for device, some in tags.items():
-            shared = self._shared(device)
-            for tag in some:
+        A device that is not in `devices` has just been removed.
+        """
+        return {
+            f"{self._prefix}/{component}/{self._node}/{place}/config": msgspec.json.encode(entity)
+            for component, place, entity in self._all(tags, devices)
+        }
+
+    def _all(
+        self, tags: Mapping[str, Sequence[Tag]], devices: Mapping[str, DeviceInfo]
+    ) -> Iterator[tuple[str, str, dict[str, Any]]]:
+        """The component of each entity, its place in topics and ids, and its message.
+
+        A place with two hyphens in a row is that of a tag: names are escaped.
+        """
+        # Home Assistant wants to know the device of the output before those behind it.
+        if tags.keys() & devices.keys():
+            yield self._connection("connection", self._names.status, self._hub())
+        for device in (each for each in tags if each in devices):
+            of, status = self._of_device(device, devices[device]), self._names.status
+            topic, escaped = self._names.of_availability(device), _escaped(device)
+            behind = {"availability": [{"topic": status}], **of}
+            yield self._connection(f"{escaped}-connection", topic, behind)
+            yield self._address(f"{escaped}-address", topic, devices[device], behind)
+            shared = {
+                "availability": [{"topic": status}, {"topic": topic}],
+                "availability_mode": "all",
+                **of,
+            }
+            for tag in tags[device]:
                 if tag.of_type.count is not None or tag.of_type.base in _NOT_SHOWN:
                     continue
                 component, own = self._entity(device, tag)
-                unique = f"{_escaped(device)}--{_escaped(tag.name)}"
+                place = f"{escaped}--{_escaped(tag.name)}"
                 entity = {
                     "name": tag.description or tag.name,
-                    "unique_id": f"{self._node}_{unique}",
+                    "unique_id": f"{self._node}_{place}",
                     **self._state(device, tag),
                     **own,
                     **shared,
                 }
-                topic = f"{self._prefix}/{component}/{self._node}/{unique}/config"
-                yield topic, msgspec.json.encode(entity)
+                yield component, place, entity
 
-    def _shared(self, device: str) -> dict[str, Any]:
-        topics = (self._names.status, self._names.of_availability(device))
-        return {
-            "availability": [{"topic": topic} for topic in topics],
-            "availability_mode": "all",
-            "device": {"identifiers": [f"{self._node}_{_escaped(device)}"], "name": device},
-            "origin": {"name": "Holdfast", "sw_version": __version__},
+    def _hub(self) -> dict[str, Any]:
+        """The device of the output."""
+        device = {
+            "identifiers": [self._node],
+            "name": f"Holdfast {self._output}",
+            "manufacturer": "Holdfast",
+            "sw_version": __version__,
         }
+        return {"device": device, "origin": ORIGIN}
+
+    def _of_device(self, device: str, info: DeviceInfo) -> dict[str, Any]:
+        found = {
+            "manufacturer": info.maker,
+            "model": info.model,
+            "sw_version": info.version,
+            "configuration_url": _page(info.host),
+        }
+        own = {
+            "identifiers": [f"{self._node}_{_escaped(device)}"],
+            "name": device,
+            "via_device": self._node,
+            **{key: value for key, value in found.items() if value is not None},
+        }
+        return {"device": own, "origin": ORIGIN}
+
+    def _connection(
+        self, place: str, topic: str, shared: dict[str, Any]
+    ) -> tuple[str, str, dict[str, Any]]:
+        """Whether the output is connected, or a device answers."""
+        entity = {
+            "name": "Connection",
+            "unique_id": f"{self._node}_{place}",
+            "state_topic": topic,
+            "payload_on": "online",
+            "payload_off": "offline",
+            "device_class": "connectivity",
+            "entity_category": "diagnostic",
+            **shared,
+        }
+        return "binary_sensor", place, entity
+
+    def _address(
+        self, place: str, topic: str, info: DeviceInfo, shared: dict[str, Any]
+    ) -> tuple[str, str, dict[str, Any]]:
+        """The address of a device: a template without the message, so it needs no topic."""
+        entity = {
+            "name": "Address",
+            "unique_id": f"{self._node}_{place}",
+            "state_topic": topic,
+            "value_template": f"{{{{ {_quoted(info.address)} }}}}",
+            "entity_category": "diagnostic",
+            **shared,
+        }
+        return "sensor", place, entity
 
     def _entity(self, device: str, tag: Tag) -> tuple[str, dict[str, Any]]:
         """The component of a tag, and what only that component has."""
@@ -157,9 +266,23 @@ def _limits(tag: Tag) -> tuple[int, int]:
 
 def _listed(names: Any) -> str:
     """A list of text in a template."""
-    escaped = (name.replace("\\", "\\\\").replace("'", "\\'") for name in names)
-    joined = "', '".join(escaped)
-    return f"['{joined}']"
+    return f"[{', '.join(map(_quoted, names))}]"
+
+
+def _quoted(text: str) -> str:
+    """Text in a template."""
+    escaped = text.replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{escaped}'"
+
+
+def _page(host: str | None) -> str | None:
+    """Where a device may have a page of its own; none on a serial line or on this machine."""
+    if host is None or host == "localhost":
+        return None
+    address = address_in(host)
+    if address is not None and address.is_loopback:
+        return None
+    return f"http://{f'[{host}]' if ':' in host else host}/"
 
 
 def _escaped(name: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from holdfast.mqtt.stream import head
+from holdfast.net.mqtt.packets import head
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

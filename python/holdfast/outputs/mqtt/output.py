@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 from collections import deque
 from typing import TYPE_CHECKING
 
-from holdfast import logs
-from holdfast.net.addresses import joined
 from holdfast.outputs.mqtt.commands import Commands
 from holdfast.outputs.mqtt.home_assistant import Discovery
 from holdfast.outputs.mqtt.messages import Message, packed_topic
 from holdfast.outputs.mqtt.payloads import Payloads
+from holdfast.outputs.mqtt.receiver import BrokerReceiver
 from holdfast.outputs.mqtt.session import Session
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from holdfast.config.outputs import MqttOutputConfig
-    from holdfast.mqtt.packets import Publish
-    from holdfast.outputs.mqtt.messages import Delivery
+    from holdfast.config.models.outputs import MqttOutputConfig
+    from holdfast.net.mqtt.packets import Publish
     from holdfast.outputs.site import Site
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
@@ -29,32 +26,24 @@ if TYPE_CHECKING:
 ONLINE, OFFLINE = b"online", b"offline"
 
 
-class MqttOutput:
-    """Publishes readings. Reconnects when it is asked to send, and after an idle second."""
+class MqttOutput(BrokerReceiver):
+    """Publishes readings."""
 
     def __init__(self, name: str, settings: MqttOutputConfig, site: Site) -> None:
-        self._name, self._settings, self._site = name, settings, site
+        super().__init__(name, settings)
+        self._settings, self._site = settings, site
         self._topics = settings.topics
-        self._client_id = settings.client_id or f"holdfast-{name}-{socket.gethostname()}"
         self._payloads = Payloads(settings)
-        self._session: Session | None = None
-        self._stop: Stop | None = None
         self._taken: list[Reading] = []
         self._messages: Sequence[Message] = ()
-        self._broker = joined(settings.host, settings.port)
         self._commands = Commands(name, self._broker, self._topics, site)
         self._tags: dict[str, set[str]] = {}
         self._answering: dict[str, bool] = {}
-        self._answers = self._revision = -1
+        self._answers = -1
         self._discovery = None if settings.discovery is None else Discovery(name, settings)
         self._entities: dict[str, bytes] = {}
         self._found: deque[str] = deque()
         self._is_born = threading.Event()
-        self._connects = self._not_accepted = 0
-
-    def until(self, stop: Stop) -> None:
-        """Takes the stop that ends all waiting. Called before all else."""
-        self._stop = stop
 
     def send(self, readings: list[Reading]) -> None:
         """Publishes readings, and waits until the broker has confirmed them.
@@ -68,22 +57,19 @@ class MqttOutput:
             self._taken, self._messages = readings, self._payloads.messages(readings)
         delivery = session.publish(self._messages)
         try:
-            session.wait(delivery)
+            self._wait(session, delivery)
         except OSError:
-            self._disconnect()
             self._messages = self._messages[delivery.confirmed :]
             raise
-        finally:
-            self._tell_refused(delivery)
         self._payloads.settle(sent=True)
         self._taken, self._messages = [], ()
-        self._tell_availability(session, answering=True)
+        self._publish_availability(session, answering=True)
 
     def idle(self) -> None:
         """Keeps the connection, and publishes what has changed besides values."""
         session = self._connected()
         self._keep_up(session)
-        self._tell_availability(session, answering=True)
+        self._publish_availability(session, answering=True)
 
     def close(self) -> None:
         """Publishes that this output is offline, and ends the connection."""
@@ -91,34 +77,18 @@ class MqttOutput:
 
     def status(self) -> dict[str, object]:
         """The broker and the connection."""
-        return {
-            "broker": self._broker,
-            "client_id": self._client_id,
-            "version": self._settings.version,
-            "reconnects": max(0, self._connects - 1),
-            "not_accepted": self._not_accepted,
-            "commands": self._commands.counts(),
-        }
+        return {**super().status(), "commands": self._commands.counts()}
 
-    def _connected(self) -> Session:
-        """The session; a new one if there is none. Raises `OSError`."""
-        if self._session is not None and (error := self._session.error) is not None:
-            self._disconnect()
-            raise ConnectionError(error)
-        if self._session is None:
-            assert self._stop is not None, "until comes first"
-            self._session = Session(
-                self._settings,
-                self._client_id,
-                self._status(OFFLINE),
-                self._on_message,
-                self._stop,
-                qos=self._settings.qos,
-                writes=self._settings.writes,
-            )
-            self._connects += 1
-            self._greet(self._session)
-        return self._session
+    def _open(self, stop: Stop) -> Session:
+        return Session(
+            self._settings,
+            self._client_id,
+            self._status(OFFLINE),
+            self._on_message,
+            stop,
+            qos=self._settings.qos,
+            writes=self._settings.writes,
+        )
 
     def _greet(self, session: Session) -> None:
         """Publishes what a broker may have lost, or has never had."""
@@ -139,7 +109,7 @@ class MqttOutput:
                 self._is_born.clear()
                 self._publish(session, self._entities)
             self._remove_stale(session)
-        self._tell_availability(session, answering=False)
+        self._publish_availability(session, answering=False)
 
     def _adopt(self, session: Session, tags: Mapping[str, Sequence[Tag]]) -> None:
         """Takes over the tags: of the first configuration, and after each reload."""
@@ -156,7 +126,10 @@ class MqttOutput:
             return
         if not self._entities:
             session.subscribe([self._discovery.birth_topic], retained=False)
-        before, self._entities = self._entities, self._discovery.entities(tags)
+        before, self._entities = (
+            self._entities,
+            self._discovery.entities(tags, self._site.devices()),
+        )
         changed = {
             topic: entity for topic, entity in self._entities.items() if before.get(topic) != entity
         }
@@ -194,7 +167,7 @@ class MqttOutput:
         if session is not None:
             session.close(last)
 
-    def _tell_availability(self, session: Session, *, answering: bool) -> None:
+    def _publish_availability(self, session: Session, *, answering: bool) -> None:
         """Publishes devices that stopped answering before values, the others after them."""
         now = self._site.answers
         if now == self._answers:
@@ -216,19 +189,6 @@ class MqttOutput:
 
     def _status(self, payload: bytes) -> Message:
         return Message(packed_topic(self._topics.status), payload, True)
-
-    def _tell_refused(self, delivery: Delivery) -> None:
-        self._not_accepted += len(delivery.refused)
-        for message, reason in delivery.refused[:1]:
-            topic = message.topic[2:].decode()
-            logs.refused(
-                "output_not_accepted",
-                kind=self._name,
-                output=self._name,
-                topic=topic,
-                reason=reason,
-                count=len(delivery.refused),
-            )
 
     def _on_message(self, message: Publish, is_retained: bool) -> None:
         """Takes a message of the broker. Called by the thread of the connection."""

@@ -1,4 +1,4 @@
-"""What readings are published as."""
+"""Converts readings to the payloads of MQTT messages."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from holdfast.tags.text import plain, text_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from holdfast.config.outputs import MqttOutputConfig
+    from holdfast.config.models.outputs import MqttOutputConfig
     from holdfast.polling import Reading
     from holdfast.tags import Tag
 
-TOGETHER = 1.0
-"""Seconds within which readings of a device belong to one poll."""
+MAX_POLL_SPREAD_S = 1.0
+"""Readings of a device that are further apart belong to different polls."""
 
 _json = msgspec.json.Encoder()
 
@@ -47,7 +47,7 @@ class Payloads:
         return messages
 
     def settle(self, *, sent: bool) -> None:
-        """Ends what the last `messages` began: they were sent, or will be made again."""
+        """Confirms the last `messages`; if they were not sent, restores the state before them."""
         before, self._before = self._before, {}
         if sent:
             return
@@ -109,7 +109,7 @@ def _polls(readings: list[Reading]) -> Iterator[list[Reading]]:
         if group and (
             reading.device != group[0].device
             or reading.tag.name in names
-            or abs(reading.time - group[0].time) > TOGETHER
+            or abs(reading.time - group[0].time) > MAX_POLL_SPREAD_S
         ):
             yield group
             group, names = [], set()

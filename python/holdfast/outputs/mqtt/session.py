@@ -5,19 +5,20 @@ from __future__ import annotations
 import ssl
 import threading
 import time
+from enum import Enum
 from typing import TYPE_CHECKING
 
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 
-from holdfast import logs
-from holdfast.mqtt.dialing import dial
-from holdfast.mqtt.password import read_password
-from holdfast.mqtt.waiting import Ended, Waiter
+from holdfast.events import log_lines
+from holdfast.net.mqtt.dialing import CONNACK_TIMEOUT_S, dial
+from holdfast.net.mqtt.waiting import Ended, Waiter
+from holdfast.net.secret_file import read_password
 from holdfast.net.secure_channel import failure_text
-from holdfast.outputs.mqtt.connection import Connection
+from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES, Connection
 from holdfast.outputs.mqtt.messages import Delivery, Message
-from holdfast.runtime.standstill import LOOK, Standstill
+from holdfast.runtime.standstill import MAX_LOOK_INTERVAL_S, Standstill
 from holdfast.runtime.stop import Stop
 
 if TYPE_CHECKING:
@@ -27,20 +28,25 @@ if TYPE_CHECKING:
     from paho.mqtt.properties import Properties
 
     from holdfast.config import BrokerConfig
-    from holdfast.mqtt.packets import Publish
-    from holdfast.mqtt.stream import BrokerSocket
+    from holdfast.net.mqtt.packets import Publish
+    from holdfast.net.mqtt.stream import BrokerSocket
 
-WELCOME = 10.0
-"""Seconds to wait for the broker's CONNACK."""
-
-PROGRESS = 10.0
+CONFIRM_TIMEOUT_S = 10.0
 """Seconds without any confirmation after which the connection is given up."""
 
-SLICE = 0.2
+STOP_CHECK_INTERVAL_S = 0.2
 """Seconds of one wait, between which a stop is noticed."""
 
-LAST = 1.0
+STOP_TIMEOUT_S = 1.0
 """Seconds for what is published at the end."""
+
+
+class Ending(Enum):
+    """How a connection is ended by this side."""
+
+    DISCONNECT = "with DISCONNECT"
+    WITH_WILL = "with DISCONNECT, and the broker publishes the will"
+    CUT = "without DISCONNECT, so that the broker publishes the will"
 
 
 class Session:
@@ -69,7 +75,7 @@ class Session:
         self._on_command = on_command
         self._settings, self._qos, self._proves = settings, qos, proves
         self._will_qos = qos if will_qos is None else will_qos
-        self._ends_with_will = self._is_cut = False
+        self._ending = Ending.DISCONNECT
         self._stop, self._end = stop, Stop()
         self._lock = threading.Lock()
         self._news = threading.Condition(self._lock)
@@ -118,11 +124,11 @@ class Session:
             while not delivery.is_done:
                 if self._is_over:
                     raise ConnectionError(self.error)
-                self._news.wait(SLICE)
+                self._news.wait(STOP_CHECK_INTERVAL_S)
                 now = time.monotonic()
                 if delivery.confirmed != confirmed:
                     confirmed, since = delivery.confirmed, now
-                elif now - since > (LAST if self._stop.is_set() else PROGRESS):
+                elif now - since > (STOP_TIMEOUT_S if self._stop.is_set() else CONFIRM_TIMEOUT_S):
                     raise TimeoutError("the broker confirmed no message in time")
 
     def close(self, last: Sequence[Message] = (), *, with_will: bool = False) -> None:
@@ -131,12 +137,15 @@ class Session:
         `with_will`: the broker publishes the will too. MQTT 3.1.1 has no way to ask for it, so the
         connection is cut if the last messages were not confirmed.
         """
-        self._ends_with_will = with_will
+        if with_will and self._settings.version == "5":
+            self._ending = Ending.WITH_WILL
         if last and not self._is_over:
             delivery = self.publish(last)
             with self._news:
-                self._news.wait_for(lambda: delivery.is_done or self._is_over, LAST)
-            self._is_cut = with_will and not delivery.is_done
+                self._news.wait_for(lambda: delivery.is_done or self._is_over, STOP_TIMEOUT_S)
+            # MQTT 3.1.1 publishes the will only if there was no DISCONNECT.
+            if with_will and not delivery.is_done and self._ending is Ending.DISCONNECT:
+                self._ending = Ending.CUT
         self._end.set()
         self._thread.join()
 
@@ -165,11 +174,13 @@ class Session:
                     will.topic[2:].decode(), will.payload, self._will_qos, will.retain
                 )
             try:
-                connection.greet()
-                end = time.monotonic() + WELCOME
+                connection.open(MaximumPacketSize=MAX_PACKET_BYTES)
+                end = time.monotonic() + CONNACK_TIMEOUT_S
                 while not self._is_accepted and connection.is_open:
                     if time.monotonic() > end:
-                        raise TimeoutError(f"the broker did not answer within {WELCOME:g} s")
+                        raise TimeoutError(
+                            f"the broker did not answer within {CONNACK_TIMEOUT_S:g} s"
+                        )
                     self._step(connection, waiter)
                 if not self._is_accepted:
                     reason = self._reason or connection.trouble
@@ -201,18 +212,18 @@ class Session:
                 for delivery in new:
                     connection.publish_all(delivery)
                 if connection.send_more():
-                    self._tell()
+                    self._notify()
                 self._step(connection, self._waiter)
         except Ended:
-            if self._ends_with_will and self._settings.version == "5":
+            if self._ending is Ending.WITH_WILL:
                 packet, reason = PacketTypes.DISCONNECT, "Disconnect with will message"
                 connection.disconnect(ReasonCode(packet, reason))
-            elif not self._is_cut:
+            elif self._ending is Ending.DISCONNECT:
                 connection.disconnect()
         except (OSError, ValueError) as error:
             self._reason = failure_text(error)
         except Exception as error:  # Nothing that a broker sends may end the output.
-            logs.problem("mqtt_failed", broker=self._settings.url)
+            log_lines.problem("mqtt_failed", broker=self._settings.url)
             self._reason = type(error).__name__
         finally:
             connection.close()
@@ -230,13 +241,13 @@ class Session:
             open_socket.connection,
             read=True,
             write=open_socket.unsent > 0,
-            seconds=0.0 if pending else min(LOOK, self._settings.keep_alive / 2),
+            seconds=0.0 if pending else min(MAX_LOOK_INTERVAL_S, self._settings.keep_alive / 2),
         )
         self._check()
         if writable:
             open_socket.flush()
         if (readable or pending) and connection.read_more():
-            self._tell()
+            self._notify()
         connection.loop_misc()
 
     def _take(self, message: Publish, is_retained: bool) -> None:
@@ -251,7 +262,7 @@ class Session:
                 seconds = self._standstill.lasted
                 raise ConnectionError(f"this output stood still for {seconds:.0f} s")
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         with self._news:
             self._news.notify_all()
 

@@ -14,48 +14,40 @@ if TYPE_CHECKING:
     from holdfast.tags import Tag
 
 INT32, INT64, FLOAT, DOUBLE, BOOLEAN, STRING = 3, 4, 9, 10, 11, 12
-FIRST_ARRAY = 22
+FIRST_ARRAY, BOOLEAN_ARRAY, STRING_ARRAY = 22, 32, 33
 
-_INTEGERS = {
-    "int16": ("Int16", 2),
-    "int32": ("Int32", 3),
-    "int64": ("Int64", 4),
-    "uint16": ("UInt16", 6),
-    "bcd16": ("UInt16", 6),
-    "uint32": ("UInt32", 7),
-    "bcd32": ("UInt32", 7),
-    "uint64": ("UInt64", 8),
+
+class _Base(NamedTuple):
+    """A type of metrics, with the types of tags that have it."""
+
+    name: str
+    field: str
+    """The field of a metric."""
+    tags: tuple[str, ...]
+    array: int | None = None
+    """The type of an array of these, if there is one."""
+    item: str = ""
+    """The format of an item of such an array."""
+
+
+_BASES = {
+    2: _Base("Int16", "int_value", ("int16",), 23, "h"),
+    INT32: _Base("Int32", "int_value", ("int32",), 24, "i"),
+    INT64: _Base("Int64", "long_value", ("int64",), 25, "q"),
+    6: _Base("UInt16", "int_value", ("uint16", "bcd16"), 27, "H"),
+    7: _Base("UInt32", "long_value", ("uint32", "bcd32"), 28, "I"),
+    8: _Base("UInt64", "long_value", ("uint64",), 29, "Q"),
+    FLOAT: _Base("Float", "float_value", ("float16", "float32"), 30, "f"),
+    DOUBLE: _Base("Double", "double_value", ("float64",), 31, "d"),
+    BOOLEAN: _Base("Boolean", "boolean_value", ("bool", "bit"), BOOLEAN_ARRAY),
+    STRING: _Base("String", "string_value", ("string",), STRING_ARRAY),
+    17: _Base("Bytes", "bytes_value", ("bytes",)),
 }
-_OTHERS = {
-    "float16": ("Float", 9),
-    "float32": ("Float", 9),
-    "float64": ("Double", 10),
-    "bool": ("Boolean", 11),
-    "bit": ("Boolean", 11),
-    "string": ("String", 12),
-    "bytes": ("Bytes", 17),
-}
-_BASES = _INTEGERS | _OTHERS
+"""The types by number, as in the specification."""
 
-_ARRAYS = {2: 23, 3: 24, 4: 25, 6: 27, 7: 28, 8: 29, 9: 30, 10: 31, 11: 32, 12: 33}
-"""The type of an array, by the type of its items."""
-
-_FORMATS = {23: "h", 24: "i", 25: "q", 27: "H", 28: "I", 29: "Q", 30: "f", 31: "d"}
-
-_FIELDS = {
-    2: "int_value",
-    3: "int_value",
-    4: "long_value",
-    6: "int_value",
-    7: "long_value",
-    8: "long_value",
-    9: "float_value",
-    10: "double_value",
-    11: "boolean_value",
-    12: "string_value",
-    17: "bytes_value",
-}
-_VALUES = (*dict.fromkeys(_FIELDS.values()),)
+_OF_TAG = {tag: number for number, base in _BASES.items() for tag in base.tags}
+_FORMATS = {base.array: base.item for base in _BASES.values() if base.item}
+_FIELDS = tuple(dict.fromkeys(base.field for base in _BASES.values()))
 
 
 class Datatype(NamedTuple):
@@ -75,18 +67,18 @@ def datatype_of(tag: Tag) -> tuple[Datatype, bool]:
 
     An array in Sparkplug has no items without a value, and there are no arrays of bytes.
     """
-    name, number = _BASES[tag.of_type.base]
+    number = _OF_TAG[tag.of_type.base]
     if tag.is_number and (tag.scale, tag.offset) != (1, 0):
-        name, number = "Double", DOUBLE
-    is_array = tag.of_type.count is not None
-    if is_array and number in _ARRAYS and (not tag.null or number in (FLOAT, DOUBLE)):
-        array = _ARRAYS[number]
-        return Datatype(array, f"{name}Array", "bytes_value", _packer(array)), False
-    return Datatype(number, name, _FIELDS[number], _single(number)), is_array
+        number = DOUBLE
+    base, is_array = _BASES[number], tag.of_type.count is not None
+    if is_array and base.array is not None and (not tag.null or number in (FLOAT, DOUBLE)):
+        packer = _packer(base.array)
+        return Datatype(base.array, f"{base.name}Array", "bytes_value", packer), False
+    return Datatype(number, base.name, base.field, _single(number)), is_array
 
 
 def _single(number: int) -> Callable[[Any], Any]:
-    if number in (2, 3):
+    if number in (2, INT32):
         return lambda value: value & 0xFFFFFFFF
     if number == INT64:
         return lambda value: value & 0xFFFFFFFFFFFFFFFF
@@ -96,9 +88,9 @@ def _single(number: int) -> Callable[[Any], Any]:
 
 
 def _packer(array: int) -> Callable[[Any], bytes]:
-    if array == 32:
+    if array == BOOLEAN_ARRAY:
         return _bits
-    if array == 33:
+    if array == STRING_ARRAY:
         return _texts
     item = _FORMATS[array]
     if array in (30, 31):
@@ -131,7 +123,7 @@ def value_of(metric: Any, datatype: Datatype) -> Any:
 
     Hosts differ in the field that they use for an integer, so each field is accepted.
     """
-    field = next((name for name in _VALUES if metric.HasField(name)), None)
+    field = next((name for name in _FIELDS if metric.HasField(name)), None)
     if field is None or metric.is_null:
         raise ValueError("it has no value")
     found = getattr(metric, field)
@@ -159,9 +151,9 @@ def _signed(value: int, field: str, number: int) -> int:
 
 
 def _unpacked(data: bytes, datatype: Datatype) -> list[Any]:
-    if datatype.number == 33:
+    if datatype.number == STRING_ARRAY:
         return [text.decode() for text in data.split(b"\0")[:-1]]
-    if datatype.number == 32:
+    if datatype.number == BOOLEAN_ARRAY:
         if len(data) < 4 or len(data) != 4 + -(-(size := struct.unpack("<I", data[:4])[0]) // 8):
             raise ValueError("an array of another length")
         return [bool(data[4 + place // 8] >> 7 - place % 8 & 1) for place in range(size)]

@@ -5,19 +5,18 @@ from __future__ import annotations
 import itertools
 import random
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from holdfast.faults import is_exception
 from holdfast.outputs.mqtt.messages import Message, packed_topic
 from holdfast.outputs.sparkplug.datatypes import BOOLEAN, INT64
 from holdfast.outputs.sparkplug.definition import Payload
 from holdfast.outputs.sparkplug.metrics import DeviceMetrics
+from holdfast.polling.faults import is_exception
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from holdfast.outputs.sparkplug.metrics import Entry
-    from holdfast.outputs.sparkplug.names import Names
     from holdfast.polling import Reading
     from holdfast.tags import Tag
 
@@ -25,14 +24,39 @@ if TYPE_CHECKING:
     """The last reading of each tag of each device."""
 
 REBIRTH = "Node Control/Rebirth"
-FIRST_ALIASES = 2**27
+MAX_FIRST_ALIAS = 2**27
 """The first alias is a random number up to this one, and each birth of a device has new aliases: a
 command for an alias of an earlier birth must never reach another tag. Hosts of Eclipse Tahu also
 request a rebirth if a device is born again with the same aliases.
 """
 
-SEQUENCE = 256
+SEQUENCE_NUMBERS = 256
 """Sequence numbers begin again after 255."""
+
+
+NAMESPACE = "spBv1.0"
+
+
+class Names(NamedTuple):
+    """The topics of an edge node."""
+
+    group: str
+    node: str
+
+    def of(self, kind: str, device: str | None = None) -> str:
+        """The topic of a type of message, such as `DDATA`."""
+        topic = f"{NAMESPACE}/{self.group}/{kind}/{self.node}"
+        return topic if device is None else f"{topic}/{device}"
+
+    def device_of(self, topic: str) -> str | None:
+        """The device that a DCMD topic names; `None` for other topics."""
+        device = topic.removeprefix(self.of("DCMD") + "/")
+        return None if device == topic or "/" in device else device
+
+
+def state_topic(host: str) -> str:
+    """The topic of the state of a host."""
+    return f"{NAMESPACE}/STATE/{host}"
 
 
 class EdgeNode:
@@ -46,13 +70,13 @@ class EdgeNode:
         self._always_typed = always_typed
         self._seq = 0
         self._session = -1
-        self._aliases = itertools.count(random.SystemRandom().randrange(1, FIRST_ALIASES))
+        self._aliases = itertools.count(random.SystemRandom().randrange(1, MAX_FIRST_ALIAS))
         self._devices: dict[str, DeviceMetrics] = {}
         self._alive: set[str] = set()
 
     def begin(self) -> None:
         """Begins a session, before its CONNECT."""
-        self._session = (self._session + 1) % SEQUENCE
+        self._session = (self._session + 1) % SEQUENCE_NUMBERS
         self._alive.clear()
 
     def death(self) -> Message:
@@ -167,7 +191,7 @@ class EdgeNode:
         )
 
     def _next(self) -> int:
-        seq, self._seq = self._seq, (self._seq + 1) % SEQUENCE
+        seq, self._seq = self._seq, (self._seq + 1) % SEQUENCE_NUMBERS
         return seq
 
 

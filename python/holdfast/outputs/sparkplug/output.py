@@ -2,53 +2,76 @@
 
 from __future__ import annotations
 
-import socket
-from typing import TYPE_CHECKING
+import threading
+from typing import TYPE_CHECKING, Any
 
-from holdfast import logs
-from holdfast.net.addresses import joined
+import msgspec
+
+from holdfast.events import log_lines
+from holdfast.outputs.mqtt.receiver import BrokerReceiver
 from holdfast.outputs.mqtt.session import Session
 from holdfast.outputs.sparkplug.commands import Commands
-from holdfast.outputs.sparkplug.names import Names, state_topic
-from holdfast.outputs.sparkplug.node import EdgeNode
-from holdfast.outputs.sparkplug.primary_host import PrimaryHost
+from holdfast.outputs.sparkplug.node import EdgeNode, Names, state_topic
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from holdfast.config.outputs import SparkplugConfig
-    from holdfast.mqtt.packets import Publish
-    from holdfast.outputs.mqtt.messages import Delivery, Message
+    from holdfast.config.models.outputs import SparkplugConfig
+    from holdfast.net.mqtt.packets import Publish
+    from holdfast.outputs.mqtt.messages import Message
     from holdfast.outputs.site import Site
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
 
-TIMEOUT = 2.0
+HOST_STATE_TIMEOUT_S = 2.0
 """Seconds to wait for the state of the primary host after connecting."""
 
 
-class SparkplugOutput:
-    """Publishes readings as an edge node. Reconnects when it is asked to send, and after an idle
-    second.
-    """
+class PrimaryHost:
+    """The state of a host. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self.is_online = False
+        self._since: int | None = None
+        self._is_known = False
+
+    def begin(self) -> None:
+        """Begins a connection, in which the state is unknown at first."""
+        with self._changed:
+            self.is_online = self._is_known = False
+
+    def take(self, payload: bytes) -> None:
+        """Takes a STATE message. Raises `ValueError` for one that is malformed.
+
+        A message that is older than the last one does not count: it is the will of a connection
+        that the host has replaced.
+        """
+        online, timestamp = _parsed(payload)
+        with self._changed:
+            if self._since is not None and timestamp < self._since:
+                return
+            self._since, self.is_online, self._is_known = timestamp, online, True
+            self._changed.notify_all()
+
+    def wait(self, seconds: float) -> None:
+        """Waits for the first message."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._is_known, seconds)
+
+
+class SparkplugOutput(BrokerReceiver):
+    """Publishes readings as an edge node."""
 
     def __init__(self, name: str, settings: SparkplugConfig, site: Site) -> None:
-        self._name, self._settings, self._site = name, settings, site
-        self._client_id = settings.client_id or f"holdfast-{name}-{socket.gethostname()}"
-        self._broker = joined(settings.host, settings.port)
+        super().__init__(name, settings)
+        self._settings, self._site = settings, site
         self._names = Names(settings.group, settings.edge_node)
         self._node = EdgeNode(self._names, always_typed=settings.datatypes == "always")
         self._commands = Commands(name, self._broker, site, self._node.find, writes=settings.writes)
         self._primary = None if settings.primary_host is None else PrimaryHost()
-        self._stop: Stop | None = None
-        self._session: Session | None = None
         self._is_born = False
-        self._revision = -1
-        self._connects = self._births = self._not_accepted = 0
-
-    def until(self, stop: Stop) -> None:
-        """Takes the stop that ends all waiting. Called before all else."""
-        self._stop = stop
+        self._births = 0
 
     def send(self, readings: list[Reading]) -> None:
         """Publishes readings, and waits until the broker must have them.
@@ -72,15 +95,11 @@ class SparkplugOutput:
     def status(self) -> dict[str, object]:
         """The broker, the node and the session."""
         found: dict[str, object] = {
-            "broker": self._broker,
-            "client_id": self._client_id,
-            "version": self._settings.version,
+            **super().status(),
             "group": self._settings.group,
             "edge_node": self._settings.edge_node,
             "born": self._is_born,
             "births": self._births,
-            "reconnects": max(0, self._connects - 1),
-            "not_accepted": self._not_accepted,
             "commands_written": self._commands.written,
             "commands_refused": self._commands.refused,
             "commands_ignored": self._commands.ignored,
@@ -110,34 +129,28 @@ class SparkplugOutput:
             self._publish(session, self._node.device_births(answering, self._latest))
         return session
 
-    def _connected(self) -> Session:
-        """The session; a new one if there is none. Raises `OSError`."""
-        if self._session is not None and (error := self._session.error) is not None:
-            self._disconnect()
-            raise ConnectionError(error)
-        if self._session is None:
-            assert self._stop is not None, "until comes first"
-            self._node.begin()
-            if self._primary is not None:
-                self._primary.begin()
-            self._session = Session(
-                self._settings,
-                self._client_id,
-                self._node.death(),
-                self._on_message,
-                self._stop,
-                qos=0,
-                will_qos=1,
-                writes=self._settings.writes,
-                proves=True,
-            )
-            self._connects += 1
-            self._session.subscribe([self._names.of("NCMD")], retained=False)
-            if self._primary is not None:
-                assert self._settings.primary_host is not None, "there is one"
-                self._session.subscribe([state_topic(self._settings.primary_host)], retained=True)
-                self._primary.wait(TIMEOUT)
-        return self._session
+    def _open(self, stop: Stop) -> Session:
+        self._node.begin()
+        if self._primary is not None:
+            self._primary.begin()
+        return Session(
+            self._settings,
+            self._client_id,
+            self._node.death(),
+            self._on_message,
+            stop,
+            qos=0,
+            will_qos=1,
+            writes=self._settings.writes,
+            proves=True,
+        )
+
+    def _greet(self, session: Session) -> None:
+        session.subscribe([self._names.of("NCMD")], retained=False)
+        if self._primary is not None:
+            assert self._settings.primary_host is not None, "there is one"
+            session.subscribe([state_topic(self._settings.primary_host)], retained=True)
+            self._primary.wait(HOST_STATE_TIMEOUT_S)
 
     def _adopt(self, session: Session) -> None:
         """Takes over the tags: of a new session, and after a reload."""
@@ -157,34 +170,14 @@ class SparkplugOutput:
 
     def _publish(self, session: Session, messages: Sequence[Message]) -> None:
         """Publishes messages, and waits until the broker must have them. Raises `OSError`."""
-        if not messages:
-            return
-        delivery = session.publish(messages)
-        try:
-            session.wait(delivery)
-        except OSError:
-            self._disconnect()
-            raise
-        finally:
-            self._tell_refused(delivery)
+        if messages:
+            self._wait(session, session.publish(messages))
 
     def _disconnect(self) -> None:
         session, self._session = self._session, None
         self._is_born = False
         if session is not None:
             session.close([self._node.death()], with_will=True)
-
-    def _tell_refused(self, delivery: Delivery) -> None:
-        self._not_accepted += len(delivery.refused)
-        for message, reason in delivery.refused[:1]:
-            logs.refused(
-                "output_not_accepted",
-                kind=self._name,
-                output=self._name,
-                topic=message.topic[2:].decode(),
-                reason=reason,
-                count=len(delivery.refused),
-            )
 
     def _on_message(self, message: Publish, is_retained: bool) -> None:
         """Takes a message of the broker. Called by the thread of the connection."""
@@ -196,10 +189,22 @@ class SparkplugOutput:
             try:
                 self._primary.take(bytes(message.payload))
             except ValueError as error:
-                logs.refused(
+                log_lines.refused(
                     "output_state_ignored",
                     kind=self._name,
                     output=self._name,
                     topic=message.topic,
                     reason=str(error),
                 )
+
+
+def _parsed(payload: bytes) -> tuple[bool, int]:
+    try:
+        found: Any = msgspec.json.decode(payload)
+    except (msgspec.DecodeError, RecursionError):
+        found = None
+    if isinstance(found, dict):
+        online, timestamp = found.get("online"), found.get("timestamp")
+        if isinstance(online, bool) and type(timestamp) is int:
+            return online, timestamp
+    raise ValueError("not the JSON of a STATE message: online and timestamp")

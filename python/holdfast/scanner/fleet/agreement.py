@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+from typing import TYPE_CHECKING, Self
 
 import msgspec
+
+from holdfast.config.values.scanning import written_pollable
+
+if TYPE_CHECKING:
+    from holdfast.scanner.settings import FleetSettings, Settings
 
 PROTOCOL = 1
 """The version of the buckets and messages that nodes share."""
@@ -31,6 +37,21 @@ class Terms(msgspec.Struct, frozen=True, kw_only=True):
     defaults: str
     limits: str
     profiles: str
+
+    @classmethod
+    def of(cls, settings: Settings, fleet: FleetSettings) -> Self:
+        """The terms of a node with these settings."""
+        return cls(
+            protocol=PROTOCOL,
+            partitions=fleet.partitions,
+            prefix=settings.prefix,
+            allow=sorted(map(written_pollable, settings.allow)),
+            writes=settings.writes,
+            strict=settings.strict,
+            defaults=str(settings.defaults),
+            limits=str(settings.limits),
+            profiles=",".join(sorted(settings.profiles)),
+        )
 
     def encoded(self) -> bytes:
         """How they are stored."""

@@ -1,9 +1,4 @@
-"""Which node should hold which partition: pure functions, the same on every node.
-
-Rendezvous hashing alone does not spread few partitions evenly, and with a limit for each node it
-moves far more than necessary. So the holders of the moment count too: each node keeps what it has,
-up to its share.
-"""
+"""Which node of a fleet polls which device: a device has a partition, and a partition a node."""
 
 from __future__ import annotations
 

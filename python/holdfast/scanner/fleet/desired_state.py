@@ -11,11 +11,9 @@ from typing import TYPE_CHECKING
 
 import msgspec
 from nats.errors import Error
-from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy, StorageType, StreamConfig
-from nats.js.errors import APIError, NotFoundError
 
-from holdfast import logs
-from holdfast.leases import Outdated, first_revision, made
+from holdfast.events import log_lines
+from holdfast.replication.leases import KeyBucket, Outdated
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms
 
 if TYPE_CHECKING:
@@ -23,18 +21,12 @@ if TYPE_CHECKING:
 
     from nats.aio.client import Client
     from nats.aio.msg import Msg
-    from nats.js import JetStreamContext
-    from nats.js.api import RawStreamMsg, StreamInfo
 
 TIMEOUT_S = 2.0
 """Time to wait for an answer of JetStream."""
 
 TERMS = "terms"
 DEVICE = "device."
-
-WRONG_SEQUENCE = (10071, 10164)
-"""Error codes of JetStream: the key has another revision than expected."""
-
 
 VISIBLE_AFTER_S = 1.0
 """Time in which nodes that start at the same time see each other."""
@@ -82,13 +74,10 @@ class DesiredState:
         `on_loss` is called when all revisions that are known have become void.
         """
         self.bucket = f"holdfast_fleet_{fleet}_wants"
-        self._stream = f"KV_{self.bucket}"
-        self._subject_prefix = f"$KV.{self.bucket}."
         self._fleet = fleet
         self._on_change = on_change
         self._on_loss = on_loss
-        self._client: Client | None = None
-        self._following: JetStreamContext.PushSubscription | None = None
+        self._bucket: KeyBucket | None = None
         self._values: dict[str, tuple[int, bytes]] = {}
         """Revision and value of each device; the value is empty if it was deleted."""
         self._made_at = ""
@@ -109,48 +98,15 @@ class DesiredState:
 
         Raises `FleetRefused` for terms in force that are others, and errors of nats-py.
         """
-        self._client = client
-        found = await self._make(client.jetstream(timeout=TIMEOUT_S))
+        if self._bucket is None or self._bucket.client is not client:
+            self._bucket = KeyBucket(client, self.bucket, TIMEOUT_S, TIMEOUT_S)
+        found = await self._bucket.make(3, self._latest)
         self._identify(str(found.created), found.state.last_seq)
         await self.agree(terms, is_in_force, may_replace=has_joined)
         await self._restore()
-        if self._following is not None:
-            with contextlib.suppress(Error):
-                await self._following.unsubscribe()
-        config = ConsumerConfig(
-            deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
-            ack_policy=AckPolicy.NONE,
-            mem_storage=True,
-            inactive_threshold=30.0,
-        )
-        context = client.jetstream(timeout=TIMEOUT_S)
-        following = await context.subscribe(
-            f"{self._subject_prefix}{DEVICE}>",
-            stream=self._stream,
-            config=config,
-            cb=self._on_message,
-        )
-        self._following = following
-        info = await following.consumer_info()
-        if not info.num_pending and not (info.delivered and info.delivered.consumer_seq):
-            self.is_read.set()
-
-    async def _make(self, context: JetStreamContext) -> StreamInfo:
-        try:
-            return await context.stream_info(self._stream)
-        except NotFoundError:
-            config = StreamConfig(
-                name=self._stream,
-                subjects=[f"{self._subject_prefix}>"],
-                max_msgs_per_subject=1,
-                storage=StorageType.FILE,
-                deny_delete=True,
-                allow_rollup_hdrs=True,
-                allow_direct=True,
-                first_seq=first_revision(self._latest),
-            )
-            await made(context, config, 3)
-            return await context.stream_info(self._stream)
+        with contextlib.suppress(Error):
+            await self._bucket.unfollow()
+        await self._bucket.follow_keys(f"{DEVICE}>", self._on_message, self.is_read.set)
 
     @property
     def _latest(self) -> int:
@@ -169,7 +125,7 @@ class DesiredState:
         self._on_loss()
         known = sum(bool(former.value) for former in self._former.values())
         fields = {"fleet": self._fleet, "bucket": self.bucket, "devices": known}
-        logs.write(logging.WARNING, "fleet_storage_lost", **fields)
+        log_lines.write(logging.WARNING, "fleet_storage_lost", **fields)
 
     async def _restore(self) -> None:
         """Stores what a lost bucket had. Raises errors of nats-py."""
@@ -180,7 +136,7 @@ class DesiredState:
             batch, left = left[:MAX_CONCURRENT_WRITES], left[MAX_CONCURRENT_WRITES:]
             stored += sum(await asyncio.gather(*map(self._restore_one, batch)))
         fields = {"fleet": self._fleet, "bucket": self.bucket, "devices": stored}
-        logs.write(logging.INFO, "subscriptions_restored", **fields)
+        log_lines.write(logging.INFO, "subscriptions_restored", **fields)
 
     async def _restore_one(self, device: str) -> bool:
         """Returns whether the value is stored now. One that is newer stays as it is."""
@@ -191,7 +147,8 @@ class DesiredState:
                 await self._put(key, former.value, revision, {FORMER_HEADER: former.header()})
                 is_stored = True
             except Outdated:
-                found = await self._found(key)
+                assert self._bucket is not None, "it is open"
+                found = await self._bucket.last(key)
                 header = "" if found is None else (found.headers or {}).get(FORMER_HEADER, "")
                 if found is None or not former.replaces(header):
                     break
@@ -201,12 +158,13 @@ class DesiredState:
 
     async def is_followed(self) -> bool:
         """Whether changes of the bucket still arrive. Raises errors of nats-py."""
-        if self._client is None or self._following is None:
+        bucket = self._bucket
+        if bucket is None or bucket.following is None:
             return False
-        info = await self._client.jetstream(timeout=TIMEOUT_S).stream_info(self._stream)
+        info = await bucket.info()
         if str(info.created) != self._made_at or info.state.last_seq < self._latest:
             return False
-        await self._following.consumer_info()  # Its server may have ended.
+        await bucket.following.consumer_info()  # Its server may have ended.
         return True
 
     async def agree(
@@ -272,42 +230,25 @@ class DesiredState:
         self._values[device] = (revision, value)
         return True
 
-    async def _on_message(self, message: Msg) -> None:
-        metadata = message.metadata
+    def _on_message(self, key: str, message: Msg) -> None:
         with contextlib.suppress(ValueError):
-            device = _text(message.subject.removeprefix(self._subject_prefix + DEVICE))
-            if self._learn(device, metadata.sequence.stream, message.data):
+            device = _text(key.removeprefix(DEVICE))
+            if self._learn(device, message.metadata.sequence.stream, message.data):
                 self._on_change(device)
-        if metadata.num_pending == 0:
-            self.is_read.set()
 
     async def _get(self, key: str) -> tuple[int, bytes]:
-        found = await self._found(key)
+        assert self._bucket is not None, "it is open"
+        found = await self._bucket.last(key)
         return (0, b"") if found is None else (found.seq or 0, found.data or b"")
-
-    async def _found(self, key: str) -> RawStreamMsg | None:
-        assert self._client is not None, "the bucket is open"
-        context = self._client.jetstream(timeout=TIMEOUT_S)
-        try:
-            return await context.get_last_msg(self._stream, f"{self._subject_prefix}{key}")
-        except NotFoundError:
-            return None
 
     async def _put(
         self, key: str, value: bytes, revision: int, more: Mapping[str, str] | None = None
     ) -> int:
-        assert self._client is not None, "the bucket is open"
-        headers = {"Nats-Expected-Last-Subject-Sequence": str(revision), **(more or {})}
+        assert self._bucket is not None, "it is open"
+        headers = dict(more or {})
         if not value:
             headers["KV-Operation"] = "DEL"
-        context = self._client.jetstream(timeout=TIMEOUT_S)
-        try:
-            ack = await context.publish(f"{self._subject_prefix}{key}", value, headers=headers)
-        except APIError as error:
-            if error.err_code in WRONG_SEQUENCE:
-                raise Outdated(key) from None
-            raise
-        return ack.seq
+        return await self._bucket.publish(key, value, revision, headers)
 
 
 def _token(device: str) -> str:

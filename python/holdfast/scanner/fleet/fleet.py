@@ -1,4 +1,10 @@
-"""One node of a fleet: its lease as a node, and the leases of its partitions."""
+"""One node of a fleet: its lease as a node, and the leases of its partitions.
+
+`assigned` says which node should hold which partition, and says the same on every node. Rendezvous
+hashing alone does not spread few partitions evenly, and with a limit for each node it moves far
+more than necessary. So the holders of the moment count too: each node keeps what it has, up to its
+share.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +15,17 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from holdfast import logs
-from holdfast.leases import Leases, LeaseThread, Relay
+from holdfast.events import log_lines
+from holdfast.replication.leases import Leases, LeaseThread, Relay
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms, digest
-from holdfast.scanner.fleet.assignment import assigned, partition_of
+from holdfast.scanner.fleet.assignment import assigned
 from holdfast.scanner.settings import FleetSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from holdfast import _core
-    from holdfast.leases import Connect, Holding, StartThread
+    from holdfast.replication.leases import Connect, Holding, StartThread
 
 NODE = "node."
 PARTITION = "partition."
@@ -66,7 +72,7 @@ class Fleet:
         devices, though it could renew their leases; it is called in their thread, which
         `start_thread` starts.
         """
-        self.settings = settings
+        self.settings, self.node = settings, settings.node
         self.terms = terms
         self._terms_digest = digest(terms.encoded())
         self._node_about = about
@@ -97,11 +103,6 @@ class Fleet:
         self._thread = LeaseThread(self.leases, connect, "holdfast-leases", start_thread)
 
     @property
-    def node(self) -> str:
-        """The name of this node."""
-        return self.settings.node
-
-    @property
     def nodes(self) -> list[str]:
         """The live nodes that don't leave."""
         return sorted(
@@ -122,10 +123,6 @@ class Fleet:
         for key in self.leases.seen.copy():
             if key.startswith(NODE) and (holder := self.leases.holder(key)) is not None:
                 yield key.removeprefix(NODE), holder
-
-    def partition(self, connection: str) -> int:
-        """The partition of a connection to devices."""
-        return partition_of(connection, self.settings.partitions)
 
     def fence(self, partition: int) -> _core.Fence:
         """The fence of a partition."""
@@ -206,7 +203,7 @@ class Fleet:
         while not self.leases.since(key):
             self._check_name()
             await asyncio.sleep(SETTLE_S)
-        logs.write(
+        log_lines.write(
             logging.INFO,
             "fleet_joined",
             fleet=self.settings.name,
@@ -242,7 +239,7 @@ class Fleet:
             nodes = self.nodes
             if nodes != known:
                 fields = {"fleet": self.settings.name, "nodes": ",".join(nodes)}
-                logs.write(logging.INFO, "fleet_changed", **fields)
+                log_lines.write(logging.INFO, "fleet_changed", **fields)
                 known = nodes
             self._assign(nodes)
             if time.monotonic() > self._shown_at + self.leases.times.renewal_s:
@@ -284,7 +281,7 @@ class Fleet:
         may_end = asyncio.Semaphore(len(keys))
         await asyncio.gather(*(self._give_back(key, may_end) for key in keys))
         await self._thread.give_back(node, 0.0)
-        logs.write(logging.INFO, "fleet_left", fleet=self.settings.name, node=self.node)
+        log_lines.write(logging.INFO, "fleet_left", fleet=self.settings.name, node=self.node)
 
     def _settle(self, key: str) -> None:
         """Begins or ends with the devices of a partition, as its lease is now.
@@ -313,7 +310,9 @@ class Fleet:
     def lost(self, key: str, reason: str) -> None:
         """A lease is not held any more."""
         self._has_changed.set()
-        logs.refused("lease_lost", kind="lease", fleet=self.settings.name, lease=key, reason=reason)
+        log_lines.refused(
+            "lease_lost", kind="lease", fleet=self.settings.name, lease=key, reason=reason
+        )
         self._settle(key)
 
     def changed(self) -> None:
@@ -323,8 +322,8 @@ class Fleet:
     def works(self, reason: str | None) -> None:
         """The bucket of leases works; or it does not, for this reason."""
         if reason is None:
-            logs.write(logging.INFO, "leases_available", fleet=self.settings.name)
+            log_lines.write(logging.INFO, "leases_available", fleet=self.settings.name)
         else:
-            logs.write(
+            log_lines.write(
                 logging.WARNING, "leases_unavailable", fleet=self.settings.name, reason=reason
             )

@@ -16,16 +16,20 @@ import msgspec
 from nats.errors import Error
 from nats.js.errors import NoStreamResponseError
 
-from holdfast import logs
 from holdfast.client.url import connection_of
-from holdfast.leases import Outdated
+from holdfast.events import log_lines
+from holdfast.net.nats import nats_reason
+from holdfast.replication.leases import Outdated
 from holdfast.runtime import tasks
+from holdfast.runtime.backoff import Backoff
 from holdfast.runtime.heartbeat import Heartbeat
 from holdfast.scanner.errors import Refused
+from holdfast.scanner.fleet.assignment import partition_of
 from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
 from holdfast.scanner.fleet.fleet import Fleet
 from holdfast.scanner.jetstream.entries import requests as stored_requests
 from holdfast.scanner.jetstream.entries import restored
+from holdfast.scanner.placement import Changed, Placement
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -33,7 +37,7 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast import _core
-    from holdfast.leases import Connect, StartThread
+    from holdfast.replication.leases import Connect, StartThread
     from holdfast.scanner.fleet.agreement import Terms
     from holdfast.scanner.messages.types import SubscribeRequest
     from holdfast.scanner.placement import DeviceHost, SubscriptionHost
@@ -41,8 +45,9 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
 
-OPEN_RETRY_S = 0.5
-"""Between attempts to open the buckets."""
+FIRST_RETRY_S = 0.5
+MAX_RETRY_S = 2.0
+"""The pauses after failures to open the buckets."""
 
 ADOPT_RETRY_S = 10.0
 """Between attempts to carry out a subscription of another node that is refused here."""
@@ -53,11 +58,14 @@ MAX_STORE_ATTEMPTS = 20
 CONNECTION_CHECK_S = 0.1
 """Between looks whether there is a connection."""
 
+LEAVE_TIMEOUT_S = 10.0
+"""Time to hand devices over to other nodes."""
+
 HANG_AFTER_S = 5.0
 """Time without a sign of life of the event loop after which leases are not renewed."""
 
 
-class FleetMember:
+class FleetMember(Placement):
     """Joins the fleet, follows the desired state, and knows which devices are its own."""
 
     def __init__(
@@ -81,10 +89,11 @@ class FleetMember:
             start_thread=start_thread,
         )
         self._heartbeat = Heartbeat()
+        self._backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S, jitter=True)
         self.desired = DesiredState(settings.name, self._on_change, self._on_loss)
         self._check_interval_s = settings.check_interval_s
         self._registry = registry
-        self._client: Client | None = None
+        self.client: Client | None = None
         self._has_new_client = asyncio.Event()
         self._has_touched = asyncio.Event()
         self._touched: set[str] = set()
@@ -98,21 +107,21 @@ class FleetMember:
 
     def connected(self, client: Client | None) -> None:
         """Sets the client; `None` while there is no connection."""
-        self._client = client
+        self.client = client
         self._has_new_client.set()
         if client is not None:
             self.fleet.connected()
 
     def _withheld(self) -> str | None:
         """Why this node can't publish values; then others should have its devices."""
-        if self._client is None:
+        if self.client is None:
             return "the other connection to NATS was lost"
         if self._heartbeat.age > HANG_AFTER_S:
             return f"the event loop hangs for {HANG_AFTER_S:g} s"
         return None
 
     async def run(
-        self, devices: DeviceHost, subscriptions: SubscriptionHost, ready: asyncio.Event
+        self, devices: DeviceHost, subscriptions: SubscriptionHost, ready: asyncio.Event, /
     ) -> None:
         """Is a node of the fleet until it is cancelled. Raises `FleetRefused`.
 
@@ -122,7 +131,7 @@ class FleetMember:
         running: list[asyncio.Task[None]] = []
         self.fleet.start()
         try:
-            async with self._heartbeat.kept():
+            async with self._heartbeat.beating():
                 await self._open(ready)
                 works = (self.fleet.run(), self._follow_again(), self._adopt_changes())
                 running += [asyncio.create_task(work) for work in works]
@@ -136,7 +145,7 @@ class FleetMember:
     async def _open(self, ready: asyncio.Event) -> None:
         """Joins the fleet, and reads the desired state."""
         while not self.is_joined:
-            client, leases = self._client, self.fleet.leases
+            client, leases = self.client, self.fleet.leases
             if client is None or leases.reason is not None or not leases.is_read:
                 await asyncio.sleep(CONNECTION_CHECK_S)
                 continue
@@ -148,9 +157,14 @@ class FleetMember:
                 await self.desired.agree(fleet.terms, fleet.has_terms, may_replace=True)
                 await self._read(ready)
                 self.is_joined = True
+                self._backoff.succeeded()
             except (Error, OSError) as error:
-                logs.refused("fleet_unavailable", kind="fleet", reason=str(error) or repr(error))
-                await asyncio.sleep(OPEN_RETRY_S)
+                await self._pause(error)
+
+    async def _pause(self, error: Exception) -> None:
+        """Waits after an attempt to open a bucket that has failed. All nodes fail together."""
+        log_lines.refused("fleet_unavailable", kind="fleet", reason=nats_reason(error))
+        await asyncio.sleep(self._backoff.failed())
 
     async def _read(self, ready: asyncio.Event) -> None:
         await self.desired.is_read.wait()
@@ -167,7 +181,7 @@ class FleetMember:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(self._check_interval_s):
                     await self._has_new_client.wait()
-            client = self._client
+            client = self.client
             if client is None:
                 await asyncio.sleep(CONNECTION_CHECK_S)
                 continue
@@ -179,9 +193,10 @@ class FleetMember:
             try:
                 await self.desired.open(client, self.fleet.terms, lambda _: True, has_joined=True)
             except (Error, OSError) as error:
-                logs.refused("fleet_unavailable", kind="fleet", reason=str(error) or repr(error))
-                await asyncio.sleep(OPEN_RETRY_S)
+                await self._pause(error)
                 self._has_new_client.set()
+            else:
+                self._backoff.succeeded()
 
     async def _adopt_changes(self) -> None:
         """Carries out what other nodes have stored."""
@@ -213,13 +228,13 @@ class FleetMember:
         times = {} if desired is None else desired.renewed
         renewed = {each for each, at in times.items() if self._renewed.get((device, each)) != at}
         try:
-            wanted: dict[str, list[SubscribeRequest]] = {}
+            by_subscriber: dict[str, list[SubscribeRequest]] = {}
             for text in () if desired is None else desired.requests:
                 request = restored(bytes(text))
-                wanted.setdefault(request.subscriber_id, []).append(request)
-            await self._subscription_host.adopt(device, wanted, renewed)
+                by_subscriber.setdefault(request.subscriber_id, []).append(request)
+            await self._subscription_host.adopt(device, by_subscriber, renewed)
         except Refused as refused:
-            logs.refused("not_restored", kind="fleet", device=device, reason=str(refused))
+            log_lines.refused("not_restored", kind="fleet", device=device, reason=str(refused))
             self._failed.add(device)
             return refused
         self._applied[device] = revision
@@ -227,17 +242,17 @@ class FleetMember:
         return None
 
     async def store(
-        self, device: str, change: Callable[[], Awaitable[object]], subscriber: str | None = None
-    ) -> None:
-        """Makes a change of the subscriptions of a device, here and in the bucket.
-
-        The lock of the device is held. `subscriber` has renewed its subscription. Raises `Refused`;
-        then nothing has changed.
-        """
+        self,
+        device: str,
+        change: Callable[[], Awaitable[Changed]],
+        subscriber: str | None = None,
+        /,
+    ) -> Changed:
+        """Makes a change of the subscriptions of a device, here and in the bucket."""
         # The change is made here first: it may be refused. If another node was faster, its value is
         # adopted, which undoes the change, and the change is made again on top of it.
         for _ in range(MAX_STORE_ATTEMPTS):
-            await change()
+            changed = await change()
             now = int(time.time() * 1000)
             renewed = {
                 each: now if each == subscriber else self._renewed.get((device, each), now)
@@ -261,12 +276,12 @@ class FleetMember:
             except (Error, OSError) as error:
                 self._has_new_client.set()  # The bucket may be lost.
                 await self._adopt_now(device)
-                reason = str(error) or type(error).__name__
+                reason = nats_reason(error)
                 is_certain = isinstance(error, NoStreamResponseError)
                 outcome = "not stored in" if is_certain else "not confirmed by"
                 raise Refused(f"{outcome} {self.desired.bucket}: {reason}") from None
             self._renewed |= {(device, each): at for each, at in renewed.items()}
-            return
+            return changed
         raise Refused(
             f"{device} was changed by other nodes {MAX_STORE_ATTEMPTS} times meanwhile: try again"
         )
@@ -284,7 +299,7 @@ class FleetMember:
         return [name for name, each in subscribers.items() if each.ttl is not None]
 
     def _check_size(self, device: str, desired: DesiredDevice | None) -> None:
-        client = self._client
+        client = self.client
         if desired is None or client is None:
             return
         size, most = len(msgspec.json.encode(desired)), client.max_payload - 1024
@@ -294,9 +309,11 @@ class FleetMember:
                 "use fewer tags, or set max_payload of the NATS server"
             )
 
-    def added(self, device: ScannedDevice) -> None:
-        """A device is known from now on."""
-        device.partition = self.fleet.partition(connection_of(device.source.target))
+    def subscribed(self, device: ScannedDevice, _subscriber: str | None, /) -> None:
+        """A device is known from now on. `store` stores its subscriptions."""
+        device.partition = partition_of(
+            connection_of(device.source.target), self.fleet.settings.partitions
+        )
         self._devices.setdefault(device.partition, {})[device.id] = device
 
     def dropped(self, device: ScannedDevice) -> None:
@@ -305,11 +322,19 @@ class FleetMember:
         if of_partition.get(device.id) is device:
             del of_partition[device.id]
 
-    def is_own(self, device: ScannedDevice) -> bool:
+    def is_own(self, device: ScannedDevice, /) -> bool:
         """Whether this node polls a device, now."""
         return self.fleet.is_own(device.partition)
 
-    def fence(self, device: ScannedDevice) -> _core.Fence:
+    def takes_writes(self, device: ScannedDevice, /) -> bool:
+        """Whether this node can write to a device, now."""
+        return self.is_own(device) and bool(device.polled_as)
+
+    def lease(self, device: ScannedDevice, /) -> int:
+        """Returns the number in the header of messages: that of a later node is greater."""
+        return self.fleet.epoch(device.partition)
+
+    def fence(self, device: ScannedDevice, /) -> _core.Fence:
         """The fence of a device."""
         return self.fleet.fence(device.partition)
 
@@ -332,7 +357,11 @@ class FleetMember:
             self._device_host.end(device)
 
     async def leave(self) -> None:
-        """Hands everything over."""
-        if self.is_joined:
-            logs.write(logging.INFO, "fleet_leaving", fleet=self.fleet.settings.name)
-            await self.fleet.leave()
+        """Hands all devices over to other nodes."""
+        if not self.is_joined:
+            return
+        log_lines.write(logging.INFO, "fleet_leaving", fleet=self.fleet.settings.name)
+        # Whatever fails here, the leases end by themselves, and others take over then.
+        with contextlib.suppress(Exception):
+            async with asyncio.timeout(LEAVE_TIMEOUT_S):
+                await self.fleet.leave()

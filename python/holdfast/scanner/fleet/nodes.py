@@ -1,34 +1,32 @@
-"""Asks the other nodes of a fleet: to carry out commands, and to report devices that they poll."""
+"""What the nodes of a fleet ask each other: to carry out commands, and to report their devices."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 from nats.errors import Error, NoRespondersError
 from nats.errors import TimeoutError as NoAnswer
 
-from holdfast import logs
-from holdfast.scanner.errors import Refused
-from holdfast.scanner.fleet.exchange import (
-    Command,
-    Executed,
-    NodeReports,
-    ReportQuestion,
-    subject,
-)
+from holdfast.events import log_lines
+from holdfast.net.nats import nats_reason
+from holdfast.scanner.errors import Moved, Refused
+from holdfast.scanner.reports.variables import joined
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Iterable
 
-    from nats.aio.client import Client
     from nats.aio.msg import Msg
 
-    from holdfast.leases import Holding
+    from holdfast.replication.leases import Holding
     from holdfast.scanner.fleet.member import FleetMember
+    from holdfast.scanner.placement import CommandHost, ReportHost
     from holdfast.scanner.subscriptions.device import ScannedDevice
+    from holdfast.scanner.subscriptions.registry import Registry
 
 Reply = TypeVar("Reply", bound=msgspec.Struct)
 
@@ -37,6 +35,46 @@ ANSWER_TIMEOUT_S = 2.0
 
 RETRY_S = 0.1
 """Between attempts to find the node that polls a device."""
+
+ENVELOPE_BYTES = 512
+"""Bytes of an answer without devices."""
+
+
+class Command(msgspec.Struct, kw_only=True):
+    """A command for a device that the other node polls."""
+
+    device: str
+    tag: str
+    text: str
+    epoch: int
+    """The revision of the lease that the sender knows. A node with an older one must not write."""
+    within: float = 0.0
+    """Seconds that it may wait for the device, besides one timeout of the device."""
+
+
+class Executed(msgspec.Struct, kw_only=True, omit_defaults=True):
+    """The answer to a command."""
+
+    error: str | None = None
+    moved: bool = False
+    """The node does not poll the device any more. Nothing was written."""
+
+
+class ReportQuestion(msgspec.Struct, kw_only=True):
+    """Asks for reports, or for variables, of devices that the other node polls."""
+
+    devices: list[str]
+
+
+class NodeReports(msgspec.Struct, kw_only=True):
+    """The reports, or the variables, of some of the devices: as many as fit into a message."""
+
+    devices: dict[str, Any]
+
+
+def subject(prefix: str, node: str, what: str, process: str = "") -> str:
+    """Where a node is asked; with `process`, only that one: two may have the same name."""
+    return ".".join((prefix, "fleet", node, *([process] if process else []), what))
 
 
 class OtherNodes:
@@ -48,23 +86,18 @@ class OtherNodes:
         self._fleet = member.fleet
         self._move_timeout_s = 2 * self._fleet.settings.lease_times.ttl_s
         """How long a command waits for a node that polls its device: twice a takeover."""
-        self._client: Client | None = None
-
-    def connected(self, client: Client | None) -> None:
-        """Sets the client; `None` while there is no connection."""
-        self._client = client
 
     async def write(
         self,
         device: ScannedDevice,
         tag: str,
         text: str,
-        own: Callable[[], Awaitable[bool]],
+        own: Callable[[], Awaitable[None]],
         remaining_s: Callable[[], float],
     ) -> None:
         """Has a command carried out by the node that polls the device. Raises `Refused`.
 
-        `own` carries it out here. It returns false, and writes nothing, if the device has moved.
+        `own` carries it out here. It raises `Moved`, and writes nothing, if the device has moved.
         `remaining_s` refuses it if it is too late, and returns how many seconds it may wait.
         """
         end = time.monotonic() + self._move_timeout_s
@@ -73,7 +106,8 @@ class OtherNodes:
             left = remaining_s()  # Each time: this loop may run for seconds.
             owner = self._fleet.holder(device.partition)
             if self._member.is_own(device):
-                if await own():
+                with contextlib.suppress(Moved):
+                    await own()
                     return
             elif owner is not None and self._fleet.is_other(owner):
                 sent = await self._forward(owner, device, tag, text, left)
@@ -130,14 +164,14 @@ class OtherNodes:
                 )
             ).devices
         except (Error, OSError) as error:
-            reason = str(error) or type(error).__name__
-            logs.refused("node_silent", kind="fleet", node=node.node, reason=reason)
+            reason = nats_reason(error)
+            log_lines.refused("node_silent", kind="fleet", node=node.node, reason=reason)
             return {}
 
     async def _ask(
         self, node: Holding, what: str, request: msgspec.Struct, kind: type[Reply], seconds: float
     ) -> Reply:
-        client = self._client
+        client = self._member.client
         if client is None:
             raise NoAnswer
         where = subject(self._prefix, node.node, what, node.process)
@@ -146,3 +180,50 @@ class OtherNodes:
             return msgspec.json.decode(answer.data, type=kind)
         except msgspec.DecodeError as error:
             raise OSError(f"node {node.node} sent a malformed answer: {error}") from None
+
+
+@dataclass(eq=False)
+class NodeAnswers:
+    """Carries out commands, and reports devices, for other nodes."""
+
+    _member: FleetMember
+    _registry: Registry
+    _commands: CommandHost
+    _reports: ReportHost
+
+    async def command(self, message: Msg) -> bytes:
+        """Carries out a command that another node has received."""
+        command = msgspec.json.decode(message.data, type=Command)
+        device = self._registry.devices.get(command.device)
+
+        def remaining_s() -> float:
+            # It has waited at the other node before, which says how long it may still wait.
+            return min(self._commands.remaining_s(message), command.within)
+
+        try:
+            # The sender may know of a later lease, which this node has not heard of yet.
+            if device is None or not self._member.is_current(device, command.epoch):
+                return msgspec.json.encode(Executed(moved=True))
+            await self._commands.write(command.device, command.tag, command.text, remaining_s)
+            executed = Executed()
+        except Moved:
+            executed = Executed(moved=True)
+        except Refused as refused:
+            executed = Executed(error=str(refused))
+        return msgspec.json.encode(executed)
+
+    async def browse(self, message: Msg) -> bytes:
+        """Reports devices that this node polls."""
+        question = msgspec.json.decode(message.data, type=ReportQuestion)
+        return self._fitting(self._reports.device_reports(question.devices))
+
+    async def variables(self, message: Msg) -> bytes:
+        """Reports the values of devices that this node polls."""
+        question = msgspec.json.decode(message.data, type=ReportQuestion)
+        return self._fitting(self._reports.device_variables(question.devices))
+
+    def _fitting(self, reports: Iterable[tuple[str, object]]) -> bytes:
+        """Returns as many reports as fit into a message."""
+        encode, room = msgspec.json.encode, self._reports.max_bytes - ENVELOPE_BYTES
+        texts = (encode(id) + b":" + encode(content) for id, content in reports)
+        return b'{"devices":{' + joined(texts, room) + b"}}"

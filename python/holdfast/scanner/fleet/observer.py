@@ -12,17 +12,17 @@ import msgspec
 from nats.errors import Error, NoRespondersError
 from nats.js.errors import NotFoundError
 
-from holdfast.leases import LEASE_TIMES, Holding, LeaseBucket
-from holdfast.scanner.fleet.exchange import subject
+from holdfast.net.nats import ANSWERING, connected_once, nats_reason
+from holdfast.replication.leases import LEASE_TIMES, Holding, LeaseBucket
 from holdfast.scanner.fleet.fleet import NODE, PARTITION, leases_of
-from holdfast.scanner.nats.connection import ANSWERING, connected_once
+from holdfast.scanner.fleet.nodes import subject
 
 if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-    from holdfast.leases import Entry
-    from holdfast.scanner.nats.connection import Servers
+    from holdfast.net.nats.connection import Servers
+    from holdfast.replication.leases import Entry
 
 CHECK_INTERVAL_S = 0.05
 """Time between two looks at a node that leaves."""
@@ -101,7 +101,7 @@ class FleetObserver:
             except TimeoutError:
                 raise FleetUnavailable(f"{self._where} does not answer") from None
             except (Error, OSError) as error:
-                raise FleetUnavailable(f"{self._where}: {_reason(error)}") from None
+                raise FleetUnavailable(f"{self._where}: {nats_reason(error)}") from None
             self._ending = ending.pop_all()
         return self
 
@@ -152,13 +152,9 @@ class FleetObserver:
         except NoRespondersError:
             raise FleetUnavailable(f"there is no node {node} at {prefix}.fleet") from None
         except (Error, OSError, msgspec.DecodeError) as error:
-            raise FleetUnavailable(f"node {node} does not answer: {_reason(error)}") from None
+            raise FleetUnavailable(f"node {node} does not answer: {nats_reason(error)}") from None
         end = time.monotonic() + LEAVE_TIMEOUT_S
         while node in (await self.look()).nodes:
             await asyncio.sleep(CHECK_INTERVAL_S)
             if time.monotonic() > end:
                 raise FleetUnavailable(f"node {node} has not left within {LEAVE_TIMEOUT_S:g} s")
-
-
-def _reason(error: Exception) -> str:
-    return str(error).removeprefix("nats: ") or type(error).__name__

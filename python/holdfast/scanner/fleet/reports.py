@@ -6,11 +6,13 @@ All nodes know all devices. What a device has is asked of the node that polls it
 from __future__ import annotations
 
 import contextlib
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import msgspec
 
-from holdfast.scanner.messages.types import DeviceReport
+from holdfast.scanner.fleet.nodes import ENVELOPE_BYTES
+from holdfast.scanner.messages.types import BrowseRequest, DeviceReport, VariablesRequest
 
 if TYPE_CHECKING:
     from nats.aio.msg import Msg
@@ -24,21 +26,18 @@ if TYPE_CHECKING:
 DEVICES_PER_QUESTION = 100
 """Devices that other nodes are asked for at once."""
 
-ENVELOPE_BYTES = 512
-"""Bytes of an answer without devices."""
 
-
+@dataclass(eq=False)
 class FleetReports:
     """Reports devices of all nodes."""
 
-    def __init__(self, registry: Registry, own: ReportHost, nodes: OtherNodes) -> None:
-        self._registry = registry
-        self._own = own
-        self._nodes = nodes
+    _registry: Registry
+    _own: ReportHost
+    _nodes: OtherNodes
 
     async def browse(self, message: Msg) -> BrowseAnswer:
         """Reports devices. Raises `Refused`."""
-        request = self._own.browse_request(message)
+        request = self._own.request(message, BrowseRequest)
         ids = sorted(self._registry.devices)
         if request.device_id is not None:
             ids = [id for id in ids if id == request.device_id]
@@ -68,7 +67,7 @@ class FleetReports:
 
     async def variables(self, message: Msg) -> bytes:
         """Returns the latest values as JSON. Raises `Refused`."""
-        request = self._own.variables_request(message)
+        request = self._own.request(message, VariablesRequest)
         left, texts = request.offset or 0, list[bytes]()
         room = self._own.max_bytes - ENVELOPE_BYTES
         ids = sorted(self._registry.devices)

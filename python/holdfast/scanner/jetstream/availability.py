@@ -8,10 +8,15 @@ from enum import Enum
 from nats.errors import NoRespondersError, TimeoutError
 from nats.js.errors import APIError, ServiceUnavailableError
 
-from holdfast import logs
+from holdfast.events import log_lines
 
 JETSTREAM_TIMEOUT_S = 2.0
 """Time to wait for an answer of JetStream."""
+
+
+FIRST_RETRY_S = 0.5
+MAX_RETRY_S = 10.0
+"""Between attempts while JetStream fails. Each failure doubles the pause, up to the second."""
 
 
 class State(Enum):
@@ -37,23 +42,18 @@ class Availability:
         """Whether the last attempt has succeeded."""
         return self.state is State.AVAILABLE
 
-    @property
-    def is_unavailable(self) -> bool:
-        """Whether the last attempt has failed."""
-        return self.state is State.UNAVAILABLE
-
     def succeeded(self) -> None:
         """Notes that an attempt has succeeded."""
         if self.state is not State.AVAILABLE:
             self.state = State.AVAILABLE
-            logs.write(logging.INFO, self._available, **self._fields)
+            log_lines.write(logging.INFO, self._available, **self._fields)
 
     def failed(self, error: Exception) -> None:
         """Notes that an attempt has failed."""
         if self.state is not State.UNAVAILABLE:
             self.state = State.UNAVAILABLE
             reason = reason_of(error)
-            logs.write(logging.WARNING, self._unavailable, **self._fields, reason=reason)
+            log_lines.write(logging.WARNING, self._unavailable, **self._fields, reason=reason)
 
 
 def reason_of(error: Exception) -> str:

@@ -1,21 +1,82 @@
-"""The buckets of JetStream that the programs of a dialect write for the scanner."""
+"""The buckets of JetStream that the programs of a dialect write for the scanner.
+
+One has the entries of subscriptions, the other a key that says whether the scanner is enabled.
+Without JetStream, and without the key, it is.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import logging
 from typing import TYPE_CHECKING, Protocol
 
+import msgspec
+
+from holdfast.events import log_lines
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.jetstream.enabled_key import EnabledKey
 from holdfast.scanner.jetstream.entry_subscriptions import EntryHost, EntrySubscriptions
+from holdfast.scanner.jetstream.key_watch import KeyWatch
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from nats.aio.client import Client
 
     from holdfast.scanner.jetstream.entry_subscriptions import RefusedEntry
-    from holdfast.scanner.jetstream.key_watch import WatchTimes
+    from holdfast.scanner.jetstream.key_watch import WatchTimes, Written
+
+BUCKET = "service_enabled"
+
+
+class _State(msgspec.Struct):
+    enabled: bool
+
+
+class EnabledKey:
+    """Follows the key of the scanner."""
+
+    def __init__(self, key: str, times: WatchTimes) -> None:
+        self._key = key
+        self.watch = KeyWatch(BUCKET, key, self._on_change, times)
+        self._last_reported: bool | None = None
+        self.enabled = True
+
+    async def run(self, enable: Callable[[bool], None]) -> None:
+        """Calls `enable` with the first state and each new one, until it is cancelled."""
+        self._enable = enable
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self.watch.run())
+            tasks.create_task(self._report_first())
+
+    async def _report_first(self) -> None:
+        """Enables the scanner if the key can't be read."""
+        await self.watch.tried.wait()
+        self._report()
+
+    async def _on_change(self, found: Mapping[str, Written | None], is_all: bool) -> None:
+        """Takes the state; a malformed one changes nothing."""
+        if self._key not in found and not is_all:
+            return
+        written = found.get(self._key)
+        try:
+            enabled = written is None or msgspec.json.decode(written.value, type=_State).enabled
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            log_lines.refused(
+                "enabled_entry_malformed", kind="enabled", key=self._key, reason=str(error)
+            )
+            return
+        if enabled != self.enabled:
+            self.enabled = enabled
+            level = logging.INFO if enabled else logging.WARNING
+            log_lines.write(
+                level, "scanner_enabled" if enabled else "scanner_disabled", key=self._key
+            )
+        self._report()
+
+    def _report(self) -> None:
+        if self._last_reported is not self.enabled:
+            self._last_reported = self.enabled
+            self._enable(self.enabled)
 
 
 class BucketHost(EntryHost, Protocol):
@@ -25,19 +86,22 @@ class BucketHost(EntryHost, Protocol):
         """Polls devices, or stops polling them."""
 
 
-class Buckets(Protocol):
-    """What programs have written."""
+class Buckets:
+    """What programs have written: nothing with tentacle-modbus, which had no such buckets."""
 
     @property
     def is_enabled(self) -> bool | None:
         """Whether devices are polled; `None` if no program can change it."""
+        return None
 
     @property
     def refused(self) -> Sequence[RefusedEntry]:
         """The refused entries of the bucket of subscriptions, by key."""
+        return ()
 
-    def key_of(self, device: str, subscriber: str | None) -> str | None:
+    def key_of(self, _device: str, _subscriber: str | None, /) -> str | None:
         """Returns the key of the entry that a subscription is from; `None` if it is from none."""
+        return None
 
     def check_not_entry(self, device: str, subscriber: str) -> None:
         """Raises `Refused` for a subscription that is from an entry."""
@@ -48,35 +112,13 @@ class Buckets(Protocol):
     async def read(self) -> None:
         """Waits until the buckets are read for the first time, but not for long."""
 
-    async def run(self, host: BucketHost) -> None:
-        """Has `host` carry out what is written, until it is cancelled."""
-
-
-class NoBuckets:
-    """Those of tentacle-modbus, which had none, see `Buckets`."""
-
-    is_enabled = None
-    refused: Sequence[RefusedEntry] = ()
-
-    def key_of(self, *_: object) -> None:
-        """Returns nothing: all subscriptions are from requests."""
-
-    def check_not_entry(self, device: str, subscriber: str) -> None:
-        """Raises nothing: all subscriptions are from requests."""
-
-    def connected(self, client: Client | None) -> None:
-        """Has nothing to read."""
-
-    async def read(self) -> None:
-        """Has nothing to wait for."""
-
     async def run(self, _host: BucketHost, /) -> None:
-        """Waits until it is cancelled."""
+        """Has `host` carry out what is written, until it is cancelled."""
         await asyncio.Event().wait()
 
 
-class TentacleNextBuckets:
-    """Those of tentacle-next, see `Buckets`."""
+class TentacleNextBuckets(Buckets):
+    """Those of tentacle-next."""
 
     def __init__(self, prefix: str, times: WatchTimes) -> None:
         self._entries = EntrySubscriptions(prefix, times)
@@ -92,7 +134,7 @@ class TentacleNextBuckets:
         """The refused entries, by key."""
         return self._entries.refused
 
-    def key_of(self, device: str, subscriber: str | None) -> str | None:
+    def key_of(self, device: str, subscriber: str | None, /) -> str | None:
         """Returns the key of the entry that a subscription is from; `None` if it is from none."""
         return self._entries.key_of(device, subscriber)
 
@@ -107,15 +149,15 @@ class TentacleNextBuckets:
 
     def connected(self, client: Client | None) -> None:
         """Sets the client; `None` while there is no connection."""
-        self._enabled_key.connected(client)
-        self._entries.connected(client)
+        self._enabled_key.watch.connected(client)
+        self._entries.watch.connected(client)
 
     async def read(self) -> None:
         """Waits until both buckets are read for the first time, but not for long."""
-        await self._enabled_key.read()
-        await self._entries.read()
+        await self._enabled_key.watch.read()
+        await self._entries.watch.read()
 
-    async def run(self, host: BucketHost) -> None:
+    async def run(self, host: BucketHost, /) -> None:
         """Has `host` carry out what is written, until it is cancelled."""
         host.enable(False)  # Until it is known that the scanner is enabled.
         async with asyncio.TaskGroup() as running:

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.device import ScannedDevice, TagOptions
     from holdfast.scanner.subscriptions.tag import Tag
 
-MAX_PART = 128 * 1024
+MAX_PART_BYTES = 128 * 1024
 """The size in bytes of tags above which a further entry is made."""
 
-MAX_ENTRY = 8 * 1024 * 1024
+MAX_ENTRY_BYTES = 8 * 1024 * 1024
 """The size limit of a stored request in bytes."""
 
 _PLAIN = re.compile(r"[A-Za-z0-9_-]+")
@@ -77,9 +77,9 @@ def requests(device: ScannedDevice, subscriber: str) -> Iterator[bytes]:
     before = _encode({key: value for key, value in head.items() if value is not None})[:-1]
     part: list[bytes] = []
     size = 0
-    for id, wanted in known.tags.items():
-        text = _tag(device.tags[id], wanted)
-        if part and size + len(text) > MAX_PART:
+    for id, options in known.tags.items():
+        text = _tag(device.tags[id], options)
+        if part and size + len(text) > MAX_PART_BYTES:
             yield before + b',"tags":[' + b",".join(part) + b"]}"
             part, size = [], 0
         part.append(text)
@@ -90,7 +90,7 @@ def requests(device: ScannedDevice, subscriber: str) -> Iterator[bytes]:
 
 def restored(value: bytes) -> SubscribeRequest:
     """Parses a stored request. Raises `Refused`."""
-    return decode(value, SubscribeRequest, MAX_ENTRY)
+    return decode(value, SubscribeRequest, MAX_ENTRY_BYTES)
 
 
 def without(found: Iterable[SubscribeRequest], ids: Collection[str]) -> list[SubscribeRequest]:
@@ -110,7 +110,7 @@ def _place(device: ScannedDevice) -> dict[str, object]:
     return {"host": target.host, "port": target.port, "transport": target.transport}
 
 
-def _tag(tag: Tag, wanted: TagOptions) -> bytes:
+def _tag(tag: Tag, options: TagOptions) -> bytes:
     """Returns a tag as JSON; without a description that would make it too long."""
     made = TagRequest(
         id=tag.id,
@@ -119,13 +119,13 @@ def _tag(tag: Tag, wanted: TagOptions) -> bytes:
         datatype=tag.requested_type,
         byte_order=tag.order,
         encoding=tag.encoding,
-        writable=wanted.writable,
-        description=wanted.description,
+        writable=options.writable,
+        description=options.description,
         null=[_marker(marker) for marker in tag.null] or None,
         profile=tag.profile,
     )
     text = _encode(made)
-    if len(text) > MAX_PART:
+    if len(text) > MAX_PART_BYTES:
         text = _encode(msgspec.structs.replace(made, description=None))
     return text
 

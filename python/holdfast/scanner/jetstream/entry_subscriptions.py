@@ -1,9 +1,9 @@
-"""Subscriptions from the entries of a JetStream bucket, as programs of tentacle-next write them.
+"""Subscriptions from the entries of a JetStream bucket, which programs of tentacle-next write.
 
 The key of an entry is `SUBSCRIBER.DEVICE`. Its value is the whole subscription, which ends when the
-entry is deleted. An entry that is refused ends the subscription of its former value, which is out
-of date. It is logged once, shown to callers, and tried again: what refuses it, such as an
-unknown name or another subscriber, may end.
+entry is deleted. If a new value is refused, the subscription of the former value ends, because that
+value is out of date. A refusal is logged once, is in the reports to callers, and the entry is tried
+again: its cause, such as an unknown host name or another subscriber, may be temporary.
 """
 
 from __future__ import annotations
@@ -17,15 +17,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
-from holdfast import logs
+from holdfast.events import log_lines
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.key_watch import KeyWatch
 from holdfast.scanner.subscriptions.key import SubscriptionKey
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping
-
-    from nats.aio.client import Client
 
     from holdfast.scanner.jetstream.key_watch import WatchTimes, Written
     from holdfast.scanner.messages.types import SubscribeRequest
@@ -38,11 +36,11 @@ MAX_ENTRIES = 50_000
 """Limit of entries; further ones are ignored."""
 
 MAX_HELD_BYTES = 64 * 1024 * 1024
-"""Limit of the values of refused entries that are kept to try them again."""
+"""Limit of the total size of refused values that are kept to try them again."""
 
 
 class Outcome(Enum):
-    """What has become of an entry."""
+    """The result of carrying out an entry."""
 
     CARRIED_OUT = "its subscription is that of its value"
     REFUSED = "refused; nothing has changed"
@@ -62,12 +60,12 @@ class Entry:
 
 @dataclass
 class RefusedEntry:
-    """Why an entry is refused, and what it is about, as far as its value can be read."""
+    """Why an entry is refused, with its device and tags if its value can be decoded."""
 
     key: str
     reason: str
     written: Written | None
-    """`None` if it is not kept to try it again."""
+    """The refused value; `None` if it is too large to be kept for another attempt."""
     device: str | None = None
     tags: list[str] = field(default_factory=list)
 
@@ -78,8 +76,8 @@ class EntryHost(Protocol):
     def check_entry(self, key: str, value: bytes) -> Subscription:
         """Returns the subscription of an entry. Raises `Refused`."""
 
-    async def carry_out_entry(self, asked: Subscription) -> None:
-        """Makes a subscription that of the entry. Raises `Refused`."""
+    async def carry_out_entry(self, subscription: Subscription) -> None:
+        """Replaces the subscription of an entry. Raises `Refused`."""
 
     async def end_entry(self, key: SubscriptionKey) -> None:
         """Ends the subscription of an entry."""
@@ -91,7 +89,7 @@ class EntrySubscriptions:
     def __init__(self, prefix: str, times: WatchTimes) -> None:
         self.bucket = BUCKET + prefix
         self._retry_s = times.retry_s
-        self._watch = KeyWatch(self.bucket, ">", self._on_change, times)
+        self.watch = KeyWatch(self.bucket, ">", self._on_change, times)
         self._entries: dict[str, Entry] = {}
         self._keys: dict[SubscriptionKey, str] = {}
         self._lock = asyncio.Lock()
@@ -99,45 +97,37 @@ class EntrySubscriptions:
         self._held_bytes = 0
         self._has_logged_limit = False
 
-    def connected(self, client: Client | None) -> None:
-        """Sets the client; `None` while there is no connection."""
-        self._watch.connected(client)
-
     @property
     def refused(self) -> list[RefusedEntry]:
         """The refused entries, by key."""
-        found = (entry.refused for _, entry in sorted(self._entries.items()))
-        return [refused for refused in found if refused is not None]
+        refused_entries = (entry.refused for _, entry in sorted(self._entries.items()))
+        return [refused for refused in refused_entries if refused is not None]
 
     def key_of(self, device: str, subscriber: str | None) -> str | None:
         """Returns the key of the entry that a subscription is from; `None` if it is from none."""
         return None if subscriber is None else self._keys.get(SubscriptionKey(device, subscriber))
 
-    async def read(self) -> None:
-        """Waits until the entries are read for the first time, but not for long."""
-        await self._watch.read()
-
     async def run(self, host: EntryHost) -> None:
         """Has `host` carry out the entries, until it is cancelled."""
         self._host = host
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._watch.run())
+            tasks.create_task(self.watch.run())
             tasks.create_task(self._try_again())
 
-    async def _on_change(self, found: Mapping[str, Written | None], is_all: bool) -> None:
-        """Carries out changed entries; with `is_all`, ends those that are not there any more."""
+    async def _on_change(self, changes: Mapping[str, Written | None], is_all: bool) -> None:
+        """Carries out changed entries; with `is_all`, removes entries that `changes` lacks."""
         async with self._lock:
-            gone = [key for key in self._entries if key not in found] if is_all else []
-            gone += [key for key, written in found.items() if written is None]
-            for key in gone:
+            deleted = [key for key in self._entries if key not in changes] if is_all else []
+            deleted += [key for key, written in changes.items() if written is None]
+            for key in deleted:
                 await self._forget(key)
-            wanted = []
-            for key, written in found.items():
+            changed = []
+            for key, written in changes.items():
                 if written is not None and self._is_new(key, written):
-                    wanted.append((key, written))
-            await self._carry_out(wanted)
-            if gone or wanted:  # One of these may have been why others were refused.
-                await self._carry_out(self._refused_entries(but={key for key, _ in wanted}))
+                    changed.append((key, written))
+            await self._carry_out(changed)
+            if deleted or changed:  # A change can remove the cause of an earlier refusal.
+                await self._carry_out(self._refused_entries(excluded={key for key, _ in changed}))
 
     def _is_new(self, key: str, written: Written) -> bool:
         """Returns whether an entry is to be carried out; adds it if it is new.
@@ -149,7 +139,9 @@ class EntrySubscriptions:
             if len(self._entries) >= MAX_ENTRIES:
                 if not self._has_logged_limit:
                     self._has_logged_limit = True
-                    logs.write(logging.WARNING, "too_many_entries", bucket=self.bucket, key=key)
+                    log_lines.write(
+                        logging.WARNING, "too_many_entries", bucket=self.bucket, key=key
+                    )
                 return False
             self._entries[key] = Entry()
             return True
@@ -175,29 +167,30 @@ class EntrySubscriptions:
             async with self._lock:
                 await self._carry_out(self._refused_entries())
 
-    def _refused_entries(self, but: Container[str] = ()) -> list[tuple[str, Written]]:
+    def _refused_entries(self, excluded: Container[str] = ()) -> list[tuple[str, Written]]:
         """Returns the refused entries whose values are kept."""
-        refused = (entry.refused for entry in self._entries.values())
+        refused_entries = (entry.refused for entry in self._entries.values())
         return [
-            (each.key, each.written)
-            for each in refused
-            if each is not None and each.written is not None and each.key not in but
+            (refused.key, refused.written)
+            for refused in refused_entries
+            if refused is not None and refused.written is not None and refused.key not in excluded
         ]
 
-    async def _carry_out(self, wanted: Iterable[tuple[str, Written]]) -> None:
+    async def _carry_out(self, entries: Iterable[tuple[str, Written]]) -> None:
         """Carries out entries. Refused ones are tried once more if a subscription has ended.
 
-        It may have been why another entry was refused, as when two entries exchange their devices.
+        The ended subscription can be the cause of a refusal: two entries that exchange their
+        devices each refuse the other until one has ended.
         """
-        refused = await self._carry_out_once(wanted)
+        refused = await self._carry_out_once(entries)
         if any(outcome is Outcome.ENDED for _, _, outcome in refused):
             await self._carry_out_once((key, written) for key, written, _ in refused)
 
     async def _carry_out_once(
-        self, wanted: Iterable[tuple[str, Written]]
+        self, entries: Iterable[tuple[str, Written]]
     ) -> list[tuple[str, Written, Outcome]]:
         """Carries out entries concurrently. Returns the refused ones."""
-        pairs = list(wanted)
+        pairs = list(entries)
         outcomes = await asyncio.gather(
             *(self._carry_out_one(key, written) for key, written in pairs)
         )
@@ -211,17 +204,17 @@ class EntrySubscriptions:
         entry = self._entries[key]
         had_subscription = entry.subscription is not None
         try:
-            asked = self._host.check_entry(key, written.value)
-            subscription = SubscriptionKey(asked.device, asked.subscriber)
-            if entry.subscription not in (None, subscription):
+            subscription = self._host.check_entry(key, written.value)
+            key_of_entry = SubscriptionKey(subscription.device, subscription.subscriber)
+            if entry.subscription not in (None, key_of_entry):
                 await self._release(entry)
-            entry.subscription = subscription
-            self._keys[subscription] = key
-            await self._host.carry_out_entry(asked)
+            entry.subscription = key_of_entry
+            self._keys[key_of_entry] = key
+            await self._host.carry_out_entry(subscription)
         except Refused as refused:
             reason = str(refused)
         except Exception as error:  # An error in one entry must not affect the others.
-            logs.problem("entry_failed", key=key)
+            log_lines.problem("entry_failed", key=key)
             reason = f"internal error: {type(error).__name__}"
         else:
             self._set_refused(entry, None)
@@ -237,26 +230,29 @@ class EntrySubscriptions:
         entry = self._entries[key]
         if had_subscription:
             await self._release(entry)
-        elif entry.subscription is not None:  # What was refused has changed nothing.
+        elif entry.subscription is not None:  # The refused request has changed nothing.
             del self._keys[entry.subscription]
             entry.subscription = None
+        # Release the former value first, so that it does not count against the limit.
         before = entry.refused
         self._set_refused(entry, None)
-        kept = written if self._held_bytes + len(written.value) <= MAX_HELD_BYTES else None
-        self._set_refused(entry, RefusedEntry(key, reason, kept, *_subject_of(written.value)))
+        kept_value = written if self._held_bytes + len(written.value) <= MAX_HELD_BYTES else None
+        self._set_refused(entry, RefusedEntry(key, reason, kept_value, *_subject_of(written.value)))
         entry.written = _identity(written)
         if before is None or before.reason != reason:
-            logs.write(logging.WARNING, "entry_refused", bucket=self.bucket, key=key, reason=reason)
+            log_lines.write(
+                logging.WARNING, "entry_refused", bucket=self.bucket, key=key, reason=reason
+            )
 
     def _set_refused(self, entry: Entry, refused: RefusedEntry | None) -> None:
-        for each, sign in ((entry.refused, -1), (refused, 1)):
-            if each is not None and each.written is not None:
-                self._held_bytes += sign * len(each.written.value)
+        for record, sign in ((entry.refused, -1), (refused, 1)):
+            if record is not None and record.written is not None:
+                self._held_bytes += sign * len(record.written.value)
         entry.refused = refused
 
 
 def check_entry(key: str, request: SubscribeRequest) -> None:
-    """Checks what only entries of the bucket must fulfil. Raises `Refused`."""
+    """Checks the rules that apply to entries but not to requests. Raises `Refused`."""
     named = f"{request.subscriber_id}.{request.device_id}"
     if key != named:
         raise Refused(f"the key is {key!r}, allowed: SUBSCRIBER.DEVICE of its value: {named!r}")
@@ -265,22 +261,25 @@ def check_entry(key: str, request: SubscribeRequest) -> None:
 
 
 def _identity(written: Written) -> tuple[int, bytes]:
-    """Returns what identifies a value of a key, also when the bucket is replaced."""
+    """Returns what identifies a value of a key.
+
+    A revision is not enough: a bucket that was deleted and created anew counts from 1 again.
+    """
     return written.revision, blake2b(written.value, digest_size=16).digest()
 
 
 def _subject_of(value: bytes) -> tuple[str | None, list[str]]:
     """Returns the device and the tags of a refused value, as far as it can be read."""
     try:
-        found = msgspec.json.decode(value)
+        decoded = msgspec.json.decode(value)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None, []
-    device = _text_value(found, "deviceId")
-    tags = found.get("tags") if type(found) is dict else None
+    device = _text_value(decoded, "deviceId")
+    tags = decoded.get("tags") if type(decoded) is dict else None
     ids = [_text_value(tag, "id") for tag in tags] if type(tags) is list else []
     return device, [] if device is None else list(dict.fromkeys(filter(None, ids)))
 
 
-def _text_value(found: Any, key: str) -> str | None:
-    value = found.get(key) if type(found) is dict else None
+def _text_value(decoded: Any, key: str) -> str | None:
+    value = decoded.get(key) if type(decoded) is dict else None
     return value if type(value) is str else None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import msgspec
 from nats.js.errors import KeyNotFoundError, NotFoundError
 
-from holdfast import logs
+from holdfast.events import log_lines
 from holdfast.scanner.jetstream.availability import JETSTREAM_TIMEOUT_S, Availability
 from holdfast.scanner.messages.types import Announcement, Heartbeat
 
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from holdfast.scanner.messages.types import HeartbeatMetadata
 
 BUCKET = "service_heartbeats"
+
+HEARTBEAT_INTERVAL_S = 10.0
+"""Time between two heartbeats."""
 
 EXPIRES_AFTER_S = 60.0
 """Time after which a heartbeat expires if it is not renewed."""
@@ -93,7 +96,7 @@ class HeartbeatKey:
         todo = (
             f"delete the bucket, so that it is created again, or set max_age {EXPIRES_AFTER_S:g} s"
         )
-        logs.write(logging.WARNING, "heartbeat_has_no_end", bucket=BUCKET, todo=todo)
+        log_lines.write(logging.WARNING, "heartbeat_has_no_end", bucket=BUCKET, todo=todo)
 
     async def stop(self, client: Client | None) -> None:
         """Deletes the heartbeat. A heartbeat that is still being renewed is not logged any more."""

@@ -17,20 +17,25 @@ from nats.js.errors import NotFoundError
 
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
-from holdfast.scanner.jetstream.availability import JETSTREAM_TIMEOUT_S, Availability
-from holdfast.scanner.jetstream.store import (
-    FETCH_BATCH,
+from holdfast.scanner.jetstream.availability import (
     FIRST_RETRY_S,
+    JETSTREAM_TIMEOUT_S,
     MAX_RETRY_S,
-    READER_EXPIRES_S,
+    Availability,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 
     from nats.aio.client import Client
     from nats.aio.msg import Msg
     from nats.js import JetStreamContext
+
+READER_EXPIRES_S = 30.0
+"""Time after which the server removes a reader that was left behind."""
+
+FETCH_BATCH = 256
+"""Entries that are read at once."""
 
 MAX_FIRST_READ_WAIT_S = 2.0
 """How long requests wait for the bucket to be read. After that, reading continues."""
@@ -85,8 +90,6 @@ class KeyWatch:
         all keys of the bucket.
         """
         self._bucket = bucket
-        self._stream = f"KV_{bucket}"
-        self._subject_prefix = f"$KV.{bucket}."
         self._keys = keys
         self._on_change = on_change
         self._times = times
@@ -143,102 +146,110 @@ class KeyWatch:
         """Reads all keys, then reports changes. Raises `_Missed`, or an error of JetStream."""
         jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
         await self._open(jetstream)
-        reader = _Reader(self._stream, self._subject_prefix, self._times)
-        try:
-            count = await reader.begin(jetstream, self._keys)
-            found: dict[str, Written | None] = {}
-            while (left := count - reader.received) > 0:
-                found |= await reader.fetch(min(left, FETCH_BATCH), JETSTREAM_TIMEOUT_S)
-            await self._on_change(found, True)
+        async with reading(jetstream, self._bucket, self._keys) as reader:
+            await self._on_change(await reader.fetch_all(), True)
             self._backoff.succeeded()
             self._availability.succeeded()
             self.tried.set()
             while True:
-                if changes := await reader.changes():
+                if changes := await reader.changes(self._times):
                     await self._on_change(changes, False)
-        except Exception:
-            await reader.delete()
-            raise
-        finally:
-            await reader.close()
 
     async def _open(self, jetstream: JetStreamContext) -> None:
         try:
-            await jetstream.stream_info(self._stream)
+            await jetstream.stream_info(f"KV_{self._bucket}")
         except NotFoundError:
             await jetstream.create_key_value(bucket=self._bucket, history=1)
 
 
-class _Reader:
+class Reader:
     """A consumer of a bucket's messages.
 
     A watcher of nats-py may report the end before the first key. The number of messages that a new
     pull consumer has is certain.
     """
 
-    def __init__(self, stream: str, subject_prefix: str, times: WatchTimes) -> None:
-        self._stream = stream
-        self._subject_prefix = subject_prefix
-        self._times = times
-        self.received = 0
+    def __init__(
+        self, jetstream: JetStreamContext, bucket: str, consumer: JetStreamContext.PullSubscription
+    ) -> None:
+        self._jetstream = jetstream
+        self._bucket = bucket
+        self._consumer = consumer
+        self._received = 0
         """The number of the last message, counted by the server."""
 
-    async def begin(self, jetstream: JetStreamContext, keys: str) -> int:
-        """Creates the consumer. Returns the number of messages that it has for now."""
-        config = ConsumerConfig(
-            deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
-            ack_policy=AckPolicy.NONE,
-            inactive_threshold=READER_EXPIRES_S,
-        )
-        self._jetstream = jetstream
-        self._subscription = await jetstream.pull_subscribe(
-            self._subject_prefix + keys, stream=self._stream, config=config
-        )
-        info = await self._subscription.consumer_info()
-        self._name = info.name
-        return info.num_pending or 0
+    async def fetch_all(self) -> dict[str, Written | None]:
+        """Returns all keys that there are now."""
+        info = await self._consumer.consumer_info()
+        self._name, count = info.name, info.num_pending or 0
+        found: dict[str, Written | None] = {}
+        while (left := count - self._received) > 0:
+            found |= await self.fetch(min(left, FETCH_BATCH), JETSTREAM_TIMEOUT_S)
+        return found
 
-    async def changes(self) -> dict[str, Written | None]:
+    async def changes(self, times: WatchTimes) -> dict[str, Written | None]:
         """Waits for changes. Returns them when no more follow, or nothing after a while."""
         try:
-            found = await self.fetch(1, self._times.quiet_s)
+            found = await self.fetch(1, times.quiet_s)
         except TimeoutError:
             await self._check()
             return {}
         end = time.monotonic() + MAX_SETTLE_S
         with contextlib.suppress(TimeoutError):
             while time.monotonic() < end:
-                found |= await self.fetch(FETCH_BATCH, self._times.settle_s)
+                found |= await self.fetch(FETCH_BATCH, times.settle_s)
         return found
 
     async def fetch(self, most: int, timeout: float) -> dict[str, Written | None]:
         """Returns the next messages, at least one. Raises `TimeoutError` if there are none."""
-        return dict(map(self._read, await self._subscription.fetch(most, timeout=timeout)))
+        return dict(map(self._read, await self._consumer.fetch(most, timeout=timeout)))
 
     def _read(self, message: Msg) -> tuple[str, Written | None]:
         number = message.metadata.sequence.consumer
-        if number != self.received + 1:  # The server counts what it sends without gaps.
+        if number != self._received + 1:  # The server counts what it sends without gaps.
             raise _Missed
-        self.received = number
+        self._received = number
         headers = message.headers or {}
         is_marker = any(header in headers for header in MARKER_HEADERS)
-        key = message.subject.removeprefix(self._subject_prefix)
+        key = message.subject.removeprefix(f"$KV.{self._bucket}.")
         revision = message.metadata.sequence.stream
         return key, None if is_marker else Written(message.data, revision)
 
     async def _check(self) -> None:
         """Checks that the server has the consumer, and delivered nothing that did not arrive."""
-        info = await self._subscription.consumer_info()
+        info = await self._consumer.consumer_info()
         delivered = 0 if info.delivered is None else info.delivered.consumer_seq
-        if delivered != self.received and self._subscription.pending_msgs == 0:
+        if delivered != self._received and self._consumer.pending_msgs == 0:
             raise _Missed
-
-    async def delete(self) -> None:
-        """Deletes the consumer, if the server can be reached. It expires anyway."""
-        with contextlib.suppress(Exception):
-            await self._jetstream.delete_consumer(self._stream, self._name)
 
     async def close(self) -> None:
         """Ends the subscription, which nats-py would repeat after each reconnect."""
         with contextlib.suppress(Exception):
-            await self._subscription.unsubscribe()
+            await self._consumer.unsubscribe()
+
+    async def delete(self) -> None:
+        """Deletes the consumer, if the server can be reached. It expires anyway."""
+        with contextlib.suppress(Exception):
+            await self._jetstream.delete_consumer(f"KV_{self._bucket}", self._name)
+
+
+@contextlib.asynccontextmanager
+async def reading(jetstream: JetStreamContext, bucket: str, keys: str) -> AsyncIterator[Reader]:
+    """Has a consumer of these keys. Raises errors of nats-py."""
+    config = ConsumerConfig(
+        deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
+        ack_policy=AckPolicy.NONE,
+        inactive_threshold=READER_EXPIRES_S,
+    )
+    subject, stream = f"$KV.{bucket}.{keys}", f"KV_{bucket}"
+    consumer = await jetstream.pull_subscribe(subject, stream=stream, config=config)
+    reader = Reader(jetstream, bucket, consumer)
+    try:
+        yield reader
+    except Exception:
+        await reader.delete()
+        raise
+    else:
+        await reader.delete()
+    finally:
+        await reader.close()

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from typing import TYPE_CHECKING
 
 import msgspec
 
-from holdfast import logs
+from holdfast.events import log_lines
 from holdfast.scanner.errors import Refused
+from holdfast.scanner.jetstream.availability import MAX_RETRY_S
 from holdfast.scanner.jetstream.entries import (
     number,
     numbered,
@@ -18,8 +20,9 @@ from holdfast.scanner.jetstream.entries import (
     status_key,
     without,
 )
-from holdfast.scanner.jetstream.store import MAX_RETRY_S, EntryStore
+from holdfast.scanner.jetstream.store import EntryStore
 from holdfast.scanner.messages.types import Status
+from holdfast.scanner.placement import Placement
 from holdfast.scanner.subscriptions.key import SubscriptionKey
 
 if TYPE_CHECKING:
@@ -28,14 +31,15 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast.scanner.messages.types import SubscribeRequest, UnsubscribeRequest
-    from holdfast.scanner.placement import SubscriptionHost
+    from holdfast.scanner.placement import DeviceHost, SubscriptionHost
+    from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
 
 MAX_RESTORE_WAIT_S = 2.0
 """How long requests wait for stored subscriptions. After that, restoring continues."""
 
 
-class StoredSubscriptions:
+class StoredSubscriptions(Placement):
     """Stores the subscriptions and states of the registry, and restores them after a start."""
 
     def __init__(self, prefix: str, registry: Registry) -> None:
@@ -54,7 +58,9 @@ class StoredSubscriptions:
         """Sets the client; `None` while there is no connection."""
         self._store.connected(client)
 
-    async def run(self, host: SubscriptionHost, ready: asyncio.Event) -> None:
+    async def run(
+        self, _devices: DeviceHost, host: SubscriptionHost, ready: asyncio.Event, /
+    ) -> None:
         """Restores and stores, until it is cancelled.
 
         `host` carries out stored requests. Subscriptions from entries of another bucket are not
@@ -67,11 +73,13 @@ class StoredSubscriptions:
 
     async def close(self) -> None:
         """Removes the states of devices, which would be out of date. Then stores nothing."""
-        await self._store.stop()
+        with contextlib.suppress(Exception):  # JetStream is optional, and may fail in any way.
+            await self._store.stop()
 
-    def changed(self, device: str, subscriber: str) -> None:
+    def subscribed(self, device: ScannedDevice, subscriber: str | None, /) -> None:
         """Stores a subscription that has changed, instead of what is pending."""
-        self._touch(SubscriptionKey(device, subscriber))
+        if subscriber is not None:
+            self._touch(SubscriptionKey(device.id, subscriber))
 
     def state_changed(self, device: str) -> None:
         """Stores the state of a device; removes it if the device is gone."""
@@ -129,7 +137,7 @@ class StoredSubscriptions:
                     continue
                 request = restored(value)
             except (Refused, msgspec.DecodeError) as error:
-                logs.refused("kept_entry_malformed", kind="kept", key=key, reason=str(error))
+                log_lines.refused("kept_entry_malformed", kind="kept", key=key, reason=str(error))
                 continue
             owner = SubscriptionKey(request.device_id, request.subscriber_id)
             is_ours = owner in self._store.touched or self._is_known(owner)
@@ -193,4 +201,4 @@ class StoredSubscriptions:
 
     @staticmethod
     def _log(level: int, event: str, owner: SubscriptionKey, **more: object) -> None:
-        logs.write(level, event, device=owner.device, subscriber=owner.subscriber, **more)
+        log_lines.write(level, event, device=owner.device, subscriber=owner.subscriber, **more)

@@ -11,12 +11,18 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
-from holdfast.scanner.jetstream.availability import JETSTREAM_TIMEOUT_S, Availability
+from holdfast.scanner.jetstream.availability import (
+    FIRST_RETRY_S,
+    JETSTREAM_TIMEOUT_S,
+    MAX_RETRY_S,
+    Availability,
+    State,
+)
+from holdfast.scanner.jetstream.key_watch import reading
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Set
@@ -30,16 +36,6 @@ if TYPE_CHECKING:
 BUCKET = "holdfast_scanner"
 STREAM = f"KV_{BUCKET}"
 KEY_SUBJECTS = f"$KV.{BUCKET}."
-
-READER_EXPIRES_S = 30.0
-"""Time after which the server removes a reader that was left behind."""
-
-FETCH_BATCH = 256
-"""Entries that are read at once."""
-
-FIRST_RETRY_S = 0.5
-MAX_RETRY_S = 10.0
-"""Between attempts while JetStream fails. Each failure doubles the pause, up to the second."""
 
 MAX_CONCURRENT_WRITES = 16
 """Subscriptions that are written at once."""
@@ -135,7 +131,7 @@ class EntryStore:
 
     async def _wait(self) -> None:
         """Waits for work; while JetStream fails, for the next attempt."""
-        if self._availability.is_unavailable and self._client is not None:
+        if self._availability.state is State.UNAVAILABLE and self._client is not None:
             client = self._client
             try:
                 async with asyncio.timeout(self._pause_s):
@@ -157,7 +153,9 @@ class EntryStore:
             bucket = await jetstream.create_key_value(bucket=BUCKET, history=1)
         entries = []
         for kind in ("subscription.*.*.*", "status.*"):
-            entries += await _entries(jetstream, f"{self._prefix}.{kind}")
+            async with reading(jetstream, BUCKET, f"{self._prefix}.{kind}") as reader:
+                found = await reader.fetch_all()
+            entries += [(key, each.value) for key, each in found.items() if each is not None]
         owners = self._on_read(entries)
         self._stored = {}
         for key, value in entries:
@@ -189,13 +187,13 @@ class EntryStore:
     async def _write_owner(
         self, jetstream: JetStreamContext, bucket: KeyValue, owner: SubscriptionKey
     ) -> None:
-        wanted = self._entries(owner)
+        entries = self._entries(owner)
         stored = self._stored.setdefault(owner, {})
-        for key, value in wanted.items():
+        for key, value in entries.items():
             if stored.get(key) != hash(value):  # A hash: values may take 128 KiB each.
                 await bucket.put(key, value)
                 stored[key] = hash(value)
-        for key in [key for key in stored if key not in wanted]:
+        for key in [key for key in stored if key not in entries]:
             # Unlike a deletion, a purge leaves no marker behind.
             await jetstream.purge_stream(STREAM, subject=KEY_SUBJECTS + key)
             del stored[key]
@@ -218,33 +216,3 @@ class EntryStore:
                 await jetstream.purge_stream(
                     STREAM, subject=f"{KEY_SUBJECTS}{self._prefix}.status.*"
                 )
-
-
-async def _entries(jetstream: JetStreamContext, keys: str) -> list[tuple[str, bytes]]:
-    """Returns the entries whose keys match.
-
-    A watcher of nats-py may report the end before the first entry. The number of entries that a new
-    pull consumer has is certain.
-    """
-    config = ConsumerConfig(
-        deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
-        ack_policy=AckPolicy.NONE,
-        inactive_threshold=READER_EXPIRES_S,
-    )
-    reader = await jetstream.pull_subscribe(KEY_SUBJECTS + keys, stream=STREAM, config=config)
-    try:
-        info = await reader.consumer_info()
-        left = info.num_pending or 0
-        found = []
-        while left > 0:
-            messages = await reader.fetch(min(left, FETCH_BATCH), timeout=JETSTREAM_TIMEOUT_S)
-            left -= len(messages)
-            found += [
-                (message.subject.removeprefix(KEY_SUBJECTS), message.data)
-                for message in messages
-                if not message.headers  # Only markers of deleted keys have headers.
-            ]
-        await jetstream.delete_consumer(STREAM, info.name)
-        return found
-    finally:
-        await reader.unsubscribe()

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from holdfast.config.scanning import Publish
+from holdfast.config.values.scanning import Publish
 from holdfast.net.addresses import LAST_PORT
 from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
 from holdfast.types import Area, Transport
@@ -27,7 +27,7 @@ Range = Annotated[list[FunctionCode | Address], Meta(min_length=2, max_length=3)
 Ranges = Annotated[list[Range], Meta(max_length=32)]
 Marker = bool | int | float | str
 
-MAX_TTL = 31_536_000
+MAX_TTL_S = 31_536_000
 """The longest `ttl` in seconds: a year."""
 
 
@@ -105,7 +105,7 @@ class SubscribeRequest(Request):
     plan: PlanRequest | None = None
     release: bool | None = None
     """Whether the connection is closed after each scan."""
-    ttl: Annotated[int, Meta(ge=1, le=MAX_TTL)] | None = None
+    ttl: Annotated[int, Meta(ge=1, le=MAX_TTL_S)] | None = None
     """Seconds after which the subscription ends, unless a request renews it. Default: it stays."""
 
 

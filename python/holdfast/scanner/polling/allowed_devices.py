@@ -12,12 +12,15 @@ from holdfast.net.allow_list import ALL_PORTS, AllowedNetwork, AllowList, NotAll
 from holdfast.net.resolver import NoSuchName, Resolver
 from holdfast.net.tls import NO_FILES
 from holdfast.scanner.errors import Refused
+from holdfast.scanner.polling.device_tls import endpoint_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from holdfast._core import Endpoint, Poller
     from holdfast.client.url import Target
     from holdfast.net.allow_list import AllowEntry
+    from holdfast.net.tls import Tls
 
 PRIVATE = tuple(
     AllowedNetwork(ip_network(text), ALL_PORTS)
@@ -38,9 +41,28 @@ WHERE = "allow it with --allow, or in nats.devices of the configuration"
 class AllowedDevices:
     """The allowed devices; without entries, `PRIVATE`."""
 
-    def __init__(self, entries: Iterable[AllowEntry] = ()) -> None:
+    def __init__(
+        self,
+        entries: Iterable[AllowEntry] = (),
+        tls: Tls = NO_FILES,
+        shared_poller: Poller | None = None,
+    ) -> None:
+        """`shared_poller` may have connections of others to the same devices."""
         self._list = AllowList(tuple(entries) or PRIVATE)
+        self._tls = tls
+        self._shared_poller = shared_poller
         self._resolve = Resolver()
+
+    async def find(self, target: Target, *, after: Target | None = None) -> tuple[Target, Endpoint]:
+        """Returns the address of a target, see `address`, and its endpoint. Raises `Refused`."""
+        address = await self.address(target, after=after)
+        if self._shared_poller is not None and target != address:
+            # The appliance may use the device by its name, and a device may accept no second
+            # connection. Then its link is used, which a name identifies.
+            by_name = endpoint_of(target, self._tls)
+            if self._shared_poller.known_link(str(target), by_name) is not None:
+                return address, by_name
+        return address, endpoint_of(address, self._tls)
 
     async def address(self, target: Target, *, after: Target | None = None) -> Target:
         """Returns the target with an allowed address of its host. Raises `Refused`.

@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
-from holdfast import logs
+from holdfast.events import log_lines
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.types import UnsubscribeRequest
 from holdfast.scanner.subscriptions.health import Health
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from holdfast.scanner.placement import Placement
-    from holdfast.scanner.polling.device_address import DeviceAddresses
+    from holdfast.scanner.polling.allowed_devices import AllowedDevices
     from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.publish.publishers import Publishers
     from holdfast.scanner.subscriptions.device import ScannedDevice
@@ -31,27 +32,19 @@ PROMPT_POLL_MAX_MS = 1000
 """Scan interval up to which a new subscriber waits for the next regular scan."""
 
 
+@dataclass(eq=False)
 class Devices:
     """The devices of the registry, from their first subscription to their last."""
 
-    def __init__(
-        self,
-        registry: Registry,
-        addresses: DeviceAddresses,
-        polling: Polling,
-        publishers: Publishers,
-        placement: Placement,
-        begin_task: Callable[[Coroutine[Any, Any, None]], None],
-    ) -> None:
-        """`begin_task` runs a lookup of an address beside the polls."""
-        self._registry = registry
-        self._addresses = addresses
-        self._polling = polling
-        self._publishers = publishers
-        self._placement = placement
-        self._begin_task = begin_task
-        self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
-        self.ttls = SubscriptionTtls()
+    _registry: Registry
+    _addresses: AllowedDevices
+    _polling: Polling
+    _publishers: Publishers
+    _placement: Placement
+    _begin_task: Callable[[Coroutine[Any, Any, None]], None]
+    """Runs a lookup of an address beside the polls."""
+    _locks: WeakValueDictionary[str, asyncio.Lock] = field(default_factory=WeakValueDictionary)
+    ttls: SubscriptionTtls = field(default_factory=SubscriptionTtls)
 
     def lock(self, device: str) -> asyncio.Lock:
         """Returns the lock that serializes changes of a device."""
@@ -59,42 +52,45 @@ class Devices:
 
     async def add(
         self,
-        asked: Subscription,
+        subscription: Subscription,
         *,
         is_stored: bool = False,
         renewed: bool = True,
-    ) -> None:
+    ) -> Collection[str]:
         """Adds a subscription, and polls and publishes accordingly. Raises `Refused`.
 
         A subscription that `is_stored` is not stored again. If it is not `renewed`, its time to
-        live runs on.
+        live runs on. Returns the tags that are new to the subscriber.
         """
-        known = self._registry.known(asked)
+        known = self._registry.known(subscription)
+        # The lookup awaits; from `subscribe` on there is no await until all state is consistent.
         # A known device keeps its address: a lookup could give another one of its name.
         address, endpoint = (
-            await self._addresses.find(asked.source.target)
+            await self._addresses.find(subscription.source.target)
             if known is None
             else (known.address, known.endpoint)
         )
-        change = self._registry.subscribe(asked, address)
+        change = self._registry.subscribe(subscription, address)
         device = change.device
-        if device is None or asked.subscriber not in device.subscribers:
-            return
+        if device is None or subscription.subscriber not in device.subscribers:
+            return change.new
         if renewed:
-            self.ttls.renew(device.id, asked.subscriber, asked.ttl)
+            self.ttls.renew(device.id, subscription.subscriber, subscription.ttl)
         if change.former is not None:
             self._drop(change.former)
         device.endpoint = endpoint
-        self._placement.added(device)
-        if not is_stored:
-            self._placement.subscribed(device.id, asked.subscriber)
+        self._placement.subscribed(device, None if is_stored else subscription.subscriber)
+        is_own = self._placement.is_own(device)
+        # Where another node polls the device, `begin` makes all of its tags fresh.
+        self._publishers.update(device, change.fresh if is_own else ())
         # A caller that subscribes to tags one by one knows the state already.
-        with_state = change.former is not None or not change.only_adds_tags
-        self._publishers.update(device, change.fresh, with_state=with_state)
+        if change.former is not None or not change.only_adds_tags:
+            self._publishers.publish_state(device)
         # At a short interval, the next regular scan comes soon enough for a new subscriber.
         waits_long = bool(change.fresh) and device.rate > PROMPT_POLL_MAX_MS
-        if change.polling or change.former or waits_long:
-            self._poll(device)
+        if is_own and (change.polling or change.former or waits_long):
+            self._polling.renew(device)
+        return change.new
 
     def keep_only(self, device_id: str, subscriber_id: str, tags: Collection[str]) -> None:
         """Removes the other tags of a subscription."""
@@ -146,10 +142,6 @@ class Devices:
             self._polling.drop(device)
             device.polled_as = ""
 
-    def resume(self) -> None:
-        """Polls all devices again."""
-        self._polling.resume()
-
     def pause(self) -> None:
         """Stops polling all devices until `resume`."""
         self._polling.pause()
@@ -162,7 +154,7 @@ class Devices:
         try:
             self._handle_poll(device, due, blocks)
         except Exception:  # An error with one device must not affect the others.
-            logs.problem("scan_failed", device=device.id)
+            log_lines.problem("scan_failed", device=device.id)
 
     def _handle_poll(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
         if not self._placement.is_own(device):
@@ -173,7 +165,7 @@ class Devices:
             self._publishers.publish_state(device)
             level = logging.WARNING if health.error else logging.INFO
             reason = {} if health.error is None else {"error": health.error}
-            logs.write(level, f"device_{health.state}", device=device.id, **reason)
+            log_lines.write(level, f"device_{health.state}", device=device.id, **reason)
         if device.may_have_moved():
             self._begin_task(self._look_up(device))
         device.latest.take(blocks)
@@ -188,9 +180,9 @@ class Devices:
                 target = device.source.target
                 address, endpoint = await self._addresses.find(target, after=device.address)
             except Refused as refused:
-                logs.refused("not_found", kind="name", device=device.id, reason=str(refused))
+                log_lines.refused("not_found", kind="name", device=device.id, reason=str(refused))
                 return
             if address != device.address:
                 device.address, device.endpoint = address, endpoint
                 self._polling.renew(device)
-                logs.write(logging.INFO, "moved", device=device.id, address=str(address))
+                log_lines.write(logging.INFO, "moved", device=device.id, address=str(address))

@@ -11,9 +11,9 @@ import logging
 import threading
 from typing import TYPE_CHECKING
 
-from holdfast import logs
+from holdfast.events import log_lines
+from holdfast.net.nats import batch
 from holdfast.scanner.messages.types import LogEntry
-from holdfast.scanner.nats import wire
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 LEVELS = {logging.DEBUG: "debug", logging.INFO: "info", logging.WARNING: "warn"}
 """The words for levels; `error` for all others."""
 
-MAX_MESSAGE = 4096
+MAX_MESSAGE_BYTES = 4096
 """The most characters of a published message."""
 
 
@@ -41,17 +41,17 @@ class LogMirror(logging.Handler):
         """Publishes a record. Stops at the first error about the own subject."""
         if record.thread != self._thread or self._refused:
             return
-        text = logs.message(record)
+        text = log_lines.message(record)
         if record.getMessage() == "nats_error" and self._subject.lower() in text.lower():
             self._refused = True  # Each further message would cause another error.
             return
         entry = LogEntry(
             timestamp=int(record.created * 1000),
             level=LEVELS.get(record.levelno, "error"),
-            message=text[:MAX_MESSAGE],
+            message=text[:MAX_MESSAGE_BYTES],
             service_type="modbus",
             module_id=self._prefix,
             logger=f"{self._prefix}:scanner",
         )
         key = ("log", next(self._numbers))
-        self._publish(key, wire.message(self._subject, entry))
+        self._publish(key, batch.message(self._subject, entry))

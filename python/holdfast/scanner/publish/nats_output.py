@@ -12,22 +12,22 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from nats.errors import Error
 
-from holdfast.faults import fault_text, is_exception
 from holdfast.net.event_loop import EventLoop
-from holdfast.net.secure_channel import failure_text
-from holdfast.outputs.sending import soon_after
-from holdfast.scanner.messages.dialects import DIALECTS
-from holdfast.scanner.nats.tolerant_client import SafeClient
+from holdfast.net.nats import SafeClient, nats_reason
+from holdfast.outputs.sending import Receiver, soon_after
+from holdfast.polling.faults import fault_text, is_exception
+from holdfast.scanner.dialects import DIALECTS
+from holdfast.scanner.messages.types import Data, Status
 from holdfast.scanner.subscriptions.tag import datatype
 from holdfast.tags.text import plain
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from holdfast.config.scanning import Dialect
+    from holdfast.config.values.scanning import Dialect
+    from holdfast.net.nats.connection import Servers
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
-    from holdfast.scanner.nats.connection import Servers
 
 CONFIRM_TIMEOUT_S = 5.0
 """Time for the server to confirm what was sent."""
@@ -45,7 +45,7 @@ MAX_PENDING_BYTES = 64 * 2**20
 _encode = msgspec.json.Encoder().encode
 
 
-class NatsOutput:
+class NatsOutput(Receiver):
     """One connection, on an event loop that runs in the thread of the output."""
 
     def __init__(self, servers: Servers, prefix: str, dialect: Dialect) -> None:
@@ -67,7 +67,7 @@ class NatsOutput:
         except (OSError, Error) as error:
             self._states.clear()  # What was published last is not certain.
             self._close_client()
-            raise OSError(failure_text(error).removeprefix("nats: ")) from error
+            raise OSError(nats_reason(error)) from error
 
     def idle(self) -> None:
         """Lets the client answer pings of the server."""
@@ -160,28 +160,20 @@ class NatsOutput:
         stamp = int(time * 1000)
         made = self._state(device, fault, stamp)
         if not fault:
-            message = {
-                "moduleId": self._prefix,
-                "deviceId": device,
-                "variableId": tag.name,
-                "value": plain(tag, value),
-                "datatype": datatype(tag.of_type),
-                "timestamp": stamp,
-            }
+            kind = datatype(tag.of_type)
+            message = Data(self._prefix, device, tag.name, plain(tag, value), kind, stamp)
             subject = self._dialect.data_subject(self._prefix, device, tag.name)
             made.append((subject, _encode(message)))
         return made
 
     def _state(self, device: str, fault: int, stamp: int) -> list[tuple[str, bytes]]:
         """The state of a device, if it has changed. One that answers with exceptions is online."""
-        state = "offline" if fault and not is_exception(fault) else "online"
-        if self._states.get(device) == state:
+        message = Status(device, "online", 0, stamp)
+        if fault and not is_exception(fault):
+            message = Status(device, "offline", 1, stamp, fault_text(fault))
+        if self._states.get(device) == message.state:
             return []
-        self._states[device] = state
-        message: dict[str, Any] = {"deviceId": device, "state": state, "failures": 0}
-        if state == "offline":
-            message |= {"failures": 1, "error": fault_text(fault)}
-        message["timestamp"] = stamp
+        self._states[device] = message.state
         payload = _encode(message)
         return [
             (f"{self._prefix}.status.{name}", payload)

@@ -1,8 +1,8 @@
 """Converts the polls of a device to messages that are due, as text for NATS. Does no I/O.
 
-The blocks of a device nearly always have the same shape. For each shape, `_Part` caches everything
-that does not depend on the values: their places, and the text around them. A value then costs only
-its own JSON and one formatting of bytes.
+The blocks of a device nearly always have the same shape. For each shape, `_BlockPart` caches
+everything that does not depend on the values: their places, and the text around them. A value then
+costs only its own JSON and one formatting of bytes.
 """
 
 from __future__ import annotations
@@ -13,17 +13,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
 
-from holdfast.scanner.messages.dialects import TENTACLE
-from holdfast.scanner.nats import wire
+from holdfast.net.nats import batch
+from holdfast.scanner.dialects import TENTACLE, Dialect
+from holdfast.scanner.messages.types import Data
 from holdfast.scanner.subscriptions.groups import Group
-from holdfast.scanner.subscriptions.tag import clean
 from holdfast.tags.changing import differs
 from holdfast.tags.decoding import Places, Undecoded, decoder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence, Set
 
-    from holdfast.scanner.messages.dialect import Dialect
     from holdfast.scanner.subscriptions.tag import Tag
     from holdfast.tags.decoding import Decoder
     from holdfast.types import Area, PolledBlock
@@ -39,7 +38,7 @@ MAX_SHAPES = 64
 """Limit of cached shapes. A device that refuses some blocks has more than one shape."""
 
 SLACK_S = 0.0005
-"""Tolerance when scheduled times are compared, because they are rounded."""
+"""Tolerance for comparing scheduled times, which the poller rounds."""
 
 _UNKNOWN = object()
 _encode = msgspec.json.Encoder().encode
@@ -53,7 +52,7 @@ class Publisher:
     ) -> None:
         """In a fleet, messages have the revision of the `lease` of the device."""
         self._lease = lease
-        self._header = b"" if lease is None else wire.lease_header(lease)
+        self._header = b"" if lease is None else batch.lease_header(lease)
         self._prefix = prefix
         self._device = device
         self._dialect = dialect
@@ -83,20 +82,24 @@ class Publisher:
         self._repeat_all = True
         if lease is None or lease == self._lease:
             return
-        self._lease, self._header = lease, wire.lease_header(lease)
+        self._lease, self._header = lease, batch.lease_header(lease)
         self._shapes.clear()
-        for due in self._groups:
-            due.parts.clear()
+        for scheduled in self._groups:
+            scheduled.parts.clear()
 
     def regroup(self, groups: Sequence[Group], new_tags: Collection[str]) -> None:
         """Changes the groups now. The next value of `new_tags` is published even if unchanged."""
         # A group with the same rate and mode keeps the time of its last publication: a new
         # subscriber must not shift the times of the others.
         before = {
-            (due.group.change, due.group.rate): due for due in self._groups if not due.is_once
+            (scheduled.group.change, scheduled.group.rate): scheduled
+            for scheduled in self._groups
+            if not scheduled.is_once
         }
         tags = {tag.id: tag for group in groups for tag in group.tags}
-        known = {tag.id for due in before.values() for tag in due.group.tags} - self._fresh
+        known = {
+            tag.id for scheduled in before.values() for tag in scheduled.group.tags
+        } - self._fresh
         self._fresh = (tags.keys() - known) | (tags.keys() & new_tags)
         ids = {tag.id for group in groups for tag in group.tags if group.change}
         same = ids == self._last.keys()
@@ -104,13 +107,20 @@ class Publisher:
         self._last |= dict.fromkeys(ids & self._fresh, _UNKNOWN)
         self._groups = []
         for group in groups:
-            due = before.get((group.change, group.rate))
-            is_same = same and due is not None and due.group == group
-            self._groups.append(due if is_same and due is not None else _ScheduledGroup(group, due))
-        publish_now = {id for due in self._groups for id in due.publish_now(self._fresh)}
+            scheduled = before.get((group.change, group.rate))
+            is_same = same and scheduled is not None and scheduled.group == group
+            self._groups.append(
+                scheduled
+                if is_same and scheduled is not None
+                else _ScheduledGroup(group, scheduled)
+            )
+        publish_now = {
+            id for scheduled in self._groups for id in scheduled.publish_now(self._fresh)
+        }
         self._schedule_first_values(self._fresh - publish_now)
         # Tags that are not published any more have no error any more.
-        self.undecoded = {id: why for id, why in self.undecoded.items() if id in tags}
+        for id in self.undecoded.keys() - tags.keys():
+            del self.undecoded[id]
 
     def _apply_updates(self) -> None:
         """Applies the changes that were requested since the last poll."""
@@ -118,7 +128,7 @@ class Publisher:
         # thousand tags one by one.
         groups = None if self._new_groups is None else self._new_groups()
         if groups is None and self._repeat_all:
-            groups = [due.group for due in self._groups if not due.is_once]
+            groups = [scheduled.group for scheduled in self._groups if not scheduled.is_once]
         if groups is None:
             return
         new_tags = self._new_tags
@@ -131,28 +141,32 @@ class Publisher:
         """Returns the messages after a poll. `due` is its scheduled time in seconds."""
         self._apply_updates()
         shape = tuple(block[:3] for block in blocks if block[3] is not None)
+        # The shape depends on the blocks that were read, so a refused block changes it.
         parts = self._shapes.get(shape)
         if parts is None:
             parts = self._compiled(shape)
         answered = [
             (block[3], b"%d" % (block[5] * 1000)) for block in blocks if block[3] is not None
         ]
-        made: list[Message] = []
+        messages: list[Message] = []
         first: set[str] = set()
         for group, compiled in parts:
-            if not compiled or not group.now(due):
+            if not compiled or not group.claim(due):
                 continue
             for block, part in compiled:
-                found = self._messages_of(part, *answered[block])
+                part_messages = self._part_messages(part, *answered[block])
+                # The group for first values comes first; no tag is published twice in one poll.
                 if first and not group.is_once:
-                    found = (message for message in found if message[0] not in first)
-                made += found
+                    part_messages = (
+                        message for message in part_messages if message[0] not in first
+                    )
+                messages += part_messages
             if group.is_once:
-                first = {id for id, _ in made}
-        if self._fresh and any(id in self._fresh for id, _ in made):
-            self._fresh.difference_update(id for id, _ in made)
+                first = {id for id, _ in messages}
+        if self._fresh and any(id in self._fresh for id, _ in messages):
+            self._fresh.difference_update(id for id, _ in messages)
             self._schedule_first_values(self._fresh)
-        return made
+        return messages
 
     def _schedule_first_values(self, ids: Set[str]) -> None:
         """Publishes the next values of these tags even if their groups are not due."""
@@ -164,11 +178,11 @@ class Publisher:
         self._groups = groups
         self._shapes.clear()
 
-    def _messages_of(self, part: _Part, data: bytes, timestamp: bytes) -> Iterable[Message]:
+    def _part_messages(self, part: _BlockPart, data: bytes, timestamp: bytes) -> Iterable[Message]:
         """Returns the messages of the tags of one group in one block."""
         values = part.decoder(data)
         if part.needs_cleaning:
-            values = [clean(value, tag) for value, tag in zip(values, part.tags, strict=True)]
+            values = [tag.value(raw) for raw, tag in zip(values, part.tags, strict=True)]
         if part.is_plain_json:  # One call for all values, instead of one for each.
             texts = _encode(values)[1:-1].split(b",")
         else:
@@ -182,12 +196,12 @@ class Publisher:
             for id, length, template, text in rows
         )
 
-    def _filtered(self, part: _Part, values: Sequence[Any]) -> list[bool]:
+    def _filtered(self, part: _BlockPart, values: Sequence[Any]) -> list[bool]:
         """Returns which values to publish; in a group that publishes changes, the changed ones.
 
         Records errors of decoding. An undecoded value counts as no value.
         """
-        picked = []
+        selected = []
         for id, value, deadband in zip(part.ids, values, part.deadbands, strict=True):
             if type(value) is Undecoded:
                 self.undecoded[id] = value.error
@@ -195,48 +209,52 @@ class Publisher:
             else:
                 self.undecoded.pop(id, None)
             last = self._last.get(id, _UNKNOWN)
-            wanted = not part.change or differs(value, last, deadband)
-            if wanted and id in self._last:
+            is_published = not part.change or differs(value, last, deadband)
+            if is_published and id in self._last:
                 self._last[id] = value
-            picked.append(wanted)
-        return picked
+            selected.append(is_published)
+        return selected
 
     def _compiled(self, shape: Shape) -> list[tuple[_ScheduledGroup, list[_Placed]]]:
         """Compiles the parts of all groups for a shape. Each tag is read from its first block."""
+        # Clearing all is enough: a usual device has few shapes, which are compiled again.
         if len(self._shapes) >= MAX_SHAPES:
             self._shapes.clear()
-        parts = [(due, list(self._parts(due, shape))) for due in self._groups]
+        parts = [
+            (scheduled, list(self._block_parts(scheduled, shape))) for scheduled in self._groups
+        ]
         self._shapes[shape] = parts
         return parts
 
-    def _parts(self, due: _ScheduledGroup, shape: Shape) -> Iterator[_Placed]:
-        taken: set[str] = set()
+    def _block_parts(self, scheduled: _ScheduledGroup, shape: Shape) -> Iterator[_Placed]:
+        covered: set[str] = set()
         for index, block in enumerate(shape):
-            part = due.parts.get(block)
-            if part is None or not taken.isdisjoint(part.ids):
-                inside = due.places.inside(*block)
-                tags = [tag for tag in inside if tag.id not in taken]
+            part = scheduled.parts.get(block)
+            if part is None or not covered.isdisjoint(part.ids):
+                inside = scheduled.places.inside(*block)
+                tags = [tag for tag in inside if tag.id not in covered]
                 if not tags:
                     continue
-                part = self._part(due, tags, block)
+                part = self._block_part(scheduled, tags, block)
+                # Only a complete part is cached: an incomplete one depends on the other blocks.
                 if len(tags) == len(inside):
-                    due.keep(block, part)
-            taken.update(part.ids)
+                    scheduled.keep(block, part)
+            covered.update(part.ids)
             yield index, part
 
-    def _part(self, due: _ScheduledGroup, tags: list[Tag], block: Place) -> _Part:
+    def _block_part(self, scheduled: _ScheduledGroup, tags: list[Tag], block: Place) -> _BlockPart:
         _, address, count = block
-        group = due.group
+        group = scheduled.group
         texts = [self._template(tag) for tag in tags]
         is_infallible = all(tag.type in _INFALLIBLE_TYPES and tag.source is None for tag in tags)
         remembered = group.change or any(tag.id in self._last for tag in tags)
-        return _Part(
+        return _BlockPart(
             decoder(tags, address, count),
             tags,
             [tag.id for tag in tags],
             [text for text, _ in texts],
             [length for _, length in texts],
-            [due.deadbands[tag.id] for tag in tags],
+            [scheduled.deadbands[tag.id] for tag in tags],
             is_plain_json=is_infallible,
             needs_cleaning=remembered or any(tag.null or tag.meaning is not None for tag in tags),
             change=group.change,
@@ -245,13 +263,16 @@ class Publisher:
 
     def _template(self, tag: Tag) -> tuple[bytes, int]:
         """Returns the text of a message, with placeholders, and the fixed part of its length."""
-        head = {"moduleId": self._prefix, "deviceId": self._device, "variableId": tag.id}
-        before = _encode(head)[:-1] + b',"value":'
-        after = b',"datatype":"%b","timestamp":' % tag.datatype.encode()
+        message = _encode(Data(self._prefix, self._device, tag.id, None, tag.datatype, 0))
+        # What follows the value has no `null`, whatever the ids have.
+        before, _, rest = message.rpartition(b"null")
+        after = rest.removesuffix(b"0}")
+        # `%` in an id must survive the formatting of the template in `_part_messages`.
         text = before.replace(b"%", b"%%") + b"%b" + after + b"%b}"
         subject = self._dialect.data_subject(self._prefix, self._device, tag.id).encode()
         size, header = len(before) + len(after) + 1, self._header
         escaped = subject.replace(b"%", b"%%")
+        # The size of the payload is only known with the value: it stays a placeholder (`%d`).
         head_line = b"PUB %b %%d\r\n" % escaped
         if header:
             head_line = b"HPUB %b %d %%d\r\n%b" % (escaped, len(header), header)
@@ -267,7 +288,7 @@ _INFALLIBLE_TYPES = {
 """Types that decode any registers, to a single JSON number or word."""
 
 
-class _Part(NamedTuple):
+class _BlockPart(NamedTuple):
     """The tags of a group that are in one block."""
 
     decoder: Decoder
@@ -287,7 +308,7 @@ class _Part(NamedTuple):
     """Whether some values may be omitted, or must be remembered."""
 
 
-_Placed: TypeAlias = tuple[int, _Part]
+_Placed: TypeAlias = tuple[int, _BlockPart]
 """The index of a block, and the part in it."""
 
 
@@ -304,7 +325,7 @@ class _ScheduledGroup:
         self.deadbands = {
             tag.id: deadband for tag, deadband in zip(group.tags, group.deadbands, strict=True)
         }
-        self.parts: dict[Place, _Part] = {}
+        self.parts: dict[Place, _BlockPart] = {}
         """The compiled parts of blocks, shared by all shapes."""
 
     def publish_now(self, fresh: Collection[str]) -> Iterable[str]:
@@ -313,13 +334,13 @@ class _ScheduledGroup:
             self._last = -math.inf
         return self.deadbands if self._last == -math.inf else ()
 
-    def keep(self, place: Place, part: _Part) -> None:
+    def keep(self, place: Place, part: _BlockPart) -> None:
         """Caches a part. The cache is limited, because blocks may differ at every poll."""
         if len(self.parts) >= MAX_SHAPES + 2 * len(self.group.tags):
             self.parts.clear()
         self.parts[place] = part
 
-    def now(self, due: float) -> bool:
+    def claim(self, due: float) -> bool:
         """Returns whether the group is due at this scan, and records the publication if so."""
         if due < self._last + self.group.rate / 1000 - SLACK_S:
             return False

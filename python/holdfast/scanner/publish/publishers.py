@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from holdfast.net.nats import batch
 from holdfast.scanner.messages.types import Status
-from holdfast.scanner.nats import wire
 from holdfast.scanner.publish.publisher import Publisher
 from holdfast.scanner.subscriptions.groups import grouped
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection
 
-    from holdfast.scanner.messages.dialect import Dialect
-    from holdfast.scanner.nats.outbox import Outbox
+    from holdfast.net.nats.outbox import Outbox
+    from holdfast.scanner.dialects import Dialect
     from holdfast.scanner.placement import Placement
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.types import PolledBlock
@@ -34,30 +34,20 @@ class Publishers:
         self.scans = 0
         """Polls that were published."""
 
-    def update(
-        self, device: ScannedDevice, fresh: Collection[str] = (), *, with_state: bool = False
-    ) -> None:
+    def update(self, device: ScannedDevice, fresh: Collection[str] = ()) -> None:
         """Applies changes of a device, and publishes the next value of `fresh` tags in any case."""
         publisher = self._publishers.get(device.id)
         if publisher is None:
-            publisher = self._publishers[device.id] = self._publisher(device)
-        # Where another node polls the device, `restart` makes all of its tags fresh.
-        publisher.update(lambda: grouped(device), fresh if self._placement.is_own(device) else ())
-        if with_state:
-            self.publish_state(device)
+            publisher = self._begin(device)
+        publisher.update(lambda: grouped(device), fresh)
 
     def restart(self, device: ScannedDevice) -> None:
         """Publishes a device that another node has published until now."""
-        publisher = self._publishers[device.id] = self._publisher(device)
-        publisher.update(lambda: grouped(device), device.tags)
+        self._begin(device).update(lambda: grouped(device), device.tags)
 
     def remove(self, device: ScannedDevice) -> None:
         """Publishes a device no more."""
         del self._publishers[device.id]
-
-    def undecoded(self, device_id: str) -> Mapping[str, str]:
-        """Returns the errors of the tags of a device that could not be decoded."""
-        return self._publishers[device_id].undecoded
 
     def repeat_values(self) -> None:
         """Publishes the next value of every tag, even if it is unchanged."""
@@ -80,7 +70,7 @@ class Publishers:
         if len(device.subjects) > 1:
             one, other = (f"{self._prefix}.data.{name}" for name in device.subjects)
             self._outbox.put(
-                [((id, tag, other), wire.readdressed(text, one, other)) for tag, text in messages]
+                [((id, tag, other), batch.readdressed(text, one, other)) for tag, text in messages]
             )
 
     def publish_state(self, device: ScannedDevice) -> None:
@@ -100,11 +90,14 @@ class Publishers:
         self._placement.state_changed(device.id)
         for name in device.subjects:
             subject = f"{self._prefix}.status.{name}"
-            text = wire.text(subject, device.status)
+            text = batch.text(subject, device.status)
             if (lease := self._placement.lease(device)) is not None:
-                text = wire.leased(text, lease)
+                text = batch.leased(text, lease)
             self._outbox.put([((device.id, subject), text)])
 
-    def _publisher(self, device: ScannedDevice) -> Publisher:
+    def _begin(self, device: ScannedDevice) -> Publisher:
         lease = self._placement.lease(device)
-        return Publisher(self._prefix, device.id, self._dialect, lease)
+        publisher = Publisher(self._prefix, device.id, self._dialect, lease)
+        self._publishers[device.id] = publisher
+        device.undecoded = publisher.undecoded
+        return publisher

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast.faults import fault_text
+from holdfast.polling.faults import fault_text
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.types import (
     BlockReport,
@@ -18,6 +18,7 @@ from holdfast.scanner.messages.types import (
 )
 from holdfast.scanner.subscriptions.health import without_overlap
 from holdfast.scanner.subscriptions.tag import CODE_OF_AREA
+from holdfast.scanner.subscriptions.write_access import unwritable
 from holdfast.tags.decoding import Places
 
 if TYPE_CHECKING:
@@ -41,32 +42,28 @@ MIN_ID_BYTES = 4
 
 def browsed(
     request: BrowseRequest,
-    devices: Mapping[str, tuple[ScannedDevice, Mapping[str, str]]],
+    devices: Mapping[str, ScannedDevice],
     counters: Mapping[str, Mapping[str, Any]],
     service: ServiceReport,
     max_bytes: int,
 ) -> BrowseAnswer:
     """Returns the answer, with at most `max_bytes` bytes.
 
-    `devices` holds each device with the errors of tags that could not be decoded. Raises `Refused`
-    for `tagOffset` without `deviceId`.
+    Raises `Refused` for `tagOffset` without `deviceId`.
     """
     answer = BrowseAnswer(True, len(devices), service, [])
     room = max_bytes - ENVELOPE_BYTES
     if request.device_id is not None:
         if request.device_id in devices:
-            device, undecoded = devices[request.device_id]
-            report = _DeviceReport(device, undecoded, counters.get(device.polled_as, {}))
+            report = DeviceReporter(devices[request.device_id], counters)
             page, answer.next_tag = report.page(request.tag_offset or 0, room)
             answer.devices.append(page)
         return answer
     if request.tag_offset is not None:
         raise Refused("tagOffset requires deviceId")
-    for at, id in enumerate(sorted(devices)[request.offset or 0 :], request.offset or 0):
-        device, undecoded = devices[id]
-        whole = _DeviceReport(device, undecoded, counters.get(device.polled_as, {})).whole(
-            max_bytes
-        )
+    first = request.offset or 0
+    for at, id in enumerate(sorted(devices)[first:], first):
+        whole = DeviceReporter(devices[id], counters).whole(max_bytes)
         size = len(_encode(whole)) + 1
         if size > room:
             answer.next = at
@@ -76,25 +73,13 @@ def browsed(
     return answer
 
 
-def device_report(
-    device: ScannedDevice,
-    undecoded: Mapping[str, str],
-    counters: Mapping[str, Mapping[str, Any]],
-    max_bytes: int,
-) -> DeviceReport:
-    """Returns the report of one device; without tags, blocks and subscribers if it is too large."""
-    return _DeviceReport(device, undecoded, counters.get(device.polled_as, {})).whole(max_bytes)
-
-
-class _DeviceReport:
+class DeviceReporter:
     """Creates the reports of one device."""
 
-    def __init__(
-        self, device: ScannedDevice, undecoded: Mapping[str, str], counters: Mapping[str, Any]
-    ) -> None:
+    def __init__(self, device: ScannedDevice, counters: Mapping[str, Mapping[str, Any]]) -> None:
+        """`counters` has those of all devices, by their names in the poller."""
         self._device = device
-        self._undecoded = undecoded
-        self._counters = counters
+        self._counters = counters.get(device.polled_as, {})
         self._tags = list(device.tags.values())
         self._places = Places(self._tags)
         self._min_tag_bytes = MIN_TAG_BYTES + MIN_ID_BYTES * len(device.subscribers)
@@ -182,7 +167,7 @@ class _DeviceReport:
             inside = self._places.inside(area, address, count)
             if not any(tag.id in ids for tag in inside):
                 continue
-            wanted = {
+            used = {
                 at
                 for tag in inside
                 for part in (tag, tag.source)
@@ -194,12 +179,12 @@ class _DeviceReport:
                 address=address,
                 count=count,
                 tags=len(inside),
-                holes=count - len(wanted),
+                holes=count - len(used),
                 error=fault_text(fault) if fault else None,
             )
 
     def _reports(self, tags: Sequence[Tag]) -> Iterator[TagReport]:
-        errors = dict(self._undecoded)
+        errors = dict(self._device.undecoded)
         for area, address, count, _, fault, _ in self._device.health.blocks:
             if fault:
                 inside = self._places.inside(area, address, count)
@@ -212,7 +197,7 @@ class _DeviceReport:
                 datatype=tag.requested_type,
                 byte_order=tag.order,
                 encoding=tag.encoding,
-                writable=self._device.unwritable(tag) is None,
+                writable=unwritable(self._device, tag) is None,
                 description=self._device.description(tag.id),
                 profile=tag.profile,
                 unit="" if tag.meaning is None else tag.meaning.unit,

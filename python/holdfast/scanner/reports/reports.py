@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from holdfast.scanner.messages.decoding import decode
-from holdfast.scanner.messages.types import BrowseRequest, VariablesRequest
-from holdfast.scanner.reports.browse import browsed, device_report
-from holdfast.scanner.reports.variables import device_variables, variables
+from holdfast.scanner.messages.types import (
+    BrowseRequest,
+    EntryReport,
+    ServiceReport,
+    VariablesRequest,
+)
+from holdfast.scanner.reports.browse import DeviceReporter, browsed
+from holdfast.scanner.reports.variables import variable, variables
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -17,12 +23,14 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
     from nats.aio.msg import Msg
 
+    from holdfast.net.nats.outbox import Outbox
     from holdfast.scanner.jetstream.buckets import Buckets
+    from holdfast.scanner.messages.decoding import Decoded
     from holdfast.scanner.messages.types import BrowseAnswer, DeviceReport, Variable
-    from holdfast.scanner.nats.outbox import Outbox
+    from holdfast.scanner.placement import Placement
     from holdfast.scanner.polling.poller import Polling
+    from holdfast.scanner.presence import Presence
     from holdfast.scanner.publish.publishers import Publishers
-    from holdfast.scanner.reports.service_status import ServiceStatus
     from holdfast.scanner.responder import Responder
     from holdfast.scanner.settings import Settings
     from holdfast.scanner.subscriptions.device import ScannedDevice
@@ -34,35 +42,27 @@ USUAL_MAX_PAYLOAD_BYTES = 2**20
 MISSED_COUNT_INTERVAL_S = 10.0
 """Between two counts of missed scans for other nodes: many devices take milliseconds."""
 
+MAX_REFUSED_SHOWN = 100
+"""Limit of refused entries in an answer."""
 
+
+@dataclass(eq=False)
 class Reports:
-    """Reports devices of the registry."""
+    """Reports the service, and devices of the registry."""
 
-    def __init__(
-        self,
-        settings: Settings,
-        registry: Registry,
-        polling: Polling,
-        publishers: Publishers,
-        outbox: Outbox,
-        status: ServiceStatus,
-        buckets: Buckets,
-        responder: Responder,
-        client: Callable[[], Client | None],
-    ) -> None:
-        """`client` returns the client while there is a connection."""
-        self._prefix = settings.prefix
-        self._max_request_bytes = settings.limits.request
-        self._registry = registry
-        self._polling = polling
-        self._publishers = publishers
-        self._outbox = outbox
-        self._status = status
-        self._buckets = buckets
-        self._responder = responder
-        self._client = client
-        self._missed = 0
-        self._missed_counted_at = -math.inf
+    _settings: Settings
+    _registry: Registry
+    _polling: Polling
+    _publishers: Publishers
+    _outbox: Outbox
+    _presence: Presence
+    _buckets: Buckets
+    _placement: Placement
+    _responder: Responder
+    _client: Callable[[], Client | None]
+    """Returns the client while there is a connection."""
+    _missed: int = 0
+    _missed_counted_at: float = -math.inf
 
     @property
     def max_bytes(self) -> int:
@@ -70,47 +70,39 @@ class Reports:
         client = self._client()
         return USUAL_MAX_PAYLOAD_BYTES if client is None else client.max_payload
 
-    def browse_request(self, message: Msg) -> BrowseRequest:
+    def request(self, message: Msg, kind: type[Decoded]) -> Decoded:
         """Parses a request; an empty one is valid. Raises `Refused`."""
-        if not message.data:
-            return BrowseRequest()
-        return decode(message.data, BrowseRequest, self._max_request_bytes)
-
-    def variables_request(self, message: Msg) -> VariablesRequest:
-        """Parses a request; an empty one is valid. Raises `Refused`."""
-        if not message.data:
-            return VariablesRequest()
-        return decode(message.data, VariablesRequest, self._max_request_bytes)
+        return decode(message.data or b"{}", kind, self._settings.limits.request)
 
     async def browse(self, message: Msg) -> BrowseAnswer:
         """Reports devices. Raises `Refused`."""
-        request = self.browse_request(message)
+        request = self.request(message, BrowseRequest)
         async with self._responder.in_order(message, is_large=True):
             return self.browsed(request, self._registry.devices)
 
     async def variables(self, message: Msg) -> bytes:
         """Returns the latest values as JSON. Raises `Refused`."""
-        request = self.variables_request(message)
+        request = self.request(message, VariablesRequest)
         async with self._responder.in_order(message, is_large=True):
-            devices = self._known(self._registry.devices)
-            refused = self._buckets.refused
-            return variables(request, devices, refused, self._prefix, self.max_bytes)
+            devices, refused = self._registry.devices, self._buckets.refused
+            return variables(request, devices, refused, self._settings.prefix, self.max_bytes)
 
     def browsed(self, request: BrowseRequest, ids: Iterable[str]) -> BrowseAnswer:
         """Returns an answer with these devices, as far as they are known. Raises `Refused`."""
-        counters, status = self._polling.counters(), self._status.report()
-        return browsed(request, self._known(ids), counters, status, self.max_bytes)
+        devices = {device.id: device for device in self._known(ids)}
+        return browsed(request, devices, self._polling.counters(), self._service(), self.max_bytes)
 
     def device_reports(self, ids: Iterable[str]) -> Iterator[tuple[str, DeviceReport]]:
         """Yields the reports of these devices, as far as they are known."""
         counters, max_bytes = self._polling.counters(), self.max_bytes
-        for id, (device, undecoded) in self._known(ids).items():
-            yield id, device_report(device, undecoded, counters, max_bytes)
+        for device in self._known(ids):
+            yield device.id, DeviceReporter(device, counters).whole(max_bytes)
 
     def device_variables(self, ids: Iterable[str]) -> Iterator[tuple[str, list[Variable]]]:
         """Yields the latest values of these devices, as far as they are known."""
-        for id, (device, undecoded) in self._known(ids).items():
-            yield id, list(device_variables(device, undecoded, self._prefix))
+        for device in self._known(ids):
+            tags = device.tags.values()
+            yield device.id, [variable(device, tag, self._settings.prefix) for tag in tags]
 
     def counts(self) -> Mapping[str, int]:
         """Returns what this scanner has done since its start, for other nodes of a fleet."""
@@ -125,7 +117,23 @@ class Reports:
             "published": self._outbox.sent,
         }
 
-    def _known(self, ids: Iterable[str]) -> dict[str, tuple[ScannedDevice, Mapping[str, str]]]:
-        """Returns devices, each with the errors of its tags that could not be decoded."""
+    def _service(self) -> ServiceReport:
+        refused = [
+            EntryReport(key=entry.key, error=entry.reason)
+            for entry in self._buckets.refused[:MAX_REFUSED_SHOWN]
+        ]
+        return ServiceReport(
+            started_at=self._presence.heartbeat.started,
+            published=self._outbox.sent,
+            replaced=self._outbox.replaced,
+            dropped=self._outbox.dropped,
+            lost_scans=self._polling.dropped,
+            other_scanners=self._presence.other_scanners.current() or None,
+            enabled=self._buckets.is_enabled,
+            refused_entries=refused or None,
+            fleet=self._placement.report(),
+        )
+
+    def _known(self, ids: Iterable[str]) -> Iterator[ScannedDevice]:
         devices = self._registry.devices
-        return {id: (devices[id], self._publishers.undecoded(id)) for id in ids if id in devices}
+        return (devices[id] for id in ids if id in devices)

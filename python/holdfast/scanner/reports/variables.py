@@ -25,62 +25,41 @@ ENVELOPE_BYTES = 2
 
 def variables(
     request: VariablesRequest,
-    devices: Mapping[str, tuple[ScannedDevice, Mapping[str, str]]],
+    devices: Mapping[str, ScannedDevice],
     refused: Iterable[RefusedEntry],
     module: str,
     max_bytes: int,
 ) -> bytes:
     """Returns the answer as JSON, with as many tags as fit into `max_bytes`.
 
-    `devices` holds each device with the errors of tags that could not be decoded. The tags are
-    sorted by device; `offset` of the request skips the first ones. The tags of `refused` follow.
+    The tags are sorted by device; `offset` of the request skips the first ones. The tags of
+    `refused` follow.
     """
-    texts: list[bytes] = []
-    room = max_bytes - ENVELOPE_BYTES
-    known = sum(
-        len(device.tags) for id, (device, _) in devices.items() if request.device_id in (None, id)
-    )
-    skipped = max((request.offset or 0) - known, 0)
-    for variable in chain(
-        (_variable(*each, module) for each in _requested(request, devices)),
+    offset = request.offset or 0
+    requested = [devices[id] for id in sorted(devices) if request.device_id in (None, id)]
+    tags = ((device, tag) for device in requested for tag in device.tags.values())
+    skipped = max(offset - sum(len(device.tags) for device in requested), 0)
+    found = chain(
+        (variable(*each, module) for each in islice(tags, offset, None)),
         islice(_refused(request, devices, refused, module), skipped, None),
-    ):
-        text = _encode(variable)
+    )
+    return b"[" + joined(map(_encode, found), max_bytes - ENVELOPE_BYTES) + b"]"
+
+
+def joined(texts: Iterable[bytes], room: int) -> bytes:
+    """Joins the first texts, as many as fit into so many bytes, with commas."""
+    fitting: list[bytes] = []
+    for text in texts:
         room -= len(text) + 1
         if room < 0:
             break
-        texts.append(text)
-    return b"[" + b",".join(texts) + b"]"
-
-
-def device_variables(
-    device: ScannedDevice, undecoded: Mapping[str, str], module: str
-) -> Iterator[Variable]:
-    """Yields the latest value of each tag of a device."""
-    for tag in list(device.tags.values()):
-        yield _variable(device, undecoded, tag, module)
-
-
-def _requested(
-    request: VariablesRequest, devices: Mapping[str, tuple[ScannedDevice, Mapping[str, str]]]
-) -> Iterator[tuple[ScannedDevice, Mapping[str, str], Tag]]:
-    ids: Iterable[str] = sorted(devices)
-    if request.device_id is not None:
-        ids = [request.device_id] if request.device_id in devices else []
-    left = request.offset or 0
-    for id in ids:
-        device, undecoded = devices[id]
-        if left >= len(device.tags):
-            left -= len(device.tags)
-            continue
-        for tag in list(device.tags.values())[left:]:
-            yield device, undecoded, tag
-        left = 0
+        fitting.append(text)
+    return b",".join(fitting)
 
 
 def _refused(
     request: VariablesRequest,
-    devices: Mapping[str, tuple[ScannedDevice, Mapping[str, str]]],
+    devices: Mapping[str, ScannedDevice],
     refused: Iterable[RefusedEntry],
     module: str,
 ) -> Iterator[Variable]:
@@ -88,7 +67,7 @@ def _refused(
     for entry in refused:
         if entry.device is None or request.device_id not in (None, entry.device):
             continue
-        known = devices[entry.device][0].tags if entry.device in devices else {}
+        known = devices[entry.device].tags if entry.device in devices else {}
         for id in entry.tags:
             if id not in known:
                 yield Variable(
@@ -103,14 +82,13 @@ def _refused(
                 )
 
 
-def _variable(
-    device: ScannedDevice, undecoded: Mapping[str, str], tag: Tag, module: str
-) -> Variable:
+def variable(device: ScannedDevice, tag: Tag, module: str) -> Variable:
+    """Returns the latest value of a tag."""
     latest = device.latest.value(tag)
     quality: Quality = "good"
     if latest is None:
         quality = "uncertain"
-    elif device.health.state != "online" or tag.id in undecoded or _failed(device, tag):
+    elif device.health.state != "online" or tag.id in device.undecoded or _failed(device, tag):
         quality = "bad"
     return Variable(
         module_id=module,

@@ -7,7 +7,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from holdfast.faults import (
+from holdfast.polling.faults import (
     EXPIRED,
     NO_CONNECTION,
     STANDBY,
@@ -51,11 +51,6 @@ NOT_WRITTEN_FAULTS = (
     EXPIRED,
 )
 """Faults of a write that the device certainly has not carried out."""
-
-
-def is_unwritten(fault: int) -> bool:
-    """Returns whether a failed write has certainly changed nothing."""
-    return fault in NOT_WRITTEN_FAULTS
 
 
 @dataclass(slots=True)

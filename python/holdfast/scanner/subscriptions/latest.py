@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from holdfast.scanner.subscriptions.tag import clean
 from holdfast.tags.decoding import Undecoded, value_of
 
 if TYPE_CHECKING:
@@ -58,7 +57,7 @@ class LatestBlocks:
             return None
         time, address, data = found
         value = value_of(tag, data, address)
-        return Latest(None if type(value) is Undecoded else clean(value, tag), time)
+        return Latest(None if type(value) is Undecoded else tag.value(value), time)
 
     def _forget_inside(self, area: Area, start: int, end: int) -> None:
         """Removes the blocks that a new one contains, and the oldest if there are too many."""

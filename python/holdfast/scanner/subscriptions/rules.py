@@ -1,20 +1,60 @@
-"""How requests are understood: what they leave out, and how strictly they are checked."""
+"""How requests are understood: limits, what they leave out, and how strictly they are checked."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from holdfast.config.scanning import SCAN_RATE, TIMEOUT
-from holdfast.scanner.messages.dialects import TENTACLE
-from holdfast.scanner.subscriptions.limits import ScannerLimits
+from holdfast.config.values.scanning import (
+    MAX_DEVICES,
+    MAX_SCAN_RATE,
+    MAX_TAGS,
+    MAX_TIMEOUT,
+    MIN_SCAN_RATE,
+    MIN_TIMEOUT,
+    SCAN_RATE,
+    TIMEOUT,
+)
+from holdfast.scanner.dialects import TENTACLE, Dialect
+from holdfast.scanner.errors import Refused
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from holdfast.config.scanning import Publish
-    from holdfast.scanner.messages.dialect import Dialect
+    from holdfast.config.values.scanning import Publish
+    from holdfast.scanner.messages.decoding import Adjustments
     from holdfast.tags import TagList
+
+
+@dataclass(frozen=True)
+class ScannerLimits:
+    """The limits of one scanner; times are in milliseconds.
+
+    Without limits, any caller could exhaust memory.
+    """
+
+    devices: int = MAX_DEVICES
+    tags: int = MAX_TAGS
+    """Tags of all devices together."""
+    device_tags: int = 10_000
+    """Tags of one device."""
+    subscribers: int = 100
+    """Subscribers of one device."""
+    shortest_scan: int = MIN_SCAN_RATE
+    longest_scan: int = MAX_SCAN_RATE
+    shortest_timeout: int = MIN_TIMEOUT
+    longest_timeout: int = MAX_TIMEOUT
+    request: int = 4 * 1024 * 1024
+    """Size of a request in bytes."""
+    command: int = 4096
+    """Size of the value of a command in bytes."""
+    pending: int = 10_000
+    """Pending requests."""
+
+    @property
+    def connections(self) -> int:
+        """The most connections to devices: one to each, and one beside it that is being closed."""
+        return self.devices
 
 
 @dataclass(frozen=True)
@@ -35,7 +75,33 @@ class Rules:
     limits: ScannerLimits = field(default_factory=ScannerLimits)
     defaults: Defaults = field(default_factory=Defaults)
     strict: bool = False
-    """Whether a request is refused that would otherwise be adjusted, see `messages.leniency`."""
+    """Whether a request is refused that would otherwise be adjusted, see `messages.decoding`."""
     dialect: Dialect = TENTACLE
     profiles: Mapping[str, TagList] = field(default_factory=dict)
     """The tags that requests can name by their profile."""
+
+    def scan_rate(self, requested: int | None, adjustments: Adjustments) -> int:
+        """Returns the scan rate of a request. Raises `Refused`.
+
+        Unless the rules are strict, one that is too short is raised. Adds this to `adjustments`.
+        """
+        limits = self.limits
+        if requested is None:
+            return self.defaults.scan_rate
+        if requested < limits.shortest_scan and not self.strict:
+            raised = f"{requested} to {limits.shortest_scan} ms"
+            adjustments.changes.append(("scan_rate_raised", raised))
+            return limits.shortest_scan
+        return _within("scanRate", requested, limits.shortest_scan, limits.longest_scan)
+
+    def timeout(self, requested: int | None) -> int:
+        """Returns the timeout of a request. Raises `Refused`."""
+        timeout = self.defaults.timeout if requested is None else requested
+        limits = self.limits
+        return _within("timeout", timeout, limits.shortest_timeout, limits.longest_timeout)
+
+
+def _within(key: str, value: int, least: int, most: int) -> int:
+    if not least <= value <= most:
+        raise Refused(f"{key} is {value}, allowed: {least} to {most} ms")
+    return value

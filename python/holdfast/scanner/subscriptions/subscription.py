@@ -1,4 +1,4 @@
-"""A subscribe request, checked without regard to other subscriptions. Does no I/O."""
+"""A subscribe request and its tags, checked without regard to other subscriptions. Does no I/O."""
 
 from __future__ import annotations
 
@@ -6,26 +6,32 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qsl, urlsplit
 
+from holdfast import tags
 from holdfast.client import url as urls
-from holdfast.client.tolerance import STRICT
-from holdfast.client.url import NetworkTarget, SerialTarget
+from holdfast.client.url import STRICT, NetworkTarget, SerialTarget
 from holdfast.net.addresses import address_in, unbracketed
-from holdfast.protocol import usual_port
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS, usual_port
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.messages.leniency import Adjustments
-from holdfast.scanner.subscriptions.device import Plan, Source
-from holdfast.scanner.subscriptions.requested_tags import requested_tags
-from holdfast.types import SERIAL_FRAMES
+from holdfast.scanner.messages.decoding import Adjustments
+from holdfast.scanner.messages.types import TagRequest
+from holdfast.scanner.subscriptions.device import NO_OPTIONS, Source, TagOptions
+from holdfast.scanner.subscriptions.plan import Plan
+from holdfast.scanner.subscriptions.tag import AREA_OF_CODE, CODE_OF_AREA, Tag
+from holdfast.scanner.subscriptions.write_access import read_only
+from holdfast.tags.tag import as_decoded
+from holdfast.types import BIT_AREAS, SERIAL_FRAMES
+from holdfast.values import ConversionError, WrongArea, codec_for
+from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast.client.url import Target
-    from holdfast.config.scanning import Publish
+    from holdfast.config.values.scanning import Publish
     from holdfast.scanner.messages.types import SubscribeRequest
-    from holdfast.scanner.subscriptions.device import TagOptions
     from holdfast.scanner.subscriptions.rules import Rules
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.tags.base import Marker
+    from holdfast.values.types import Type
 
 SETTINGS = ("timeout", "release", "plan")
 """The settings of a device that a request may leave out, once another has set them."""
@@ -60,7 +66,8 @@ def subscription_of(
     if request.deadband and publish != "change":
         raise Refused('deadband requires "publish": "change"')
     deadband = defaults.deadband if request.deadband is None else request.deadband
-    rate, timeout = _rate(request, rules, adjustments), _timeout(request, rules)
+    rate = rules.scan_rate(request.scan_rate, adjustments)
+    timeout = rules.timeout(request.timeout)
     source = Source(
         _target(request),
         1 if request.unit_id is None else request.unit_id,
@@ -94,29 +101,6 @@ def _check_id(id: str) -> None:
         raise Refused(f"deviceId is {id!r}, allowed: printable characters and blanks")
 
 
-def _rate(request: SubscribeRequest, rules: Rules, adjustments: Adjustments) -> int:
-    """Returns the scan rate; one that is too short is raised. Raises `Refused`."""
-    limits, rate = rules.limits, request.scan_rate
-    if rate is None:
-        return rules.defaults.scan_rate
-    if rate < limits.shortest_scan and not rules.strict:
-        adjustments.changes.append(("scan_rate_raised", f"{rate} to {limits.shortest_scan} ms"))
-        return limits.shortest_scan
-    return _within("scanRate", rate, limits.shortest_scan, limits.longest_scan)
-
-
-def _timeout(request: SubscribeRequest, rules: Rules) -> int:
-    timeout = rules.defaults.timeout if request.timeout is None else request.timeout
-    limits = rules.limits
-    return _within("timeout", timeout, limits.shortest_timeout, limits.longest_timeout)
-
-
-def _within(key: str, value: int, least: int, most: int) -> int:
-    if not least <= value <= most:
-        raise Refused(f"{key} is {value}, allowed: {least} to {most} ms")
-    return value
-
-
 def _target(request: SubscribeRequest) -> Target:
     given = [key for key in ("host", "port", "transport") if getattr(request, key) is not None]
     if request.url is not None:
@@ -138,3 +122,141 @@ def _target(request: SubscribeRequest) -> Target:
     is_address = address_in(request.host) is not None
     host = unbracketed(request.host) if is_address else request.host
     return NetworkTarget(transport, host, port)
+
+
+ORDERS = {"big": "ABCD", "little": "DCBA"}
+"""Other names of byte orders, as callers of tentacle-modbus use them."""
+
+NUMERIC = ("bcd", "float", "int", "uint")
+"""What the names of numeric types begin with."""
+
+NO_MARKERS: frozenset[Marker] = frozenset()
+"""One object for nearly all tags."""
+
+
+def requested_tags(
+    request: SubscribeRequest, rules: Rules, adjustments: Adjustments
+) -> tuple[dict[str, Tag], dict[str, TagOptions]]:
+    """Returns the tags of a request by id, and what it sets for each. Raises `Refused`.
+
+    A tag of the request replaces that of its profile.
+    """
+    order = ORDERS.get(request.byte_order or "big", request.byte_order or "")
+    of_profile = [] if request.profile is None else _profile_requests(request.profile, rules)
+    replaceable = {entry.id for entry in of_profile}
+    entries = [(f"profile {request.profile}", entry) for entry in of_profile]
+    entries += ((f"tags[{index}]", entry) for index, entry in enumerate(request.tags))
+    options = {entry.id: _options(entry) for _, entry in entries}
+    found: dict[str, Tag] = {}
+    for where, entry in entries:
+        made = _tag(entry, order, where, rules, adjustments)
+        before = found.get(made.id)
+        if before is not None and made.id in replaceable:
+            replaceable -= {made.id}  # A second one in the request would be a repetition.
+        elif before is not None:
+            if rules.strict:
+                raise Refused(f"{where}: duplicate id {made.id!r}")
+            if made != before and not rules.dialect.last_definition_counts:
+                raise Refused(f"{where}: {made.id!r} is {made}, and already {before}")
+            adjustments.changes.append(("tag_repeated", made.id))
+        found[made.id] = made
+    return found, options
+
+
+def _options(entry: TagRequest) -> TagOptions:
+    if entry.writable is None and entry.description is None:
+        return NO_OPTIONS
+    return TagOptions(entry.writable, entry.description)
+
+
+def _tag(
+    request: TagRequest, order: str, where: str, rules: Rules, adjustments: Adjustments
+) -> Tag:
+    """Creates the tag of a request; `order` is the default byte order. Raises `Refused`.
+
+    Unless the rules are strict, a number in an area of bits becomes a boolean, and `writable` is
+    ignored in an area that can't be written. Adds this to `adjustments`.
+    """
+    if request.profile is not None:
+        return _of_profile(request.profile, request.id, where, rules)
+    area = AREA_OF_CODE[request.function_code]
+    name = request.datatype
+    if name == "boolean" or name.startswith("boolean["):
+        name = "bool" + name.removeprefix("boolean")
+    order = request.byte_order or order
+    order = ORDERS.get(order, order)
+    try:
+        type = parsed(name)
+        if _is_number(type) and area in BIT_AREAS and not rules.strict:
+            adjustments.changes.append(("datatype_ignored", f"{request.id} ({name} in {area})"))
+            name, type = "bool", parsed("bool")
+        if type.base == "bool":
+            order = "ABCD"  # It has none: then equal tags are equal, whatever a request says.
+        elif area not in BIT_AREAS:
+            for note in rules.dialect.byte_order_notes(request, area, order):
+                adjustments.byte_orders.append((request.id, note))
+            order = rules.dialect.byte_orders.get((name, order), order)
+        codec_for(area, name, order, request.encoding)
+    except WrongArea:
+        raise Refused(
+            f"{where}: datatype is {name}, functionCode {request.function_code} reads boolean"
+        ) from None
+    except ConversionError as error:
+        raise Refused(f"{where}: {error}") from None
+    if request.address + type.registers > ADDRESSES:
+        raise Refused(
+            f"{where}: {name} from address {request.address}: the last address is {LAST_ADDRESS}"
+        )
+    null = _null_markers(request, type, where)
+    made = Tag(request.id, area, request.address, name, order, null, request.encoding)
+    if request.writable and (flaw := read_only(made)) is not None:
+        if area in WRITE_LIMITS or rules.strict:
+            raise Refused(f"{where}: {flaw}")
+        adjustments.changes.append(("writable_ignored", f"{request.id} ({area})"))
+    return made
+
+
+def _null_markers(request: TagRequest, type: Type, where: str) -> frozenset[Marker]:
+    if not request.null:
+        return NO_MARKERS
+    try:
+        return frozenset(as_decoded(each, type, request.encoding) for each in request.null)
+    except ValueError as error:
+        raise Refused(f"{where}.null: {error}") from None
+
+
+def _is_number(type: Type) -> bool:
+    return type.count is None and type.base.startswith(NUMERIC)
+
+
+def _profile_requests(name: str, rules: Rules) -> list[TagRequest]:
+    """Returns the tags of a profile as requests. Raises `Refused`."""
+    return [
+        TagRequest(
+            id=tag.name,
+            address=tag.address,
+            function_code=CODE_OF_AREA[tag.area],
+            datatype=tag.type,
+            writable=tag.writable,
+            description=tag.description or None,
+            profile=name,
+        )
+        for tag in _profile(name, "profile", rules)
+    ]
+
+
+def _of_profile(name: str, id: str, where: str, rules: Rules) -> Tag:
+    profile = _profile(name, f"{where}.profile", rules)
+    if id not in profile:
+        raise Refused(f"{where}: the profile {name} has no tag {id!r}")
+    tag = profile[id]
+    made = (tag.area, tag.address, tag.type, tag.order, tag.null, tag.encoding)
+    return Tag(id, *made, profile=name, meaning=tag)
+
+
+def _profile(name: str, where: str, rules: Rules) -> tags.TagList:
+    found = rules.profiles.get(name)
+    if found is None:
+        allowed = ", ".join(rules.profiles) or "none, the configuration has no profiles"
+        raise Refused(f"{where} is {name!r}, allowed: {allowed}")
+    return found

@@ -16,22 +16,6 @@ use crate::poller::panic_guard::spawn_guarded;
 use crate::poller::results::Receivers;
 
 #[test]
-fn polls_stay_due_at_whole_intervals_after_missed_polls() {
-    let (due, interval) = (Instant::now(), Duration::from_millis(100));
-    let of = |now: u64| {
-        let (next, missed) = first_from(due + Duration::from_millis(now), due, interval);
-        ((next - due).as_millis(), missed)
-    };
-    assert_eq!(of(0), (0, 0));
-    assert_eq!(of(1), (100, 1));
-    assert_eq!(of(100), (100, 1));
-    assert_eq!(of(101), (200, 2));
-    assert_eq!(of(86_400_000), (86_400_000, 864_000));
-    assert_eq!(first_from(due - interval, due, interval), (due, 0));
-    assert_eq!(first_from(due + interval, due, Duration::ZERO), (due, 0));
-}
-
-#[test]
 fn reads_are_split_into_parts_that_fit_into_one_request() {
     let of = |area, count, limits: &PlanLimits| {
         let read = ReadSettings { area, address: 5, count, into: None, forward: true };

@@ -1,0 +1,7 @@
+//! When a link sends nothing: failed connects, units that are silent, floods, leases and deadlines.
+
+pub(crate) mod circuit_breaker;
+pub(crate) mod connect_pause;
+pub(crate) mod fence;
+pub(crate) mod flood;
+pub(crate) mod permit;

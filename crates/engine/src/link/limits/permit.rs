@@ -1,0 +1,40 @@
+//! What is checked at the last moment before a request is sent.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use tokio::time::timeout_at;
+
+use crate::client::ClientError;
+use crate::link::limits::fence::Fence;
+
+/// Until when a request may be sent. The default is without a limit.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Permit {
+    /// The fence of the device.
+    pub fence: Option<Arc<Fence>>,
+    /// After this, the caller no longer expects its write to be sent.
+    pub until: Option<Instant>,
+}
+
+impl Permit {
+    /// # Errors
+    /// [`ClientError::Fenced`] or [`ClientError::Expired`].
+    pub fn check(&self) -> Result<(), ClientError> {
+        if self.fence.as_ref().is_some_and(|fence| !fence.allows()) {
+            return Err(ClientError::Fenced);
+        }
+        if self.until.is_some_and(|until| Instant::now() >= until) {
+            return Err(ClientError::Expired);
+        }
+        Ok(())
+    }
+
+    /// Waits for a turn; `None` if it does not come in time.
+    pub async fn in_time<T>(&self, turn: impl Future<Output = T>) -> Option<T> {
+        match self.until {
+            None => Some(turn.await),
+            Some(until) => timeout_at(until.into(), turn).await.ok(),
+        }
+    }
+}

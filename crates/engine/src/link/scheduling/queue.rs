@@ -1,0 +1,189 @@
+//! Which request is next on a link: writes in the order of their arrival, then requests of preferred sources,
+//! then all others. Sources of the same rank take turns, however many requests one of them has. A
+//! rank that was skipped [`MAX_PASSED_OVER`] times is served next, so that no rank starves.
+
+use std::collections::VecDeque;
+use std::net::IpAddr;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use holdfast_protocol::pdu::EncodedRequest;
+
+/// How often a rank is skipped in favour of higher ones.
+const MAX_PASSED_OVER: u32 = 4;
+
+const RANKS: usize = 3;
+
+/// Numbers the sources of requests. 0 is the poller.
+static SOURCES: AtomicU64 = AtomicU64::new(1);
+
+/// A number of a new source of requests.
+pub(crate) fn source() -> u64 {
+    SOURCES.fetch_add(1, Ordering::Relaxed)
+}
+
+/// How much a request matters beside others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Priority {
+    Usual,
+    /// To a unit that was silent the last time: it leaves room for the others.
+    Doubtful,
+    /// A read of a preferred source.
+    Preferred,
+    /// A write, or a request with a person or program waiting for it.
+    Urgent,
+}
+
+impl Priority {
+    /// That of a request of `peer`, which is `None` on a serial line and for an event loop.
+    pub(in crate::link) fn of(
+        request: &EncodedRequest,
+        peer: Option<IpAddr>,
+        preferred: &[IpAddr],
+    ) -> Priority {
+        let is_preferred = |peer: IpAddr| preferred.contains(&peer.to_canonical());
+        match peer {
+            _ if !request.is_read() => Priority::Urgent,
+            Some(peer) if !preferred.is_empty() && is_preferred(peer) => Priority::Preferred,
+            _ => Priority::Usual,
+        }
+    }
+
+    fn rank(self) -> usize {
+        match self {
+            Priority::Urgent => 0,
+            Priority::Preferred => 1,
+            Priority::Usual | Priority::Doubtful => 2,
+        }
+    }
+}
+
+pub(in crate::link) struct Queue<T> {
+    ranks: [TakingTurns<T>; RANKS],
+    passed_over: [u32; RANKS],
+}
+
+impl<T> Default for Queue<T> {
+    fn default() -> Queue<T> {
+        Queue { ranks: Default::default(), passed_over: [0; RANKS] }
+    }
+}
+
+impl<T> Queue<T> {
+    pub(in crate::link) fn push(&mut self, source: u64, priority: Priority, item: T) {
+        // Writes go in the order of their arrival: as if all came from one source.
+        let source = if priority == Priority::Urgent { 0 } else { source };
+        self.ranks[priority.rank()].push(source, item);
+    }
+
+    pub(in crate::link) fn pop(&mut self) -> Option<T> {
+        let waits = |rank: &usize| !self.ranks[*rank].is_empty();
+        let starved = |rank: &usize| self.passed_over[*rank] >= MAX_PASSED_OVER;
+        let next = (0..RANKS).filter(waits).find(starved).or((0..RANKS).find(waits))?;
+        for lower in (next + 1..RANKS).filter(|rank| !self.ranks[*rank].is_empty()) {
+            self.passed_over[lower] += 1;
+        }
+        self.passed_over[next] = 0;
+        self.ranks[next].pop()
+    }
+}
+
+/// Sources that take turns.
+struct TakingTurns<T> {
+    /// Every source has at least one item.
+    sources: VecDeque<(u64, VecDeque<T>)>,
+}
+
+impl<T> Default for TakingTurns<T> {
+    fn default() -> TakingTurns<T> {
+        TakingTurns { sources: VecDeque::new() }
+    }
+}
+
+impl<T> TakingTurns<T> {
+    fn is_empty(&self) -> bool {
+        self.sources.is_empty()
+    }
+
+    fn push(&mut self, source: u64, item: T) {
+        match self.sources.iter_mut().find(|(other, _)| *other == source) {
+            Some((_, items)) => items.push_back(item),
+            None => self.sources.push_back((source, VecDeque::from([item]))),
+        }
+    }
+
+    fn pop(&mut self) -> Option<T> {
+        let (source, mut items) = self.sources.pop_front()?;
+        let item = items.pop_front();
+        if !items.is_empty() {
+            self.sources.push_back((source, items));
+        }
+        item
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn all(queue: &mut Queue<&'static str>) -> Vec<&'static str> {
+        std::iter::from_fn(|| queue.pop()).collect()
+    }
+
+    #[test]
+    fn sources_take_turns() {
+        let mut queue = Queue::default();
+        for (source, item) in [(1, "a1"), (1, "a2"), (1, "a3"), (2, "b1"), (3, "c1"), (2, "b2")] {
+            queue.push(source, Priority::Usual, item);
+        }
+        assert_eq!(all(&mut queue), ["a1", "b1", "c1", "a2", "b2", "a3"]);
+    }
+
+    #[test]
+    fn writes_go_first_in_the_order_of_their_arrival() {
+        let mut queue = Queue::default();
+        queue.push(1, Priority::Usual, "read");
+        queue.push(2, Priority::Preferred, "preferred read");
+        for (source, item) in [(1, "w1"), (1, "w2"), (2, "w3")] {
+            queue.push(source, Priority::Urgent, item);
+        }
+        assert_eq!(all(&mut queue), ["w1", "w2", "w3", "preferred read", "read"]);
+    }
+
+    #[test]
+    fn no_rank_starves() {
+        let mut queue = Queue::default();
+        queue.push(1, Priority::Usual, "read");
+        queue.push(2, Priority::Preferred, "preferred read");
+        for _ in 0..20 {
+            queue.push(3, Priority::Urgent, "write");
+        }
+        let order = all(&mut queue);
+        assert_eq!(order.iter().position(|item| *item == "preferred read"), Some(4));
+        assert_eq!(order.iter().position(|item| *item == "read"), Some(5));
+    }
+
+    proptest! {
+        #[test]
+        fn nothing_is_lost_and_each_source_keeps_its_order(
+            pushed in prop::collection::vec((0u64..5, 0usize..3, any::<bool>()), 0..200)
+        ) {
+            let ranks = [Priority::Usual, Priority::Preferred, Priority::Urgent];
+            let mut queue = Queue::default();
+            let mut popped = Vec::new();
+            for (number, (source, rank, pop)) in pushed.iter().enumerate() {
+                queue.push(*source, ranks[*rank], (*source, *rank, number));
+                popped.extend(pop.then(|| queue.pop()).flatten());
+            }
+            popped.extend(std::iter::from_fn(|| queue.pop()));
+            prop_assert_eq!(popped.len(), pushed.len());
+            for source in 0..5 {
+                for rank in 0..3 {
+                    let of = |each: &&(u64, usize, usize)| (each.0, each.1) == (source, rank);
+                    prop_assert!(popped.iter().filter(of).is_sorted_by_key(|each| each.2));
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,153 @@
+//! Carries out the requests of listeners and event loops, on the thread of the link. For listeners, every
+//! failure becomes the exception of a gateway (V1.1b3, 7); event loops get the error itself.
+
+use std::cell::RefCell;
+use std::rc::Rc;
+use std::sync::{Arc, Weak};
+
+use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
+use tokio::sync::mpsc;
+use tokio::task::spawn_local;
+
+use crate::client::ClientError;
+use crate::link::access::Link;
+use crate::link::fault::{Exchanged, Fault, exception, fault};
+use crate::link::limits::circuit_breaker::CircuitBreakers;
+use crate::link::limits::permit::Permit;
+use crate::link::route::{Call, LinkCounters, LinkSettings, Reply, SharedLink};
+use crate::link::scheduling::shared_reads::{SharedReads, shareable};
+use crate::link::scheduling::write_barrier::Order;
+
+/// Carries out the requests to a link until all that could send some are dropped.
+pub(crate) async fn serve(
+    link: Rc<Link>,
+    settings: LinkSettings,
+    shared: Weak<SharedLink>,
+    mut calls: mpsc::UnboundedReceiver<Call>,
+) {
+    if let Some(shared) = shared.upgrade() {
+        shared.connect_counters(link.strays());
+    }
+    let reads = SharedReads::new(settings.coalesce, settings.cache);
+    let breakers = CircuitBreakers::new(link.retry);
+    let order = Arc::<Order>::default();
+    let serving = Rc::new(Serving { link, order, reads, breakers, error: RefCell::default() });
+    while let Some(call) = calls.recv().await {
+        let Some(shared) = shared.upgrade() else { return };
+        spawn_local(Rc::clone(&serving).carry_out(call, shared));
+    }
+}
+
+struct Serving {
+    link: Rc<Link>,
+    order: Arc<Order>,
+    reads: SharedReads,
+    breakers: CircuitBreakers,
+    /// Why the address could not be reached the last time.
+    error: RefCell<Option<Arc<ClientError>>>,
+}
+
+impl Serving {
+    async fn carry_out(self: Rc<Self>, call: Call, shared: Arc<SharedLink>) {
+        let Call { unit_id, request, source, priority, mut reply } = call;
+        let counters = &shared.counters;
+        // Callers of an event loop wait for their own replies, and share one source.
+        if reply.is_of_listener() {
+            reply.hold(self.order.wait(source, request.is_read()).await);
+        }
+        let read = shareable(unit_id, &request);
+        let changes = self.link.changes.get();
+        if let Some(pdu) = read.as_ref().and_then(|read| self.reads.cached(read, changes)) {
+            counters.cached.add();
+            return reply.send(Ok(&pdu));
+        }
+        let Some(reply) = self.admitted(unit_id, &request, vec![reply], counters).pop() else {
+            return;
+        };
+        let Some(joining) = self.reads.join(read.clone(), reply) else {
+            return counters.coalesced.add();
+        };
+        let turn = self.link.turn(source, priority).await;
+        let replies = joining.leave();
+        if replies.iter().all(Reply::is_unwanted) {
+            return counters.withdrawn.add();
+        }
+        // Requests before this one may have opened a breaker while it waited.
+        let replies = self.admitted(unit_id, &request, replies, counters);
+        let Some(timeout) = replies.iter().map(Reply::timeout).max() else { return };
+        replies.iter().for_each(Reply::note_sent);
+        let changes = self.link.changes.get();
+        let answered =
+            self.link.exchange(unit_id, &request, timeout, true, &Permit::default()).await;
+        drop(turn);
+        self.record(unit_id, &answered, replies.iter().any(Reply::is_of_listener));
+        let error = match answered {
+            Ok(pdu) => {
+                counters.replies.add();
+                if let Some(read) = read {
+                    self.reads.keep(read, &pdu, changes);
+                }
+                return replies.into_iter().for_each(|reply| reply.send(Ok(&pdu)));
+            }
+            Err(error) => error,
+        };
+        let fault = fault(&error);
+        match fault {
+            Fault::Exception(_) => {
+                counters.replies.add();
+                counters.exceptions.add();
+            }
+            Fault::Timeout => counters.timeouts.add(),
+            _ => counters.failures.add(),
+        }
+        let pdu = exception(request.pdu(), fault.exception(self.breakers.is_unreachable()));
+        replies.into_iter().for_each(|reply| reply.send(Err((&error, &pdu))));
+    }
+
+    /// Fails fast where a breaker is open, and returns the other callers. Event loops choose their timeouts
+    /// and look for silent addresses: they fail fast only if the address can't be reached.
+    fn admitted(
+        &self,
+        unit_id: u8,
+        request: &EncodedRequest,
+        replies: Vec<Reply>,
+        counters: &LinkCounters,
+    ) -> Vec<Reply> {
+        let Err(code) = self.breakers.check(unit_id) else { return replies };
+        let pdu = exception(request.pdu(), code.code());
+        let error = self.error.borrow();
+        let error = error.as_ref().filter(|_| code == ExceptionCode::GatewayPathUnavailable);
+        let mut admitted = Vec::new();
+        let mut is_refused = false;
+        for reply in replies {
+            match error {
+                Some(error) => reply.send(Err((error, &pdu))),
+                None if reply.is_of_listener() => reply.send(Ok(&pdu)),
+                None => {
+                    admitted.push(reply);
+                    continue;
+                }
+            }
+            is_refused = true;
+        }
+        if is_refused {
+            counters.refused_down.add();
+        }
+        admitted
+    }
+
+    /// Notes the outcome for the breakers. The timeouts of event loops alone say nothing about a unit: they
+    /// may be short.
+    fn record(&self, unit_id: u8, answered: &Exchanged, from_listener: bool) {
+        let is_unreachable = self.link.retry_at().is_some();
+        if let Err(error) = answered
+            && is_unreachable
+        {
+            self.error.replace(Some(Arc::clone(error)));
+        }
+        let outcome = answered.as_ref().map(drop).map_err(|error| fault(error));
+        if outcome != Err(Fault::Timeout) || from_listener || is_unreachable {
+            self.breakers.record(unit_id, outcome, is_unreachable);
+        }
+    }
+}

@@ -1,0 +1,886 @@
+//! The open connections of a listener, and their limits.
+//!
+//! With TLS, a connection takes a place among the sessions only once its handshake has authenticated
+//! the peer. Until then it has a place among the handshakes, and only handshakes give way to it.
+
+use std::collections::{BTreeMap, HashMap};
+use std::net::{IpAddr, SocketAddr};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
+
+use tokio::task::AbortHandle;
+
+use crate::server::connections::peer::Peer;
+use crate::tls::server::PeerCertificate;
+
+/// A connection without any request so far counts as idle for this much longer, so that connections
+/// that never send anything do not displace those that do.
+const LONGER_WITHOUT_REQUEST: Duration = Duration::from_secs(60);
+
+/// The time that the first bytes of a new connection of HTTP have to arrive before it can be closed for
+/// another.
+const FIRST_BYTES_TIME: Duration = Duration::from_millis(100);
+
+/// What happens to a new connection when a limit is reached.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WhenFull {
+    /// The new connection is closed.
+    Refuse,
+    /// The connection that has been idle longest is closed. A connection in the middle of a Raw
+    /// Ingest packet is closed only if all are.
+    Evict,
+}
+
+/// The limits on open connections.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ConnectionLimits {
+    pub max_connections: usize,
+    pub max_connections_per_source: Option<usize>,
+    pub when_full: WhenFull,
+    /// The most connections whose handshake is not complete. They are not among
+    /// `max_connections`. `None`: connections begin without a handshake.
+    pub max_handshakes: Option<usize>,
+    /// How long a connection in the middle of a request is never closed for another. One that had a
+    /// response within this time is in use.
+    pub grace: Duration,
+}
+
+impl ConnectionLimits {
+    /// For a listener without connections.
+    pub(in crate::server) const NONE: ConnectionLimits = ConnectionLimits {
+        max_connections: 0,
+        max_connections_per_source: None,
+        when_full: WhenFull::Refuse,
+        max_handshakes: None,
+        grace: Duration::ZERO,
+    };
+}
+
+/// What a connection of HTTP waits for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum WaitingFor {
+    /// The peer has not begun a request yet.
+    FirstRequest,
+    /// The peer has had a response, and may begin another request.
+    NextRequest,
+    /// The peer has begun a request, or has not taken a response.
+    Rest,
+    /// The peer waits. Such a connection is never closed for another.
+    Handler,
+}
+
+#[derive(Debug)]
+pub(crate) struct Admission {
+    epoch: Instant,
+    table: Mutex<Table>,
+}
+
+#[derive(Debug)]
+struct Table {
+    limits: ConnectionLimits,
+    next_id: u64,
+    sessions: HashMap<u64, Held>,
+    /// In order of age.
+    handshakes: BTreeMap<u64, Held>,
+    per_source: HashMap<IpAddr, Places>,
+    /// When a connection that had no response may be evicted next, as [`Activity::last_request`].
+    next_unserved: u64,
+}
+
+/// Connections that leave no place for another one.
+#[derive(Debug, Clone, Copy)]
+enum Crowd {
+    OfSource(IpAddr),
+    All,
+}
+
+impl Crowd {
+    fn has(self, held: &Held) -> bool {
+        match self {
+            Crowd::OfSource(source) => held.source() == source,
+            Crowd::All => true,
+        }
+    }
+}
+
+/// In the order in which sessions give way; of the same standing, the one that has been idle longest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Standing {
+    Idle,
+    AmidPacket,
+    /// It has just had its response.
+    JustServed,
+}
+
+/// The places that a source has taken.
+#[derive(Debug, Clone, Copy, Default)]
+struct Places {
+    sessions: usize,
+    handshakes: usize,
+}
+
+#[derive(Debug)]
+struct Held {
+    peer: Peer,
+    opened: SystemTime,
+    /// When it was admitted, as [`Activity::last_request`].
+    admitted: u64,
+    activity: Arc<Activity>,
+    /// Set once the task of the connection runs.
+    task: Option<AbortHandle>,
+}
+
+/// What a connection and the table of connections tell each other without waiting.
+#[derive(Debug)]
+struct Activity {
+    /// In microseconds since the epoch of the admission. Before any request, when it was admitted.
+    last_request: AtomicU64,
+    is_amid_packet: AtomicBool,
+    /// Whether the peer waits for a response that takes its time.
+    is_busy: AtomicBool,
+    /// Whether `last_request` is the time of the last response.
+    is_served: AtomicBool,
+    /// Whether the connection has had its last reply, and waits for its peer to close.
+    is_answered: AtomicBool,
+    /// Whether the connection must look up its rights again.
+    is_outdated: AtomicBool,
+}
+
+/// An open connection.
+#[derive(Debug, Clone)]
+pub struct OpenConnection {
+    /// Its number among the connections of its listener.
+    pub id: u64,
+    pub peer: Peer,
+    pub opened: SystemTime,
+    /// The time since the last request, or since it was opened.
+    pub idle: Duration,
+}
+
+/// The limit is reached, and no connection can be evicted.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Full;
+
+/// A connection that was closed in favour of another.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Evicted {
+    Connection(Peer),
+    Handshake(Peer),
+    /// It had its last reply: nothing was lost.
+    Answered(Peer),
+}
+
+/// The place of one connection. Dropping it frees the place.
+#[derive(Debug)]
+pub(crate) struct Ticket {
+    id: u64,
+    activity: Arc<Activity>,
+    admission: Arc<Admission>,
+}
+
+impl Admission {
+    pub(crate) fn new(limits: ConnectionLimits) -> Admission {
+        let table = Table {
+            limits,
+            next_id: 0,
+            sessions: HashMap::new(),
+            handshakes: BTreeMap::new(),
+            per_source: HashMap::new(),
+            next_unserved: 0,
+        };
+        Admission { epoch: Instant::now(), table: Mutex::new(table) }
+    }
+
+    /// Changes the limits. Open connections stay.
+    pub(crate) fn set_limits(&self, limits: ConnectionLimits) {
+        self.table().limits = limits;
+    }
+
+    /// Admits a connection from `peer`. Also returns the connection that was evicted for it.
+    pub(crate) fn admit(
+        self: &Arc<Self>,
+        peer: SocketAddr,
+    ) -> Result<(Ticket, Option<Evicted>), Full> {
+        let mut table = self.table();
+        let max_handshakes = table.limits.max_handshakes;
+        let evicted = match max_handshakes {
+            None => table.clear_session(peer.ip(), self.since(Instant::now()))?,
+            Some(most) => table.clear_handshake(peer.ip(), most)?,
+        };
+        let id = table.next_id;
+        table.next_id += 1;
+        let admitted = self.since(Instant::now());
+        let activity = Arc::new(Activity {
+            last_request: AtomicU64::new(admitted),
+            is_amid_packet: AtomicBool::new(false),
+            is_busy: AtomicBool::new(false),
+            is_served: AtomicBool::new(false),
+            is_answered: AtomicBool::new(false),
+            is_outdated: AtomicBool::new(false),
+        });
+        let (peer, opened) = (peer.into(), SystemTime::now());
+        let held = Held { peer, opened, admitted, activity: Arc::clone(&activity), task: None };
+        match max_handshakes {
+            None => table.insert_session(id, held),
+            Some(_) => table.insert_handshake(id, held),
+        }
+        Ok((Ticket { id, activity, admission: Arc::clone(self) }, evicted))
+    }
+
+    /// Ends the connections for which `ends` has a reason. The others look up their rights again,
+    /// before they answer the next request. Returns the reasons, and whom they concern.
+    pub(crate) fn review<R>(&self, ends: impl Fn(&Peer) -> Option<R>) -> Vec<(Peer, R)> {
+        let mut table = self.table();
+        let mut ending = Vec::new();
+        for (id, held) in table.held() {
+            match ends(&held.peer) {
+                Some(reason) => ending.push((*id, reason)),
+                None => held.activity.is_outdated.store(true, Ordering::Release),
+            }
+        }
+        let ended = |(id, reason)| table.end(id).map(|held| (held.peer, reason));
+        ending.into_iter().filter_map(ended).collect()
+    }
+
+    /// Ends one connection. Returns its peer, `None` if there is no such connection.
+    pub(crate) fn end(&self, id: u64) -> Option<Peer> {
+        self.table().end(id).map(|held| held.peer)
+    }
+
+    /// The open connections, in the order in which they were opened.
+    pub(crate) fn sessions(&self) -> Vec<OpenConnection> {
+        let now = self.since(Instant::now());
+        let session = |(id, held): (&u64, &Held)| OpenConnection {
+            id: *id,
+            peer: held.peer.clone(),
+            opened: held.opened,
+            idle: Duration::from_micros(
+                now.saturating_sub(held.activity.last_request.load(Ordering::Relaxed)),
+            ),
+        };
+        let mut sessions: Vec<OpenConnection> = self.table().held().map(session).collect();
+        sessions.sort_unstable_by_key(|session| session.id);
+        sessions
+    }
+
+    pub(crate) fn open(&self) -> usize {
+        let table = self.table();
+        table.sessions.len() + table.handshakes.len()
+    }
+
+    fn table(&self) -> MutexGuard<'_, Table> {
+        self.table.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn since(&self, now: Instant) -> u64 {
+        now.saturating_duration_since(self.epoch).as_micros() as u64
+    }
+}
+
+impl Table {
+    /// Makes sure that there is a place for a session.
+    fn clear_session(&mut self, source: IpAddr, now: u64) -> Result<Option<Evicted>, Full> {
+        let Some(crowd) = self.crowd(source.to_canonical()) else {
+            return Ok(None);
+        };
+        if let Some(id) = self.answered(crowd) {
+            return Ok(self.end(id).map(|held| Evicted::Answered(held.peer)));
+        }
+        self.evict(crowd, now).map(Some)
+    }
+
+    /// The sessions that leave no place for one of `source`. `None`: there is a place.
+    fn crowd(&self, source: IpAddr) -> Option<Crowd> {
+        if self.is_most(self.places(source).sessions) {
+            Some(Crowd::OfSource(source))
+        } else {
+            (self.sessions.len() >= self.limits.max_connections).then_some(Crowd::All)
+        }
+    }
+
+    /// The first of these sessions that has had its last reply.
+    fn answered(&self, crowd: Crowd) -> Option<u64> {
+        let is_answered = |held: &Held| {
+            held.task.is_some()
+                && crowd.has(held)
+                && held.activity.is_answered.load(Ordering::Relaxed)
+        };
+        self.sessions.iter().filter(|(_, held)| is_answered(held)).map(|(id, _)| *id).min()
+    }
+
+    /// Makes sure that there is a place for a handshake. The oldest handshake gives way: one that
+    /// takes its time is more likely a peer that never completes it.
+    fn clear_handshake(&mut self, source: IpAddr, most: usize) -> Result<Option<Evicted>, Full> {
+        let source = source.to_canonical();
+        let places = self.places(source);
+        if let Some(crowd) = self.crowd(source)
+            && self.limits.when_full == WhenFull::Refuse
+            && self.answered(crowd).is_none()
+        {
+            return Err(Full);
+        }
+        let crowd = if self.is_most(places.handshakes) {
+            Crowd::OfSource(source)
+        } else if self.handshakes.len() < most {
+            return Ok(None);
+        } else {
+            Crowd::All
+        };
+        let is_evictable = |held: &Held| held.task.is_some() && crowd.has(held);
+        let oldest = self.handshakes.iter().find(|(_, held)| is_evictable(held));
+        let id = *oldest.ok_or(Full)?.0;
+        Ok(self.end(id).map(|held| Evicted::Handshake(held.peer)))
+    }
+
+    /// Closes the session of a crowd that gives way first.
+    fn evict(&mut self, crowd: Crowd, now: u64) -> Result<Evicted, Full> {
+        if self.limits.when_full == WhenFull::Refuse {
+            return Err(Full);
+        }
+        let grace = self.limits.grace.as_micros() as u64;
+        let sessions = || self.sessions.iter().filter(|(_, held)| crowd.has(held));
+        // A flood of connections that never complete a request has half of the places at most.
+        let in_use = sessions().filter(|(_, held)| held.is_in_use(now, grace)).count();
+        let spares = 2 * in_use < sessions().count();
+        let candidates = sessions().filter(|(_, held)| {
+            held.task.is_some()
+                && held.may_go(now, grace)
+                && !(spares && held.is_in_use(now, grace))
+                && (held.is_served() || now >= self.next_unserved)
+        });
+        let id = candidates.min_by_key(|(id, held)| held.rank(**id, now, grace)).map(|(id, _)| *id);
+        let held = self.end(id.ok_or(Full)?).ok_or(Full)?;
+        if !held.is_served() {
+            // Places become free one by one, so that a flood that comes in waves does not get them all.
+            self.next_unserved = now + grace / self.limits.max_connections.max(1) as u64;
+        }
+        Ok(Evicted::Connection(held.peer))
+    }
+
+    /// Whether a source may not have more than this many places of a kind.
+    fn is_most(&self, count: usize) -> bool {
+        self.limits.max_connections_per_source.is_some_and(|most| count >= most)
+    }
+
+    /// All connections.
+    fn held(&self) -> impl Iterator<Item = (&u64, &Held)> {
+        self.sessions.iter().chain(&self.handshakes)
+    }
+
+    fn held_mut(&mut self, id: u64) -> Option<&mut Held> {
+        self.sessions.get_mut(&id).or_else(|| self.handshakes.get_mut(&id))
+    }
+
+    fn places(&self, source: IpAddr) -> Places {
+        self.per_source.get(&source).copied().unwrap_or_default()
+    }
+
+    fn insert_session(&mut self, id: u64, held: Held) {
+        self.per_source.entry(held.source()).or_default().sessions += 1;
+        self.sessions.insert(id, held);
+    }
+
+    fn insert_handshake(&mut self, id: u64, held: Held) {
+        self.per_source.entry(held.source()).or_default().handshakes += 1;
+        self.handshakes.insert(id, held);
+    }
+
+    fn remove(&mut self, id: u64) -> Option<Held> {
+        let session = self.sessions.remove(&id);
+        let was_session = session.is_some();
+        let held = session.or_else(|| self.handshakes.remove(&id))?;
+        let mut places = self.places(held.source());
+        match was_session {
+            true => places.sessions -= 1,
+            false => places.handshakes -= 1,
+        }
+        match places.sessions + places.handshakes {
+            0 => self.per_source.remove(&held.source()),
+            _ => self.per_source.insert(held.source(), places),
+        };
+        Some(held)
+    }
+
+    /// Removes a connection and aborts its task, which drops the socket.
+    fn end(&mut self, id: u64) -> Option<Held> {
+        let held = self.remove(id)?;
+        if let Some(task) = &held.task {
+            task.abort();
+        }
+        Some(held)
+    }
+}
+
+impl Held {
+    /// The order in which sessions give way. Only those of HTTP have a `grace`: one that has just had its
+    /// response does not give way to those that never complete a request.
+    fn rank(&self, id: u64, now: u64, grace: u64) -> (Standing, i128, u64) {
+        let last_request = self.activity.last_request.load(Ordering::Relaxed);
+        let has_no_request = last_request == self.admitted;
+        let longer = if has_no_request { LONGER_WITHOUT_REQUEST.as_micros() as i128 } else { 0 };
+        let standing = if self.activity.is_amid_packet.load(Ordering::Relaxed) {
+            Standing::AmidPacket
+        } else if self.waited(now) < grace {
+            Standing::JustServed
+        } else {
+            Standing::Idle
+        };
+        (standing, i128::from(last_request) - longer, id)
+    }
+
+    /// Whether it may be closed for another connection now.
+    fn may_go(&self, now: u64, grace: u64) -> bool {
+        let Activity { is_amid_packet, is_busy, .. } = &*self.activity;
+        let grace = match is_amid_packet.load(Ordering::Relaxed) {
+            true => grace,
+            false if self.is_served() => 0,
+            false => grace.min(FIRST_BYTES_TIME.as_micros() as u64),
+        };
+        !is_busy.load(Ordering::Relaxed) && self.waited(now) >= grace
+    }
+
+    /// Whether a request is being answered, or was within the grace.
+    fn is_in_use(&self, now: u64, grace: u64) -> bool {
+        let is_busy = self.activity.is_busy.load(Ordering::Relaxed);
+        is_busy || self.is_served() && self.waited(now) < grace
+    }
+
+    fn is_served(&self) -> bool {
+        self.activity.is_served.load(Ordering::Relaxed)
+    }
+
+    fn waited(&self, now: u64) -> u64 {
+        now.saturating_sub(self.activity.last_request.load(Ordering::Relaxed))
+    }
+
+    fn source(&self) -> IpAddr {
+        self.peer.ip().to_canonical()
+    }
+}
+
+impl Ticket {
+    pub(crate) fn id(&self) -> u64 {
+        self.id
+    }
+
+    /// Moves the connection to the sessions: its peer is authenticated. Also returns the session
+    /// that was evicted for it.
+    ///
+    /// # Errors
+    /// There is no place.
+    pub(crate) fn establish(&self) -> Result<Option<Evicted>, Full> {
+        let mut table = self.admission.table();
+        let Some(source) = table.handshakes.get(&self.id).map(Held::source) else {
+            // It has just been evicted, and ends at the next await.
+            return Ok(None);
+        };
+        let evicted = table.clear_session(source, self.admission.since(Instant::now()))?;
+        if let Some(held) = table.remove(self.id) {
+            let now = self.admission.since(Instant::now());
+            self.activity.last_request.store(now.max(held.admitted + 1), Ordering::Relaxed);
+            table.insert_session(self.id, held);
+        }
+        Ok(evicted)
+    }
+
+    /// Records the time of a request.
+    #[inline]
+    pub(crate) fn touch(&self, now: Instant) {
+        self.activity.last_request.store(self.admission.since(now), Ordering::Relaxed);
+    }
+
+    /// Records the certificate that the peer has proved to own.
+    pub(crate) fn identify(&self, certificate: Arc<PeerCertificate>) {
+        if let Some(held) = self.admission.table().held_mut(self.id) {
+            held.peer.certificate = Some(certificate);
+        }
+    }
+
+    /// Whether rights must be looked up again. The next call returns false.
+    #[inline]
+    pub(crate) fn take_outdated(&self) -> bool {
+        self.activity.is_outdated.load(Ordering::Relaxed)
+            && self.activity.is_outdated.swap(false, Ordering::Acquire)
+    }
+
+    /// Records what a connection of HTTP waits for, and since when.
+    pub(crate) fn wait(&self, waiting: WaitingFor, since: Instant) {
+        self.touch(since);
+        self.set_amid_packet(waiting == WaitingFor::Rest);
+        self.activity.is_busy.store(waiting == WaitingFor::Handler, Ordering::Relaxed);
+        self.activity.is_served.store(waiting == WaitingFor::NextRequest, Ordering::Relaxed);
+    }
+
+    /// Records whether part of a packet has arrived.
+    pub(crate) fn set_amid_packet(&self, is_amid_packet: bool) {
+        self.activity.is_amid_packet.store(is_amid_packet, Ordering::Relaxed);
+    }
+
+    /// Records that the connection has had its last reply: it gives its place to any other one.
+    pub(crate) fn set_answered(&self) {
+        self.activity.is_answered.store(true, Ordering::Relaxed);
+    }
+
+    pub(crate) fn is_answered(&self) -> bool {
+        self.activity.is_answered.load(Ordering::Relaxed)
+    }
+}
+
+/// Sets the task of a connection, so that it can be evicted.
+pub(crate) fn attach(admission: &Admission, id: u64, task: AbortHandle) {
+    match admission.table().held_mut(id) {
+        Some(held) => held.task = Some(task),
+        // It was ended before its task ran, or its task has ended.
+        None => task.abort(),
+    }
+}
+
+impl Drop for Ticket {
+    fn drop(&mut self) {
+        self.admission.table().remove(self.id);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    fn peer(last: u8, port: u16) -> SocketAddr {
+        SocketAddr::from(([127, 0, 0, last], port))
+    }
+
+    fn session(last: u8, port: u16) -> Evicted {
+        Evicted::Connection(peer(last, port).into())
+    }
+
+    fn admission(
+        max_connections: usize,
+        max_connections_per_source: Option<usize>,
+        when_full: WhenFull,
+    ) -> Arc<Admission> {
+        Arc::new(Admission::new(ConnectionLimits {
+            max_connections,
+            max_connections_per_source,
+            when_full,
+            max_handshakes: None,
+            grace: Duration::ZERO,
+        }))
+    }
+
+    /// A listener with TLS.
+    fn with_handshakes(
+        max_handshakes: usize,
+        max_connections: usize,
+        max_connections_per_source: Option<usize>,
+        when_full: WhenFull,
+    ) -> Arc<Admission> {
+        Arc::new(Admission::new(ConnectionLimits {
+            max_connections,
+            max_connections_per_source,
+            when_full,
+            max_handshakes: Some(max_handshakes),
+            grace: Duration::ZERO,
+        }))
+    }
+
+    /// Begins a handshake.
+    fn begin(
+        admission: &Arc<Admission>,
+        runtime: &tokio::runtime::Runtime,
+        peer: SocketAddr,
+    ) -> (Ticket, Option<Evicted>) {
+        let (ticket, evicted) = admission.admit(peer).unwrap();
+        attach(admission, ticket.id(), task(runtime));
+        (ticket, evicted)
+    }
+
+    fn task(runtime: &tokio::runtime::Runtime) -> AbortHandle {
+        runtime.spawn(std::future::pending::<()>()).abort_handle()
+    }
+
+    #[test]
+    fn dropping_a_ticket_frees_its_place() {
+        let admission = admission(1, None, WhenFull::Refuse);
+        let (ticket, _) = admission.admit(peer(1, 1)).unwrap();
+        assert_eq!(admission.admit(peer(1, 2)).unwrap_err(), Full);
+        drop(ticket);
+        assert!(admission.admit(peer(1, 2)).is_ok());
+    }
+
+    #[test]
+    fn the_limit_of_a_source_counts_mapped_addresses_as_the_same() {
+        let admission = admission(9, Some(1), WhenFull::Refuse);
+        let mapped: SocketAddr = "[::ffff:127.0.0.1]:2".parse().unwrap();
+        let held = admission.admit(peer(1, 1)).unwrap();
+        assert_eq!(admission.admit(mapped).unwrap_err(), Full);
+        assert!(admission.admit(peer(2, 1)).is_ok());
+        drop(held);
+        assert!(admission.admit(mapped).is_ok());
+    }
+
+    /// Which of several connections of HTTP gives way, given what each waits for, and for how long.
+    fn http_evicts(waiting: &[(WaitingFor, Duration)]) -> Option<usize> {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let mut limits = admission(waiting.len(), None, WhenFull::Evict).table().limits;
+        limits.grace = Duration::from_secs(1);
+        let mut admission = Admission::new(limits);
+        admission.epoch -= Duration::from_secs(200);
+        let admission = Arc::new(admission);
+        let now = Instant::now();
+        let tickets: Vec<Ticket> = waiting
+            .iter()
+            .zip(0..)
+            .map(|((waiting, long), port)| {
+                let (ticket, _) = begin(&admission, &runtime, peer(1, port));
+                ticket.wait(*waiting, now - *long);
+                ticket
+            })
+            .collect();
+        let evicted = admission.admit(peer(2, 0)).ok()?.1;
+        assert_eq!(tickets.len(), waiting.len());
+        (0..waiting.len()).find(|port| evicted == Some(session(1, *port as u16)))
+    }
+
+    #[test]
+    fn connections_of_http_give_way_that_wait_longest_for_a_request_then_those_within_one() {
+        use WaitingFor::{FirstRequest as Request, Handler, Rest};
+        let of = |seconds: u64| Duration::from_millis(seconds * 1000 + 500);
+        type Case<'a> = (&'a [(WaitingFor, Duration)], Option<usize>);
+        let cases: [Case<'_>; 10] = [
+            (&[(Request, of(2)), (Request, of(3)), (Request, of(1))], Some(1)),
+            (&[(Request, of(0)), (Rest, of(99))], Some(1)),
+            (&[(Request, of(2)), (Rest, of(99))], Some(0)),
+            (&[(Request, of(0)), (Rest, of(0))], Some(0)),
+            (&[(Rest, of(99)), (Request, of(1))], Some(1)),
+            (&[(Rest, of(91)), (Rest, of(92)), (Rest, of(0))], Some(1)),
+            (&[(Handler, of(99)), (Rest, of(1))], Some(1)),
+            (&[(Handler, of(99)), (Handler, of(99))], None),
+            (&[(Rest, of(0))], None),
+            (&[(Handler, of(99)), (Rest, of(0))], None),
+        ];
+        for (waiting, evicted) in cases {
+            assert_eq!(http_evicts(waiting), evicted, "{waiting:?}");
+        }
+    }
+
+    #[test]
+    fn connections_of_http_in_use_have_half_of_the_places() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let mut limits = admission(3, None, WhenFull::Evict).table().limits;
+        limits.grace = Duration::from_secs(60);
+        let mut admission = Admission::new(limits);
+        admission.epoch -= Duration::from_secs(1);
+        let admission = Arc::new(admission);
+        let begin = |port, waiting| {
+            let (ticket, evicted) = admission.admit(peer(1, port))?;
+            attach(&admission, ticket.id(), task(&runtime));
+            ticket.wait(waiting, Instant::now());
+            Ok::<_, Full>((ticket, evicted))
+        };
+        let _used = [1, 2, 3].map(|port| begin(port, WaitingFor::NextRequest).unwrap());
+        let (silent, evicted) = begin(4, WaitingFor::FirstRequest).unwrap();
+        assert_eq!(evicted, Some(session(1, 1)), "all are in use");
+        let (other, evicted) = begin(5, WaitingFor::FirstRequest).unwrap();
+        assert_eq!(evicted, Some(session(1, 2)), "two of three are in use");
+        assert_eq!(begin(6, WaitingFor::Rest).unwrap_err(), Full, "its first bytes may arrive");
+        silent.wait(WaitingFor::FirstRequest, Instant::now() - 2 * FIRST_BYTES_TIME);
+        other.wait(WaitingFor::FirstRequest, Instant::now() - 2 * FIRST_BYTES_TIME);
+        let (_last, evicted) = begin(7, WaitingFor::Rest).unwrap();
+        assert_eq!(evicted, Some(session(1, 4)), "it is silent");
+        assert_eq!(begin(8, WaitingFor::Rest).unwrap_err(), Full, "the next place is free later");
+    }
+
+    #[test]
+    fn the_connection_that_has_been_idle_longest_is_evicted() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = admission(3, None, WhenFull::Evict);
+        let tickets = [1, 2, 3].map(|port| {
+            let (ticket, evicted) = admission.admit(peer(1, port)).unwrap();
+            assert_eq!(evicted, None);
+            attach(&admission, ticket.id(), task(&runtime));
+            ticket
+        });
+        let later = Instant::now() + Duration::from_secs(1);
+        for (seconds, index) in [(3, 0), (1, 1), (2, 2)] {
+            tickets[index].touch(later + Duration::from_secs(seconds));
+        }
+        let (_fourth, evicted) = admission.admit(peer(1, 4)).unwrap();
+        assert_eq!(evicted, Some(session(1, 2)));
+        assert_eq!(admission.open(), 3);
+    }
+
+    #[test]
+    fn a_connection_in_the_middle_of_a_packet_is_evicted_last() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = admission(3, None, WhenFull::Evict);
+        let admit = |port| {
+            let (ticket, evicted) = admission.admit(peer(1, port)).unwrap();
+            attach(&admission, ticket.id(), task(&runtime));
+            (ticket, evicted)
+        };
+        let tickets = [1, 2, 3].map(|port| admit(port).0);
+        tickets[0].set_amid_packet(true);
+        tickets[2].set_amid_packet(true);
+        let (_fourth, evicted) = admit(4);
+        assert_eq!(evicted, Some(session(1, 2)));
+        let (fifth, evicted) = admit(5);
+        assert_eq!(evicted, Some(session(1, 4)), "the silent one, although it is the newest");
+        fifth.set_amid_packet(true);
+        let (sixth, evicted) = admit(6);
+        assert_eq!(evicted, Some(session(1, 1)), "all are in the middle of a packet");
+        sixth.set_amid_packet(true);
+        fifth.set_amid_packet(false);
+        assert_eq!(admit(7).1, Some(session(1, 5)), "its packet is complete");
+    }
+
+    #[test]
+    fn a_connection_that_was_answered_gives_its_place_to_any_other() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        for when_full in [WhenFull::Refuse, WhenFull::Evict] {
+            let admission = admission(3, Some(2), when_full);
+            let admit = |last, port| {
+                let (ticket, evicted) = admission.admit(peer(last, port))?;
+                attach(&admission, ticket.id(), task(&runtime));
+                Ok::<_, Full>((ticket, evicted))
+            };
+            let answered = |last, port| Some(Evicted::Answered(peer(last, port).into()));
+            let tickets = [(1, 1), (2, 1), (1, 2)].map(|(last, port)| admit(last, port).unwrap().0);
+            tickets[1].set_answered();
+            let (_fourth, evicted) = admit(3, 1).unwrap();
+            assert_eq!(evicted, answered(2, 1));
+            tickets[2].set_answered();
+            let (_fifth, evicted) = admit(1, 3).unwrap();
+            assert_eq!(evicted, answered(1, 2), "the limit of the source");
+            let next = admit(1, 4).map(|(_, evicted)| evicted);
+            let expected =
+                if when_full == WhenFull::Evict { Ok(Some(session(1, 1))) } else { Err(Full) };
+            assert_eq!(next, expected, "no other one was answered");
+        }
+    }
+
+    #[test]
+    fn a_session_that_was_answered_keeps_no_handshake_out() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = with_handshakes(2, 1, None, WhenFull::Refuse);
+        let (first, _) = begin(&admission, &runtime, peer(1, 1));
+        assert_eq!(first.establish(), Ok(None));
+        assert_eq!(admission.admit(peer(1, 2)).unwrap_err(), Full);
+        first.set_answered();
+        let (second, evicted) = begin(&admission, &runtime, peer(1, 2));
+        assert_eq!(evicted, None, "only its session needs the place");
+        assert_eq!(second.establish(), Ok(Some(Evicted::Answered(peer(1, 1).into()))));
+    }
+
+    #[test]
+    fn a_source_at_its_limit_evicts_only_its_own_connections() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = admission(9, Some(1), WhenFull::Evict);
+        let _held = [(1, 1), (2, 2)].map(|(last, port)| {
+            let (ticket, _) = admission.admit(peer(last, port)).unwrap();
+            attach(&admission, ticket.id(), task(&runtime));
+            ticket
+        });
+        let (_third, evicted) = admission.admit(peer(2, 3)).unwrap();
+        assert_eq!(evicted, Some(session(2, 2)));
+    }
+
+    #[test]
+    fn a_connection_without_a_request_gives_way_to_those_with_requests() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = admission(3, None, WhenFull::Evict);
+        let busy = [1, 2].map(|port| begin(&admission, &runtime, peer(1, port)).0);
+        busy.iter().for_each(|ticket| ticket.touch(Instant::now()));
+        let mut silent = vec![begin(&admission, &runtime, peer(1, 3)).0];
+        for port in 4..20 {
+            let (ticket, evicted) = begin(&admission, &runtime, peer(1, port));
+            assert_eq!(evicted, Some(session(1, port - 1)));
+            silent.push(ticket);
+        }
+    }
+
+    #[test]
+    fn connections_that_were_idle_for_long_give_way_to_new_ones_without_a_request() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let mut admission = admission(3, None, WhenFull::Evict);
+        // The others sent their last requests before the silence that a new connection has ahead.
+        Arc::get_mut(&mut admission).unwrap().epoch -=
+            LONGER_WITHOUT_REQUEST + Duration::from_secs(10);
+        let _dead = [1, 2, 3].map(|port| {
+            let ticket = begin(&admission, &runtime, peer(1, port)).0;
+            ticket.touch(admission.epoch + Duration::from_secs(u64::from(port)));
+            ticket
+        });
+        let evicted = [4, 5, 6].map(|port| begin(&admission, &runtime, peer(1, port)));
+        let evicted = evicted.each_ref().map(|(_, evicted)| evicted.clone());
+        assert_eq!(evicted, [1, 2, 3].map(|port| Some(session(1, port))));
+    }
+
+    #[test]
+    fn handshakes_displace_each_other_and_no_session() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        for when_full in [WhenFull::Evict, WhenFull::Refuse] {
+            let admission = with_handshakes(2, 3, None, when_full);
+            let sessions = [1, 2].map(|port| begin(&admission, &runtime, peer(1, port)).0);
+            sessions.iter().for_each(|ticket| assert_eq!(ticket.establish(), Ok(None)));
+            let silent: Vec<_> =
+                (10..40).map(|port| begin(&admission, &runtime, peer(1, port))).collect();
+            let evicted: Vec<_> =
+                silent.iter().filter_map(|(_, evicted)| evicted.clone()).collect();
+            let oldest: Vec<_> =
+                (10..38).map(|port| Evicted::Handshake(peer(1, port).into())).collect();
+            assert_eq!(evicted, oldest);
+            assert_eq!(admission.open(), 4, "{when_full:?}");
+        }
+    }
+
+    #[test]
+    fn an_authenticated_peer_takes_the_place_of_the_session_that_is_idle_longest() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = with_handshakes(9, 2, None, WhenFull::Evict);
+        let tickets = [1, 2, 3].map(|port| {
+            let (ticket, evicted) = begin(&admission, &runtime, peer(1, port));
+            assert_eq!(evicted, None);
+            ticket
+        });
+        assert_eq!(tickets[1].establish(), Ok(None));
+        assert_eq!(tickets[0].establish(), Ok(None));
+        assert_eq!(tickets[2].establish(), Ok(Some(session(1, 2))));
+        assert_eq!(admission.open(), 2);
+    }
+
+    #[test]
+    fn without_eviction_a_full_listener_refuses_a_peer_before_and_after_its_handshake() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = with_handshakes(9, 1, None, WhenFull::Refuse);
+        let tickets = [1, 2].map(|port| begin(&admission, &runtime, peer(1, port)).0);
+        assert_eq!(tickets[1].establish(), Ok(None));
+        assert_eq!(tickets[0].establish(), Err(Full));
+        assert_eq!(admission.admit(peer(2, 3)).unwrap_err(), Full);
+        drop(tickets);
+        assert_eq!((admission.open(), admission.table().per_source.len()), (0, 0));
+    }
+
+    #[test]
+    fn handshakes_of_a_source_at_its_limit_displace_only_each_other() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = with_handshakes(9, 9, Some(2), WhenFull::Evict);
+        let _other = begin(&admission, &runtime, peer(2, 1));
+        let _held = [1, 2].map(|port| begin(&admission, &runtime, peer(1, port)));
+        let (third, evicted) = begin(&admission, &runtime, peer(1, 3));
+        assert_eq!(evicted, Some(Evicted::Handshake(peer(1, 1).into())));
+        assert_eq!(third.establish(), Ok(None));
+    }
+
+    #[test]
+    fn a_handshake_that_was_just_evicted_takes_no_place() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = with_handshakes(1, 1, None, WhenFull::Evict);
+        let first = begin(&admission, &runtime, peer(1, 1)).0;
+        let _second = begin(&admission, &runtime, peer(1, 2));
+        assert_eq!(first.establish(), Ok(None));
+        assert_eq!(admission.open(), 1);
+    }
+}

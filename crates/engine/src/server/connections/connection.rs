@@ -1,0 +1,959 @@
+//! A Modbus connection over a stream: receives bytes, answers all complete requests in order, sends
+//! bytes.
+//!
+//! All connections of a worker thread share one pair of buffers ([`Scratch`]): nothing is awaited
+//! between a read and the write that answers it. A connection keeps only what is left over: the
+//! beginning of a request, or replies that a slow peer has not read. While replies wait, no more
+//! requests are read. Requests to devices are answered later ([`super::reply_order`]).
+
+use std::cell::RefCell;
+use std::future::poll_fn;
+use std::io;
+use std::mem;
+use std::pin::{Pin, pin};
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use holdfast_protocol::pdu;
+use tokio::sync::watch;
+use tokio::task::yield_now;
+use tokio::time::{Instant, Sleep, sleep_until};
+
+use crate::server::connections::admission::Ticket;
+use crate::server::connections::fair_share::{Share, WORK_OF_READ};
+use crate::server::connections::listener::ListenerContext;
+use crate::server::connections::peer::Peer;
+use crate::server::connections::reply_order::{Deferral, Deferred, MAX_WAITING};
+use crate::server::reports::event::Kind;
+use crate::server::reports::refused_request::{RefusedRequest, Reported};
+use crate::server::requests::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};
+use crate::server::rights::policy::PeerRights;
+use crate::server::transports::framing::{Ascii, Framing, Mbap, Next, Rtu};
+use crate::server::transports::stream::{self, Stream};
+
+/// Bytes per read of a socket.
+const INPUT_BYTES: usize = 4096;
+
+/// Room for the replies to all requests of one read, and for those that come later.
+const OUTPUT_BYTES: usize =
+    output::<Mbap>(output::<Rtu>(output::<Ascii>(0))) + MAX_WAITING * Ascii::MAX_LEN;
+
+const fn output<F: Framing>(least: usize) -> usize {
+    // A read has room for at least one byte.
+    assert!(F::MAX_LEN < INPUT_BYTES);
+    assert!(F::HEADER_LEN + pdu::MAX_LEN <= F::MAX_LEN);
+    let len = (INPUT_BYTES / F::SHORTEST + 1) * F::MAX_LEN;
+    if len > least { len } else { least }
+}
+
+/// The most reads of a connection before other tasks run.
+const READS_PER_TURN: u32 = 4;
+
+/// The most reads of the remaining input before a connection ends: a peer may go on sending.
+const MAX_LAST_READS: usize = 64;
+
+/// A timer without a deadline fires after this time.
+pub(crate) const NO_DEADLINE: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
+
+struct Scratch {
+    input: Box<[u8]>,
+    output: Box<[u8]>,
+}
+
+thread_local! {
+    static SCRATCH: RefCell<Scratch> = RefCell::new(Scratch {
+        input: vec![0; INPUT_BYTES].into_boxed_slice(),
+        output: vec![0; OUTPUT_BYTES].into_boxed_slice(),
+    });
+}
+
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Timeouts {
+    /// The longest time without a request. `None`: no limit.
+    pub(crate) idle: Option<Duration>,
+    /// The longest time from the first byte of a request to its last, and for a peer to read its
+    /// replies.
+    pub(crate) request: Duration,
+    /// The longest time between two reads of a request. After that, the request is discarded, and the
+    /// next byte starts a frame; `None` where silence means nothing.
+    pub(crate) frame: Option<Duration>,
+}
+
+/// What a connection may do, and how long it may take.
+pub(crate) struct Terms {
+    pub(crate) rights: Arc<PeerRights>,
+    pub(crate) timeouts: Timeouts,
+}
+
+/// Looks up the terms of a connection again; `None` if it has no rights any more.
+pub(crate) type Renewal = Box<dyn Fn() -> Option<Terms> + Send + Sync>;
+
+pub(crate) struct Connection<F: Framing, S> {
+    stream: S,
+    answering: Answering<F>,
+    timeouts: Timeouts,
+    renewal: Renewal,
+    ticket: Ticket,
+    /// Bytes queued for the peer.
+    unsent: Vec<u8>,
+    last_request: Instant,
+    arrival: Arrival,
+    /// Reads since other tasks last ran.
+    reads_in_turn: u32,
+    share: Share,
+}
+
+/// What has arrived of the next request.
+#[derive(Debug, Clone, Copy)]
+enum Arrival {
+    /// Nothing: the peer is idle.
+    Nothing,
+    /// The beginning of a request or of a TLS record, or bytes that are discarded until a silence.
+    Partial { begun: Instant, last_read: Instant },
+}
+
+/// The state that replies depend on.
+struct Answering<F: Framing> {
+    context: Arc<ListenerContext>,
+    peer: Peer,
+    unit_server: Arc<UnitServer>,
+    rights: Arc<PeerRights>,
+    /// The beginning of an incomplete request.
+    partial: F::Partial,
+    partial_len: usize,
+    /// What is known of the bytes before it.
+    before: F::Before,
+    /// The last character of an ASCII frame, which the peer can change.
+    delimiter: u8,
+    reported: Reported,
+    /// `None` until a request is answered later.
+    deferred: Option<Box<Deferred>>,
+}
+
+/// The result of answering some input.
+struct Answered {
+    /// Bytes of output.
+    len: usize,
+    requests: usize,
+    /// Frames that were discarded.
+    discarded: usize,
+    /// Bytes of complete frames.
+    consumed: usize,
+    /// A frame was broken. Bytes after it were ignored.
+    broken: bool,
+}
+
+impl<F: Framing, S: Stream> Connection<F, S> {
+    pub(crate) fn new(
+        context: Arc<ListenerContext>,
+        unit_server: Arc<UnitServer>,
+        (stream, peer): (S, Peer),
+        Terms { rights, timeouts }: Terms,
+        renewal: Renewal,
+        ticket: Ticket,
+    ) -> Connection<F, S> {
+        let share = Share::of(peer.ip());
+        let answering = Answering::new(context, peer, unit_server, rights);
+        let last_request = Instant::now();
+        Connection {
+            stream,
+            answering,
+            timeouts,
+            renewal,
+            ticket,
+            unsent: Vec::new(),
+            last_request,
+            arrival: Arrival::Nothing,
+            reads_in_turn: 0,
+            share,
+        }
+    }
+
+    /// Takes over bytes that were already read: the beginning of a request.
+    pub(crate) fn begin_with(&mut self, received: &[u8]) {
+        if !received.is_empty() {
+            self.answering.keep(received);
+            let begun = self.last_request;
+            self.arrival = Arrival::Partial { begun, last_read: begun };
+        }
+    }
+
+    /// Serves until the connection ends. The end is counted before the peer can see it.
+    pub(crate) async fn run(mut self, stop: watch::Receiver<bool>) {
+        let (context, peer) = (Arc::clone(&self.answering.context), self.answering.peer.clone());
+        // The engine waits until all receivers are dropped.
+        let running = stop.clone();
+        match self.serve(stop).await {
+            Some(end) => {
+                self.answering.give_up(running);
+                context.ended(end, peer);
+                // After replies that were cut off, a closing message would be misread.
+                if self.unsent.is_empty() {
+                    self.stream.end(&mut self.unsent);
+                    let _ = stream::write(self.stream.socket(), &mut self.unsent);
+                }
+            }
+            None => {
+                self.finish().await;
+                context.ended(Kind::Closed, peer);
+            }
+        }
+    }
+
+    /// Serves until the connection ends. Returns `None` when the engine stops.
+    async fn serve(&mut self, mut stop: watch::Receiver<bool>) -> Option<Kind> {
+        // With a peer that never pauses, the branch for `stop` would never run.
+        let flooded = stop.clone();
+        let mut stopping = pin!(stop.wait_for(|stop| *stop));
+        let mut alarm = pin!(sleep_until(self.last_request + NO_DEADLINE));
+        loop {
+            if let Err(end) = self.send_unsent().await {
+                return Some(end);
+            }
+            if flooded.has_changed().unwrap_or(true) {
+                return None;
+            }
+            self.set_alarm(alarm.as_mut());
+            let step = tokio::select! {
+                biased;
+                step = poll_fn(|context| self.poll(context)) => step,
+                () = &mut alarm => self.on_alarm(),
+                _ = &mut stopping => return None,
+            };
+            if let Err(end) = step {
+                return Some(end);
+            }
+            if self.reads_in_turn == READS_PER_TURN {
+                self.reads_in_turn = 0;
+                yield_now().await;
+            }
+        }
+    }
+
+    /// Reads and answers once, unless the source has used its share. Or writes replies that have come.
+    fn poll(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
+        if self.answering.is_waiting() {
+            if let Poll::Ready(step) = self.poll_deferred(context) {
+                return Poll::Ready(step);
+            }
+            if self.answering.is_full() {
+                return Poll::Pending;
+            }
+        }
+        if self.share.poll(context).is_pending() {
+            self.reads_in_turn = 0;
+            return Poll::Pending;
+        }
+        let read = self.poll_read(context);
+        self.share.pass_on();
+        read
+    }
+
+    /// Reads once, answers all complete requests, and writes once.
+    fn poll_read(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
+        SCRATCH.with_borrow_mut(|Scratch { input, output }| {
+            let partial = self.answering.restore(input);
+            let read = self.stream.poll_read(context, &mut input[partial..], &mut self.unsent);
+            let Poll::Ready(read) = read else {
+                self.reads_in_turn = 0;
+                return Poll::Pending;
+            };
+            self.reads_in_turn += 1;
+            let read = read?;
+            self.renew()?;
+            let answered = self.answering.answer(&input[..partial + read], output);
+            self.share.charge(WORK_OF_READ);
+            self.note_times(&answered);
+            let output = &output[..answered.len];
+            if !output.is_empty() {
+                self.stream.send(output, &mut self.unsent)?;
+            }
+            Poll::Ready(if answered.broken { Err(Kind::BrokenFrame) } else { Ok(()) })
+        })
+    }
+
+    /// Writes replies that have come, and answers what waited for them.
+    fn poll_deferred(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
+        SCRATCH.with_borrow_mut(|Scratch { input, output }| {
+            let Some(mut len) = self.answering.collect(context, output) else {
+                self.reads_in_turn = 0;
+                return Poll::Pending;
+            };
+            self.reads_in_turn += 1;
+            let mut broken = false;
+            // Requests that waited for the replies go on at once: no byte need arrive for them.
+            let behind = self.answering.resume(input);
+            if behind > 0 {
+                self.renew()?;
+                let answered = self.answering.answer(&input[..behind], &mut output[len..]);
+                len += answered.len;
+                broken = answered.broken;
+                self.note_times(&answered);
+            } else {
+                self.last_request = Instant::now();
+            }
+            if len > 0 {
+                self.stream.send(&output[..len], &mut self.unsent)?;
+            }
+            Poll::Ready(if broken { Err(Kind::BrokenFrame) } else { Ok(()) })
+        })
+    }
+
+    /// Looks up rights and timeouts again after a reload.
+    #[inline]
+    fn renew(&mut self) -> Result<(), Kind> {
+        if self.ticket.take_outdated() {
+            let Terms { rights, timeouts } = (self.renewal)().ok_or(Kind::RightsRevoked)?;
+            (self.answering.rights, self.timeouts) = (rights, timeouts);
+            // Other rights refuse other requests: each first one is reported again.
+            self.answering.reported = Reported::default();
+        }
+        Ok(())
+    }
+
+    /// Updates the times that the deadlines depend on.
+    fn note_times(&mut self, answered: &Answered) {
+        let now = Instant::now();
+        if answered.requests > 0 {
+            self.last_request = now;
+            self.ticket.touch(now.into_std());
+        }
+        self.share.charge((answered.requests + answered.discarded) as u32);
+        let is_at_start = F::is_at_start(&self.answering.before);
+        if self.answering.partial_len == 0 && is_at_start && !self.stream.is_amid_record() {
+            self.arrival = Arrival::Nothing;
+            return;
+        }
+        // Bytes that are discarded until a silence do not put off the end of the connection.
+        let is_new = answered.requests > 0 || answered.consumed > 0 && is_at_start;
+        let begun = match self.arrival {
+            Arrival::Partial { begun, .. } if !is_new => begun,
+            _ => now,
+        };
+        self.arrival = Arrival::Partial { begun, last_read: now };
+    }
+
+    /// Waits for the peer to read its replies.
+    async fn send_unsent(&mut self) -> Result<(), Kind> {
+        if !self.unsent.is_empty() {
+            let time_limit = self.timeouts.request;
+            stream::send_all(self.stream.socket(), &self.unsent, time_limit).await?;
+            // Frees the buffer of a slow peer: most connections never need one.
+            self.unsent = Vec::new();
+        }
+        Ok(())
+    }
+
+    /// When and why the connection ends.
+    fn end(&self) -> (Instant, Kind) {
+        let is_amid_request = self.answering.partial_len > 0 || self.stream.is_amid_record();
+        // Bytes that are discarded do not put off the end for want of requests.
+        let idle = self.timeouts.idle.filter(|_| !is_amid_request && !self.answering.is_waiting());
+        let idle = (self.last_request + idle.unwrap_or(NO_DEADLINE), Kind::Idle);
+        let Arrival::Partial { begun, .. } = self.arrival else { return idle };
+        let request = (begun + self.timeouts.request, Kind::RequestTimeout);
+        if is_amid_request || request.0 < idle.0 { request } else { idle }
+    }
+
+    /// When a silence ends a frame.
+    fn frame_end(&self) -> Option<Instant> {
+        match self.arrival {
+            Arrival::Nothing => None,
+            Arrival::Partial { last_read, .. } => {
+                self.timeouts.frame.map(|frame| last_read + frame)
+            }
+        }
+    }
+
+    fn deadline(&self) -> Instant {
+        let (end, _) = self.end();
+        self.frame_end().map_or(end, |frame_end| frame_end.min(end))
+    }
+
+    /// Moves the alarm to an earlier time. A later deadline is set when the alarm fires: requests
+    /// are much more frequent than alarms.
+    fn set_alarm(&self, alarm: Pin<&mut Sleep>) {
+        let deadline = self.deadline();
+        if deadline < alarm.deadline() || alarm.is_elapsed() {
+            alarm.reset(deadline);
+        }
+    }
+
+    /// Discards the beginning of a request that nothing followed, or ends the connection.
+    fn on_alarm(&mut self) -> Result<(), Kind> {
+        let (now, (end, kind)) = (Instant::now(), self.end());
+        if now < self.deadline() {
+            return Ok(());
+        }
+        if self.share.is_waiting() {
+            // What the peer has sent is not read yet: it is not to blame for silence.
+            self.last_request = now;
+            if let Arrival::Partial { .. } = self.arrival {
+                self.arrival = Arrival::Partial { begun: now, last_read: now };
+            }
+            return Ok(());
+        }
+        if self.frame_end().is_some_and(|frame_end| frame_end < end) {
+            self.answering.discard_partial();
+            self.arrival = Arrival::Nothing;
+            return Ok(());
+        }
+        Err(kind)
+    }
+
+    /// Answers what the system has already received, then ends. The engine drops connections whose
+    /// devices take too long.
+    async fn finish(&mut self) {
+        // An error: a peer that does not read loses these replies.
+        if self.answering.drain(&mut self.stream, &mut self.unsent).is_err() {
+            return;
+        }
+        while self.answering.is_waiting() {
+            let step = poll_fn(|context| self.poll_deferred(context)).await;
+            let sent = stream::write(self.stream.socket(), &mut self.unsent);
+            if step.is_err() || sent.is_err() {
+                return;
+            }
+        }
+        self.stream.end(&mut self.unsent);
+        let _ = stream::write(self.stream.socket(), &mut self.unsent);
+    }
+}
+
+impl<F: Framing> Answering<F> {
+    fn new(
+        context: Arc<ListenerContext>,
+        peer: Peer,
+        unit_server: Arc<UnitServer>,
+        rights: Arc<PeerRights>,
+    ) -> Answering<F> {
+        Answering {
+            context,
+            peer,
+            unit_server,
+            rights,
+            partial: F::NO_PARTIAL,
+            partial_len: 0,
+            before: F::Before::default(),
+            delimiter: ASCII_DELIMITER,
+            reported: Reported::default(),
+            deferred: None,
+        }
+    }
+
+    /// Copies the beginning of a request to the start of `input`. Returns its length.
+    fn restore(&self, input: &mut [u8]) -> usize {
+        let partial = &self.partial.as_ref()[..self.partial_len];
+        input[..partial.len()].copy_from_slice(partial);
+        self.partial_len
+    }
+
+    /// Answers the complete requests of `input`, and keeps the incomplete one after them.
+    fn answer(&mut self, input: &[u8], output: &mut [u8]) -> Answered {
+        let mut answered =
+            Answered { len: 0, requests: 0, discarded: 0, consumed: 0, broken: false };
+        let mut rest = input;
+        let mut decoded = F::NOT_DECODED;
+        loop {
+            let before = self.before.clone();
+            match F::next(&mut self.before, rest, || self.delimiter, &mut decoded) {
+                Next::Request { tag, unit_id, pdu, len } => {
+                    let place = self.unit_server.elsewhere(&self.rights, unit_id, pdu);
+                    if place.is_some() || self.deferred.is_some() {
+                        let deferred = self.deferred.get_or_insert_default();
+                        let ours = (&*self.unit_server, &*self.rights, &*self.context);
+                        let request = (tag, unit_id, pdu);
+                        match deferred.defer(ours, place, self.peer.ip(), request) {
+                            Deferral::Later(refused) => {
+                                self.note_refused(refused);
+                                rest = &rest[len..];
+                                answered.requests += 1;
+                                continue;
+                            }
+                            Deferral::Wait => {
+                                // It is framed again later, with what was known before it.
+                                deferred.leave(rest);
+                                self.before = before;
+                                rest = &[];
+                                break;
+                            }
+                            Deferral::Now => {}
+                        }
+                    }
+                    rest = &rest[len..];
+                    answered.requests += 1;
+                    answered.len += self.reply(tag, unit_id, pdu, &mut output[answered.len..]);
+                }
+                Next::Foreign { len } => {
+                    rest = &rest[len..];
+                    self.unit_server.discard(|frames| &frames.foreign);
+                    answered.discarded += 1;
+                }
+                Next::Damaged { len } => {
+                    rest = &rest[len..];
+                    self.unit_server.discard(|frames| &frames.damaged);
+                    answered.discarded += 1;
+                }
+                Next::Stray { len } => rest = &rest[len..],
+                Next::Broken => {
+                    self.unit_server.discard(|frames| &frames.broken);
+                    answered.broken = true;
+                    break;
+                }
+                Next::Incomplete => break,
+            }
+        }
+        answered.consumed = input.len() - rest.len();
+        self.keep(rest);
+        answered
+    }
+
+    /// Keeps an incomplete frame, which is shorter than the longest one.
+    fn keep(&mut self, rest: &[u8]) {
+        let partial = self.partial.as_mut();
+        let len = rest.len().min(partial.len());
+        partial[..len].copy_from_slice(&rest[..len]);
+        self.partial_len = len;
+    }
+
+    /// Discards the beginning of a request: the next byte starts a frame.
+    fn discard_partial(&mut self) {
+        if mem::take(&mut self.partial_len) > 0 {
+            self.unit_server.discard(|frames| &frames.damaged);
+        }
+        self.before = F::Before::default();
+    }
+
+    /// Whether replies come later.
+    #[inline]
+    fn is_waiting(&self) -> bool {
+        self.deferred.as_ref().is_some_and(|deferred| !deferred.is_empty())
+    }
+
+    /// Whether nothing more may be read before a reply has come.
+    fn is_full(&self) -> bool {
+        self.deferred.as_ref().is_some_and(|deferred| deferred.is_full())
+    }
+
+    /// Writes the replies that have come at the start of `output`, framed. Returns their length; `None`
+    /// while there is none.
+    fn collect(&mut self, context: &mut Context<'_>, output: &mut [u8]) -> Option<usize> {
+        let deferred = self.deferred.as_mut()?;
+        let mut len = None;
+        while let Poll::Ready((asked, reply)) = deferred.poll_next(&self.unit_server, context) {
+            let (tag, unit_id) = (asked.tag, asked.unit_id);
+            asked.record(&self.context, Some(&self.peer), &reply);
+            let at = len.get_or_insert(0);
+            let frame = &mut output[*at..];
+            let pdu = &reply.pdu[..];
+            if !pdu.is_empty() {
+                frame[F::HEADER_LEN..][..pdu.len()].copy_from_slice(pdu);
+                *at += F::complete(frame, tag, unit_id, pdu.len());
+            }
+        }
+        len
+    }
+
+    /// The peer has disconnected. Replies of devices that still come are recorded.
+    fn give_up(&mut self, running: watch::Receiver<bool>) {
+        let Some(deferred) = self.deferred.take().filter(|deferred| !deferred.is_empty()) else {
+            return;
+        };
+        let (context, unit_server) = (Arc::clone(&self.context), Arc::clone(&self.unit_server));
+        let (peer, given_up) = (self.peer.clone(), deferred.give_up());
+        tokio::spawn(async move {
+            for waiting in given_up {
+                if let Some((asked, reply)) = waiting.complete(&unit_server).await {
+                    asked.record(&context, Some(&peer), &reply);
+                }
+            }
+            // The engine waits for this until all receivers are dropped.
+            drop(running);
+        });
+    }
+
+    /// Copies what waited for replies to the start of `input`. Returns its length.
+    fn resume(&mut self, input: &mut [u8]) -> usize {
+        self.deferred.as_mut().map_or(0, |deferred| deferred.resume(input))
+    }
+
+    /// Writes one framed reply at the start of `output`. Returns its length, 0 when there is none.
+    #[inline]
+    fn reply(&mut self, tag: u16, unit_id: u8, request: &[u8], output: &mut [u8]) -> usize {
+        let room = output.get_mut(F::HEADER_LEN..);
+        let Some(buffer) = room.and_then(<[u8]>::first_chunk_mut::<{ pdu::MAX_LEN }>) else {
+            return 0;
+        };
+        let ours = (&*self.unit_server, &*self.rights);
+        let (len, refused) = self.context.answer(ours, Some(&self.peer), unit_id, request, buffer);
+        self.note_refused(refused);
+        let answered = &buffer[..len.unwrap_or_default()];
+        self.delimiter = changed_delimiter(request, answered).unwrap_or(self.delimiter);
+        len.map_or(0, |len| F::complete(output, tag, unit_id, len))
+    }
+
+    /// Reports the first refusal for each reason.
+    #[inline]
+    fn note_refused(&self, refused: Option<RefusedRequest>) {
+        if let Some(refused) = refused
+            && self.reported.is_first(&refused)
+        {
+            self.context.refuse_request(refused, Some(self.peer.clone()));
+        }
+    }
+
+    /// Sends `unsent`, then reads, answers and sends until no input is left, without waiting.
+    fn drain(&mut self, stream: &mut impl Stream, unsent: &mut Vec<u8>) -> io::Result<()> {
+        stream::write(stream.socket(), unsent)?;
+        SCRATCH.with_borrow_mut(|Scratch { input, output }| {
+            for _ in 0..MAX_LAST_READS {
+                // The replies of devices come first.
+                if self.is_waiting() {
+                    break;
+                }
+                let partial = self.restore(input);
+                let Some(len) = stream.read_now(&mut input[partial..], unsent) else { break };
+                let answered = self.answer(&input[..partial + len], output);
+                let output = &output[..answered.len];
+                if !output.is_empty() && stream.send(output, unsent).is_err() {
+                    break;
+                }
+                stream::write(stream.socket(), unsent)?;
+                if answered.broken {
+                    break;
+                }
+            }
+            Ok(())
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::SocketAddr;
+
+    use holdfast_memory::{Area, Contents, Layout, Memory, Span};
+    use holdfast_protocol::frame::{ascii, mbap, rtu};
+
+    use super::*;
+    use crate::server::connections::admission::{Admission, ConnectionLimits};
+    use crate::server::requests::identity::Identity;
+    use crate::server::requests::unit_server::UnitSettings;
+    use crate::server::rights::functions::{AccessMode, Functions};
+    use crate::server::rights::policy::Rule;
+    use crate::server::transports::cuts::assert_same_outcome;
+    use crate::server::transports::framing::MbapBesidePackets;
+
+    fn memory() -> Arc<Memory> {
+        let span = Span::new(0, 2000).unwrap();
+        let layout =
+            Area::ALL.into_iter().fold(Layout::default(), |layout, area| layout.with(area, span));
+        Arc::new(Memory::new(layout, None).unwrap())
+    }
+
+    fn answering<F: Framing>() -> Answering<F> {
+        answering_with(memory())
+    }
+
+    fn answering_with<F: Framing>(memory: Arc<Memory>) -> Answering<F> {
+        let rule = Rule {
+            sources: Vec::new(),
+            roles: None,
+            units: vec![(1, memory)],
+            elsewhere: Vec::new(),
+            access: AccessMode::ReadWrite,
+            functions: Functions::All,
+            narrowed: Vec::new(),
+        };
+        let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
+        let identity = Identity::new(&objects, &[]).unwrap();
+        Answering::new(
+            Arc::new(ListenerContext::for_tests()),
+            Peer::from(SocketAddr::from(([127, 0, 0, 1], 1))),
+            Arc::new(UnitServer::new(identity, UnitSettings::default())),
+            Arc::new(PeerRights::new(&rule)),
+        )
+    }
+
+    fn frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {
+        [&mbap::header(7, unit_id, pdu.len())[..], pdu].concat()
+    }
+
+    fn ascii_frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {
+        let mut frame = [0; ascii::MAX_LEN];
+        let len = ascii::encode(unit_id, pdu, &mut frame).unwrap();
+        frame[..len].to_vec()
+    }
+
+    fn rtu_frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {
+        let mut frame = [0; rtu::MAX_LEN];
+        let len = rtu::encode(unit_id, pdu, &mut frame).unwrap();
+        frame[..len].to_vec()
+    }
+
+    /// Requests of each function, and some that are refused.
+    const PDUS: [&[u8]; 16] = [
+        &[1, 0, 3, 7, 0xD0 - 3],
+        &[2, 0, 0, 0, 9],
+        &[3, 0, 0, 0, 125],
+        &[4, 0, 1, 0, 2],
+        &[5, 0, 9, 0xFF, 0],
+        &[6, 0, 9, 1, 2],
+        &[8, 0, 0, 1, 2],
+        &[8, 0, 0x0B, 0, 0],
+        &[11],
+        &[15, 0, 3, 0, 9, 2, 0xFF, 1],
+        &[17],
+        &[22, 0, 4, 0, 0xF2, 0, 0x25],
+        &[23, 0, 0, 0, 2, 0, 1, 0, 1, 2, 0xBE, 0xEF],
+        &[43, 14, 3, 0],
+        &[3, 0xFF, 0xFF, 0, 2],
+        &[99],
+    ];
+
+    const LONG_WRITE: [u8; 252] = {
+        let mut pdu = [0; 252];
+        (pdu[0], pdu[4], pdu[5]) = (16, 123, 246);
+        pdu
+    };
+
+    fn requests(frame: fn(u8, &[u8]) -> Vec<u8>) -> Vec<u8> {
+        PDUS.iter().copied().chain([&LONG_WRITE[..]]).flat_map(|pdu| frame(1, pdu)).collect()
+    }
+
+    #[test]
+    fn answering_requests_allocates_nothing() {
+        allocates_nothing::<Mbap>(&requests(frame));
+        allocates_nothing::<Ascii>(&requests(ascii_frame));
+    }
+
+    fn allocates_nothing<F: Framing>(input: &[u8]) {
+        let (mut answering, mut output) = (answering::<F>(), vec![0; OUTPUT_BYTES]);
+        answering.answer(input, &mut output);
+        let mut requests = 0;
+        let allocations = allocation_counter::measure(|| {
+            requests = answering.answer(input, &mut output).requests;
+        });
+        assert_eq!(requests, 17);
+        assert_eq!(allocations.count_total, 0);
+    }
+
+    /// What comes of the pieces of a stream, and of the silence after it: replies, the end of the
+    /// connection, counters and memory.
+    fn outcome<F: Framing>(
+        pieces: &[&[u8]],
+        output: &mut [u8],
+    ) -> (Vec<u8>, bool, String, Vec<Contents>) {
+        let memory = memory();
+        let (mut answering, mut input) =
+            (answering_with::<F>(Arc::clone(&memory)), vec![0; INPUT_BYTES]);
+        let (mut replies, mut broken) = (Vec::new(), false);
+        for piece in pieces {
+            let partial = answering.restore(&mut input);
+            input[partial..partial + piece.len()].copy_from_slice(piece);
+            let answered = answering.answer(&input[..partial + piece.len()], output);
+            replies.extend_from_slice(&output[..answered.len]);
+            broken = answered.broken;
+            if broken {
+                break;
+            }
+        }
+        if !broken {
+            answering.discard_partial();
+        }
+        let counters = &answering.unit_server.counters;
+        let counted = format!("{:?} {:?}", counters.frames, counters.bus());
+        (replies, broken, counted, Memory::contents(&[memory]))
+    }
+
+    fn have_the_same_outcome<F: Framing>(cases: &[Vec<u8>]) {
+        let output = RefCell::new(vec![0; OUTPUT_BYTES]);
+        assert_same_outcome(cases, |pieces| outcome::<F>(pieces, &mut output.borrow_mut()));
+    }
+
+    /// The requests of [`requests`], one a case.
+    fn each_request(frame: fn(u8, &[u8]) -> Vec<u8>) -> Vec<Vec<u8>> {
+        PDUS.iter()
+            .map(|pdu| frame(1, pdu))
+            .chain([frame(1, &LONG_WRITE), frame(9, &[17])])
+            .collect()
+    }
+
+    #[test]
+    fn modbus_tcp_has_the_same_outcome_however_it_is_cut() {
+        let foreign = [0, 1, 0, 9, 0, 2, 1, 17].to_vec();
+        let broken = [0, 1, 0, 0, 0, 255, 1, 17].to_vec();
+        let begun = frame(1, &LONG_WRITE)[..40].to_vec();
+        let packet = b"RI\x01\x03\x00\x01\x00\x00\x00\x01\x00\x07".to_vec();
+        let cases = [each_request(frame), vec![foreign, broken, begun, packet]].concat();
+        have_the_same_outcome::<Mbap>(&cases);
+        have_the_same_outcome::<MbapBesidePackets>(&cases);
+    }
+
+    #[test]
+    fn rtu_in_a_stream_has_the_same_outcome_however_it_is_cut() {
+        let mut damaged = rtu_frame(1, PDUS[2]);
+        damaged[7] ^= 1;
+        // The last byte of the data is the first byte of the CRC of those before it.
+        let [low, _] = rtu::crc(&[1, 99, 1]).to_le_bytes();
+        let misleading = rtu_frame(1, &[99, 1, low]);
+        let begun = [1, 16, 0, 0, 0, 0x7B, 0xF6].to_vec();
+        let cases = [
+            each_request(rtu_frame),
+            vec![damaged.clone(), rtu_frame(1, &[17]), damaged.clone(), damaged],
+            vec![misleading.clone(), rtu_frame(0, &[17]), misleading, rtu_frame(1, &[17])],
+            vec![begun, rtu_frame(1, PDUS[2]), vec![0], vec![0x64; 300], vec![1, 20, 255]],
+        ];
+        have_the_same_outcome::<Rtu>(&cases.concat());
+    }
+
+    #[test]
+    fn ascii_in_a_stream_has_the_same_outcome_however_it_is_cut() {
+        // Characters between frames, a frame cut short, a wrong checksum, and a line without end.
+        let disturbed = [b"\r\nx\0".to_vec(), ascii_frame(1, &[17]), b":0111:0111EF\r\n".to_vec()];
+        let endless = [b":".to_vec(), vec![b'0'; 2 * ascii::MAX_LEN], ascii_frame(1, &[17])];
+        let delimiter = ascii_frame(1, &[8, 0, 3, b'!', 0]);
+        let cases =
+            [each_request(ascii_frame), vec![disturbed.concat(), endless.concat(), delimiter]];
+        have_the_same_outcome::<Ascii>(&cases.concat());
+    }
+
+    #[test]
+    fn rtu_after_a_silence_is_never_part_of_what_came_before() {
+        let mut output = vec![0; OUTPUT_BYTES];
+        let read = rtu_frame(1, &[3, 0, 0, 0, 1]);
+        let answer = rtu_frame(1, &[3, 2, 0, 0]);
+        let begun = [1, 16, 0, 0, 0, 0x7B, 0xF6].to_vec();
+        let swallowed = [&begun[..], &read].concat();
+        let mut damaged = read.clone();
+        damaged[7] ^= 1;
+        let lost = [&damaged[..], &[0; 12]].concat();
+        for before in [begun, swallowed, damaged, lost, rtu_frame(1, &[99]), vec![0x64; 300]] {
+            let mut answering = answering::<Rtu>();
+            let first = answering.answer(&before, &mut output);
+            let replies = rtu_frame(1, &[99]) == before;
+            assert_eq!(first.len > 0, replies, "{before:02x?}");
+            answering.discard_partial();
+            assert_eq!(answering.partial_len, 0);
+            let len = answering.answer(&read, &mut output).len;
+            assert_eq!(output[..len], answer, "{before:02x?}");
+        }
+    }
+
+    #[test]
+    fn a_peer_is_not_to_blame_for_silence_while_its_source_waits() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let _guard = runtime.enter();
+        let bound = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let client = std::net::TcpStream::connect(bound.local_addr().unwrap()).unwrap();
+        client.set_nonblocking(true).unwrap();
+        let (stream, peer) = (
+            tokio::net::TcpStream::from_std(client).unwrap(),
+            SocketAddr::from(([192, 0, 2, 1], 1)),
+        );
+        let limits = ConnectionLimits { max_connections: 1, ..ConnectionLimits::NONE };
+        let (ticket, _) = Arc::new(Admission::new(limits)).admit(peer).unwrap();
+        let Answering { context, unit_server, rights, .. } = answering::<Mbap>();
+        let timeouts = Timeouts { idle: None, request: Duration::ZERO, frame: None };
+        let terms = Terms { rights, timeouts };
+        let stream = (stream, peer.into());
+        let renewal = Box::new(|| None);
+        let mut connection =
+            Connection::<Mbap, _>::new(context, unit_server, stream, terms, renewal, ticket);
+        connection.begin_with(&[0]);
+        let other = Share::of([192, 0, 2, 2].into());
+        connection.share.charge(1_000_000);
+        let mut context = Context::from_waker(std::task::Waker::noop());
+        assert!(connection.poll(&mut context).is_pending());
+        assert_eq!(connection.on_alarm(), Ok(()));
+        drop(other);
+        assert!(connection.poll(&mut context).is_pending(), "nothing has arrived");
+        assert_eq!(connection.on_alarm(), Err(Kind::RequestTimeout));
+    }
+
+    #[test]
+    fn the_output_has_room_for_the_replies_to_any_input() {
+        let shortest = frame(1, &[17]);
+        let input = shortest.repeat(INPUT_BYTES / shortest.len());
+        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        assert_eq!(answered.requests, INPUT_BYTES / Mbap::SHORTEST);
+        assert!(answered.requests * mbap::MAX_LEN <= OUTPUT_BYTES);
+
+        let shortest = ascii_frame(1, &[17]);
+        let input = shortest.repeat(INPUT_BYTES / shortest.len());
+        let answered = answering::<Ascii>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        assert_eq!(answered.requests, INPUT_BYTES / Ascii::SHORTEST);
+        assert!(answered.requests * ascii::MAX_LEN <= OUTPUT_BYTES);
+    }
+
+    #[test]
+    fn the_longest_ascii_reply_is_encoded_in_place() {
+        let longest = [&[8, 0, 0][..], &[0xA5; 250]].concat();
+        let mut output = vec![0; OUTPUT_BYTES];
+        let answered = answering::<Ascii>().answer(&ascii_frame(1, &longest), &mut output);
+        assert_eq!(output[..answered.len], ascii_frame(1, &longest));
+        assert_eq!(answered.len, ascii::MAX_LEN);
+    }
+
+    #[test]
+    fn an_ascii_line_without_end_leaves_nothing_behind() {
+        let mut answering = answering::<Ascii>();
+        let damaged =
+            |answering: &Answering<Ascii>| answering.unit_server.counters.frames.damaged.get();
+        let line = [b":".to_vec(), vec![b'0'; INPUT_BYTES - 1]].concat();
+        let answered = answering.answer(&line, &mut vec![0; OUTPUT_BYTES]);
+        assert_eq!((answered.consumed, answering.partial_len), (INPUT_BYTES, 0));
+        assert_eq!(damaged(&answering), 1);
+
+        answering.answer(&line[..ascii::MAX_LEN - 1], &mut vec![0; OUTPUT_BYTES]);
+        assert_eq!((answering.partial_len, damaged(&answering)), (ascii::MAX_LEN - 1, 1));
+    }
+
+    #[test]
+    fn requests_before_a_broken_frame_are_answered_and_none_after_it() {
+        let input = [frame(1, &[17]), vec![0, 0, 0, 0, 1, 0, 1, 17], frame(1, &[17])].concat();
+        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        assert_eq!((answered.requests, answered.broken), (1, true));
+    }
+
+    #[test]
+    fn a_packet_among_frames_breaks_a_connection_that_also_accepts_packets() {
+        // Unit id 2 is the length of a frame that ends in the middle of the packet.
+        let write = frame(1, &[6, 0, 0, 0, 7]);
+        let packet = [b"RI\x01\x03\x00\x02\x00\x00\x00\x06", &write[..]].concat();
+        let input = [frame(1, &[17]), packet].concat();
+        for cut in 0..=input.len() {
+            let mut shared = answering::<MbapBesidePackets>();
+            let (mut buffer, mut output) = (vec![0; INPUT_BYTES], vec![0; OUTPUT_BYTES]);
+            let (mut requests, mut broken) = (0, false);
+            for part in [&input[..cut], &input[cut..]] {
+                let partial = shared.restore(&mut buffer);
+                buffer[partial..partial + part.len()].copy_from_slice(part);
+                let answered = shared.answer(&buffer[..partial + part.len()], &mut output);
+                requests += answered.requests;
+                broken |= answered.broken;
+                if answered.broken {
+                    break;
+                }
+            }
+            assert_eq!((requests, broken), (1, true), "cut at {cut}");
+            let frames = &shared.unit_server.counters.frames;
+            assert_eq!((frames.broken.get(), frames.foreign.get()), (1, 0));
+        }
+        // A version that is wrong makes no difference: its sender takes it for a packet too.
+        let input = [&frame(1, &[17])[..], b"RI\x02\x03\x00\x02\x00\x00\x00\x06", &write].concat();
+        let answered = answering::<MbapBesidePackets>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        assert_eq!((answered.requests, answered.broken), (1, true));
+        // Frames of other protocols, and transaction ids like the start of a packet, are as before.
+        let foreign = [0x52, 0x48, 2, 1, 0, 2, 1, 17];
+        let mut harmless = frame(1, &[17]);
+        harmless[..2].copy_from_slice(b"RI");
+        let input = [&foreign[..], &harmless].concat();
+        let answered = answering::<MbapBesidePackets>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        assert_eq!((answered.requests, answered.broken), (1, false));
+        let input = [b"RI\x01\x09\x00\x02\x01\x11", &frame(1, &[17])[..]].concat();
+        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        assert_eq!((answered.requests, answered.broken), (1, false), "no packets at this port");
+    }
+}

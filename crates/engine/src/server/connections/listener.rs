@@ -1,0 +1,355 @@
+//! What all listeners share: a name, a socket, and the admission, counting and reporting of
+//! connections.
+
+use std::io;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use holdfast_protocol::pdu::Buffer;
+use socket2::{Domain, Protocol, SockRef, Socket, TcpKeepalive, Type};
+use tokio::net::TcpStream;
+use tokio::runtime::Handle;
+use tokio::sync::watch;
+
+use crate::server::connections::admission::{
+    Admission, ConnectionLimits, Evicted, Full, Ticket, attach,
+};
+use crate::server::connections::live::Live;
+use crate::server::connections::peer::Peer;
+use crate::server::reports::audit::{Auditor, Permit};
+use crate::server::reports::counters::ConnectionCounters;
+use crate::server::reports::event::{Kind, Reporter};
+use crate::server::reports::refused_request::RefusedRequest;
+use crate::server::requests::unit_server::UnitServer;
+use crate::server::rights::policy::PeerRights;
+
+/// The most connections that wait in the system to be accepted.
+const MAX_BACKLOG: i32 = 1024;
+
+/// The most unread bytes of a connection that the system buffers, in each direction.
+/// Linux doubles it for its own bookkeeping. Without it, systems allow several megabytes.
+const SOCKET_BUFFER_BYTES: usize = 256 * 1024;
+
+/// TCP keepalive: the idle time before the first probe, where it is no setting.
+pub(crate) const KEEPALIVE: Duration = Duration::from_secs(60);
+
+/// How many probes without an answer end a connection. Together they take as long as the idle time.
+const KEEPALIVE_PROBES: u32 = 4;
+
+/// The pause after a failed accept, usually for lack of file descriptors.
+pub(crate) const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+/// The part of a listener that does not depend on its protocol.
+#[derive(Debug)]
+pub(crate) struct ListenerContext {
+    pub(crate) name: Arc<str>,
+    pub(crate) admission: Arc<Admission>,
+    pub(crate) connections: ConnectionCounters,
+    pub(crate) auditor: Option<Auditor>,
+    reporter: Reporter,
+}
+
+impl ListenerContext {
+    pub(crate) fn new(
+        name: &str,
+        limits: Option<ConnectionLimits>,
+        reporter: Reporter,
+        auditor: Option<Auditor>,
+    ) -> ListenerContext {
+        ListenerContext {
+            name: name.into(),
+            admission: Arc::new(Admission::new(limits.unwrap_or(ConnectionLimits::NONE))),
+            connections: ConnectionCounters::default(),
+            auditor,
+            reporter,
+        }
+    }
+
+    #[cfg(test)]
+    pub(crate) fn for_tests() -> ListenerContext {
+        let (reporter, _) = crate::server::reports::event::channel(
+            crate::server::reports::event::Verbosity::Nothing,
+        );
+        ListenerContext::new("test", None, reporter, None)
+    }
+
+    /// Permits a request to a memory. `None` if it can't be recorded, although it must.
+    #[inline]
+    pub(crate) fn permit(&self, request: &[u8]) -> Option<Permit> {
+        self.permitted(|auditor| auditor.permit(request))
+    }
+
+    /// As `permit`, for a request to a device.
+    pub(crate) fn permit_forwarded(&self, request: &[u8]) -> Option<Permit> {
+        self.permitted(|auditor| auditor.permit_forwarded(request))
+    }
+
+    /// As `permit`, for the write of a packet.
+    pub(crate) fn permit_packet(&self, payload: &[u8]) -> Option<Permit> {
+        self.permitted(|auditor| auditor.permit_packet(payload))
+    }
+
+    #[inline]
+    fn permitted(&self, ask: impl FnOnce(&Auditor) -> Option<Permit>) -> Option<Permit> {
+        self.auditor.as_ref().map_or_else(|| Some(Permit::default()), ask)
+    }
+
+    pub(crate) fn report(&self, kind: Kind, peer: Option<Peer>) {
+        self.reporter.report(&self.name, kind, peer, None);
+    }
+
+    /// Counts and reports the end of a connection.
+    pub(crate) fn ended(&self, kind: Kind, peer: impl Into<Peer>) {
+        self.ended_with(kind, peer, None);
+    }
+
+    /// The same, for a peer that has presented a certificate.
+    pub(crate) fn ended_with(&self, kind: Kind, peer: impl Into<Peer>, subject: Option<&str>) {
+        match kind {
+            Kind::Idle => self.connections.idle.add(),
+            Kind::RightsRevoked => self.connections.rights_revoked.add(),
+            Kind::Ended => self.connections.ended.add(),
+            Kind::RequestTimeout => self.connections.request_timeout.add(),
+            Kind::SlowReader => self.connections.slow_reader.add(),
+            Kind::BrokenRequest => self.connections.broken_request.add(),
+            Kind::TlsFailed(reason) => self.connections.tls_failed.add(reason),
+            _ => {}
+        }
+        self.reporter.report(&self.name, kind, Some(peer.into()), subject);
+    }
+
+    /// Ends the connections that a service does not serve any more in the place of `before`.
+    pub(crate) fn review<S: Service>(&self, before: &S, service: &S) {
+        for (peer, kind) in self.admission.review(|peer| service.ends(before, peer)) {
+            self.ended(kind, peer);
+        }
+    }
+
+    /// Counts and reports a connection that was closed for another.
+    pub(crate) fn evicted(&self, evicted: Option<Evicted>) {
+        match evicted {
+            None => {}
+            Some(Evicted::Connection(peer)) => {
+                self.connections.evicted.add();
+                self.report(Kind::Evicted, Some(peer));
+            }
+            Some(Evicted::Handshake(peer)) => {
+                self.connections.evicted_handshakes.add();
+                self.report(Kind::EvictedHandshake, Some(peer));
+            }
+            Some(Evicted::Answered(peer)) => self.ended(Kind::Closed, peer),
+        }
+    }
+
+    pub(crate) fn refuse_full(&self, peer: impl Into<Peer>) {
+        self.connections.refused_full.add();
+        self.report(Kind::RefusedFull, Some(peer.into()));
+    }
+
+    pub(crate) fn refuse_source(&self, peer: SocketAddr) {
+        self.connections.refused_source.add();
+        self.report(Kind::RefusedSource, Some(peer.into()));
+    }
+
+    /// Answers a request from a memory: permits it, and records it if it writes. Returns the length of the
+    /// reply, if there is one, and what was refused.
+    #[inline]
+    pub(crate) fn answer(
+        &self,
+        (unit_server, rights): (&UnitServer, &PeerRights),
+        peer: Option<&Peer>,
+        unit_id: u8,
+        request: &[u8],
+        reply: &mut Buffer,
+    ) -> (Option<usize>, Option<RefusedRequest>) {
+        let is_for_listen_only = unit_server.listen_only.refuses(request);
+        if is_for_listen_only {
+            self.connections.refused_listen_only.add();
+            self.report(Kind::RefusedListenOnly, peer.cloned());
+        }
+        let permit = self.permit(request);
+        let len = unit_server.answer(rights, unit_id, request, permit.is_some(), reply);
+        let answered = &reply[..len.unwrap_or_default()];
+        let refused = RefusedRequest::by(rights, unit_id, request, answered);
+        if let Some(auditor) = &self.auditor {
+            auditor.note(&self.name, peer, unit_id, (request, answered), permit);
+        }
+        // A request for listen only mode has been reported as such.
+        (len, refused.filter(|_| !is_for_listen_only))
+    }
+
+    /// Reports a refused request. The exceptions are counted elsewhere.
+    pub(crate) fn refuse_request(&self, refused: RefusedRequest, peer: Option<Peer>) {
+        self.report(Kind::RefusedRequest(refused), peer);
+    }
+
+    pub(crate) fn refuse_role(&self, peer: Peer) {
+        self.connections.refused_role.add();
+        self.report(Kind::RefusedRole, Some(peer));
+    }
+}
+
+/// An admitted connection.
+pub(crate) struct Admitted<G> {
+    pub(crate) stream: TcpStream,
+    pub(crate) peer: SocketAddr,
+    pub(crate) rights: Arc<G>,
+    /// Bytes that have already been read, and not answered.
+    pub(crate) received: Vec<u8>,
+    pub(crate) ticket: Ticket,
+}
+
+/// The protocol of a listener.
+pub(crate) trait Service: Send + Sync + Sized + 'static {
+    type PeerRights: Send + Sync + 'static;
+
+    fn rights(&self, peer: IpAddr) -> Option<Arc<Self::PeerRights>>;
+
+    /// Why a connection ends that `before` served, now that this service has taken its place; `None`
+    /// if it stays.
+    fn ends(&self, before: &Self, peer: &Peer) -> Option<Kind>;
+
+    /// Answers what has arrived if that is possible without waiting.
+    fn serve_at_once(
+        &self,
+        _front: &ListenerContext,
+        connection: Admitted<Self::PeerRights>,
+    ) -> Admitted<Self::PeerRights> {
+        connection
+    }
+
+    /// Serves a connection to its end. `live` is this service, or what has taken its place.
+    fn serve(
+        self: Arc<Self>,
+        live: Arc<Live<Self>>,
+        context: Arc<ListenerContext>,
+        connection: Admitted<Self::PeerRights>,
+        stop: watch::Receiver<bool>,
+    ) -> impl Future<Output = ()> + Send;
+}
+
+/// Accepts connections until `stop`, and distributes them to the workers in turn.
+pub(crate) async fn accept<S: Service>(
+    context: Arc<ListenerContext>,
+    service: Arc<Live<S>>,
+    socket: std::net::TcpListener,
+    workers: Vec<Handle>,
+    mut stop: watch::Receiver<bool>,
+) {
+    let Ok(socket) = tokio::net::TcpListener::from_std(socket) else {
+        return;
+    };
+    loop {
+        let accepted = tokio::select! {
+            biased;
+            _ = stop.wait_for(|stop| *stop) => return,
+            accepted = socket.accept() => accepted,
+        };
+        match accepted {
+            Ok((stream, peer)) => admit(&context, &service, stream, peer, &workers, &stop),
+            Err(error) if is_of_one_peer(&error) => {}
+            Err(_) => {
+                context.connections.accept_errors.add();
+                context.report(Kind::AcceptError, None);
+                tokio::time::sleep(ACCEPT_PAUSE).await;
+            }
+        }
+    }
+}
+
+/// Checks the rights and limits of a new connection, and starts to serve it.
+fn admit<S: Service>(
+    context: &Arc<ListenerContext>,
+    live: &Arc<Live<S>>,
+    stream: TcpStream,
+    peer: SocketAddr,
+    workers: &[Handle],
+    stop: &watch::Receiver<bool>,
+) {
+    if live.get().rights(peer.ip()).is_none() {
+        return context.refuse_source(peer);
+    }
+    let (ticket, evicted) = match context.admission.admit(peer) {
+        Ok(admitted) => admitted,
+        Err(Full) => return context.refuse_full(peer),
+    };
+    context.evicted(evicted);
+    context.connections.accepted.add();
+    context.report(Kind::Opened, Some(peer.into()));
+    // A reload reviews the admitted connections. This one looks up its rights only now.
+    let service = live.get();
+    let Some(rights) = service.rights(peer.ip()) else {
+        return context.refuse_source(peer);
+    };
+    let id = ticket.id();
+    let connection = Admitted { stream, peer, rights, received: Vec::new(), ticket };
+    let connection = service.serve_at_once(context, connection);
+    let (context, live, stop) = (Arc::clone(context), Arc::clone(live), stop.clone());
+    let admission = Arc::clone(&context.admission);
+    let task = if let [worker] = workers {
+        worker.spawn(service.serve(live, context, connection, stop))
+    } else {
+        let Admitted { stream, peer, rights, received, ticket } = connection;
+        let Ok(stream) = stream.into_std() else { return };
+        let worker = &workers[id as usize % workers.len()];
+        worker.spawn(async move {
+            // The socket must be registered with the worker that serves it.
+            let Ok(stream) = TcpStream::from_std(stream) else { return };
+            let connection = Admitted { stream, peer, rights, received, ticket };
+            service.serve(live, context, connection, stop).await;
+        })
+    };
+    attach(&admission, id, task.abort_handle());
+}
+
+/// Binds a listening socket that is not registered with a runtime.
+///
+/// # Errors
+/// The address can't be had.
+pub fn bind_tcp(address: SocketAddr) -> io::Result<std::net::TcpListener> {
+    let socket = Socket::new(Domain::for_address(address), Type::STREAM, Some(Protocol::TCP))?;
+    // On other systems, the option lets two programs bind the same port.
+    #[cfg(unix)]
+    socket.set_reuse_address(true)?;
+    // Connections inherit both. The system may have lower limits.
+    let _ = socket.set_recv_buffer_size(SOCKET_BUFFER_BYTES);
+    let _ = socket.set_send_buffer_size(SOCKET_BUFFER_BYTES);
+    bind(&socket, address)?;
+    socket.listen(MAX_BACKLOG)?;
+    Ok(socket.into())
+}
+
+/// Binds a datagram socket that is not registered with a runtime.
+pub(crate) fn bind_udp(address: SocketAddr) -> io::Result<std::net::UdpSocket> {
+    let socket = Socket::new(Domain::for_address(address), Type::DGRAM, Some(Protocol::UDP))?;
+    bind(&socket, address)?;
+    Ok(socket.into())
+}
+
+fn bind(socket: &Socket, address: SocketAddr) -> io::Result<()> {
+    if address.is_ipv6() {
+        socket.set_only_v6(false)?;
+    }
+    socket.bind(&address.into())?;
+    socket.set_nonblocking(true)
+}
+
+/// Disables delays of replies, and enables keepalive to detect lost peers. The options are not
+/// essential: errors are ignored.
+pub(crate) fn set_options(stream: &TcpStream, idle: Duration) {
+    // Systems count whole seconds.
+    let interval = (idle / KEEPALIVE_PROBES).max(Duration::from_secs(1));
+    let keepalive = TcpKeepalive::new().with_time(idle).with_interval(interval);
+    // Windows always sends ten probes.
+    #[cfg(not(target_os = "windows"))]
+    let keepalive = keepalive.with_retries(KEEPALIVE_PROBES);
+    let _ = stream.set_nodelay(true);
+    let _ = SockRef::from(stream).set_tcp_keepalive(&keepalive);
+}
+
+/// Whether an error of `accept` concerns one peer, not the listener.
+pub(crate) fn is_of_one_peer(error: &io::Error) -> bool {
+    use io::ErrorKind::{ConnectionAborted, ConnectionReset, Interrupted, WouldBlock};
+    matches!(error.kind(), ConnectionAborted | ConnectionReset | Interrupted | WouldBlock)
+}

@@ -1,0 +1,11 @@
+//! Connections: which are admitted, which must wait for others, and their way from bytes to replies.
+
+pub(crate) mod admission;
+pub(crate) mod closing;
+pub(crate) mod connection;
+pub(crate) mod fair_share;
+pub(crate) mod listener;
+pub(crate) mod live;
+pub(crate) mod partial_packet;
+pub(crate) mod peer;
+pub(crate) mod reply_order;

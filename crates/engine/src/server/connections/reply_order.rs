@@ -1,0 +1,214 @@
+//! Requests of a connection whose replies come later. Replies keep the order of their requests, and
+//! only requests that are answered elsewhere overtake each other on their way.
+//!
+//! A request that can be answered here waits until all before it are answered: its client expects the
+//! effects of those. A connection with too many such requests is not read for a while.
+
+use std::collections::VecDeque;
+use std::net::IpAddr;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+
+use holdfast_protocol::pdu::ExceptionCode;
+
+use crate::link::{Asker, PendingReply, Reply, exception, source};
+use crate::server::connections::listener::ListenerContext;
+use crate::server::connections::peer::Peer;
+use crate::server::reports::audit::{Forwarded, Permit};
+use crate::server::reports::refused_request::RefusedRequest;
+use crate::server::requests::unit_server::UnitServer;
+use crate::server::rights::policy::{Elsewhere, PeerRights};
+
+/// The most requests of a connection that wait for replies.
+pub(in crate::server) const MAX_WAITING: usize = 16;
+
+pub(in crate::server) struct Deferred {
+    source: u64,
+    waiting: VecDeque<Waiting>,
+    /// Received bytes that are read as requests when there is room again.
+    unread: Vec<u8>,
+}
+
+/// A request without its reply.
+pub(in crate::server) struct Waiting {
+    asked: Asked,
+    reply: Expected,
+    /// Whether a journal carries it out. Those of a connection are carried out in their order.
+    is_step: bool,
+}
+
+/// A request that is answered elsewhere.
+pub(in crate::server) struct Asked {
+    pub(in crate::server) tag: u16,
+    pub(in crate::server) unit_id: u8,
+    /// The device that the request was passed on to; `None` if it was refused, or is of a memory.
+    route: Option<Arc<str>>,
+    request: Vec<u8>,
+    permit: Option<Permit>,
+}
+
+pub(in crate::server) enum Expected {
+    Pending(PendingReply),
+    /// It was refused.
+    Known(Reply),
+}
+
+/// When a request is answered.
+pub(in crate::server) enum Deferral {
+    /// Its reply comes later. It may already be refused.
+    Later(Option<RefusedRequest>),
+    /// It must wait until others are answered.
+    Wait,
+    /// It can be answered now.
+    Now,
+}
+
+impl Default for Deferred {
+    fn default() -> Deferred {
+        Deferred { source: source(), waiting: VecDeque::new(), unread: Vec::new() }
+    }
+}
+
+impl Deferred {
+    pub(in crate::server) fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
+    }
+
+    /// Whether received bytes wait until there is room.
+    pub(in crate::server) fn is_full(&self) -> bool {
+        !self.unread.is_empty()
+    }
+
+    /// Sends a request on its way, if its unit is elsewhere and there is room.
+    pub(in crate::server) fn defer(
+        &mut self,
+        (unit_server, rights, context): (&UnitServer, &PeerRights, &ListenerContext),
+        place: Option<&Elsewhere>,
+        peer: IpAddr,
+        (tag, unit_id, request): (u16, u8, &[u8]),
+    ) -> Deferral {
+        let place = match place {
+            // Without a request before it, nothing can reorder its effects.
+            None if self.is_empty() => return Deferral::Now,
+            Some(place @ Elsewhere::Device(_)) if self.waiting.len() < MAX_WAITING => place,
+            // A write to a mirror also changes the memory, which requests before it may read or write.
+            Some(place @ Elsewhere::Mirror(_)) if self.is_empty() => place,
+            Some(place @ Elsewhere::Journal(_))
+                if self.waiting.len() < MAX_WAITING
+                    && self.waiting.iter().all(|waiting| waiting.is_step) =>
+            {
+                place
+            }
+            _ => return Deferral::Wait,
+        };
+        let asker = Asker { source: self.source, peer: Some(peer), waiting: self.waiting.len() };
+        let (asked, reply, refused) = Asked::send(context, (tag, unit_id, request), |permitted| {
+            unit_server.forward(rights, place, &asker, unit_id, request, permitted)
+        });
+        let is_step = matches!(place, Elsewhere::Journal(_));
+        self.waiting.push_back(Waiting { asked, reply, is_step });
+        Deferral::Later(refused)
+    }
+
+    /// The client has disconnected. Requests that wait for their turn are not sent. Returns the others, whose
+    /// replies still come.
+    pub(in crate::server) fn give_up(self) -> VecDeque<Waiting> {
+        for waiting in &self.waiting {
+            if let Expected::Pending(pending) = &waiting.reply {
+                pending.give_up();
+            }
+        }
+        self.waiting
+    }
+
+    /// Keeps received bytes until there is room.
+    pub(in crate::server) fn leave(&mut self, bytes: &[u8]) {
+        debug_assert!(self.unread.is_empty() && !bytes.is_empty());
+        self.unread.extend_from_slice(bytes);
+    }
+
+    /// Moves those bytes to the start of `input`, and returns their length.
+    pub(in crate::server) fn resume(&mut self, input: &mut [u8]) -> usize {
+        let unread = std::mem::take(&mut self.unread);
+        input[..unread.len()].copy_from_slice(&unread);
+        unread.len()
+    }
+
+    /// The next reply, once it is there.
+    pub(in crate::server) fn poll_next(
+        &mut self,
+        unit_server: &UnitServer,
+        context: &mut Context<'_>,
+    ) -> Poll<(Asked, Reply)> {
+        let Some(first) = self.waiting.front_mut() else { return Poll::Pending };
+        let reply = match &mut first.reply {
+            Expected::Known(reply) => std::mem::take(reply),
+            Expected::Pending(pending) => match Pin::new(pending).poll(context) {
+                Poll::Ready(reply) => first.asked.count(unit_server, reply.ok()),
+                Poll::Pending => return Poll::Pending,
+            },
+        };
+        let first = self.waiting.pop_front().expect("there is a first request");
+        Poll::Ready((first.asked, reply))
+    }
+}
+
+impl Waiting {
+    /// Waits for the reply. `None` if the request was not sent.
+    pub(in crate::server) async fn complete(
+        self,
+        unit_server: &UnitServer,
+    ) -> Option<(Asked, Reply)> {
+        let reply = match self.reply {
+            Expected::Known(reply) => reply,
+            Expected::Pending(pending) => self.asked.count(unit_server, Some(pending.await.ok()?)),
+        };
+        Some((self.asked, reply))
+    }
+}
+
+impl Asked {
+    /// Sends a request on its way by `forward`, which gets whether it is permitted. It may be refused
+    /// at once.
+    pub(in crate::server) fn send(
+        context: &ListenerContext,
+        (tag, unit_id, request): (u16, u8, &[u8]),
+        forward: impl FnOnce(bool) -> Result<(Option<Arc<str>>, PendingReply), ExceptionCode>,
+    ) -> (Asked, Expected, Option<RefusedRequest>) {
+        let permit = context.permit_forwarded(request);
+        let sent = forward(permit.is_some());
+        let refused = RefusedRequest::before_device(unit_id, request, &sent);
+        let (route, reply) = match sent {
+            Ok((route, pending)) => (route, Expected::Pending(pending)),
+            Err(code) => {
+                let pdu = exception(request, code.code());
+                (None, Expected::Known(Reply { pdu, ..Reply::default() }))
+            }
+        };
+        (Asked { tag, unit_id, route, request: request.to_vec(), permit }, reply, refused)
+    }
+
+    /// Counts the reply, and returns it. `None` means that the link has ended.
+    pub(in crate::server) fn count(&self, unit_server: &UnitServer, reply: Option<Reply>) -> Reply {
+        let ended = || exception(&self.request, ExceptionCode::GatewayPathUnavailable.code());
+        let reply = reply.unwrap_or_else(|| Reply { pdu: ended(), ..Reply::default() });
+        unit_server.forwarded(&self.request, &reply.pdu);
+        reply
+    }
+
+    /// Records the request with its reply.
+    pub(in crate::server) fn record(
+        self,
+        context: &ListenerContext,
+        peer: Option<&Peer>,
+        reply: &Reply,
+    ) {
+        if let Some(auditor) = &context.auditor {
+            let Asked { unit_id, route, request, permit, .. } = self;
+            let (route, request, log_sequence) = (route.as_ref(), &request[..], reply.log_sequence);
+            let forwarded = Forwarded { route, request, reply: &reply.pdu, log_sequence };
+            auditor.note_forwarded(&context.name, peer, unit_id, forwarded, permit);
+        }
+    }
+}

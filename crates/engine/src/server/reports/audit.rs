@@ -1,0 +1,344 @@
+//! Writes, for an audit log. Sending never blocks. When the queue is full, records are dropped and
+//! counted, or the writes are refused: then each write takes room for its record before it is carried
+//! out.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use holdfast_protocol::raw_ingest;
+
+use crate::server::connections::peer::Peer;
+use crate::server::reports::refused_request::writes;
+use crate::server::rights::functions::only_reads;
+
+/// The most bytes in the queue.
+const MAX_QUEUE_BYTES: usize = 32 << 20;
+
+/// Bytes of a record without its data.
+const RECORD_OVERHEAD_BYTES: usize = 128;
+
+/// What happens to a write that can't be recorded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unrecordable {
+    /// It is carried out. Its record is missing.
+    Write,
+    /// It is refused.
+    Refuse,
+}
+
+/// A write that was carried out or refused.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Record {
+    pub listener: Arc<str>,
+    /// `None` on a serial line.
+    pub peer: Option<Peer>,
+    pub write: Written,
+    /// Where the log of a memory has the write.
+    pub log_sequence: Option<u64>,
+}
+
+/// A request that was answered elsewhere, and its reply. `route` is the name of the device that it was
+/// passed on to.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Forwarded<'a> {
+    pub(crate) route: Option<&'a Arc<str>>,
+    pub(crate) request: &'a [u8],
+    pub(crate) reply: &'a [u8],
+    pub(crate) log_sequence: Option<u64>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Written {
+    /// A request, unchanged, and the code of the exception that it was refused with. `route` is the
+    /// name of what it was passed on to.
+    Modbus { unit_id: u8, pdu: Vec<u8>, refused: Option<u8>, route: Option<Arc<str>> },
+    /// A packet: its header, if it has a valid one, and the payload if it was written.
+    Packet {
+        format: raw_ingest::Format,
+        header: Option<raw_ingest::Header>,
+        payload: Vec<u8>,
+        refused: Option<raw_ingest::Refusal>,
+    },
+}
+
+/// The sending side.
+#[derive(Debug, Clone)]
+pub(crate) struct Auditor {
+    sender: Sender<Option<Record>>,
+    shared: Arc<Shared>,
+    unrecordable: Unrecordable,
+}
+
+/// Permission to carry out a request.
+#[derive(Debug, Default)]
+pub(crate) struct Permit {
+    room: Option<Room>,
+}
+
+/// Room in the queue for one record, until this is dropped.
+#[derive(Debug)]
+struct Room {
+    shared: Arc<Shared>,
+    size: usize,
+}
+
+/// The receiving side.
+#[derive(Debug)]
+pub(crate) struct Records {
+    /// `None` only wakes the reader of the queue.
+    receiver: Mutex<Receiver<Option<Record>>>,
+    /// Keeps the channel open without listeners: the reader of the queue must still wait then.
+    sender: Sender<Option<Record>>,
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    /// The size of the records in the queue, and of the room that is taken.
+    waiting: AtomicUsize,
+    lost: AtomicU64,
+    /// Whether the log can't be written at present.
+    failing: AtomicBool,
+}
+
+pub(crate) fn auditing(unrecordable: Unrecordable) -> (Auditor, Records) {
+    let (sender, receiver) = channel();
+    let shared = Arc::new(Shared::default());
+    let records = Records {
+        receiver: Mutex::new(receiver),
+        sender: sender.clone(),
+        shared: Arc::clone(&shared),
+    };
+    (Auditor { sender, shared, unrecordable }, records)
+}
+
+impl Auditor {
+    /// Permits a request to a memory. `None` if it writes and can't be recorded.
+    pub(crate) fn permit(&self, request: &[u8]) -> Option<Permit> {
+        match self.unrecordable {
+            Unrecordable::Refuse if writes(request) => self.take_room(request.len()),
+            _ => Some(Permit::default()),
+        }
+    }
+
+    /// Permits a request to a device. `None` if it may write and can't be recorded.
+    pub(crate) fn permit_forwarded(&self, request: &[u8]) -> Option<Permit> {
+        match self.unrecordable {
+            Unrecordable::Refuse if !only_reads(request) => self.take_room(request.len()),
+            _ => Some(Permit::default()),
+        }
+    }
+
+    /// Permits the write of a packet. `None` if it can't be recorded.
+    pub(crate) fn permit_packet(&self, payload: &[u8]) -> Option<Permit> {
+        match self.unrecordable {
+            Unrecordable::Refuse => self.take_room(payload.len()),
+            Unrecordable::Write => Some(Permit::default()),
+        }
+    }
+
+    fn take_room(&self, len: usize) -> Option<Permit> {
+        if self.shared.failing.load(Ordering::Relaxed) {
+            return None;
+        }
+        let room = Room { shared: Arc::clone(&self.shared), size: RECORD_OVERHEAD_BYTES + len };
+        let waiting = self.shared.waiting.fetch_add(room.size, Ordering::Relaxed);
+        (waiting <= MAX_QUEUE_BYTES).then_some(Permit { room: Some(room) })
+    }
+
+    /// Records a Modbus request if it writes. `reply` is its reply; empty when there is none.
+    pub(crate) fn note(
+        &self,
+        listener: &Arc<str>,
+        peer: Option<&Peer>,
+        unit_id: u8,
+        (request, reply): (&[u8], &[u8]),
+        permit: Option<Permit>,
+    ) {
+        if writes(request) {
+            let answered = Forwarded { route: None, request, reply, log_sequence: None };
+            self.send(record(listener, peer, unit_id, answered), permit);
+        }
+    }
+
+    /// Records a request to a device or a journal, unless it is known to only read. Its reply is what
+    /// was answered there, or in its place.
+    pub(crate) fn note_forwarded(
+        &self,
+        listener: &Arc<str>,
+        peer: Option<&Peer>,
+        unit_id: u8,
+        forwarded: Forwarded<'_>,
+        permit: Option<Permit>,
+    ) {
+        if !only_reads(forwarded.request) {
+            self.send(record(listener, peer, unit_id, forwarded), permit);
+        }
+    }
+
+    /// Queues a record, in the room that the permit has taken, if it has.
+    pub(crate) fn send(&self, record: Record, permit: Option<Permit>) {
+        let size = record.size();
+        if let Some(mut room) = permit.and_then(|permit| permit.room) {
+            debug_assert_eq!(room.size, size);
+            // The room belongs to the record now, until the record is taken.
+            room.size = 0;
+        } else if self.shared.waiting.fetch_add(size, Ordering::Relaxed) > MAX_QUEUE_BYTES {
+            self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
+            self.shared.lost.fetch_add(1, Ordering::Relaxed);
+            return;
+        }
+        if self.sender.send(Some(record)).is_err() {
+            self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
+            self.shared.lost.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+impl Drop for Room {
+    fn drop(&mut self) {
+        self.shared.waiting.fetch_sub(self.size, Ordering::Relaxed);
+    }
+}
+
+fn record(
+    listener: &Arc<str>,
+    peer: Option<&Peer>,
+    unit_id: u8,
+    forwarded: Forwarded<'_>,
+) -> Record {
+    let Forwarded { route, request, reply, log_sequence } = forwarded;
+    let refused = match reply {
+        [code, exception, ..] if code & 0x80 != 0 => Some(*exception),
+        _ => None,
+    };
+    let write = Written::Modbus { unit_id, pdu: request.to_vec(), refused, route: route.cloned() };
+    Record { listener: Arc::clone(listener), peer: peer.cloned(), write, log_sequence }
+}
+
+impl Record {
+    fn size(&self) -> usize {
+        RECORD_OVERHEAD_BYTES
+            + match &self.write {
+                Written::Modbus { pdu, .. } => pdu.len(),
+                Written::Packet { payload, .. } => payload.len(),
+            }
+    }
+}
+
+impl Records {
+    /// Takes up to `most` records. Waits up to `timeout` for the first, and not for the others.
+    pub(crate) fn take(&self, timeout: Duration, most: usize) -> Vec<Record> {
+        let receiver = self.receiver.lock().unwrap_or_else(PoisonError::into_inner);
+        let first = receiver.recv_timeout(timeout).ok();
+        let records: Vec<Record> =
+            first.into_iter().chain(receiver.try_iter()).flatten().take(most).collect();
+        let size = records.iter().map(Record::size).sum();
+        self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
+        records
+    }
+
+    /// Wakes the reader of the queue.
+    pub(crate) fn wake(&self) {
+        let _ = self.sender.send(None);
+    }
+
+    /// Whether the log can't be written, so that writes which must be recorded are refused. Wakes
+    /// the reader of the queue: it has to try again.
+    pub(crate) fn set_failing(&self, failing: bool) {
+        self.shared.failing.store(failing, Ordering::Relaxed);
+        self.wake();
+    }
+
+    /// The number of dropped records.
+    pub(crate) fn lost(&self) -> u64 {
+        self.shared.lost.load(Ordering::Relaxed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Instant;
+
+    use super::*;
+
+    const WRITE: &[u8] = &[6, 0, 1, 0, 7];
+    const READ: &[u8] = &[3, 0, 1, 0, 1];
+
+    fn send(auditor: &Auditor, permit: Option<Permit>) {
+        auditor.note(&"scada".into(), None, 1, (WRITE, WRITE), permit);
+    }
+
+    #[test]
+    fn a_write_that_must_be_recorded_takes_room_before_it_is_carried_out() {
+        let (auditor, records) = auditing(Unrecordable::Refuse);
+        let most = MAX_QUEUE_BYTES / (RECORD_OVERHEAD_BYTES + WRITE.len()) + 1;
+        let permits: Vec<Permit> = (0..most).map_while(|_| auditor.permit(WRITE)).collect();
+        assert_eq!(permits.len(), most);
+        assert!(auditor.permit(WRITE).is_none());
+        assert!(auditor.permit_forwarded(WRITE).is_none());
+        assert!(auditor.permit_packet(&[0, 1]).is_none());
+        assert!(auditor.permit(READ).is_some() && auditor.permit_forwarded(READ).is_some());
+        for permit in permits {
+            send(&auditor, Some(permit));
+        }
+        assert_eq!((records.take(Duration::ZERO, usize::MAX).len(), records.lost()), (most, 0));
+        assert!(auditor.permit(WRITE).is_some());
+    }
+
+    #[test]
+    fn room_that_is_not_used_is_released() {
+        let (auditor, records) = auditing(Unrecordable::Refuse);
+        let taken = |_| auditor.permit(WRITE).is_some();
+        assert!((0..2 * MAX_QUEUE_BYTES / RECORD_OVERHEAD_BYTES).all(taken));
+        assert_eq!(records.shared.waiting.load(Ordering::Relaxed), 0);
+    }
+
+    #[test]
+    fn without_room_that_was_taken_records_are_dropped_and_counted() {
+        for unrecordable in [Unrecordable::Write, Unrecordable::Refuse] {
+            let (auditor, records) = auditing(unrecordable);
+            let most = MAX_QUEUE_BYTES / (RECORD_OVERHEAD_BYTES + WRITE.len()) + 1;
+            for _ in 0..most + 5 {
+                send(&auditor, None);
+            }
+            assert_eq!(records.lost(), 5);
+            assert_eq!(auditor.permit(WRITE).is_some(), unrecordable == Unrecordable::Write);
+            assert_eq!(records.take(Duration::ZERO, usize::MAX).len(), most);
+            assert!(auditor.permit(WRITE).is_some());
+        }
+    }
+
+    #[test]
+    fn while_the_log_fails_only_writes_that_must_be_recorded_are_refused() {
+        for (unrecordable, refused) in [(Unrecordable::Write, false), (Unrecordable::Refuse, true)]
+        {
+            let (auditor, records) = auditing(unrecordable);
+            for failing in [true, false] {
+                records.set_failing(failing);
+                assert_eq!(auditor.permit(WRITE).is_none(), refused && failing);
+                assert!(auditor.permit(READ).is_some());
+            }
+        }
+    }
+
+    #[test]
+    fn whoever_waits_for_writes_can_be_woken() {
+        let (_auditor, records) = auditing(Unrecordable::Write);
+        records.wake();
+        assert_eq!(records.take(Duration::MAX, 10), []);
+        records.set_failing(true);
+        assert_eq!(records.take(Duration::MAX, 10), []);
+    }
+
+    #[test]
+    fn whoever_waits_for_writes_waits_even_if_there_are_no_listeners() {
+        let (auditor, records) = auditing(Unrecordable::Write);
+        drop(auditor);
+        let (began, timeout) = (Instant::now(), Duration::from_millis(20));
+        assert_eq!(records.take(timeout, 10), []);
+        assert!(began.elapsed() >= timeout);
+    }
+}

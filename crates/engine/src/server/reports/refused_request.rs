@@ -1,0 +1,170 @@
+//! Modbus requests that a listener refuses because of rights, or because a memory is sealed: what
+//! the log has of them.
+
+use std::sync::atomic::{AtomicU8, Ordering};
+
+use holdfast_protocol::pdu::{ExceptionCode, Function};
+
+use crate::server::rights::policy::PeerRights;
+
+/// A refused request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct RefusedRequest {
+    pub unit_id: u8,
+    pub function_code: u8,
+    pub why: Why,
+}
+
+/// Why a request was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Why {
+    /// The function is not known, or not allowed for the peer.
+    Function,
+    /// The peer does not have the unit.
+    Unit,
+    /// An address does not exist, or the peer may not use it.
+    Address,
+    /// A write to a memory that is sealed.
+    Sealed,
+}
+
+impl Why {
+    /// The name of the event.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Why::Function => "refused_function",
+            Why::Unit => "refused_unit",
+            Why::Address => "refused_address",
+            Why::Sealed => "refused_sealed",
+        }
+    }
+}
+
+impl RefusedRequest {
+    /// The refusal that a memory's reply to a request is; `None` for any other reply.
+    #[inline]
+    pub(crate) fn by(
+        rights: &PeerRights,
+        unit_id: u8,
+        request: &[u8],
+        reply: &[u8],
+    ) -> Option<RefusedRequest> {
+        let &[code, exception, ..] = reply else { return None };
+        if code & 0x80 == 0 {
+            return None;
+        }
+        let code = ExceptionCode::from_code(exception)?;
+        let why = match code {
+            ExceptionCode::ServerDeviceBusy if writes(request) => Why::Sealed,
+            // With a memory, it is the device whose values the memory has that does not answer.
+            ExceptionCode::GatewayTargetFailedToRespond if rights.memory(unit_id).is_none() => {
+                Why::Unit
+            }
+            _ => return RefusedRequest::with(unit_id, request, code),
+        };
+        Some(RefusedRequest::new(unit_id, request, why))
+    }
+
+    /// The refusal of a request that was not sent to its device; `None` if it was, or can't be.
+    pub(crate) fn before_device<T>(
+        unit_id: u8,
+        request: &[u8],
+        sent: &Result<T, ExceptionCode>,
+    ) -> Option<RefusedRequest> {
+        RefusedRequest::with(unit_id, request, *sent.as_ref().err()?)
+    }
+
+    fn with(unit_id: u8, request: &[u8], code: ExceptionCode) -> Option<RefusedRequest> {
+        let why = match code {
+            ExceptionCode::IllegalFunction => Why::Function,
+            ExceptionCode::IllegalDataAddress => Why::Address,
+            _ => return None,
+        };
+        Some(RefusedRequest::new(unit_id, request, why))
+    }
+
+    fn new(unit_id: u8, request: &[u8], why: Why) -> RefusedRequest {
+        let function_code = request.first().copied().unwrap_or_default();
+        RefusedRequest { unit_id, function_code, why }
+    }
+}
+
+pub(super) fn writes(request: &[u8]) -> bool {
+    Function::from_pdu(request).is_some_and(Function::is_write)
+}
+
+/// The reasons that were reported for a connection or line: each is reported once.
+#[derive(Debug, Default)]
+pub(crate) struct Reported(AtomicU8);
+
+impl Reported {
+    /// Whether a refusal is the first for its reason.
+    pub(crate) fn is_first(&self, refused: &RefusedRequest) -> bool {
+        let bit = 1 << refused.why as u8;
+        self.0.fetch_or(bit, Ordering::Relaxed) & bit == 0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use holdfast_memory::{Layout, Memory};
+
+    use super::*;
+    use crate::server::rights::functions::{AccessMode, Functions};
+    use crate::server::rights::policy::Rule;
+
+    const READ: [u8; 5] = [3, 0, 0, 0, 1];
+    const WRITE: [u8; 5] = [6, 0, 0, 0, 1];
+
+    fn why(request: &[u8], reply: &[u8]) -> Option<Why> {
+        RefusedRequest::by(&PeerRights::none(), 1, request, reply).map(|refused| refused.why)
+    }
+
+    #[test]
+    fn a_unit_whose_memory_is_stale_is_not_refused_for_rights() {
+        let memory = Memory::new(Layout::default(), None).unwrap();
+        let rights = PeerRights::new(&Rule {
+            sources: Vec::new(),
+            roles: None,
+            units: vec![(1, Arc::new(memory))],
+            elsewhere: Vec::new(),
+            access: AccessMode::ReadWrite,
+            functions: Functions::All,
+            narrowed: Vec::new(),
+        });
+        for (unit_id, expected) in [(1, None), (2, Some(Why::Unit))] {
+            let refused = RefusedRequest::by(&rights, unit_id, &READ, &[0x83, 0x0B]);
+            assert_eq!(refused.map(|refused| refused.why), expected);
+        }
+    }
+
+    #[test]
+    fn a_refusal_has_the_reason_of_its_exception() {
+        assert_eq!(why(&WRITE, &[0x86, 1]), Some(Why::Function));
+        assert_eq!(why(&READ, &[0x83, 2]), Some(Why::Address));
+        assert_eq!(why(&WRITE, &[0x86, 6]), Some(Why::Sealed));
+        assert_eq!(why(&READ, &[0x83, 0x0B]), Some(Why::Unit));
+    }
+
+    #[test]
+    fn other_replies_are_no_refusal() {
+        // A sealed memory is read again and again until it is opened.
+        for (request, reply) in [(READ, [0x83, 6]), (READ, [0x83, 3]), (WRITE, [0x86, 4])] {
+            assert_eq!(why(&request, &reply), None);
+        }
+        assert_eq!(why(&WRITE, &WRITE), None);
+        assert_eq!(why(&WRITE, &[]), None);
+    }
+
+    #[test]
+    fn each_reason_is_reported_once() {
+        let reported = Reported::default();
+        let refused = |why| RefusedRequest { unit_id: 1, function_code: 6, why };
+        for why in [Why::Function, Why::Unit, Why::Address, Why::Sealed] {
+            assert!(reported.is_first(&refused(why)));
+            assert!(!reported.is_first(&refused(why)));
+        }
+    }
+}

@@ -1,0 +1,118 @@
+//! Which functions a rule allows, and which requests are known to only read.
+
+use holdfast_protocol::pdu::{Function, Request};
+
+/// Functions of the standard that only read, and that memories do not serve (V1.1b3, 6): file records,
+/// FIFO queue.
+pub const OTHER_READS: [u8; 2] = [20, 24];
+
+/// The function of the standard that writes file records (V1.1b3, 6.15).
+pub const WRITE_FILE_RECORD: u8 = 21;
+
+/// Whether memories serve a function. Only devices know the others.
+pub fn is_served(code: u8) -> bool {
+    Function::from_code(code).is_some() && !OTHER_READS.contains(&code) && code != WRITE_FILE_RECORD
+}
+
+/// What answers the requests to a unit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::server) enum Answerer {
+    Device,
+    Memory {
+        /// Whether function 7 has bits to read.
+        exception_status: bool,
+    },
+}
+
+impl Answerer {
+    pub(in crate::server) const PLAIN_MEMORY: Answerer =
+        Answerer::Memory { exception_status: false };
+
+    fn knows(self, code: u8) -> bool {
+        match self {
+            Answerer::Device => true,
+            Answerer::Memory { exception_status }
+                if code == Function::ReadExceptionStatus.code() =>
+            {
+                exception_status
+            }
+            Answerer::Memory { .. } => is_served(code),
+        }
+    }
+}
+
+/// What a rule allows its peers to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AccessMode {
+    ReadOnly,
+    ReadWrite,
+}
+
+/// The function codes of a rule.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Functions {
+    All,
+    Only(Vec<u8>),
+    Except(Vec<u8>),
+}
+
+/// Function codes.
+#[derive(Debug, Clone, Copy, Default)]
+pub(in crate::server) struct Codes([u64; 4]);
+
+impl Codes {
+    #[inline]
+    pub(in crate::server) fn has(&self, code: u8) -> bool {
+        self.0[usize::from(code >> 6)] >> (code & 63) & 1 == 1
+    }
+
+    pub(in crate::server) fn of(
+        functions: &Functions,
+        access: AccessMode,
+        answerer: Answerer,
+    ) -> Codes {
+        let mut codes = Codes::default();
+        for code in (0..=u8::MAX).filter(|code| is_allowed(*code, functions, access, answerer)) {
+            codes.0[usize::from(code >> 6)] |= 1 << (code & 63);
+        }
+        codes
+    }
+
+    pub(in crate::server) fn with(self, other: Codes) -> Codes {
+        Codes(std::array::from_fn(|index| self.0[index] | other.0[index]))
+    }
+}
+
+fn is_allowed(code: u8, functions: &Functions, access: AccessMode, answerer: Answerer) -> bool {
+    let (named, listed) = match functions {
+        Functions::All => (true, false),
+        Functions::Only(codes) => (codes.contains(&code), true),
+        Functions::Except(codes) => (!codes.contains(&code), false),
+    };
+    let writes = access == AccessMode::ReadWrite;
+    named
+        && answerer.knows(code)
+        && match Function::from_code(code) {
+            Some(function) => writes || !function.is_write(),
+            None => writes && listed && code & 0x80 == 0,
+        }
+}
+
+/// Whether a request writes, also to a file of a device.
+#[inline]
+pub(in crate::server) fn is_write(request: &[u8]) -> bool {
+    let code = request.first().copied().unwrap_or_default();
+    Function::from_code(code).is_some_and(Function::is_write)
+}
+
+/// Whether a request is known to change nothing in a device.
+pub(in crate::server) fn only_reads(request: &[u8]) -> bool {
+    let code = request.first().copied().unwrap_or_default();
+    match Function::from_code(code) {
+        Some(Function::Diagnostics | Function::EncapsulatedInterface) => {
+            Request::parse(request).is_ok_and(|request| request.is_read())
+        }
+        Some(function) => !function.is_write(),
+        None => false,
+    }
+}

@@ -1,0 +1,317 @@
+//! Access rules, compiled into tables.
+
+use std::collections::{BTreeMap, HashMap};
+use std::net::IpAddr;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use holdfast_memory::{Area, Memory};
+use holdfast_protocol::pdu::{ExceptionCode, Function, Request, SubFunction};
+use ipnet::IpNet;
+
+use crate::link::Route;
+use crate::poller::Passage;
+use crate::server::rights::functions::{AccessMode, Answerer, Codes, Functions, only_reads};
+use crate::server::rights::ranges::Ranges;
+
+/// The exception for what a peer may not do: for a peer that may only read, a write is no function.
+pub(crate) const NOT_ALLOWED: ExceptionCode = ExceptionCode::IllegalFunction;
+
+/// The rights of peers from some networks.
+#[derive(Debug, Clone)]
+pub struct Rule {
+    pub sources: Vec<IpNet>,
+    /// The roles that a rule applies to; empty text is the null role, `None` is any role. Only TLS
+    /// has roles.
+    pub roles: Option<Vec<String>>,
+    pub units: Vec<(u8, Arc<Memory>)>,
+    /// Units whose requests, or some of them, go to devices.
+    pub elsewhere: Vec<(u8, Elsewhere)>,
+    pub access: AccessMode,
+    pub functions: Functions,
+    /// Units with rights of their own, in place of those of the rule.
+    pub narrowed: Vec<(u8, Narrowed)>,
+}
+
+/// The rights of one unit.
+#[derive(Debug, Clone)]
+pub struct Narrowed {
+    pub access: AccessMode,
+    pub functions: Functions,
+    pub ranges: Ranges,
+    /// Area and address of the eight bits that function 7 reads; with `None`, the unit does not have it.
+    pub exception_status: Option<(Area, u16)>,
+}
+
+/// Where requests to a unit go that its memory does not answer.
+#[derive(Debug, Clone)]
+pub enum Elsewhere {
+    /// All go to a device. The unit has no memory.
+    Device(Route),
+    /// Writes into some ranges of its memory are passed on.
+    Mirror(Arc<Passage>),
+    /// Writes are carried out by the journal of its memory.
+    Journal(Arc<Memory>),
+}
+
+/// The rights of some peers.
+#[derive(Debug)]
+pub struct PolicyEntry<G> {
+    pub sources: Vec<IpNet>,
+    /// As in [`Rule`].
+    pub roles: Option<Vec<String>>,
+    pub rights: G,
+}
+
+/// Which peers have which rights: the first entry that matches a peer applies.
+#[derive(Debug)]
+pub struct Grants<G>(pub Vec<PolicyEntry<Arc<G>>>);
+
+impl<G> Grants<G> {
+    /// The rights of a peer with that role, or whatever its role; `None` when no entry matches.
+    pub fn rights(&self, peer: IpAddr, role: Option<&str>) -> Option<Arc<G>> {
+        let mut entries = self.0.iter();
+        let found = entries.find(|entry| match_peer(&entry.sources, &entry.roles, peer, role));
+        found.map(|entry| Arc::clone(&entry.rights))
+    }
+}
+
+/// Whether an entry with these sources and roles is for a peer.
+fn match_peer(
+    sources: &[IpNet],
+    roles: &Option<Vec<String>>,
+    peer: IpAddr,
+    role: Option<&str>,
+) -> bool {
+    let is_allowed =
+        |role| roles.as_ref().is_none_or(|roles| roles.iter().any(|each| each == role));
+    contain(sources, peer) && role.is_none_or(is_allowed)
+}
+
+/// Whether one of the networks has this address. An IPv4-mapped IPv6 address is treated as IPv4.
+fn contain(sources: &[IpNet], peer: IpAddr) -> bool {
+    let peer = peer.to_canonical();
+    sources.iter().any(|network| network.contains(&peer))
+}
+
+/// The rules of a Modbus listener. For each unit id, the first rule that names the peer and the unit
+/// decides.
+#[derive(Debug)]
+pub struct Policy {
+    rules: Vec<Rule>,
+    /// The rights by each rule alone.
+    alone: Vec<Arc<PeerRights>>,
+    /// The rights by several rules, by their numbers.
+    together: Mutex<HashMap<Vec<usize>, Arc<PeerRights>>>,
+}
+
+impl Policy {
+    pub fn of(rules: &[Rule]) -> Policy {
+        let alone = rules.iter().map(|rule| Arc::new(PeerRights::new(rule))).collect();
+        Policy { rules: rules.to_vec(), alone, together: Mutex::default() }
+    }
+
+    /// The rights of a peer with that role, or whatever its role; `None` when no rule matches.
+    pub fn rights(&self, peer: IpAddr, role: Option<&str>) -> Option<Arc<PeerRights>> {
+        let matches = |rule: &Rule| match_peer(&rule.sources, &rule.roles, peer, role);
+        let mut matching =
+            self.rules.iter().enumerate().filter(|(_, rule)| matches(rule)).map(|(at, _)| at);
+        let first = matching.next()?;
+        let Some(second) = matching.next() else {
+            return self.alone.get(first).cloned();
+        };
+        let numbers: Vec<usize> = [first, second].into_iter().chain(matching).collect();
+        let mut together = self.together.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(known) = together.get(&numbers) {
+            return Some(Arc::clone(known));
+        }
+        let rules = numbers.iter().filter_map(|number| self.rules.get(*number));
+        let rights = Arc::new(PeerRights::of(rules));
+        together.insert(numbers, Arc::clone(&rights));
+        Some(rights)
+    }
+}
+
+/// The rights of a peer, compiled to a table by unit id.
+#[derive(Debug)]
+pub struct PeerRights {
+    units: Box<[Option<UnitRights>; 256]>,
+    /// The functions of all units together: what a peer learns of units that it does not have.
+    functions: Codes,
+}
+
+#[derive(Debug)]
+struct UnitRights {
+    /// `None` if all requests go elsewhere.
+    memory: Option<Arc<Memory>>,
+    /// Where requests may go; the first place that takes one gets it. `None` if the memory answers
+    /// everything.
+    places: Option<Box<[Elsewhere]>>,
+    functions: Codes,
+    access: AccessMode,
+    /// `None` if there is no limit.
+    ranges: Option<Ranges>,
+    exception_status: Option<(Area, u16)>,
+}
+
+impl PeerRights {
+    pub fn new(rule: &Rule) -> PeerRights {
+        PeerRights::of([rule])
+    }
+
+    /// The rights of a peer that may do nothing: every request is answered with exception 01.
+    pub fn none() -> PeerRights {
+        PeerRights::of([])
+    }
+
+    /// The rights by some rules; for each unit id, the first one that names it decides.
+    fn of<'r>(rules: impl IntoIterator<Item = &'r Rule>) -> PeerRights {
+        let mut units = Box::new([const { None }; 256]);
+        let mut functions = Codes::default();
+        for rule in rules {
+            let mut own: BTreeMap<u8, (Option<Arc<Memory>>, Option<Elsewhere>)> = BTreeMap::new();
+            for (unit, memory) in &rule.units {
+                own.entry(*unit).or_default().0 = Some(Arc::clone(memory));
+            }
+            for (unit, place) in &rule.elsewhere {
+                own.entry(*unit).or_default().1 = Some(place.clone());
+            }
+            for (unit, (memory, elsewhere)) in own {
+                let place = &mut units[usize::from(unit)];
+                if place.is_some() {
+                    continue;
+                }
+                let narrowed = rule.narrowed.iter().find(|(narrowed, _)| *narrowed == unit);
+                let (access, allowed, ranges, exception_status) = match narrowed {
+                    None => (rule.access, &rule.functions, None, None),
+                    Some((_, own)) => {
+                        let ranges = (!own.ranges.is_everything()).then(|| own.ranges.clone());
+                        (own.access, &own.functions, ranges, own.exception_status)
+                    }
+                };
+                let answerer = match elsewhere {
+                    Some(Elsewhere::Device(_)) => Answerer::Device,
+                    _ => Answerer::Memory { exception_status: exception_status.is_some() },
+                };
+                let codes = Codes::of(allowed, access, answerer);
+                functions = functions.with(match answerer {
+                    Answerer::Memory { .. } => codes,
+                    // A peer must not learn which units are of devices.
+                    Answerer::Device => Codes::of(allowed, access, Answerer::PLAIN_MEMORY),
+                });
+                let has_journal = |memory: &&Arc<Memory>| memory.has_journal();
+                let journal = memory.as_ref().filter(has_journal).cloned().map(Elsewhere::Journal);
+                let functions = codes;
+                let places: Box<[_]> = elsewhere.into_iter().chain(journal).collect();
+                let places = (!places.is_empty()).then_some(places);
+                *place = Some(UnitRights {
+                    memory,
+                    places,
+                    functions,
+                    access,
+                    ranges,
+                    exception_status,
+                });
+            }
+            if rule.units.is_empty() && rule.elsewhere.is_empty() {
+                functions =
+                    functions.with(Codes::of(&rule.functions, rule.access, Answerer::PLAIN_MEMORY));
+            }
+        }
+        PeerRights { units, functions }
+    }
+
+    #[inline]
+    fn unit(&self, unit_id: u8) -> Option<&UnitRights> {
+        self.units[usize::from(unit_id)].as_ref()
+    }
+
+    /// The memory of a unit id.
+    #[inline]
+    pub fn memory(&self, unit_id: u8) -> Option<&Memory> {
+        self.unit(unit_id)?.memory.as_deref()
+    }
+
+    /// Where requests to a unit id go, or some of them.
+    #[inline]
+    pub(crate) fn elsewhere(&self, unit_id: u8) -> Option<&[Elsewhere]> {
+        self.unit(unit_id)?.places.as_deref()
+    }
+
+    /// The ranges that requests to a unit id must be inside, if they are limited.
+    #[inline]
+    pub(crate) fn ranges(&self, unit_id: u8) -> Option<&Ranges> {
+        self.unit(unit_id)?.ranges.as_ref()
+    }
+
+    /// Where the eight bits are that function 7 reads from the memory of a unit id.
+    pub(crate) fn exception_status(&self, unit_id: u8) -> Option<(Area, u16)> {
+        self.unit(unit_id)?.exception_status
+    }
+
+    /// The exception for a request that the peer may not send to this unit: its function is not allowed (writes
+    /// are not, for a peer that may only read), or its sub-function is unknown, or changes what it may only read.
+    #[inline]
+    pub(crate) fn refusal(
+        &self,
+        unit_id: u8,
+        (function_code, pdu): (u8, &[u8]),
+        request: &Result<Request<'_>, ExceptionCode>,
+    ) -> Option<ExceptionCode> {
+        let changes_state = || {
+            function_code == Function::Diagnostics.code()
+                && self.is_read_only(unit_id)
+                && SubFunction::from_pdu(pdu).is_some_and(SubFunction::changes_state)
+        };
+        let refused = !self.allows(unit_id, function_code)
+            || *request == Err(ExceptionCode::IllegalFunction)
+            || changes_state();
+        refused.then_some(NOT_ALLOWED)
+    }
+
+    /// Whether a request to a device is denied although its function is allowed: a read-only peer may send
+    /// only what is known to change nothing, which a sub-function decides too.
+    pub(crate) fn denies(&self, unit_id: u8, request: &[u8]) -> bool {
+        self.is_read_only(unit_id) && !only_reads(request)
+    }
+
+    /// One unit id per memory, chosen among the `wanted` unit ids: the first one that may do what is
+    /// asked, or else the first one.
+    pub fn one_unit_of_each_memory(
+        &self,
+        wanted: impl Fn(u8) -> bool,
+        may: impl Fn(u8) -> bool,
+    ) -> Vec<u8> {
+        let mut found: Vec<(u8, &Arc<Memory>)> = Vec::new();
+        for (unit_id, unit) in (0..=u8::MAX).zip(self.units.iter()) {
+            let Some(memory) = unit.as_ref().and_then(|unit| unit.memory.as_ref()) else {
+                continue;
+            };
+            if !wanted(unit_id) {
+                continue;
+            }
+            match found.iter_mut().find(|(_, known)| Arc::ptr_eq(known, memory)) {
+                None => found.push((unit_id, memory)),
+                Some((chosen, _)) if !may(*chosen) && may(unit_id) => *chosen = unit_id,
+                Some(_) => {}
+            }
+        }
+        found.into_iter().map(|(unit_id, _)| unit_id).collect()
+    }
+
+    /// Whether a function code is known and allowed for a unit; for a unit that the peer does not have,
+    /// whether it is for any.
+    #[inline]
+    pub fn allows(&self, unit_id: u8, function_code: u8) -> bool {
+        let functions = self.unit(unit_id).map_or(&self.functions, |unit| &unit.functions);
+        functions.has(function_code)
+    }
+
+    /// Whether a peer may not write to a unit; for a unit that it does not have, whether to none.
+    pub fn is_read_only(&self, unit_id: u8) -> bool {
+        let is_read_only = |unit: &UnitRights| unit.access == AccessMode::ReadOnly;
+        match self.unit(unit_id) {
+            Some(unit) => is_read_only(unit),
+            None => self.units.iter().flatten().all(is_read_only),
+        }
+    }
+}

@@ -1,0 +1,13 @@
+//! Listeners, by transport: where a frame ends, and what carries it.
+
+#[cfg(test)]
+pub(crate) mod cuts;
+pub(crate) mod framing;
+pub(crate) mod raw_ingest;
+pub(crate) mod secure;
+pub(crate) mod serial;
+pub(crate) mod shared_port;
+pub(crate) mod stream;
+pub(crate) mod tcp;
+pub(crate) mod tls;
+pub(crate) mod udp;

@@ -1,0 +1,148 @@
+//! The stream of a connection: a socket, or TLS over a socket.
+
+use std::io::{self, ErrorKind, Read, Write};
+use std::pin::Pin;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use socket2::SockRef;
+use tokio::io::{AsyncRead, ReadBuf};
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+
+use crate::server::reports::event::Kind;
+
+/// Why a stream has no more data.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum End {
+    /// The peer has sent everything.
+    ByPeer,
+    /// The connection broke.
+    Broken,
+    /// TLS failed. The reason is a word for programs.
+    TlsFailed(&'static str),
+}
+
+impl From<End> for Kind {
+    fn from(end: End) -> Kind {
+        match end {
+            End::ByPeer | End::Broken => Kind::Closed,
+            End::TlsFailed(reason) => Kind::TlsFailed(reason),
+        }
+    }
+}
+
+/// `unsent` holds bytes that the system has not accepted yet. Further bytes are appended to it, so
+/// that they keep their order.
+pub(crate) trait Stream: Send {
+    /// Reads once. Returns the length of received Modbus data, which can be 0. An error ends the
+    /// connection.
+    fn poll_read(
+        &mut self,
+        context: &mut Context<'_>,
+        input: &mut [u8],
+        unsent: &mut Vec<u8>,
+    ) -> Poll<Result<usize, End>>;
+
+    /// Reads once what the system has already received; `None` when there is no more.
+    fn read_now(&mut self, input: &mut [u8], unsent: &mut Vec<u8>) -> Option<usize>;
+
+    /// Sends as much as the system accepts without blocking.
+    fn send(&mut self, output: &[u8], unsent: &mut Vec<u8>) -> Result<(), Kind>;
+
+    /// Whether the peer has sent part of a TLS record.
+    fn is_amid_record(&self) -> bool;
+
+    /// Appends the message that announces the end, if the stream has one.
+    fn end(&mut self, unsent: &mut Vec<u8>);
+
+    fn socket(&self) -> &TcpStream;
+}
+
+impl Stream for TcpStream {
+    #[inline]
+    fn poll_read(
+        &mut self,
+        context: &mut Context<'_>,
+        input: &mut [u8],
+        _unsent: &mut Vec<u8>,
+    ) -> Poll<Result<usize, End>> {
+        let mut buffer = ReadBuf::new(input);
+        let Poll::Ready(read) = AsyncRead::poll_read(Pin::new(self), context, &mut buffer) else {
+            return Poll::Pending;
+        };
+        let len = buffer.filled().len();
+        Poll::Ready(match read {
+            Err(_) => Err(End::Broken),
+            Ok(()) if len == 0 => Err(End::ByPeer),
+            Ok(()) => Ok(len),
+        })
+    }
+
+    fn read_now(&mut self, input: &mut [u8], _unsent: &mut Vec<u8>) -> Option<usize> {
+        read(self, input)
+    }
+
+    #[inline]
+    fn send(&mut self, output: &[u8], unsent: &mut Vec<u8>) -> Result<(), Kind> {
+        send(self, output, unsent)
+    }
+
+    #[inline]
+    fn is_amid_record(&self) -> bool {
+        false
+    }
+
+    fn end(&mut self, _unsent: &mut Vec<u8>) {}
+
+    fn socket(&self) -> &TcpStream {
+        self
+    }
+}
+
+/// Sends what the system accepts without blocking, and appends the rest to `unsent`. If `unsent` is
+/// not empty, all of `output` is appended.
+#[inline]
+pub(crate) fn send(socket: &TcpStream, output: &[u8], unsent: &mut Vec<u8>) -> Result<(), Kind> {
+    let sent = if unsent.is_empty() { socket.try_write(output) } else { Ok(0) };
+    match sent {
+        Ok(sent) => unsent.extend_from_slice(&output[sent..]),
+        Err(error) if error.kind() == ErrorKind::WouldBlock => unsent.extend_from_slice(output),
+        Err(_) => return Err(Kind::Closed),
+    }
+    Ok(())
+}
+
+/// Sends all of `output`. Fails when nothing can be sent for the duration of `time_limit`.
+pub(crate) async fn send_all(
+    socket: &TcpStream,
+    output: &[u8],
+    time_limit: Duration,
+) -> Result<(), Kind> {
+    let mut sent = 0;
+    while sent < output.len() {
+        match timeout(time_limit, socket.writable()).await {
+            Err(_) => return Err(Kind::SlowReader),
+            Ok(Err(_)) => return Err(Kind::Closed),
+            Ok(Ok(())) => {}
+        }
+        match socket.try_write(&output[sent..]) {
+            Ok(len) => sent += len,
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+            Err(_) => return Err(Kind::Closed),
+        }
+    }
+    Ok(())
+}
+
+/// Reads directly from the system, even if the runtime does not report the socket as readable.
+pub(crate) fn read(socket: &TcpStream, input: &mut [u8]) -> Option<usize> {
+    (&*SockRef::from(socket)).read(input).ok().filter(|len| *len > 0)
+}
+
+/// Sends all of `unsent` without waiting, or fails.
+pub(crate) fn write(socket: &TcpStream, unsent: &mut Vec<u8>) -> io::Result<()> {
+    let written = (&*SockRef::from(socket)).write_all(unsent);
+    unsent.clear();
+    written
+}

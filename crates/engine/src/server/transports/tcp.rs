@@ -1,0 +1,296 @@
+//! Listeners for Modbus TCP, with or without TLS, RTU over TCP and ASCII over TCP.
+
+use std::io::ErrorKind;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::watch;
+use tokio::time::{Instant, timeout_at};
+
+use crate::server::connections::admission::{ConnectionLimits, Ticket};
+use crate::server::connections::connection::{Connection, NO_DEADLINE, Renewal, Terms, Timeouts};
+use crate::server::connections::listener::{Admitted, ListenerContext, Service, set_options};
+use crate::server::connections::live::Live;
+use crate::server::connections::peer::Peer;
+use crate::server::reports::counters::PacketCounters;
+use crate::server::reports::event::Kind;
+use crate::server::requests::unit_server::{UnitServer, UnitSettings};
+use crate::server::rights::policy::{PeerRights, Policy, Rule};
+use crate::server::transports::framing::{Ascii, Framing, Mbap, MbapBesidePackets, Rtu};
+use crate::server::transports::raw_ingest::{RawIngest, RawSettings};
+use crate::server::transports::secure::secured;
+use crate::server::transports::shared_port::{Beginning, DECISIVE_BYTES};
+use crate::server::transports::stream::Stream;
+use crate::tls::server::ServerTls;
+
+/// The framing of Modbus on a TCP stream.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StreamFraming {
+    /// Modbus TCP: an MBAP header before each PDU.
+    Mbap,
+    /// RTU over TCP: RTU frames, one after another.
+    Rtu,
+    /// ASCII over TCP: ASCII frames, one after another.
+    Ascii,
+}
+
+/// A listener for Modbus over TCP connections.
+#[derive(Debug, Clone)]
+pub struct StreamSettings {
+    /// With port 0, the system picks a port. `[::]` also accepts IPv4 connections.
+    pub bind: SocketAddr,
+    pub framing: StreamFraming,
+    pub rules: Vec<Rule>,
+    pub limits: ConnectionLimits,
+    /// Closes a connection after this time without a request. `None`: never.
+    pub idle_timeout: Option<Duration>,
+    /// The longest time from the first byte of a request to its last, and for a peer to read its
+    /// replies. With TLS also for the handshake.
+    pub request_timeout: Duration,
+    /// With RTU frames: the silence after which an incomplete request may be followed by the next.
+    pub frame_timeout: Option<Duration>,
+    /// The seconds without a byte after which the system asks whether the peer is still there.
+    pub keepalive: u16,
+    pub units: UnitSettings,
+    /// `None` is plain TCP.
+    pub tls: Option<Arc<ServerTls>>,
+    /// Raw Ingest packets on the same port, only with MBAP frames over plain TCP.
+    pub raw_ingest: Option<RawSettings>,
+}
+
+pub(crate) struct ModbusStream {
+    unit_server: Arc<UnitServer>,
+    policy: Policy,
+    /// The rights of a peer that no rule names, by its role.
+    no_rights: Arc<PeerRights>,
+    timeouts: Timeouts,
+    keepalive: Duration,
+    framing: StreamFraming,
+    tls: Option<Arc<ServerTls>>,
+    raw_ingest: Option<Arc<RawIngest>>,
+}
+
+impl ModbusStream {
+    /// `packets` counts Raw Ingest packets on the same port.
+    pub(crate) fn new(
+        settings: &StreamSettings,
+        unit_server: Arc<UnitServer>,
+        packets: Option<Arc<PacketCounters>>,
+    ) -> ModbusStream {
+        let may_share = settings.framing == StreamFraming::Mbap && settings.tls.is_none();
+        debug_assert!(may_share || settings.raw_ingest.is_none());
+        ModbusStream {
+            raw_ingest: settings
+                .raw_ingest
+                .as_ref()
+                .map(|raw| Arc::new(RawIngest::new(raw, packets.unwrap_or_default()))),
+            unit_server,
+            policy: Policy::of(&settings.rules),
+            no_rights: Arc::new(PeerRights::none()),
+            timeouts: Timeouts {
+                idle: settings.idle_timeout,
+                request: settings.request_timeout,
+                frame: settings.frame_timeout,
+            },
+            keepalive: Duration::from_secs(settings.keepalive.into()),
+            framing: settings.framing,
+            tls: settings.tls.clone(),
+        }
+    }
+
+    /// The counters of Raw Ingest packets on the same port.
+    pub(crate) fn packets(&self) -> Option<Arc<PacketCounters>> {
+        self.raw_ingest.as_ref().map(|raw| Arc::clone(&raw.packets))
+    }
+
+    /// The terms of a connection: of any role, or of the role in its certificate.
+    fn terms(&self, peer: &Peer) -> Option<Terms> {
+        let rights = match &peer.certificate {
+            None => self.rights(peer.ip())?,
+            Some(_) => self.policy.rights(peer.ip(), peer.role())?,
+        };
+        Some(Terms { rights, timeouts: self.timeouts })
+    }
+
+    async fn connection<F: Framing>(
+        &self,
+        live: Arc<Live<ModbusStream>>,
+        context: Arc<ListenerContext>,
+        admitted: Admitted<PeerRights>,
+        stop: watch::Receiver<bool>,
+    ) {
+        match &self.tls {
+            None => {
+                let Admitted { stream, peer, rights, ticket, received } = admitted;
+                self.modbus::<F, _>(
+                    live,
+                    context,
+                    (stream, peer.into()),
+                    (rights, received),
+                    ticket,
+                    stop,
+                )
+                .await;
+            }
+            // In a box of its own, so that plain connections do not reserve memory for it.
+            Some(tls) => Box::pin(self.secure::<F>(tls, live, context, admitted, stop)).await,
+        }
+    }
+
+    /// Performs the handshake, selects the rights by the role in the certificate, and serves the
+    /// connection.
+    async fn secure<F: Framing>(
+        &self,
+        tls: &ServerTls,
+        live: Arc<Live<ModbusStream>>,
+        context: Arc<ListenerContext>,
+        admitted: Admitted<PeerRights>,
+        stop: watch::Receiver<bool>,
+    ) {
+        let Admitted { stream, peer, ticket, .. } = admitted;
+        let (time_limit, stopping) = (self.timeouts.request, stop.clone());
+        let secured = secured(tls, &context, (stream, peer), &ticket, time_limit, stopping).await;
+        let Some((stream, peer)) = secured else { return };
+        // A reload reviews connections by their roles. This one looks up its rights only now.
+        let rights = live.get().terms(&peer).map(|terms| terms.rights).unwrap_or_else(|| {
+            // The session stays, and each request gets exception 01 (MB-TCP-Security, R-23, R-31).
+            context.refuse_role(peer.clone());
+            Arc::clone(&self.no_rights)
+        });
+        self.modbus::<F, _>(live, context, (stream, peer), (rights, Vec::new()), ticket, stop)
+            .await;
+    }
+
+    async fn modbus<F: Framing, S: Stream>(
+        &self,
+        live: Arc<Live<ModbusStream>>,
+        context: Arc<ListenerContext>,
+        (stream, peer): (S, Peer),
+        (rights, received): (Arc<PeerRights>, Vec<u8>),
+        ticket: Ticket,
+        stop: watch::Receiver<bool>,
+    ) {
+        let unit_server = Arc::clone(&self.unit_server);
+        let (terms, renewal) =
+            (Terms { rights, timeouts: self.timeouts }, renewal(live, peer.clone()));
+        let stream = (stream, peer);
+        let mut connection =
+            Connection::<F, S>::new(context, unit_server, stream, terms, renewal, ticket);
+        connection.begin_with(&received);
+        connection.run(stop).await;
+    }
+
+    /// Serves a connection that may begin with a packet: its first bytes decide.
+    async fn shared(
+        &self,
+        raw: &Arc<RawIngest>,
+        live: Arc<Live<ModbusStream>>,
+        context: Arc<ListenerContext>,
+        mut admitted: Admitted<PeerRights>,
+        mut stop: watch::Receiver<bool>,
+    ) {
+        let peer = admitted.peer;
+        let begun = Instant::now();
+        loop {
+            match Beginning::of(&admitted.received) {
+                Beginning::Unknown => {}
+                Beginning::Modbus => {
+                    admitted.ticket.set_amid_packet(false);
+                    return self
+                        .connection::<MbapBesidePackets>(live, context, admitted, stop)
+                        .await;
+                }
+                Beginning::Packet => {
+                    let Admitted { stream, peer, received, ticket, .. } = admitted;
+                    let Some(rights) = raw.rights(peer.ip()) else {
+                        ticket.set_answered();
+                        return raw.refuse_peer(&context, (stream, peer), &received, stop).await;
+                    };
+                    let admitted = Admitted { stream, peer, rights, received, ticket };
+                    let renewal =
+                        Box::new(move || live.get().raw_ingest.as_ref()?.rights(peer.ip()));
+                    return raw.serve_packets(context, raw.sending(admitted), renewal, stop).await;
+                }
+            }
+            let is_new = admitted.received.is_empty();
+            let time_limit = if is_new { self.timeouts.idle } else { Some(self.timeouts.request) };
+            let deadline = begun + time_limit.unwrap_or(NO_DEADLINE);
+            let readable = tokio::select! {
+                readable = timeout_at(deadline, admitted.stream.readable()) => readable,
+                _ = stop.wait_for(|stop| *stop) => return context.ended(Kind::Closed, peer),
+            };
+            // No more than what decides: the server of the protocol reads the rest.
+            let mut chunk = [0; DECISIVE_BYTES];
+            let missing = DECISIVE_BYTES - admitted.received.len();
+            match readable {
+                Err(_) if is_new => return context.ended(Kind::Idle, peer),
+                Err(_) => return context.ended(Kind::RequestTimeout, peer),
+                Ok(Err(_)) => return context.ended(Kind::Closed, peer),
+                Ok(Ok(())) => match admitted.stream.try_read(&mut chunk[..missing]) {
+                    Ok(0) => return context.ended(Kind::Closed, peer),
+                    Ok(len) => {
+                        admitted.received.extend_from_slice(&chunk[..len]);
+                        admitted.ticket.set_amid_packet(true);
+                    }
+                    Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+                    Err(_) => return context.ended(Kind::Closed, peer),
+                },
+            }
+        }
+    }
+}
+
+/// Looks up the rights of a connection after a reload. One that had none by its role has none still.
+fn renewal(live: Arc<Live<ModbusStream>>, peer: Peer) -> Renewal {
+    Box::new(move || {
+        let service = live.get();
+        let no_rights =
+            || Terms { rights: Arc::clone(&service.no_rights), timeouts: service.timeouts };
+        let terms = service.terms(&peer);
+        terms.or_else(|| peer.certificate.is_some().then(no_rights))
+    })
+}
+
+impl Service for ModbusStream {
+    type PeerRights = PeerRights;
+
+    fn rights(&self, peer: IpAddr) -> Option<Arc<PeerRights>> {
+        let rights = self.policy.rights(peer, None);
+        rights.or_else(|| {
+            let raw = self.raw_ingest.as_ref()?;
+            raw.rights(peer).map(|_| Arc::clone(&self.no_rights))
+        })
+    }
+
+    fn ends(&self, before: &ModbusStream, peer: &Peer) -> Option<Kind> {
+        let is_other = self.framing != before.framing || self.tls.is_some() != before.tls.is_some();
+        if is_other || self.rights(peer.ip()).is_none() {
+            return Some(Kind::RightsRevoked);
+        }
+        let (tls, certificate) = (self.tls.as_ref()?, peer.certificate.as_ref()?);
+        if let Err(failure) = tls.judge(certificate) {
+            return Some(Kind::TlsFailed(failure.reason()));
+        }
+        // A session that never had rights keeps its exceptions.
+        (self.terms(peer).is_none() && before.terms(peer).is_some()).then_some(Kind::RightsRevoked)
+    }
+
+    async fn serve(
+        self: Arc<Self>,
+        live: Arc<Live<Self>>,
+        context: Arc<ListenerContext>,
+        connection: Admitted<PeerRights>,
+        stop: watch::Receiver<bool>,
+    ) {
+        set_options(&connection.stream, self.keepalive);
+        if let Some(raw) = &self.raw_ingest {
+            return self.shared(raw, live, context, connection, stop).await;
+        }
+        match self.framing {
+            StreamFraming::Mbap => self.connection::<Mbap>(live, context, connection, stop).await,
+            StreamFraming::Rtu => self.connection::<Rtu>(live, context, connection, stop).await,
+            StreamFraming::Ascii => self.connection::<Ascii>(live, context, connection, stop).await,
+        }
+    }
+}

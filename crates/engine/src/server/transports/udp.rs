@@ -1,0 +1,347 @@
+//! Modbus over UDP and RTU over UDP: one request per datagram. The reply comes from the address that
+//! received the request.
+
+use std::io::{self, ErrorKind, IoSliceMut};
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use holdfast_protocol::frame::{mbap, rtu};
+use holdfast_protocol::pdu::{self, ExceptionCode};
+use quinn_udp::{RecvMeta, Transmit, UdpSocketState};
+use socket2::SockRef;
+use tokio::io::Interest;
+use tokio::net::UdpSocket;
+use tokio::sync::watch;
+use tokio::task::{JoinSet, yield_now};
+
+use crate::link::{Asker, Reply, source};
+use crate::server::connections::listener::ListenerContext;
+use crate::server::connections::live::Live;
+use crate::server::connections::reply_order::{Asked, Expected};
+use crate::server::reports::refused_request::RefusedRequest;
+use crate::server::requests::unit_server::{UnitServer, UnitSettings};
+use crate::server::rights::policy::{Policy, Rule};
+use crate::server::transports::framing::{Datagram, Mbap, Next, Rtu};
+
+/// Bytes per read of a socket. The system may deliver several datagrams of one peer at once.
+const INPUT_BYTES: usize = 64 * 1024;
+
+/// The most reads before other tasks run.
+const READS_PER_TURN: u32 = 16;
+
+/// The most reads of the remaining input when the listener stops.
+const MAX_LAST_READS: usize = 1024;
+
+/// The most requests of a listener that wait for devices.
+const MAX_PENDING_REPLIES: usize = 1024;
+
+/// The longest frame of any framing of datagrams.
+const MAX_FRAME_LEN: usize = mbap::MAX_LEN;
+
+const _: () = assert!(rtu::MAX_LEN <= MAX_FRAME_LEN);
+
+/// The framing of Modbus in a datagram.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DatagramFraming {
+    /// Modbus UDP: an MBAP header before the PDU.
+    Mbap,
+    /// RTU over UDP: an RTU frame.
+    Rtu,
+}
+
+/// A listener for Modbus datagrams.
+#[derive(Debug, Clone)]
+pub struct UdpSettings {
+    /// With port 0, the system picks a port. `[::]` also accepts IPv4 datagrams.
+    pub bind: SocketAddr,
+    pub framing: DatagramFraming,
+    pub rules: Vec<Rule>,
+    pub units: UnitSettings,
+}
+
+pub(crate) struct ModbusUdp {
+    unit_server: Arc<UnitServer>,
+    policy: Arc<Live<Policy>>,
+    framing: DatagramFraming,
+}
+
+impl ModbusUdp {
+    pub(crate) fn new(
+        framing: DatagramFraming,
+        policy: Arc<Live<Policy>>,
+        unit_server: Arc<UnitServer>,
+    ) -> ModbusUdp {
+        ModbusUdp { unit_server, policy, framing }
+    }
+
+    /// Answers datagrams until `stop`, then those that the system has already received.
+    pub(crate) async fn serve(
+        self,
+        context: Arc<ListenerContext>,
+        socket: std::net::UdpSocket,
+        stop: watch::Receiver<bool>,
+    ) {
+        match self.framing {
+            DatagramFraming::Mbap => self.serve_framed::<Mbap>(&context, socket, stop).await,
+            DatagramFraming::Rtu => self.serve_framed::<Rtu>(&context, socket, stop).await,
+        }
+    }
+
+    async fn serve_framed<D: Datagram>(
+        &self,
+        context: &ListenerContext,
+        socket: std::net::UdpSocket,
+        mut stop: watch::Receiver<bool>,
+    ) {
+        let Ok(state) = UdpSocketState::new((&socket).into()) else { return };
+        let Ok(socket) = UdpSocket::from_std(socket) else { return };
+        let socket = Datagrams { socket, state };
+        let mut input = vec![0; INPUT_BYTES].into_boxed_slice();
+        let mut later = Later { source: source(), replies: JoinSet::new() };
+        let mut turns = 0;
+        loop {
+            turns += 1;
+            if turns == READS_PER_TURN {
+                turns = 0;
+                // Datagrams that never pause leave time for connections, and for `stop`.
+                yield_now().await;
+            }
+            let ready = tokio::select! {
+                biased;
+                _ = stop.wait_for(|stop| *stop) => break,
+                Some(Ok(completed)) = later.replies.join_next(), if !later.replies.is_empty() => {
+                    self.complete::<D>(context, &socket, completed);
+                    continue;
+                }
+                ready = socket.socket.readable() => ready,
+            };
+            // An error reports that an earlier reply was not delivered.
+            let received = ready.and_then(|()| {
+                socket.socket.try_io(Interest::READABLE, || socket.receive(&mut input))
+            });
+            if let Ok(meta) = received {
+                self.take::<D>(context, &socket, &meta, &input, &mut later);
+            }
+        }
+        for _ in 0..MAX_LAST_READS {
+            match socket.receive(&mut input) {
+                Ok(meta) => self.take::<D>(context, &socket, &meta, &input, &mut later),
+                Err(error) if error.kind() == ErrorKind::WouldBlock => break,
+                Err(_) => {}
+            }
+        }
+        // The engine drops listeners whose devices take too long.
+        while let Some(Ok(completed)) = later.replies.join_next().await {
+            self.complete::<D>(context, &socket, completed);
+        }
+    }
+
+    /// Answers all datagrams of one read. All have the same length, except the last.
+    fn take<D: Datagram>(
+        &self,
+        context: &ListenerContext,
+        socket: &Datagrams,
+        meta: &RecvMeta,
+        input: &[u8],
+        later: &mut Later,
+    ) {
+        let mut output = [0; MAX_FRAME_LEN];
+        let mut rest = &input[..meta.len];
+        loop {
+            let (datagram, more) = rest.split_at(meta.stride.min(rest.len()));
+            let len = self.answer::<D>(context, meta, datagram, &mut output, later);
+            if len > 0 {
+                socket.send(&output[..len], meta);
+            }
+            if more.is_empty() || datagram.is_empty() {
+                return;
+            }
+            rest = more;
+        }
+    }
+
+    /// Sends the reply of a device.
+    fn complete<D: Datagram>(
+        &self,
+        context: &ListenerContext,
+        socket: &Datagrams,
+        Completed { asked, meta, reply }: Completed,
+    ) {
+        let reply = asked.count(&self.unit_server, reply);
+        let (tag, unit_id) = (asked.tag, asked.unit_id);
+        asked.record(context, Some(&meta.addr.into()), &reply);
+        let pdu = &reply.pdu[..];
+        if !pdu.is_empty() {
+            let mut frame = [0; MAX_FRAME_LEN];
+            frame[D::HEADER_LEN..][..pdu.len()].copy_from_slice(pdu);
+            let len = D::complete(&mut frame, tag, unit_id, pdu.len());
+            socket.send(&frame[..len], &meta);
+        }
+    }
+
+    /// Returns the length of the reply, 0 when there is none, or none yet.
+    fn answer<D: Datagram>(
+        &self,
+        context: &ListenerContext,
+        meta: &RecvMeta,
+        datagram: &[u8],
+        output: &mut [u8; MAX_FRAME_LEN],
+        later: &mut Later,
+    ) -> usize {
+        let peer = meta.addr;
+        let Some(rights) = self.policy.get().rights(peer.ip(), None) else {
+            context.refuse_source(peer);
+            return 0;
+        };
+        let (tag, unit_id, request) = match D::only(datagram) {
+            Next::Request { tag, unit_id, pdu, .. } => (tag, unit_id, pdu),
+            Next::Foreign { .. } => {
+                self.unit_server.discard(|frames| &frames.foreign);
+                return 0;
+            }
+            Next::Damaged { .. } => {
+                self.unit_server.discard(|frames| &frames.damaged);
+                return 0;
+            }
+            Next::Broken | Next::Incomplete | Next::Stray { .. } => {
+                self.unit_server.discard(|frames| &frames.broken);
+                return 0;
+            }
+        };
+        let Some(buffer) = output[D::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
+            return 0;
+        };
+        if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
+            let waiting = later.replies.len();
+            let asker = Asker { source: later.source, peer: Some(peer.ip()), waiting };
+            let asked = Asked::send(context, (tag, unit_id, request), |permitted| {
+                if waiting >= MAX_PENDING_REPLIES {
+                    return Err(ExceptionCode::ServerDeviceBusy);
+                }
+                self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted)
+            });
+            let (asked, reply, refused) = asked;
+            note_refused(context, refused, peer);
+            return match reply {
+                Expected::Pending(pending) => {
+                    let meta = *meta;
+                    later
+                        .replies
+                        .spawn(async move { Completed { asked, meta, reply: pending.await.ok() } });
+                    0
+                }
+                Expected::Known(reply) => {
+                    asked.record(context, Some(&peer.into()), &reply);
+                    buffer[..reply.pdu.len()].copy_from_slice(&reply.pdu);
+                    D::complete(output, tag, unit_id, reply.pdu.len())
+                }
+            };
+        }
+        let ours = (&*self.unit_server, &*rights);
+        let (len, refused) = context.answer(ours, Some(&peer.into()), unit_id, request, buffer);
+        note_refused(context, refused, peer);
+        len.map_or(0, |len| D::complete(output, tag, unit_id, len))
+    }
+}
+
+/// Requests to devices, whose replies come later.
+struct Later {
+    source: u64,
+    replies: JoinSet<Completed>,
+}
+
+/// A request to a device, with its reply; `None` when the link has ended.
+struct Completed {
+    asked: Asked,
+    meta: RecvMeta,
+    reply: Option<Reply>,
+}
+
+fn note_refused(context: &ListenerContext, refused: Option<RefusedRequest>, peer: SocketAddr) {
+    if let Some(refused) = refused {
+        context.refuse_request(refused, Some(peer.into()));
+    }
+}
+
+/// A socket that reports the local address of each datagram.
+struct Datagrams {
+    socket: UdpSocket,
+    state: UdpSocketState,
+}
+
+impl Datagrams {
+    fn receive(&self, input: &mut [u8]) -> io::Result<RecvMeta> {
+        let mut meta = [RecvMeta::default()];
+        self.state.recv((&self.socket).into(), &mut [IoSliceMut::new(input)], &mut meta)?;
+        Ok(meta[0])
+    }
+
+    /// A reply that the system does not accept is lost, as any datagram can be.
+    fn send(&self, reply: &[u8], to: &RecvMeta) {
+        let transmit = Transmit {
+            destination: to.addr,
+            ecn: None,
+            contents: reply,
+            segment_size: None,
+            src_ip: to.dst_ip,
+        };
+        // Sends directly by the system: the runtime may not know yet that the socket is writable.
+        if self.state.try_send((&self.socket).into(), &transmit).is_err() {
+            // The request may have been sent to a broadcast address, which cannot be the source of
+            // a reply.
+            let _ = SockRef::from(&self.socket).send_to(reply, &to.addr.into());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use holdfast_memory::{Area, Layout, Memory, Span};
+
+    use super::*;
+    use crate::server::connections::listener::bind_udp;
+    use crate::server::requests::identity::Identity;
+    use crate::server::rights::functions::{AccessMode, Functions};
+
+    #[test]
+    fn other_tasks_run_between_many_datagrams_that_have_arrived() {
+        const DATAGRAMS: usize = 100;
+        let span = Span::new(0, 10).unwrap();
+        let layout = Layout::default().with(Area::HoldingRegisters, span);
+        let rule = Rule {
+            sources: vec!["127.0.0.1/32".parse().unwrap()],
+            roles: None,
+            units: vec![(1, Arc::new(Memory::new(layout, None).unwrap()))],
+            elsewhere: Vec::new(),
+            access: AccessMode::ReadOnly,
+            functions: Functions::All,
+            narrowed: Vec::new(),
+        };
+        let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
+        let identity = Identity::new(&objects, &[]).unwrap();
+        let unit_server = Arc::new(UnitServer::new(identity, UnitSettings::default()));
+        let policy = Arc::new(Live::new(Policy::of(&[rule])));
+        let service = ModbusUdp::new(DatagramFraming::Mbap, policy, Arc::clone(&unit_server));
+        let socket = bind_udp("127.0.0.1:0".parse().unwrap()).unwrap();
+        let client = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+        client.connect(socket.local_addr().unwrap()).unwrap();
+        for _ in 0..DATAGRAMS {
+            client.send(&[0, 0, 0, 0, 0, 6, 1, 3, 0, 0, 0, 1]).unwrap();
+        }
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let (_engine, stop) = watch::channel(false);
+        let read = || unit_server.counters.requests().map(|(_, count)| count).sum::<u64>();
+        let most = runtime.block_on(async {
+            let context = Arc::new(ListenerContext::for_tests());
+            let _serving = tokio::spawn(service.serve(context, socket, stop));
+            let (mut most, mut before) = (0, 0);
+            while before < DATAGRAMS as u64 {
+                yield_now().await;
+                most = most.max(read() - before);
+                before = read();
+            }
+            most
+        });
+        assert!(most <= u64::from(READS_PER_TURN), "{most} without a pause");
+    }
+}

@@ -1,0 +1,156 @@
+//! Verifies the certificates of clients, for a server.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use rustls::pki_types::{CertificateDer, UnixTime};
+use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
+use rustls::{CertificateError, DistinguishedName, Error, OtherError};
+
+use super::TlsFailure;
+use super::certificate::{Parsed, Purpose};
+use super::doubts::Doubts;
+use super::files::FileError;
+use super::notes::{Chain, noted};
+use super::provider::handshake_signatures;
+use super::revocation::{List, Lists};
+use super::server_files::{Protocol, ServerFiles};
+use super::verification::{Listed, Trust};
+
+/// Verifies the certificates of clients.
+#[derive(Debug)]
+pub(super) struct Clients {
+    trust: Trust,
+    subjects: Vec<DistinguishedName>,
+    /// The allowed roles; `None` is any.
+    roles: Option<Vec<String>>,
+}
+
+impl Clients {
+    /// `None`: clients need no certificate.
+    pub(super) fn load(
+        files: &ServerFiles,
+        doubts: &mut Doubts<'_>,
+    ) -> Result<Option<Clients>, FileError> {
+        let ca_key = files.protocol.ca_key();
+        let Some(ca_file) = &files.ca_file else {
+            return may_lack_authorities(files).map(|()| None);
+        };
+        let listed = listed(ca_file)?;
+        let subjects = listed.iter().filter_map(Listed::subject).collect();
+        doubts.of_listed(ca_file, &listed);
+        let lists = match &files.crl_file {
+            Some(file) if !listed.iter().any(Listed::is_authority) => {
+                let flaw = format!("crl_file requires an authority (CA:TRUE) in {ca_key}");
+                return Err(FileError::content(file, flaw));
+            }
+            Some(file) => {
+                let lists = List::of_file(file)?;
+                doubts.of_lists(file, &lists, &listed);
+                lists
+            }
+            None => Vec::new(),
+        };
+        let trust = Trust::new(listed, Lists { lists, expired: files.expired_lists });
+        Ok(Some(Clients { trust, subjects, roles: files.roles.clone() }))
+    }
+
+    /// Verifies the certificate of a client, its own first, and its role.
+    pub(super) fn judge(
+        &self,
+        chain: &[CertificateDer<'_>],
+        now: UnixTime,
+    ) -> Result<(), TlsFailure> {
+        let (own, intermediates) = chain.split_first().ok_or(TlsFailure::NoCertificate)?;
+        self.trust.judge(own, intermediates, Purpose::Client, now)?;
+        let role = Parsed::new(own).map_err(Error::from)?.role()?;
+        match &self.roles {
+            Some(allowed) if !allowed.contains(&role) => Err(TlsFailure::WrongRole { role }),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// # Errors
+/// The protocol, or another setting, requires the authorities of clients.
+fn may_lack_authorities(files: &ServerFiles) -> Result<(), FileError> {
+    let ca_key = files.protocol.ca_key();
+    if files.protocol == Protocol::Modbus {
+        let flaw = format!("found without {ca_key}, which Modbus/TCP Security requires");
+        return Err(FileError::content(&files.cert_file, flaw));
+    }
+    if let Some(file) = &files.crl_file {
+        let flaw = format!("found without {ca_key}, allowed: only with it");
+        return Err(FileError::content(file, flaw));
+    }
+    if files.roles.is_some() {
+        let flaw = format!("found with roles and without {ca_key}, allowed: roles only with it");
+        return Err(FileError::content(&files.cert_file, flaw));
+    }
+    Ok(())
+}
+
+/// Reads authorities and self-signed certificates. Any other certificate is a mistake.
+fn listed(file: &Path) -> Result<Arc<[Listed]>, FileError> {
+    let listed = Listed::of_file(file)?;
+    let is_mistake = |listed: &Listed| !listed.is_authority() && !listed.is_self_signed();
+    if let Some(index) = listed.iter().position(is_mistake) {
+        let flaw =
+            format!("certificate {}: neither an authority (CA:TRUE) nor self-signed", index + 1);
+        return Err(FileError::content(file, flaw));
+    }
+    Ok(listed)
+}
+
+impl ClientCertVerifier for Clients {
+    fn root_hint_subjects(&self) -> &[DistinguishedName] {
+        &self.subjects
+    }
+
+    fn verify_client_cert(
+        &self,
+        end_entity: &CertificateDer<'_>,
+        intermediates: &[CertificateDer<'_>],
+        now: UnixTime,
+    ) -> Result<ClientCertVerified, Error> {
+        let chain = std::iter::once(end_entity).chain(intermediates);
+        let chain: Chain = chain.map(|each| each.clone().into_owned()).collect();
+        noted(|notes| {
+            notes.chain = Some(Arc::clone(&chain));
+            notes.proved = Some(now);
+        });
+        self.judge(&chain, now).map_err(|failure| {
+            let refused = refused(&failure);
+            noted(|notes| notes.failure = Some(failure));
+            refused
+        })?;
+        Ok(ClientCertVerified::assertion())
+    }
+
+    handshake_signatures!();
+}
+
+/// The error with which rustls sends the alert for a failure (RFC 8446, 6.2).
+fn refused(failure: &TlsFailure) -> Error {
+    let error = match failure {
+        TlsFailure::Expired { .. }
+        | TlsFailure::NotYetValid { .. }
+        | TlsFailure::IssuerExpired { .. }
+        | TlsFailure::IssuerNotYetValid { .. } => CertificateError::Expired,
+        TlsFailure::Revoked => CertificateError::Revoked,
+        TlsFailure::UnknownIssuer
+        | TlsFailure::UnknownRevocation
+        | TlsFailure::ExpiredRevocationList { .. } => CertificateError::UnknownIssuer,
+        TlsFailure::WrongPurpose { .. }
+        | TlsFailure::WrongKeyUsage
+        | TlsFailure::UnsupportedCertificate { .. } => CertificateError::InvalidPurpose,
+        TlsFailure::BadCertificate
+        | TlsFailure::BadSignature
+        | TlsFailure::TwoRoles
+        | TlsFailure::RoleType
+        | TlsFailure::UnsupportedExtension => CertificateError::BadEncoding,
+        TlsFailure::WrongRole { .. } => CertificateError::ApplicationVerificationFailure,
+        other => return CertificateError::Other(OtherError(Arc::new(other.clone()))).into(),
+    };
+    error.into()
+}

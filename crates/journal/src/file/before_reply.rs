@@ -1,0 +1,134 @@
+//! With `sync` 0: steps are stored before they are answered.
+//!
+//! All steps that wait are carried out on shadows: memories that only this thread sees. That shows what they
+//! do and in which order. What differs then is stored in one transaction. After it, the same steps are
+//! carried out on the memories, and answered.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::time::Duration;
+
+use holdfast_memory::{Access, Action, Area, Memory, Outcome, Read, Refusal, Step};
+
+use super::error::FileError;
+use super::image::{Changes, PAGE_BYTES, Page};
+use super::queue::{Next, Queue, Waiting};
+use super::store::Store;
+
+pub(super) struct BeforeReply {
+    store: Store,
+    memories: Vec<Arc<Memory>>,
+    shadows: Vec<Arc<Memory>>,
+    /// The numbers of the memories in the file.
+    ids: Vec<u16>,
+    queue: Arc<Queue>,
+    retry: Duration,
+}
+
+impl BeforeReply {
+    pub fn new(
+        store: Store,
+        memories: Vec<Arc<Memory>>,
+        ids: Vec<u16>,
+        queue: Arc<Queue>,
+        retry: Duration,
+    ) -> BeforeReply {
+        let shadow = |memory: &Arc<Memory>| {
+            let shadow = Memory::new(memory.layout(), memory.gate());
+            Arc::new(shadow.expect("the memory has this layout and gate"))
+        };
+        let shadows = memories.iter().map(shadow).collect();
+        BeforeReply { store, memories, shadows, ids, queue, retry }
+    }
+
+    pub fn run(mut self) -> Result<(), FileError> {
+        self.restore_shadows();
+        loop {
+            match self.queue.next(self.store.in_doubt().then_some(self.retry)) {
+                Next::Steps(steps) => self.carry_out(steps),
+                // The status has the error, and the next attempt may succeed.
+                Next::Idle => drop(self.store.store(Changes::default())),
+                Next::Stop => return self.store.close(),
+            }
+        }
+    }
+
+    fn carry_out(&mut self, steps: Vec<Waiting>) {
+        let mut touched = BTreeSet::new();
+        let mut outcomes: Vec<Outcome> = Vec::with_capacity(steps.len());
+        for Waiting { step, .. } in &steps {
+            let outcome = step.carry_out(&self.shadows);
+            // A refused step has changed nothing.
+            if outcome.is_ok() {
+                self.touch(step, &mut touched);
+            }
+            outcomes.push(outcome);
+        }
+        let pages = touched.into_iter().filter_map(|place| self.changed(place)).collect();
+        // The memories have not changed yet: only the shadows are ahead.
+        if self.store.store(Changes { pages, ..Changes::default() }).is_err() {
+            self.restore_shadows();
+            return self.queue.refuse(steps.into_iter().map(|each| each.done), Refusal::NotStored);
+        }
+        for (Waiting { step, done, since }, expected) in steps.into_iter().zip(outcomes) {
+            // The disk may have taken its time.
+            let outcome = step.carry_out_late(&self.memories, Some(since.elapsed()));
+            debug_assert_eq!(outcome, expected, "a step does the same to equal memories");
+            done(outcome);
+        }
+    }
+
+    /// Notes the pages that a step writes.
+    fn touch(&self, step: &Step, touched: &mut BTreeSet<Place>) {
+        let mut note = |member: u16, area: Area, address: u16, count: usize| {
+            let memory = &self.shadows[usize::from(member)];
+            let first = usize::from(address - memory.span(area).start());
+            let items = items_of_a_page(area);
+            let numbers = first / items..=(first + count - 1) / items;
+            touched.extend(numbers.map(|number| Place { member, area, number: number as u16 }));
+        };
+        match &step.action {
+            Action::Write(writes) => {
+                for write in writes {
+                    note(write.member, write.area, write.address, write.count);
+                }
+            }
+            &Action::Mask { member, area, address, .. } => note(member, area, address, 1),
+            Action::WriteThenRead { write, .. } => {
+                note(write.member, write.area, write.address, write.count);
+            }
+        }
+    }
+
+    /// A page of a shadow, unless it is in the file already.
+    fn changed(&self, Place { member, area, number }: Place) -> Option<Page> {
+        let (shadow, memory) = (&self.shadows[usize::from(member)], self.ids[usize::from(member)]);
+        let (span, items) = (shadow.span(area), items_of_a_page(area));
+        let first = usize::from(number) * items;
+        let count = items.min(span.size() as usize - first);
+        let mut bytes = vec![0; area.byte_len(count)];
+        let address = span.start() + first as u16;
+        let read = Read { area, address, count, out: &mut bytes };
+        shadow.read(Access::Ingest, read).expect("the page is in the area");
+        let page = Page { memory, area: area as u8, number, bytes };
+        (!self.store.image().has(&page)).then_some(page)
+    }
+
+    fn restore_shadows(&mut self) {
+        for (shadow, contents) in self.shadows.iter().zip(Memory::contents(&self.memories)) {
+            shadow.restore(&contents);
+        }
+    }
+}
+
+/// Where a page is.
+#[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Place {
+    member: u16,
+    area: Area,
+    number: u16,
+}
+
+fn items_of_a_page(area: Area) -> usize {
+    if area.is_bits() { PAGE_BYTES * 8 } else { PAGE_BYTES / 2 }
+}

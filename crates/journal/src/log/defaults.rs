@@ -1,0 +1,38 @@
+//! The settings of a log that are not given. Each number is beside the rule that uses it.
+
+use std::time::Duration;
+
+use super::parts::comparer::DIGEST_EVERY;
+use super::parts::recovery::REJOIN_AFTER;
+use super::parts::snapshotter::{SNAPSHOT_AFTER, SNAPSHOT_STEPS};
+use super::settings::{Login, Servers, Settings, WhenBehind};
+use super::shared::MAX_QUEUE_STEPS;
+use super::stream::connection::CONNECT_TIMEOUT;
+use super::stream::server_lag::MAX_CUT_OFF;
+
+impl Settings {
+    pub fn new(name: &str, node: &str, urls: Vec<String>) -> Settings {
+        Settings {
+            name: name.to_owned(),
+            node: node.to_owned(),
+            servers: Servers {
+                urls,
+                login: Login::None,
+                tls: None,
+                connect_timeout: CONNECT_TIMEOUT,
+            },
+            replicas: 1,
+            write_timeout: Duration::from_secs(1),
+            when_behind: WhenBehind::Serve,
+            max_lag: Duration::from_secs(5),
+            snapshot_steps: SNAPSHOT_STEPS,
+            snapshot_after: SNAPSHOT_AFTER,
+            digest_every: DIGEST_EVERY,
+            queue: MAX_QUEUE_STEPS,
+            rejoin_after: Some(REJOIN_AFTER),
+            memory_file: None,
+            max_cut_off: MAX_CUT_OFF,
+            answers_early: false,
+        }
+    }
+}

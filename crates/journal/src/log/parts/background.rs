@@ -1,0 +1,43 @@
+//! Work that takes long, beside a session: it reports its result to the session.
+
+use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
+
+use crate::log::stream::store::{Pointer, Store};
+
+/// The result of work in the background.
+pub(in crate::log) enum Report {
+    /// Whether this node may take a snapshot.
+    Leased(bool),
+    /// The revision of the snapshot's key, or why there is none.
+    Stored(Result<(u64, Pointer), String>),
+    /// The digest that the log leads to.
+    Replayed { sequence: u64, digest: Result<String, String> },
+}
+
+/// Runs work on the store of one session.
+pub(in crate::log) struct Background {
+    store: Store,
+    reports: UnboundedSender<Report>,
+}
+
+impl Background {
+    pub(in crate::log) fn new(store: Store) -> (Background, UnboundedReceiver<Report>) {
+        let (reports, reported) = unbounded_channel();
+        (Background { store, reports }, reported)
+    }
+
+    pub(in crate::log) fn store(&self) -> &Store {
+        &self.store
+    }
+
+    pub(in crate::log) fn spawn<F>(&self, work: impl FnOnce(Store) -> F)
+    where
+        F: Future<Output = Report> + Send + 'static,
+    {
+        let (work, reports) = (work(self.store.clone()), self.reports.clone());
+        tokio::spawn(async move {
+            // Fails if the session has ended. The next one reads the store anew.
+            let _ = reports.send(work.await);
+        });
+    }
+}

@@ -1,0 +1,172 @@
+//! Digests of this node and of the others: when they are compared, and what a difference leads to.
+
+use std::sync::Arc;
+
+use holdfast_memory::Memory;
+use serde::{Deserialize, Serialize};
+
+use crate::log::digests::{Digests, Verdict};
+use crate::log::error::{End, LogError};
+use crate::log::follower::digest_at;
+use crate::log::layout::copies;
+use crate::log::parts::background::{Background, Report};
+use crate::log::settings::{Settings, is_word};
+use crate::log::shared::Shared;
+use crate::log::state::State;
+use crate::log::status::{Digest, Event};
+use crate::log::stream::store::{DIGEST_KEY_PREFIX, Pointer};
+
+/// Nodes compare their digests at sequences that are multiples of this.
+pub(in crate::log) const DIGEST_EVERY: u64 = 10_000;
+
+/// The length of a digest as text.
+const DIGEST_CHARS: usize = 64;
+
+/// Compares the digests of all nodes.
+pub(in crate::log) struct Comparer {
+    settings: Arc<Settings>,
+    shared: Arc<Shared>,
+    digests: Digests,
+    is_replaying: bool,
+}
+
+/// What a node stores as its digest.
+#[derive(Serialize, Deserialize)]
+struct Published {
+    sequence: u64,
+    digest: String,
+}
+
+/// What a replay of the log says about the digest of this node.
+pub(in crate::log) enum Replayed {
+    Agrees,
+    /// This node has forgotten its digest, or had none.
+    Unknown,
+    Failed,
+}
+
+impl Comparer {
+    pub(in crate::log) fn new(settings: &Arc<Settings>, shared: &Arc<Shared>) -> Comparer {
+        let digests = Digests::new(&settings.node);
+        let (settings, shared) = (Arc::clone(settings), Arc::clone(shared));
+        Comparer { settings, shared, digests, is_replaying: false }
+    }
+
+    /// A replay ends with the session that has begun it.
+    pub(in crate::log) fn begin_session(&mut self) {
+        self.is_replaying = false;
+    }
+
+    /// What was compared before is void: the contents were wrong.
+    pub(in crate::log) fn forget(&mut self) {
+        self.digests = Digests::new(&self.settings.node);
+    }
+
+    /// Whether all nodes compare their digests at this sequence, although none of them asks for it.
+    pub(in crate::log) fn is_due(&self, sequence: u64) -> bool {
+        sequence.is_multiple_of(self.settings.digest_every)
+    }
+
+    /// Stores the digest of this node for the others, and compares it.
+    pub(in crate::log) fn publish(
+        &mut self,
+        background: &Background,
+        sequence: u64,
+        digest: &str,
+    ) -> Verdict {
+        let published = Published { sequence, digest: digest.to_owned() };
+        if let Ok(value) = serde_json::to_vec(&published) {
+            let keys = background.store().keys.clone();
+            let key = format!("{DIGEST_KEY_PREFIX}{}", self.settings.node);
+            // If this fails, other nodes see the next digest.
+            tokio::spawn(async move { keys.put(key, value.into()).await.map(drop) });
+        }
+        let own = Digest { sequence, digest: digest.to_owned(), agrees: None };
+        self.shared.update(|view| view.digest = Some(own));
+        self.digests.add(&self.settings.node, sequence, digest)
+    }
+
+    /// Compares the digest of another node. `None` if that is not one.
+    pub(in crate::log) fn receive(
+        &mut self,
+        state: &State,
+        key: &str,
+        value: &[u8],
+    ) -> Option<(u64, Verdict)> {
+        let node = key.strip_prefix(DIGEST_KEY_PREFIX).unwrap_or_default();
+        let Published { sequence, digest } = serde_json::from_slice(value).ok()?;
+        let is_digest = is_word(node) && digest.len() == DIGEST_CHARS;
+        // Anyone may write the key. Only nodes that have sent a message have a vote.
+        if !is_digest || node == self.settings.node || !state.knows(node) {
+            return None;
+        }
+        let verdict = self.digests.add(node, sequence, &digest);
+        self.shared.update_node(node, |node| node.digest = Some((sequence, digest)));
+        Some((sequence, verdict))
+    }
+
+    /// Shows in the status whether other nodes have the same digest.
+    pub(in crate::log) fn show(&self, sequence: u64, agrees: bool) {
+        self.shared.update(|view| {
+            if let Some(digest) = view.digest.as_mut().filter(|digest| digest.sequence == sequence)
+            {
+                digest.agrees = Some(agrees);
+            }
+        });
+    }
+
+    /// The error of a node whose contents are wrong.
+    pub(in crate::log) fn differs(&self, sequence: u64, other: String) -> End {
+        let found = self.digests.own(sequence).unwrap_or_default().to_owned();
+        LogError::Differs { sequence, found, other }.into()
+    }
+
+    /// Finds out what the log leads to, beside the session: no majority of nodes says it. Returns
+    /// whether that has begun.
+    pub(in crate::log) fn replay(
+        &mut self,
+        background: &Background,
+        pointer: Option<&Pointer>,
+        members: &[Arc<Memory>],
+        sequence: u64,
+    ) -> bool {
+        let Some(pointer) = pointer.cloned() else { return false };
+        if std::mem::replace(&mut self.is_replaying, true) {
+            return false;
+        }
+        // The memories themselves go on with the session.
+        let members = copies(members);
+        background.spawn(|store| async move {
+            let digest = match members {
+                Ok(members) => digest_at(&store, &pointer, members, sequence).await,
+                Err(error) => Err(error.to_string()),
+            };
+            Report::Replayed { sequence, digest }
+        });
+        true
+    }
+
+    /// A replay has ended.
+    ///
+    /// # Errors
+    /// [`LogError::Differs`] if the log leads to other contents than those of this node.
+    pub(in crate::log) fn replayed(
+        &mut self,
+        sequence: u64,
+        digest: Result<String, String>,
+    ) -> Result<Replayed, End> {
+        self.is_replaying = false;
+        match digest {
+            Ok(digest) => match self.digests.own(sequence) {
+                None => Ok(Replayed::Unknown),
+                Some(own) if own == digest => Ok(Replayed::Agrees),
+                Some(_) => Err(self.differs(sequence, format!("the log leads to {digest}"))),
+            },
+            Err(reason) => {
+                let fields = [("sequence", &*sequence.to_string()), ("reason", &reason)];
+                self.shared.event(Event::new("log_replay_failed", &fields));
+                Ok(Replayed::Failed)
+            }
+        }
+    }
+}

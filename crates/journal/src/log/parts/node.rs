@@ -1,0 +1,120 @@
+//! A node of a log: the parts that outlast a session, and what they owe to others meanwhile.
+//!
+//! | part | decides |
+//! | --- | --- |
+//! | [`Applier`] | what a message of the stream does |
+//! | [`Sender`] | what is sent, and the outcome that writers see |
+//! | [`Snapshotter`] | when a snapshot is taken and stored |
+//! | [`Comparer`] | whether digests of nodes agree |
+//! | [`Recovery`] | whether the contents are right |
+//! | [`ServerLag`] | whether the servers have lost messages |
+//!
+//! The parts do not know each other. A session passes on what one of them finds out.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use holdfast_memory::Memory;
+
+use crate::log::error::{End, LogError};
+use crate::log::parts::applier::Applier;
+use crate::log::parts::comparer::Comparer;
+use crate::log::parts::note::Note;
+use crate::log::parts::recovery::Recovery;
+use crate::log::parts::sender::Sender;
+use crate::log::parts::snapshotter::Snapshotter;
+use crate::log::settings::Settings;
+use crate::log::shared::{Checkpoint, Shared};
+use crate::log::stream::server_lag::ServerLag;
+
+/// How often deadlines are checked.
+pub(in crate::log) const CHECK_INTERVAL: Duration = Duration::from_millis(20);
+
+/// What lasts from one session to the next.
+pub(in crate::log) struct Node {
+    pub(in crate::log) settings: Arc<Settings>,
+    pub(in crate::log) shared: Arc<Shared>,
+    /// The layout of the memories.
+    pub(in crate::log) fingerprint: String,
+    pub(in crate::log) applier: Applier,
+    pub(in crate::log) sender: Sender,
+    pub(in crate::log) snapshotter: Snapshotter,
+    pub(in crate::log) comparer: Comparer,
+    pub(in crate::log) recovery: Recovery,
+    pub(in crate::log) lag: ServerLag,
+}
+
+impl Node {
+    pub(in crate::log) fn new(
+        settings: Arc<Settings>,
+        fingerprint: String,
+        shared: Arc<Shared>,
+        members: Vec<Arc<Memory>>,
+    ) -> Node {
+        Node {
+            applier: Applier::new(&settings, &shared, members),
+            sender: Sender::new(&settings, &shared),
+            snapshotter: Snapshotter::new(&settings, &shared),
+            comparer: Comparer::new(&settings, &shared),
+            recovery: Recovery::new(&settings, &shared),
+            lag: ServerLag::new(settings.max_cut_off),
+            fingerprint,
+            settings,
+            shared,
+        }
+    }
+
+    /// Begins with the contents of the file.
+    ///
+    /// # Errors
+    /// [`LogError::Snapshot`] if they are not those of the note.
+    pub(in crate::log) fn resume(&mut self, note: Note) -> Result<(), LogError> {
+        self.applier.resume(note)
+    }
+
+    pub(in crate::log) fn begin_session(&mut self) {
+        self.lag.begin_session();
+        self.snapshotter.begin_session();
+        self.comparer.begin_session();
+    }
+
+    /// The contents are wrong: the next session loads a snapshot.
+    pub(in crate::log) fn drop_contents(&mut self, error: LogError) {
+        self.comparer.forget();
+        self.recovery.drop_contents(error);
+    }
+
+    /// What the file is to keep, unless the contents are wrong or not there yet.
+    pub(in crate::log) fn checkpoint(&self) -> Option<Checkpoint> {
+        self.applier.checkpoint().filter(|_| self.recovery.is_right())
+    }
+
+    /// What has to be done in time, whatever this node waits for: the file is given what it asks for, and
+    /// writers learn that their steps were not confirmed.
+    pub(in crate::log) fn keep_deadlines(&mut self, now: Instant) {
+        // While a snapshot is loaded, the file waits.
+        if self.shared.is_checkpoint_requested() && self.applier.has_contents() {
+            self.shared.give_checkpoint(self.checkpoint());
+        }
+        self.sender.expire(now);
+    }
+
+    /// Waits for something, and meanwhile keeps the deadlines.
+    pub(in crate::log) async fn run_with_expiry<T>(
+        &mut self,
+        work: impl Future<Output = T>,
+    ) -> Result<T, End> {
+        let mut work = std::pin::pin!(work);
+        loop {
+            tokio::select! {
+                done = &mut work => return Ok(done),
+                () = tokio::time::sleep(CHECK_INTERVAL) => {
+                    self.keep_deadlines(Instant::now());
+                    if self.shared.is_stopping() {
+                        return Err(End::Stopped);
+                    }
+                }
+            }
+        }
+    }
+}

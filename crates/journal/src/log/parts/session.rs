@@ -1,0 +1,375 @@
+//! A session: one connection to the servers.
+//!
+//! It reads the stream from what was applied last, sends steps, and passes on what one part of the
+//! [`Node`] finds out to the others. It ends at the first doubt, with all that the client has not sent.
+
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use async_nats::jetstream::{self, Context, kv};
+use async_nats::{Client, Subscriber};
+use futures_util::StreamExt;
+use tokio::sync::mpsc::UnboundedReceiver;
+use tokio::time::MissedTickBehavior;
+
+use crate::log::digests::Verdict;
+use crate::log::error::End;
+use crate::log::parts::background::{Background, Report};
+use crate::log::parts::comparer::Replayed;
+use crate::log::parts::join::join;
+use crate::log::parts::node::{CHECK_INTERVAL, Node};
+use crate::log::parts::sender::Publisher;
+use crate::log::state::{Applied, digest_of};
+use crate::log::status::{Event, Phase};
+use crate::log::stream::connection::{Connected, connect};
+use crate::log::stream::messages::Messages;
+use crate::log::stream::raw_message::Received;
+use crate::log::stream::store::{DIGEST_KEY_PREFIX, SNAPSHOT_KEY, Store, parsed};
+
+/// The most further messages that are applied before steps are sent.
+const MAX_FURTHER_MESSAGES: usize = 255;
+
+/// How long requests to JetStream may take.
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(3);
+
+/// The shortest heartbeat that a consumer is asked for.
+const MIN_HEARTBEAT: Duration = Duration::from_millis(200);
+
+struct Session<'n> {
+    node: &'n mut Node,
+    publisher: Publisher,
+    background: Background,
+    catch_up: CatchUp,
+    began: Instant,
+    last_applied: Instant,
+    /// The last sequence of the stream when the session began.
+    stream_end: u64,
+}
+
+/// Whether this node has applied all that the log had when the session began.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum CatchUp {
+    /// It reads the stream. Nothing was sent in this session.
+    Reading,
+    /// When its message with this counter is applied, it has caught up.
+    Announced {
+        counter: u64,
+    },
+    CaughtUp,
+}
+
+/// What a session waits for.
+struct Sources {
+    connected: Connected,
+    messages: Messages,
+    acks: Subscriber,
+    watch: kv::Watch,
+    reports: UnboundedReceiver<Report>,
+}
+
+/// Runs a session. Returns why it has ended, and whether the node had caught up.
+pub(in crate::log) async fn run(node: &mut Node) -> (End, bool) {
+    node.begin_session();
+    match Session::open(node).await {
+        Ok((mut session, sources)) => {
+            let Err(end) = session.serve(sources).await;
+            (end, session.catch_up == CatchUp::CaughtUp)
+        }
+        Err(end) => (end, false),
+    }
+}
+
+impl<'n> Session<'n> {
+    /// Connects, and loads a snapshot if that is needed.
+    async fn open(node: &'n mut Node) -> Result<(Session<'n>, Sources), End> {
+        let settings = Arc::clone(&node.settings);
+        let name = format!("holdfast log {} {}", settings.name, settings.node);
+        let connected = node.run_with_expiry(connect(&settings.servers, name)).await??;
+        let store = open_store(node, &connected.client).await?;
+        let from = join(node, &store).await?;
+        mend_keys(node, &store).await?;
+        let messages = Messages::new(&store, from);
+        let publisher = Publisher::new(connected.client.clone(), &settings);
+        let acks = node.run_with_expiry(publisher.acknowledgements()).await??;
+        let watched = [SNAPSHOT_KEY.to_owned(), format!("{DIGEST_KEY_PREFIX}>")];
+        let watch = node.run_with_expiry(store.keys.watch_many_with_history(watched)).await?;
+        let watch = watch.map_err(|error| End::lost("subscribe", error))?;
+        let info = store.stream.cached_info();
+        let (stream_end, replicas) = (info.state.last_sequence, info.config.num_replicas);
+        let server = connected.server.clone();
+        node.shared.event(Event::new("log_connected", &[("server", &server)]));
+        node.shared.update(|view| {
+            view.server = Some(server);
+            view.replicas = replicas;
+        });
+        let (background, reports) = Background::new(store);
+        let (now, catch_up) = (Instant::now(), CatchUp::Reading);
+        let (began, last_applied) = (now, now);
+        let session =
+            Session { node, publisher, background, catch_up, began, last_applied, stream_end };
+        Ok((session, Sources { connected, messages, acks, watch, reports }))
+    }
+
+    async fn serve(&mut self, sources: Sources) -> Result<Infallible, End> {
+        let Sources { mut connected, mut messages, mut acks, mut watch, mut reports } = sources;
+        // Steps whose time is over are not sent again.
+        self.node.sender.expire(Instant::now());
+        self.announce().await?;
+        let mut checks = tokio::time::interval(CHECK_INTERVAL);
+        checks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            if messages.are_calm() {
+                self.consume(&mut messages).await?;
+            }
+            tokio::select! {
+                received = messages.next() => {
+                    self.receive(&received?)?;
+                    // What has arrived together is answered before steps are sent: writers that
+                    // were answered write again, and their steps become one batch.
+                    for _ in 0..MAX_FURTHER_MESSAGES {
+                        let Some(received) = messages.next_now() else { break };
+                        self.receive(&received?)?;
+                    }
+                    self.announce().await?;
+                    self.send_waiting().await?;
+                }
+                ack = acks.next() => self.node.sender.acknowledged(ack)?,
+                () = self.node.shared.arrived.notified() => self.send_waiting().await?,
+                entry = watch.next() => match entry {
+                    Some(Ok(entry)) => self.watched(&entry)?,
+                    Some(Err(error)) => return Err(End::lost("watching the keys of the log", error)),
+                    None => return Err(End::Lost("the watch of the keys has ended".to_owned())),
+                },
+                Some(report) = reports.recv() => self.reported(report).await?,
+                end = connected.end() => {
+                    // The message that has ended the connection comes next in the next session.
+                    while let Some(Ok(received)) = messages.next_now() {
+                        self.receive(&received)?;
+                    }
+                    return Err(end);
+                }
+                _ = checks.tick() => self.check().await?,
+            }
+        }
+    }
+
+    /// Lets a consumer deliver the next messages: all that were fetched lately are harmless.
+    async fn consume(&mut self, messages: &mut Messages) -> Result<(), End> {
+        let from = self.node.applier.sequence() + 1;
+        let heartbeat = (self.node.settings.silence() / 4).max(MIN_HEARTBEAT);
+        let consumer = self.background.store().consume(from, heartbeat);
+        messages.consume(self.node.run_with_expiry(consumer).await??);
+        Ok(())
+    }
+
+    /// Sends what was not confirmed before, and the message at which this node has caught up. A node
+    /// that has sent nothing yet first reads all that the log had when the session began.
+    async fn announce(&mut self) -> Result<(), End> {
+        let Session { node, publisher, .. } = self;
+        if self.catch_up != CatchUp::Reading {
+            return Ok(());
+        }
+        // Its start has to be behind all its starts in the log.
+        if !node.sender.has_started() && node.applier.sequence() < self.stream_end {
+            return Ok(());
+        }
+        let last_start = node.applier.state().last_start(&node.settings.node);
+        node.sender.ensure_start(last_start)?;
+        node.sender.resend(publisher).await?;
+        let compares = !node.recovery.is_right();
+        let counter = node.sender.send_probe(publisher, compares, self.began).await?;
+        self.catch_up = CatchUp::Announced { counter };
+        Ok(())
+    }
+
+    async fn send_waiting(&mut self) -> Result<(), End> {
+        self.node.sender.send_waiting(&mut self.publisher).await
+    }
+
+    /// Applies a message of the stream.
+    fn receive(&mut self, received: &Received) -> Result<(), End> {
+        let Node { applier, sender, .. } = &mut *self.node;
+        let applied = applier.receive(received, |origin| sender.first_sent(origin))?;
+        let Some(applied) = applied else { return Ok(()) };
+        self.last_applied = Instant::now();
+        let (mut compares, mut is_for_snapshot) = (false, false);
+        match applied {
+            Applied::Fresh { origin, compares: is_asked, outcomes } => {
+                compares = is_asked;
+                if let Some(counter) = self.node.sender.applied(&origin, outcomes)? {
+                    is_for_snapshot = self.node.snapshotter.is_requested_at(counter);
+                    self.applied_own(counter);
+                }
+            }
+            Applied::Stale(origin) => self.node.sender.check_start(&origin)?,
+            Applied::Ignored(_) => {}
+        }
+        let sequence = received.place.sequence;
+        if compares || self.node.comparer.is_due(sequence) {
+            self.compare(sequence, is_for_snapshot)?;
+        }
+        Ok(())
+    }
+
+    /// A message of this node was applied. Has it caught up?
+    fn applied_own(&mut self, counter: u64) {
+        if !matches!(self.catch_up, CatchUp::Announced { counter: at } if at <= counter) {
+            return;
+        }
+        self.catch_up = CatchUp::CaughtUp;
+        let Node { shared, applier, recovery, .. } = &mut *self.node;
+        shared.open(self.publisher.max_steps_bytes());
+        let sequence = applier.sequence();
+        shared.event(Event::new("log_caught_up", &[("sequence", &sequence.to_string())]));
+        if recovery.caught_up(sequence) {
+            shared.update(|view| {
+                view.phase = Phase::Running;
+                view.last_error = None;
+            });
+        }
+    }
+
+    /// Compares the contents of this node with those of the others.
+    fn compare(&mut self, sequence: u64, is_for_snapshot: bool) -> Result<(), End> {
+        let Node { applier, snapshotter, comparer, .. } = &mut *self.node;
+        let encoded = applier.state().encode();
+        let digest = digest_of(&encoded);
+        let verdict = comparer.publish(&self.background, sequence, &digest);
+        if is_for_snapshot {
+            snapshotter.prepare(applier.state(), encoded, digest);
+        }
+        self.judge(sequence, verdict)
+    }
+
+    /// Draws the consequences of a comparison.
+    fn judge(&mut self, sequence: u64, verdict: Verdict) -> Result<(), End> {
+        let Node { snapshotter, comparer, recovery, .. } = &mut *self.node;
+        match verdict {
+            Verdict::Alone => {}
+            Verdict::Agrees => {
+                snapshotter.store(&self.background, sequence);
+                recovery.confirm(sequence);
+                comparer.show(sequence, true);
+            }
+            Verdict::Differs(other) => {
+                return Err(comparer.differs(sequence, format!("most nodes have {other}")));
+            }
+            Verdict::Unclear(_) => {
+                snapshotter.dispute(sequence);
+                comparer.show(sequence, false);
+                if self.replay(sequence) {
+                    let at = sequence.to_string();
+                    self.node.shared.event(Event::new("log_digests_differ", &[("sequence", &at)]));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn replay(&mut self, sequence: u64) -> bool {
+        let Node { applier, snapshotter, comparer, .. } = &mut *self.node;
+        let members = &applier.state().members;
+        comparer.replay(&self.background, snapshotter.pointer(), members, sequence)
+    }
+
+    /// A key of the log was written.
+    fn watched(&mut self, entry: &kv::Entry) -> Result<(), End> {
+        let Node { applier, snapshotter, comparer, .. } = &mut *self.node;
+        if entry.key == SNAPSHOT_KEY {
+            snapshotter.learn(entry.revision, parsed(&entry.value)?);
+            return Ok(());
+        }
+        match comparer.receive(applier.state(), &entry.key, &entry.value) {
+            Some((sequence, verdict)) => self.judge(sequence, verdict),
+            None => Ok(()),
+        }
+    }
+
+    async fn reported(&mut self, report: Report) -> Result<(), End> {
+        match report {
+            Report::Leased(true) => {
+                let until = Instant::now() + self.node.settings.write_timeout;
+                let Node { sender, snapshotter, .. } = &mut *self.node;
+                let counter = sender.send_probe(&mut self.publisher, true, until).await?;
+                snapshotter.requested(counter);
+            }
+            Report::Leased(false) => self.node.snapshotter.postpone(),
+            Report::Stored(stored) => self.node.snapshotter.stored(stored),
+            Report::Replayed { sequence, digest } => self.replayed(sequence, digest)?,
+        }
+        Ok(())
+    }
+
+    fn replayed(&mut self, sequence: u64, digest: Result<String, String>) -> Result<(), End> {
+        let Node { snapshotter, comparer, recovery, .. } = &mut *self.node;
+        match comparer.replayed(sequence, digest)? {
+            Replayed::Agrees => {
+                snapshotter.store(&self.background, sequence);
+                recovery.confirm(sequence);
+            }
+            Replayed::Unknown => snapshotter.store(&self.background, sequence),
+            Replayed::Failed => recovery.postpone(),
+        }
+        // If that was it, it is being stored.
+        snapshotter.drop_disputed();
+        Ok(())
+    }
+
+    /// Does what is due.
+    async fn check(&mut self) -> Result<(), End> {
+        let now = Instant::now();
+        self.node.keep_deadlines(now);
+        self.node.shared.expire(now);
+        // Steps that were sent are still answered before the end.
+        if self.node.shared.is_stopping() && self.node.sender.is_idle() {
+            return Err(End::Stopped);
+        }
+        let silent = now.saturating_duration_since(self.last_applied.max(self.began));
+        // A server that is cut off from the stream may keep the connection open for long.
+        if silent > self.node.settings.silence() {
+            let seconds = silent.as_secs_f64();
+            return Err(End::Lost(format!("the log has confirmed nothing for {seconds:.1} s")));
+        }
+        self.prove_contact(now).await?;
+        self.send_waiting().await?;
+        let Node { applier, snapshotter, recovery, .. } = &mut *self.node;
+        snapshotter.store_undisputed(&self.background, now);
+        // Only a node that is up to date and sure of its contents takes a snapshot.
+        if recovery.is_right() && self.catch_up == CatchUp::CaughtUp {
+            snapshotter.consider(&self.background, applier.state(), now);
+        }
+        if let Some(sequence) = recovery.overdue(now) {
+            self.replay(sequence);
+        }
+        Ok(())
+    }
+
+    /// Sends a message if nothing was sent for a while: when it is applied, the contents are current.
+    async fn prove_contact(&mut self, now: Instant) -> Result<(), End> {
+        let settings = &self.node.settings;
+        let quiet = now.saturating_duration_since(self.publisher.last_sent());
+        if self.catch_up != CatchUp::Reading && quiet >= settings.tick() {
+            let until = now + settings.write_timeout;
+            self.node.sender.send_probe(&mut self.publisher, false, until).await?;
+        }
+        Ok(())
+    }
+}
+
+async fn open_store(node: &mut Node, client: &Client) -> Result<Store, End> {
+    let mut context: Context = jetstream::new(client.clone());
+    context.set_timeout(REQUEST_TIMEOUT);
+    let (settings, fingerprint) = (Arc::clone(&node.settings), node.fingerprint.clone());
+    node.run_with_expiry(Store::open(&context, &settings, &fingerprint, true)).await?
+}
+
+/// Anyone may write keys whose headers end the connection. They would end each session.
+async fn mend_keys(node: &mut Node, store: &Store) -> Result<(), End> {
+    let Some(pointer) = node.snapshotter.pointer().cloned() else { return Ok(()) };
+    if node.run_with_expiry(store.mend_keys(&pointer)).await?? {
+        let reason = "keys of the log that can't be read were replaced";
+        node.shared.event(Event::new("log_error", &[("reason", reason)]));
+    }
+    Ok(())
+}

@@ -1,0 +1,132 @@
+//! One connection to the servers. It is not made again: what it had not sent is lost with it, and
+//! is not sent later.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use async_nats::{Client, ConnectOptions, Event, ServerAddr};
+use tokio::sync::watch;
+
+use crate::log::error::{End, LogError};
+use crate::log::settings::{Login, Servers};
+
+/// The most commands that wait for the connection.
+const MAX_WAITING_COMMANDS: usize = 4096;
+
+/// How long one attempt to connect may take.
+pub(in crate::log) const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// How often the connection is tried, and how long requests may take.
+const PING_INTERVAL: Duration = Duration::from_secs(2);
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(3);
+
+/// After its end, a client waits for this time before it connects again. It is dropped before.
+const NO_RECONNECT_DELAY: Duration = Duration::from_secs(86_400);
+
+pub(in crate::log) struct Connected {
+    pub(in crate::log) client: Client,
+    pub(in crate::log) server: String,
+    ended: watch::Receiver<Option<String>>,
+}
+
+impl Connected {
+    /// Waits for the end of the connection.
+    pub(in crate::log) async fn end(&mut self) -> End {
+        match self.ended.wait_for(Option::is_some).await {
+            Ok(reason) => End::Lost(reason.clone().unwrap_or_default()),
+            Err(_) => End::Lost("the client has ended".to_owned()),
+        }
+    }
+}
+
+pub(in crate::log) async fn connect(servers: &Servers, name: String) -> Result<Connected, End> {
+    let mut addresses = Vec::new();
+    for url in &servers.urls {
+        let address: ServerAddr = url
+            .parse()
+            .map_err(|error| LogError::Settings(format!("servers: {url:?}: {error}")))?;
+        addresses.push(address);
+    }
+    let (sender, ended) = watch::channel(None);
+    let was_connected = Arc::new(AtomicBool::new(false));
+    let options = login(&servers.login).await?;
+    let options = match &servers.tls {
+        None => options,
+        Some(tls) => {
+            let options = options.require_tls(true);
+            let options = match &tls.ca {
+                Some(file) => options.add_root_certificates(readable(file)?),
+                None => options,
+            };
+            match &tls.own {
+                Some((cert, key)) => {
+                    options.add_client_certificate(readable(cert)?, readable(key)?)
+                }
+                None => options,
+            }
+        }
+    };
+    let connected_before = Arc::clone(&was_connected);
+    let options = options
+        .name(name)
+        .connection_timeout(servers.connect_timeout)
+        .request_timeout(Some(REQUEST_TIMEOUT))
+        .ping_interval(PING_INTERVAL)
+        .client_capacity(MAX_WAITING_COMMANDS)
+        .ignore_discovered_servers()
+        // The client would send what it has not sent before: writes that were refused meanwhile.
+        .reconnect_delay_callback(move |_| {
+            if connected_before.load(Ordering::Acquire) {
+                NO_RECONNECT_DELAY
+            } else {
+                Duration::ZERO
+            }
+        })
+        .event_callback(move |event| {
+            let reason = match event {
+                Event::Disconnected | Event::Closed => Some("the connection was lost".to_owned()),
+                // The next session finds another server before this one ends.
+                Event::LameDuckMode => Some("the server is about to stop".to_owned()),
+                _ => None,
+            };
+            if reason.is_some() {
+                sender.send_replace(reason);
+            }
+            std::future::ready(())
+        });
+    let client = options.connect(addresses).await.map_err(|error| End::lost("connect", error))?;
+    was_connected.store(true, Ordering::Release);
+    let info = client.server_info();
+    let server = format!("{}:{}", info.host, info.port);
+    Ok(Connected { client, server, ended })
+}
+
+async fn login(login: &Login) -> Result<ConnectOptions, LogError> {
+    let options = ConnectOptions::new();
+    Ok(match login {
+        Login::None => options,
+        Login::User { name, password_file } => {
+            let password = password_file.as_deref().map(secret).transpose()?.unwrap_or_default();
+            options.user_and_password(name.clone(), password)
+        }
+        Login::Token { file } => options.token(secret(file)?),
+        Login::Credentials { file } => {
+            options.credentials_file(file).await.map_err(|error| LogError::file(file, &error))?
+        }
+    })
+}
+
+fn secret(file: &Path) -> Result<String, LogError> {
+    let text = std::fs::read_to_string(file).map_err(|error| LogError::file(file, &error))?;
+    let text = text.strip_suffix('\n').unwrap_or(&text);
+    Ok(text.strip_suffix('\r').unwrap_or(text).to_owned())
+}
+
+/// The path of a file that can be read.
+fn readable(file: &Path) -> Result<PathBuf, LogError> {
+    // The client names no file in its errors.
+    std::fs::File::open(file).map_err(|error| LogError::file(file, &error))?;
+    Ok(file.to_owned())
+}

@@ -1,0 +1,206 @@
+//! Messages of a log: steps of one node that travel together, or none.
+//!
+//! A message begins with a mark and a version. Bytes without the mark were not sent by a node.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use holdfast_memory::{Memory, Step};
+use thiserror::Error;
+
+use crate::encoding::{self, DecodeError};
+use crate::log::settings::is_word;
+
+const MARK: [u8; 3] = *b"HFL";
+
+/// Of messages and snapshots, since both change together.
+pub(in crate::log) const VERSION: u8 = 1;
+
+/// The node that sent a message, and the number of the message.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Origin {
+    pub node: String,
+    /// Grows with each start of the node, in the order of the log.
+    pub start: u64,
+    /// Grows with each message of a start.
+    pub counter: u64,
+}
+
+impl Origin {
+    /// The value of the header `Nats-Msg-Id`.
+    pub(in crate::log) fn message_id(&self) -> String {
+        format!("{}/{}/{}", self.node, self.start, self.counter)
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(in crate::log) struct Message {
+    pub(in crate::log) origin: Origin,
+    /// Whether all nodes compare their contents here.
+    pub(in crate::log) compares: bool,
+    pub(in crate::log) steps: Vec<Step>,
+}
+
+/// Why bytes are not a message.
+#[derive(Debug, PartialEq, Eq, Error)]
+pub(in crate::log) enum MessageError {
+    #[error("its version is {0}")]
+    Version(u8),
+    #[error("it was not sent by a node")]
+    Foreign,
+    #[error("it is malformed")]
+    Malformed,
+    #[error("it is of a node beyond the {MAX_NODES} that a log may have had")]
+    TooManyNodes,
+    #[error("step {index}: {error}")]
+    Step { index: usize, error: DecodeError },
+}
+
+/// How many nodes a log may have had.
+pub(in crate::log) const MAX_NODES: usize = 1024;
+
+/// The most bytes before the steps, with those before one step.
+pub(in crate::log) const OVERHEAD_BYTES: usize = 128;
+
+/// Encodes a message of steps that are encoded already.
+pub(in crate::log) fn encode<'a>(
+    origin: &Origin,
+    compares: bool,
+    steps: impl ExactSizeIterator<Item = &'a [u8]> + Clone,
+) -> Bytes {
+    let len: usize = steps.clone().map(|step| step.len() + 4).sum();
+    let mut out = Vec::with_capacity(len + OVERHEAD_BYTES);
+    out.extend_from_slice(&MARK);
+    out.push(VERSION);
+    out.push(u8::from(compares));
+    out.push(u8::try_from(origin.node.len()).expect("names of nodes are short"));
+    out.extend_from_slice(origin.node.as_bytes());
+    out.extend_from_slice(&origin.start.to_le_bytes());
+    out.extend_from_slice(&origin.counter.to_le_bytes());
+    for step in steps {
+        out.extend_from_slice(&u32::try_from(step.len()).expect("steps are short").to_le_bytes());
+        out.extend_from_slice(step);
+    }
+    out.into()
+}
+
+pub(in crate::log) fn decode(
+    bytes: &[u8],
+    members: &[Arc<Memory>],
+) -> Result<Message, MessageError> {
+    let bytes = bytes.strip_prefix(&MARK).ok_or(MessageError::Foreign)?;
+    let (&version, bytes) = bytes.split_first().ok_or(MessageError::Foreign)?;
+    if version != VERSION {
+        return Err(MessageError::Version(version));
+    }
+    let (compares, bytes) = match bytes.split_first() {
+        Some((&flag @ (0 | 1), bytes)) => (flag == 1, bytes),
+        _ => return Err(MessageError::Malformed),
+    };
+    let (origin, mut bytes) = origin(bytes).ok_or(MessageError::Malformed)?;
+    let mut steps = Vec::new();
+    while !bytes.is_empty() {
+        let (step, rest) = step(bytes).ok_or(MessageError::Malformed)?;
+        let index = steps.len();
+        let step =
+            encoding::decode(step, members).map_err(|error| MessageError::Step { index, error })?;
+        steps.push(step);
+        bytes = rest;
+    }
+    Ok(Message { origin, compares, steps })
+}
+
+fn origin(bytes: &[u8]) -> Option<(Origin, &[u8])> {
+    let (&len, bytes) = bytes.split_first()?;
+    let (node, bytes) = bytes.split_at_checked(usize::from(len))?;
+    let node = str::from_utf8(node).ok().filter(|node| is_word(node))?;
+    let (start, bytes) = bytes.split_first_chunk()?;
+    let (counter, bytes) = bytes.split_first_chunk()?;
+    let (start, counter) = (u64::from_le_bytes(*start), u64::from_le_bytes(*counter));
+    Some((Origin { node: node.to_owned(), start, counter }, bytes))
+}
+
+fn step(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
+    let (len, bytes) = bytes.split_first_chunk()?;
+    bytes.split_at_checked(u32::from_le_bytes(*len) as usize)
+}
+
+#[cfg(test)]
+mod tests {
+    use holdfast_memory::{Access, Action, Area, Layout, Span};
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn members() -> Vec<Arc<Memory>> {
+        let span = Span::new(0, 10).unwrap();
+        let layout = Layout::default().with(Area::HoldingRegisters, span);
+        vec![Arc::new(Memory::new(layout, None).unwrap())]
+    }
+
+    fn mask(address: u16) -> Step {
+        let area = Area::HoldingRegisters;
+        let action = Action::Mask { member: 0, area, address, and_mask: 3, or_mask: 4 };
+        Step { access: Access::Client, action }
+    }
+
+    fn encoded(origin: &Origin, compares: bool, steps: &[Step]) -> Bytes {
+        let steps: Vec<Vec<u8>> = steps
+            .iter()
+            .map(|step| {
+                let mut bytes = Vec::new();
+                encoding::encode(step, &mut bytes);
+                bytes
+            })
+            .collect();
+        encode(origin, compares, steps.iter().map(Vec::as_slice))
+    }
+
+    proptest! {
+        #[test]
+        fn a_message_is_decoded_as_it_was(
+            node in "[a-zA-Z0-9_-]{1,64}",
+            start: u64,
+            counter: u64,
+            compares: bool,
+            addresses in prop::collection::vec(0..10u16, 0..5),
+        ) {
+            let origin = Origin { node, start, counter };
+            let steps: Vec<Step> = addresses.into_iter().map(mask).collect();
+            let bytes = encoded(&origin, compares, &steps);
+            let message = Message { origin, compares, steps };
+            prop_assert_eq!(decode(&bytes, &members()), Ok(message));
+        }
+
+        #[test]
+        fn any_bytes_are_a_message_or_an_error(
+            marked: bool,
+            mut bytes in prop::collection::vec(any::<u8>(), 0..100),
+        ) {
+            if marked {
+                bytes.splice(0..0, *b"HFL\x01\x00\x01a");
+            }
+            let _ = decode(&bytes, &members());
+        }
+
+        #[test]
+        fn changed_bytes_are_a_message_or_an_error(at in any::<prop::sample::Index>(), byte: u8) {
+            let origin = Origin { node: "a".to_owned(), start: 1, counter: 2 };
+            let mut bytes = encoded(&origin, false, &[mask(1), mask(2)]).to_vec();
+            let at = at.index(bytes.len());
+            bytes[at] = byte;
+            let _ = decode(&bytes, &members());
+        }
+    }
+
+    #[test]
+    fn bytes_of_others_are_distinguished_from_another_version() {
+        let of = |bytes: &[u8]| decode(bytes, &members());
+        assert_eq!(of(b"hello"), Err(MessageError::Foreign));
+        assert_eq!(of(b"HFL\x02whatever"), Err(MessageError::Version(2)));
+        assert_eq!(of(b"HFL\x01"), Err(MessageError::Malformed));
+        let origin = Origin { node: "a".to_owned(), start: 1, counter: 2 };
+        let error = of(&encoded(&origin, false, &[mask(1), mask(10)])).unwrap_err();
+        assert!(matches!(error, MessageError::Step { index: 1, .. }), "{error}");
+    }
+}

@@ -1,0 +1,8 @@
+//! The stream of a log in JetStream: the connection to it, its messages, and what is stored beside it.
+
+pub(crate) mod connection;
+pub(crate) mod message;
+pub(crate) mod messages;
+pub(crate) mod raw_message;
+pub(crate) mod server_lag;
+pub(crate) mod store;

@@ -1,0 +1,420 @@
+//! What a log keeps in JetStream: its stream, snapshots in an object store, and a bucket of keys that
+//! names the newest snapshot and has the digests of all nodes.
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use async_nats::jetstream::consumer::{AckPolicy, DeliverPolicy, pull};
+use async_nats::jetstream::context::{CreateStreamErrorKind, GetStreamErrorKind};
+use async_nats::jetstream::object_store::{self, ObjectMetadata, ObjectStore};
+use async_nats::jetstream::stream::{
+    Config, DiscardPolicy, Info, RetentionPolicy, StorageType, Stream,
+};
+use async_nats::jetstream::{Context, ErrorCode, kv};
+use bytes::Bytes;
+use futures_util::StreamExt;
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use tokio::io::AsyncReadExt;
+
+use crate::log::error::{End, LogError};
+use crate::log::layout::difference;
+use crate::log::settings::Settings;
+use crate::log::state::{Place, State, digest_of};
+use crate::log::stream::message::{MAX_NODES, VERSION};
+use crate::log::stream::raw_message::{Received, fetch};
+
+/// Within this time, the servers themselves notice a message that was sent twice.
+const DUPLICATE_WINDOW: Duration = Duration::from_secs(120);
+
+/// After this time without a pull, the server deletes a consumer.
+const CONSUMER_TTL: Duration = Duration::from_secs(30);
+
+/// How long the lease of the node that takes a snapshot lasts.
+const LEASE_TTL: Duration = Duration::from_secs(30);
+
+/// How long one part of a snapshot may take to arrive.
+const SNAPSHOT_READ_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// No snapshot is longer than this.
+const MAX_SNAPSHOT_BYTES: u64 = 1 << 30;
+
+/// The key that names the snapshots.
+pub(in crate::log) const SNAPSHOT_KEY: &str = "snapshot";
+/// The name of a node follows.
+pub(in crate::log) const DIGEST_KEY_PREFIX: &str = "digest.";
+
+const META_VERSION: &str = "holdfast-version";
+const META_LAYOUT: &str = "holdfast-layout";
+const META_ID: &str = "holdfast-id";
+
+#[derive(Clone)]
+pub(in crate::log) struct Store {
+    context: Context,
+    pub(in crate::log) stream: Stream,
+    pub(in crate::log) keys: kv::Store,
+    leases: kv::Store,
+    objects: ObjectStore,
+}
+
+/// Names the snapshots of a log.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(in crate::log) struct Pointer {
+    pub(in crate::log) newest: Snapshot,
+    pub(in crate::log) previous: Option<Snapshot>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(in crate::log) struct Snapshot {
+    pub(in crate::log) sequence: u64,
+    pub(in crate::log) stored: i64,
+    pub(in crate::log) steps: u64,
+    pub(in crate::log) object: String,
+    pub(in crate::log) digest: String,
+    pub(in crate::log) node: String,
+}
+
+impl Snapshot {
+    /// A snapshot of this state, which is not stored yet.
+    pub(in crate::log) fn of(state: &State, digest: String, node: &str) -> Snapshot {
+        Snapshot {
+            sequence: state.place.sequence,
+            stored: state.place.stored,
+            steps: state.steps,
+            object: format!("{:016x}", unique() as u64),
+            digest,
+            node: node.to_owned(),
+        }
+    }
+}
+
+pub(in crate::log) fn subject(log: &str) -> String {
+    format!("holdfast.log.{log}.steps")
+}
+
+fn stream_name(log: &str) -> String {
+    format!("holdfast-log-{log}")
+}
+
+impl Store {
+    /// Opens what the log keeps, and makes what does not exist.
+    ///
+    /// The stream and its fingerprint are made in one request, and only the first one succeeds: all
+    /// nodes see the same fingerprint.
+    pub(in crate::log) async fn open(
+        context: &Context,
+        settings: &Settings,
+        fingerprint: &str,
+        create: bool,
+    ) -> Result<Store, End> {
+        let name = stream_name(&settings.name);
+        let missing = |error: &dyn std::fmt::Display| End::lost("the stream of the log", error);
+        let stream = match context.get_stream(&name).await {
+            Ok(stream) => stream,
+            Err(error) if is_missing(&error.kind()) => {
+                if !create {
+                    let text = format!("the servers have no log {:?}", settings.name);
+                    return Err(LogError::Settings(text).into());
+                }
+                match context.create_stream(config(settings, fingerprint)).await {
+                    Ok(stream) => stream,
+                    // Another node was first: its fingerprint is checked below.
+                    Err(error) if is_taken(&error.kind()) => {
+                        context.get_stream(&name).await.map_err(|error| missing(&error))?
+                    }
+                    Err(error) => return Err(End::lost("making the stream of the log", error)),
+                }
+            }
+            Err(error) => return Err(missing(&error)),
+        };
+        check(stream.cached_info(), fingerprint)?;
+        let bucket = |suffix: &str| format!("{name}{suffix}");
+        let pointers = keys(context, settings, bucket(""), Duration::ZERO, create).await?;
+        let leases = keys(context, settings, bucket("-leases"), LEASE_TTL, create).await?;
+        let objects = match context.get_object_store(bucket("")).await {
+            Ok(objects) => objects,
+            Err(error) if !create => return Err(End::lost("the snapshots of the log", error)),
+            Err(_) => {
+                let config = object_store::Config {
+                    bucket: bucket(""),
+                    num_replicas: settings.replicas,
+                    ..object_store::Config::default()
+                };
+                // Fails if another node makes it at the same time.
+                let _ = context.create_object_store(config).await;
+                context
+                    .get_object_store(bucket(""))
+                    .await
+                    .map_err(|error| End::lost("the snapshots of the log", error))?
+            }
+        };
+        Ok(Store { context: context.clone(), stream, keys: pointers, leases, objects })
+    }
+
+    /// Tells the stream from another one with the same name.
+    pub(in crate::log) fn id(&self) -> Option<&str> {
+        self.stream.cached_info().config.metadata.get(META_ID).map(String::as_str)
+    }
+
+    /// A consumer, from this sequence on.
+    pub(in crate::log) async fn consume(
+        &self,
+        from: u64,
+        heartbeat: Duration,
+    ) -> Result<pull::Stream, End> {
+        let config = pull::Config {
+            deliver_policy: DeliverPolicy::ByStartSequence { start_sequence: from },
+            // The node itself remembers what it has applied.
+            ack_policy: AckPolicy::None,
+            inactive_threshold: CONSUMER_TTL,
+            num_replicas: 1,
+            memory_storage: true,
+            ..pull::Config::default()
+        };
+        let lost = |error: &dyn std::fmt::Display| End::lost("reading the stream", error);
+        let consumer = self.stream.create_consumer(config).await.map_err(|error| lost(&error))?;
+        let pulls = consumer.stream().max_messages_per_batch(500).heartbeat(heartbeat);
+        pulls.messages().await.map_err(|error| lost(&error))
+    }
+
+    /// The last sequence of the stream.
+    pub(in crate::log) async fn last(&self) -> Result<u64, End> {
+        let info = self.stream.get_info().await;
+        Ok(info.map_err(|error| End::lost("the stream of the log", error))?.state.last_sequence)
+    }
+
+    /// The message at this sequence, if the stream has it.
+    pub(in crate::log) async fn message(&self, sequence: u64) -> Result<Option<Received>, End> {
+        let name = &self.stream.cached_info().config.name;
+        fetch(&self.context, name, json!({"seq": sequence})).await
+    }
+
+    /// Which snapshots there are, and the revision of that knowledge.
+    pub(in crate::log) async fn pointer(&self) -> Result<Option<(u64, Pointer)>, End> {
+        let which = json!({"last_by_subj": format!("{}{SNAPSHOT_KEY}", self.keys.prefix)});
+        match fetch(&self.context, &self.keys.stream_name, which).await? {
+            // A deleted key is empty.
+            Some(entry) if !entry.payload.is_empty() => {
+                Ok(Some((entry.place.sequence, parsed(&entry.payload)?)))
+            }
+            _ => Ok(None),
+        }
+    }
+
+    /// Replaces the key of the snapshot, or removes digests, if a watch can't read them. Returns whether
+    /// it has done so. A digest that is missing is stored again at the next comparison.
+    pub(in crate::log) async fn mend_keys(&self, pointer: &Pointer) -> Result<bool, End> {
+        let (stream, lost) = (&self.keys.stream_name, |error: &dyn std::fmt::Display| {
+            End::lost("mending the keys", error)
+        });
+        let which = json!({"last_by_subj": format!("{}{SNAPSHOT_KEY}", self.keys.prefix)});
+        let mut is_mended = false;
+        if let Some(entry) = fetch(&self.context, stream, which).await?
+            && !entry.is_readable
+        {
+            let value = serde_json::to_vec(pointer).map_err(|error| lost(&error))?;
+            let updated = self.keys.update(SNAPSHOT_KEY, value.into(), entry.place.sequence).await;
+            updated.map_err(|error| lost(&error))?;
+            is_mended = true;
+        }
+        let digests = format!("{}{DIGEST_KEY_PREFIX}>", self.keys.prefix);
+        let (mut from, mut seen) = (1, 0);
+        loop {
+            let which = json!({"seq": from, "next_by_subj": digests});
+            let Some(entry) = fetch(&self.context, stream, which).await? else { break };
+            (from, seen) = (entry.place.sequence + 1, seen + 1);
+            if !entry.is_readable || seen > MAX_NODES {
+                let purged = self.keys.stream.purge().filter(digests).await;
+                purged.map_err(|error| lost(&error))?;
+                is_mended = true;
+                break;
+            }
+        }
+        Ok(is_mended)
+    }
+
+    /// Loads one of the snapshots.
+    pub(in crate::log) async fn load(
+        &self,
+        snapshot: &Snapshot,
+        state: &mut State,
+    ) -> Result<(), End> {
+        let place = Place { sequence: snapshot.sequence, stored: snapshot.stored };
+        let damaged = |what: String| {
+            let text = format!("the snapshot at sequence {}: {what}", place.sequence);
+            End::Fatal(LogError::Snapshot(text))
+        };
+        let missing = |error: object_store::GetError| match error.kind() {
+            object_store::GetErrorKind::NotFound => damaged("it is missing".to_owned()),
+            _ => End::lost("reading a snapshot", error),
+        };
+        let object = self.objects.get(&snapshot.object).await.map_err(missing)?;
+        // Anyone may store an object of any size.
+        let mut object = object.take(MAX_SNAPSHOT_BYTES);
+        let mut bytes = Vec::new();
+        loop {
+            let read =
+                tokio::time::timeout(SNAPSHOT_READ_TIMEOUT, object.read_buf(&mut bytes)).await;
+            let read = read.map_err(|_| End::Lost("the snapshot does not arrive".to_owned()))?;
+            if read.map_err(|error| End::lost("reading a snapshot", error))? == 0 {
+                break;
+            }
+        }
+        let digest = digest_of(&bytes);
+        if digest != snapshot.digest {
+            let expected = &snapshot.digest;
+            return Err(damaged(format!("its digest is {digest}, expected is {expected}")));
+        }
+        Ok(state.load(&bytes, place)?)
+    }
+
+    /// Whether this node may take a snapshot now.
+    pub(in crate::log) async fn lease(&self, node: &str) -> bool {
+        self.leases.create(SNAPSHOT_KEY, Bytes::copy_from_slice(node.as_bytes())).await.is_ok()
+    }
+
+    pub(in crate::log) async fn release(&self) {
+        // Otherwise it expires.
+        let _ = self.leases.delete(SNAPSHOT_KEY).await;
+    }
+
+    /// Stores a snapshot and names it the newest, if the newest is still the one of `seen`.
+    pub(in crate::log) async fn put(
+        &self,
+        seen: Option<(u64, Pointer)>,
+        encoded: &[u8],
+        mut snapshot: Snapshot,
+    ) -> Result<(u64, Pointer), String> {
+        snapshot.object = format!("{}-{}-{}", snapshot.sequence, snapshot.node, snapshot.object);
+        let object = ObjectMetadata { name: snapshot.object.clone(), ..ObjectMetadata::default() };
+        let mut bytes = encoded;
+        self.objects.put(object, &mut bytes).await.map_err(|error| error.to_string())?;
+        // The key is changed only if it is as it was seen: of two nodes, one fails.
+        let (revision, previous) =
+            seen.map(|(at, of)| (Some(at), Some(of.newest))).unwrap_or_default();
+        let name = snapshot.object.clone();
+        let pointer = Pointer { newest: snapshot, previous };
+        let value = Bytes::from(serde_json::to_vec(&pointer).map_err(|error| error.to_string())?);
+        let named = match revision {
+            None => self.keys.create(SNAPSHOT_KEY, value).await.map_err(|error| error.to_string()),
+            Some(at) => {
+                self.keys.update(SNAPSHOT_KEY, value, at).await.map_err(|error| error.to_string())
+            }
+        };
+        match named {
+            Ok(revision) => Ok((revision, pointer)),
+            Err(error) => {
+                // If this fails as well, the next snapshot removes it.
+                let _ = self.objects.delete(&name).await;
+                Err(error)
+            }
+        }
+    }
+
+    /// Removes messages and snapshots from before the snapshot before the last.
+    pub(in crate::log) async fn tidy(&self, pointer: &Pointer) -> Result<(), String> {
+        let Some(previous) = &pointer.previous else { return Ok(()) };
+        // The last snapshot may turn out to be damaged: the one before it can still be continued.
+        if previous.sequence > 1 {
+            let purge = self.stream.purge().sequence(previous.sequence);
+            purge.await.map_err(|error| error.to_string())?;
+        }
+        let mut objects = self.objects.list().await.map_err(|error| error.to_string())?;
+        while let Some(object) = objects.next().await {
+            let name = object.map_err(|error| error.to_string())?.name;
+            if name != pointer.newest.object && name != previous.object {
+                self.objects.delete(&name).await.map_err(|error| error.to_string())?;
+            }
+        }
+        Ok(())
+    }
+}
+
+pub(in crate::log) fn parsed(pointer: &[u8]) -> Result<Pointer, LogError> {
+    serde_json::from_slice(pointer)
+        .map_err(|error| LogError::Snapshot(format!("the key of the snapshot: {error}")))
+}
+
+fn config(settings: &Settings, fingerprint: &str) -> Config {
+    let id = format!("{:032x}", unique());
+    let metadata =
+        [(META_VERSION, VERSION.to_string()), (META_LAYOUT, fingerprint.to_owned()), (META_ID, id)];
+    Config {
+        name: stream_name(&settings.name),
+        description: Some("Writes to memories of Holdfast, in their order".to_owned()),
+        subjects: vec![subject(&settings.name)],
+        storage: StorageType::File,
+        retention: RetentionPolicy::Limits,
+        // Without limits. If a server sets one, a full stream refuses messages: it must not drop the oldest,
+        // which nodes have not applied yet.
+        max_messages: -1,
+        max_bytes: -1,
+        max_messages_per_subject: -1,
+        discard: DiscardPolicy::New,
+        num_replicas: settings.replicas,
+        duplicate_window: DUPLICATE_WINDOW,
+        deny_delete: true,
+        metadata: metadata.map(|(key, value)| (key.to_owned(), value)).into(),
+        ..Config::default()
+    }
+}
+
+/// A number that no other process has drawn.
+pub(in crate::log) fn unique() -> u128 {
+    let mut bytes = [0; 16];
+    aws_lc_rs::rand::fill(&mut bytes).expect("the system has random numbers");
+    u128::from_le_bytes(bytes)
+}
+
+fn is_missing(kind: &GetStreamErrorKind) -> bool {
+    matches!(kind, GetStreamErrorKind::JetStream(error)
+        if error.error_code() == ErrorCode::STREAM_NOT_FOUND)
+}
+
+fn is_taken(kind: &CreateStreamErrorKind) -> bool {
+    matches!(kind, CreateStreamErrorKind::JetStream(error)
+        if error.error_code() == ErrorCode::STREAM_NAME_EXIST)
+}
+
+/// Checks that a stream is of this version and layout.
+fn check(info: &Info, fingerprint: &str) -> Result<(), LogError> {
+    let metadata: &HashMap<String, String> = &info.config.metadata;
+    let (Some(version), Some(layout), Some(_)) =
+        (metadata.get(META_VERSION), metadata.get(META_LAYOUT), metadata.get(META_ID))
+    else {
+        let text = format!("stream {} is not that of a log: delete it", info.config.name);
+        return Err(LogError::Settings(text));
+    };
+    let found = version.parse().unwrap_or(u8::MAX);
+    if found != VERSION {
+        return Err(LogError::Version { what: "the log", found, supported: VERSION });
+    }
+    difference(layout, fingerprint).map_or(Ok(()), |difference| Err(LogError::Layout(difference)))
+}
+
+async fn keys(
+    context: &Context,
+    settings: &Settings,
+    bucket: String,
+    max_age: Duration,
+    create: bool,
+) -> Result<kv::Store, End> {
+    let lost = |error: &dyn std::fmt::Display| End::lost("the keys of the log", error);
+    match context.get_key_value(&bucket).await {
+        Ok(keys) => Ok(keys),
+        Err(error) if !create => Err(lost(&error)),
+        Err(_) => {
+            let config = kv::Config {
+                bucket: bucket.clone(),
+                history: 1,
+                max_age,
+                storage: StorageType::File,
+                num_replicas: settings.replicas,
+                ..kv::Config::default()
+            };
+            // Fails if another node makes it at the same time.
+            let _ = context.create_key_value(config).await;
+            context.get_key_value(&bucket).await.map_err(|error| lost(&error))
+        }
+    }
+}

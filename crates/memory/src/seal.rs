@@ -1,0 +1,49 @@
+//! The seal of a memory: which bit opens it, when it closes again, and whose accesses it refuses.
+
+use crate::area::Area;
+use crate::error::Refusal;
+use crate::operation::{Access, Write};
+
+/// When the gate bit opens the seal.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum GateMode {
+    /// The first ingest that leaves the gate bit at 1 opens the memory permanently.
+    Once,
+    /// The memory is sealed whenever the gate bit is 0.
+    Level,
+}
+
+/// The bit that opens a sealed memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Gate {
+    pub area: Area,
+    pub address: u16,
+    pub mode: GateMode,
+}
+
+impl Gate {
+    #[inline]
+    pub(crate) fn is_in(self, write: &Write<'_>) -> bool {
+        let start = usize::from(write.address);
+        self.area == write.area && (start..start + write.count).contains(&usize::from(self.address))
+    }
+
+    /// Whether the memory is sealed after an ingest that has left the gate bit like this.
+    #[inline]
+    pub(crate) fn seals(self, was_sealed: bool, bit: bool) -> bool {
+        match self.mode {
+            GateMode::Once => was_sealed && !bit,
+            GateMode::Level => !bit,
+        }
+    }
+}
+
+/// Whether the seal admits an access.
+#[inline]
+pub(crate) const fn admit(access: Access, is_sealed: bool) -> Result<(), Refusal> {
+    match (access, is_sealed) {
+        (Access::Client, true) => Err(Refusal::Sealed),
+        (Access::Restore, false) => Err(Refusal::Unsealed),
+        _ => Ok(()),
+    }
+}

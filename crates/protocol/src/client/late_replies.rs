@@ -1,0 +1,385 @@
+//! Late replies: what earlier requests may still bring on lines and streams without transaction ids, and how
+//! long a request waits for it.
+//!
+//! A request that ended without its reply stays here until that reply has come, or until late replies are
+//! known to have ended. Meanwhile, nothing is sent whose reply could be taken for it.
+
+use alloc::collections::{BTreeSet, VecDeque};
+use core::time::Duration;
+
+use super::raised_timeouts::Lateness;
+use super::tolerance::{AcceptUnit, Tolerance};
+use super::{GUARD, Time};
+use crate::pdu::{EncodedRequest, Request};
+
+/// Requests without a reply that are remembered. With the bounds on their time, there are never as many.
+const MAX_UNANSWERED_REQUESTS: usize = 64;
+
+/// A late reply may take this many times the timeout, as long as nothing else is known.
+const LATENESS_FACTOR: u32 = 3;
+
+/// How long after its timeout a late reply may come at most, where there are no transaction ids.
+pub const MAX_LATENESS: Duration = Duration::from_secs(10);
+
+/// By the timeouts of other requests, a late reply may take no longer than this.
+const MAX_LATENESS_BY_OTHERS: Duration = Duration::from_secs(1);
+
+/// A late reply may take so long however short the timeouts are: a request may have had only what was left of
+/// its time.
+const MIN_LATENESS: Duration = Duration::from_millis(250);
+
+/// Replies that a new line or stream has to give, none of them twice, before it needs no guard time.
+const PROBATION_REPLIES: u32 = 8;
+
+/// The same after a reply that nobody asked for.
+const PROBATION_REPLIES_AFTER_STRAY: u32 = 1000;
+
+/// The longest guard time.
+const MAX_GUARD: Duration = GUARD.saturating_mul(10);
+
+/// Replies that were doubted because they equal one to another request, and turned out right: no more are
+/// doubted until one comes that nobody asked for.
+const MAX_WRONG_DOUBTS: u32 = 8;
+
+/// Requests in a row that have no other reply than one that comes too fast, after which none is too fast.
+const MAX_TOO_FAST_IN_A_ROW: u8 = 2;
+
+/// Replies that are compared with the next one.
+const MAX_RECENT_REPLIES: usize = 16;
+
+/// A reply that came longer ago is not repeated now.
+const RECENT_REPLY_TIME: Duration = MAX_GUARD;
+
+/// How long after a reply that is not its own that may come to a request within its timeout, if the unit is usually
+/// faster.
+const WAIT_AFTER_OTHER_REPLY: Duration = Duration::from_millis(500);
+
+/// How long after a damaged reply its own may come to a request, as long as nothing is known of the unit.
+const WAIT_AFTER_DAMAGED_REPLY: Duration = Duration::from_millis(250);
+
+/// What earlier requests may still bring.
+#[derive(Debug, Default)]
+pub(super) struct LateReplies {
+    /// The oldest first.
+    unanswered: VecDeque<Unanswered>,
+    /// Units and functions of which a reply never came: a device may send it with the next one.
+    never_came: BTreeSet<(u8, u8)>,
+    lateness: Lateness,
+    guard: Guard,
+    /// When something was received the last time, or a request ended.
+    pub(super) used: Time,
+    /// The line is faster than its settings say: replies showed it that were the first ones, or the only ones.
+    is_fast: bool,
+    /// A late reply has come.
+    has_late: bool,
+    /// A reply to the request came too fast.
+    too_fast: bool,
+    /// Requests in a row that had no other reply than one that came too fast.
+    only_too_fast: u8,
+    /// Reads in a row whose echo came before their reply. Here because a new connection keeps it.
+    pub(super) echoes: u8,
+    /// The newest first.
+    recent: VecDeque<Recent>,
+}
+
+/// A reply, as checksums.
+#[derive(Debug, Clone, Copy)]
+struct Recent {
+    request: u32,
+    reply: u32,
+    at: Time,
+}
+
+/// A request that ended without its reply.
+#[derive(Debug)]
+pub(super) struct Unanswered {
+    pub(super) unit_id: u8,
+    pub(super) request: EncodedRequest,
+    sent: Time,
+    /// The reply may come until then.
+    until: Time,
+    /// What comes before is a copy of the reply to another attempt of the same call.
+    from: Time,
+}
+
+/// Why a request ended without its reply.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Ended {
+    TimedOut,
+    WithConnection,
+    /// By a reply that is not its own, or by an exception that a gateway sent in its place.
+    Other,
+    /// By bytes that may have been its reply.
+    Damaged,
+}
+
+/// Whether replies may come twice.
+#[derive(Debug, Default)]
+struct Guard {
+    /// A reply has come.
+    has_begun: bool,
+    /// Replies since the last one that nobody asked for.
+    clean: u32,
+    /// What was learned from those that nobody asked for; `None` before the first.
+    learned: Option<Duration>,
+    doubts: u32,
+}
+
+impl LateReplies {
+    /// The timeout of a request to this unit: more than `timeout` if late replies repeat.
+    pub(super) fn timeout(&self, unit_id: u8, timeout: Duration) -> Duration {
+        self.lateness.timeout(unit_id, timeout)
+    }
+
+    /// Until when a reply may come that could be taken for the one to this request.
+    pub(super) fn until(
+        &mut self,
+        unit_id: u8,
+        request: &EncodedRequest,
+        tolerance: &Tolerance,
+        now: Time,
+    ) -> Option<Time> {
+        self.expire(now);
+        let accepted = tolerance.accept_unit;
+        let alike = self.unanswered.iter().filter(|earlier| {
+            let same_unit = accepted != AcceptUnit::Requested || earlier.unit_id == unit_id;
+            same_unit && may_confuse(&earlier.request, request, tolerance.pad)
+        });
+        alike.map(|earlier| earlier.until).max()
+    }
+
+    /// Forgets requests whose replies can't come any more, as far as is known.
+    pub(super) fn expire(&mut self, now: Time) {
+        let never_came = &mut self.never_came;
+        self.unanswered.retain(|earlier| {
+            let may_come = earlier.until > now;
+            if !may_come && let Some(function) = earlier.request.pdu().first() {
+                never_came.insert((earlier.unit_id, *function));
+            }
+            may_come
+        });
+    }
+
+    /// The time after a reply in which the same one may come again.
+    pub(super) fn guard(&self) -> Duration {
+        let Guard { has_begun, clean, learned, .. } = self.guard;
+        let (guard, enough) = match learned {
+            // Nothing can be repeated.
+            None if !has_begun => (Duration::ZERO, PROBATION_REPLIES),
+            None => (GUARD, PROBATION_REPLIES),
+            Some(learned) => (learned, PROBATION_REPLIES_AFTER_STRAY),
+        };
+        if clean < enough { guard } else { Duration::ZERO }
+    }
+
+    /// Whether the line may be faster than its settings say. Asked for a reply that came too fast: one of
+    /// the first, while the guard time excludes another reason, shows it.
+    pub(super) fn is_fast_line(&mut self) -> bool {
+        let Guard { clean, learned, .. } = self.guard;
+        self.is_fast |= learned.is_none() && clean < PROBATION_REPLIES;
+        self.is_fast
+    }
+
+    /// Whether a reply that came too fast shows that the line is faster than its settings say: it is no copy
+    /// of a recent one, and the line has never brought a late reply, of which it may be a copy, or one that
+    /// nobody asked for, such as one to another master.
+    pub(super) fn shows_fast_line(&mut self, reply: &[u8]) -> bool {
+        let reply = crc32fast::hash(reply);
+        let is_copy = self.recent.iter().any(|recent| recent.reply == reply);
+        self.is_fast |= self.guard.learned.is_none() && !self.has_late && !is_copy;
+        self.is_fast
+    }
+
+    /// Notes that the reply to a request came too fast to be its own.
+    pub(super) fn came_too_fast(&mut self) {
+        self.too_fast = true;
+        self.stray(Duration::ZERO);
+    }
+
+    /// Notes that a request timed out. A copy of an earlier reply that came too fast would have been followed
+    /// by its own: if none is, time and again, the line is faster than its settings say, as one over USB or a
+    /// network is.
+    fn timed_out(&mut self) {
+        self.only_too_fast = if self.too_fast { self.only_too_fast + 1 } else { 0 };
+        self.is_fast |= self.only_too_fast >= MAX_TOO_FAST_IN_A_ROW;
+        self.too_fast = false;
+    }
+
+    /// Notes a reply that nobody asked for, this time after the last one.
+    pub(super) fn stray(&mut self, after: Duration) {
+        let learned = self.guard.learned.unwrap_or(GUARD);
+        // Much later, it says nothing of the time between a reply and its repetition.
+        let after = if after > MAX_GUARD { Duration::ZERO } else { after * 2 };
+        self.guard = Guard {
+            has_begun: true,
+            clean: 0,
+            learned: Some(after.clamp(learned, MAX_GUARD)),
+            doubts: 0,
+        };
+    }
+
+    /// Until when the reply may come to a request that ended without it.
+    fn until_after(
+        &mut self,
+        unit_id: u8,
+        (sent, timeout): (Time, Duration),
+        how: Ended,
+        now: Time,
+    ) -> Time {
+        let longest = self.lateness.longest(unit_id);
+        let usual = longest.map(|longest| (longest * 4).max(GUARD));
+        let longest_timeout = self.lateness.note_timeout(unit_id, timeout);
+        match how {
+            Ended::TimedOut => {
+                let latest = self.lateness.latest(unit_id) * 2;
+                let by_others = (longest_timeout * LATENESS_FACTOR).min(MAX_LATENESS_BY_OTHERS);
+                let known = usual.unwrap_or(GUARD).max(latest).max(by_others).max(MIN_LATENESS);
+                sent + (timeout * LATENESS_FACTOR).max(known).min(timeout + MAX_LATENESS)
+            }
+            Ended::Other | Ended::WithConnection => {
+                let left = (sent + longest_timeout).saturating_sub(now).min(WAIT_AFTER_OTHER_REPLY);
+                // It may have been given up as late as by a timeout.
+                let is_silent = how == Ended::WithConnection;
+                let took = if is_silent { now.saturating_sub(sent) } else { Duration::ZERO };
+                now + usual
+                    .unwrap_or(GUARD)
+                    .max(left)
+                    .max(took * (LATENESS_FACTOR - 1))
+                    .min(MAX_LATENESS)
+            }
+            Ended::Damaged => (sent + timeout).min(now + usual.unwrap_or(WAIT_AFTER_DAMAGED_REPLY)),
+        }
+    }
+
+    /// Notes that a request was answered that repeats an earlier one of the same call, sent at this time:
+    /// the reply may be that to the earlier one, and its own may still come.
+    pub(super) fn repeated(
+        &mut self,
+        (unit_id, request): (u8, &EncodedRequest),
+        sent: Time,
+        now: Time,
+    ) {
+        let same = |earlier: &&mut Unanswered| {
+            earlier.unit_id == unit_id && earlier.request.pdu() == request.pdu()
+        };
+        for earlier in self.unanswered.iter_mut().filter(same) {
+            // As long after this request as it would have been waited for after the earlier one.
+            earlier.until += sent.saturating_sub(earlier.sent);
+            earlier.from = now + GUARD;
+        }
+    }
+
+    /// Notes a request that was sent at this time and ended without its reply.
+    pub(super) fn ended(
+        &mut self,
+        (unit_id, request): (u8, &EncodedRequest),
+        (sent, timeout): (Time, Duration),
+        how: Ended,
+        now: Time,
+    ) {
+        if how == Ended::TimedOut {
+            self.timed_out();
+        }
+        let until = self.until_after(unit_id, (sent, timeout), how, now);
+        if until <= now {
+            self.never_came.extend(request.pdu().first().map(|function| (unit_id, *function)));
+            return;
+        }
+        if self.unanswered.len() == MAX_UNANSWERED_REQUESTS {
+            self.unanswered.pop_front();
+        }
+        let request = request.clone();
+        self.unanswered.push_back(Unanswered { unit_id, request, sent, until, from: Time::ZERO });
+    }
+
+    /// The longest time of a reply of this unit that was not late.
+    pub(super) fn longest(&self, unit_id: u8) -> Duration {
+        self.lateness.longest(unit_id).unwrap_or_default()
+    }
+
+    /// Requests whose replies may still come.
+    pub(super) fn unanswered(&self) -> impl Iterator<Item = &Unanswered> {
+        self.unanswered.iter()
+    }
+
+    /// Notes the late reply to the request at this place. Returns how long it took.
+    pub(super) fn late(&mut self, place: usize, now: Time) -> Duration {
+        self.has_late = true;
+        if self.unanswered.get(place).is_some_and(|earlier| now < earlier.from) {
+            return Duration::ZERO;
+        }
+        let Some(earlier) = self.unanswered.remove(place) else { return Duration::ZERO };
+        self.guard.has_begun = true;
+        let took = now.saturating_sub(earlier.sent).min(earlier.until - earlier.sent);
+        self.lateness.late(earlier.unit_id, took);
+        took
+    }
+
+    /// Whether this reply is believed only if no other follows: one to an earlier request never came, or it
+    /// equals a recent one to another request.
+    pub(super) fn is_doubtful(&self, request: (u8, &[u8]), reply: &[u8], now: Time) -> bool {
+        let (unit_id, pdu) = request;
+        if pdu.first().is_some_and(|function| self.never_came.contains(&(unit_id, *function))) {
+            return true;
+        }
+        if self.guard.doubts >= MAX_WRONG_DOUBTS {
+            return false;
+        }
+        let (request, reply) = (checksum(request), crc32fast::hash(reply));
+        let last = self.recent.iter().find(|recent| recent.request == request);
+        let is_usual = last.is_some_and(|last| last.reply == reply);
+        let since = now.saturating_sub(RECENT_REPLY_TIME);
+        !is_usual && self.recent.iter().any(|other| other.reply == reply && other.at >= since)
+    }
+
+    /// Notes a reply that is believed, and whether it was doubted.
+    pub(super) fn believed(
+        &mut self,
+        request: (u8, &[u8]),
+        reply: &[u8],
+        doubted: bool,
+        now: Time,
+    ) {
+        self.guard.doubts += u32::from(doubted);
+        if let (unit_id, [function, ..]) = request {
+            self.never_came.remove(&(unit_id, *function));
+        }
+        let (request, reply) = (checksum(request), crc32fast::hash(reply));
+        self.recent.retain(|recent| recent.request != request);
+        self.recent.truncate(MAX_RECENT_REPLIES - 1);
+        self.recent.push_front(Recent { request, reply, at: now });
+    }
+
+    /// Notes a reply that was asked for, and took this time.
+    pub(super) fn answered(&mut self, unit_id: u8, took: Duration, timeout: Duration) {
+        self.guard.has_begun = true;
+        self.guard.clean = self.guard.clean.saturating_add(1);
+        (self.too_fast, self.only_too_fast) = (false, 0);
+        self.lateness.answered(unit_id, took, timeout);
+    }
+}
+
+/// Whether a reply to the earlier request could be taken for one to the other: not if both read a different
+/// number of bytes, which their replies contain. Bytes may be added to a reply that is padded.
+fn may_confuse(earlier: &EncodedRequest, other: &EncodedRequest, pads: bool) -> bool {
+    let same_function = earlier.pdu().first() == other.pdu().first();
+    same_function && (pads || read_bytes(earlier) == read_bytes(other))
+}
+
+/// The number of bytes that a read asks for; `None` for any other request.
+fn read_bytes(request: &EncodedRequest) -> Option<usize> {
+    match request.request()? {
+        Request::ReadCoils(range) | Request::ReadDiscreteInputs(range) => Some(range.byte_len()),
+        Request::ReadHoldingRegisters(range) | Request::ReadInputRegisters(range) => {
+            Some(range.byte_len())
+        }
+        _ => None,
+    }
+}
+
+fn checksum((unit_id, pdu): (u8, &[u8])) -> u32 {
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(&[unit_id]);
+    hasher.update(pdu);
+    hasher.finalize()
+}

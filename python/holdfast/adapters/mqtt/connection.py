@@ -1,0 +1,230 @@
+"""One connection to a broker: paho's client, but messages are received here.
+
+- A message is acknowledged after it was written, with every quality of service. With QoS 2 paho
+  sends PUBREC before it delivers the message, so a crash between the two would lose the message.
+- A message that a memory can't keep at the moment is not acknowledged, and the connection ends.
+- The properties of a message are parsed here, in linear time.
+- A packet over the size limit is not kept in memory while it arrives.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import TYPE_CHECKING, NamedTuple
+
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from holdfast.adapters.mqtt.inbox import MAX_PAYLOAD_BYTES
+from holdfast.ingest import KEEPING
+from holdfast.net.mqtt.client import BrokerClient
+from holdfast.net.mqtt.packets import MAX_PROPERTIES_BYTES, acknowledgement, parse_publish
+from holdfast.net.mqtt.stream import Packets
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from paho.mqtt.client import Client
+    from paho.mqtt.properties import Properties
+    from paho.mqtt.reasoncodes import ReasonCode
+
+    from holdfast.adapters.mqtt.inbox import Inbox
+    from holdfast.config import MappingConfig, MqttConfig, SubscriptionConfig
+    from holdfast.net.mqtt.packets import Publish
+    from holdfast.net.mqtt.stream import BrokerSocket
+
+SESSION_EXPIRY_S = 3600
+"""Seconds that the broker keeps the session while this client is disconnected. MQTT 5 only."""
+
+MAX_WAITING_PACKETS = 100
+"""Limit of unsent packets. Above it answers are dropped."""
+
+MAX_UNSENT_PACKETS = 1000
+"""Limit of unsent packets, mostly acknowledgements. Above it nothing is read from the broker."""
+
+_MAX_UNACKNOWLEDGED = 20
+"""Limit of answers that are sent and not acknowledged; further answers wait."""
+
+_KEPT = MAX_PROPERTIES_BYTES + 2**17
+"""Bytes kept of a packet over the size limit: enough for everything before the payload."""
+
+_LARGEST = MAX_PAYLOAD_BYTES + _KEPT
+
+_READ_BYTES = 65_536
+
+_PUBLISH, _PUBACK, _PUBREC, _PUBREL, _PUBCOMP, _PINGRESP = 0x30, 0x40, 0x50, 0x60, 0x70, 0xD0
+
+
+class _Pending(NamedTuple):
+    """An answer that waits until the broker has acknowledged others."""
+
+    topic: str
+    payload: bytes
+    properties: Properties
+
+
+class BrokerConnection(BrokerClient):
+    """One connection, from dialing to its end. A reconnect creates a new object."""
+
+    def __init__(
+        self,
+        settings: MqttConfig,
+        password: bytes | None,
+        dial: Callable[[], BrokerSocket],
+        unreleased: set[int],
+        inbox: Inbox,
+        answer: Callable[[BrokerConnection, Publish, Mapping[str, object]], None],
+    ) -> None:
+        """`unreleased` are QoS 2 packet identifiers, kept from one connection to the next.
+
+        `answer` is called for each message, after its acknowledgement.
+        """
+        super().__init__(
+            settings, settings.client_id, password, dial, session_expiry=SESSION_EXPIRY_S
+        )
+        self._unreleased = unreleased
+        self._inbox = inbox
+        self._answer = answer
+        self._largest_sent: int | None = None
+        self.most_qos = 1
+        """The highest quality of service that the broker accepts, at most 1."""
+        self._packets = Packets(_LARGEST, _KEPT)
+        self._alive_at = time.monotonic()
+        self._arrived: Iterator[tuple[int, bytes | bytearray, int]] = iter(())
+        """What was read and is not handled yet."""
+        self._is_late = False
+        """Whether there may be something in `_arrived`."""
+        self._most_on_the_way = _MAX_UNACKNOWLEDGED
+        self._on_the_way: set[int] = set()
+        self._waiting: deque[_Pending] = deque()
+        self.on_publish = self._send_waiting
+
+    @property
+    def may_read(self) -> bool:
+        """Whether the broker has taken enough of what is sent to it."""
+        return self.connection.unsent < MAX_UNSENT_PACKETS
+
+    @property
+    def pending(self) -> bool:
+        """Whether `read_more` has something to do though nothing arrives."""
+        return self.connection.failure is not None or (self.may_read and self._is_late)
+
+    def accepted(self, properties: Properties | None) -> None:
+        """Applies the limits from the broker's CONNACK."""
+        self.on_log = None
+        most: int = getattr(properties, "ReceiveMaximum", _MAX_UNACKNOWLEDGED)
+        self._most_on_the_way = min(most, _MAX_UNACKNOWLEDGED)
+        self._largest_sent = getattr(properties, "MaximumPacketSize", None)
+        self.most_qos = min(getattr(properties, "MaximumQoS", 1), 1)
+
+    def ask_for(
+        self, subscription: SubscriptionConfig | MappingConfig, *, again: bool
+    ) -> int | None:
+        """Sends SUBSCRIBE and returns its packet identifier, `None` when it could not be sent.
+
+        With `again`, the broker does not send retained messages a second time (MQTT 5).
+        """
+        if not self._five:
+            return self.subscribe(subscription.topic, subscription.qos)[1]
+        options = SubscribeOptions(
+            qos=subscription.qos,
+            retainHandling=(
+                SubscribeOptions.RETAIN_SEND_IF_NEW_SUB
+                if again
+                else SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
+            ),
+        )
+        return self.subscribe(subscription.topic, options=options)[1]
+
+    def takes(self, size: int) -> bool:
+        """Returns whether the broker accepts a message of this size, plus packet overhead."""
+        return self._largest_sent is None or size + 64 <= self._largest_sent
+
+    def answer(self, topic: str, payload: bytes, qos: int, properties: Properties) -> bool:
+        """Publishes a message. Returns false if too many wait."""
+        if not qos:
+            self.publish(topic, payload, 0, properties=properties)
+            return True
+        if len(self._on_the_way) + len(self._waiting) >= MAX_WAITING_PACKETS:
+            return False
+        self._waiting.append(_Pending(topic, payload, properties))
+        self._send_waiting()
+        return True
+
+    def _send_waiting(
+        self,
+        _client: Client | None = None,
+        _data: object = None,
+        identifier: int = 0,
+        _reason: ReasonCode | None = None,
+        _properties: Properties | None = None,
+    ) -> None:
+        """Publishes answers that wait, after the acknowledgement of another."""
+        self._on_the_way.discard(identifier)
+        while self._waiting and len(self._on_the_way) < self._most_on_the_way:
+            topic, payload, properties = self._waiting.popleft()
+            sent = self.publish(topic, payload, 1, properties=properties)
+            self._on_the_way.add(sent.mid)
+
+    def read_more(self) -> None:
+        """Reads and handles what has arrived, while the broker takes the answers."""
+        if not self._is_late:
+            data = self.connection.read(_READ_BYTES)
+            self._arrived = self._packets.feed(data)
+            if data:
+                self._note_alive()
+        self._is_late = True
+        for first, body, size in self._arrived:
+            self._handle(first, body, size)
+            if not self.is_open or not self.may_read:
+                return
+        self._is_late = False
+        if self.connection.failure is not None:
+            self.notice()
+
+    def _note_alive(self) -> None:
+        """Tells paho that the broker lives: its answer to a ping may be behind many messages."""
+        now = time.monotonic()
+        if now - self._alive_at >= self._settings.keep_alive / 4:
+            self._alive_at = now
+            self.pass_on(_PINGRESP, b"")
+
+    def _handle(self, first: int, body: bytes | bytearray, size: int) -> None:
+        """Handles a packet, whose body is cut if it is shorter than `size`."""
+        if first & 0xF0 == _PUBLISH:
+            self._take(first, body, size)
+        elif first & 0xF0 == _PUBREL:
+            if len(body) < 2:
+                raise ValueError("a PUBREL packet without identifier")
+            identifier = int.from_bytes(body[:2])
+            self._unreleased.discard(identifier)
+            self._acknowledge(_PUBCOMP, identifier)
+        else:
+            self.pass_on(first, body)
+
+    def _take(self, first: int, body: bytes | bytearray, size: int) -> None:
+        try:
+            message = parse_publish(first, body, size, five=self._five)
+        except ValueError as error:
+            self.end(f"malformed message: {error}")
+            return
+        if message.qos == 2 and message.identifier in self._unreleased:
+            self._acknowledge(_PUBREC, message.identifier)
+            return
+        result = self._inbox.take(message)
+        if message.qos and result.get("reason") in KEEPING:
+            # Without an acknowledgement, the broker sends the message again after a reconnect.
+            self.end(str(result["detail"]))
+            return
+        if message.qos == 1:
+            self._acknowledge(_PUBACK, message.identifier)
+        elif message.qos == 2:
+            self._unreleased.add(message.identifier)
+            self._acknowledge(_PUBREC, message.identifier)
+        # The answer follows the acknowledgement: if the broker closes the connection because of
+        # the answer, it does not deliver the message again.
+        if self.connection.failure is None:
+            self._answer(self, message, result)
+
+    def _acknowledge(self, first: int, identifier: int) -> None:
+        self.connection.put(acknowledgement(first, identifier))

@@ -1,0 +1,186 @@
+"""The audit log of a running appliance: opened, filled with writes and refusals, closed."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+from holdfast._core import __version__
+from holdfast.appliance.parts.part import Part
+from holdfast.config.values.urls import parse_syslog
+from holdfast.events import log_lines
+from holdfast.events.audit import Audit, Copies, Journal, Syslog
+from holdfast.events.audit.refusals import INTERVAL_S, Refusals
+from holdfast.runtime.heartbeat import PERIOD_S, Heartbeat
+from holdfast.runtime.standstill import WallClock
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from holdfast._core import Engine
+    from holdfast.appliance.parts.part import Plan
+    from holdfast.config import AuditConfig, Config
+    from holdfast.types import ThreadHeartbeat
+
+# The most writes that are moved to the audit log at once.
+BATCH = 1000
+
+# How long the thread waits for a write. The engine wakes it for each write, and when it stops.
+TIMEOUT_S = PERIOD_S
+
+# The time between attempts to write a log that fails.
+RETRY_S = 1.0
+
+
+class NoAudit(Part):
+    """An appliance without an audit log. The times of its log lines are watched nevertheless."""
+
+    log: Audit | None = None
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self._clock = WallClock()
+
+    def log_changes(self) -> None:
+        """Logs and records a step of the wall clock."""
+        step = self._clock.look()
+        if step is not None:
+            self._note("clock_stepped", step=step)
+
+    def record_writes_of(self, engine: Engine) -> None:
+        """Records writes of clients, and refusals, from now on."""
+
+    def _note(self, event: str, **fields: object) -> None:
+        """Records an event. Does not wait."""
+
+    def stats(self) -> Mapping[str, Any]:
+        """The counters of the log."""
+        return {"audit": None if self.log is None else self.log.counts()}
+
+
+class AuditLog(NoAudit):
+    """The audit log: opened before anything listens, closed after the last write."""
+
+    # A service that hangs may wait for a shared log, and writes its record when that is left.
+    closing_rank = 1
+
+    def open(self, plan: Plan) -> None:
+        """Opens the file, and records the start."""
+        settings = plan.config.audit
+        assert settings is not None, "there is an audit log"
+        self.log = log = Audit(
+            settings.file,
+            max_bytes=settings.max_bytes,
+            keep=settings.keep,
+            closed=settings.fail == "closed",
+            copies=_copies(settings),
+        )
+        self._record("start")
+        self.closing.callback(log.close)
+        self.closing.callback(self._record, "stop")
+
+    def record_writes_of(self, engine: Engine) -> None:
+        """Starts the thread that records. It ends when everything is recorded."""
+        assert self.log is not None, "opened before the listeners"
+        self._recorder = WriteRecorder(self.log, engine)
+        self._recorder.start()
+        self.closing.callback(self._recorder.finish)
+
+    def prepare(self, plan: Plan) -> Callable[[], None]:  # noqa: ARG002
+        """The file may have been renamed."""
+        return self._reopen
+
+    def _note(self, event: str, **fields: object) -> None:
+        self._recorder.note(event, **fields)
+
+    def heartbeats(self) -> Sequence[ThreadHeartbeat]:
+        """The heartbeat of the thread."""
+        return [self._recorder.heartbeat()]
+
+    def _reopen(self) -> None:
+        assert self.log is not None, "it is open while the appliance runs"
+        self.log.reopen()
+        self._record("reload")
+
+    def _record(self, event: str) -> None:
+        """Records an event of the appliance, with the digest of its configuration."""
+        assert self.log is not None, "it is open while the appliance runs"
+        sha256 = self.config.sha256
+        self.log.write(event=event, version=__version__, config_sha256=sha256)
+
+
+def audit_of(config: Config) -> NoAudit:
+    """The part for a configuration."""
+    return NoAudit(config) if config.audit is None else AuditLog(config)
+
+
+class WriteRecorder:
+    """Moves writes and refusals to the audit log, in a thread, until the engine has stopped."""
+
+    def __init__(self, audit: Audit, engine: Engine, interval: float = INTERVAL_S) -> None:
+        """`interval` is that of `Refusals`."""
+        self._audit = audit
+        self._engine = engine
+        self._refusals = Refusals(interval)
+        self._events: deque[dict[str, object]] = deque()
+        self._lost = 0
+        self._stopped = threading.Event()
+        self._heartbeat = Heartbeat()
+        self._thread = threading.Thread(target=self._run, name="holdfast-audit")
+        audit.on_failing(engine.set_audit_failing)
+
+    def start(self) -> None:
+        """Starts the thread."""
+        log_lines.observe(self._refusals.note)
+        self._thread.start()
+
+    def note(self, event: str, **fields: object) -> None:
+        """Records an event. Does not wait. Thread-safe."""
+        self._events.append({"event": event, **fields})
+
+    def heartbeat(self) -> ThreadHeartbeat:
+        """Returns the heartbeat of the thread. Thread-safe."""
+        return self._thread.name, self._heartbeat.age, self._thread.native_id
+
+    def finish(self) -> None:
+        """Waits until all is moved. Call it after the engine and the services have stopped."""
+        log_lines.forget(self._refusals.note)
+        self._stopped.set()
+        self._engine.stop()  # Ends the wait for a write.
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            self._heartbeat.beat()
+            ended = self._stopped.is_set()
+            if self._audit.closed and self._audit.failing and not ended:
+                # Writes wait in the queue of the engine, whose room is limited.
+                self._stopped.wait(RETRY_S)
+                self._audit.retry()
+                continue
+            writes = self._engine.next_writes(0 if ended else TIMEOUT_S, BATCH)
+            more = self._refusals.rest() if ended else self._refusals.take()
+            while self._events:
+                more.append(self._events.popleft())
+            self._audit.write_all([*writes, *more], done=True)
+            self._log_lost()
+            if ended and not writes:
+                return
+
+    def _log_lost(self) -> None:
+        missed = self._engine.lost_writes
+        if missed > self._lost:
+            self._audit.write(lost=missed - self._lost)
+            log_lines.write(logging.ERROR, "audit_lost", count=missed - self._lost)
+            self._lost = missed
+
+
+def _copies(settings: AuditConfig) -> list[Copies]:
+    copies = []
+    if settings.syslog is not None:
+        copies.append(Copies("syslog", Syslog(*parse_syslog(settings.syslog))))
+    if settings.journald:
+        copies.append(Copies("journald", Journal()))
+    return copies

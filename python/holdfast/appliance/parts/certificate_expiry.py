@@ -1,0 +1,174 @@
+"""The certificates that a configuration names: doubts about them, and when they expire."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+from holdfast.appliance.parts.part import Part
+from holdfast.client.url import NetworkTarget
+from holdfast.config import HTTP_SERVICES, tls_of
+from holdfast.events import log_lines
+from holdfast.runtime import extras
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from holdfast.appliance.parts.part import Plan
+    from holdfast.client.url import Target
+    from holdfast.config import ClientTlsConfig, Config
+    from holdfast.config.text.source import KeyPath
+    from holdfast.net.certificates.expiry import Expiry
+    from holdfast.net.tls import Tls
+
+Kind: TypeAlias = Literal["server", "certificates", "revocation_lists"]
+
+Expiries: TypeAlias = "dict[str, dict[str, float]]"
+"""The earliest expiry in each configured file, in seconds of Unix time, by the kind of files."""
+
+SOON_S = 30 * 24 * 3600.0
+"""A certificate that expires within this time is logged."""
+
+REPEAT_S = 24 * 3600.0
+"""A certificate is logged again after this time."""
+
+KINDS: dict[str, Kind] = {
+    "cert_file": "server",
+    "ca_file": "certificates",
+    "client_ca_file": "certificates",
+    "crl_file": "revocation_lists",
+}
+"""The keys with certificates of servers."""
+
+CLIENTS = (("mqtt", "tls"), ("nats", "tls"), ("nats", "device_tls"), ("gateway", "device_tls"))
+"""The keys with certificates of clients."""
+
+
+@dataclass(frozen=True)
+class _Named:
+    """A file, and the key of the configuration that names it."""
+
+    place: KeyPath
+    file: str
+    kind: Kind
+    by_core: bool = False
+    """Whether the core also reads it, and warns when it is not valid."""
+
+
+class CertificateExpiry(Part):
+    """The expiries of all configured files. Each is logged once a day."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self._expiries: Expiries = {}
+        self._logged: dict[tuple[str, str, str], float] = {}
+
+    def prepare(self, plan: Plan) -> Callable[[], None]:
+        """Reads the files of the configuration."""
+        found = expiries(plan.config)
+
+        def adopt() -> None:
+            self._expiries = found
+
+        return adopt
+
+    def log_changes(self) -> None:
+        """Logs what is due."""
+        self.log_due(self._expiries, time.time())
+
+    def stats(self) -> Mapping[str, Any]:
+        """When each file expires, in seconds of Unix time."""
+        return self._expiries
+
+    def log_due(self, expiries: Expiries, now: float) -> None:
+        """Logs what is due at a Unix time."""
+        for kinds, ends in expiries.items():
+            kind = kinds.removesuffix("s").replace("_", " ")
+            for file, end in ends.items():
+                if end - now > SOON_S:
+                    continue
+                event = "certificate_expired" if end <= now else "certificate_expires"
+                logged = self._logged.get((event, kind, file))
+                # The clock may have been set back.
+                if logged is not None and 0 <= now - logged < REPEAT_S:
+                    continue
+                self._logged[event, kind, file] = now
+                level = logging.ERROR if end <= now else logging.WARNING
+                expires = log_lines.timestamp(end)
+                log_lines.write(level, event, kind=kind, file=file, expires=expires)
+
+
+def expiries(config: Config) -> Expiries:
+    """Reads when the configured certificates and revocation lists expire."""
+    found: Expiries = {"certificates": {}, "revocation_lists": {}}
+    for each in _named(config):
+        if dates := _dates(each):
+            kind = "certificates" if each.kind == "server" else each.kind
+            found[kind][each.file] = min(one.ends.timestamp() for one in dates)
+    return found
+
+
+def doubts(config: Config) -> list[tuple[KeyPath, str]]:
+    """Returns what is doubtful about the certificates: each key and a warning."""
+    found: dict[str, tuple[KeyPath, str]] = {}
+    reason = extras.missing("certs")
+    for each in _named(config):
+        if reason is not None:
+            return [(each.place, f"its dates are not checked, which {reason}")]
+        from holdfast.net.certificates import expiry
+
+        now = expiry.now()
+        texts = [one.doubt(now) for one in _dates(each) if one.is_valid(now) or not each.by_core]
+        if each.kind == "server":
+            texts.append(expiry.nameless(each.file))
+        for text in texts:
+            if text is not None:
+                warning = f"{each.file}: {text}"
+                found.setdefault(warning, (each.place, warning))
+    return list(found.values())
+
+
+def _dates(named: _Named) -> list[Expiry]:
+    if extras.missing("certs") is not None:
+        return []
+    from holdfast.net.certificates import expiry
+
+    if named.kind == "revocation_lists":
+        return expiry.of_revocation_lists(named.file)
+    return expiry.of_certificates(named.file)
+
+
+def _named(config: Config) -> Iterator[_Named]:
+    servers: list[tuple[KeyPath, object]] = [
+        (("listeners", name, "tls"), tls_of(listener))
+        for name, listener in config.listeners.items()
+    ]
+    servers += [((key, "tls"), getattr(getattr(config, key), "tls", None)) for key in HTTP_SERVICES]
+    for place, tls in servers:
+        for key, kind in KINDS.items():
+            if (file := getattr(tls, key, None)) is not None:
+                yield _Named((*place, key), str(file), kind, by_core=True)
+    for section, part in CLIENTS:
+        client: ClientTlsConfig | None = getattr(getattr(config, section), part, None)
+        for key in ("ca_file", "cert_file"):
+            if (file := getattr(client, key, None)) is not None:
+                yield _Named((section, part, key), str(file), "certificates")
+    for name, device in config.devices.items():
+        yield from _of_url(("devices", name, "url"), device.target)
+        for index, forward in enumerate(device.forward):
+            yield from _of_client(("devices", name, "forward", index, "url"), forward.receiver.tls)
+    for name, link in config.links.items():
+        yield from _of_url(("links", name, "url"), link.target)
+
+
+def _of_url(place: KeyPath, target: Target) -> Iterator[_Named]:
+    if isinstance(target, NetworkTarget):
+        yield from _of_client(place, target.tls)
+
+
+def _of_client(place: KeyPath, tls: Tls | None) -> Iterator[_Named]:
+    for file in () if tls is None else (tls.ca, tls.cert):
+        if file is not None:
+            yield _Named(place, file, "certificates")

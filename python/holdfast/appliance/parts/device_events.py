@@ -1,0 +1,101 @@
+"""Logs what happens to devices and links: their health, their receivers, unrequested data."""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import TYPE_CHECKING, Any
+
+from holdfast.events import log_lines
+from holdfast.polling.faults import fault_word
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Mapping, Sequence
+
+    from holdfast.config.models.devices import ForwardConfig
+
+_QUIET_S = 600.0
+"""The time without unrequested data after which more of it is logged again."""
+
+
+class DeviceEvents:
+    """Compares counters with those of the last call. For one thread, except for `health`."""
+
+    def __init__(self) -> None:
+        self.health: dict[str, str] = {}
+        """The health of each polled device at the last call."""
+        self._plan_errors: dict[str, str | None] = {}
+        self._unstored: dict[str, int] = {}
+        self._strays: dict[tuple[str, str, str], tuple[int, float]] = {}
+        self._forwarded: dict[tuple[str, int], Mapping[str, Any]] = {}
+        self._unreachable: set[tuple[str, int]] = set()
+
+    def replace(self, gone: Iterable[str], polled: Collection[str]) -> None:
+        """Forgets devices that are gone, or polled with other settings from now on."""
+        names = {*gone, *polled}
+        for known in (self.health, self._plan_errors, self._unstored):
+            for name in names & known.keys():
+                del known[name]
+        self._forwarded = {key: at for key, at in self._forwarded.items() if key[0] not in names}
+        self._unreachable = {key for key in self._unreachable if key[0] not in names}
+        self.health |= dict.fromkeys(polled, "unknown")
+
+    def log_device(
+        self, name: str, counted: Mapping[str, Any], forwards: Sequence[ForwardConfig]
+    ) -> None:
+        """Logs changes of a polled device."""
+        health, plan_error, unstored = counted["health"], counted["plan_error"], counted["unstored"]
+        if plan_error is not None and plan_error != self._plan_errors.get(name):
+            log_lines.write(logging.ERROR, "device_unplanned", device=name, error=plan_error)
+        self._plan_errors[name] = plan_error
+        refused = unstored - self._unstored.get(name, 0)
+        if refused:
+            log_lines.write(logging.ERROR, "device_unstored", device=name, count=refused)
+        self._unstored[name] = unstored
+        of_receivers = zip(forwards, counted.get("forward", ()), strict=True)
+        for index, (forward, now) in enumerate(of_receivers):
+            self._log_forward((name, index), str(forward.receiver), now)
+        if health != self.health[name]:
+            self.health[name] = health
+            fields: dict[str, object] = {"device": name, "health": health}
+            if health == "error":
+                error = fault_word(counted["last_error"])
+                fields |= {"error": error, "failures": counted["failures"]}
+            usual = health in ("ok", "standby")
+            log_lines.write(logging.INFO if usual else logging.WARNING, "device_health", **fields)
+        self.log_strays("device", name, counted)
+
+    def log_strays(self, kind: str, name: str, counted: Mapping[str, int]) -> None:
+        """Logs that a device or link has begun to send unrequested data, or late replies only."""
+        if self._has_begun((kind, name, "stray_bytes"), counted):
+            strays = {"replies": counted["unexpected_replies"], "bytes": counted["stray_bytes"]}
+            log_lines.write(logging.WARNING, "unrequested_data", **{kind: name}, **strays)
+        if self._has_begun((kind, name, "raised_timeouts"), counted):
+            late = counted["late_replies"]
+            log_lines.write(logging.WARNING, "timeout_raised", **{kind: name}, late_replies=late)
+
+    def _has_begun(self, key: tuple[str, str, str], counted: Mapping[str, int]) -> bool:
+        """Whether a counter has begun to count, or goes on after a while."""
+        now, count = time.monotonic(), counted[key[-1]]
+        before, since = self._strays.get(key, (0, -_QUIET_S))
+        if count != before:
+            self._strays[key] = (count, now)
+        return count > before and now - since >= _QUIET_S
+
+    def _log_forward(self, key: tuple[str, int], receiver: str, now: Mapping[str, Any]) -> None:
+        """Logs what happened at one receiver of a device."""
+        before = self._forwarded.get(key, {})
+        self._forwarded[key] = now
+        refused = now["refused"] - before.get("refused", 0)
+        replied = refused + now["sent"] - before.get("sent", 0)
+        failed = now["failed"] - before.get("failed", 0)
+        fields: dict[str, object] = {"device": key[0], "receiver": receiver}
+        if refused:
+            log_lines.refused("forward_refused", kind=key, **fields, count=refused)
+        if replied and key in self._unreachable:
+            self._unreachable.discard(key)
+            log_lines.write(logging.INFO, "forward_back", **fields)
+        elif failed and not replied and key not in self._unreachable:
+            self._unreachable.add(key)
+            fields |= {key: now[key] for key in ("reason", "error") if now[key] is not None}
+            log_lines.write(logging.WARNING, "forward_failed", **fields)

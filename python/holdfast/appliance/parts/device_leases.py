@@ -1,0 +1,212 @@
+"""Which of the appliances of a log polls each device that is read into a replicated memory.
+
+One lease for each address, because devices behind it share a connection. Whoever has it polls, all
+others stand by. The thread of a log holds the leases. The native poller uses a device while
+its fence is open.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+from holdfast.appliance.nats_servers import nats_servers
+from holdfast.appliance.parts.part import Part
+from holdfast.client.url import connection_of
+from holdfast.events import log_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from holdfast import _core
+    from holdfast.appliance.parts.part import Plan
+    from holdfast.appliance.parts.shared_logs import SharedLogs
+    from holdfast.config import Config
+    from holdfast.replication.leases import LeaseTimes
+    from holdfast.types import ThreadHeartbeat
+
+_ENDING_S = 2.0
+"""How long to wait for polls and writes in progress before a lease is given back."""
+
+
+def leased(config: Config) -> dict[str, str]:
+    """The logs of devices that only one node polls, by device."""
+    found: dict[str, str] = {}
+    for name, device in config.devices.items():
+        if not device.is_polled:
+            continue
+        memories = [read.into.memory for read in device.reads if read.into is not None]
+        if device.status is not None:
+            memories.append(device.status.memory)
+        for memory in memories:
+            replicate = config.memories[memory].replicate
+            if replicate is not None:
+                found.setdefault(name, replicate.log)
+    return found
+
+
+def key_of(config: Config, device: str) -> str:
+    """The key of the lease of a device: its address, in characters that a key may have."""
+    return connection_of(config.devices[device].target).encode().hex()
+
+
+class DeviceLeases(Part):
+    """The leases of all logs of a configuration."""
+
+    def __init__(self, config: Config, logs: SharedLogs, times: LeaseTimes | None) -> None:
+        super().__init__(config)
+        self._shared_logs = logs
+        logs_used = set(leased(config).values()) | {
+            memory.replicate.log for memory in config.memories.values() if memory.replicate
+        }
+        self._of_log = {name: _LogLeases(name, config, times) for name in sorted(logs_used)}
+
+    def fence(self, device: str, config: Config) -> _core.Fence | None:
+        """The fence of a device; `None` if every node polls it."""
+        log = leased(config).get(device)
+        return None if log is None else self._of_log[log].leases.fence(key_of(config, device))
+
+    def prepare(self, plan: Plan) -> Callable[[], None]:
+        """Holds leases for the devices of the configuration, gives those of removed ones back."""
+        return lambda: self._adopt(plan.config)
+
+    def _adopt(self, config: Config) -> None:
+        logs = leased(config)
+        for name, of_log in self._of_log.items():
+            devices: dict[str, list[str]] = {}
+            for device, log in logs.items():
+                if log == name:
+                    devices.setdefault(key_of(config, device), []).append(device)
+            of_log.adopt(devices)
+
+    def start(self) -> None:
+        """Begins to take leases."""
+        for of_log in self._of_log.values():
+            of_log.start()
+
+    def stats(self) -> Mapping[str, Any]:
+        """The state of each log, with those who poll its devices. Thread-safe."""
+        # Each log with memories has leases, also without devices.
+        found = self._shared_logs.status()
+        return {
+            "logs": {
+                name: {**status, "devices": self._of_log[name].status()}
+                for name, status in found.items()
+            }
+        }
+
+    def heartbeats(self) -> list[ThreadHeartbeat]:
+        """The heartbeats of the threads. Thread-safe."""
+        found = (of_log.heartbeat() for of_log in self._of_log.values())
+        return [each for each in found if each is not None]
+
+    def close(self) -> None:
+        """Gives all leases back, while devices are still polled."""
+        for of_log in self._of_log.values():
+            of_log.stop()
+
+
+class _State(Enum):
+    """Whether the thread of a log's leases runs."""
+
+    STOPPED = "not started, or stopped"
+    IDLE = "started, and there are no devices"
+    RUNNING = "there are devices, or there were"
+
+
+@dataclass
+class _LogLeases:
+    """The leases of one log, in a thread of its own while there are devices."""
+
+    log: str
+    config: Config
+    times: LeaseTimes | None
+
+    def __post_init__(self) -> None:
+        # Only an appliance with logs loads the client of NATS.
+        from holdfast.replication.leases import LEASE_TIMES, Leases, LeaseThread
+
+        settings = self.config.logs[self.log]
+        self.leases = Leases(
+            f"holdfast-log-{self.log}-devices",
+            settings.node,
+            self,
+            times=self.times or LEASE_TIMES,
+            replicas=settings.replicas,
+            about=lambda key: {"devices": self._devices.get(key, [])},
+        )
+        self._servers = nats_servers(settings)
+        self._thread = LeaseThread(self.leases, self._connect, f"holdfast-leases-{self.log}")
+        self._devices: dict[str, list[str]] = {}
+        self._missing: set[tuple[str, str]] = set()
+        self._state = _State.STOPPED
+
+    def adopt(self, devices: dict[str, list[str]]) -> None:
+        before, self._devices = self._devices, devices
+        if self._state is _State.RUNNING:
+            self._thread.want(devices)
+            for key in set(before) - set(devices):
+                self._thread.give_back_soon(key, _ENDING_S)
+        elif self._state is _State.IDLE:
+            self.start()
+
+    def start(self) -> None:
+        self._state = _State.RUNNING if self._devices else _State.IDLE
+        if self._devices:
+            self._thread.start()
+            self._thread.want(self._devices)
+
+    def stop(self) -> None:
+        self._state = _State.STOPPED
+        self._thread.stop(_ENDING_S)
+
+    def heartbeat(self) -> ThreadHeartbeat | None:
+        return self._thread.heartbeat
+
+    def status(self) -> dict[str, dict[str, Any]]:
+        found = {}
+        for key, devices in dict(self._devices).items():
+            holder = self.leases.holder(key)
+            for device in devices:
+                known = holder is None or device in holder.about.get("devices", [device])
+                found[device] = {
+                    "node": holder.node if holder is not None and known else None,
+                    "polled_here": self.leases.is_held(key),
+                }
+        return dict(sorted(found.items()))
+
+    def taken(self, key: str) -> None:
+        for device in self._devices.get(key, ()):
+            log_lines.write(logging.INFO, "device_taken_over", device=device, log=self.log)
+
+    def lost(self, key: str, reason: str) -> None:
+        for device in self._devices.get(key, ()):
+            log_lines.write(
+                logging.WARNING, "device_given_up", device=device, log=self.log, reason=reason
+            )
+
+    def works(self, reason: str | None) -> None:
+        if reason is None:
+            log_lines.write(logging.INFO, "leases_available", log=self.log)
+        else:
+            log_lines.write(logging.WARNING, "leases_unavailable", log=self.log, reason=reason)
+
+    def changed(self) -> None:
+        """Notes devices that nobody polls: the holder of their address does not have them."""
+        for key, devices in self._devices.items():
+            holder = self.leases.holder(key)
+            if holder is None:
+                continue
+            for device in devices:
+                unknown = device not in holder.about.get("devices", [device])
+                if unknown and (device, holder.node) not in self._missing:
+                    self._missing.add((device, holder.node))
+                    fields = {"device": device, "log": self.log, "node": holder.node}
+                    log_lines.write(logging.WARNING, "device_not_polled", **fields)
+
+    async def _connect(self, connected: Callable[[Any], None]) -> None:
+        from holdfast.net.nats import Broker, Ping
+
+        await Broker(self._servers, {}, connected, Ping(), name="holdfast leases").run()

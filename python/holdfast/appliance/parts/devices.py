@@ -1,0 +1,163 @@
+"""The native poller: polled devices, the links of listeners, and the values of tags."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from holdfast import _core
+from holdfast.appliance.parts import native_devices
+from holdfast.appliance.parts.device_events import DeviceEvents
+from holdfast.appliance.parts.part import Part
+from holdfast.appliance.parts.tag_values import TagValues
+from holdfast.appliance.parts.tag_writes import TagWrites
+from holdfast.config.checks.units import routed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from holdfast.appliance.parts.audit import NoAudit
+    from holdfast.appliance.parts.device_leases import DeviceLeases
+    from holdfast.appliance.parts.mirrors import Mirrors
+    from holdfast.appliance.parts.part import Plan
+    from holdfast.config import Config
+    from holdfast.polling import Reading
+    from holdfast.types import ThreadHeartbeat
+
+_END_TIMEOUT_S = 5.0
+"""How long to wait for a thread that ends with the poller."""
+
+
+class Devices(Part):
+    """All that uses the native poller. There is none until something requires it."""
+
+    def __init__(
+        self, config: Config, audit: NoAudit, leases: DeviceLeases, mirrors: Mirrors
+    ) -> None:
+        super().__init__(config)
+        self._audit, self._leases, self._mirrors = audit, leases, mirrors
+        self.poller: _core.Poller | None = None
+        self.values: TagValues | None = None
+        """The values of tags, once there are tags; `writes` with them."""
+        self.writes: TagWrites | None = None
+        self.passages: dict[str, _core.Passage] = {}
+        """How services write to memories whose writes go to devices."""
+        self._links: Mapping[str, _core.Link] = {}
+        self._polled: set[str] = set()
+        self._events = DeviceEvents()
+
+    def open(self, plan: Plan) -> None:
+        """Creates links and devices. They are polled only once all parts are open."""
+        self._show_disabled(plan)
+        self._begin = self._prepare(plan)
+
+    def start(self) -> None:
+        """Begins to poll."""
+        self._begin()
+
+    def prepare(self, plan: Plan) -> Callable[[], None]:
+        """Creates links, and the devices with other settings."""
+        replace = self._prepare(plan)
+
+        def adopt() -> None:
+            replace()
+            # A poll of a device that was just disabled can't write its status block any more.
+            self._show_disabled(plan)
+
+        return adopt
+
+    def _prepare(self, plan: Plan) -> Callable[[], None]:
+        config = plan.config
+        polled = {name for name, device in config.devices.items() if device.is_polled}
+        poller, values, writes = self.poller, self.values, self.writes
+        if poller is None and (polled or config.links or routed(config) or config.nats is not None):
+            poller = _core.Poller([])
+            plan.undo.callback(poller.stop)
+        if poller is not None:
+            if values is None and any(config.devices[name].has_tags for name in polled):
+                values = TagValues(poller.receiver())
+                writes = TagWrites(poller, self._audit.log, values.find)
+            # The first use of an address decides the settings of its connection: links first.
+            plan.links = native_devices.links(config, plan.memories, poller)
+        results = None if values is None else values.results
+        made = {
+            name: native_devices.device(
+                name, config, plan.memories, results, self._leases.fence(name, config)
+            )
+            for name in config.devices
+            if name in polled and f"devices.{name}" in plan.changed
+        }
+
+        def adopt() -> None:
+            self.poller, self.values, self.writes = poller, values, writes
+            if values is not None:
+                values.adopt(config)
+                values.start()
+            self.passages.update(plan.links.passages)
+            for name in self.passages.keys() - plan.links.passages.keys():
+                del self.passages[name]
+            self._links = plan.links.links
+            gone = self._polled - polled
+            if poller is not None:
+                for name in gone:
+                    poller.remove(name)
+                for name, device in made.items():
+                    if name in self._polled:
+                        poller.replace(name, device, at_once=False)
+                    else:
+                        poller.add(device)
+            self._polled = polled
+            self._events.replace(gone, made)
+
+        return adopt
+
+    def close(self) -> None:
+        """Stops the poller, and with it the threads that take its results."""
+        if self.poller is not None:
+            self.poller.stop()
+        for thread in (self.values, self.writes):
+            if thread is not None:
+                thread.join(_END_TIMEOUT_S)
+
+    def log_changes(self) -> None:
+        """Logs changes of devices and links."""
+        for name, counted in self._counters().items():
+            self._events.log_device(name, counted, self.config.devices[name].forward)
+        for name, link in self._links.items():
+            if name not in self.config.devices:
+                self._events.log_strays("link", name, link.counters())
+
+    def heartbeats(self) -> list[ThreadHeartbeat]:
+        """The heartbeats of the poller and of the thread that takes values."""
+        found = [] if self.poller is None else [self.poller.heartbeat]
+        if self.values is not None and (tags := self.values.heartbeat()) is not None:
+            found.append(tags)
+        return found
+
+    def stats(self) -> Mapping[str, Any]:
+        """The health and the counters of each device, the counters of each link."""
+        disabled = [name for name, device in self.config.devices.items() if not device.enabled]
+        found = {**self._counters(), **{name: {"health": "disabled"} for name in disabled}}
+        aging = self._mirrors.status()
+        for name in found.keys() & aging.keys():
+            found[name]["mirrors"] = aging[name]
+        links = {name: link.counters() for name, link in self._links.items()}
+        return {"devices": found, "links": links}
+
+    def health(self) -> dict[str, str]:
+        """The health of each polled device when `log_changes` looked last. Thread-safe."""
+        return dict(self._events.health)
+
+    def readings(self) -> list[Reading]:
+        """The last reading of each tag. Thread-safe."""
+        return [] if self.values is None else self.values.latest()
+
+    def _counters(self) -> dict[str, dict[str, Any]]:
+        """The counters of the devices in the configuration. Those of the scanner have a slash."""
+        found = {} if self.poller is None else self.poller.counters()
+        return {name: counted for name, counted in found.items() if "/" not in name}
+
+    def _show_disabled(self, plan: Plan) -> None:
+        """Writes the status blocks of disabled devices."""
+        for name, device in plan.config.devices.items():
+            if not device.enabled and device.status is not None:
+                native_devices.show_disabled(name, device.status, plan.memories)

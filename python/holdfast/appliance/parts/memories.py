@@ -1,0 +1,168 @@
+"""The memories of an appliance, and the files that keep them over restarts.
+
+Files are opened before anything listens, and closed last. A reload adds memories, and never touches
+the others.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+from holdfast import _core
+from holdfast.appliance.parts.part import Part
+from holdfast.events import log_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from holdfast._core import Memory
+    from holdfast.appliance.parts.part import Plan
+    from holdfast.config import Config, MemoryConfig
+
+
+class UnusableFile(OSError):
+    """A file of memories is damaged, in use, or can't be written."""
+
+
+class Memories(Part):
+    """The memories by name, and their files."""
+
+    def __init__(self, config: Config, memories: dict[str, Memory]) -> None:
+        super().__init__(config)
+        self.by_name = memories
+        """Services use it too, so that they find memories that a reload has added."""
+        self._seals = {name: memory.seal_changes for name, memory in memories.items()}
+        self._files: dict[Path, _core.MemoryFile] = {}
+        self._of_logs: dict[str, Path] = {}
+        self._failing: dict[Path, str | None] = {}
+
+    def open(self, plan: Plan) -> None:
+        """Loads the contents of the memories. Raises `UnusableFile`."""
+        try:
+            for path, names in _files_of(self.config).items():
+                self._open(path, names, plan.memories)
+        except OSError as error:
+            raise UnusableFile(str(error)) from None
+
+    def prepare(self, plan: Plan) -> Callable[[], None]:
+        """Creates memories that the configuration adds."""
+        names = plan.config.memories.keys() - self.by_name.keys()
+        added = {name: created(plan.config, name) for name in plan.config.memories if name in names}
+        plan.memories |= added
+
+        def adopt() -> None:
+            self._seals |= {name: memory.seal_changes for name, memory in added.items()}
+            self.by_name.update(added)
+
+        return adopt
+
+    def log_seals(self) -> None:
+        """Logs seals that have opened or closed since the last call."""
+        for name, memory in self.by_name.items():
+            before, now = self._seals[name], memory.seal_changes
+            if now != before:
+                self._seals[name] = now
+                opened, closed = (count - past for count, past in zip(now, before, strict=True))
+                state = "sealed" if memory.sealed else "open"
+                log_lines.write(
+                    logging.INFO, "seal", memory=name, state=state, opened=opened, closed=closed
+                )
+
+    def _open(self, path: Path, names: list[str], memories: Mapping[str, _core.Memory]) -> None:
+        first = self.config.memories[names[0]]
+        keep, replicate = first.keep, first.replicate
+        assert keep is not None, "the memory is kept"
+        members = [(name, memories[name]) for name in names]
+        file = _core.MemoryFile(str(path), members, keep.sync, of_log=replicate is not None)
+        self._files[path] = file
+        self.closing.callback(_close, path, file)
+        for warning in file.warnings:
+            log_lines.write(logging.WARNING, "memory_file_differs", file=path, warning=warning)
+        for name in names:
+            if name not in file.loaded:
+                fill(memories[name], self.config.memories[name])
+        if replicate is None:
+            file.start()
+        else:
+            self._of_logs[replicate.log] = path
+        loaded = ",".join(file.loaded) or "-"
+        log_lines.write(logging.INFO, "memory_file", file=path, loaded=loaded, sync=keep.sync)
+
+    def of_log(self, log: str) -> Path | None:
+        """The file of the memories of a log."""
+        return self._of_logs.get(log)
+
+    def note(self, log: str) -> bytes | None:
+        """What that file has noted of the log."""
+        path = self.of_log(log)
+        return None if path is None else self._files[path].note
+
+    def follow(self, name: str, log: _core.Log) -> None:
+        """Stores from now on what the memories of a log contain. Raises `UnusableFile`."""
+        path = self.of_log(name)
+        if path is None:
+            return
+        try:
+            self._files[path].start(log)
+        except OSError as error:
+            raise UnusableFile(str(error)) from None
+
+    def stats(self) -> Mapping[str, Any]:
+        """The state and the counters of each file."""
+        files = self._files.items()
+        return {"memory_files": {str(path): dict(file.status()) for path, file in files}}
+
+    def log_changes(self) -> None:
+        """Logs files that can't be written any more, and those that can again."""
+        for path, file in self._files.items():
+            error = file.status()["failing"]
+            if error is not None and self._failing.get(path) is None:
+                log_lines.write(logging.ERROR, "memory_file_failing", file=path, error=error)
+            elif error is None and self._failing.get(path) is not None:
+                log_lines.write(logging.INFO, "memory_file_back", file=path)
+            self._failing[path] = error
+
+
+def created(config: Config, name: str) -> Memory:
+    """Creates a memory with its initial values; one that is kept gets its values later."""
+    settings = config.memories[name]
+    made = empty(settings)
+    if settings.keep is None:
+        # Of a log, the first node has them; the others get those of the log.
+        fill(made, settings)
+    return made
+
+
+def empty(settings: MemoryConfig) -> Memory:
+    """Creates the memory that the settings describe, with all values 0."""
+    seal = settings.seal
+    return _core.Memory(
+        **{area: (span.start, span.size) for area, span in settings.areas().items()},
+        seal=None if seal is None else (seal.area, seal.address, seal.mode),
+    )
+
+
+def fill(made: Memory, settings: MemoryConfig) -> None:
+    """Writes the initial values."""
+    writes = [(run.area, run.address, run.values) for run in settings.initial_values]
+    if writes:
+        made.write_many(writes)
+
+
+def _close(path: Path, file: _core.MemoryFile) -> None:
+    """Stores what is left."""
+    try:
+        file.stop()
+    except OSError as error:
+        log_lines.write(logging.ERROR, "memory_file_failing", file=path, error=error)
+
+
+def _files_of(config: Config) -> dict[Path, list[str]]:
+    """The names of the memories in each file."""
+    files: dict[Path, list[str]] = {}
+    for name, settings in config.memories.items():
+        if settings.keep is not None:
+            files.setdefault(settings.keep.file, []).append(name)
+    return files

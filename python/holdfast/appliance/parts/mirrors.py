@@ -1,0 +1,113 @@
+"""The ranges that devices are read into: who may write them, and how old their values are."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from holdfast import _core
+from holdfast.appliance.parts.part import Part
+from holdfast.events import log_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from holdfast._core import Memory
+    from holdfast.appliance.parts.part import Plan
+    from holdfast.config import Config
+    from holdfast.types import Area
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where values of a device are in memory."""
+
+    memory: str
+    area: Area
+    address: int
+    count: int
+
+    @property
+    def range(self) -> tuple[Area, int, int]:
+        """The place in its memory."""
+        return self.area, self.address, self.count
+
+
+class Mirror(NamedTuple):
+    """A range that a device is read into, whose age is watched."""
+
+    device: str
+    source: tuple[object, ...]
+    """Where the values come from. With another source, the values in memory are not of it."""
+    place: Place
+    age: _core.MirrorAge
+
+
+class Mirrors(Part):
+    """The ranges of all devices. `status` is thread-safe."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self._mirrors: tuple[Mirror, ...] = ()
+        self._stale: set[Place] = set()
+
+    def prepare(self, plan: Plan) -> Callable[[], None]:
+        """Reserves the ranges of the configuration before its devices are polled."""
+        return lambda: self.adopt(plan.config, plan.memories)
+
+    def adopt(self, config: Config, memories: Mapping[str, Memory]) -> None:
+        """Takes over a configuration. Ages of ranges that are read as before stay."""
+        known = {(mirror.source, mirror.place): mirror.age for mirror in self._mirrors}
+        mirrors = []
+        reserved: dict[str, list[tuple[Area, int, int]]] = {}
+        for name, device in config.devices.items():
+            for read in device.reads:
+                if (into := read.into) is None:
+                    continue
+                place = Place(into.memory, into.area, into.address, read.count)
+                if device.enabled and device.writes != "local":
+                    reserved.setdefault(into.memory, []).append(place.range)
+                if device.stale is None:
+                    continue
+                after, refuses = device.stale.after, device.stale.answer == "exception"
+                source = (name, device.url, device.unit, read.area, read.address)
+                age = known.get((source, place))
+                if age is None:
+                    age = _core.MirrorAge(after, refuses=refuses)
+                age.set(after, refuses=refuses)
+                mirrors.append(Mirror(name, source, place, age))
+        for name, memory in memories.items():
+            aging = [(*each.place.range, each.age) for each in mirrors if each.place.memory == name]
+            memory.mirror(reserved.get(name, []), aging)
+        self._mirrors = tuple(mirrors)
+        self._stale &= {mirror.place for mirror in mirrors}
+
+    def status(self) -> dict[str, list[dict[str, Any]]]:
+        """Returns the ranges of each device whose age is watched, and since when they are stale."""
+        found: dict[str, list[dict[str, Any]]] = {}
+        now = time.time()
+        for mirror in self._mirrors:
+            age, stale_for = mirror.age.seconds, mirror.age.stale_for
+            entry = {
+                **asdict(mirror.place),
+                "age": None if age is None else round(age, 3),
+                "stale_since": None if stale_for is None else round(now - stale_for, 3),
+            }
+            found.setdefault(mirror.device, []).append(entry)
+        return found
+
+    def log_changes(self) -> None:
+        """Logs which ranges have become stale, or are read again, since the last call."""
+        for device, place, age in ((each.device, each.place, each.age) for each in self._mirrors):
+            is_stale = age.stale_for is not None and age.seconds is not None
+            if is_stale == (place in self._stale):
+                continue
+            self._stale ^= {place}
+            log_lines.write(
+                logging.WARNING if is_stale else logging.INFO,
+                "mirror_stale" if is_stale else "mirror_fresh",
+                device=device,
+                **asdict(place),
+            )

@@ -1,0 +1,208 @@
+"""The values of tags: from the native poller to the outputs, on a thread of its own."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from holdfast.client.url import NetworkTarget
+from holdfast.config.models.devices import DeviceIdentityConfig
+from holdfast.events import log_lines
+from holdfast.outputs import Buffer, Changes, Sending
+from holdfast.outputs.site import DeviceInfo
+from holdfast.polling import Reading
+from holdfast.polling.readings import Reader
+from holdfast.runtime.heartbeat import Heartbeat
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from holdfast._core import Results
+    from holdfast.config import Config, DeviceConfig
+    from holdfast.config.models.outputs import Output
+    from holdfast.outputs import Receiver
+    from holdfast.outputs.stored import Stored
+    from holdfast.polling import DevicePoll
+    from holdfast.tags import Tag
+    from holdfast.types import ThreadHeartbeat
+
+_WAIT_S = 1.0
+"""How long one wait for polls takes."""
+
+_GATHER_S = 0.005
+"""How long a batch waits for more polls, so that batches have a useful size."""
+
+
+def _info(device: DeviceConfig) -> DeviceInfo:
+    identity, target = device.identity or DeviceIdentityConfig(), device.target
+    return DeviceInfo(
+        f"{target}, unit {device.unit}",
+        target.host if isinstance(target, NetworkTarget) else None,
+        identity.vendor_name,
+        identity.model_name or device.profile,
+        identity.revision,
+    )
+
+
+@dataclass
+class _Output:
+    """What an output publishes, and what it has not sent yet."""
+
+    settings: Output
+    changes: Changes
+    buffer: Buffer
+
+
+class TagValues:
+    """Converts the polls that a receiver takes, and offers them to each output.
+
+    Ends with the poller.
+    """
+
+    def __init__(self, results: Results) -> None:
+        self.results = results
+        self._lock = threading.Lock()
+        self._readers: dict[str, Reader] = {}
+        self._outputs: dict[str, _Output] = {}
+        self._latest: dict[str, list[Reading]] = {}
+        self._answering: dict[str, bool] = {}
+        self.revision = 0
+        """Changes with the tags of any device, and with `devices`."""
+        self.devices: dict[str, DeviceInfo] = {}
+        """What is known of each device with tags. Replaced as a whole."""
+        self.answers = 0
+        """Changes when a device stops to answer, or answers again."""
+        self._heartbeat = Heartbeat()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="holdfast-tags", daemon=True)
+
+    def start(self) -> None:
+        """Starts the thread, if it does not run yet."""
+        if self._thread.ident is None:
+            self._thread.start()
+
+    def join(self, timeout: float) -> None:
+        """Waits for the thread, which ends with the poller."""
+        if self._thread.ident is not None:
+            self._thread.join(timeout)
+
+    def adopt(self, config: Config) -> None:
+        """Takes over devices and outputs. Outputs keep what they have to send."""
+        readers = {
+            name: Reader(name, tags)
+            for name, device in config.devices.items()
+            if device.is_polled and len(tags := config.tags(name))
+        }
+        with self._lock:
+            before = {name: reader.tags for name, reader in self._readers.items()}
+            now = {name: reader.tags for name, reader in readers.items()}
+            changed = {name for name in {*before, *now} if before.get(name) != now.get(name)}
+            devices = {name: _info(config.devices[name]) for name in readers}
+            self.revision += bool(changed) or devices != self.devices
+            self.devices = devices
+            self._answering = {
+                name: answers for name, answers in self._answering.items() if name in readers
+            }
+            # A reader keeps its decoders while the tags of its device stay.
+            unchanged = {name: self._readers[name] for name in readers if name not in changed}
+            self._readers = readers | unchanged
+            self._latest = {
+                name: found for name, found in self._latest.items() if name not in changed
+            }
+            outputs: dict[str, _Output] = {}
+            for name, settings in config.outputs.items():
+                known = self._outputs.get(name)
+                if known is None or known.settings != settings:
+                    buffer = Buffer() if known is None else known.buffer
+                    changes = Changes(settings.publish, settings.heartbeat)
+                    known = _Output(settings, changes, buffer)
+                known.buffer.most = settings.buffer.values
+                known.changes.forget(changed)
+                outputs[name] = known
+            self._outputs = outputs
+
+    def sending(self, name: str, receiver: Callable[[], Receiver]) -> Sending:
+        """The adapter of an output."""
+        output = self._outputs[name]
+        settings = output.settings.buffer
+        file = settings.file
+
+        def opened() -> Stored:
+            from holdfast.outputs.stored import Stored
+
+            assert file is not None, "called only with a file"
+            return Stored(file, settings.max_bytes, self.find)
+
+        return Sending(name, receiver(), output.buffer, None if file is None else opened)
+
+    def find(self, device: str, tag: str) -> Tag | None:
+        """A tag of the configuration."""
+        reader = self._readers.get(device)
+        return None if reader is None else reader.named.get(tag)
+
+    def latest(self) -> list[Reading]:
+        """The last reading of each tag. Thread-safe."""
+        with self._lock:
+            return [reading for readings in self._latest.values() for reading in readings]
+
+    def tags(self) -> dict[str, tuple[Tag, ...]]:
+        """The tags of each device. Thread-safe."""
+        with self._lock:
+            readers = self._readers
+        return {name: reader.tags for name, reader in readers.items()}
+
+    def answering(self) -> dict[str, bool]:
+        """Whether each device answers, as far as it is known. Thread-safe."""
+        with self._lock:
+            return dict(self._answering)
+
+    def refresh(self, output: str) -> None:
+        """Publishes the next value of each tag to an output, also if unchanged. Thread-safe."""
+        with self._lock:
+            if output in self._outputs:
+                self._outputs[output].changes.forget(self._readers)
+
+    def heartbeat(self) -> ThreadHeartbeat | None:
+        """The heartbeat of the thread; `None` before the start."""
+        if self._thread.ident is None:
+            return None
+        return self._thread.name, self._heartbeat.age, self._thread.native_id
+
+    def _run(self) -> None:
+        while (taken := self.results.take(_WAIT_S)) is not None:
+            self._heartbeat.beat()
+            found = taken[0]
+            if not found:
+                continue
+            self._ending.wait(_GATHER_S)
+            more = self.results.take(0.0)
+            if more is not None:
+                found += more[0]
+            try:
+                with self._lock:
+                    polls = [
+                        self._readers[name].poll(blocks)
+                        for name, _, blocks in found
+                        if name in self._readers
+                    ]
+                    self._offer(polls)
+            except Exception:  # A fault in one poll must not end all outputs.
+                log_lines.problem("tag_values_failed")
+
+    def _offer(self, polls: Iterable[DevicePoll]) -> None:
+        for poll in polls:
+            self._latest[poll.device] = poll.readings
+            answers = poll.has_answered
+            if self._answering.get(poll.device) is not answers:
+                self._answering[poll.device] = answers
+                self.answers += 1
+        for output in self._outputs.values():
+            only = output.settings.devices
+            readings = [
+                reading
+                for poll in polls
+                if only is None or poll.device in only
+                for reading in poll.readings
+            ]
+            output.buffer.offer(output.changes.of(readings))

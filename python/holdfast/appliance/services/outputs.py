@@ -1,0 +1,136 @@
+"""Outputs: publish the values of tags. Only configured outputs load their library."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, assert_never
+
+from holdfast.appliance.nats_servers import nats_servers
+from holdfast.appliance.services.services import Service
+from holdfast.appliance.services.supervision import Supervisor
+from holdfast.config.models.outputs import (
+    FileConfig,
+    InfluxConfig,
+    MqttOutputConfig,
+    NatsOutputConfig,
+    SparkplugConfig,
+)
+from holdfast.outputs.site import NotWritten
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator, Mapping
+
+    from holdfast.appliance.parts.tag_values import TagValues
+    from holdfast.appliance.parts.tag_writes import TagWrites
+    from holdfast.appliance.services.services import Services
+    from holdfast.config import Config
+    from holdfast.config.models.outputs import Output
+    from holdfast.outputs import Receiver
+    from holdfast.outputs.site import DeviceInfo, Site
+    from holdfast.polling import Reading
+    from holdfast.tags import Tag
+
+PREFIX = "output/"
+"""The beginning of the names of outputs among the adapters, whose names have no slash."""
+
+
+class Outputs(Service):
+    """The services of the section `outputs`."""
+
+    def adapters(self, config: Config, running: Services) -> Iterator[Supervisor]:
+        """Yields all outputs, if there are tags."""
+        values, writes = running.context.devices.values, running.context.devices.writes
+        if values is None or writes is None:
+            return
+        for name, settings in config.outputs.items():
+            site = OutputSite(name, settings.devices, values, writes)
+            factory = partial(values.sending, name, partial(receiver, name, settings, site))
+            yield Supervisor(f"{PREFIX}{name}", factory, settings)
+
+
+class OutputSite:
+    """The devices of the appliance, as one output may see them: a `holdfast.outputs.site.Site`."""
+
+    def __init__(
+        self, output: str, only: Collection[str] | None, values: TagValues, writes: TagWrites
+    ) -> None:
+        self._output, self._only = output, only
+        self._values, self._writes = values, writes
+
+    @property
+    def revision(self) -> int:
+        """Changes with the tags of any device, and with `devices`."""
+        return self._values.revision
+
+    @property
+    def answers(self) -> int:
+        """Changes when a device stops to answer, or answers again."""
+        return self._values.answers
+
+    def tags(self) -> dict[str, tuple[Tag, ...]]:
+        """The tags of each device."""
+        return {name: tags for name, tags in self._values.tags().items() if self._has(name)}
+
+    def devices(self) -> Mapping[str, DeviceInfo]:
+        """What is known of each device."""
+        return self._values.devices
+
+    def answering(self) -> dict[str, bool]:
+        """Whether each device answers, as far as it is known."""
+        answers = self._values.answering()
+        return {name: answer for name, answer in answers.items() if self._has(name)}
+
+    def latest(self) -> list[Reading]:
+        """The last reading of each tag."""
+        return [reading for reading in self._values.latest() if self._has(reading.device)]
+
+    def _has(self, device: str) -> bool:
+        return self._only is None or device in self._only
+
+    def refresh(self) -> None:
+        """Has the next value of each tag published, also if it is unchanged."""
+        self._values.refresh(self._output)
+
+    def write(
+        self,
+        device: str,
+        tag: str,
+        text: str,
+        peer: str,
+        done: Callable[[NotWritten | None], None],
+    ) -> None:
+        """Writes a value, as text. Raises `NotWritten` if nothing was sent."""
+        if not self._has(device):
+            raise NotWritten("unknown_tag", "no such tag")
+        self._writes.write(device, tag, text, f"output/{self._output}", peer, done)
+
+
+def receiver(name: str, settings: Output, site: Site) -> Receiver:
+    """The receiver that the settings describe."""
+    match settings:
+        case InfluxConfig():
+            from holdfast.outputs.influx import Influx
+
+            return Influx(settings)
+        case NatsOutputConfig():
+            from holdfast.scanner.publish.nats_output import NatsOutput
+
+            return NatsOutput(nats_servers(settings), settings.prefix, settings.dialect)
+        case MqttOutputConfig():
+            from holdfast.outputs.mqtt import MqttOutput
+
+            return MqttOutput(name, settings, site)
+        case SparkplugConfig():
+            from holdfast.outputs.sparkplug import SparkplugOutput
+
+            return SparkplugOutput(name, settings, site)
+        case FileConfig(format="sqlite"):
+            from holdfast.outputs.text_file import Database
+
+            return Database(settings)
+        case FileConfig():
+            from holdfast.outputs.text_file import TextFile
+
+            return TextFile(settings)
+        case _:
+            assert_never(settings)

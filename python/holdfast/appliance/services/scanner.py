@@ -1,0 +1,63 @@
+"""The scanner: polls devices for subscribers on NATS."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holdfast.appliance.nats_servers import nats_servers, tls_files
+from holdfast.appliance.services.services import Service
+from holdfast.appliance.services.supervision import Starter, Supervisor
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from holdfast.appliance.services.services import Services
+    from holdfast.config import Config, NatsConfig
+    from holdfast.config.models.tags import ProfileConfig
+    from holdfast.scanner import Settings
+
+
+class ScannerService(Service):
+    """The service of the section `nats`."""
+
+    def adapters(self, config: Config, running: Services) -> Iterator[Supervisor]:
+        """Yields the adapter, if there is the section."""
+        if config.nats is None:
+            return
+        from holdfast.scanner.adapter import ScannerAdapter
+
+        settings = scanner_settings(config.nats, config.profiles)
+        starter, poller = Starter(), running.context.devices.poller
+        yield Supervisor(
+            "nats",
+            lambda: ScannerAdapter(settings, poller, starter.start),
+            config.nats,
+            config.profiles,
+            may_end=True,
+            starter=starter,
+        )
+
+
+def scanner_settings(
+    settings: NatsConfig, profiles: Mapping[str, ProfileConfig] | None = None
+) -> Settings:
+    """Returns the settings of the scanner."""
+    from holdfast.scanner import Defaults, FleetSettings, Ping, ScannerLimits, Settings
+
+    fleet, given = settings.fleet, settings.defaults
+    return Settings(
+        nats_servers(settings),
+        settings.prefix,
+        settings.devices,
+        ScannerLimits(devices=settings.limits.devices, tags=settings.limits.tags),
+        tls_files(settings.device_tls),
+        defaults=Defaults(given.timeout, given.publish, given.deadband, given.scan_rate),
+        writes=settings.writes,
+        strict=settings.strict,
+        ping=Ping(settings.ping.interval, settings.ping.outstanding),
+        publish_logs=settings.publish_logs,
+        keep_subscriptions=settings.keep_subscriptions,
+        dialect=settings.dialect,
+        profiles={name: profile.tag_list for name, profile in (profiles or {}).items()},
+        fleet=None if fleet is None else FleetSettings(fleet.name, fleet.node, fleet.partitions),
+    )

@@ -1,0 +1,46 @@
+"""The log of a service, which has no standard error: a file that is rotated."""
+
+from __future__ import annotations
+
+import io
+import logging
+from logging.handlers import RotatingFileHandler
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MAX_BYTES = 10_000_000
+"""Bytes of a file."""
+
+BACKUPS = 5
+"""Older files, `NAME.log.1` and so on."""
+
+
+class LogFile(io.TextIOBase):
+    """A stream to a rotated file. What can't be written is dropped: the service goes on."""
+
+    def __init__(self, file: Path) -> None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        self._handler = _Handler(file, maxBytes=MAX_BYTES, backupCount=BACKUPS, encoding="utf-8")
+
+    def writable(self) -> bool:
+        """It is."""
+        return True
+
+    def write(self, text: str, /) -> int:
+        """Appends text."""
+        self._handler.handle(logging.makeLogRecord({"msg": text}))
+        return len(text)
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._handler.close()
+        super().close()
+
+
+class _Handler(RotatingFileHandler):
+    terminator = ""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Drops the text: the default writes to standard error, which leads back here."""

@@ -1,0 +1,1 @@
+"""Commands for an appliance: its configuration, its files, and the one that runs."""

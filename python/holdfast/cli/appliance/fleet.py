@@ -1,0 +1,114 @@
+"""`holdfast fleet`: the scanners that share devices, and how to end one without a gap."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import time
+from typing import Any
+
+import click
+
+from holdfast.cli import SuggestingGroup
+from holdfast.cli.exit_codes import ExitCode, fail
+from holdfast.cli.options.nats import nats_options
+from holdfast.cli.options.option import flag, json_option, option, parsed_by
+from holdfast.cli.terminal_text import counted, print_json, table
+from holdfast.config.values.scanning import PREFIX, parse_member
+from holdfast.net import event_loop
+from holdfast.scanner import Servers
+from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
+
+_HEAD = ("node", "state", "partitions", "devices", "tags", "scans/s", "missed", "version")
+_SAMPLE_INTERVAL_S = 1.0
+"""Between two samples, from which rates are calculated."""
+
+
+@click.group(cls=SuggestingGroup, epilog="Example: holdfast fleet status plant")
+def fleet() -> None:
+    """Show and drain the scanners of a fleet."""
+
+
+@fleet.command(epilog="Example: holdfast fleet status plant --watch")
+@click.argument("fleet", type=parsed_by(parse_member), metavar="NAME")
+@nats_options
+@json_option
+@flag("--watch", "Print anew every second, until Ctrl-C.")
+def status(fleet: str, servers: Servers, as_json: bool, watch: bool) -> None:
+    """Show the nodes of the fleet NAME, and what each of them does.
+
+    Exit codes: 0 every partition has a node, 1 NATS can't be reached, 3 there is no live node, or
+    a partition has none.
+    """
+    try:
+        is_well = event_loop.run(_status(fleet, servers, as_json, watch))
+    except (FleetUnavailable, OSError) as error:
+        fail(error, reason="connection")
+    except KeyboardInterrupt:
+        return
+    if not is_well:
+        sys.exit(ExitCode.ATTENTION)
+
+
+async def _status(name: str, servers: Servers, as_json: bool, watch: bool) -> bool:
+    async with FleetObserver(name, servers) as observer:
+        before, at = await observer.look(), time.monotonic()
+        while True:
+            await asyncio.sleep(_SAMPLE_INTERVAL_S)
+            now, seconds = await observer.look(), time.monotonic() - at
+            shown = now.shown(before, seconds)
+            if as_json:
+                seen = {key: value for key, value in shown.items() if key != "fleet"}
+                print_json({"ok": True, "target": name, **seen})
+            else:
+                click.echo("\n".join(_lines(shown)))
+            before, at = now, time.monotonic()
+            if not watch:
+                return bool(shown["nodes"]) and not shown["free_partitions"]
+
+
+def _lines(shown: dict[str, Any]) -> list[str]:
+    if not shown["nodes"]:
+        return [f"fleet {shown['fleet']}: no live node"]
+    rows = [
+        (
+            node["node"],
+            node["state"],
+            str(node["partitions"]),
+            str(node["devices"]),
+            str(node["tags"]),
+            f"{node['scans_per_second']:.1f}",
+            str(node["missed"]),
+            node["version"],
+        )
+        for node in shown["nodes"]
+    ]
+    free = shown["free_partitions"]
+    lines = [
+        f"fleet {shown['fleet']}: {counted(len(rows), 'node')}, {shown['partitions']} partitions"
+        + (f", {free} of them without a node" if free else "")
+    ]
+    return [*lines, *(f"  {line}" for line in table(_HEAD, rows))]
+
+
+@fleet.command(epilog="Example: holdfast fleet drain plant scan-a")
+@click.argument("name", type=parsed_by(parse_member))
+@click.argument("node", type=parsed_by(parse_member))
+@option("--prefix", "SUBJECT", "First part of all subjects.", default=PREFIX)
+@nats_options
+def drain(name: str, node: str, prefix: str, servers: Servers) -> None:
+    """Have NODE of the fleet NAME hand its devices over to the other nodes, and end.
+
+    Returns when the node has left. Exit codes: 0 it has left, 1 there is no such node, or it did
+    not leave.
+    """
+    try:
+        event_loop.run(_drain(name, node, prefix, servers))
+    except (FleetUnavailable, OSError) as error:
+        fail(error)
+    click.echo(f"{node} has left the fleet {name}.")
+
+
+async def _drain(name: str, node: str, prefix: str, servers: Servers) -> None:
+    async with FleetObserver(name, servers) as observer:
+        await observer.drain(node, prefix)

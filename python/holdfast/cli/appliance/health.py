@@ -1,0 +1,181 @@
+"""`holdfast health`: asks a running appliance whether it is ready, for scripts and containers."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import ssl
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+import click
+
+from holdfast.cli.exit_codes import ExitCode, fail
+from holdfast.cli.options.duration import Duration, timeout_option
+from holdfast.cli.options.option import flag, json_option, option
+from holdfast.cli.options.tls import tls_options
+from holdfast.cli.terminal_text import plain, print_json, show_problems, table
+from holdfast.net.addresses import joined, reachable
+from holdfast.net.http import health as probes
+from holdfast.runtime.bounded_files import require_stored
+
+if TYPE_CHECKING:
+    from holdfast.net.tls import Tls
+
+MAX_ANSWER_BYTES = 1 << 20
+"""The most bytes of an answer that are read."""
+
+SERVICES = ("metrics", "gateway")
+"""The sections of services that answer probes, the one to ask first."""
+
+
+class _NoAnswer(Exception):
+    """The appliance has not answered a probe."""
+
+
+@click.command(epilog="Example: holdfast health plant.yaml")
+@click.argument("file", required=False, type=click.Path(path_type=Path))
+@option("--url", "URL", "Ask here, as in http://127.0.0.1:9464, without FILE.")
+@flag("--live", "Ask whether it is live, instead of whether it is ready.")
+@timeout_option("4", "Time for the whole answer.", Duration(0.1, 3600))
+@json_option
+@tls_options("tls", "tls", "Trusted authorities of the service.")
+def health(
+    file: Path | None, url: str | None, live: bool, timeout: float, as_json: bool, tls: Tls
+) -> None:
+    """Ask the appliance that runs FILE on this machine whether it is ready.
+
+    The address is that of the section `metrics` in FILE, otherwise of `gateway`. With --url,
+    nothing is read from FILE, which is faster. A certificate is verified with --url, and with
+    --tls-ca.
+
+    Exit codes: 0 ready (with --live: live), 1 not ready or no answer in time, 2 wrong usage, or
+    FILE has errors or none of the sections.
+    """
+    if (file is None) == (url is None):
+        raise click.UsageError("Give either FILE or --url.")
+    if url is None:
+        assert file is not None
+        base, context = _configured(file), _context(tls, verified=tls.ca is not None)
+    else:
+        base, context = _checked(url), _context(tls, verified=True)
+    path = probes.LIVE if live else probes.READY
+    try:
+        found = _probe(base, path, timeout, context)
+    except _NoAnswer as error:
+        fail(f"{base}{path}: {error}", reason="connection", target=f"{base}{path}")
+    state = "live" if live else "ready"
+    if as_json:
+        failed = [name for name, check in found["checks"].items() if not check["ok"]]
+        wrong = {"reason": "not_" + state, "detail": ", ".join(failed)} if not found["ok"] else {}
+        answer = {"ok": found["ok"], "target": f"{base}{path}", **wrong, "checks": found["checks"]}
+        print_json(answer, indent=2)
+    else:
+        click.echo(_shown(found, state))
+    sys.exit(ExitCode.SUCCESS if found["ok"] else ExitCode.FAILED)
+
+
+def _configured(file: Path) -> str:
+    """The URL of the service in a configuration. Exits with 2 if it has none."""
+    from holdfast.config import ConfigError, load
+
+    try:
+        config = load(file)
+    except ConfigError as error:
+        show_problems(error)
+        sys.exit(ExitCode.WRONG)
+    for name in SERVICES:
+        service = getattr(config, name)
+        if service is None:
+            continue
+        if service.bind.port == 0:
+            raise click.UsageError(f"{file}: {name}.bind has port 0: use --url.")
+        scheme = "http" if service.tls is None else "https"
+        return f"{scheme}://{joined(reachable(service.bind.host), service.bind.port)}"
+    sections = " or ".join(f"`{name}`" for name in SERVICES)
+    raise click.UsageError(f"{file} has no section {sections}, which answer probes.")
+
+
+def _checked(url: str) -> str:
+    """The scheme, host and port of a URL. Raises `click.BadParameter`."""
+    parts = urlsplit(url)
+    try:
+        valid = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        valid = False
+    if not valid or parts.path not in ("", "/") or parts.query or parts.fragment or parts.username:
+        allowed = "allowed: http://HOST:PORT or https://HOST:PORT"
+        raise click.BadParameter(f"found {url!r}, {allowed}.", param_hint="'--url'")
+    return url.removesuffix("/")
+
+
+def _context(tls: Tls, *, verified: bool) -> ssl.SSLContext:
+    """The TLS of the connection. Raises `click.UsageError` for unusable files."""
+    try:
+        require_stored(tls.ca, tls.cert, tls.key)
+        context = ssl.create_default_context(cafile=tls.ca)
+        if tls.cert is not None:
+            context.load_cert_chain(tls.cert, tls.key)
+    except (OSError, ValueError) as error:
+        raise click.UsageError(f"TLS: {error}") from error
+    if not verified:
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
+    return context
+
+
+def _probe(base: str, path: str, timeout: float, context: ssl.SSLContext) -> dict[str, Any]:
+    """The answer to a probe. Raises `_NoAnswer`."""
+    found: list[dict[str, Any] | _NoAnswer] = []
+    # Names are looked up, and answers arrive, in steps that no timeout of a socket covers together.
+    asking = threading.Thread(
+        target=lambda: found.append(_response(base, path, timeout, context)), daemon=True
+    )
+    asking.start()
+    asking.join(timeout)
+    outcome = found[0] if found else _NoAnswer(f"no answer in {timeout:g} s")
+    if isinstance(outcome, _NoAnswer):
+        raise outcome
+    return outcome
+
+
+def _response(
+    base: str, path: str, timeout: float, context: ssl.SSLContext
+) -> dict[str, Any] | _NoAnswer:
+    parts = urlsplit(base)
+    connection = (
+        http.client.HTTPSConnection(
+            parts.hostname or "", parts.port, timeout=timeout, context=context
+        )
+        if parts.scheme == "https"
+        else http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=timeout)
+    )
+    try:
+        with contextlib.closing(connection):
+            connection.request("GET", path)
+            response = connection.getresponse()
+            status, body = response.status, response.read(MAX_ANSWER_BYTES)
+    except TimeoutError:
+        return _NoAnswer(f"no answer in {timeout:g} s")
+    except (OSError, http.client.HTTPException) as error:
+        return _NoAnswer(plain(str(error)) or type(error).__name__)
+    try:
+        answer = json.loads(body)
+        checks = answer["checks"]
+        [each["ok"] for each in checks.values()]
+    except (ValueError, TypeError, KeyError, AttributeError):
+        return _NoAnswer(f"status {status}, not the answer of an appliance to a probe")
+    return {"ok": status == http.client.OK, "checks": checks}
+
+
+def _shown(found: dict[str, Any], state: str) -> str:
+    lines = [state if found["ok"] else f"not {state}"]
+    rows = [
+        (plain(name), "ok" if check["ok"] else "failed", plain(str(check.get("detail", ""))))
+        for name, check in found["checks"].items()
+    ]
+    return "\n".join([*lines, *(f"  {line}" for line in table(("check", "", "detail"), rows))])

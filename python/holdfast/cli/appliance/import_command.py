@@ -1,0 +1,168 @@
+"""`holdfast import`: converts the configuration of another program."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from holdfast.cli import SuggestingGroup
+from holdfast.cli.exit_codes import ExitCode, fail
+from holdfast.cli.options.item import areas_of
+from holdfast.cli.options.option import config_argument, flag, json_option, option, option_group
+from holdfast.cli.terminal_text import (
+    counted,
+    print_json,
+    print_problems,
+    problems_to_json,
+    show_problems,
+)
+from holdfast.config import ConfigError
+from holdfast.importing import ORDINALS, NotImportable, read_mma, read_replicator
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from holdfast.importing import Imported
+    from holdfast.types import Area
+
+
+_common = option_group(
+    config_argument,
+    option("--output", "OUT", "Write the YAML to this file.", click.Path(path_type=Path)),
+    flag("--force", "Replace OUT if it exists."),
+    json_option,
+)
+"""Adds the argument and the options of all imports."""
+
+
+@click.group(
+    "import",
+    cls=SuggestingGroup,
+    epilog="Example: holdfast import mma config.yaml --output plant.yaml",
+)
+def import_() -> None:
+    """Convert the configuration of another program."""
+
+
+@import_.command(epilog="Example: holdfast import mma config.yaml --output plant.yaml")
+@_common
+@flag(
+    "--as-it-was-meant/--as-it-ran as_meant",
+    "Convert keys that the source ignored as documented, or as they ran. Default: as it ran.",
+)
+@flag("--keep-published-tokens", "Keep REST tokens that are in the documentation of the source.")
+@option(
+    "--grant-rest",
+    "AREA,...",
+    "Areas that REST may write too, such as hr.",
+    areas_of,
+)
+@option("--grant-mqtt", "AREA,...", "The same for MQTT.", areas_of)
+def mma(
+    file: Path,
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+    as_meant: bool,
+    keep_published_tokens: bool,
+    grant_rest: tuple[Area, ...] | None,
+    grant_mqtt: tuple[Area, ...] | None,
+) -> None:
+    """Convert FILE, a configuration of the Modbus Memory Appliance, to a Holdfast configuration.
+
+    Prints the new configuration. Notes on standard error, and comments in the configuration, say
+    what was not converted, what was changed and what to check. Exit codes: 0 done, 1 can't write
+    OUT, 2 can't import FILE.
+    """
+    read = partial(
+        read_mma,
+        file,
+        as_meant=as_meant,
+        keep_published_tokens=keep_published_tokens,
+        grant_rest=grant_rest or (),
+        grant_mqtt=grant_mqtt or (),
+    )
+    _convert(read, file, output, force, as_json)
+
+
+@import_.command(epilog="Example: holdfast import replicator replicator.yaml --output mirror.yaml")
+@_common
+def replicator(file: Path, output: Path | None, force: bool, as_json: bool) -> None:
+    """Convert FILE, a configuration of the Modbus Replicator, to a Holdfast configuration.
+
+    Prints the new configuration. Notes on standard error, and comments in the configuration, say
+    what was not converted, what was changed and what to check. Exit codes: 0 done, 1 can't write
+    OUT, 2 can't import FILE.
+    """
+    _convert(lambda: read_replicator(file), file, output, force, as_json)
+
+
+def _convert(
+    read: Callable[[], Imported], file: Path, output: Path | None, force: bool, as_json: bool
+) -> None:
+    if output is not None and _same(file, output):
+        raise click.UsageError("OUT and FILE are the same file.")
+    try:
+        imported = read()
+    except ConfigError as error:
+        _refuse(error, as_json)
+    if output is not None:
+        _write(output, imported.to_yaml(), force)
+    if as_json:
+        print_json(_answer(imported), indent=2)
+        return
+    if output is None:
+        click.echo(imported.to_yaml(), nl=False)
+    for note in imported.notes:
+        click.echo(str(note), err=True)
+    click.echo(_summary(imported, output), err=True)
+
+
+def _refuse(error: ConfigError, as_json: bool) -> None:
+    """Prints why the import is impossible, and exits with 2."""
+    notes = error.notes if isinstance(error, NotImportable) else ()
+    if as_json:
+        print_problems(error, notes=problems_to_json(notes))
+    else:
+        for note in notes:
+            click.echo(str(note), err=True)
+        show_problems(error)
+    sys.exit(ExitCode.WRONG)
+
+
+def _write(output: Path, text: str, force: bool) -> None:
+    try:
+        with output.open("w" if force else "x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        fail(f"{output}: already exists; --force overwrites it", reason="file", prefix="")
+    except OSError as error:
+        why = f"can't be written: {error.strerror or error}"
+        fail(f"{output}: {why}", reason="file", prefix="")
+
+
+def _same(file: Path, output: Path) -> bool:
+    try:
+        return file.samefile(output)
+    except OSError:
+        return False
+
+
+def _summary(imported: Imported, output: Path | None) -> str:
+    of = ""
+    if imported.generation is not None:
+        of = f" is of the {ORDINALS[imported.generation]} generation"
+    notes = counted(len(imported.notes), "note")
+    check = f"; next: holdfast check {output}" if output is not None else ""
+    return f"{imported.file}{of}: {notes}{check}"
+
+
+def _answer(imported: Imported) -> dict[str, object]:
+    answer: dict[str, object] = {"ok": True, "target": imported.file, "problems": []}
+    if imported.generation is not None:
+        answer["generation"] = imported.generation
+    return {**answer, "notes": problems_to_json(imported.notes), "config": imported.data}

@@ -1,0 +1,84 @@
+"""`holdfast log status`: the logs of a running appliance, and the nodes that share them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from holdfast.appliance.control import NotRunning, ask
+from holdfast.cli.exit_codes import ExitCode, fail
+from holdfast.cli.options.option import config_argument, json_option
+from holdfast.cli.terminal_text import print_json, table
+from holdfast.events import log_lines
+
+_HEAD = ("node", "last message", "at", "digest of", "digest")
+_DEVICES = ("device", "polled by")
+_DIGEST = 12
+"""Characters of a digest that are shown."""
+
+
+@click.command("status", epilog="Example: holdfast log status plant.yaml")
+@config_argument
+@json_option
+def log_status(file: Path, as_json: bool) -> None:
+    """Show the logs of the appliance that runs FILE on this machine, and the nodes in them.
+
+    Exit codes: 0 all logs are well, 1 no appliance of this user runs FILE, 3 a log is not
+    connected, has failed, or nodes have different contents.
+    """
+    try:
+        found = ask(file, "replicas")["logs"]
+    except NotRunning as error:
+        fail(error, reason="connection")
+    if as_json:
+        print_json({"ok": True, "target": str(file), "logs": found}, indent=2)
+    elif not found:
+        click.echo("no memory is replicated")
+    else:
+        for name, status in found.items():
+            click.echo("\n".join(_shown(name, status)))
+    if not all(_is_well(status) for status in found.values()):
+        sys.exit(ExitCode.ATTENTION)
+
+
+def _is_well(status: dict[str, Any]) -> bool:
+    differs = status["digest"] is not None and status["digest"][2] is False
+    return status["phase"] == "running" and status["connected"] and not differs
+
+
+def _shown(name: str, status: dict[str, Any]) -> list[str]:
+    where = f"connected to {status['server']}" if status["connected"] else "not connected"
+    contact = status["contact_age"]
+    lines = [
+        f"log {name}: {status['phase']}, {where}",
+        f"  sequence {status['sequence']}, {status['lag']} behind the last known, "
+        + ("no contact yet" if contact is None else f"contact {contact:.1f} s ago"),
+        f"  writes of this node: {status['steps']} done, {status['unavailable']} not sent, "
+        f"{status['not_confirmed']} not confirmed",
+    ]
+    if (server := status["embedded"]) is not None:
+        state = "running" if server["running"] else "not running"
+        lines.append(f"  embedded server: {state}, started again {server['restarts']} times")
+    if status["failure"] is not None:
+        lines.append(f"  failed: {status['failure'][1]}")
+    elif status["last_error"] is not None and not status["connected"]:
+        lines.append(f"  last error: {status['last_error']}")
+    lines += (f"  {line}" for line in table(_HEAD, map(_row, status["nodes"])))
+    devices = status.get("devices")
+    if devices:
+        lines += (f"  {line}" for line in table(_DEVICES, map(_polled, devices.items())))
+    return lines
+
+
+def _polled(device: tuple[str, dict[str, Any]]) -> tuple[str, ...]:
+    name, found = device
+    return name, "nobody" if found["node"] is None else found["node"]
+
+
+def _row(node: dict[str, Any]) -> tuple[str, ...]:
+    at, digest = node["digest"] or ("", "")
+    when = log_lines.timestamp(node["time_ns"] / 1e9)
+    return node["name"], str(node["sequence"]), when, str(at), digest[:_DIGEST]

@@ -1,0 +1,101 @@
+"""Reads and changes files that keep memories, while no appliance uses them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from holdfast import _core
+from holdfast.types import BIT_AREAS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from holdfast.config.initial_values import InitialRun
+    from holdfast.types import Area
+
+
+class KeptArea(NamedTuple):
+    """The values of an area, from its first address on."""
+
+    start: int
+    values: list[int]
+
+    @property
+    def addresses(self) -> range:
+        """The addresses."""
+        return range(self.start, self.start + len(self.values))
+
+
+def contents(file: Path, *, set_aside: bool = False) -> dict[str, dict[Area, KeptArea]]:
+    """The areas of each memory in a file, after a check of the whole file. Raises `OSError`.
+
+    With `set_aside`, what was cut from them because their configuration had other areas.
+    """
+    found = _core.read_memory_file(str(file), set_aside=set_aside)
+    return {
+        name: {
+            area: KeptArea(start, _values(area, size, data))
+            for area, (start, size, data) in areas.items()
+        }
+        for name, areas in found.items()
+    }
+
+
+def replace(file: Path, memory: str, runs: Iterable[InitialRun], *, merge: bool) -> None:
+    """Stores values in a memory of the file; all others become 0, unless they are merged.
+
+    Raises `OSError` for a file that can't be used, and `OutOfRange`.
+    """
+    areas = contents(file)[memory]
+    spans: Any = {area: (kept.start, len(kept.values)) for area, kept in areas.items()}
+    made = _core.Memory(**spans)
+    opened = _core.MemoryFile(str(file), [(memory, made)], 1.0)
+    try:
+        writes: list[tuple[Area, int, Sequence[int]]] = []
+        if not merge:
+            zeros = ((area, kept.start, [0] * len(kept.values)) for area, kept in areas.items())
+            writes += zeros
+        writes += ((run.area, run.address, run.values) for run in runs)
+        if writes:
+            made.write_many(writes)
+        opened.start()
+    finally:
+        opened.stop()
+
+
+def release(file: Path, memory: str) -> None:
+    """Deletes what is set aside of a memory of the file. Raises `OSError`."""
+    _core.release_memory_file(str(file), memory)
+
+
+def csv_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]:
+    """Lines of area,address,value; those with the value 0 only if `zeros` are wanted."""
+    yield "area,address,value"
+    for area, kept in areas.items():
+        for address, value in zip(kept.addresses, kept.values, strict=True):
+            if value or zeros:
+                yield f"{area},{address},{value}"
+
+
+def yaml_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]:
+    """Areas with runs of values: `ADDRESS: [VALUE, …]`."""
+    for area, kept in areas.items():
+        yield f"{area}:" if any(kept.values) or zeros else f"{area}: {{}}"
+        first, run = 0, list[int]()
+        for address, value in zip(kept.addresses, kept.values, strict=True):
+            if not value and not zeros:
+                continue
+            if run and address != first + len(run):
+                yield f"  {first}: {run}"
+                run = []
+            first = first if run else address
+            run.append(value)
+        if run:
+            yield f"  {first}: {run}"
+
+
+def _values(area: Area, size: int, data: bytes) -> list[int]:
+    if area in BIT_AREAS:
+        return [data[index // 8] >> index % 8 & 1 for index in range(size)]
+    return [int.from_bytes(data[index : index + 2], "big") for index in range(0, 2 * size, 2)]

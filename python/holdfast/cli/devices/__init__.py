@@ -1,0 +1,1 @@
+"""Commands that read, write, find, describe and simulate devices."""

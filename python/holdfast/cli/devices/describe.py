@@ -1,0 +1,291 @@
+"""`holdfast describe`: describes an undocumented device as a tag list."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from holdfast.cli import CommandWithSubcommands, complete_subcommand
+from holdfast.cli.devices.describe_output import (
+    described_lines,
+    head_lines,
+    sunspec_to_json,
+    unit_to_json,
+    units_lines,
+    units_to_json,
+)
+from holdfast.cli.devices.search_report import Ended, RangeReport, Report, ended_to_json
+from holdfast.cli.exit_codes import fail
+from holdfast.cli.options import device
+from holdfast.cli.options.duration import every_option, timeout_option
+from holdfast.cli.options.option import flag, json_option, number_option, option
+from holdfast.cli.options.search import announced, planned, survey_options
+from holdfast.cli.options.units import refuse_broadcast, unit_ids
+from holdfast.cli.options.url import checked_url
+from holdfast.cli.signals import interruptions
+from holdfast.cli.terminal_text import number_ranges
+from holdfast.client.url import SerialTarget, parse
+from holdfast.config.tag_files.read import KINDS
+from holdfast.config.tag_files.write import tags_as_csv, tags_as_yaml
+from holdfast.discovery import description, device_search
+from holdfast.discovery.description import Description
+from holdfast.net.certificates import files
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from holdfast.cli.options.search import Settings
+    from holdfast.client import SyncClient
+    from holdfast.discovery.device_search import Unit
+
+UNITS = "1-10,255"
+LINE_UNITS = "1-10"
+_UNITS_HELP = f"Unit ids to ask, as in 1-10,255.  [default: {UNITS}; {LINE_UNITS} on a serial line]"
+MAX_LINES = 60
+"""The most lines of tags in the text; a file and JSON have all tags."""
+
+
+def _file(text: str) -> Path:
+    path = Path(text)
+    if path.suffix.lower() not in KINDS:
+        raise click.BadParameter(f"{text!r} ends with none of {', '.join(KINDS)}.")
+    if not path.absolute().parent.is_dir():
+        raise click.BadParameter(f"the folder of {text!r} does not exist.")
+    return path
+
+
+SUBCOMMANDS = {
+    "map": ("devices.map_command:map_", "Find the addresses of a device."),
+    "guess": ("devices.guess:guess", "Guess the type and byte order of a value."),
+    "identify": ("devices.identify:identify", "Print the identification of a device."),
+    "status": ("devices.status:status", "Print exception status, event counter and event log."),
+}
+
+
+@click.command(
+    cls=CommandWithSubcommands,
+    subcommands=SUBCOMMANDS,
+    epilog="Example: holdfast describe tcp://192.168.0.10 --output meter.yaml",
+)
+@click.argument("url", type=checked_url, metavar="URL", shell_complete=complete_subcommand)
+@option("--units", "LIST", _UNITS_HELP, unit_ids)
+@option("--output", "FILE", "Write the tag list to FILE: YAML or CSV, by its suffix.", _file)
+@flag("--force", "Replace FILE if it exists.")
+@survey_options
+@number_option("--times", "Number of readings of each address, to observe changes.", 1, 100, 3)
+@every_option("1", "Interval between these readings.")
+@flag("--all everything", f"Show all tags, not only {MAX_LINES} lines.")
+@timeout_option()
+@json_option
+def describe(
+    url: str,
+    units: tuple[int, ...] | None,
+    output: Path | None,
+    force: bool,
+    settings: Settings,
+    times: int,
+    every: float,
+    everything: bool,
+    timeout: float,
+    as_json: bool,
+) -> None:
+    """Describe the device at URL by reading: which unit ids answer, which addresses exist, and what
+    they probably mean. Nothing is written to the device.
+
+    Asks each unit id for its identification (functions 43/14 and 17), decodes SunSpec models by
+    their published definitions, finds other addresses as `describe map` does, reads them several
+    times, and infers types and byte order. The result is a list of tags that do not overlap.
+
+    The confidence of a tag is the probability of its type and order. Names, scales and units of
+    guessed tags are not known: compare the values with a display or a manual, then edit the file.
+    Registers that are always 0 say nothing about their type.
+
+    The registers at usual starts come first, then the other registers, then coils and discrete
+    inputs. Unit ids and ranges are printed when they are found; with --json, as elements of
+    "found". Each unit id is written to FILE when its description is complete.
+
+    Ctrl-C, or SIGTERM, prints and writes the results so far, and where the search did not look. A
+    second one ends the command at once. FILE is replaced as a whole, or not at all.
+
+    Exit codes: 0 done; 1 no unit id answered, or the search ended early; 2 wrong usage.
+    """
+    is_line = isinstance(parse(url), SerialTarget)
+    asked = units or unit_ids(LINE_UNITS if is_line else UNITS)
+    if is_line:
+        refuse_broadcast(asked)
+    if output is not None and output.exists() and not force:
+        raise click.UsageError(f"{output} exists; --force replaces it.")
+    with interruptions() as signals:
+        report = Report({"target": url} if as_json else None, signals)
+        plan = _Plan(settings, times, every, output, None if everything else MAX_LINES)
+        run = _Run(url, asked, plan, report)
+        with device.connect(url, asked[0], timeout) as client:
+            why = run.carry_out(client, ignores_possible=not is_line)
+        run.end(why)
+    if why is not None:
+        fail(f"{url}: {why}", is_printed=as_json)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What to do with each unit id."""
+
+    settings: Settings
+    times: int
+    every: float
+    output: Path | None
+    most: int | None
+    """The most lines of tags in the text."""
+
+
+class _Run:
+    """The search of a device, and its findings so far."""
+
+    def __init__(self, url: str, asked: Sequence[int], plan: _Plan, report: Report) -> None:
+        self._url = url
+        self._asked = asked
+        self._plan = plan
+        self._report = report
+        self._seen: list[Unit] = []
+        self._ignores = False
+        self._found: list[Description] = []
+        self._files: list[str] = []
+        self._unwritten: Ended | None = None
+        """The error of the first file that could not be written."""
+
+    @property
+    def _answering(self) -> list[int]:
+        return [each.unit for each in self._seen if each.answers]
+
+    @property
+    def _to_describe(self) -> list[int]:
+        return self._answering[:1] if self._ignores else self._answering
+
+    def carry_out(self, client: SyncClient, *, ignores_possible: bool) -> Ended | None:
+        """Asks unit ids, and describes those that answer. Returns why it ended early, or `None`."""
+        why = self._attempt(lambda: self._ask(client, ignores_possible=ignores_possible))
+        lines = units_lines(self._url, self._asked, self._seen, self._ignores)
+        self._report.text(*lines)
+        if why is not None:
+            return why
+        for number in self._to_describe:
+            client.unit = number
+            unit = _UnitReport(Description(number, planned(self._plan.settings)), self._report)
+            self._found.append(unit.found)
+            why = self._attempt(partial(self._describe, unit, client))
+            self._conclude(unit)
+            if why is not None:
+                return why
+        return self._unwritten if self._found else Ended("nothing", "no unit id answered")
+
+    def end(self, why: Ended | None) -> None:
+        """Prints what is known when the search has ended."""
+        left = self._to_describe[len(self._found) :]
+        if left:
+            self._report.text("", f"Incomplete. Not described: unit ids {number_ranges(left)}.")
+        self._report.end(
+            {
+                **ended_to_json(why),
+                **units_to_json(self._asked, self._seen, self._ignores),
+                "not_described": left,
+                "files": self._files,
+                "units": [unit_to_json(each) for each in self._found],
+            }
+        )
+
+    def _attempt(self, work: Callable[[], None]) -> Ended | None:
+        return self._report.attempt(work, self._url, lambda: self._answering)
+
+    def _ask(self, client: SyncClient, *, ignores_possible: bool) -> None:
+        asked = self._asked
+        with self._report.progress("Asking", len(asked), lambda: ""):
+            for unit in device_search.units(client, asked, delay=self._plan.settings.delay):
+                with self._report.held():
+                    self._seen.append(unit)
+                    self._report.advance(len(self._seen))
+                    if unit.answers:
+                        self._report.text(f"Unit {unit.unit} answers.")
+                        about = dict(unit.identity.objects)
+                        self._report.entry({"unit": unit.unit, "identification": about})
+        if ignores_possible and 1 < len(asked) == len(self._answering):
+            self._ignores = device_search.ignores_unit(client, asked)
+
+    def _describe(self, unit: _UnitReport, client: SyncClient) -> None:
+        survey = unit.found.survey
+        if sys.stderr.isatty():
+            click.echo(f"Unit {unit.found.unit}: {announced(survey)}", err=True)
+        with self._report.progress("Mapping", survey.total, lambda: f"unit {unit.found.unit}"):
+            description.describe(
+                unit.found,
+                client,
+                reads=self._plan.times,
+                every=self._plan.every,
+                delay=self._plan.settings.delay,
+                progress=lambda _: unit.update(),
+            )
+
+    def _conclude(self, unit: _UnitReport) -> None:
+        """Infers the tags of a unit id, writes its file, and prints them."""
+        unit.end()
+        if sys.stderr.isatty():
+            click.echo("Inferring types.", err=True)
+        description.conclude(unit.found, now=time.time())
+        file = self._written(unit.found)
+        self._report.text(*described_lines(unit.found, self._plan.most))
+        if file is not None:
+            self._files.append(str(file))
+            self._report.text(f"Written: {file}")
+
+    def _written(self, found: Description) -> Path | None:
+        """Writes the tag list of a unit id: to a file of its own if several answer."""
+        path = self._plan.output
+        if path is None or not found.tags:
+            return None
+        if len(self._to_describe) > 1:
+            path = path.with_stem(f"{path.stem}-unit{found.unit}")
+        tags = [each.tag for each in found.tags]
+        text = tags_as_csv(tags) if path.suffix.lower() == ".csv" else tags_as_yaml(tags)
+        try:
+            files.replace(path, text.encode())
+        except OSError as error:
+            text = f"{path} can't be written: {error.strerror}"
+            self._unwritten = self._unwritten or Ended("file", text)
+            return None
+        return path
+
+
+class _UnitReport:
+    """The output about a unit id while it is described."""
+
+    def __init__(self, found: Description, report: Report) -> None:
+        self.found = found
+        self._report = report
+        self._ranges = RangeReport(report, found.survey, {"unit": found.unit})
+        self._has_head = False
+
+    def update(self) -> None:
+        """Prints what was found since the last call."""
+        self._head()
+        self._ranges.update()
+        self._report.advance(self.found.survey.at)
+
+    def end(self) -> None:
+        """Prints the other findings."""
+        self._head()
+        self._ranges.end()
+
+    def _head(self) -> None:
+        if self._has_head:
+            return
+        with self._report.held():
+            self._has_head = True
+            self._report.text("", *head_lines(self.found))
+            if self.found.sunspec is not None:
+                fields = {"unit": self.found.unit, "sunspec": sunspec_to_json(self.found.sunspec)}
+                self._report.entry(fields)

@@ -1,0 +1,217 @@
+"""The description of a device as text and for JSON."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+from holdfast.cli import terminal_text
+from holdfast.cli.devices import coverage
+from holdfast.cli.terminal_text import number_ranges
+from holdfast.config.tag_files.write import scale_as_data
+from holdfast.discovery.segments import FILL_REASONS
+from holdfast.tags.scale import RegisterScale
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from holdfast.discovery.description import Described, Description
+    from holdfast.discovery.device_search import Unit
+    from holdfast.discovery.sunspec import SunSpec
+
+FILL_REASON_TEXTS = tuple(FILL_REASONS.values())
+MAX_BITS_SHOWN = 16
+"""The most bits in a cell."""
+
+
+def units_lines(
+    url: str, asked: Sequence[int], seen: Sequence[Unit], ignores: bool
+) -> Iterator[str]:
+    """Which unit ids answer, as text."""
+    answering = [each.unit for each in seen if each.answers]
+    silent = [each.unit for each in seen if not each.answers]
+    unasked = set(asked) - set(answering) - set(silent)
+    yield (
+        f"{url}: unit ids that answer: {number_ranges(answering)}"
+        + (f"; no device: {number_ranges(silent)}" if silent else "")
+        + f"; not asked: {number_ranges(unasked) + ' and ' if unasked else ''}all others"
+    )
+    if ignores:
+        yield "It also answers a rare unit id: it probably ignores them. One is described."
+
+
+def head_lines(found: Description) -> list[str]:
+    """The identification of a unit id, and its SunSpec models."""
+    about = terminal_text.plain(str(found.identity)) or "no identification"
+    lines = [terminal_text.styled(f"Unit {found.unit}: {about}", bold=True)]
+    if found.sunspec is not None:
+        models = ", ".join(
+            f"{each.id} {each.label or '(unknown here)'}" for each in found.sunspec.models
+        )
+        end = "" if found.sunspec.is_complete else "; the end of the models was not found"
+        lines.append(f"SunSpec at {found.sunspec.base}: models {models or 'none'}{end}")
+    return lines
+
+
+def described_lines(found: Description, most: int | None) -> list[str]:
+    """A description as text, with at most so many lines of tags."""
+    orders = []
+    if found.orders:
+        order, share = max(found.orders.items(), key=lambda each: each[1])
+        orders.append(f"Byte order: probably {order} ({share:.2f})")
+    rows = list(_rows(found.tags))
+    head = ("name", "area", "address", "type", "order", "value", "unit", "confidence", "why")
+    tags = terminal_text.table(head, rows[:most], "<<><<><>") if rows else []
+    if most is not None and len(rows) > most:
+        tags.append(f"and {len(rows) - most} more lines; --all shows them")
+    for (area, extent), error in found.unread.items():
+        tags.append(f"{area} {extent.start}-{extent.stop - 1} could not be read again: {error}")
+    counts = [*coverage.counts(found.survey), *coverage.incomplete(found.survey)]
+    parts = (orders, tags, counts, () if found.survey.exact else coverage.UNKNOWN)
+    return [line for part in parts if part for line in ("", *part)]
+
+
+def _rows(tags: Sequence[Described]) -> Iterator[tuple[str, ...]]:
+    """A row for each tag. Neighbouring bits share one, and neighbours that contain nothing."""
+    for kind, group in itertools.groupby(_runs(tags), key=lambda each: each[0]):
+        own = [tag for _, tag in group]
+        first, last = own[0], own[-1]
+        if kind[1] is None or len(own) == 1:
+            yield from map(_row, own)
+            continue
+        is_bit = first.tag.type == "bool"
+        count = sum(each.tag.count for each in own)
+        changed = is_bit and any(each.reasons for each in own)
+        yield (
+            f"{first.tag.name} … {last.tag.name}" if terminal_text.fits("…") else first.tag.name,
+            first.tag.area,
+            f"{first.tag.address}-{last.tag.end - 1}",
+            f"bool[{count}]" if is_bit else f"uint16[{count}]",
+            "",
+            _bits([bool(each.values[-1]) for each in own]) if is_bit else _value(first),
+            "",
+            f"{first.confidence:.2f}",
+            "some change" if changed else ", ".join(first.reasons),
+        )
+
+
+def _runs(tags: Sequence[Described]) -> Iterator[tuple[tuple[int, str | None], Described]]:
+    """Tags, each with the number and kind of its run; the kind is `None` for a run of one."""
+    number, before, kind_before = 0, None, None
+    for each in tags:
+        kind = _kind(each)
+        follows = before is not None and (before.area, before.end) == (
+            each.tag.area,
+            each.tag.address,
+        )
+        if kind is None or kind != kind_before or not follows:
+            number += 1
+        yield (number, kind), each
+        before, kind_before = each.tag, kind
+
+
+def _kind(each: Described) -> str | None:
+    """The kind of a tag: neighbours of one kind share a row; `None`: a row for the tag alone."""
+    if each.tag.type == "bool":
+        return "bits"
+    return each.reasons[0] if each.reasons and each.reasons[0] in FILL_REASON_TEXTS else None
+
+
+def _bits(bits: Sequence[bool]) -> str:
+    return "".join("1" if bit else "0" for bit in bits[:MAX_BITS_SHOWN]) + (
+        "…" if len(bits) > MAX_BITS_SHOWN else ""
+    )
+
+
+def _row(each: Described) -> tuple[str, ...]:
+    tag = each.tag
+    return (
+        tag.name,
+        tag.area,
+        str(tag.address) if tag.count == 1 else f"{tag.address}-{tag.end - 1}",
+        tag.type,
+        tag.order if tag.count > 1 else "",
+        _value(each),
+        tag.unit,
+        f"{each.confidence:.2f}",
+        ", ".join(each.reasons),
+    )
+
+
+def _value(each: Described) -> str:
+    """The value of the last read, after that of the first read if it changed."""
+    first, last = (_shown(each, each.values[at]) for at in (0, -1))
+    return last if first == last else f"{first} … {last}"
+
+
+def _shown(each: Described, raw: object) -> str:
+    tag = each.tag
+    if tag.of_type.count is not None and not isinstance(raw, list):
+        return terminal_text.shown(raw, tag.of_type.base)
+    if isinstance(raw, list):
+        return _bits(raw)
+    value = (each.shown or tag).value(raw)
+    name = tag.state(value)
+    text = terminal_text.shown(value, tag.of_type.base)
+    return f"{text} ({name})" if name else text
+
+
+def units_to_json(asked: Sequence[int], seen: Sequence[Unit], ignores: bool) -> dict[str, object]:
+    """Which unit ids answer, for JSON."""
+    done = [each.unit for each in seen]
+    return {
+        "answering": [each.unit for each in seen if each.answers],
+        "silent": [each.unit for each in seen if not each.answers],
+        "not_asked": [unit for unit in asked if unit not in done],
+        "ignores_unit": ignores,
+    }
+
+
+def sunspec_to_json(found: SunSpec) -> dict[str, object]:
+    """The SunSpec models of a unit id for JSON."""
+    return {
+        "base": found.base,
+        "complete": found.is_complete,
+        "models": [
+            {"id": each.id, "name": each.name, "address": each.address, "length": each.length}
+            for each in found.models
+        ],
+    }
+
+
+def unit_to_json(found: Description) -> dict[str, object]:
+    """The description of a unit id for JSON."""
+    return {
+        "unit": found.unit,
+        "complete": found.survey.is_done,
+        "identification": dict(found.identity.objects),
+        "sunspec": None if found.sunspec is None else sunspec_to_json(found.sunspec),
+        "orders": {order: round(share, 4) for order, share in found.orders.items()},
+        "areas": {
+            each.area: {
+                "state": each.state,
+                "exist": each.addresses,
+                "absent": sum(map(len, each.absent)),
+                "not_asked": len(found.survey.span) - each.asked,
+                "not_searched_from": found.survey.not_searched_from(each),
+            }
+            for each in found.survey.areas
+        },
+        "tags": [_tag(each) for each in found.tags],
+    }
+
+
+def _tag(each: Described) -> dict[str, object]:
+    tag = each.tag
+    return {
+        "name": tag.name,
+        "area": tag.area,
+        "address": tag.address,
+        "type": tag.type,
+        "order": tag.order,
+        "scale": scale_as_data(tag.scale) if isinstance(tag.scale, RegisterScale) else tag.scale,
+        "unit": tag.unit,
+        "confidence": round(each.confidence, 4),
+        "values": [terminal_text.jsonable(value) for value in each.values],
+        "reasons": list(each.reasons),
+    }

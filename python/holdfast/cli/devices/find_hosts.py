@@ -1,0 +1,138 @@
+"""`holdfast find NETWORK`: hosts that answer Modbus TCP."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import click
+
+from holdfast.cli import terminal_text
+from holdfast.cli.devices.search_report import INTERRUPTED, NOTHING, Report, ended_to_json
+from holdfast.cli.exit_codes import ExitCode
+from holdfast.cli.options import device
+from holdfast.discovery import device_search
+from holdfast.discovery.device_search import Host
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from holdfast.discovery.device_search import State
+    from holdfast.net.addresses import Network
+
+MAX_CONCURRENT_HOSTS = 64
+"""Hosts at a time."""
+
+LISTED_STATES = ("modbus", "open")
+"""The states of hosts that are listed; others are counted."""
+
+
+def find_hosts(
+    target: str,
+    networks: Sequence[Network],
+    port: int,
+    units: Sequence[int],
+    timeout: float,
+    rate: float,
+    as_json: bool,
+) -> None:
+    """Finds hosts, prints them, and exits with 1 if there are none."""
+    urls = [Host(str(each), port, "silent").url for each in device_search.addresses(networks)]
+    total = len(urls)
+    if sys.stderr.isatty():
+        click.echo(
+            f"{terminal_text.counted(total, 'address')}, port {port}, at most {rate:g} connections "
+            f"a second. Ctrl-C stops.",
+            err=True,
+        )
+    report = Report({"target": target, "port": port} if as_json else None)
+    hosts = HostReport(report, max(map(len, urls)))
+    found: list[Host] = []
+
+    async def look() -> None:
+        seen = device_search.hosts(
+            networks,
+            port=port,
+            timeout=timeout,
+            rate=rate,
+            concurrency=min(MAX_CONCURRENT_HOSTS, total),
+            units=units,
+        )
+        with report.progress("Finding", total, lambda: f"{_answering(found)} found"):
+            async for host in seen:
+                found.append(host)
+                hosts.add(host)
+                report.advance(len(found))
+
+    interrupted = False
+    try:
+        asyncio.run(look())
+    except KeyboardInterrupt:
+        interrupted = True
+    counts = Counter(host.state for host in found)
+    report.text(*([""] if hosts.printed else []), _counted(counts, total, total - len(found)))
+    report.end(
+        {
+            **ended_to_json(INTERRUPTED if interrupted else None if counts["modbus"] else NOTHING),
+            "complete": not interrupted,
+            "counts": {
+                **{state: counts[state] for state in ("modbus", "open", "refused", "silent")},
+                "asked": len(found),
+                "not_asked": total - len(found),
+            },
+        }
+    )
+    if interrupted and not as_json:
+        click.echo("holdfast: interrupted", err=True)
+    device.hint_at_late_replies(max((host.longest_late for host in found), default=0.0), timeout)
+    if interrupted or not counts["modbus"]:
+        sys.exit(ExitCode.FAILED)
+
+
+class HostReport:
+    """The table of the hosts that are found, as they come."""
+
+    def __init__(self, report: Report, width: int) -> None:
+        self.printed = 0
+        self._report = report
+        self._row = f"{{:{width}}}  {{:>4}}  {{:7}}  {{}}"
+
+    def add(self, host: Host) -> None:
+        """Prints a host, if it answers or has the port open."""
+        if host.state not in LISTED_STATES:
+            return
+        if self.printed == 0:
+            head = self._row.format("url", "unit", "answer", "identification")
+            self._report.text(terminal_text.styled(head, bold=True))
+        self.printed += 1
+        unit = "" if host.unit is None else str(host.unit)
+        answer = host.detail if host.state == "modbus" else f"no Modbus: {host.detail}"
+        identity = terminal_text.plain(str(host.identity))
+        self._report.text(self._row.format(host.url, unit, answer, identity).rstrip())
+        self._report.entry(_host(host))
+
+
+def _answering(found: Iterable[Host]) -> int:
+    return sum(host.state == "modbus" for host in found)
+
+
+def _host(host: Host) -> dict[str, object]:
+    return {
+        "host": host.address,
+        "url": host.url,
+        "modbus": host.state == "modbus",
+        "unit": host.unit,
+        "detail": host.detail,
+        "identification": dict(host.identity.objects),
+    }
+
+
+def _counted(counts: Counter[State], total: int, left: int) -> str:
+    return (
+        f"{terminal_text.counted(total, 'address')}: {counts['modbus']} answer Modbus, "
+        f"{counts['open']} accept connections but do not answer Modbus, "
+        f"{counts['refused']} refuse them, {counts['silent']} do not respond"
+        + (f", {left} were not asked" if left else "")
+    )

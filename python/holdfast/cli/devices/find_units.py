@@ -1,0 +1,115 @@
+"""`holdfast find URL`: unit ids that answer."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+import click
+
+from holdfast.cli import terminal_text
+from holdfast.cli.devices.search_report import NOTHING, Report, ended_to_json
+from holdfast.cli.exit_codes import ExitCode
+from holdfast.cli.options import device
+from holdfast.cli.options.units import refuse_broadcast
+from holdfast.cli.signals import interruptions
+from holdfast.cli.terminal_text import number_ranges
+from holdfast.client.url import SerialTarget, parse
+from holdfast.discovery import device_search
+from holdfast.protocol import MAX_SERIAL_UNIT
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from holdfast.client import SyncClient
+    from holdfast.discovery.device_search import Unit
+
+ROW = "{:>4}  {:7}  {}"
+"""A row of the table: unit id, answer, identification."""
+
+
+def find_units(url: str, asked: Sequence[int], timeout: float, delay: float, as_json: bool) -> None:
+    """Finds unit ids, prints them, and exits with 1 if there are none."""
+    if isinstance(parse(url), SerialTarget):
+        refuse_broadcast(asked)
+    if sys.stderr.isatty():
+        most = len(asked) * (timeout + delay)
+        click.echo(f"{len(asked)} unit ids, at most {most:.0f} s. Ctrl-C stops.", err=True)
+    found: list[Unit] = []
+    with interruptions() as signals:
+        report = Report({"target": url} if as_json else None, signals)
+        ignores = False
+
+        def search() -> None:
+            nonlocal ignores
+            with report.progress("Finding", len(asked), lambda: f"{_count(found)} found"):
+                for unit in device_search.units(client, asked, delay=delay):
+                    with report.held():
+                        found.append(unit)
+                        if unit.answers:
+                            _print(unit, report, is_first=_count(found) == 1)
+                        report.advance(len(found))
+                ignores = _ignores(client, url, found)
+
+        with device.connect(url, asked[0], timeout) as client:
+            why = report.attempt(search, url, lambda: _count(found))
+        left = asked[len(found) :]
+        report.text(*_units(url, found, left, ignores))
+        report.end(
+            {
+                **ended_to_json(why or (None if _count(found) else NOTHING)),
+                "complete": why is None,
+                "ignores_unit": ignores,
+                "asked": [each.unit for each in found],
+                "not_asked": list(left),
+            }
+        )
+    if why is not None and not as_json:
+        click.echo(f"holdfast: {url}: {why}", err=True)
+    if why is not None or not _count(found):
+        sys.exit(ExitCode.FAILED)
+
+
+def _print(unit: Unit, report: Report, *, is_first: bool) -> None:
+    identity = terminal_text.plain(str(unit.identity))
+    row = ROW.format(str(unit.unit), unit.detail, identity).rstrip()
+    head = terminal_text.styled(ROW.format("unit", "answer", "identification"), bold=True)
+    report.text(*([head] if is_first else []), row)
+    report.entry(unit_to_json(unit))
+
+
+def _ignores(client: SyncClient, url: str, found: Sequence[Unit]) -> bool:
+    """Whether the device probably ignores the unit id: it answers all, also a rare one."""
+    if isinstance(parse(url), SerialTarget) or len(found) < 2 or _count(found) < len(found):
+        return False
+    asked = [each.unit for each in found]
+    # With all unit ids of the standard asked, there is no rare one left to ask.
+    return len(asked) >= MAX_SERIAL_UNIT or device_search.ignores_unit(client, asked)
+
+
+def _count(found: Iterable[Unit]) -> int:
+    return sum(each.answers for each in found)
+
+
+def unit_to_json(found: Unit) -> dict[str, object]:
+    """A unit id for JSON."""
+    return {
+        "unit": found.unit,
+        "detail": found.detail,
+        "identification": dict(found.identity.objects),
+    }
+
+
+def _units(url: str, found: Sequence[Unit], left: Sequence[int], ignores: bool) -> list[str]:
+    """The summary at the end of the search."""
+    count = _count(found)
+    silent = [each.unit for each in found if not each.answers]
+    lines = [""] if count else []
+    lines.append(f"{url}: {terminal_text.counted(count, 'unit id')} of {len(found)} asked answer")
+    if silent:
+        lines.append(f"no device: {number_ranges(silent)}")
+    if left:
+        lines.append(f"not asked: {number_ranges(left)}")
+    if ignores:
+        lines.append("The device answers every unit id: it probably ignores them.")
+    return lines

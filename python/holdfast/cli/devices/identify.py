@@ -1,0 +1,148 @@
+"""`holdfast describe identify`: prints the identification of a device."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, TypeVar
+
+import click
+
+from holdfast.cli import terminal_text
+from holdfast.cli.exit_codes import ExitCode
+from holdfast.cli.options import device
+from holdfast.cli.options.option import json_option
+from holdfast.cli.options.url import url_argument
+from holdfast.cli.terminal_text import print_json
+from holdfast.client.requests import OBJECT_NAMES
+from holdfast.errors import ModbusError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from holdfast.client.requests import Identification, ServerId
+
+Answer = TypeVar("Answer")
+
+LEVELS = {1: "basic", 2: "regular", 3: "extended"}
+
+
+@click.command(epilog="Example: holdfast describe identify tcp://192.168.0.10 --unit 3")
+@url_argument
+@device.device_options
+@json_option
+def identify(url: str, unit: int, timeout: float, as_json: bool) -> None:
+    """Print the identification of the device at URL.
+
+    Requests the device identification (function 43/14) and the server id (function 17). Many
+    devices support only one of them, or neither.
+
+    Exit codes: 0 the device supports at least one, 1 neither, 2 wrong usage.
+    """
+    with device.connect(url, unit, timeout) as client:
+        identification = answer_of(client.identify)
+        server_id = answer_of(client.report_server_id)
+    said = [each for each in (identification, server_id) if not isinstance(each, ModbusError)]
+    if as_json:
+        answer = {
+            "ok": bool(said),
+            "target": url,
+            "unit": unit,
+            **(device.problem(identification) if not said else {}),
+            "identification": answer_to_json(identification, _identification),
+            "server_id": answer_to_json(server_id, _server_id),
+        }
+        print_json(answer, indent=2)
+    elif isinstance(identification, ModbusError) and isinstance(server_id, ModbusError):
+        click.echo(f"holdfast: {url}: function 43/14: {identification}", err=True)
+        click.echo(f"holdfast: {url}: function 17: {server_id}", err=True)
+    else:
+        click.echo("\n".join([*_identified(identification), "", *_served(server_id)]))
+    if not said:
+        sys.exit(ExitCode.FAILED)
+
+
+def answer_of(call: Callable[[], Answer]) -> Answer | ModbusError:
+    """The result of a call, or its error."""
+    try:
+        return call()
+    except ModbusError as error:
+        return error
+
+
+def answer_to_json(
+    answer: Answer | ModbusError, made: Callable[[Answer], dict[str, object]]
+) -> dict[str, object]:
+    """An answer, or its error, for JSON."""
+    if isinstance(answer, ModbusError):
+        return {"ok": False, **device.problem(answer)}
+    return {"ok": True, **made(answer)}
+
+
+def _identification(answer: Identification) -> dict[str, object]:
+    names = {name: getattr(answer, name) for name in OBJECT_NAMES}
+    objects = {str(number): data.hex() for number, data in sorted(answer.objects.items())}
+    return {**names, "conformity_level": answer.conformity_level, "objects": objects}
+
+
+def _server_id(answer: ServerId) -> dict[str, object]:
+    return {
+        "server_id": answer.server_id,
+        "running": answer.running,
+        "additional": answer.additional.hex(),
+        "data": answer.data.hex(),
+    }
+
+
+def _identified(answer: Identification | ModbusError) -> list[str]:
+    """The identification as text."""
+    head = terminal_text.styled("Device identification (function 43/14)", bold=True)
+    if isinstance(answer, ModbusError):
+        return [head, f"  {terminal_text.styled(str(answer), fg='red')}"]
+    level = LEVELS.get(answer.conformity_level & 0x7F)
+    rows = [
+        (_name(number), _text(data) if number < 0x80 or _is_text(data) else data.hex(" "))
+        for number, data in sorted(answer.objects.items())
+    ]
+    code = f"0x{answer.conformity_level:02X}"
+    rows.append(("conformity level", f"{code}, {level}" if level else code))
+    return [head, *listed(rows)]
+
+
+def _served(answer: ServerId | ModbusError) -> list[str]:
+    """The server id as text."""
+    head = terminal_text.styled("Server id (function 17)", bold=True)
+    if isinstance(answer, ModbusError):
+        return [head, f"  {terminal_text.styled(str(answer), fg='red')}"]
+    rows = [("bytes", answer.data.hex(" "))]
+    if answer.server_id is not None:
+        rows.insert(0, ("server id", str(answer.server_id)))
+    if answer.running is not None:
+        rows.insert(1, ("running", "yes" if answer.running else "no"))
+        if answer.additional and _is_text(answer.additional):
+            rows.insert(2, ("text", _text(answer.additional)))
+    return [head, *listed(rows)]
+
+
+def listed(rows: list[tuple[str, str]]) -> list[str]:
+    """Indented lines of names and texts."""
+    width = max(len(name) for name, _ in rows)
+    return [f"  {name:{width}}  {text}".rstrip() for name, text in rows]
+
+
+def _name(number: int) -> str:
+    return (
+        terminal_text.words(OBJECT_NAMES[number])
+        if number < len(OBJECT_NAMES)
+        else f"object {number}"
+    )
+
+
+def _is_text(data: bytes) -> bool:
+    try:
+        return data.decode().rstrip("\0").isprintable()
+    except UnicodeDecodeError:
+        return False
+
+
+def _text(data: bytes) -> str:
+    return terminal_text.plain(data.decode("utf-8", "replace").rstrip("\0"))

@@ -1,0 +1,1 @@
+"""The live views of `holdfast watch`: their screen, their sources, and what has changed."""

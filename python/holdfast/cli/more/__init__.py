@@ -1,0 +1,1 @@
+"""Commands for single purposes: Raw Ingest packets and load tests."""

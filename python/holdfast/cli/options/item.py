@@ -1,0 +1,285 @@
+"""Items, as commands take them: `hr:0`, `hr 0`, `40001`, `4x0001`, `%MW0`, `hr:0:float32:CDAB`.
+
+An address beside an area counts from 0, as in requests. Modicon numbers count from 1 and name the
+area themselves. A spelling with two readings is refused, and the error names both.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import click
+from click.shell_completion import CompletionItem
+
+from holdfast.cli.options.option import Command, flag
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS
+from holdfast.runtime.text import suggestion
+from holdfast.types import AREAS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from holdfast.types import Area
+
+SHORT: dict[str, Area] = dict(zip(("co", "di", "hr", "ir"), AREAS, strict=True))
+SHORT_OF = {area: short for short, area in SHORT.items()}
+MODICON: dict[str, Area] = dict(zip("0143", AREAS, strict=True))
+"""The first digits of Modicon numbers."""
+
+SIZED = ("bit", "string", "bytes")
+"""Types whose name has a colon."""
+
+FORM = "AREA:ADDRESS[:TYPE[:ORDER]], as in hr:100:float32:CDAB"
+MODICON_FORMS = "40001, 400001 or 4x0001, and 0, 1, 3 for coils, discrete inputs, input registers"
+RANGE = "[ITEM [COUNT]]"
+ITEMS = "[ITEM [COUNT] | ITEM...]"
+
+_MODICON = re.compile(r"([0134])(?:([xX])([0-9]{1,5})|([0-9]{4,5}))")
+_IEC = re.compile(r"%([A-Z]+)([0-9]{1,5})(.*)", re.I)
+IEC_AREAS: dict[str, Area] = {"M": "coils", "MW": "holding_registers"}
+IEC_READINGS = {
+    "MD": "hr:{0}:uint32 or hr:{1}:uint32, as controllers count words or pairs of words",
+    "MF": "hr:{0}:float32 or hr:{1}:float32, as controllers count words or pairs of words",
+    "IW": "ir:{0} or, with CODESYS, hr:{0}",
+    "QW": "hr:{0} or, with CODESYS, ir:{0}",
+    "MX": "co:{0}, or a bit of a register, as in hr:0:bit:3",
+}
+"""What addresses of IEC 61131-3 may mean that controllers use in several ways."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """An area, and an address in that area."""
+
+    area: Area
+    address: int
+
+
+@dataclass(frozen=True)
+class Item:
+    """An item of the command line."""
+
+    text: str
+    place: Place
+    count: int | None
+    """The number of addresses of FIRST-LAST."""
+    type: str | None
+    order: str
+
+
+def number(text: str) -> int | None:
+    """Parses a non-negative integer, decimal or 0x. Returns `None` for other text."""
+    if re.fullmatch("0[xX][0-9a-fA-F]{1,20}", text):
+        return int(text, 16)
+    return int(text) if re.fullmatch("[0-9]{1,20}", text) else None
+
+
+def span(text: str, last: int = LAST_ADDRESS) -> range | None:
+    """Parses FIRST-LAST or a single number, up to `last`. Returns `None` for other text."""
+    first, dash, end = text.strip().partition("-")
+    numbers = number(first), number(end if dash else first)
+    if numbers[0] is None or numbers[1] is None or not numbers[0] <= numbers[1] <= last:
+        return None
+    return range(numbers[0], numbers[1] + 1)
+
+
+def area_of(text: str) -> Area:
+    """Parses the name of an area, a short form or an unambiguous prefix, in any case."""
+    name = re.sub("[^a-z]", "", text.lower())
+    if name in SHORT:
+        return SHORT[name]
+    found = [area for area in AREAS if name and area.replace("_", "").startswith(name)]
+    if len(found) == 1 and re.fullmatch("[A-Za-z_ -]+", text):
+        return found[0]
+    near = suggestion(text.lower().replace("-", "_"), (*AREAS, *SHORT))
+    raise click.UsageError(f"{text!r} is not an area, allowed: {', '.join((*AREAS, *SHORT))}{near}")
+
+
+def areas_of(text: str) -> tuple[Area, ...]:
+    """Parses a comma-separated list of areas, and returns them in the order of the standard."""
+    chosen = {area_of(name.strip()) for name in text.split(",")}
+    return tuple(area for area in AREAS if area in chosen)
+
+
+def range_of(text: str) -> tuple[Area, int, int]:
+    """Parses AREA:FIRST-LAST. Returns the area, the first address, and the one after the last."""
+    area, _, addresses = text.partition(":")
+    found = span(addresses)
+    if found is None:
+        raise click.BadParameter(
+            f"{text!r} is not AREA:FIRST-LAST, as in hr:100-119, up to {LAST_ADDRESS}."
+        )
+    return area_of(area), found.start, found.stop
+
+
+def take(words: Sequence[str], *, modicon: bool = False) -> tuple[Item, list[str]]:
+    """Parses the item at the start of the arguments. Returns it and the remaining arguments."""
+    left = list(words)
+    if not left:
+        raise click.UsageError("Missing argument 'AREA'.")
+    text = left.pop(0)
+    head, *parts = text.split(":")
+    place, count = _numbered(head, modicon=modicon), None
+    if place is None:
+        area = area_of(head)
+        if not parts:
+            if not left:
+                raise click.UsageError("Missing argument 'ADDRESS'.")
+            parts = left.pop(0).split(":")
+            text = f"{text}:{':'.join(parts)}"
+        place, count = _addressed(parts.pop(0), area, modicon=modicon)
+    kind = parts.pop(0).lower() if parts else None
+    if kind in SIZED and parts:
+        kind = f"{kind}:{parts.pop(0)}"
+    order = parts.pop(0).upper() if parts else "ABCD"
+    if parts or text.endswith(":") or (count is not None and kind is not None):
+        raise click.UsageError(f"{text!r} is not {FORM}.")
+    return Item(text, place, count, kind, order), left
+
+
+def take_range(words: Sequence[str], *, modicon: bool = False) -> tuple[Item, int | None]:
+    """Parses an item and an optional COUNT after it, which is all that may be there."""
+    item, left = take(words, modicon=modicon)
+    if item.count is not None and left:
+        raise click.UsageError(f"{item.text!r} and COUNT: give only one.")
+    if len(left) > 1:
+        raise click.UsageError(f"Got unexpected extra argument ({' '.join(left[1:])}).")
+    count = item.count
+    if left:
+        count = number(left[0])
+        if count is None or not 1 <= count <= ADDRESSES:
+            raise click.UsageError(f"COUNT is {left[0]!r}, allowed: 1 to {ADDRESSES}.")
+    return item, count
+
+
+def single(
+    words: Sequence[str], *, modicon: bool, count: int | None = None
+) -> tuple[Place, int | None]:
+    """Parses an item without a type, and the number of its addresses, if it is named.
+
+    `count` is the value of `--count`.
+    """
+    item, named = take_range(words, modicon=modicon)
+    if item.type is not None:
+        raise click.UsageError(f"{item.text!r}: a type can't be used here.")
+    if named is not None and count is not None:
+        raise click.UsageError("COUNT and --count are the same: give only one.")
+    place, named = item.place, named or count
+    if place.address + (named or 1) > ADDRESSES:
+        raise click.UsageError(
+            f"{named} from address {place.address}: the last address is {LAST_ADDRESS}."
+        )
+    return place, named
+
+
+def are_several(words: Sequence[str], *, modicon: bool) -> bool:
+    """Whether arguments are items with names of their own, not one item and its COUNT."""
+    if not words:
+        return False
+    item, left = take(words, modicon=modicon)
+    if not left:
+        return ":" in words[0] and item.count is None
+    if number(left[0]) is None:
+        # `hr 0 x` has a wrong COUNT, `hr 0 hr 4` and `hr 0 4x0003` have another item.
+        return (
+            ":" in words[0]
+            or re.match("%|[134][xX]|[^:]+:", left[0]) is not None
+            or (len(left) > 1 and left[0].isalpha())
+        )
+    has_own_area = ":" in words[0] or not words[0][:1].isalpha()
+    match = _MODICON.fullmatch(left[0])
+    if has_own_area and match is not None:
+        meant = _modicon(left[0])
+        raise click.UsageError(
+            f"{left[0]!r} is not clear: type --count {left[0]} for that many, or "
+            f"{SHORT_OF[meant.area]}:{meant.address} for the Modicon number."
+        )
+    return False
+
+
+def modicon_hint(place: Place) -> str | None:
+    """A hint for an address that does not exist but looks like a Modicon number."""
+    match = _MODICON.fullmatch(str(place.address))
+    if match is None or MODICON[match[1]] != place.area:
+        return None
+    meant = int(match[4]) - 1
+    if meant < 0:
+        return None
+    return f"addresses count from 0; as a Modicon number (--modicon) {place.address} is {meant}"
+
+
+def complete(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Completes areas in a shell."""
+    return [CompletionItem(area) for area in AREAS if area.startswith(incomplete)]
+
+
+def words_argument(metavar: str, *, required: bool = False) -> Callable[[Command], Command]:
+    """Adds the words after a URL, which begin with an item."""
+    return click.argument(
+        "words", nargs=-1, required=required, metavar=metavar, shell_complete=complete
+    )
+
+
+modicon_option = flag("--modicon", "Addresses are Modicon numbers, also beside an area: hr 40001.")
+
+
+def _numbered(text: str, *, modicon: bool) -> Place | None:
+    """The place of a number that names its area: Modicon's, or IEC's. `None` for other text."""
+    if text.startswith("%"):
+        return _iec(text)
+    match = _MODICON.fullmatch(text)
+    if match is not None and text[:2] in ("0x", "0X") and not modicon:
+        meant = _modicon(text).address
+        raise click.UsageError(
+            f"{text!r} is not clear: type co:{meant} for the Modicon number, or name the area of "
+            f"the address {int(text, 16)}, as in hr:{text}."
+        )
+    if match is not None or (modicon and not text[:1].isalpha()):
+        return _modicon(text)
+    if number(text) is not None:
+        raise click.UsageError(
+            f"{text!r} has no area: type hr:{text} for a holding register, counted from 0, or "
+            "co, di, ir instead of hr."
+        )
+    return None
+
+
+def _addressed(text: str, area: Area, *, modicon: bool) -> tuple[Place, int | None]:
+    """The place of an address beside its area, and the number of addresses of FIRST-LAST."""
+    if modicon or re.fullmatch("[134][xX][0-9]+", text):
+        place = _modicon(text)
+        if place.area != area:
+            raise click.UsageError(f"{text} is in {place.area}, not in {area}.")
+        return place, None
+    found = span(text)
+    if found is None:
+        near = ""
+        if _MODICON.fullmatch(text):
+            meant = _modicon(text)
+            near = f"; did you mean {SHORT_OF[meant.area]}:{meant.address}, Modicon's {text}?"
+        allowed = f"allowed: 0 to {LAST_ADDRESS}, decimal or 0x{near}"
+        raise click.UsageError(f"ADDRESS is {text!r}, {allowed}")
+    return Place(area, found.start), len(found) if "-" in text else None
+
+
+def _modicon(text: str) -> Place:
+    match = _MODICON.fullmatch(text)
+    count = int(match[3] or match[4]) if match else 0
+    if match is None or not 1 <= count <= ADDRESSES:
+        raise click.UsageError(f"{text!r} is not a Modicon number, as in {MODICON_FORMS}.")
+    return Place(MODICON[match[1]], count - 1)
+
+
+def _iec(text: str) -> Place:
+    match = _IEC.fullmatch(text)
+    kind, address = (match[1].upper(), int(match[2])) if match else ("", 0)
+    if kind in IEC_READINGS:
+        readings = IEC_READINGS[kind].format(address, 2 * address)
+        raise click.UsageError(f"{text!r} is not clear: type {readings}.")
+    if match is None or match[3] or kind not in IEC_AREAS or address > LAST_ADDRESS:
+        raise click.UsageError(
+            f"{text!r} is not an item, allowed: %MW0 for hr:0, %M0 for co:0, up to {LAST_ADDRESS}."
+        )
+    return Place(IEC_AREAS[kind], address)

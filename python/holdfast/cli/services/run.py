@@ -1,0 +1,346 @@
+"""`holdfast run`: runs an appliance until a signal."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shlex
+import shutil
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from holdfast.adapters.foreign import UnknownAdapter
+from holdfast.appliance import Appliance
+from holdfast.appliance.control import Control
+from holdfast.appliance.parts.memories import UnusableFile
+from holdfast.appliance.parts.shared_logs import LogNotJoined
+from holdfast.appliance.service_manager import ServiceManager
+from holdfast.appliance.services.gateway import gateway_settings
+from holdfast.appliance.services.scanner import scanner_settings
+from holdfast.cli.configuration import load_or_exit, load_whole
+from holdfast.cli.exit_codes import ExitCode, fail
+from holdfast.cli.options.item import MODICON
+from holdfast.cli.options.option import config_argument
+from holdfast.cli.services.reloader import Reloader
+from holdfast.cli.signals import Interrupted, Signals
+from holdfast.cli.terminal_text import ranges_shown
+from holdfast.config import GatewayConfig, ModbusTcpListener, RouteConfig, UnitMemoryConfig
+from holdfast.config.checks.rights import unit_rights
+from holdfast.config.fingerprint import files_of
+from holdfast.config.values.scanning import written_pollable
+from holdfast.events import log_lines
+from holdfast.net.addresses import joined, reachable
+from holdfast.net.http.port import explained
+from holdfast.protocol import WRITE_LIMITS
+from holdfast.runtime.bounded_files import Unreadable
+from holdfast.runtime.interpreter import spare_what_stays, yield_interpreter
+from holdfast.types import BIT_AREAS, REGISTER_AREAS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from holdfast.appliance.parts.listeners import ListenAddress
+    from holdfast.appliance.windows_service.control import ServiceControl
+    from holdfast.config import (
+        Config,
+        DeviceConfig,
+        NatsConfig,
+        RawRuleConfig,
+        RuleConfig,
+        SerialRuleConfig,
+    )
+    from holdfast.config.checks.rights import UnitRights
+    from holdfast.config.models.outputs import Output
+    from holdfast.types import Area
+
+# A signal is noticed within this time.
+SIGNAL_INTERVAL_S = 0.2
+
+OTHER_FILES = 128
+"""Open files that are not connections: listeners, metrics requests, the interpreter's files."""
+
+# Who ends a connection at a request of `holdfast sessions`, in the audit log.
+SOURCE = {"source": "holdfast sessions"}
+
+# Maximum number of devices in the greeting.
+MAX_DEVICES = 10
+
+# mbpoll's number for each area. Registers come first, as they are the better example.
+MBPOLL_TYPES = {
+    area: number
+    for preferred in (REGISTER_AREAS, BIT_AREAS)
+    for number, area in MODICON.items()
+    if area in preferred
+}
+
+
+@click.command(epilog="Example: holdfast run examples/plant.yaml")
+@config_argument
+def run(file: Path) -> None:
+    """Run the appliance with the configuration FILE.
+
+    Prints listeners and polled devices, then serves until Ctrl-C or SIGTERM. Exit codes: 0 stopped
+    by a signal, 1 can't bind a listener, 2 the configuration has errors. The ports of REST, gateway
+    and metrics are retried until they are free.
+    """
+    config = load_or_exit(file)
+    serve(config, lambda appliance: _greeting(appliance, file), named=str(file), file=file)
+
+
+def serve(
+    config: Config,
+    greeting: Callable[[Appliance], str],
+    *,
+    named: str,
+    file: Path | None = None,
+    load: Callable[[], Config] | None = None,
+    retries_ports: bool = True,
+    control: ServiceControl | None = None,
+) -> None:
+    """Runs an appliance until a signal. Exits with 1 or 2 if it can't start.
+
+    With `file`, it is reread at SIGHUP, at a request of `holdfast reload`, or when it changes. With
+    `load`, what it returns is taken over at SIGHUP. Without `retries_ports`, a port of HTTP that is
+    in use is an error. With `control`, requests of Windows take the place of signals.
+    """
+    log_lines.configure(config.log.level, config.log.format)
+    yield_interpreter()
+    raise_open_file_limit(_connections(config) + _watched(config, file))
+    signals = control or Signals(
+        reload="always" if file else "with a terminal" if load else "never"
+    )
+    manager = control or ServiceManager()
+    appliance = Appliance(config, retries_ports=retries_ports)
+    # A start may take long. What changes meanwhile is noticed after it.
+    reloading: Reloader | None = None
+    if file is not None:
+        reloading = Reloader(appliance, manager, lambda: load_whole(file), file)
+    elif load is not None:
+        reloading = Reloader(appliance, manager, load)
+    try:
+        with signals.interrupting():
+            appliance.start()
+    except Interrupted:
+        appliance.stop()
+        return
+    except UnusableFile as error:
+        fail(error, ExitCode.WRONG)
+    except LogNotJoined as error:
+        fail(error, ExitCode.WRONG if error.is_settings else ExitCode.FAILED)
+    except Unreadable as error:
+        fail(error)
+    except OSError as error:
+        fail(explained(error))
+    except UnknownAdapter as error:
+        click.echo(f"{named}: {error}", err=True)
+        sys.exit(ExitCode.WRONG)
+    with ExitStack() as parts:
+        parts.callback(manager.close)
+        parts.callback(appliance.stop)
+        parts.callback(manager.stopping)
+        if reloading is not None:
+            parts.callback(reloading.close)
+        if reloading is not None and file is not None:
+            parts.callback(_control(appliance, reloading, file))
+        spare_what_stays()
+        click.echo(greeting(appliance))
+        manager.ready()
+        while not signals.received:
+            appliance.log_events(timeout=SIGNAL_INTERVAL_S)
+            if appliance.is_live:
+                manager.feed_watchdog()
+            if reloading is not None:
+                reloading.step(requested=signals.take_reload())
+
+
+def _control(appliance: Appliance, reloading: Reloader, file: Path) -> Callable[[], object]:
+    """Opens the control socket. Returns what closes it. Without one, all the rest still works."""
+    handlers: dict[str, Callable[..., Mapping[str, Any]]] = {
+        "reload": reloading.ask,
+        "sessions": lambda: {"sessions": appliance.sessions()},
+        "replicas": lambda: {"logs": appliance.replicas()},
+        "end": lambda listener, id: {"ended": appliance.end_session(listener, id, SOURCE)},
+    }
+    try:
+        return Control(file, handlers).close
+    except OSError as error:
+        log_lines.write(logging.WARNING, "control_unavailable", reason=str(error))
+        return lambda: None
+
+
+def _connections(config: Config) -> int:
+    """The maximum number of open connections of a configuration."""
+    served = [*config.listeners.values(), config.rest]
+    limits = ("max_connections", "max_handshakes")
+    most = sum(getattr(each, limit, 0) or 0 for each in served for limit in limits)
+    most += sum(1 + len(device.forward) for device in config.devices.values())
+    most += len(config.links)
+    if config.nats is not None:
+        most += scanner_settings(config.nats).limits.connections
+    if config.gateway is not None:
+        most += gateway_settings(config.gateway).limits.open_connections
+    return most
+
+
+def raise_open_file_limit(connections: int) -> None:
+    """Raises the limit on open files for `connections`; logs if the system does not allow it."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit.
+        return
+    needed = connections + OTHER_FILES
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return
+    allowed = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+    except (ValueError, OSError):  # The system has a lower limit that it does not report.
+        allowed = soft
+    if allowed < needed:
+        log_lines.write(logging.WARNING, "too_few_open_files", needed=needed, allowed=allowed)
+
+
+def _watched(config: Config, file: Path | None) -> int:
+    """The number of files that are kept open while they are watched."""
+    if file is None or config.reload != "on-change":
+        return 0
+    return len(files_of(file, config))
+
+
+def _greeting(appliance: Appliance, file: Path) -> str:
+    endpoints, config = appliance.endpoints(), appliance.config
+    devices, nats = list(config.devices.items()), config.nats
+    shown = devices[:MAX_DEVICES]
+    names = [*(endpoint.name for endpoint in endpoints), *(name for name, _ in shown)]
+    names += [*config.links, *config.outputs, *([] if nats is None else ["nats"])]
+    width = max(map(len, names), default=0)
+    lines = [f"{file} is served:", ""]
+    for endpoint in endpoints:
+        lines.append(f"  {endpoint.name:{width}}  {_address(endpoint)}")
+        if endpoint.error is not None:
+            lines.append(f"  {'':{width}}    not served yet, retried: {endpoint.error}")
+        rules = getattr(endpoint.settings, "rules", ())
+        lines += [f"  {'':{width}}    {_granted(rule)}" for rule in rules]
+        if isinstance(endpoint.settings, GatewayConfig):
+            lines.append(f"  {'':{width}}    {_reached(endpoint.settings)}")
+    if nats is not None:
+        lines.append(f"  {'nats':{width}}  {', '.join(nats.servers)}")
+        lines.append(f"  {'':{width}}    {_scanned(nats)}")
+    lines += [f"  {name:{width}}  {link.url}" for name, link in config.links.items()]
+    lines += [f"  {name:{width}}  {_polled(device)}" for name, device in shown]
+    if len(devices) > len(shown):
+        lines.append(f"  and {len(devices) - len(shown)} more devices")
+    lines += [f"  {name:{width}}  {_published(output)}" for name, output in config.outputs.items()]
+    lines += ["", "Try:", ""]
+    lines += [f"  {command}" for command in _suggestions(appliance, endpoints, file)]
+    return "\n".join([*lines, "", "Ctrl-C stops it."])
+
+
+def _address(endpoint: ListenAddress) -> str:
+    if endpoint.port is None:
+        return f"{endpoint.type}  {endpoint.host}"
+    address = joined(endpoint.host, endpoint.port)
+    if endpoint.type in ("http", "https"):
+        return f"{endpoint.type}://{address}"
+    return f"{endpoint.type}  {address}"
+
+
+def _polled(device: DeviceConfig) -> str:
+    """The polling of a device, in one line."""
+    if not device.enabled:
+        return f"{device.url} unit {device.unit}, not polled"
+    if device.interval is None or not device.has_readings:
+        return f"{device.url} unit {device.unit}, by routes only"
+    return f"{device.url} unit {device.unit}, polled every {device.interval:g} s"
+
+
+def _published(output: Output) -> str:
+    """The destination of an output, in one line."""
+    servers = getattr(output, "servers", ())
+    to = getattr(output, "url", None) or ", ".join(servers) or str(getattr(output, "file", ""))
+    return f"{output.type}  {to}"
+
+
+def _reached(gateway: GatewayConfig) -> str:
+    """The access that the gateway gives, in one line."""
+    can = "reads and writes" if gateway.access == "read-write" else "reads"
+    sources = ", ".join(map(str, gateway.sources))
+    tokens = "no tokens" if gateway.tokens == "none" else "a token each"
+    return f"console and API; {can} {', '.join(map(str, gateway.allow))} for {sources}; {tokens}"
+
+
+def _scanned(nats: NatsConfig) -> str:
+    """The devices and subject of the scanner, in one line."""
+    devices = ", ".join(map(written_pollable, nats.devices))
+    return f"polls and writes {devices} for subscribers at {nats.prefix}.subscribe"
+
+
+def _granted(rule: RuleConfig | SerialRuleConfig | RawRuleConfig) -> str:
+    """The access that a rule gives, in one line."""
+    units = ", ".join(f"{key} = {_behind(target)}" for key, target in rule.units.items())
+    to = f"units {units}" if units else f"memories {', '.join(getattr(rule, 'memories', ()))}"
+    rights = getattr(rule, "access", None) or f"writes {', '.join(getattr(rule, 'areas', ()))}"
+    sources = ", ".join(str(source) for source in getattr(rule, "sources", ()))
+    roles = getattr(rule, "roles", None)
+    of = "" if roles is None else f" as {', '.join(role or 'no role' for role in roles)}"
+    return f"{to}; {rights} for {sources or 'the line'}{of}"
+
+
+def _behind(target: str | UnitMemoryConfig | RouteConfig) -> str:
+    """The memory or device behind a unit id, and its own rights."""
+    if isinstance(target, str):
+        return target
+    name = target.route if isinstance(target, RouteConfig) else target.memory
+    own: list[str] = [] if target.access is None else [target.access]
+    for key in ("functions", "deny"):
+        codes = getattr(target, key)
+        own += [] if codes is None else [f"{key} {', '.join(map(str, codes))}"]
+    if isinstance(target, UnitMemoryConfig):
+        own += [] if target.read is None else [f"reads {ranges_shown(target.read)}"]
+        own += [] if target.write is None else [f"writes {ranges_shown(target.write)}"]
+        bits = target.exception_status
+        own += [] if bits is None else [f"exception status {ranges_shown([bits])}"]
+    return f"{name} ({'; '.join(own)})" if own else name
+
+
+def _suggestions(appliance: Appliance, endpoints: list[ListenAddress], file: Path) -> list[str]:
+    """Example commands for this appliance: a read, a write if one is allowed, the check."""
+    check = f"{_program()} check {shlex.quote(str(file))}"
+    for endpoint in endpoints:
+        if not isinstance(endpoint.settings, ModbusTcpListener):
+            continue
+        for rule in endpoint.settings.rules:
+            unit, rights = next(unit_rights(rule))
+            place = f"mbpoll -m tcp -p {endpoint.port} -a {unit} -0"
+            host = reachable(endpoint.host)
+            if rights.memory is None:
+                return [f"{place} -t 4 -r 0 -c 1 -1 {host}", check]
+            area, addresses = _example(appliance.memories[rights.memory].areas, rights)
+            command = f"{place} -t {MBPOLL_TYPES[area]} -r {addresses.start}"
+            read = f"{command} -c {min(len(addresses), 5)} -1 {host}"
+            writable = rights.access == "read-write" and area in WRITE_LIMITS
+            writable = writable and rights.write is None
+            return [read, f"{command} {host} 1", check] if writable else [read, check]
+    return [check]
+
+
+def _example(areas: Mapping[Area, range], rights: UnitRights) -> tuple[Area, range]:
+    """The area, and addresses of it, of the command that reads."""
+    if rights.read is not None:
+        return rights.read[0].area, rights.read[0].addresses
+    preferred = next((area for area in MBPOLL_TYPES if area in areas), None)
+    area = next(iter(areas)) if preferred is None else preferred
+    return area, areas[area]
+
+
+def _program() -> str:
+    """The name with which this program was called, or its path if a shell can't find it."""
+    name = click.get_current_context().find_root().info_name or "holdfast"
+    if name == "holdfast" and shutil.which(name) is None:
+        return shlex.quote(os.path.relpath(sys.argv[0]))
+    return name

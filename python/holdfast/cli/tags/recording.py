@@ -1,0 +1,120 @@
+"""Values of tags as CSV: lines with a time and a cell for each tag, and files of such lines."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import os
+import stat
+from typing import TYPE_CHECKING
+
+from holdfast.cli import terminal_text
+from holdfast.events import log_lines
+from holdfast.tags.text import text_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from holdfast.client.tag_reading import Reading
+    from holdfast.tags import Tag
+
+FILE_MODE = 0o644
+
+
+class NotARecording(ValueError):
+    """A file that has something else."""
+
+
+def head(tags: Iterable[Tag]) -> str:
+    """The line with the names of the columns."""
+    return _line(["time", *(tag.name for tag in tags)])
+
+
+def row(moment: float, readings: Sequence[Reading]) -> str:
+    """The line of one reading; the cell of a tag that was not read is empty.
+
+    States are numbers, so that the line can be plotted and played back.
+    """
+    cells = [terminal_text.plain(text_of(each.tag, each.value, states=False)) for each in readings]
+    return _line([log_lines.timestamp(moment), *cells])
+
+
+def _line(cells: Sequence[str]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(cells)
+    return text.getvalue()
+
+
+class Recording:
+    """A file that lines are appended to. Each line is written at once, so none is torn.
+
+    Raises `OSError`, and `NotARecording` for a file with other columns. If the last line of the
+    file is incomplete, as after a power failure, it is removed.
+    """
+
+    def __init__(self, path: Path, tags: Iterable[Tag]) -> None:
+        self.removed = 0
+        """Bytes of an incomplete line that were removed."""
+        flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
+        self._file = os.open(path, flags, FILE_MODE)
+        try:
+            self._begin(head(tags).encode())
+        except BaseException:
+            self.close()
+            raise
+
+    def _begin(self, head: bytes) -> None:
+        about = os.fstat(self._file)
+        if not stat.S_ISREG(about.st_mode) or about.st_size == 0:
+            self._append(head)
+            return
+        found = self._at(0, len(head))
+        if not head.startswith(found):
+            first = found.partition(b"\n")[0].decode(errors="replace")
+            allowed = head.decode().rstrip()
+            raise NotARecording(
+                f"found {terminal_text.plain(first)!r} in the first line, allowed: {allowed!r}, "
+                "an empty file or a new one"
+            )
+        whole = self._whole(about.st_size)
+        if whole < about.st_size:
+            self.removed = about.st_size - whole
+            os.ftruncate(self._file, whole)
+        if not whole:
+            self._append(head)
+
+    def _whole(self, size: int) -> int:
+        """The bytes up to the end of the last whole line."""
+        end = size
+        while end:
+            start = max(0, end - 65536)
+            place = self._at(start, end - start).rfind(b"\n")
+            if place >= 0:
+                return start + place + 1
+            end = start
+        return 0
+
+    def _at(self, start: int, count: int) -> bytes:
+        os.lseek(self._file, start, os.SEEK_SET)
+        return os.read(self._file, count)
+
+    def add(self, moment: float, readings: Sequence[Reading]) -> None:
+        """Appends a line, or nothing. Raises `OSError`."""
+        self._append(row(moment, readings).encode())
+
+    def _append(self, line: bytes) -> None:
+        written = 0
+        try:
+            while written < len(line):
+                written += os.write(self._file, line[written:])
+        except BaseException:
+            if written:
+                with contextlib.suppress(OSError):
+                    os.ftruncate(self._file, os.fstat(self._file).st_size - written)
+            raise
+
+    def close(self) -> None:
+        """Closes the file."""
+        os.close(self._file)

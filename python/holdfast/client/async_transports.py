@@ -1,0 +1,456 @@
+"""The transports of the client for asyncio.
+
+Over TCP and TLS: many requests in flight on one connection, without threads. The native connection
+frames requests, matches replies, tracks deadlines and handles TLS; `AsyncConnection` owns the
+socket, one timer and the futures. Requests from the same turn of the event loop are sent in one
+write, and replies that arrive together are delivered together, so a busy connection causes few
+wake-ups. All other transports have one request at a time: `ThreadedConnection`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+import os
+import socket
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from math import inf
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+from holdfast._core import Attempt, Connection
+from holdfast.client.endpoint import blocking
+from holdfast.client.tcp_connect import addresses, connected
+from holdfast.errors import ConnectFailed, ConnectionLost, ModbusError, RequestTimeout
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable
+
+    from holdfast._core import Endpoint, Request
+    from holdfast.client.url import NetworkTarget, Target
+
+CLOSED = "connection lost: closed by this side"
+
+END_CALL_INTERVAL_S = 0.2
+"""Seconds after which a call of a thread is ended again that had not begun before."""
+
+
+class AsyncTransport(Protocol):
+    """Carries calls to a device, for asyncio. `BlockingClient` of the core is the other one."""
+
+    def call(self, request: Request, unit: int, timeout: float) -> Awaitable[Any]:
+        """Sends a request, and waits for the result."""
+        ...
+
+    async def close(self) -> None:
+        """Closes the connection."""
+
+    @property
+    def late(self) -> int:
+        """How many replies arrived after their timeout."""
+
+    @property
+    def longest_late(self) -> float:
+        """How many seconds the slowest of them took; 0 if there were none."""
+
+
+class ThreadedConnection:
+    """A transport with one request at a time, in a thread of its own."""
+
+    def __init__(self, target: Target) -> None:
+        self._core = blocking(target)
+        self._executor: ThreadPoolExecutor | None = None
+
+    async def call(self, request: Request, unit: int, timeout: float) -> Any:
+        """Sends a request after the calls before it, and waits for the result."""
+        if self._executor is None:
+            self._executor = ThreadPoolExecutor(1, "holdfast-client")
+        loop = asyncio.get_running_loop()
+        executor = self._executor
+        return await loop.run_in_executor(executor, self._carry, executor, request, unit, timeout)
+
+    def _carry(
+        self, executor: ThreadPoolExecutor, request: Request, unit: int, timeout: float
+    ) -> Any:
+        # The client was closed, and possibly used again, while this call waited for its turn.
+        if executor is not self._executor:
+            raise ConnectionLost(CLOSED)
+        return self._core.call(request, unit, timeout)
+
+    async def close(self) -> None:
+        """Closes the connection; the current call and waiting calls fail."""
+        executor, self._executor = self._executor, None
+        if executor is not None:
+            await asyncio.to_thread(self._end, executor)
+
+    def _end(self, executor: ThreadPoolExecutor) -> None:
+        closed = executor.submit(self._core.close)
+        while not closed.done():
+            # A call may begin only now.
+            self._core.end_call()
+            wait([closed], END_CALL_INTERVAL_S)
+        executor.shutdown()
+
+    @property
+    def late(self) -> int:
+        """How many replies arrived after their timeout."""
+        return self._core.late
+
+    @property
+    def longest_late(self) -> float:
+        """How many seconds the slowest of them took; 0 if there were none."""
+        return self._core.longest_late
+
+
+class AsyncConnection:
+    """The connection of a client over TCP or TLS, in one event loop at a time."""
+
+    def __init__(self, target: NetworkTarget, endpoint: Endpoint, max_in_flight: int) -> None:
+        self._target = target
+        self._endpoint = endpoint
+        self._max_in_flight = 1 if target.tolerance.is_one_at_a_time else max_in_flight
+        self._last: _LoopConnection | None = None
+
+    def call(self, request: Request, unit: int, timeout: float) -> Awaitable[Any]:
+        """Sends a request as soon as a place is free, and waits for the result.
+
+        Raises `RuntimeError` while the client is in use in another event loop.
+        """
+        return self._here().call(request, unit, timeout)
+
+    async def close(self) -> None:
+        """Closes the connection; pending calls fail."""
+        await self._here().close()
+
+    @property
+    def late(self) -> int:
+        """How many replies arrived after their timeout."""
+        return 0 if self._last is None else self._last.late
+
+    @property
+    def longest_late(self) -> float:
+        """How many seconds the slowest of them took; 0 if there were none."""
+        return 0.0 if self._last is None else self._last.longest_late
+
+    def _here(self) -> _LoopConnection:
+        """The connection of this loop. In another loop it starts over."""
+        loop, last = asyncio.get_running_loop(), self._last
+        if last is not None and last.loop is loop:
+            return last
+        if last is not None and last.in_use and not last.loop.is_closed():
+            raise RuntimeError("the client is in use in another event loop: close it there")
+        # An object for each loop: calls that a closed loop has left behind may end at any time,
+        # and must not give back places of the new one.
+        late = (0, 0.0) if last is None else (last.late, last.longest_late)
+        here = _LoopConnection(self._target, self._endpoint, self._max_in_flight, loop, *late)
+        self._last = here
+        return here
+
+
+@dataclass(eq=False)
+class _LoopConnection:
+    """A connection in one event loop. Connects on demand, and reconnects after a loss."""
+
+    target: NetworkTarget
+    endpoint: Endpoint
+    max_in_flight: int
+    loop: asyncio.AbstractEventLoop
+    late_before: int = 0
+    longest_late_before: float = 0.0
+    """The late replies of connections that have ended."""
+
+    def __post_init__(self) -> None:
+        self._free = self.max_in_flight
+        self._queue: deque[asyncio.Future[None]] = deque()
+        self._open: _Protocol | None = None
+        self._last: Connection | None = None
+        """The newest connection, open or ended: its late replies may come on the next one."""
+        self._connecting: asyncio.Task[_Protocol] | None = None
+        self._is_looking_up = False
+        """Whether the attempt to connect waits, or has waited, for the addresses of the host."""
+        self._connect_at = -inf
+
+    async def call(self, request: Request, unit: int, timeout: float) -> Any:
+        if self._free:
+            self._free -= 1
+        else:
+            await self._turn()
+        try:
+            deadline = self.loop.time() + timeout
+            attempt = None
+            while True:
+                connection = self._open
+                if connection is None:
+                    connection = await self._connected(deadline, timeout)
+                ticket, future = connection.send(request, unit, deadline, timeout, attempt)
+                try:
+                    result = await future
+                except asyncio.CancelledError:
+                    connection.cancel(ticket)
+                    raise
+                if type(result) is not Attempt:
+                    return result
+                attempt = result
+                await asyncio.sleep(attempt.pause)
+                if attempt.has_own_timeout:
+                    deadline = self.loop.time() + timeout
+        finally:
+            if self._queue:
+                self._next_turn()
+            else:
+                self._free += 1
+
+    async def close(self) -> None:
+        for turn in self._queue:
+            if not turn.done():
+                turn.set_exception(ConnectionLost(CLOSED))
+        self._queue.clear()
+        if self._connecting is not None:
+            self._connecting.cancel()
+            await asyncio.wait([self._connecting])
+        if self._open is not None:
+            ended = self._open.ended
+            self._open.close()
+            await ended
+
+    @property
+    def in_use(self) -> bool:
+        """Whether there is a connection, or a pending call."""
+        connected = self._open is not None or self._connecting is not None
+        return connected or self._free < self.max_in_flight
+
+    @property
+    def late(self) -> int:
+        return self.late_before + (0 if self._open is None else self._open.core.late)
+
+    @property
+    def longest_late(self) -> float:
+        here = 0.0 if self._open is None else self._open.core.longest_late
+        return max(self.longest_late_before, here)
+
+    async def _turn(self) -> None:
+        """Waits for a free place in flight, in the order of the calls."""
+        turn = self.loop.create_future()
+        self._queue.append(turn)
+        try:
+            await turn
+        except asyncio.CancelledError:
+            if turn.done() and not turn.cancelled() and turn.exception() is None:
+                self._next_turn()
+            raise
+
+    def _next_turn(self) -> None:
+        """Gives a free place to the next waiting call."""
+        while self._queue:
+            turn = self._queue.popleft()
+            if not turn.done():
+                turn.set_result(None)
+                return
+        self._free += 1
+
+    async def _connected(self, deadline: float, timeout: float) -> _Protocol:
+        """The connection; connects if necessary. Several calls can wait for the same attempt."""
+        if self._connecting is None:
+            self._connecting = self.loop.create_task(self._connect(timeout))
+            self._connecting.add_done_callback(self._connect_ended)
+        connecting = self._connecting
+        done, _ = await asyncio.wait([connecting], timeout=deadline - self.loop.time())
+        if not done:
+            raise self._not_in_time(timeout)
+        if connecting.cancelled():
+            raise ConnectionLost(CLOSED)
+        failure = connecting.exception()
+        if isinstance(failure, ModbusError):
+            raise copy.copy(failure) from failure.__cause__
+        return connecting.result()
+
+    async def _connect(self, timeout: float) -> _Protocol:
+        target = self.target
+        self._is_looking_up = False
+        if self._connect_at > self.loop.time():
+            await asyncio.sleep(min(self._connect_at - self.loop.time(), timeout))
+        self._last = core = Connection(self.endpoint, self.loop.time(), self._last)
+        protocol = _Protocol(self, core, has_pauses=target.tolerance.has_pauses)
+        deadline = self.loop.time() + timeout
+        try:
+            async with asyncio.timeout_at(deadline):
+                try:
+                    self._is_looking_up = True
+                    found = await addresses(target.host, target.port)
+                    self._is_looking_up = False
+                    connection = await connected(found, deadline)
+                    await self.loop.create_connection(lambda: protocol, sock=connection)
+                except OSError as error:
+                    if isinstance(error, TimeoutError) and error.errno is None:
+                        raise  # Of this side, not of the system.
+                    raise ConnectFailed(str(target), explained(error)) from error
+                await protocol.ready
+        except TimeoutError:
+            raise self._not_in_time(timeout) from None
+        finally:
+            if not protocol.is_ready:
+                protocol.close()
+        return protocol
+
+    def _not_in_time(self, timeout: float) -> RequestTimeout:
+        why = ": its name was not resolved" if self._is_looking_up else ""
+        text = f"no connection to {self.target} within {timeout:g} s{why}"
+        return RequestTimeout(text, maybe_sent=False)
+
+    def _connect_ended(self, task: asyncio.Task[_Protocol]) -> None:
+        self._connecting = None
+        # The connection may already be lost.
+        if not task.cancelled() and task.exception() is None and task.result().is_ready:
+            self._open = task.result()
+
+    def lost(self, connection: _Protocol) -> None:
+        """The connection has ended: the next call makes a new one."""
+        self._connect_at = self.loop.time() + self.target.tolerance.reconnect
+        self.late_before += connection.core.late
+        self.longest_late_before = max(self.longest_late_before, connection.core.longest_late)
+        if self._open is connection:
+            self._open = None
+
+
+class _Protocol(asyncio.Protocol):
+    """One connection: sends requests and receives replies."""
+
+    def __init__(self, here: _LoopConnection, core: Connection, *, has_pauses: bool) -> None:
+        self.core = core
+        self._has_pauses = has_pauses
+        self._here = here
+        self._loop = here.loop
+        self.ready: asyncio.Future[None] = self._loop.create_future()
+        """Done when requests can be sent."""
+        self.ended: asyncio.Future[None] = self._loop.create_future()
+        """Done when the socket is closed."""
+        self._futures: dict[int, asyncio.Future[Any]] = {}
+        self._alarm: asyncio.TimerHandle | None = None
+        self._alarm_at = inf
+        self._flushing = False
+        self._transport: asyncio.Transport | None = None
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether requests can be sent."""
+        return self._transport is not None and self.core.is_ready
+
+    def send(
+        self,
+        request: Request,
+        unit: int,
+        deadline: float,
+        timeout: float,
+        attempt: Attempt | None,
+    ) -> tuple[int, asyncio.Future[Any]]:
+        """Sends a request: at once if no other is pending, else with others of this loop turn.
+
+        Returns its ticket and the future of its result.
+        """
+        # When the call began. Without pauses the core needs no later time, and each look at the
+        # clock costs something.
+        now = deadline - timeout
+        if self._has_pauses or attempt is not None:
+            now = self._loop.time()
+        ticket = self.core.send(request, unit, max(deadline - now, 0.0), now, attempt)
+        if not self._futures:
+            self._flush()
+        elif not self._flushing:
+            self._flushing = True
+            self._loop.call_soon(self._flush)
+        future = self._futures[ticket] = self._loop.create_future()
+        if self._has_pauses:
+            deadline = self.core.deadline or deadline
+        if deadline < self._alarm_at:
+            self._set_alarm(deadline)
+        return ticket, future
+
+    def cancel(self, ticket: int) -> None:
+        """Drops a request whose caller no longer waits."""
+        if self._futures.pop(ticket, None) is not None:
+            self.core.cancel(ticket)
+
+    def close(self) -> None:
+        """Closes the connection; pending requests raise `ConnectionLost`."""
+        self._settle(self.core.close())
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.Transport", transport)  # Those of uvloop have no such base.
+        self._settle([])
+
+    def data_received(self, data: bytes) -> None:
+        self._settle(self.core.receive(data, self._loop.time()))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._settle(self.core.lost(None if exc is None else explained(exc)))
+        self.ended.set_result(None)
+
+    def _settle(self, completed: list[tuple[int, Any]]) -> None:
+        """Delivers results, continues the handshake, and handles the end of the connection."""
+        for ticket, result in completed:
+            future = self._futures.pop(ticket)
+            if future.done():
+                continue
+            if isinstance(result, ModbusError):
+                future.set_exception(result)
+            else:
+                future.set_result(result)
+        if not self.ready.done():
+            self._greet()
+        closed = self.core.closed
+        if closed is not None:
+            self._end(closed)
+
+    def _greet(self) -> None:
+        """Continues the handshake before the first request."""
+        self._flush()
+        if self.core.is_ready:
+            self.ready.set_result(None)
+
+    def _end(self, why: ModbusError) -> None:
+        if self._alarm is not None:
+            self._alarm.cancel()
+            self._alarm = None
+        if not self.ready.done():
+            self.ready.set_exception(why)
+            self.ready.exception()  # Marks it retrieved: the waiting call may be cancelled.
+        transport, self._transport = self._transport, None
+        if transport is not None:
+            self._here.lost(self)
+            outgoing = self.core.outgoing()
+            if outgoing and not transport.is_closing():
+                transport.write(outgoing)
+            transport.abort()
+
+    def _flush(self) -> None:
+        self._flushing = False
+        if self._transport is not None:
+            outgoing = self.core.outgoing()
+            if outgoing:
+                self._transport.write(outgoing)
+
+    def _set_alarm(self, at: float) -> None:
+        if self._alarm is not None:
+            self._alarm.cancel()
+        self._alarm_at = at
+        self._alarm = self._loop.call_at(at, self._look_at_deadlines)
+
+    def _look_at_deadlines(self) -> None:
+        """Ends calls after their deadline, and sets the timer for the next deadline."""
+        self._alarm, self._alarm_at = None, inf
+        self._settle(self.core.advance(self._loop.time()))
+        if self._has_pauses:
+            self._flush()
+        deadline = self.core.deadline
+        if deadline is not None and self._transport is not None:
+            self._set_alarm(deadline)
+
+
+def explained(error: Exception) -> str:
+    """The system's text for an error, without the address that asyncio adds."""
+    if isinstance(error, socket.gaierror):
+        return error.strerror or str(error)
+    if isinstance(error, OSError) and error.errno is not None:
+        return os.strerror(error.errno)
+    return str(error)

@@ -1,0 +1,263 @@
+"""Reads tags: neighbours in one request, and a refused block costs only its own tags."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+from holdfast._core import plan_blocks
+from holdfast.client.requests import carry_out, carry_out_async
+from holdfast.errors import (
+    ConnectFailed,
+    ConnectionLost,
+    InvalidResponse,
+    ModbusError,
+    ModbusException,
+    RequestTimeout,
+    TlsFailed,
+)
+from holdfast.protocol import ILLEGAL_ADDRESS, ILLEGAL_VALUE, READ_LIMITS
+from holdfast.tags.decoding import Decoder, Undecoded, decoder
+from holdfast.types import BIT_AREAS
+from holdfast.values import ConversionError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Generator, Iterable, Sequence
+
+    from holdfast.client import SyncClient
+    from holdfast.tags import Tag
+    from holdfast.types import Area
+
+MAX_UNANSWERED = 3
+"""Requests in a row without an answer that end a reading."""
+
+REFUSAL_RETRY_S = 60.0
+"""Seconds after which what the device refuses is tried again."""
+
+ILLEGAL = (ILLEGAL_ADDRESS, ILLEGAL_VALUE)
+"""Exceptions that depend on the request, not on the state of the device."""
+
+GATEWAY = (0x0A, 0x0B)
+"""Exceptions of a gateway whose device does not answer."""
+
+Error: TypeAlias = ModbusError | ConversionError
+Result = TypeVar("Result")
+Steps: TypeAlias = "Generator[_Block, bytes, Result]"
+Fetch: TypeAlias = "Callable[[Area, int, int], Awaitable[bytes]]"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What was read of a tag."""
+
+    tag: Tag
+    value: Any = None
+    """The value; `None` without one, also if the device says that it has none."""
+    error: Error | None = None
+    """Why nothing was read."""
+
+
+@dataclass
+class _Block:
+    """One request, or several for an array that exceeds one. It has whole fields."""
+
+    area: Area
+    address: int
+    count: int
+    fields: list[_Field]
+    decode: Decoder
+    requested_in: int = 0
+    """The number of the last reading that requested it; 0 is none."""
+    answered: bool = True
+    refused: ModbusException | None = None
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        """Blocks that answered come first, then new ones, then those silent for longest."""
+        if not self.requested_in:
+            return 1, 0
+        return (0, 0) if self.answered else (2, self.requested_in)
+
+
+@dataclass
+class _Field:
+    """A range of addresses, and the indexes of its tags."""
+
+    area: Area
+    address: int
+    count: int
+    tags: list[int] = field(default_factory=list)
+
+
+class TagReader:
+    """Reads tags, and remembers for a minute what the device refuses.
+
+    Gaps of up to `max_gap` registers or bits between tags are read with them.
+    """
+
+    def __init__(
+        self,
+        tags: Iterable[Tag],
+        *,
+        max_gap: int = 0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.tags = tuple(tags)
+        self._max_gap = max_gap
+        self._clock = clock
+        self._number = 0
+        self._readings: dict[int, Reading] = {}
+        self._blocks: list[_Block] = []
+        self._planned = 0.0
+        self._is_whole = False
+        """Whether the blocks are those of the plan, as nothing has been refused."""
+
+    @property
+    def requests(self) -> list[tuple[Area, int, int]]:
+        """The blocks of the next reading: area, address, count."""
+        self._plan()
+        return [(block.area, block.address, block.count) for block in self._blocks]
+
+    def read(
+        self, client: SyncClient, between: Callable[[], object] = lambda: None
+    ) -> list[Reading]:
+        """Reads all tags, in their order. `between` is called after every request.
+
+        A device that does not answer three requests in a row is not asked any further.
+        """
+
+        def answer(block: _Block) -> bytes:
+            try:
+                return _fetch(client, block)
+            finally:
+                between()
+
+        return carry_out(self._steps(), answer)
+
+    async def read_with(self, fetch: Fetch) -> list[Reading]:
+        """As `read`, but `fetch` returns the bytes of area, address and count, as in a reply."""
+        return await carry_out_async(
+            self._steps(), lambda block: fetch(block.area, block.address, block.count)
+        )
+
+    def _steps(self) -> Steps[list[Reading]]:
+        """Reads all tags: yields what to request, and takes the bytes of the reply."""
+        self._plan()
+        self._number += 1
+        self._readings = {}
+        silent = 0
+        ended: ModbusError | None = None
+        blocks: list[_Block] = []
+        for block in sorted(self._blocks, key=lambda each: each.rank):
+            if block.refused is not None:
+                self._fail(block, block.refused)
+                blocks.append(block)
+                continue
+            if ended is not None:
+                self._fail(block, ended)
+                blocks.append(block)
+                continue
+            replacements, error = yield from self._request(block)
+            blocks += replacements
+            if error is None:
+                silent = 0
+                continue
+            silent += 1
+            if silent == MAX_UNANSWERED or isinstance(error, ConnectFailed | TlsFailed):
+                ended = error
+        self._blocks = sorted(blocks, key=lambda each: (each.area, each.address))
+        return [self._readings[index] for index in range(len(self.tags))]
+
+    def _plan(self) -> None:
+        """Makes blocks of all tags, at first and some time after a refusal."""
+        now = self._clock()
+        if self._blocks and (self._is_whole or now - self._planned < REFUSAL_RETRY_S):
+            return
+        self._planned, self._is_whole = now, True
+        fields: dict[tuple[Area, int, int], _Field] = {}
+        for index, tag in enumerate(self.tags):
+            place = tag.area, tag.span.start, len(tag.span)
+            fields.setdefault(place, _Field(*place)).tags.append(index)
+        short: list[_Field] = []
+        long: list[_Field] = []
+        for each in fields.values():
+            (short if each.count <= READ_LIMITS[each.area] else long).append(each)
+        planned = plan_blocks(
+            [(each.area, each.address, each.count) for each in short], max_gap=self._max_gap
+        )
+        self._blocks = [self._block([short[at] for at in inside]) for _, _, _, inside, _ in planned]
+        self._blocks += [self._block([each]) for each in long]
+
+    def _block(self, fields: Sequence[_Field]) -> _Block:
+        found = sorted(fields, key=lambda each: each.address)
+        address = found[0].address
+        count = max(each.address + each.count for each in found) - address
+        tags = [self.tags[index] for each in found for index in each.tags]
+        return _Block(found[0].area, address, count, found, decoder(tags, address, count))
+
+    def _request(self, block: _Block) -> Steps[tuple[list[_Block], ModbusError | None]]:
+        """Reads a block. Returns the blocks that replace it, and the error of a silent device."""
+        block.requested_in = self._number
+        try:
+            data = yield block
+        except ModbusError as error:
+            if isinstance(error, ModbusException) and error.code in ILLEGAL:
+                self._is_whole = False
+                if len(block.fields) > 1:
+                    return (yield from self._bisect(block))
+                block.refused = error
+            self._fail(block, error)
+            block.answered = not _is_silence(error)
+            return [block], None if block.answered else error
+        block.answered = True
+        self._decode(block, data)
+        return [block], None
+
+    def _bisect(self, block: _Block) -> Steps[tuple[list[_Block], ModbusError | None]]:
+        """Reads the halves of a refused block; the second only if the device still answers."""
+        middle = len(block.fields) // 2
+        first, second = self._block(block.fields[:middle]), self._block(block.fields[middle:])
+        blocks, error = yield from self._request(first)
+        if error is not None:
+            self._fail(second, error)
+            return [*blocks, second], error
+        others, error = yield from self._request(second)
+        return blocks + others, error
+
+    def _decode(self, block: _Block, data: bytes) -> None:
+        indexes = [index for each in block.fields for index in each.tags]
+        for index, raw in zip(indexes, block.decode(data), strict=True):
+            tag = self.tags[index]
+            if isinstance(raw, Undecoded):
+                self._readings[index] = Reading(tag, error=ConversionError(raw.error))
+            else:
+                self._readings[index] = Reading(tag, tag.value(raw))
+
+    def _fail(self, block: _Block, error: ModbusError) -> None:
+        for each in block.fields:
+            for index in each.tags:
+                self._readings[index] = Reading(self.tags[index], error=error)
+
+
+def _fetch(client: SyncClient, block: _Block) -> bytes:
+    """The bytes of a block, as in a Modbus reply."""
+    area, address, count = block.area, block.address, block.count
+    if area not in BIT_AREAS:
+        registers: bytes = client.read(area, address, f"bytes:{2 * count}")
+        return registers
+    read_bits = client.read_coils if area == "coils" else client.read_discrete_inputs
+    return packed(read_bits(address, count))
+
+
+def packed(bits: Sequence[bool]) -> bytes:
+    """Bits as in a Modbus reply."""
+    together = sum(bit << at for at, bit in enumerate(bits))
+    return together.to_bytes((len(bits) + 7) // 8, "little")
+
+
+def _is_silence(error: ModbusError) -> bool:
+    """Whether the device did not answer, so that more requests would likely wait in vain."""
+    if isinstance(error, ModbusException):
+        return error.code in GATEWAY
+    return isinstance(error, ConnectionLost | RequestTimeout | InvalidResponse)

@@ -1,0 +1,90 @@
+"""Connects over TCP to the first address of a host that accepts, before a deadline.
+
+Each address gets a share of the remaining time, so that one dead address does not use it up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from typing import TYPE_CHECKING
+
+from holdfast.net.resolver import CONFIGURED
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from holdfast.net.resolver import SocketAddress
+
+
+async def addresses(host: str, port: int) -> list[SocketAddress]:
+    """Returns the addresses of a host, in the system's order. Raises `OSError`.
+
+    A cancellation ends it at once, and no event loop waits for the lookup when it is closed.
+    """
+    found = CONFIGURED.look_up(host, port)
+    # An address needs no lookup.
+    return found.result() if found.done() else await asyncio.wrap_future(found)
+
+
+async def connected(candidates: Sequence[SocketAddress], deadline: float) -> socket.socket:
+    """Returns a connection to the first of the addresses that accepts.
+
+    `deadline` is a time of the clock of the event loop. Raises `OSError`.
+    """
+    loop = asyncio.get_running_loop()
+    for others, (family, address) in _countdown(candidates):
+        try:
+            connection = socket.socket(family)
+            try:
+                _prepare(connection)
+                async with asyncio.timeout((deadline - loop.time()) / (others + 1)):
+                    await loop.sock_connect(connection, address)
+            except BaseException:
+                connection.close()
+                raise
+            return connection
+        except OSError:
+            if not others:
+                raise
+    raise OSError("the host has no address")
+
+
+def connected_sync(host: str, port: int, deadline: float) -> socket.socket:
+    """Like `addresses` and `connected`, without an event loop."""
+    candidates = CONFIGURED.wait_for(host, port, remaining_s(deadline))
+    for others, (family, address) in _countdown(candidates):
+        try:
+            connection = socket.socket(family)
+            try:
+                _prepare(connection)
+                connection.settimeout(remaining_s(deadline) / (others + 1))
+                connection.connect(address)
+                connection.setblocking(False)
+            except BaseException:
+                connection.close()
+                raise
+            return connection
+        except OSError:
+            if not others:
+                raise
+    raise OSError("the host has no address")
+
+
+def _countdown(candidates: Sequence[SocketAddress]) -> Iterator[tuple[int, SocketAddress]]:
+    """The addresses, each with the number of addresses after it."""
+    return zip(reversed(range(len(candidates))), candidates, strict=True)
+
+
+def _prepare(connection: socket.socket) -> None:
+    connection.setblocking(False)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+def remaining_s(deadline: float) -> float:
+    """The seconds until a deadline. Raises `TimeoutError` after it."""
+    seconds = deadline - time.monotonic()
+    if seconds <= 0:
+        raise TimeoutError
+    return seconds

@@ -1,0 +1,110 @@
+"""Builds the models from plain data, and translates pydantic's errors.
+
+Each error becomes one message: what was found, and what is allowed.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from holdfast.config.allowed_words import allowed, known_keys
+from holdfast.config.models.listeners import LISTENER_TYPES, UNIT_TAGS
+from holdfast.config.models.outputs import OUTPUT_TYPES
+from holdfast.config.models.partial import partial
+from holdfast.config.models.root import Config
+from holdfast.config.text.messages import shape, show
+from holdfast.runtime.text import either, listing, suggestion
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pydantic_core import ErrorDetails
+
+    from holdfast.config.text.report import Report
+    from holdfast.config.text.source import KeyPath
+
+_KEY = "[key]"
+_NO_KIND = ("union_tag_invalid", "union_tag_not_found")
+_TOKENS = (("rest", "tokens"), ("gateway", "tokens"))
+_SERVERS = ("nats", "servers")
+_CONSEQUENCES = ("default_factory_not_called",)
+"""Errors that are only consequences of other errors."""
+
+
+def build(data: object, folder: Path, report: Report) -> Config:
+    """Builds a `Config`; from invalid data its valid part, and reports problems.
+
+    Files are relative to `folder`.
+    """
+    context = {"folder": folder}
+    try:
+        return Config.model_validate(data, context=context)
+    except ValidationError as errors:
+        for error in errors.errors(include_url=False):
+            _add(_untagged(error["loc"]), error, report)
+        return partial(data, context)
+
+
+def _untagged(path: KeyPath) -> KeyPath:
+    """The path without the tags that pydantic inserts for discriminated unions."""
+    of_listener = path[:1] == ("listeners",) and path[2:] != (_KEY,)
+    of_output = path[:1] == ("outputs",) and path[2:] != (_KEY,)
+    if of_listener or of_output or path[:2] in _TOKENS:
+        path = path[:2] + path[3:]
+    of_unit = of_listener and path[4:5] == ("units",) and path[6:7] and path[6] in UNIT_TAGS
+    return path[:6] + path[7:] if of_unit else path
+
+
+def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
+    kind, data = error["type"], report.document.data
+    of_key = bool(path) and path[-1] == _KEY
+    path = path[:-1] if of_key else path
+    if kind in _CONSEQUENCES or (kind == "too_short" and error["input"]):
+        return  # The error inside the value has its own report.
+    if kind in _NO_KIND:
+        _add_kind((*path, "type"), error["input"], report)
+    elif kind == "missing":
+        report.add_key(path, f"missing, allowed: {allowed(path, data)}")
+    elif kind in ("extra_forbidden", "invalid_key"):
+        report.add_key(path, _unknown(path, data))
+    elif kind == "problem_at":
+        context = error["ctx"]
+        where = (*path, context["key"]) if context["key"] else path
+        report.add(where, context["message"], of_key=context["of_key"])
+    elif kind == "value_error":
+        report.add(path, str(error["ctx"]["error"]), of_key=of_key)
+    else:
+        while not report.document.holds(path):
+            path = path[:-1]
+        near = suggestion(error["input"], _words(error)) if kind == "literal_error" else ""
+        words = f"{allowed(path, data)}{near}"
+        report.add(path, f"found {_shown(path, error['input'])}, allowed: {words}")
+
+
+def _words(error: ErrorDetails) -> list[str]:
+    """The words that a literal allows."""
+    return re.findall("'([^']*)'", error["ctx"]["expected"])
+
+
+def _add_kind(path: KeyPath, owner: dict[str, Any], report: Report) -> None:
+    types = OUTPUT_TYPES if path[0] == "outputs" else LISTENER_TYPES
+    words = f"allowed: {either(types)}"
+    if "type" not in owner:
+        report.add_key(path, f"missing, {words}")
+    else:
+        near = suggestion(owner["type"], types)
+        report.add(path, f"found {show(owner['type'])}, {words}{near}")
+
+
+def _shown(path: KeyPath, value: object) -> str:
+    """The value as text, or only its shape if it could contain a secret."""
+    of_token = path[:2] in _TOKENS and len(path) <= 3
+    return shape(value) if of_token or path == _SERVERS else show(value)
+
+
+def _unknown(path: KeyPath, data: object) -> str:
+    known = known_keys(path[:-1], data)
+    return f"unknown key, allowed: {listing(known)}{suggestion(path[-1], known)}"

@@ -1,0 +1,113 @@
+"""Checks rules between keys of outputs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holdfast.config.checks.common import check_name, given, items, until_invalid
+from holdfast.config.checks.nats import check_dialect_of, check_nats
+from holdfast.config.checks.services import check_broker
+from holdfast.config.checks.tls import check_client_tls, check_files
+from holdfast.config.models.outputs import (
+    InfluxConfig,
+    MqttOutputConfig,
+    NatsOutputConfig,
+    SparkplugConfig,
+)
+from holdfast.config.text.messages import show
+from holdfast.config.values.topics import TAG
+
+if TYPE_CHECKING:
+    from holdfast.config.checks.common import Scope
+    from holdfast.config.models.outputs import Output
+    from holdfast.config.text.source import KeyPath
+
+
+def check_outputs(scope: Scope) -> None:
+    """Reports what is wrong."""
+    with until_invalid():
+        for path, output in items(("outputs",), scope.config.outputs):
+            with until_invalid():
+                for where, name in items((*path, "devices"), output.devices or ()):
+                    check_name(where, name, scope.names("devices"), "devices", scope.report)
+            with until_invalid():
+                _check_output(scope, path, output)
+
+
+def _check_output(scope: Scope, path: KeyPath, output: Output) -> None:
+    if not output.type:
+        return  # Never: the read ends the checks of an output whose type is invalid.
+    if isinstance(output, InfluxConfig):
+        _check_influx(scope, path, output)
+    elif isinstance(output, NatsOutputConfig):
+        check_nats(path, output, scope.report)
+        check_dialect_of(path, output, scope.report)
+    elif isinstance(output, MqttOutputConfig):
+        check_broker(path, output, scope.report)
+        _check_topics(scope, path, output)
+    elif isinstance(output, SparkplugConfig):
+        check_broker(path, output, scope.report)
+        _check_sparkplug(scope, path, output)
+
+
+def _check_influx(scope: Scope, path: KeyPath, output: InfluxConfig) -> None:
+    target, report = output.target, scope.report
+    if target.path in ("", "/") and not given(output, "bucket"):
+        report.add_key((*path, "bucket"), "missing, allowed: a bucket, or a url with a path")
+    if given(output, "tls") and not target.secure:
+        report.add_key((*path, "tls"), "found with http://, allowed: only with https://")
+    if len(given(output, "username", "token_file")) > 1:
+        message = "found together with token_file, allowed: only one of them"
+        report.add_key((*path, "username"), message)
+    user = given(output, "username", "password_file")
+    if len(user) == 1:
+        other = "password_file" if user == ["username"] else "username"
+        report.add_key((*path, *user), f"found without {other}")
+    check_files(path, output, ("token_file", "password_file"), report)
+    check_client_tls((*path, "tls"), output.tls, report)
+
+
+def _check_sparkplug(scope: Scope, path: KeyPath, output: SparkplugConfig) -> None:
+    for other_path, other in items(("outputs",), scope.config.outputs):
+        if other is output:
+            break
+        if not isinstance(other, SparkplugConfig):
+            continue
+        with until_invalid():
+            if (other.group, other.edge_node) == (output.group, output.edge_node):
+                found = f"found {show(output.edge_node)}"
+                message = f"{found}, which outputs.{other_path[-1]} has in the same group"
+                scope.report.add((*path, "edge_node"), message)
+
+
+def _check_topics(scope: Scope, path: KeyPath, output: MqttOutputConfig) -> None:
+    template, whole = output.topic, output.payload == "device"
+    if template is not None and whole and TAG in template:
+        message = f"found {show(template)} with payload: device, allowed: without {TAG}"
+        scope.report.add((*path, "topic"), message)
+    if template is not None and not whole and TAG not in template:
+        message = f"found {show(template)}, allowed: with {TAG} (optional with payload: device)"
+        scope.report.add((*path, "topic"), message)
+    names = output.topics
+    for device in scope.names("devices"):
+        if names.is_of_device(names.status, device):
+            message = f"found {show(names.status)}, which is a topic of the device {device}"
+            message += ", allowed: another topic"
+            scope.report.add_key((*path, "status"), message)
+            break
+
+
+def warn_of_outputs(scope: Scope) -> None:
+    """Warns about settings of valid outputs that have no effect."""
+    config = scope.config
+    if config.outputs and not any(device.has_tags for device in config.devices.values()):
+        scope.report.warn(("outputs",), "has no effect: no device has tags")
+    for name, output in config.outputs.items():
+        if not isinstance(output, MqttOutputConfig):
+            continue
+        path: KeyPath = ("outputs", name)
+        if given(output, "discovery_prefix") and output.discovery is None:
+            scope.report.warn((*path, "discovery_prefix"), "has no effect without discovery")
+        if output.discovery is not None and not output.retain:
+            message = "with it, Home Assistant has no value after a start until one changes"
+            scope.report.warn((*path, "retain"), message)

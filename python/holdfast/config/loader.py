@@ -1,0 +1,133 @@
+"""Loads a file into a `Config`, or reports every problem of the file.
+
+The models check each value. Then the checks test rules between values, on all models and parts of
+models that are valid, so an error in one does not hide an error in the other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from difflib import get_close_matches
+from pathlib import Path
+
+from holdfast.config.allowed_words import allowed, known_keys
+from holdfast.config.build import build
+from holdfast.config.checks.common import Scope
+from holdfast.config.checks.connections import AddressChecks, check_sockets
+from holdfast.config.checks.devices import check_devices, warn_of_devices
+from holdfast.config.checks.extras import check_extras
+from holdfast.config.checks.former_keys import take_out_former_keys
+from holdfast.config.checks.listeners import (
+    check_listeners,
+    warn_of_listeners,
+    warn_of_source_limit,
+)
+from holdfast.config.checks.memories import check_memories, warn_of_grants
+from holdfast.config.checks.nats import check_logs, warn_of_logs
+from holdfast.config.checks.outputs import check_outputs, warn_of_outputs
+from holdfast.config.checks.services import check_services
+from holdfast.config.checks.tags import check_tags
+from holdfast.config.checks.units import warn_of_routes
+from holdfast.config.models.root import Config
+from holdfast.config.tag_files.profiles import ProfileFiles
+from holdfast.config.text import source
+from holdfast.config.text.messages import shape, show
+from holdfast.config.text.problems import ConfigError, Problem
+from holdfast.config.text.report import Report
+from holdfast.config.text.templates import expanded
+from holdfast.runtime import bounded_files
+
+
+def load(path: Path | str) -> Config:
+    """Reads a configuration. Raises `ConfigError` with every problem.
+
+    Valid settings without effect are in `Config.warnings`.
+    """
+    return loaded(path)[0]
+
+
+def loaded(path: Path | str) -> tuple[Config, source.Document]:
+    """Reads a configuration, as `load` does. Returns it with its document."""
+    file = str(path)
+
+    def work() -> tuple[Config, source.Document]:
+        content = source.read_bytes(Path(path), file)
+        document, problems = source.parse(source.decoded(content, file), file)
+        config = checked(document, problems, Path(path).absolute().parent)
+        return config.with_sha256(hashlib.sha256(content).hexdigest()), document
+
+    try:
+        return bounded_files.answered(work)
+    except bounded_files.NotAnswered as error:
+        raise ConfigError(file, [unanswered(error)]) from None
+
+
+def unanswered(error: bounded_files.NotAnswered) -> Problem:
+    """The problem of a file that was not read in time."""
+    return Problem(str(error.filename), None, None, "", f"can't be read: {error.strerror}")
+
+
+def checked(document: source.Document, problems: list[Problem], folder: Path) -> Config:
+    """The configuration of a document that has these problems. It names files from `folder`.
+
+    Raises `ConfigError` with these problems, and all others.
+    """
+    found = _foreign(document.data)
+    if found is not None:
+        message = f"found {found}, allowed: {allowed((), None)}"
+        raise ConfigError(document.file, problems or [Problem(document.file, 1, 1, "", message)])
+    assert isinstance(document.data, dict), "anything else is foreign"
+    report = Report(document)
+    profiles = ProfileFiles(folder, report)
+    profiles.read()
+    expanded(report)
+    take_out_former_keys(report)
+    config = build(report.document.data, folder, report)
+    scope = Scope(config, folder, report)
+    _check(scope)
+    problems = [*problems, *report.problems, *report.elsewhere]
+    if problems:
+        raise ConfigError(document.file, problems)
+    _warn(scope)
+    config.with_profile_files(profiles.files)
+    return config.with_warnings(sorted(report.warnings, key=lambda warning: warning.line or 0))
+
+
+def _check(scope: Scope) -> None:
+    """Reports every problem between valid values."""
+    check_memories(scope)
+    check_listeners(scope)
+    check_services(scope)
+    check_logs(scope)
+    AddressChecks(scope).check()
+    check_devices(scope)
+    check_outputs(scope)
+    check_tags(scope)
+    check_sockets(scope)
+    check_extras(scope)
+
+
+def _warn(scope: Scope) -> None:
+    """Warns about valid settings that have no effect, or probably a wrong one."""
+    warn_of_listeners(scope)
+    if scope.config.rest is not None:
+        warn_of_source_limit(scope, ("rest",), scope.config.rest)
+    warn_of_logs(scope)
+    warn_of_devices(scope)
+    warn_of_outputs(scope)
+    warn_of_grants(scope)
+    warn_of_routes(scope)
+
+
+def _foreign(data: object) -> str | None:
+    """What a file is that is no configuration. Its content is not shown: it could be a secret."""
+    if data is None:
+        return "an empty file"
+    if not isinstance(data, dict):
+        return shape(data) if data else show(data)
+    known = known_keys((), None)
+    if not data or any(get_close_matches(str(key), known, cutoff=0.8) for key in data):
+        return None
+    return (
+        f"a mapping with {len(data)} other keys" if len(data) > 1 else "a mapping with another key"
+    )

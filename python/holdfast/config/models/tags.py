@@ -1,0 +1,93 @@
+"""Models of tags and profiles: names, types and units for what a device has."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Annotated, Any
+
+from pydantic import Field, PlainSerializer, PlainValidator, Strict
+from pydantic.config import JsonDict
+from pydantic.json_schema import WithJsonSchema
+
+from holdfast.config.models.base import Model
+from holdfast.config.models.memories import Register
+from holdfast.config.values.scalars import NAME_KEYS, Name, NotNull, whole_number
+from holdfast.config.values.tag_scale import SCALE_SCHEMA, ScaleConfig, parse_scale, written_scale
+from holdfast.tags import Tag, TagList
+from holdfast.tags.tag import Rounding
+from holdfast.types import Area
+from holdfast.values.orders import DEFAULT_ORDER
+
+Number = Annotated[float, Field(allow_inf_nan=False), whole_number]
+Marker = bool | int | float | str
+Scale = Annotated[
+    float | ScaleConfig,
+    PlainValidator(parse_scale),
+    PlainSerializer(written_scale),
+    WithJsonSchema(SCALE_SCHEMA),
+]
+
+_INTEGER_KEYS: JsonDict = {"propertyNames": {"pattern": "^-?[0-9]+$"}}
+
+
+class TagConfig(Model):
+    """A tag: a place in a device, the type of its value, and what the value means."""
+
+    area: Area
+    """The area."""
+    address: Register
+    """The first address, as in the protocol: counted from 0."""
+    type: str = ""
+    """The type, such as float32, bit:3 or string:20. Default: bool or uint16, by area."""
+    order: Annotated[str | None, NotNull()] = None
+    """The byte order: ABCD, DCBA, BADC or CDAB. Default: that of the profile, or ABCD."""
+    encoding: Annotated[str | None, NotNull()] = None
+    """The encoding of text. Default: ASCII."""
+    scale: Scale = 1.0
+    """The value is scale × number + offset, where the number is what the registers hold. A mapping
+    with from and as names the register that contains the scale."""
+    offset: Number = 0.0
+    """What is added."""
+    unit: str = ""
+    """The unit of the value, such as V or °C."""
+    writable: bool = False
+    """Whether outputs and commands may write it."""
+    min: Annotated[Number | None, NotNull()] = None
+    """The smallest value that may be written."""
+    max: Annotated[Number | None, NotNull()] = None
+    """The largest value that may be written."""
+    states: dict[int, str] = Field(default={}, json_schema_extra=_INTEGER_KEYS)
+    """Names of values, by number."""
+    null: Annotated[tuple[Marker, ...], Strict(False)] = ()
+    """What the registers hold when no value is available, such as 65535 or nan."""
+    deadband: Number = 0.0
+    """How much a value must change to count as changed."""
+    round: Annotated[Rounding | None, NotNull()] = None
+    """What happens to a value between two steps. Default: exact for writes, nearest in mqtt.map."""
+    description: str = ""
+    """A description, for people."""
+
+    def tag(self, name: str, order: str) -> Tag:
+        """The tag, with a default order. Raises `TagError`."""
+        settings: dict[str, Any] = {key: getattr(self, key) for key in _KEYS}
+        order = (self.order or order).upper()
+        if isinstance(self.scale, ScaleConfig):
+            settings["scale"] = self.scale.of(order)
+        return Tag(name, null=frozenset(self.null), order=order, **settings)
+
+
+_KEYS = tuple(key for key in TagConfig.model_fields if key not in ("null", "order"))
+
+
+class ProfileConfig(Model):
+    """The tags of a kind of device."""
+
+    order: str = DEFAULT_ORDER
+    """The byte order of tags that name none: ABCD, DCBA, BADC or CDAB."""
+    tags: dict[Name, TagConfig] = Field(min_length=1, json_schema_extra=NAME_KEYS)
+    """The tags, by name."""
+
+    @cached_property
+    def tag_list(self) -> TagList:
+        """The tags; the same for all devices of the profile. Raises `TagError`."""
+        return TagList(tag.tag(name, self.order) for name, tag in self.tags.items())

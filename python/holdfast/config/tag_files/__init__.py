@@ -1,0 +1,1 @@
+"""Tag lists and profiles as files of their own."""

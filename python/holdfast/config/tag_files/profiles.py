@@ -1,0 +1,67 @@
+"""Reads profiles that a configuration names by their files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from holdfast.config.checks.common import unreadable
+from holdfast.config.tag_files.read import KINDS, load_profile
+from holdfast.config.text.messages import show
+from holdfast.config.text.problems import ConfigError
+from holdfast.config.text.raw_access import entries, mapping
+from holdfast.config.values.scalars import NAME_FORM, is_name
+from holdfast.runtime.text import either
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from holdfast.config.text.report import Report
+    from holdfast.config.text.source import KeyPath
+
+_ANY = {"tags": {"any": {"area": "coils", "address": 0}}}
+"""In place of a profile that could not be read, so that its users are checked all the same."""
+
+
+@dataclass
+class ProfileFiles:
+    """The profile files of one configuration, relative to `folder`."""
+
+    folder: Path
+    report: Report
+    files: list[Path] = field(default_factory=list)
+
+    def read(self) -> None:
+        """Replaces a list of files in the document by the profiles in them."""
+        document = self.report.document
+        data = mapping(document.data)
+        if not isinstance(data.get("profiles"), list):
+            return
+        profiles: dict[str, Any] = {}
+        for index, file in enumerate(entries(data["profiles"])):
+            self._read(("profiles", index), file, profiles)
+        self.report.document = replace(document, data={**data, "profiles": profiles})
+
+    def _read(self, path: KeyPath, file: object, profiles: dict[str, Any]) -> None:
+        if not isinstance(file, str) or not file.lower().endswith(KINDS) or "\0" in file:
+            self.report.add(path, f"found {show(file)}, allowed: a file {either(KINDS)}")
+            return
+        where = self.folder / file
+        if not is_name(where.stem):
+            message = f"found {show(file)}, which names the profile {show(where.stem)}"
+            self.report.add(path, f"{message}, allowed: {NAME_FORM}")
+            return
+        if where.stem in profiles:
+            message = f"found {show(file)}, a second file for the profile {where.stem}"
+            self.report.add(path, f"{message}, allowed: one")
+            return
+        if reason := unreadable(where):
+            self.report.add(path, f"found {show(file)}, which can't be read: {reason}")
+            profiles[where.stem] = _ANY
+            return
+        self.files.append(where)
+        try:
+            profiles[where.stem] = load_profile(where, file).model_dump(exclude_unset=True)
+        except ConfigError as error:
+            self.report.elsewhere += error.problems
+            profiles[where.stem] = _ANY

@@ -1,0 +1,176 @@
+"""Reads a tag list from a file: YAML with `order` and `tags`, or CSV with one tag a line."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from holdfast.config import build
+from holdfast.config.checks.common import Scope
+from holdfast.config.checks.tags import check_profiles
+from holdfast.config.text import source
+from holdfast.config.text.messages import show
+from holdfast.config.text.problems import ConfigError, Problem
+from holdfast.config.text.report import Report
+from holdfast.config.values.scalars import is_name
+from holdfast.config.values.tag_scale import FORMS, PLACE_KEYS
+from holdfast.runtime.text import listing, suggestion
+from holdfast.tags import TagList
+
+if TYPE_CHECKING:
+    from holdfast.config.models.tags import ProfileConfig
+    from holdfast.config.text.source import KeyPath
+
+KINDS = (".yaml", ".yml", ".csv")
+COLUMNS = (
+    *("name", "area", "address", "type", "order"),
+    *("scale", "offset", "unit", "writable", "description"),
+)
+"""The columns of CSV, in this order if the file does not name them."""
+MORE_COLUMNS = ("min", "max", "deadband", "round", "encoding", "null")
+"""Columns that a file can have if it names its columns."""
+
+_SHORT = {
+    **dict.fromkeys(("co", "coil"), "coils"),
+    **dict.fromkeys(("di", "discrete"), "discrete_inputs"),
+    **dict.fromkeys(("hr", "holding"), "holding_registers"),
+    **dict.fromkeys(("ir", "input"), "input_registers"),
+}
+"""Names of areas that lists of manufacturers have."""
+
+_TEXT = ("name", "type", "order", "unit", "description", "encoding", "round")
+
+
+def load_tags(path: Path | str) -> TagList:
+    """Reads a tag list. Raises `ConfigError` with every problem."""
+    return load_profile(Path(path), str(path)).tag_list
+
+
+def parse_tags(text: str, file: str, *, is_csv: bool) -> TagList:
+    """Parses a tag list; messages call it `file`. Raises `ConfigError` with every problem."""
+    return _profile(text, file, "tags", Path(), is_csv=is_csv).tag_list
+
+
+def load_profile(path: Path, file: str) -> ProfileConfig:
+    """Reads a profile; messages call it `file`. Raises `ConfigError` with every problem."""
+    name = path.stem if is_name(path.stem) else "tags"
+    text = source.read_text(path, file, "YAML or CSV")
+    return _profile(text, file, name, path.parent, is_csv=path.suffix.lower() == ".csv")
+
+
+def _profile(text: str, file: str, name: str, folder: Path, *, is_csv: bool) -> ProfileConfig:
+    if is_csv:
+        document, problems = _csv(text, file)
+    else:
+        document, problems = source.parse(text, file)
+    if not isinstance(document.data, dict):
+        message = f"found {show(document.data)}, allowed: a mapping with the keys order, tags"
+        raise ConfigError(file, problems or [Problem(file, 1, 1, "", message)])
+    whole = document.inside("profiles", name)
+    report = Report(whole)
+    config = build.build(whole.data, folder, report)
+    check_profiles(Scope(config, folder, report))
+    problems += [_without(f"profiles.{name}", problem) for problem in report.problems]
+    if problems:
+        raise ConfigError(file, problems)
+    return config.profiles[name]
+
+
+def _without(prefix: str, problem: Problem) -> Problem:
+    return replace(problem, key=problem.key.removeprefix(prefix).removeprefix("."))
+
+
+@dataclass
+class _Table:
+    """The tags of a CSV file, as data with places."""
+
+    file: str
+    problems: list[Problem] = field(default_factory=list)
+    tags: dict[Any, Any] = field(default_factory=dict)
+    lines: dict[KeyPath, int] = field(default_factory=dict)
+
+    def refuse(self, line: int, message: str, key: str = "") -> None:
+        self.problems.append(Problem(self.file, line, None, key, message))
+
+    def take(self, line: int, columns: list[str], cells: list[str]) -> None:
+        """Adds the tag of a line."""
+        if len(cells) > len(columns):
+            self.refuse(line, f"found {len(cells)} cells, allowed: up to {len(columns)}")
+            return
+        given = {key: cell for key, cell in zip(columns, cells, strict=False) if cell}
+        name = given.pop("name", None)
+        if name is None:
+            self.refuse(line, "the tag has no name, allowed: a name in the column name")
+        elif name in self.tags:
+            first = self.lines["tags", name]
+            self.refuse(line, f"the tag {show(name)} is given twice, first in line {first}")
+        else:
+            self.tags[name] = {key: _cell(key, cell) for key, cell in given.items()}
+            self.lines["tags", name] = line
+
+
+def _csv(text: str, file: str) -> tuple[source.Document, list[Problem]]:
+    table, columns = _Table(file), list[str]()
+    sample = next((line for line in text.splitlines() if line.strip() and line[0] != "#"), "")
+    separator = ";" if sample.count(";") > sample.count(",") else ","
+    rows = csv.reader(io.StringIO(text, newline=None), delimiter=separator)
+    try:
+        for row in rows:
+            cells = [cell.strip() for cell in row]
+            if not any(cells) or cells[0].startswith("#"):
+                continue
+            if columns:
+                table.take(rows.line_num, columns, cells)
+            elif "name" in map(str.lower, cells):
+                columns = _columns(table, rows.line_num, cells)
+            else:
+                columns = list(COLUMNS)
+                table.take(rows.line_num, columns, cells)
+    except csv.Error as error:
+        table.refuse(rows.line_num, f"not CSV: {error}")
+    document = source.table(file, {"tags": table.tags}, table.lines)
+    return document, table.problems
+
+
+def _columns(table: _Table, line: int, cells: list[str]) -> list[str]:
+    known = (*COLUMNS, *MORE_COLUMNS)
+    columns = [cell.lower() for cell in cells]
+    for column in columns:
+        if column not in known:
+            words = f"found the column {show(column)}, allowed: {listing(known)}"
+            table.refuse(line, f"{words}{suggestion(column, known)}")
+        elif columns.count(column) > 1:
+            table.refuse(line, f"two columns have the name {show(column)}")
+    return columns
+
+
+def _cell(key: str, cell: str) -> Any:
+    """The value of a cell, as YAML would have it."""
+    if key == "area":
+        return _SHORT.get(cell.lower(), cell.lower())
+    if key in _TEXT:
+        return cell
+    if key == "scale":
+        return _scale(cell)
+    if key == "writable":
+        words = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+        return words.get(cell.lower(), cell)
+    if key == "null":
+        return [source.scalar(part.strip()) for part in cell.split("|")]
+    return source.scalar(cell)
+
+
+def _scale(cell: str) -> Any:
+    """A scale: a number, or `exponent W_SF`, `factor hr 12 uint16` for one in a register."""
+    form, *words = cell.split()
+    if form.lower() not in FORMS or not words:
+        return source.scalar(cell)
+    if len(words) == 1:
+        return {"from": words[0], "as": form.lower()}
+    if len(words) > len(PLACE_KEYS):
+        return cell
+    place = {key: _cell(key, word) for key, word in zip(PLACE_KEYS, words, strict=False)}
+    return {"from": place, "as": form.lower()}

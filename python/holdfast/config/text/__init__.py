@@ -1,0 +1,1 @@
+"""The text of a configuration: YAML with places, templates, and the report of all problems."""

@@ -1,0 +1,91 @@
+"""MQTT topics: filters, and the names that an MQTT output uses."""
+
+from __future__ import annotations
+
+import re
+
+from holdfast.config.text.messages import show
+from holdfast.net.mqtt import MAX_TEXT
+
+BASE = "plant"
+DEVICE, TAG = "{device}", "{tag}"
+
+SET, REPLY = "set", "reply"
+"""The levels after the topic of a tag for commands, and for replies to them."""
+
+
+def parse_topic_filter(text: object) -> str:
+    """Checks a topic filter. Raises `ValueError` if MQTT 5, section 4.7, does not allow it."""
+    allowed = f"allowed: a topic filter of 1 to {MAX_TEXT} bytes"
+    if not isinstance(text, str):
+        raise ValueError(f"found {show(text)}, {allowed}")
+    size = len(text.encode(errors="surrogatepass"))
+    if not 1 <= size <= MAX_TEXT:
+        raise ValueError(f"found text of {size} bytes, {allowed}")
+    if re.search("[\0\ud800-\udfff]", text):
+        raise ValueError(f"found {show(text)}, allowed: a topic filter without NUL or surrogates")
+    *inner, last = text.split("/")
+    if "#" in "".join(inner) or ("#" in last and last != "#"):
+        raise ValueError(f"found {show(text)}, allowed: '#' only alone in the last level")
+    if any("+" in level and level != "+" for level in (*inner, last)):
+        raise ValueError(f"found {show(text)}, allowed: '+' only alone in its level")
+    return text
+
+
+def parse_topic_name(text: object) -> str:
+    """Checks the name of a topic to publish to. Raises `ValueError`."""
+    name = parse_topic_filter(text)
+    if "+" in name or "#" in name or name.startswith("$"):
+        raise ValueError(f"found {show(name)}, allowed: a topic without +, # and $ at its begin")
+    return name
+
+
+def parse_topic_template(text: object) -> str:
+    """Checks a topic with placeholders. Raises `ValueError`.
+
+    A placeholder is a whole level, so that no two tags share a topic.
+    """
+    template = parse_topic_name(text)
+    levels = template.split("/")
+    for level in levels:
+        if level not in (DEVICE, TAG) and ("{" in level or "}" in level):
+            known = re.fullmatch(r"\{[^{}]*\}", level) is None and (DEVICE in level or TAG in level)
+            words = "each alone in its level" if known else f"only {DEVICE} and {TAG}"
+            raise ValueError(f"found {show(template)}, allowed as placeholders: {words}")
+    if levels.count(DEVICE) != 1 or levels.count(TAG) > 1:
+        raise ValueError(f"found {show(template)}, allowed: {DEVICE} once, {TAG} at most once")
+    return template
+
+
+class TopicNames:
+    """The names of topics, from a template. Names of devices and tags are safe in topics."""
+
+    def __init__(self, template: str | None, status: str | None, *, whole_device: bool) -> None:
+        if template is None:
+            template = f"{BASE}/{DEVICE}" if whole_device else f"{BASE}/{DEVICE}/{TAG}"
+        self.template = template
+        first = template.partition("{")[0].rstrip("/")
+        self.status = status or "/".join([*([first] if first else []), "holdfast", "status"])
+        """The topic of the output itself."""
+
+    def of_device(self, device: str) -> str:
+        """The topic of a device, for templates without tag."""
+        return self.template.replace(DEVICE, device)
+
+    def of_tag(self, device: str, tag: str) -> str:
+        """The topic of a tag."""
+        topic = self.of_device(device)
+        return topic.replace(TAG, tag) if TAG in self.template else f"{topic}/{tag}"
+
+    def of_commands(self, device: str, tag: str) -> str:
+        """The topic that commands for a tag are sent to."""
+        return f"{self.of_tag(device, tag)}/{SET}"
+
+    def of_availability(self, device: str) -> str:
+        """The topic that is online while a device answers."""
+        return f"{self.status}/{device}"
+
+    def is_of_device(self, topic: str, device: str) -> bool:
+        """Whether a topic can be one of the values of a device."""
+        own = re.escape(self.of_device(device)).replace(re.escape(TAG), "[^/]+")
+        return re.fullmatch(own, topic) is not None

@@ -1,0 +1,361 @@
+"""Describes a device that nobody documented, by reading only.
+
+Asks what the device says about itself, decodes SunSpec models by their definitions, finds the
+other addresses, reads them several times, and divides them into probable values. The result is a
+list of tags that do not overlap, each with a confidence.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from holdfast.discovery import address_search, device_search, segments, sunspec
+from holdfast.discovery.device_search import Identity
+from holdfast.errors import ModbusException
+from holdfast.protocol import READ_LIMITS
+from holdfast.tags import Tag
+from holdfast.tags.scale import RegisterScale
+from holdfast.types import BIT_AREAS
+from holdfast.values.types import parsed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from holdfast.client import SyncClient
+    from holdfast.discovery.address_search import Survey
+    from holdfast.discovery.segments import Habit, Value
+    from holdfast.discovery.sunspec import Model, Point, SunSpec
+    from holdfast.types import Area
+
+SHORT = {
+    "coils": "co",
+    "discrete_inputs": "di",
+    "holding_registers": "hr",
+    "input_registers": "ir",
+}
+"""What the names of tags begin with."""
+
+SINGLE_BITS = 64
+"""Ranges of more bits become tags of many bits each."""
+
+MAX_BITS_PER_TAG = 256
+MAX_REGISTERS_PER_TAG = READ_LIMITS["holding_registers"]
+
+MIN_GAP_REGISTERS = 8
+"""So many registers that contain nothing separate the values before them from those behind."""
+
+MAX_CONFIDENCE = 0.99
+"""The highest confidence of a guess."""
+
+IMPROBABLE = 0.01
+"""The probability up to which a habit is not considered."""
+
+MAX_ORDER_REGISTERS = 400
+"""Registers from which the order of a device is inferred; more would cost time only."""
+
+
+@dataclass(frozen=True)
+class Described:
+    """A tag, and how sure it is."""
+
+    tag: Tag
+    confidence: float
+    """The probability of type and order; 1 if they are known."""
+    values: tuple[Any, ...]
+    """The numbers, bits or texts of each read, without scale."""
+    reasons: tuple[str, ...]
+    shown: Tag | None = None
+    """The tag with the scale that its register contained; `None` if no register does."""
+
+
+@dataclass
+class Description:
+    """What is known about one unit id of a device, so far."""
+
+    unit: int
+    survey: Survey
+    identity: Identity = field(default_factory=Identity)
+    sunspec: SunSpec | None = None
+    reads: dict[tuple[Area, range], list[list[int]]] = field(default_factory=dict)
+    """The contents of each range that was read, of every read."""
+    unread: dict[tuple[Area, range], str] = field(default_factory=dict)
+    """Ranges that exist but could not be read again, and why."""
+    seen: dict[Area, dict[int, int]] = field(default_factory=dict)
+    """The contents that the survey read."""
+    orders: Mapping[str, float] = field(default_factory=dict)
+    """The probability of each order of the device; empty if no register says anything."""
+    tags: list[Described] = field(default_factory=list)
+
+
+def describe(
+    found: Description,
+    client: SyncClient,
+    *,
+    reads: int,
+    every: float,
+    delay: float,
+    progress: Callable[[Survey], object] | None = None,
+) -> None:
+    """Carries out a description. Call `conclude` after it, also if an exception ended it early.
+
+    Raises `ModbusError` if the device is silent, and `Unfinished` of the survey.
+    """
+    found.identity = device_search.identify(client, found.unit)
+    if any(each.area == "holding_registers" for each in found.survey.areas):
+        found.sunspec = sunspec.find(client.read_holding_registers)
+
+    def read(area: Area, address: int, kind: str) -> None:
+        content: list[int] = client.read(area, address, kind)
+        found.seen.setdefault(area, {}).update(enumerate(content, address))
+
+    address_search.run_sync(found.survey, read, progress, delay=delay)
+    if progress is not None:
+        progress(found.survey)
+    places = list(_places(found))
+    for turn in range(reads):
+        if turn and places:
+            time.sleep(every)
+        for area, extent, largest in places:
+            if (area, extent) in found.unread:
+                continue
+            try:
+                content = list(_contents(client, area, extent, largest, delay))
+            except ModbusException as error:
+                found.unread[area, extent] = str(error)
+                found.reads.pop((area, extent), None)
+            else:
+                found.reads.setdefault((area, extent), []).append(content)
+
+
+def _places(found: Description) -> Iterator[tuple[Area, range, int]]:
+    """The ranges to read, without those of SunSpec, and the largest read of their area."""
+    known = found.sunspec.extent if found.sunspec is not None else range(0)
+    for each in found.survey.areas:
+        for extent in each.ranges:
+            parts = [extent]
+            if each.area == "holding_registers" and known:
+                before = range(extent.start, min(extent.stop, known.start))
+                behind = range(max(extent.start, known.stop), extent.stop)
+                parts = [before, behind]
+            for part in parts:
+                if len(part):
+                    yield each.area, part, max(1, each.largest)
+
+
+def _contents(
+    client: SyncClient, area: Area, extent: range, largest: int, delay: float
+) -> Iterator[int]:
+    kind = "bool" if area in BIT_AREAS else "uint16"
+    step = min(largest, READ_LIMITS[area])
+    for first in range(extent.start, extent.stop, step):
+        if delay:
+            time.sleep(delay)
+        count = min(step, extent.stop - first)
+        yield from client.read(area, first, f"{kind}[{count}]")
+
+
+def conclude(found: Description, now: float | None = None) -> None:
+    """Infers the tags from what was read; from what the survey has seen, where it ended early.
+
+    `now` is the time in seconds of Unix time.
+    """
+    for area, extent, _ in _places(found):
+        if (area, extent) not in found.reads and (area, extent) not in found.unread:
+            found.reads[area, extent] = [[found.seen[area][each] for each in extent]]
+    pieces = list(_pieces(found))
+    habits = _habits(pieces, now)
+    found.orders = segments.order_shares(habits)
+    tags = list(_of_sunspec(found.sunspec)) if found.sunspec is not None else []
+    for (area, extent), contents in found.reads.items():
+        if area in BIT_AREAS:
+            tags += _bits(area, extent, contents)
+    for piece in pieces:
+        tags += _values(piece, habits, now)
+    areas = [each.area for each in found.survey.areas]
+    found.tags = sorted(tags, key=lambda each: (areas.index(each.tag.area), each.tag.address))
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Consecutive registers, either all of interest or all without content."""
+
+    area: Area
+    address: int
+    reads: list[list[int]]
+    is_empty: bool
+
+
+def _pieces(found: Description) -> Iterator[_Piece]:
+    """The registers that were read, divided where many contain nothing."""
+    for (area, extent), contents in found.reads.items():
+        if area in BIT_AREAS:
+            continue
+        start = 0
+        for first, stop in _empty(contents):
+            if first > start:
+                yield _cut(area, extent.start, contents, start, first, is_empty=False)
+            yield _cut(area, extent.start, contents, first, stop, is_empty=True)
+            start = stop
+        if start < len(extent):
+            yield _cut(area, extent.start, contents, start, len(extent), is_empty=False)
+
+
+def _cut(
+    area: Area, address: int, reads: list[list[int]], first: int, stop: int, *, is_empty: bool
+) -> _Piece:
+    return _Piece(area, address + first, [read[first:stop] for read in reads], is_empty)
+
+
+def _empty(reads: list[list[int]]) -> Iterator[tuple[int, int]]:
+    """The runs of registers that contain nothing in any read."""
+    first = 0
+    size = len(reads[0])
+    while first < size:
+        content = reads[0][first]
+        stop = first
+        if content in segments.FILL:
+            while stop < size and all(read[stop] == content for read in reads):
+                stop += 1
+        if stop - first >= MIN_GAP_REGISTERS:
+            yield first, stop
+        first = max(stop, first + 1)
+
+
+def _habits(pieces: Sequence[_Piece], now: float | None) -> dict[Habit, float]:
+    """The probability of each habit of the device, from the first pieces with content."""
+    parts: list[list[list[int]]] = []
+    seen = 0
+    for piece in pieces:
+        if not piece.is_empty and seen < MAX_ORDER_REGISTERS:
+            parts.append([read[: MAX_ORDER_REGISTERS - seen] for read in piece.reads])
+            seen += len(parts[-1][0])
+    if not parts:
+        return {}
+    shares = segments.habits(parts, now=now)
+    return {habit: share for habit, share in shares.items() if share > IMPROBABLE}
+
+
+def _values(piece: _Piece, habits: Mapping[Habit, float], now: float | None) -> Iterator[Described]:
+    if piece.is_empty:
+        yield from _filled(piece)
+        return
+    division = segments.divide(piece.reads, now=now, habits=habits, is_open=False)
+    for value, chance in division.best:
+        sure = segments.confidence(chance, value.kind)
+        if not any(value.found) or value.reasons == (segments.FILL_REASONS[0xFFFF],):
+            sure = min(sure, segments.NOTHING_KNOWN)
+        yield _described(piece, value, min(sure, MAX_CONFIDENCE))
+
+
+def _filled(piece: _Piece) -> Iterator[Described]:
+    """Registers that contain nothing, in tags of limited size."""
+    content = piece.reads[0][0]
+    size = len(piece.reads[0])
+    for first in range(0, size, MAX_REGISTERS_PER_TAG):
+        count = min(MAX_REGISTERS_PER_TAG, size - first)
+        reasons = (segments.FILL_REASONS[content],)
+        kind = "uint16" if count == 1 else f"uint16[{count}]"
+        tag = _tag(piece.area, piece.address + first, kind, "ABCD", segments.NOTHING_KNOWN, reasons)
+        yield Described(tag, segments.NOTHING_KNOWN, (content,) * len(piece.reads), reasons)
+
+
+def _described(piece: _Piece, value: Value, confidence: float) -> Described:
+    kind = value.type
+    if kind == segments.PART:
+        kind = "uint16"
+        confidence = min(confidence, segments.NOTHING_KNOWN)
+    reasons = value.reasons if any(value.found) else (segments.FILL_REASONS[0],)
+    if value.also is not None and any(value.found):
+        reasons = (*reasons, f"or {value.also}")
+    size = segments.SIZES.get(value.kind, value.registers)
+    if size < value.registers:
+        kind = f"{kind}[{value.registers // size}]"
+    tag = _tag(piece.area, piece.address + value.offset, kind, value.order, confidence, reasons)
+    return Described(tag, confidence, value.found, reasons)
+
+
+def _bits(area: Area, extent: range, contents: Sequence[Sequence[int]]) -> Iterator[Described]:
+    size = 1 if len(extent) <= SINGLE_BITS else MAX_BITS_PER_TAG
+    for first in range(0, len(extent), size):
+        count = min(size, len(extent) - first)
+        kind = "bool" if count == 1 else f"bool[{count}]"
+        found = tuple(
+            bool(read[first]) if count == 1 else [bool(bit) for bit in read[first : first + count]]
+            for read in contents
+        )
+        reasons = ("changes",) if any(each != found[0] for each in found) else ()
+        address = extent.start + first
+        tag = Tag(f"{SHORT[area]}_{address}", area, address, kind)
+        yield Described(tag, 1.0, found, reasons)
+
+
+def _tag(
+    area: Area, address: int, kind: str, order: str, confidence: float, reasons: Sequence[str]
+) -> Tag:
+    text = f"confidence {confidence:.2f}{': ' if reasons else ''}{', '.join(reasons)}"
+    return Tag(f"{SHORT[area]}_{address}", area, address, kind, order, description=text)
+
+
+def _of_sunspec(found: SunSpec) -> Iterator[Described]:
+    """The points of all models that have a value."""
+    names: set[str] = set()
+    for model in found.models:
+        for point in model.points:
+            if point.value is not None:
+                yield _of_point(model, point, names)
+
+
+def _of_point(model: Model, point: Point, names: set[str]) -> Described:
+    scale, flaw = _scale_of(point)
+    name = _unique(f"{model.name}_{point.name}{'_raw' if flaw else ''}", names)
+    text = f"SunSpec model {model.id}"
+    if point.label:
+        text += f", {point.label}"
+    if point.scaled_by is not None:
+        text += f"; {'no ' if flaw else ''}scale from {point.scaled_by}"
+    if flaw:
+        text += f", {flaw}"
+    if point.can_be_written:
+        text += "; can be written"
+    tag = Tag(
+        name,
+        "holding_registers",
+        point.address,
+        point.type,
+        scale=1 if flaw else point.scale,
+        unit="" if flaw else point.unit,
+        states=point.states,
+        null=frozenset(() if point.missing is None else (point.missing,)),
+        description=text,
+    )
+    if scale is None:
+        return Described(tag, 1.0, (point.value,), (text,))
+    return Described(replace(tag, scale=scale), 1.0, (point.value,), (text,), shown=tag)
+
+
+def _scale_of(point: Point) -> tuple[RegisterScale | None, str]:
+    """The register that contains the scale of a point, or why no tag can have it."""
+    if point.scaled_at is None:
+        return None, ""
+    size = parsed(point.type).registers
+    first, last = (
+        min(point.address, point.scaled_at),
+        max(point.address + size, point.scaled_at + 1),
+    )
+    if last - first > READ_LIMITS["holding_registers"]:
+        return None, f"which is at {point.scaled_at}, too far to be read with it"
+    source = Tag("", "holding_registers", point.scaled_at, "int16")
+    return RegisterScale("exponent", source=source), ""
+
+
+def _unique(name: str, names: set[str]) -> str:
+    """The name, with a number if another tag has it, of at most 64 characters."""
+    chosen, number = name[:64], 1
+    while chosen in names:
+        number += 1
+        chosen = f"{name[:60]}_{number}"
+    names.add(chosen)
+    return chosen

@@ -1,0 +1,334 @@
+"""Finds Modbus devices: hosts of networks, unit ids of a device, settings of a serial line.
+
+Everything is read; nothing is written. A device is found if it answers a request, with values or
+with an exception.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from asyncio import sleep
+from dataclasses import dataclass, field
+from time import monotonic
+from time import sleep as pause
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+from holdfast.client import Client, SyncClient
+from holdfast.errors import (
+    ConnectFailed,
+    ConnectionLost,
+    InvalidResponse,
+    ModbusError,
+    ModbusException,
+    RequestTimeout,
+)
+from holdfast.net.addresses import joined
+from holdfast.protocol import MAX_SERIAL_UNIT
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+
+    from holdfast.client.requests import Identification, ServerId
+    from holdfast.client.url import Parity
+    from holdfast.net.addresses import Address, Network
+
+BEHIND_GATEWAY = (0x0A, 0x0B)
+"""Exceptions of a gateway whose device is not there."""
+
+UNUSUAL_UNIT = 231
+"""A unit id that is rare: a device that answers it too probably ignores unit ids."""
+
+HOST_UNITS = (1, 255, 0)
+"""Unit ids to try at a host. Devices without a serial line often use 255 or 0."""
+
+GATEWAY_UNITS = tuple(range(1, MAX_SERIAL_UNIT + 1))
+"""Unit ids to try behind a gateway, or on a line whose settings are known."""
+
+LINE_UNITS = tuple(range(1, 11))
+"""Unit ids to try on a serial line: each takes a timeout, with each of its settings."""
+
+BAUDS = (9600, 19200, 38400, 57600, 115200, 4800, 2400, 1200)
+PARITIES: tuple[Parity, ...] = ("none", "even", "odd")
+
+State: TypeAlias = Literal["modbus", "open", "refused", "silent", "error"]
+"""What an address is: answers Modbus; only has the port open; refuses; does not respond."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a device says about itself; empty if it does not support it."""
+
+    objects: tuple[tuple[str, str], ...] = ()
+    """Names and texts of function 43/14, or the server id of function 17."""
+
+    def __str__(self) -> str:
+        return " ".join(text for _, text in self.objects)
+
+
+@dataclass
+class Host:
+    """An address of a network, and what was found there."""
+
+    address: str
+    port: int
+    state: State
+    unit: int | None = None
+    """The unit id that answered."""
+    detail: str = ""
+    identity: Identity = field(default_factory=Identity)
+    longest_late: float = 0.0
+    """How many seconds its slowest late reply took; 0 if there was none."""
+
+    @property
+    def url(self) -> str:
+        """The URL of the device."""
+        return f"tcp://{joined(self.address, self.port)}"
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit id that was asked."""
+
+    unit: int
+    answers: bool
+    detail: str
+    """The answer, or why there is none."""
+    identity: Identity = Identity()
+    is_garbled: bool = False
+    """Whether bytes came that are not a valid reply: the settings of a line may be wrong."""
+
+
+@dataclass(frozen=True)
+class LineSettings:
+    """Settings of a serial line."""
+
+    baud: int
+    parity: Parity
+
+    def url(self, mode: str, device: str) -> str:
+        """The URL of the line with these settings."""
+        stop = "&stop_bits=1" if self.parity == "none" else ""
+        return f"{mode}://{device}?baud={self.baud}&parity={self.parity}{stop}"
+
+
+@dataclass
+class Rate:
+    """Lets at most so many begin in a second. The first begins at once."""
+
+    per_second: float
+    _next: float = 0.0
+
+    async def turn(self) -> None:
+        """Waits for the next turn."""
+        now = monotonic()
+        begins = max(self._next, now)
+        self._next = begins + 1 / self.per_second
+        await sleep(begins - now)
+
+
+def addresses(networks: Iterable[Network]) -> Iterator[Address]:
+    """All hosts of networks, each once."""
+    seen: set[Address] = set()
+    for network in networks:
+        for address in network.hosts():
+            if address not in seen:
+                seen.add(address)
+                yield address
+
+
+def size(networks: Iterable[Network]) -> int:
+    """How many hosts networks have at most."""
+    return sum(each.num_addresses for each in networks)
+
+
+async def hosts(
+    networks: Iterable[Network],
+    *,
+    port: int,
+    timeout: float,
+    rate: float,
+    concurrency: int,
+    units: Sequence[int] = HOST_UNITS,
+) -> AsyncIterator[Host]:
+    """Looks at every host of networks, and yields each as soon as its result is known.
+
+    Begins at most `rate` connections a second, and looks at `concurrency` hosts at a time.
+    """
+    pace = Rate(rate)
+    results: asyncio.Queue[Host | None] = asyncio.Queue()
+    left = addresses(networks)
+
+    async def work() -> None:
+        for address in left:
+            await pace.turn()
+            results.put_nowait(await _host(str(address), port, timeout, units))
+
+    async def all_work() -> None:
+        try:
+            async with asyncio.TaskGroup() as group:
+                for _ in range(concurrency):
+                    group.create_task(work())
+        finally:
+            results.put_nowait(None)
+
+    running = asyncio.create_task(all_work())
+    try:
+        while (host := await results.get()) is not None:
+            yield host
+        await running
+    finally:
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+
+
+async def _host(address: str, port: int, timeout: float, units: Sequence[int]) -> Host:
+    host = Host(address, port, "silent")
+    async with Client(host.url, timeout=timeout) as client:
+        await _ask(host, client, units)
+        host.longest_late = client.longest_late
+    return host
+
+
+async def _ask(host: Host, client: Client, units: Sequence[int]) -> None:
+    """Asks unit ids until one answers, and notes in `host` what was found."""
+    for unit in units:
+        try:
+            await client.read("holding_registers", 0, "uint16", unit=unit)
+            host.detail = "answers"
+        except ModbusException as error:
+            host.detail = str(error)
+            if error.code in BEHIND_GATEWAY:
+                host.state = "modbus"
+                continue
+        except ConnectFailed as error:
+            host.detail = error.detail
+            host.state = _unreachable(error) if host.state == "silent" else host.state
+            return
+        except (RequestTimeout, ConnectionLost, InvalidResponse) as error:
+            if isinstance(error, RequestTimeout) and not error.maybe_sent:
+                return  # No connection was made: the other unit ids would wait as long.
+            if host.state != "modbus":
+                host.state = "open"
+                host.detail = str(error)
+            continue
+        host.state, host.unit = "modbus", unit
+        with contextlib.suppress(ModbusError):
+            host.identity = identity(await client.identify(unit=unit))
+        return
+
+
+def _unreachable(error: ConnectFailed) -> State:
+    return "refused" if isinstance(error.__cause__, ConnectionRefusedError) else "silent"
+
+
+def units(client: SyncClient, unit_ids: Iterable[int], *, delay: float = 0.0) -> Iterator[Unit]:
+    """Asks unit ids one by one, and yields each. Raises `ConnectFailed`."""
+    for count, unit in enumerate(unit_ids):
+        if count and delay:
+            pause(delay)
+        yield probe(client, unit)
+
+
+def probe(client: SyncClient, unit: int) -> Unit:
+    """Asks one unit id. Raises `ConnectFailed`."""
+    try:
+        client.read("holding_registers", 0, "uint16", unit=unit)
+        detail = "answers"
+    except ModbusException as error:
+        if error.code in BEHIND_GATEWAY:
+            return Unit(unit, answers=False, detail=str(error))
+        detail = str(error)
+    except ConnectFailed:
+        raise
+    except ModbusError as error:
+        is_garbled = isinstance(error, InvalidResponse)
+        return Unit(unit, answers=False, detail=str(error), is_garbled=is_garbled)
+    return Unit(unit, answers=True, detail=detail, identity=identify(client, unit))
+
+
+def identify(client: SyncClient, unit: int) -> Identity:
+    """What a device says about itself, by function 43/14, else 17."""
+    try:
+        return identity(client.identify(unit=unit))
+    except ModbusError:
+        pass
+    try:
+        return server_identity(client.report_server_id(unit=unit))
+    except ModbusError:
+        return Identity()
+
+
+def identity(answer: Identification) -> Identity:
+    """An answer to function 43/14 as text."""
+    names = ("vendor_name", "product_code", "revision", "product_name", "model_name")
+    texts = ((name, getattr(answer, name)) for name in names)
+    return Identity(tuple((name, text) for name, text in texts if text))
+
+
+def server_identity(answer: ServerId) -> Identity:
+    """An answer to function 17 as text."""
+    data = answer.additional if answer.running is not None else answer.data
+    text = bytes(each for each in data if 0x20 <= each < 0x7F).decode().strip()
+    return Identity((("server_id", text),)) if len(text) >= 3 else Identity()
+
+
+def ignores_unit(client: SyncClient, unit_ids: Iterable[int]) -> bool:
+    """Whether a device answers a unit id that is rare and was not asked: it may ignore unit ids."""
+    return UNUSUAL_UNIT not in unit_ids and probe(client, UNUSUAL_UNIT).answers
+
+
+def line_settings(bauds: Sequence[int], parities: Sequence[Parity]) -> list[LineSettings]:
+    """The settings to try, the most common first."""
+    return [LineSettings(baud, parity) for baud in bauds for parity in parities]
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """An attempt to find a device on a line."""
+
+    settings: LineSettings
+    found: Unit
+    is_usable: bool = True
+    """Whether the line can be opened with these settings."""
+    longest_late: float = 0.0
+    """How many seconds the slowest late reply with these settings took so far."""
+
+
+def line(
+    mode: str,
+    device: str,
+    settings: Sequence[LineSettings],
+    unit_ids: Sequence[int],
+    timeout: float,
+) -> Iterator[Attempt]:
+    """Asks unit ids with each setting, and yields every attempt: the first unit id with all
+    settings, then the others. Ends after the unit ids of the first setting that has an answer.
+
+    Raises `ConnectFailed` if the line can't be opened with any setting.
+    """
+    failures: dict[LineSettings, ConnectFailed] = {}
+    for part in (unit_ids[:1], unit_ids[1:]):
+        for each in settings:
+            if each in failures:
+                continue
+            answered = False
+            with SyncClient(each.url(mode, device), timeout=timeout) as client:
+                for unit in part:
+                    try:
+                        found = probe(client, unit)
+                    except ConnectFailed as error:
+                        failures[each] = error
+                        refused = Unit(unit, answers=False, detail=error.detail)
+                        yield Attempt(each, refused, is_usable=False)
+                        break
+                    answered = answered or found.answers
+                    yield Attempt(each, found, longest_late=client.longest_late)
+                if answered:
+                    for unit in unit_ids[1:] if part == unit_ids[:1] else ():
+                        found = probe(client, unit)
+                        yield Attempt(each, found, longest_late=client.longest_late)
+                    return
+        if len(failures) == len(settings):
+            raise failures[settings[0]]

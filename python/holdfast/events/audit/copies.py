@@ -1,0 +1,125 @@
+"""Copies of the lines of an audit log, sent elsewhere by a thread of their own.
+
+Nobody waits for a copy: a receiver that is slow or down delays no write. Its lines wait in a queue;
+those that don't fit are dropped and counted.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import threading
+from collections import deque
+from typing import TYPE_CHECKING, Protocol
+
+from holdfast.events import log_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+MAX_WAITING_BYTES = 32 * 2**20
+"""The most bytes that wait for a receiver."""
+
+RETRY_DELAY_S = 1.0
+"""Seconds before a line is sent again."""
+
+CLOSE_TIMEOUT_S = 2.0
+"""Seconds to send what waits when the log is closed."""
+
+
+class Receiver(Protocol):
+    """Where copies go."""
+
+    def send(self, line: bytes) -> None:
+        """Sends a line without its line feed. Raises `OSError`; the next call tries anew."""
+
+    def close(self) -> None:
+        """Closes the connection."""
+
+
+class Copies:
+    """Sends lines to a receiver, in order, each until that succeeds. Thread-safe."""
+
+    def __init__(self, name: str, receiver: Receiver) -> None:
+        self.name = name
+        self._receiver = receiver
+        self._waiting: deque[bytes] = deque()
+        self._size = 0
+        self._sent = self._failed = self._dropped = 0
+        self._down = self._closing = False
+        self._change = threading.Condition()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"holdfast-{name}", daemon=True)
+
+    def start(self) -> None:
+        """Begins to send."""
+        self._thread.start()
+
+    def put(self, lines: Sequence[bytes]) -> None:
+        """Queues lines; drops those that don't fit. Never waits."""
+        with self._change:
+            for line in lines:
+                if self._size + len(line) > MAX_WAITING_BYTES:
+                    self._dropped += 1
+                    continue
+                self._size += len(line)
+                self._waiting.append(line)
+            self._change.notify()
+
+    def counts(self) -> dict[str, int]:
+        """Returns the numbers of lines sent, failed attempts, lines dropped and lines waiting."""
+        with self._change:
+            return {
+                "sent": self._sent,
+                "failed": self._failed,
+                "dropped": self._dropped,
+                "waiting": len(self._waiting),
+            }
+
+    def close(self) -> None:
+        """Sends what waits, for a limited time; drops the rest."""
+        with self._change:
+            self._closing = True
+            self._change.notify()
+        self._thread.join(CLOSE_TIMEOUT_S)
+        self._closed.set()
+        with self._change:
+            lost, self._dropped = len(self._waiting), self._dropped + len(self._waiting)
+            self._waiting.clear()
+        if lost:
+            log_lines.write(logging.ERROR, "audit_copies_lost", receiver=self.name, count=lost)
+
+    def _run(self) -> None:
+        while (line := self._next()) is not None:
+            try:
+                self._receiver.send(line.rstrip(b"\n"))
+            except OSError as error:
+                self._note(error)
+            else:
+                self._note(None)
+        self._receiver.close()
+
+    def _next(self) -> bytes | None:
+        """The first line that waits; `None` after the last, and when it is too late."""
+        with self._change:
+            while not self._waiting and not self._closing:
+                self._change.wait()
+            return self._waiting[0] if self._waiting and not self._closed.is_set() else None
+
+    def _note(self, error: OSError | None) -> None:
+        """Counts an attempt. A line that is too long will never be sent: it is dropped."""
+        too_long = error is not None and error.errno == errno.EMSGSIZE
+        with self._change:
+            self._failed += error is not None
+            self._sent += error is None
+            self._dropped += too_long
+            if (error is None or too_long) and self._waiting:
+                self._size -= len(self._waiting.popleft())
+        if error is not None:
+            log_lines.problem("audit_copy_failed", receiver=self.name)
+            if not too_long:
+                self._down = True
+                self._closed.wait(RETRY_DELAY_S)
+        elif self._down:
+            self._down = False
+            log_lines.write(logging.INFO, "audit_copies_back", receiver=self.name)

@@ -1,0 +1,194 @@
+"""The file of an audit log: whole lines are appended, and a file that is too large is put aside.
+
+A full file is renamed to `.1`, `.2` and so on. A file that something else has renamed is created
+anew, so `logrotate` works too. Only one process at a time can write a file.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import stat
+from typing import TYPE_CHECKING
+
+from holdfast.events import log_lines
+from holdfast.events.audit.chain import End, digest_of, place_of
+from holdfast.events.audit.lock import lock
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+FILE_MODE = 0o640
+"""The access to a new file: the owner writes, the group reads."""
+
+CLOSED = -1
+CHUNK_BYTES = 64 * 1024
+MAX_LINE_BYTES = 4 * 2**20
+"""A line that is longer is not a line of an audit log. Raw Ingest packets have up to 0.4 MB."""
+
+
+class AuditFile:
+    """Appends lines. Raises `OSError` if the file can't be opened, or another process writes it."""
+
+    def __init__(self, file: Path, *, max_bytes: int, keep: int) -> None:
+        self.file = file
+        self.broken: str | None
+        """Why the chain breaks before the next line, if it does."""
+        self._max_bytes = max_bytes
+        self._keep = keep
+        self._prefix = b""
+        self._descriptor = CLOSED
+        self._identity: tuple[int, int] | None = None
+        self._is_regular = False
+        self._size = 0
+        self._open()
+        try:
+            self.end, self.broken = self._found()
+        except OSError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Closes the file."""
+        descriptor, self._descriptor, self._identity = self._descriptor, CLOSED, None
+        if descriptor != CLOSED:
+            os.close(descriptor)
+
+    def check(self) -> None:
+        """Looks what others have done to the file, and opens a new one if it has lost its name."""
+        try:
+            status = self.file.stat()
+        except OSError:
+            status = None
+        if status is not None and _identity(status) == self._identity:
+            if self._is_regular and status.st_size != self._size:
+                self.broken, self._size = "changed", status.st_size
+                self._end_last_line()
+            return
+        if self._is_regular and self._descriptor != CLOSED and not _links(self._descriptor):
+            self.broken = "deleted"
+        self.close()
+        self._open()
+        self._end_last_line()
+
+    def append(self, lines: list[bytes], *, together: bool = False) -> Iterator[int]:
+        """Appends lines, and yields the numbers of lines that were stored at once.
+
+        With `together`, stores all of them or none. Raises `OSError`.
+        """
+        while lines:
+            count = self._fitting(lines)
+            if self._size and (count == 0 or (together and count < len(lines))):
+                self.rotate()
+                count = self._fitting(lines)
+            count = len(lines) if together else max(count, 1)
+            self._write(b"".join(lines[:count]))
+            yield count
+            lines = lines[count:]
+
+    def rotate(self) -> None:
+        """Renames the files and begins a new one. If that fails, goes on with the present one."""
+        names = [self.file, *(self.numbered(number) for number in range(1, self._keep + 1))]
+        if self._prefix:
+            self._write(b"")
+        self.close()  # Windows renames no open file.
+        try:
+            for newer, older in reversed(list(itertools.pairwise(names))):
+                if newer.exists():
+                    newer.replace(older)
+        except OSError:
+            log_lines.problem("audit_not_rotated", file=str(self.file))
+        self._open()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether the file has no line yet."""
+        return self._size == 0
+
+    def numbered(self, number: int) -> Path:
+        """The name of a file that was put aside."""
+        return self.file.with_name(f"{self.file.name}.{number}")
+
+    def _open(self) -> None:
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
+        self._descriptor = os.open(self.file, flags, FILE_MODE)
+        status = os.fstat(self._descriptor)
+        self._identity = _identity(status)
+        self._size = status.st_size
+        self._is_regular = stat.S_ISREG(status.st_mode)
+        if self._is_regular and not lock(self._descriptor):
+            self.close()
+            raise OSError(f"{self.file}: another process writes this audit log")
+
+    def _fitting(self, lines: list[bytes]) -> int:
+        """The number of lines that fit into the open file."""
+        size = self._size
+        for count, line in enumerate(lines):
+            size += len(line)
+            if size > self._max_bytes:
+                return count
+        return len(lines)
+
+    def _write(self, data: bytes) -> None:
+        """Appends whole lines, or nothing."""
+        data, written = self._prefix + data, 0
+        try:
+            while written < len(data):
+                written += os.write(self._descriptor, data[written:])
+        except OSError:
+            if written:
+                os.ftruncate(self._descriptor, self._size)
+            raise
+        self._prefix = b""
+        self._size += len(data)
+
+    def _found(self) -> tuple[End, str | None]:
+        """The end of the chain in the files, and why it does not simply go on."""
+        last = last_lines(self.file) if self._is_regular else []
+        if last:
+            return self._end_of(last)
+        before = last_lines(self.numbered(1)) if self.numbered(1).is_file() else []
+        if not before:
+            return End(), "new"
+        place, digest = place_of(before[-1]), digest_of(before[-1])
+        return End(0 if place is None else place.seq, digest), "missing"
+
+    def _end_of(self, last: list[bytes]) -> tuple[End, str | None]:
+        *others, line = last
+        if not line.endswith(b"\n"):
+            self._end_last_line()
+            place = place_of(others[-1]) if others else None
+            seq = 0 if place is None else place.seq + 1
+            return End(seq, digest_of(line + b"\n")), "torn"
+        place = place_of(line)
+        if place is None:
+            return End(0, digest_of(line)), "unchained"
+        return End(place.seq, digest_of(line)), None
+
+    def _end_last_line(self) -> None:
+        """Ends an incomplete last line with the next line that is written."""
+        last = last_lines(self.file) if self._is_regular and self._size else []
+        self._prefix = b"\n" if last and not last[-1].endswith(b"\n") else b""
+
+
+def _identity(status: os.stat_result) -> tuple[int, int]:
+    return status.st_dev, status.st_ino
+
+
+def _links(descriptor: int) -> int:
+    """The number of names that a file has."""
+    return os.fstat(descriptor).st_nlink
+
+
+def last_lines(file: Path) -> list[bytes]:
+    """The last two lines of a file with their line ends, or fewer. Reads only its end."""
+    data, line_ends = b"", 3
+    with file.open("rb") as opened:
+        at = opened.seek(0, os.SEEK_END)
+        while at > 0 and data.count(b"\n") < line_ends and len(data) < 2 * MAX_LINE_BYTES:
+            before, at = at, max(0, at - CHUNK_BYTES)
+            opened.seek(at)
+            data = opened.read(before - at) + data
+    *lines, rest = data.split(b"\n")
+    return [*(line + b"\n" for line in lines), *([rest] if rest else [])][-2:]

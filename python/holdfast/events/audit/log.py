@@ -1,0 +1,255 @@
+"""Writes the audit log: to its file, and as copies to syslog and the journal.
+
+The lines of REST, MQTT and adapters are in the file before memory is written. Those of Modbus and
+Raw Ingest follow shortly after, because native threads serve these. Lost lines are reported in a
+line of their own.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import TYPE_CHECKING
+
+from holdfast.events import log_lines
+from holdfast.events.audit.chain import BREAK, End, Record, chained, encoded
+from holdfast.events.audit.file import AuditFile
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from holdfast.events.audit.copies import Copies
+
+
+class Unrecorded(Exception):
+    """A write can't be recorded, and must not be carried out."""
+
+
+class Group:
+    """The lines of writes that are about to be carried out."""
+
+    def __init__(self) -> None:
+        self.bodies: list[bytes] = []
+        self.is_refused = False
+
+
+class Audit:
+    """An audit log. Thread-safe. Raises `OSError` if the file can't be opened.
+
+    With `closed`, a write that can't be recorded must not be carried out: `write_group` and
+    `require` raise `Unrecorded`. Without a file, `copies` are the only log.
+    """
+
+    def __init__(
+        self,
+        file: Path | None,
+        *,
+        max_bytes: int,
+        keep: int,
+        closed: bool = False,
+        copies: Sequence[Copies] = (),
+    ) -> None:
+        self.closed = closed
+        self._file = None if file is None else AuditFile(file, max_bytes=max_bytes, keep=keep)
+        self._copies = copies
+        self._lock = threading.Lock()
+        self._end = End() if self._file is None else self._file.end
+        self._lines = self._failed = self._missing = 0
+        self._kept: list[Record] = []
+        self._group = Group()
+        self._failing = self._closed = False
+        self._on_failing: Callable[[bool], object] = lambda _: None
+        for each in copies:
+            each.start()
+
+    def write(self, **fields: object) -> None:
+        """Writes one line: the time, its place in the chain, then the fields."""
+        self.write_all([fields])
+
+    def write_all(self, lines: Iterable[Mapping[str, object]], *, done: bool = False) -> None:
+        """Writes lines, all with the present time.
+
+        After lines that could not be written, a line with their number comes first. But if the log
+        is `closed` and the lines are `done`, writes that were carried out, they wait in memory, and
+        are written as soon as that is possible.
+        """
+        records = self._records(lines)
+        with self._lock:
+            stored = self._store(records)
+            if stored == len(records):
+                return
+            if self.closed and done:
+                self._kept += records[stored:]
+            else:
+                self._lose(records[stored:])
+
+    def queue(self, lines: Iterable[Mapping[str, object]]) -> Group:
+        """Queues the lines of a write that is about to be carried out, for `write_group`.
+
+        Lines that are queued before that call are written together: a call of the system costs
+        several times as much as a line.
+        """
+        bodies = [encoded(fields) for fields in lines]
+        with self._lock:
+            self._group.bodies += bodies
+            return self._group
+
+    def write_group(self, group: Group) -> None:
+        """Writes the lines of a group, unless that was done already.
+
+        Raises `Unrecorded` if the log is `closed` and can't be written; no line is stored then.
+        """
+        with self._lock:
+            if group is self._group:
+                self._group = Group()
+                now = log_lines.timestamp(time.time())
+                records = [Record(now, body) for body in group.bodies]
+                stored = self._store(records, together=self.closed)
+                if stored < len(records):
+                    group.is_refused = self.closed
+                    if not self.closed:
+                        self._lose(records[stored:])
+        if group.is_refused:
+            raise Unrecorded
+
+    def require(self) -> None:
+        """Raises `Unrecorded` if the log is `closed` and could not be written last time."""
+        if self.closed and self._failing:
+            self.retry()
+            if self._failing:
+                raise Unrecorded
+
+    def retry(self) -> None:
+        """Writes lines that wait, and the number of lines that are missing."""
+        with self._lock:
+            if self._kept or self._missing or self._failing:
+                self._store([])
+
+    def rotate(self) -> None:
+        """Puts the file aside as if it were full, and begins a new one. An empty file stays."""
+        with self._lock:
+            if self._file is None or self._closed:
+                return
+            try:
+                self._file.check()
+                if not self._file.is_empty:
+                    self._file.rotate()
+            except OSError:
+                self._fail()
+
+    def reopen(self) -> None:
+        """Opens a new file if something else has renamed or deleted the present one."""
+        with self._lock:
+            if self._file is None or self._closed:
+                return
+            try:
+                self._file.check()
+            except OSError:
+                self._fail()
+
+    @property
+    def failing(self) -> bool:
+        """Whether the file could not be written last time."""
+        return self._failing
+
+    def on_failing(self, callback: Callable[[bool], object]) -> None:
+        """Calls `callback` now, and whenever the file begins or ceases to fail."""
+        with self._lock:
+            self._on_failing = callback
+            callback(self._failing)
+
+    def counts(self) -> dict[str, object]:
+        """Returns the numbers of lines written, failed and waiting, and those of the copies."""
+        with self._lock:
+            return {
+                "lines": self._lines,
+                "failed": self._failed,
+                "waiting": len(self._kept),
+                "failing": self._failing,
+                "copies": {each.name: each.counts() for each in self._copies},
+            }
+
+    def close(self) -> None:
+        """Writes what waits, and closes file and copies. Later lines are lost."""
+        self.retry()
+        with self._lock:
+            self._lose(self._kept)
+            self._kept, self._closed = [], True
+            if self._file is not None:
+                self._file.close()
+        for each in self._copies:
+            each.close()
+
+    @staticmethod
+    def _records(lines: Iterable[Mapping[str, object]]) -> list[Record]:
+        now = log_lines.timestamp(time.time())
+        return [Record(now, encoded(fields)) for fields in lines]
+
+    def _store(self, records: list[Record], *, together: bool = False) -> int:
+        """Stores records after all that wait. Returns how many of them were stored."""
+        reports: list[Mapping[str, object]] = []
+        if self._closed:
+            return 0
+        if self._file is not None:
+            try:
+                self._file.check()
+            except OSError:
+                self._fail()
+                return 0
+            if self._file.broken is not None:
+                reports.append({"event": BREAK, "reason": self._file.broken})
+        if self._missing:
+            reports.append({"lost": self._missing})
+        before = [*(self._records(reports) if reports else ()), *self._kept]
+        written = self._append([*before, *records] if before else records, together=together)
+        if written >= len(reports):
+            self._missing = 0
+            if self._file is not None:
+                self._file.broken = None
+            self._kept = self._kept[written - len(reports) :]
+        self._lines += max(0, written - len(reports))
+        return max(0, written - len(before))
+
+    def _append(self, records: list[Record], *, together: bool) -> int:
+        """Appends records to the file, then sends their copies. Returns how many were stored."""
+        lines, ends = chained(self._end, records)
+        written = 0
+        if self._file is None:
+            written = len(lines)
+        else:
+            try:
+                for count in self._file.append(lines, together=together):
+                    written += count
+            except OSError:
+                self._fail()
+            else:
+                self._set_failing(False)
+        if written:
+            self._end = ends[written - 1]
+        self._send(lines[:written])
+        return written
+
+    def _send(self, lines: Sequence[bytes]) -> None:
+        for each in self._copies:
+            each.put(lines)
+
+    def _lose(self, records: Sequence[Record]) -> None:
+        """Counts lines that the file lacks. Their copies have no place in the chain."""
+        self._failed += len(records)
+        self._missing += len(records)
+        self._send([record.unchained() for record in records])
+
+    def _fail(self) -> None:
+        """Reports the present exception."""
+        assert self._file is not None
+        log_lines.problem("audit_failed", file=str(self._file.file))
+        self._set_failing(True)
+
+    def _set_failing(self, failing: bool) -> None:
+        if failing != self._failing:
+            self._failing = failing
+            if not failing:
+                log_lines.write(logging.INFO, "audit_back", lost=self._missing)
+            self._on_failing(failing)

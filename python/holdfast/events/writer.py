@@ -1,0 +1,96 @@
+"""Writes log lines from a thread of its own, so that a reader who stops reading holds up nobody."""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import threading
+import time
+from collections import deque
+from typing import TextIO
+
+MAX_WAITING_LINES = 10_000
+"""Lines that wait at most. More are dropped and counted."""
+
+MAX_LINES_PER_WRITE = 500
+"""Lines of one write."""
+
+CLOSE_TIMEOUT_S = 1.0
+"""Seconds that the end of the program waits for the lines, by default."""
+
+
+class QueuedHandler(logging.Handler):
+    """Queues lines for a stream. `dropped` counts those that found the queue full."""
+
+    def __init__(self, stream: TextIO, timeout: float = CLOSE_TIMEOUT_S) -> None:
+        """`timeout` is that of `flush`, in seconds."""
+        super().__init__()
+        self._stream, self._timeout = stream, timeout
+        self._lines: deque[str] = deque()
+        self._changed = threading.Condition()
+        self._writing = False
+        self._noted = 0
+        self.dropped = 0
+        threading.Thread(target=self._write_for_ever, name="holdfast-log", daemon=True).start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queues a line. Never waits for the stream."""
+        try:
+            line = self.format(record) + "\n"
+        except Exception:  # As all handlers do.
+            self.handleError(record)
+            return
+        with self._changed:
+            if len(self._lines) >= MAX_WAITING_LINES:
+                self.dropped += 1
+            else:
+                self._lines.append(line)
+            self._changed.notify_all()
+
+    def flush(self) -> None:
+        """Waits until all lines are written, up to the timeout."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._lines and not self._writing, self._timeout)
+
+    def _write_for_ever(self) -> None:
+        while True:
+            with self._changed:
+                self._writing = False
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: self._lines)
+                count = min(len(self._lines), MAX_LINES_PER_WRITE)
+                lines = [self._lines.popleft() for _ in range(count)]
+                missing, self._noted = self.dropped - self._noted, self.dropped
+                self._writing = True
+            if missing:
+                lines.append(self._note(missing))
+            self._write("".join(lines))
+
+    def _note(self, count: int) -> str:
+        record = logging.makeLogRecord(
+            {
+                "name": "holdfast",
+                "levelname": "WARNING",
+                "msg": "log_dropped",
+                "created": time.time(),
+                "fields": {"count": count},
+            }
+        )
+        return self.format(record) + "\n"
+
+    def _write(self, text: str) -> None:
+        """Writes without the lock of the stream, which the end of the program needs."""
+        try:
+            descriptor = self._stream.fileno()
+        except (OSError, ValueError):  # It is no file.
+            self._stream.write(text)
+            return
+        data = text.encode(self._stream.encoding or "utf-8", "backslashreplace")
+        while data:
+            try:
+                data = data[os.write(descriptor, data) :]
+            except BlockingIOError:
+                select.select([], [descriptor], [])
+            except OSError:
+                return  # Nobody reads it any more.

@@ -1,0 +1,1 @@
+"""The operations of the gateway on devices, one module for each kind."""

@@ -1,0 +1,1 @@
+"""Streams of events: watched ranges, and views of several ranges."""

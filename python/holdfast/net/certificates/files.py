@@ -1,0 +1,52 @@
+"""Writes certificates and keys."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+"""Flags for a new file; Windows would convert line ends without `O_BINARY`."""
+
+SECRET = 0o600
+PUBLIC = 0o644
+"""The modes of files with keys, and of other files."""
+
+
+def write_new(contents: Mapping[Path, tuple[bytes, int]]) -> None:
+    """Writes new files, each with its content and mode: all of them, or none.
+
+    Raises `FileExistsError` if there is one of them, and `OSError`.
+    """
+    for file in contents:
+        if file.exists():
+            raise FileExistsError(f"{file} exists, and is not overwritten")
+    written: list[Path] = []
+    try:
+        for file, (content, mode) in contents.items():
+            descriptor = os.open(file, NEW, mode)
+            written.append(file)
+            with os.fdopen(descriptor, "wb") as opened:
+                opened.write(content)
+                opened.flush()
+                # After a power cut, an empty file could take the place of a secret for good.
+                os.fsync(opened.fileno())
+    except BaseException:
+        for file in written:
+            file.unlink(missing_ok=True)
+        raise
+
+
+def replace(file: Path, content: bytes, mode: int = PUBLIC) -> None:
+    """Writes a file that programs may read at the same time. Raises `OSError`."""
+    new = file.with_name(f".{file.name}.{os.getpid()}")
+    write_new({new: (content, mode)})
+    try:
+        new.replace(file)
+    except BaseException:
+        new.unlink(missing_ok=True)
+        raise

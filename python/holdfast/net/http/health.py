@@ -1,0 +1,53 @@
+"""The answers to probes: whether a process is live, and whether it is ready for its clients.
+
+The paths are those of every HTTP service that answers probes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import msgspec
+
+from holdfast.net.http.requests import JSON, Response, response
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+LIVE = "/health/live"
+READY = "/health/ready"
+PATHS = (LIVE, READY)
+
+
+@dataclass(frozen=True)
+class Check:
+    """The result of one check: `detail` is a sentence without secrets."""
+
+    ok: bool
+    detail: str
+
+
+class HealthSource(Protocol):
+    """What is asked for the state of the process. Thread-safe; does not wait for anything."""
+
+    def live(self) -> Mapping[str, Check]:
+        """Returns the checks that must all pass, or a restart is the only remedy."""
+
+    def ready(self) -> Mapping[str, Check]:
+        """Returns the checks that must all pass before clients are sent here."""
+
+
+def answer(health: HealthSource, path: str, *, details: bool = True) -> Response:
+    """Returns the response for a path of `PATHS`.
+
+    Without `details`, the body has only the name of each check and whether it has passed.
+    """
+    checks = health.live() if path == LIVE else health.ready()
+    ok = all(check.ok for check in checks.values())
+    shown = {
+        name: {"ok": check.ok, "detail": check.detail} if details else {"ok": check.ok}
+        for name, check in checks.items()
+    }
+    body = msgspec.json.encode({"ok": ok, "checks": shown})
+    return response(JSON, body, status=200 if ok else 503)

@@ -1,0 +1,93 @@
+"""The rule for Host, Origin and Sec-Fetch-Site, which every HTTP application applies.
+
+It keeps web pages out. A page of another site can send requests to any address that its visitor
+reaches; the browser tells where they come from. And a page can point its own name at this machine
+(DNS rebinding), so that the browser takes it for a page of this server; the name in Host tells.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from typing import TYPE_CHECKING
+
+from holdfast.net.addresses import address_in
+from holdfast.net.http.requests import BadRequest
+
+if TYPE_CHECKING:
+    from collections.abc import Container
+
+    from holdfast.net.http.requests import Request
+
+_OWN = (b"same-origin", b"none")
+"""The values of Sec-Fetch-Site for a page of this server, and for what a person opens."""
+
+
+class Origins:
+    """The rule of one application."""
+
+    def __init__(
+        self, *, names: Container[str] | None, allowed: str, is_https: bool = False
+    ) -> None:
+        """`names`: those that Host may have besides addresses, in lower case; `None`: any.
+
+        `allowed` says in errors which Hosts are allowed.
+        """
+        self._names = names
+        self._allowed = allowed
+        self._schemes = (b"https",) if is_https else (b"http", b"https")
+        """Over HTTP, an Origin may have HTTPS: a proxy in front of this server may speak it."""
+
+    @staticmethod
+    def check_host(request: Request) -> None:
+        """Raises `BadRequest` unless the request has one Host; with HTTP/1.0 it may have none."""
+        hosts = len(request.values(b"host"))
+        if hosts > 1 or (hosts == 0 and request.version != "1.0"):
+            raise BadRequest("malformed", f"{hosts} Host headers, HTTP/1.1 requires exactly one")
+
+    def check(self, request: Request) -> None:
+        """Raises `BadRequest` for a request of another site's page, and for a name in Host."""
+        if self._is_foreign(request):
+            raise BadRequest("foreign_page", "the request is from a page of another site")
+        if self._names is not None and not is_direct(request, self._names):
+            raise BadRequest("foreign_page", f"Host is a name, allowed{self._allowed}")
+
+    def admits(self, request: Request) -> bool:
+        """Whether `check` finds nothing."""
+        try:
+            self.check(request)
+        except BadRequest:
+            return False
+        return True
+
+    def _is_foreign(self, request: Request) -> bool:
+        origins = request.values(b"origin")
+        if origins:
+            scheme, _, host = origins[0].lower().partition(b"://")
+            own = (request.header(b"host") or b"").lower()
+            if len(origins) > 1 or scheme not in self._schemes or host != own:
+                return True
+        return any(site not in _OWN for site in request.values(b"sec-fetch-site"))
+
+
+def is_direct(request: Request, names: Container[str] = ()) -> bool:
+    """Whether Host is missing, an IP address, `localhost`, or one of `names` in lower case."""
+    host = request.header(b"host")
+    name = None if host is None else _name_in(host)
+    return name is None or name in names
+
+
+def is_from_page(request: Request) -> bool:
+    """Whether a web page sent the request, also one of this server."""
+    return any(request.values(name) for name in (b"origin", b"referer", b"sec-fetch-site"))
+
+
+@functools.lru_cache(maxsize=64)
+def _name_in(host: bytes) -> str | None:
+    """Returns the name in a Host header; `None` for an IP address and `localhost`.
+
+    An address with a zone is none: no URL has one.
+    """
+    name = re.sub(r":[0-9]*\Z", "", host.decode("latin-1")).lower()
+    is_address = "%" not in name and address_in(name) is not None
+    return None if name == "localhost" or is_address else name

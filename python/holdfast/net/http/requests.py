@@ -1,0 +1,225 @@
+"""The requests and responses of HTTP: what a handler gets from a host, and gives back.
+
+This module does not know routes. An invalid request raises `BadRequest`; the application converts
+its reason to a status code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import re
+from collections.abc import Awaitable, Callable
+from dataclasses import KW_ONLY, dataclass, field
+from typing import TYPE_CHECKING, TypeAlias
+
+import msgspec
+
+from holdfast.runtime.text import clip
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+Headers: TypeAlias = list[tuple[bytes, bytes]]
+"""Names in lower case, and values."""
+
+JSON = b"application/json"
+
+SAFE: Headers = [(b"cache-control", b"no-store"), (b"x-content-type-options", b"nosniff")]
+"""Headers of every response: no caching, no guessing of content types."""
+
+_JSON = re.compile(rb'application/json[ \t]*(;[ \t]*charset="?utf-?8"?[ \t]*)?', re.I)
+_JSON_WITH_PARAMETERS = re.compile(rb"application/json[ \t]*(;.*)?", re.I)
+_MAX_SHOWN = 40
+
+
+class BadRequest(Exception):
+    """A request is invalid or refused: `reason` is a word, `detail` a sentence."""
+
+    def __init__(self, reason: str, detail: str) -> None:
+        self.reason = reason
+        self.detail = detail
+        super().__init__(f"{reason}: {detail}")
+
+
+class ClientDisconnected(Exception):
+    """The client closed the connection."""
+
+
+class BrokenBody(Exception):
+    """The body of a request is not valid HTTP. The host answers it, not the handler."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """The certificate of a client over mutual TLS."""
+
+    subject: str
+    serial: str
+    role: str | None = None
+
+
+@dataclass(slots=True)
+class Response:
+    """A whole response. The host adds `date`, and `content-length` where HTTP has one."""
+
+    status: int
+    body: bytes = b""
+    headers: Headers = field(default_factory=list)
+    closes: bool = False
+    """Whether the host closes the connection then. It reads on until the peer has the response."""
+
+
+def response(kind: bytes, body: bytes, *more: tuple[bytes, bytes], status: int = 200) -> Response:
+    """Returns a response with a body of this content type."""
+    return Response(status, body, [(b"content-type", kind), *SAFE, *more])
+
+
+def rejection(status: int, reason: str, detail: str, word: str = "rejected") -> Response:
+    """Returns the refusal of a request, in JSON."""
+    body = msgspec.json.encode({"status": word, "reason": reason, "detail": detail})
+    return response(JSON, body, status=status)
+
+
+@dataclass(slots=True, eq=False)
+class Request:
+    """One request. A host makes a subclass for a body that still arrives, and for streams."""
+
+    method: str
+    path: str
+    """The path, percent-decoded."""
+    query: bytes
+    """The part behind `?`, as it was sent."""
+    headers: Headers
+    peer: str
+    """The address of the client as text: `10.0.0.9:51200`."""
+    _: KW_ONLY
+    version: str = "1.1"
+    """The version of HTTP, `1.0` or `1.1`."""
+    whole: bytes | None = b""
+    """The body, if it has arrived together with the head; `None` while it still arrives."""
+    identity: Identity | None = None
+    who: str = "-"
+    """The name of the token's owner; `-` until the token was checked."""
+    _by_name: dict[bytes, list[bytes]] | None = field(default=None, init=False, repr=False)
+
+    # What a host provides.
+
+    async def receive(self, most: int) -> bytes:
+        """Waits for a body that still arrives, at most `most` bytes.
+
+        Raises `BadRequest`, `BrokenBody` and `ClientDisconnected`.
+        """
+        raise NotImplementedError
+
+    def when_gone(self, function: Callable[[], object] | None) -> None:
+        """Calls a function when the client is gone, or at once if it is; `None`: no more.
+
+        The body must have been read.
+        """
+        raise NotImplementedError
+
+    async def begin(self, status: int, headers: Headers) -> None:
+        """Begins a stream. From here on, a half-close of the client means that it is gone."""
+        raise NotImplementedError
+
+    async def send(self, data: bytes) -> None:
+        """Sends a part of a stream when there is room for it. Raises `ClientDisconnected`."""
+        raise NotImplementedError
+
+    async def end(self) -> None:
+        """Ends a stream."""
+        raise NotImplementedError
+
+    # The body.
+
+    def arrived(self, most: int) -> bytes | None:
+        """Returns the body, at most `most` bytes; `None` if it still arrives. Raises `BadRequest`.
+
+        A body that is too large by its length is refused before it arrives.
+        """
+        size = self.header(b"content-length")
+        if len(self.whole or b"") > most or (size is not None and int(size) > most):
+            raise BadRequest("too_large", f"the body has more than {most} bytes")
+        return self.whole
+
+    async def body(self, most: int) -> bytes:
+        """Reads the body, at most `most` bytes. Raises `BadRequest` and `ClientDisconnected`."""
+        whole = self.arrived(most)
+        if whole is not None:
+            return whole
+        self.whole = await self.receive(most)
+        return self.whole
+
+    # The headers.
+
+    def values(self, name: bytes) -> list[bytes]:
+        """Returns the values of all headers of this name."""
+        by_name = self._by_name
+        if by_name is None:
+            by_name = self._by_name = {}
+            for key, value in self.headers:
+                by_name.setdefault(key, []).append(value)
+        return by_name.get(name, [])
+
+    def header(self, name: bytes) -> bytes | None:
+        """Returns the value of the last header of this name, if there is one."""
+        found = self.values(name)
+        return found[-1] if found else None
+
+    def check_json(self, *also: bytes, parameters: bool = False) -> None:
+        """Raises `BadRequest` unless Content-Type is JSON or in `also`, without compression.
+
+        With `parameters`, the type may have any parameters.
+        """
+        kind = self.header(b"content-type")
+        form = _JSON_WITH_PARAMETERS if parameters else _JSON
+        if (kind is None or not form.fullmatch(kind)) and (kind or b"") not in also:
+            raise BadRequest(
+                "not_json", f"Content-Type is {_found(kind)}, allowed: application/json"
+            )
+        self.check_uncompressed()
+
+    def check_uncompressed(self) -> None:
+        """Raises `BadRequest` for a compressed body."""
+        coding = self.header(b"content-encoding")
+        if coding is not None and coding.lower() != b"identity":
+            raise BadRequest("not_json", f"Content-Encoding is {_found(coding)}, allowed: none")
+
+    def owner(self, tokens: Iterable[tuple[str, bytes]]) -> str:
+        """Returns the name of the request's token. Raises `BadRequest` if there is none.
+
+        `tokens` are names and SHA-256 hashes.
+        """
+        found = self.values(b"authorization")
+        if len(found) != 1:
+            detail = "more than one Authorization header" if found else "no Authorization header"
+            raise BadRequest("unauthorized", f"{detail}, required: Authorization: Bearer TOKEN")
+        scheme, _, secret = found[0].partition(b" ")
+        if scheme.lower() != b"bearer":
+            raise BadRequest("unauthorized", "Authorization is not of the form Bearer TOKEN")
+        digest = hashlib.sha256(secret.strip()).digest()
+        owner = None
+        for name, known in tokens:  # Compares all of them, so the time reveals nothing.
+            if hmac.compare_digest(known, digest):
+                owner = name
+        if owner is None:
+            raise BadRequest("unauthorized", "unknown token")
+        return owner
+
+
+SecondStep: TypeAlias = Callable[[], Response]
+"""The second step of a handler: it is called once the others of the batch have had their first."""
+
+Handler: TypeAlias = Callable[[Request], Response | SecondStep | Awaitable[Response | None]]
+"""Answers a request: at once, in two steps, or as a coroutine. `None`: it has sent a stream."""
+
+
+def shown(text: str) -> str:
+    """Quotes untrusted text, cut to a limited length."""
+    return json.dumps(clip(text, _MAX_SHOWN))
+
+
+def _found(value: bytes | None) -> str:
+    return "missing" if value is None else shown(value.decode("latin-1"))

@@ -1,0 +1,147 @@
+"""Queues messages for NATS. While NATS is slow or disconnected, it keeps only the newest of a tag.
+
+As long as the server accepts messages, they are sent in order. Otherwise each message replaces the
+older one of the same tag, and the number of kept messages is limited. So the scanner neither blocks
+nor grows, and after a reconnect the server gets the current values.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import OrderedDict
+from dataclasses import KW_ONLY, dataclass
+from typing import TYPE_CHECKING
+
+from nats.errors import Error
+
+from holdfast.net.nats import batch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from holdfast.net.nats.tolerant_client import SafeClient
+
+MAX_BACKLOG_BYTES = 2 * 1024 * 1024
+"""Unsent bytes above which the connection counts as slow."""
+
+MAX_BATCH_BYTES = 512 * 1024
+"""Bytes of kept messages that are sent at once. The others can still be replaced."""
+
+MAX_KEPT_MESSAGES = 200_000
+"""Limit of kept messages."""
+
+CHECK_INTERVAL_S = 0.005
+"""Time between checks whether a slow connection accepts more."""
+
+
+@dataclass(eq=False)
+class Outbox:
+    """The queue of messages for NATS."""
+
+    max_kept: int = MAX_KEPT_MESSAGES
+    _: KW_ONLY
+    may_send: Callable[[], bool] = lambda: True
+    """Asked before each sending. While it returns false, messages are dropped."""
+    on_drop: Callable[[], None] = lambda: None
+    """Called when messages are dropped."""
+    at_once: bool = False
+    """Whether nothing waits in this process after a sending."""
+
+    def __post_init__(self) -> None:
+        self._client: SafeClient | None = None
+        self._queue: list[bytes] = []
+        self._queue_bytes = 0
+        self._kept: OrderedDict[object, bytes] = OrderedDict()
+        self._has_messages = asyncio.Event()
+        self.sent = 0
+        """Messages sent to the connection."""
+        self.replaced = 0
+        """Messages that a newer one of the same tag replaced."""
+        self.dropped = 0
+        """Messages lost because too many were kept."""
+
+    def connected(self, client: SafeClient | None) -> None:
+        """Sets the client for further messages; `None` while there is no connection."""
+        self._client = client
+        self._has_messages.set()
+
+    def put(self, messages: Iterable[tuple[object, bytes]]) -> None:
+        """Adds messages. Each has a key, such as device and tag; a newer message replaces it."""
+        if self._kept or self._queue_bytes > MAX_BACKLOG_BYTES or not self._accepts():
+            for key, text in messages:
+                self._keep(key, text)
+        else:
+            texts = [text for _, text in messages]
+            self._queue += texts
+            self._queue_bytes += sum(map(len, texts))
+        self._has_messages.set()
+
+    async def answer(self, subject: str, text: bytes) -> None:
+        """Sends a message that a caller waits for, before all queued messages."""
+        client = self._client
+        if client is not None and client.is_connected:
+            await batch.send(client, text, 1)
+        else:
+            self.put([(subject, text)])
+
+    async def run(self) -> None:
+        """Sends queued messages, until it is cancelled."""
+        while True:
+            await self._has_messages.wait()
+            self._has_messages.clear()
+            while (self._queue or self._kept) and self._client is not None:
+                if not self.may_send():
+                    self.dropped += len(self._queue) + len(self._kept)
+                    self._queue, self._queue_bytes = [], 0
+                    self._kept.clear()
+                    self.on_drop()
+                    continue
+                if not self._accepts() or (self.at_once and batch.unsent(self._client) > 0):
+                    await asyncio.sleep(CHECK_INTERVAL_S)
+                    continue
+                await self._send(self._client)
+
+    async def flush(self) -> None:
+        """Waits until the server has received all messages, or is disconnected."""
+        while (self._queue or self._kept) and self._client is not None:
+            await asyncio.sleep(CHECK_INTERVAL_S)
+        if self._client is not None:
+            with contextlib.suppress(Error):
+                await self._client.flush()
+
+    async def _send(self, client: SafeClient) -> None:
+        texts = self._queue
+        self._queue, self._queue_bytes = [], 0
+        if not texts:
+            texts = self._oldest()
+        self.sent += len(texts)
+        if self.at_once:
+            batch.send_at_once(client, b"".join(texts), len(texts))
+        else:
+            await batch.send(client, b"".join(texts), len(texts))
+
+    def _oldest(self) -> list[bytes]:
+        """Removes and returns the oldest kept messages, about `MAX_BATCH_BYTES` bytes."""
+        texts, size = [], 0
+        while self._kept and size < MAX_BATCH_BYTES:
+            _, text = self._kept.popitem(last=False)
+            texts.append(text)
+            size += len(text)
+        return texts
+
+    def _accepts(self) -> bool:
+        """Returns whether the connection currently accepts more."""
+        client = self._client
+        return (
+            client is not None and client.is_connected and batch.backlog(client) < MAX_BACKLOG_BYTES
+        )
+
+    def _keep(self, key: object, text: bytes) -> None:
+        # A replacement keeps the position of the older message, so it can't wait forever.
+        if key in self._kept:
+            self.replaced += 1
+        elif len(self._kept) >= self.max_kept:
+            self._kept.popitem(last=False)
+            self.dropped += 1
+        self._kept[key] = text

@@ -1,0 +1,327 @@
+"""A NATS client that survives malformed messages, and the bytes between it and its server.
+
+The server forwards subjects with invalid UTF-8 or vertical tabs, and malformed headers. The parser
+of nats-py stops at any of them, permanently or for some time. So this transport takes the messages
+out of what the server sends, and the parser gets the other lines only.
+
+TLS is the core's, and the certificate of a server is judged as that of a device.
+
+It also notes what is known of the age of each message: NATS does not tell when one was sent. The
+server answers pings in order, so what follows an answer was sent after the ping.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+from nats.aio.transport import TcpTransport
+from nats.errors import Error, ProtocolError
+
+from holdfast.events import log_lines
+from holdfast.net.secure_channel import SecureChannel
+from holdfast.net.tls import NO_FILES, Tls
+from holdfast.runtime.standstill import now
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+    from urllib.parse import ParseResult
+
+END = b"\r\n"
+CHUNK_BYTES = 65_536
+PING, PONG = b"PING\r\n", b"PONG\r\n"
+MAX_LINE_BYTES = 1024 * 1024
+"""The longest line of the protocol in bytes. INFO lines are the longest."""
+
+
+class _Head(NamedTuple):
+    """The line before the bytes of a message."""
+
+    subject: bytes
+    sid: int
+    reply: bytes
+    header: int
+    """Bytes of its headers."""
+    size: int
+    """Bytes of headers and payload."""
+
+
+class MessageTransport(TcpTransport):
+    """Calls `deliver` with the id of the subscription, subject, reply, payload and headers."""
+
+    def __init__(
+        self,
+        deliver: Callable[[int, bytes, bytes, bytes, bytes], Awaitable[None]],
+        *,
+        requires_tls: bool,
+    ) -> None:
+        """`requires_tls`: refuse a server without TLS before anything is sent to it. nats-py would
+        continue without encryption.
+        """
+        super().__init__()  # type: ignore[no-untyped-call]
+        self._deliver = deliver
+        self._requires_tls = requires_tls
+        self._buffer = bytearray()
+        self._head: _Head | None = None
+        self._channel: SecureChannel | None = None
+        self._early = b""
+        """What was decrypted and is not read yet."""
+        self._pings: deque[tuple[float, bool]] = deque()
+        """Times of pings without an answer, and whether the client does not know of them."""
+        self.pinged = self.answered = -math.inf
+        """When the last ping was sent, and the last one that was answered."""
+
+    def __bool__(self) -> bool:
+        return True  # nats-py replaces a transport that is false.
+
+    @property
+    def unsent(self) -> int:
+        """Bytes that were not handed to the system."""
+        assert self._io_writer is not None, "it was connected"
+        return self._io_writer.transport.get_write_buffer_size()
+
+    def ping(self) -> None:
+        """Pings the server, without the knowledge of the client."""
+        self._note_ping(hidden=True)
+        self._send(PING)
+
+    def _note_ping(self, *, hidden: bool) -> None:
+        self.pinged = now()
+        self._pings.append((self.pinged, hidden))
+
+    async def connect(self, uri: ParseResult, buffer_size: int, connect_timeout: int) -> None:
+        """Connects anew, after the end of the connection before."""
+        # A connection that was refused, such as for its credentials: nats-py would forget it open.
+        self.close()
+        self._buffer.clear()
+        self._head = None
+        self._early = b""
+        self._pings.clear()
+        await super().connect(uri, buffer_size, connect_timeout)
+
+    def close(self) -> None:
+        """Closes the connection, if there is one."""
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            super().write(channel.end())  # type: ignore[no-untyped-call]
+        super().close()  # type: ignore[no-untyped-call]
+
+    async def connect_tls(
+        self, uri: str | ParseResult, ssl_context: Any, buffer_size: int, connect_timeout: int
+    ) -> None:
+        """Begins TLS. `ssl_context` is a `Tls`; otherwise the system's authorities are trusted.
+
+        Raises `OSError` for a server that is not trusted, and for unusable files.
+        """
+        files = ssl_context if isinstance(ssl_context, Tls) else NO_FILES
+        host = uri if isinstance(uri, str) else str(uri.hostname)
+        channel = SecureChannel(host, files)
+        try:
+            async with asyncio.timeout(connect_timeout):
+                super().write(channel.outgoing())  # type: ignore[no-untyped-call]
+                while not channel.is_ready:
+                    self._early += await self._decrypted(channel, buffer_size)
+        except BaseException:
+            self.close()
+            raise
+        self._channel = channel
+
+    async def _decrypted(self, channel: SecureChannel, buffer_size: int) -> bytes:
+        data: bytes = await super().read(buffer_size)
+        if not data:
+            channel.check_lost()
+            raise ConnectionResetError("the server closed the connection")
+        try:
+            return channel.receive(data)
+        finally:
+            super().write(channel.outgoing())  # type: ignore[no-untyped-call]
+
+    def write(self, payload: bytes) -> None:
+        """Sends bytes, and notes when a ping is sent."""
+        if payload == PING:
+            self._note_ping(hidden=False)
+        self._send(payload)
+
+    def writelines(self, payload: list[bytes]) -> None:
+        """Sends bytes."""
+        self._send(b"".join(payload))
+
+    def _send(self, data: bytes) -> None:
+        if self._channel is not None:
+            data = self._channel.encrypted(data)
+        elif self._requires_tls:
+            return  # At its end, nats-py sends what waits, also to a server that was refused.
+        super().write(data)  # type: ignore[no-untyped-call]
+
+    async def readline(self) -> bytes:
+        """Returns one of the lines that begin a connection."""
+        line = await self._line()
+        if line.startswith(PONG):
+            self._answer()
+        elif self._requires_tls and line.startswith(b"INFO"):
+            _check_tls(_decoded(line.removeprefix(b"INFO")))
+        return line
+
+    async def _line(self) -> bytes:
+        if self._channel is None:
+            try:
+                line: bytes = await super().readline()  # type: ignore[no-untyped-call]
+            except ValueError:
+                raise Error("nats: the server sent a line that is too long") from None
+            return line
+        while b"\n" not in self._early:
+            if len(self._early) > MAX_LINE_BYTES:
+                raise Error("nats: the server sent a line that is too long")
+            self._early += await self._decrypted(self._channel, CHUNK_BYTES)
+        line, end, self._early = self._early.partition(b"\n")
+        return line + end
+
+    async def _received(self, buffer_size: int) -> bytes:
+        if self._channel is None:
+            plain: bytes = await super().read(buffer_size)
+            return plain
+        early, self._early = self._early, b""
+        return early or await self._decrypted(self._channel, buffer_size)
+
+    async def read(self, buffer_size: int) -> bytes:
+        """Delivers the messages that have arrived, and returns the other lines.
+
+        Raises `ProtocolError` for malformed lines.
+        """
+        self._buffer += await self._received(buffer_size)
+        others = b""
+        while self._buffer:
+            if self._head is not None:
+                if not await self._take_message(self._head):
+                    break
+                continue
+            end = self._buffer.find(END)
+            if end < 0:
+                if len(self._buffer) > MAX_LINE_BYTES:
+                    raise ProtocolError(f"nats: a line is longer than {MAX_LINE_BYTES} bytes")
+                break
+            line = bytes(self._buffer[:end])
+            del self._buffer[: end + len(END)]
+            others += self._take_line(line)
+        return others
+
+    async def _take_message(self, head: _Head) -> bool:
+        """Delivers a message; returns false if it is not complete."""
+        if len(self._buffer) < head.size + len(END):
+            return False
+        headers = bytes(self._buffer[: head.header])
+        payload = bytes(self._buffer[head.header : head.size])
+        del self._buffer[: head.size + len(END)]
+        self._head = None
+        await self._deliver(head.sid, head.subject, head.reply, payload, headers)
+        return True
+
+    def _take_line(self, line: bytes) -> bytes:
+        """Returns the line in a form that nats-py parses; nothing for what it need not know.
+
+        Words end at spaces and tabs only, as for the server.
+        """
+        word, _, rest = line.replace(b"\t", b" ").partition(b" ")
+        if word in (b"MSG", b"HMSG"):
+            self._head = _head(rest, with_header=word == b"HMSG")
+        elif word == b"PING":
+            return PING
+        elif word == b"PONG":
+            return b"" if self._answer() else PONG
+        elif word == b"INFO":
+            return b"INFO " + json.dumps(_decoded(rest)).encode() + END
+        elif word == b"-ERR":
+            return b"-ERR '%b'" % _error_text(rest) + END
+        elif word != b"+OK":
+            raise ProtocolError("nats: unknown protocol")
+        return b""
+
+    def _answer(self) -> bool:
+        """Notes the answer to the oldest ping. Returns whether the client knows nothing of it."""
+        if not self._pings:
+            return False
+        self.answered, hidden = self._pings.popleft()
+        return hidden
+
+
+def _head(rest: bytes, *, with_header: bool) -> _Head:
+    parts = [part for part in rest.split(b" ") if part]
+    names = len(parts) - 1 - with_header
+    try:
+        subject, sid, *reply = parts[:names]
+        header, size = map(int, [b"0"] * (not with_header) + parts[names:])
+        return _Head(subject, int(sid), b"".join(reply), header, size)
+    except ValueError:
+        raise ProtocolError("nats: malformed MSG") from None
+
+
+def _decoded(info: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(info)
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise ProtocolError("nats: malformed INFO")
+    return found
+
+
+def _check_tls(info: dict[str, Any]) -> None:
+    if not info.get("tls_required"):
+        raise Error("the server does not use TLS")
+
+
+def _error_text(rest: bytes) -> bytes:
+    """The reason of an error as nats-py requires it: not empty, and in UTF-8."""
+    text = " ".join(rest.decode(errors="backslashreplace").split()).strip("'")
+    return text.encode() or b"no reason given"
+
+
+@dataclass
+class Received(Msg):
+    """A message, with times of `now`."""
+
+    sent_after: float = -math.inf
+    """When the last ping was sent that the server has answered before it sent the message."""
+    received: float = field(default_factory=now)
+
+
+class SafeClient(Client):
+    """Skips malformed messages, and logs them with a limited rate. Messages are `Received`."""
+
+    def __init__(self, *, requires_tls: bool = False) -> None:
+        """`requires_tls`: refuse a server without TLS."""
+        super().__init__()
+        self.transport = MessageTransport(self._deliver, requires_tls=requires_tls)
+        self._transport = self.transport
+        self.msg_class = self._with_age  # type: ignore[assignment]
+
+    async def prove(self, since: float) -> None:
+        """Pings the server, unless that was done after `since`."""
+        if self.is_connected and self.transport.pinged < since:
+            self.transport.ping()
+
+    def _with_age(self, **parts: Any) -> Received:
+        return Received(**parts, sent_after=self.transport.answered)
+
+    async def _deliver(
+        self, sid: int, subject: bytes, reply: bytes, payload: bytes, headers: bytes
+    ) -> None:
+        try:
+            await self._process_msg(sid, subject, reply, payload, headers)
+        except Exception as error:  # One malformed message must not stop the others.
+            shown = subject.decode(errors="backslashreplace")
+            log_lines.refused(
+                "message_malformed", kind="nats", subject=shown, reason=_reason(error)
+            )
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, UnicodeDecodeError):
+        return "invalid UTF-8 in the subject, the reply subject or a header"
+    return f"malformed headers ({type(error).__name__})"

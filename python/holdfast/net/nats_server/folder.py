@@ -1,0 +1,139 @@
+"""The folder of a NATS server: its data, its configuration, and who uses it."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import signal
+import sys
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from holdfast.events.audit.lock import lock
+from holdfast.net.certificates.files import SECRET, replace
+from holdfast.net.secret_file import read_secret
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+LEFT_OVER_END_TIMEOUT_S = 10.0
+"""Seconds that a server which has lost its appliance has to end."""
+
+
+class ServerUnusable(OSError):
+    """The server can't be started. The message says why."""
+
+
+class InUse(ServerUnusable):
+    """Another process uses the folder."""
+
+
+@dataclass(frozen=True)
+class Access:
+    """Where a server listens, and what its clients show.
+
+    A token file in the folder of the server is made if it does not exist.
+    """
+
+    host: str
+    port: int
+    username: str | None = None
+    password_file: Path | None = None
+    token_file: Path | None = None
+
+
+class Folder:
+    """A folder that one process uses, from the constructor to `close`.
+
+    Two files are locked: `holdfast.lock` by this process, and `nats-server.lock` by the server,
+    which inherits the lock. A server that has lost its appliance is found by its lock, and ended.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Creates the folder if it does not exist. Raises `ServerUnusable`."""
+        self.path = path
+        self.ended: int | None = None
+        """The process id of a server that was left over."""
+        self._own = self._server = -1
+        try:
+            path.mkdir(mode=0o700, exist_ok=True)
+            self._own = _opened(path / "holdfast.lock")
+            self._server = _opened(path / "nats-server.lock")
+            self._lock()
+        except BaseException as error:
+            self.close()
+            if isinstance(error, OSError) and not isinstance(error, ServerUnusable):
+                reason = error.strerror or error
+                raise ServerUnusable(f"{path} can't be used: {reason}") from error
+            raise
+
+    @property
+    def inherited(self) -> int:
+        """The descriptor of the lock that the server inherits."""
+        return self._server
+
+    def configured(self, access: Access) -> Path:
+        """Writes the server's configuration. Returns its file."""
+        file = self.path / "nats-server.conf"
+        try:
+            settings = json.dumps(self._settings(access), indent=2, ensure_ascii=False)
+            replace(file, f"{settings}\n".encode(), SECRET)
+        except OSError as error:
+            named = error.filename or file
+            raise ServerUnusable(f"{named} can't be used: {error.strerror or error}") from error
+        return file
+
+    def close(self) -> None:
+        """Unlocks the folder."""
+        for descriptor in (self._own, self._server):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._own = self._server = -1
+
+    def _lock(self) -> None:
+        if not lock(self._own):
+            raise InUse(f"{self.path} is in use by another process")
+        deadline = time.monotonic() + LEFT_OVER_END_TIMEOUT_S
+        while not lock(self._server):
+            left = _process_of(self._server)
+            if left is None or (self.ended is not None and time.monotonic() > deadline):
+                shown = "" if left is None else f", process {left}"
+                raise InUse(f"{self.path} is in use by another nats-server{shown}")
+            self.ended = left
+            with suppress(ProcessLookupError):
+                os.kill(left, signal.SIGTERM)
+            time.sleep(0.05)
+
+    def _settings(self, access: Access) -> dict[str, Any]:
+        return {
+            "server_name": "holdfast",
+            "host": access.host,
+            "port": access.port,
+            # A confirmed write is on the disk, as there is no other server that has it.
+            "jetstream": {"store_dir": str(self.path / "store"), "sync_interval": "always"},
+            "authorization": self._authorization(access),
+        }
+
+    def _authorization(self, access: Access) -> dict[str, str]:
+        if access.username is not None:
+            secret = "" if access.password_file is None else read_secret(access.password_file)
+            return {"user": access.username, "password": secret}
+        assert access.token_file is not None, "clients show something"
+        if access.token_file.parent == self.path and not access.token_file.exists():
+            replace(access.token_file, f"{secrets.token_hex(32)}\n".encode(), SECRET)
+        return {"token": read_secret(access.token_file)}
+
+
+def _opened(file: Path) -> int:
+    return os.open(file, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o600)
+
+
+def _process_of(descriptor: int) -> int | None:
+    """The process that has locked the file, as it has noted itself."""
+    if sys.platform == "win32":
+        return None
+    text = os.pread(descriptor, 20, 0)
+    return int(text) if text.strip().isdigit() else None

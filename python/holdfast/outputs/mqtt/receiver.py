@@ -1,0 +1,88 @@
+"""What outputs to brokers have in common: one session, which begins anew after a failure."""
+
+from __future__ import annotations
+
+import socket
+from abc import abstractmethod
+from typing import TYPE_CHECKING
+
+from holdfast.events import log_lines
+from holdfast.net.addresses import joined
+from holdfast.outputs.sending import Receiver
+
+if TYPE_CHECKING:
+    from holdfast.config.models.outputs import MqttOutputConfig, SparkplugConfig
+    from holdfast.outputs.mqtt.messages import Delivery
+    from holdfast.outputs.mqtt.session import Session
+    from holdfast.runtime.stop import Stop
+
+
+class BrokerReceiver(Receiver):
+    """A receiver with a session. Connects when it is asked to send, and after an idle second."""
+
+    def __init__(self, name: str, settings: MqttOutputConfig | SparkplugConfig) -> None:
+        self._name, self._version = name, settings.version
+        self._client_id = settings.client_id or f"holdfast-{name}-{socket.gethostname()}"
+        self._broker = joined(settings.host, settings.port)
+        self._stop: Stop | None = None
+        self._session: Session | None = None
+        self._revision = -1
+        """The revision of the tags that were published."""
+        self._connects = self._not_accepted = 0
+
+    def until(self, stop: Stop) -> None:
+        """Takes the stop that ends all waiting. Called before all else."""
+        self._stop = stop
+
+    def status(self) -> dict[str, object]:
+        """The broker and the connection."""
+        return {
+            "broker": self._broker,
+            "client_id": self._client_id,
+            "version": self._version,
+            "reconnects": max(0, self._connects - 1),
+            "not_accepted": self._not_accepted,
+        }
+
+    @abstractmethod
+    def _open(self, stop: Stop) -> Session:
+        """Opens a session. Raises `OSError`."""
+
+    @abstractmethod
+    def _greet(self, session: Session) -> None:
+        """Begins a new session with what the broker must have or know first."""
+
+    @abstractmethod
+    def _disconnect(self) -> None:
+        """Ends the session, if there is one."""
+
+    def _connected(self) -> Session:
+        """The session; a new one if there is none. Raises `OSError`."""
+        if self._session is not None and (error := self._session.error) is not None:
+            self._disconnect()
+            raise ConnectionError(error)
+        if self._session is None:
+            assert self._stop is not None, "until comes first"
+            self._session = self._open(self._stop)
+            self._connects += 1
+            self._greet(self._session)
+        return self._session
+
+    def _wait(self, session: Session, delivery: Delivery) -> None:
+        """Waits until the broker must have all messages. Raises `OSError`."""
+        try:
+            session.wait(delivery)
+        except OSError:
+            self._disconnect()
+            raise
+        finally:
+            self._not_accepted += len(delivery.refused)
+            for message, reason in delivery.refused[:1]:
+                log_lines.refused(
+                    "output_not_accepted",
+                    kind=self._name,
+                    output=self._name,
+                    topic=message.topic[2:].decode(),
+                    reason=reason,
+                    count=len(delivery.refused),
+                )

@@ -1,0 +1,272 @@
+"""Backups of a log: its streams as files, and the number of servers that keep them.
+
+A backup is a folder: `backup.json`, and one file for each stream, as the servers send it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import json
+import os
+import time
+from typing import TYPE_CHECKING, Any
+
+from nats.errors import Error, NoRespondersError
+
+from holdfast.net import event_loop
+from holdfast.net.nats import connected_once, nats_reason
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+    from pathlib import Path
+    from typing import TypeVar
+
+    from nats.aio.msg import Msg
+
+    from holdfast.net.nats import SafeClient, Servers
+
+    T = TypeVar("T")
+
+VERSION = 1
+STREAM_NOT_FOUND = 10059
+"""The code of JetStream for a stream that does not exist."""
+
+CHUNK_BYTES = 128 * 1024
+ANSWER_TIMEOUT_S = 30.0
+"""Seconds within which a server must answer, or send the next part."""
+
+LEADER_TIMEOUT_S = 10.0
+"""Seconds within which servers must know where a request goes. They elect leaders, and one makes a
+stream before the others know of it."""
+
+RETRY_S = 0.1
+"""Seconds between two attempts."""
+
+
+class BackupFailed(Exception):
+    """The message says what can't be done, and why."""
+
+
+class _NotFound(BackupFailed):
+    """The servers don't have the stream."""
+
+
+def streams(log: str) -> list[str]:
+    """The streams of a log, the one with the steps last."""
+    name = f"holdfast-log-{log}"
+    return [f"KV_{name}", f"OBJ_{name}", name]
+
+
+def leases(log: str) -> list[str]:
+    """The streams of leases, which nodes create anew: no backup has them."""
+    return [f"KV_holdfast-log-{log}-leases", f"KV_holdfast-log-{log}-devices"]
+
+
+def back_up(servers: Servers, log: str, folder: Path) -> int:
+    """Writes a backup to a new folder. Returns the number of messages. Raises `BackupFailed`.
+
+    What is confirmed later is not in it. Nodes may run: the newest snapshot is fetched before the
+    steps that follow it.
+    """
+    try:
+        folder.mkdir()
+    except OSError as error:
+        raise BackupFailed(f"{folder}: {error.strerror or error}") from error
+    try:
+        return _run(servers, lambda client: _back_up(client, log, folder))
+    except BaseException:
+        for file in folder.iterdir():
+            file.unlink()
+        folder.rmdir()
+        raise
+
+
+def restore(servers: Servers, log: str, replicas: int, folder: Path) -> int:
+    """Puts a backup on servers that don't have the log. Returns the number of messages.
+
+    No node may run. Raises `BackupFailed`. What was restored by then is deleted again, unless the
+    connection is lost.
+    """
+    found = _checked(folder, log)
+    return _run(servers, lambda client: _restore(client, log, replicas, folder, found))
+
+
+def set_replicas(servers: Servers, log: str, replicas: int) -> dict[str, tuple[int, int]]:
+    """Has each stream of the log kept by so many servers. Returns the numbers before and now.
+
+    Raises `BackupFailed`.
+    """
+    return _run(servers, lambda client: _set_replicas(client, log, replicas))
+
+
+def _run(servers: Servers, work: Callable[[SafeClient], Coroutine[Any, Any, T]]) -> T:
+    async def connected() -> T:
+        async with connected_once(servers, "holdfast log") as client:
+            return await work(client)
+
+    try:
+        return event_loop.run(connected())
+    except (Error, OSError, TimeoutError) as error:
+        raise BackupFailed(nats_reason(error)) from error
+
+
+async def _ask(client: SafeClient, subject: str, request: Any = None) -> dict[str, Any]:
+    """A request to JetStream. Raises `BackupFailed` with the error of the servers."""
+    payload = b"" if request is None else json.dumps(request).encode()
+    reply = await _request(client, f"$JS.API.{subject}", payload)
+    answer: dict[str, Any] = json.loads(reply.data)
+    if "error" in answer:
+        error = answer["error"]
+        kind = _NotFound if error.get("err_code") == STREAM_NOT_FOUND else BackupFailed
+        raise kind(str(error.get("description", error)))
+    return answer
+
+
+async def _request(client: SafeClient, subject: str, payload: bytes) -> Msg:
+    """A request that is sent again while nobody is there to take it."""
+    until = time.monotonic() + LEADER_TIMEOUT_S
+    while True:
+        try:
+            return await client.request(subject, payload, timeout=ANSWER_TIMEOUT_S)
+        except NoRespondersError as error:
+            if time.monotonic() > until:
+                reason = (
+                    f"{subject}: nobody answers; JetStream is off, or its servers have no leader"
+                )
+                raise BackupFailed(reason) from error
+            await asyncio.sleep(RETRY_S)
+
+
+async def _config(client: SafeClient, name: str) -> dict[str, Any] | None:
+    """The configuration of a stream; `None` if the servers don't have it."""
+    try:
+        return dict((await _ask(client, f"STREAM.INFO.{name}"))["config"])
+    except _NotFound:
+        return None
+
+
+async def _back_up(client: SafeClient, log: str, folder: Path) -> int:
+    contents = {}
+    for name in streams(log):
+        contents[name] = await _fetch(client, name, folder / name)
+    text = json.dumps({"version": VERSION, "log": log, "streams": contents}, indent=2)
+    with (folder / "backup.json").open("xb") as out:
+        out.write(text.encode())
+        out.flush()
+        os.fsync(out.fileno())
+    return int(contents[streams(log)[-1]]["state"]["messages"])
+
+
+async def _fetch(client: SafeClient, name: str, file: Path) -> dict[str, Any]:
+    """Writes a stream to a file. Returns what a server needs to restore it."""
+    inbox = client.new_inbox()
+    parts = await client.subscribe(inbox)
+    request = {"deliver_subject": inbox, "no_consumers": True, "chunk_size": CHUNK_BYTES}
+    answer = await _ask(client, f"STREAM.SNAPSHOT.{name}", request)
+    digest = hashlib.sha256()
+    with file.open("xb") as out:
+        while True:
+            part = await parts.next_msg(timeout=ANSWER_TIMEOUT_S)
+            if not part.data:
+                status = (part.headers or {}).get("Status", "204")
+                if status != "204":
+                    raise BackupFailed(f"{name}: the server has ended the backup: {part.headers}")
+                break
+            out.write(part.data)
+            digest.update(part.data)
+            if part.reply:
+                await client.publish(part.reply, b"")
+        out.flush()
+        os.fsync(out.fileno())
+    await parts.unsubscribe()
+    return {
+        "config": answer["config"],
+        "state": answer["state"],
+        "sha256": digest.hexdigest(),
+    }
+
+
+def _checked(folder: Path, log: str) -> dict[str, Any]:
+    """The streams of a backup, whose files are complete."""
+    try:
+        found = json.loads((folder / "backup.json").read_bytes())
+        if found["version"] != VERSION:
+            raise BackupFailed(f"{folder}: version {found['version']}, allowed: {VERSION}")
+        if found["log"] != log:
+            raise BackupFailed(f"{folder}: a backup of the log {found['log']}, not of {log}")
+        contents: dict[str, Any] = found["streams"]
+        for name in streams(log):
+            with (folder / name).open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            if digest != contents[name]["sha256"]:
+                raise BackupFailed(f"{folder / name}: damaged, its SHA-256 is another one")
+    except OSError as error:
+        raise BackupFailed(f"{error.filename}: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise BackupFailed(f"{folder}: damaged, or not a backup of a log") from error
+    return contents
+
+
+async def _restore(
+    client: SafeClient, log: str, replicas: int, folder: Path, contents: dict[str, Any]
+) -> int:
+    every = (*streams(log), *leases(log))
+    there = [name for name in every if await _config(client, name) is not None]
+    if there:
+        raise BackupFailed(f"the servers already have {', '.join(there)}")
+    done: list[str] = []
+    try:
+        for name in streams(log):
+            config = contents[name]["config"] | {"num_replicas": replicas}
+            request = {"config": config, "state": contents[name]["state"]}
+            answer = await _ask(client, f"STREAM.RESTORE.{name}", request)
+            # Only now: a stream that the servers have refused to restore may belong to a node.
+            done.append(name)
+            await _send(client, name, answer["deliver_subject"], folder / name, contents[name])
+    except BaseException:
+        for name in done:
+            with contextlib.suppress(Error):  # What has failed before is the reason.
+                await client.request(f"$JS.API.STREAM.DELETE.{name}", b"", timeout=ANSWER_TIMEOUT_S)
+        raise
+    return int(contents[streams(log)[-1]]["state"]["messages"])
+
+
+async def _send(
+    client: SafeClient, name: str, subject: str, file: Path, content: dict[str, Any]
+) -> None:
+    with file.open("rb") as data:
+        while part := data.read(CHUNK_BYTES):
+            reply = await _request(client, subject, part)
+            if reply.data:
+                raise BackupFailed(f"{name}: {_error(reply.data)}")
+    reply = await _request(client, subject, b"")
+    found = json.loads(reply.data)
+    if "error" in found:
+        raise BackupFailed(f"{name}: {_error(reply.data)}")
+    messages = found["state"]["messages"]
+    if messages != content["state"]["messages"]:
+        raise BackupFailed(f"{name}: the server has restored {messages} messages only")
+
+
+def _error(data: bytes) -> str:
+    try:
+        return str(json.loads(data)["error"]["description"])
+    except (ValueError, KeyError, TypeError):
+        return data[:200].decode(errors="replace")
+
+
+async def _set_replicas(client: SafeClient, log: str, replicas: int) -> dict[str, tuple[int, int]]:
+    found = {}
+    for name in (*streams(log), *leases(log)):
+        config = await _config(client, name)
+        if config is None:
+            if name in leases(log):
+                continue  # No node has needed it since the log was restored.
+            raise BackupFailed(f"the servers don't have {name}")
+        before = config["num_replicas"]
+        if before != replicas:
+            await _ask(client, f"STREAM.UPDATE.{name}", config | {"num_replicas": replicas})
+        found[name] = before, replicas
+    return found

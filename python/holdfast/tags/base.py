@@ -1,0 +1,95 @@
+"""What the tags of a tag list and those of the scanner have in common. Does no I/O."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+from holdfast.types import BIT_AREAS
+from holdfast.values.types import parsed
+
+if TYPE_CHECKING:
+    from collections.abc import Set
+
+    from holdfast.types import Area
+
+Marker: TypeAlias = bool | int | float | str
+"""What registers hold when a device has no value."""
+
+DEFAULT_MAX_GAP = 10
+"""The largest gap between tags, in bits or registers, that is read with them by default."""
+
+
+class TagError(ValueError):
+    """A tag that can't be: `key` is the wrong part, such as `scale`."""
+
+    def __init__(self, key: str, message: str) -> None:
+        super().__init__(message)
+        self.key = key
+
+
+class Scaled(NamedTuple):
+    """A value that was made with the scale of the same reply."""
+
+    value: Any
+
+
+class BaseTag(ABC):
+    """A place in a device, and the type of its value."""
+
+    # A subclass has slots or not: the scanner keeps a million tags.
+    __slots__ = ()
+
+    area: Area
+    address: int
+    """The first address."""
+    type: str
+    order: str
+    """The byte order."""
+    encoding: str | None
+    """The encoding of text; `None` for ASCII."""
+    null: Set[Marker]
+    """What the registers hold when no value is available; NaN never is one."""
+
+    @property
+    @abstractmethod
+    def source(self) -> BaseTag | None:
+        """The register that contains the scale, if one does."""
+
+    @abstractmethod
+    def value(self, raw: Any) -> Any:
+        """The value of what the registers hold; `None` if none is available."""
+
+    @abstractmethod
+    def scaled(self, raw: Any, content: Any) -> Scaled:
+        """The value, from the contents of its registers and of that of its scale.
+
+        Raises `ValueError` if there is a number, but no scale.
+        """
+
+    @property
+    def count(self) -> int:
+        """The number of bits or registers."""
+        return parsed(self.type).registers
+
+    @property
+    def end(self) -> int:
+        """The address after the last one."""
+        return self.address + self.count
+
+    @property
+    def span(self) -> range:
+        """The addresses that one request must read: those of the value and of its scale."""
+        of = self.source
+        if of is None:
+            return range(self.address, self.end)
+        return range(min(self.address, of.address), max(self.end, of.end))
+
+    @property
+    def of_bits(self) -> bool:
+        """Whether the tag is in an area of bits."""
+        return self.area in BIT_AREAS
+
+    def is_null(self, raw: Any) -> bool:
+        """Whether what the registers hold stands for no value."""
+        return bool(raw != raw or (self.null and raw in self.null))

@@ -1,0 +1,112 @@
+"""Scale and offset: value = scale × number + offset, and back, without rounding errors.
+
+0.1 means one tenth, not the nearest binary number, so 215 × 0.1 is 21.5. A device may have the
+scale in a register, such as the scale factors of SunSpec.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+from holdfast.tags.base import TagError
+from holdfast.values.digits import shortest
+from holdfast.values.types import parsed
+
+if TYPE_CHECKING:
+    from holdfast.tags.base import BaseTag
+
+Form: TypeAlias = Literal["factor", "exponent"]
+
+EXPONENTS = range(-10, 11)
+"""The exponents that SunSpec allows; 0x8000 is that of a point without a value."""
+
+
+@dataclass(frozen=True)
+class RegisterScale:
+    """Where the scale of a tag is, and what its value means."""
+
+    form: Form
+    """`factor`: the value is the scale. `exponent`: the scale is 10 to the power of the value."""
+    name: str | None = None
+    """The tag of the register, in the same tag list; `None` if only its place is known."""
+    source: BaseTag | None = None
+    """The register. With a name, `None` until a tag list has found it."""
+
+    def __str__(self) -> str:
+        return f"{self.form} from {self.name or self.where}"
+
+    @property
+    def where(self) -> str:
+        """The register, for messages."""
+        assert self.source is not None, "a tag list finds the registers of all scales"
+        return f"{self.source.area} {self.source.address}"
+
+    def factor(self, content: Any) -> float:
+        """The scale for the decoded content of the register. Raises `ValueError` without one."""
+        assert self.source is not None, "a tag list finds the registers of all scales"
+        value = self.source.value(content)
+        if value is None:
+            raise ValueError(f"the scale in {self.where} has no value")
+        if self.form == "exponent":
+            if value not in EXPONENTS:
+                allowed = f"exponents from {EXPONENTS[0]} to {EXPONENTS[-1]}"
+                raise ValueError(f"the scale in {self.where} is 10^{value}, allowed: {allowed}")
+            return 10 ** int(value) if value >= 0 else float(f"1e{int(value)}")
+        if value == 0 or not math.isfinite(value):
+            allowed = "a finite number other than 0"
+            raise ValueError(f"the scale in {self.where} is {value}, allowed: {allowed}")
+        if value == content and isinstance(value, float):
+            return float(shortest(value, parsed(self.source.type).base))
+        return float(value) if isinstance(value, float) else int(value)
+
+    def linear(self, content: Any, offset: float) -> Linear:
+        """Scale and offset for the decoded content of the register. Raises `ValueError`."""
+        return linear_of(self.factor(content), offset)
+
+
+@lru_cache(1024)
+def linear_of(scale: float, offset: float) -> Linear:
+    """Scale and offset, cached."""
+    return Linear(scale, offset)
+
+
+class Linear:
+    """A scale and an offset. Raises `TagError` for a scale of 0 and for infinite numbers."""
+
+    def __init__(self, scale: float, offset: float) -> None:
+        for name, number in (("scale", scale), ("offset", offset)):
+            if not math.isfinite(number):
+                raise TagError(name, f"{name} is {number}, allowed: a finite number")
+        if scale == 0:
+            raise TagError("scale", "scale is 0, allowed: any other number")
+        self._scale, self._offset = _exact(scale), _exact(offset)
+        self._whole = self._scale.denominator == self._offset.denominator == 1
+        self._over = math.lcm(self._scale.denominator, self._offset.denominator)
+        self._times = self._scale.numerator * (self._over // self._scale.denominator)
+        self._plus = self._offset.numerator * (self._over // self._offset.denominator)
+        self.is_identity = scale == 1 and offset == 0
+
+    def value(self, number: float | Fraction) -> int | float:
+        """The value of a number in the registers; an integer if everything is one."""
+        if isinstance(number, int):
+            scaled = number * self._times + self._plus
+            return scaled if self._whole else scaled / self._over
+        if isinstance(number, float) and not math.isfinite(number):
+            return number
+        try:
+            return float(Fraction(number) * self._scale + self._offset)
+        except OverflowError:
+            return math.copysign(math.inf, number * self._times)
+
+    def number(self, value: float) -> Fraction:
+        """The number in the registers for a finite value."""
+        return (_exact(value) - self._offset) / self._scale
+
+
+def _exact(number: float) -> Fraction:
+    """The number as it is written."""
+    return Fraction(repr(number)) if isinstance(number, float) else Fraction(number)

@@ -1,4 +1,0 @@
-"""Services of Windows: installing them, and answering the service control manager.
-
-`installed` and `host` require pywin32, so they are imported only by commands that need them.
-"""

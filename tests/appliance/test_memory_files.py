@@ -1,0 +1,351 @@
+"""Memories that are kept: over restarts, with disks that fail, and what clients are told."""
+
+from __future__ import annotations
+
+import json
+import re
+import resource
+import signal
+import socket
+import urllib.error
+import urllib.request
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from holdfast.appliance import Appliance
+from holdfast.appliance.parts.memories import UnusableFile
+from holdfast.appliance.reload import ReloadRefused
+from holdfast.config import load
+from support import wire
+from support.cli import RunCommand, invoke
+from support.config_folder import Folder, written
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+Settings = dict[str, Any]
+
+UNUSED = {
+    "scada": {
+        "type": "modbus-tcp",
+        "bind": "127.0.0.1:0",
+        "rules": [{"sources": ["127.0.0.0/8"], "units": {1: "plant"}, "access": "read-write"}],
+    }
+}
+
+
+def keeping(sync: float = 0, file: str = "plant.redb", **more: Any) -> Settings:
+    return {"holding_registers": 100, "keep": {"file": file, "sync": sync}, **more}
+
+
+def config(folder: Path, listeners: Settings = UNUSED, **memories: Settings) -> Any:
+    """Loads a configuration; without memories, that of one that is kept."""
+    parts = {"memories": memories or {"plant": keeping()}, "listeners": listeners}
+    (folder / "p.yaml").write_text(written(parts))
+    return load(folder / "p.yaml")
+
+
+@pytest.mark.parametrize("sync", [0, 1, 3600])
+def test_values_survive_a_restart(tmp_path: Path, sync: float) -> None:
+    settings = config(tmp_path, plant=keeping(sync))
+    appliance = Appliance(settings)
+    for number in range(3):
+        with appliance:
+            memory = appliance.memories["plant"]
+            assert memory.read("holding_registers", 5, 1) == [number]
+            memory.write("holding_registers", 5, [number + 1])
+    with Appliance(settings) as other:
+        assert other.memories["plant"].read("holding_registers", 5, 1) == [3]
+
+
+def test_a_crash_costs_at_most_a_second_by_default(tmp_path: Path) -> None:
+    settings = config(tmp_path, plant={"coils": 8, "keep": {"file": "plant.redb"}})
+    assert settings.memories["plant"].keep.sync == 1
+    with Appliance(settings) as appliance:
+        appliance.memories["plant"].write("coils", 0, [1])
+    with Appliance(settings) as again:
+        assert again.memories["plant"].read("coils", 0, 1) == [1]
+
+
+def test_initial_values_are_those_of_the_first_start(tmp_path: Path) -> None:
+    (tmp_path / "values.csv").write_text("holding_registers,1,7\nholding_registers,2,8\n")
+    settings = config(tmp_path, plant=keeping(initial="values.csv"))
+    with Appliance(settings) as first:
+        assert first.memories["plant"].read("holding_registers", 1, 2) == [7, 8]
+        first.memories["plant"].write("holding_registers", 1, [0])
+    with Appliance(settings) as second:
+        assert second.memories["plant"].read("holding_registers", 1, 2) == [0, 8]
+
+
+@pytest.mark.parametrize(("mode", "sealed"), [("once", True), ("level", False)])
+def test_nobody_knows_how_old_the_contents_of_an_open_memory_are(
+    tmp_path: Path, mode: str, sealed: bool
+) -> None:
+    seal = {"area": "discrete_inputs", "address": 3, "mode": mode}
+    settings = config(tmp_path, plant=keeping(discrete_inputs=8, seal=seal))
+    with Appliance(settings) as first:
+        first.memories["plant"].write("discrete_inputs", 3, [1])
+        assert not first.memories["plant"].sealed
+    with Appliance(settings) as second:
+        memory = second.memories["plant"]
+        assert memory.sealed == sealed
+        memory.write("holding_registers", 0, [1])
+        assert memory.sealed == sealed
+        memory.write("discrete_inputs", 3, [1])
+        assert not memory.sealed
+
+
+def test_addresses_that_remain_keep_their_values(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Appliance(config(tmp_path)) as first:
+        first.memories["plant"].write("holding_registers", 0, range(100))
+    smaller = keeping(holding_registers={"start": 50, "size": 60}, coils=8)
+    with Appliance(config(tmp_path, plant=smaller)) as second:
+        values = second.memories["plant"].read("holding_registers", 50, 60)
+        assert values == [*range(50, 100), *[0] * 10]
+    told = [vars(each)["fields"] for each in caplog.records if each.message.endswith("_differs")]
+    assert any("holding_registers" in each["warning"] for each in told)
+
+
+def test_values_of_an_area_that_is_gone_for_one_start_come_back(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = keeping(coils=8)
+    with Appliance(config(tmp_path, plant=whole)) as first:
+        first.memories["plant"].write("holding_registers", 0, range(100))
+        first.memories["plant"].write("coils", 3, [1])
+    for _ in range(2):
+        caplog.clear()
+        with Appliance(config(tmp_path, plant=keeping(holding_registers=10))) as second:
+            second.memories["plant"].write("holding_registers", 9, [77])
+        fields = [vars(each)["fields"] for each in caplog.records]
+        warnings = [each["warning"] for each in fields if "warning" in each]
+        assert "set aside in the file: coils 0-7, holding_registers 10-99" in warnings[-1]
+        assert "'holdfast memory release' deletes them" in warnings[-1]
+    with Appliance(config(tmp_path, plant=whole)) as third:
+        memory = third.memories["plant"]
+        assert memory.read("holding_registers", 0, 100) == [*range(9), 77, *range(10, 100)]
+        assert memory.read("coils", 0, 8) == [0, 0, 0, 1, 0, 0, 0, 0]
+
+
+def test_memories_in_one_file_are_written_in_one_step(tmp_path: Path) -> None:
+    both = {"one": keeping(), "plant": keeping(), "alone": keeping(file="alone.redb")}
+    with Appliance(config(tmp_path, **both)) as appliance:
+        assert appliance.memories["one"].waits
+    names = sorted(file.name for file in tmp_path.glob("*.redb"))
+    assert names == ["alone.redb", "plant.redb"]
+
+
+def test_a_file_that_is_damaged_or_in_use_keeps_everything_from_starting(tmp_path: Path) -> None:
+    settings = config(tmp_path)
+    with Appliance(settings):
+        with pytest.raises(UnusableFile, match=r"plant\.redb: .*in use") as caught:
+            Appliance(settings).start()
+        assert str(tmp_path) in str(caught.value)
+    file = tmp_path / "plant.redb"
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UnusableFile, match=r"plant\.redb: .*damaged"):
+        Appliance(settings).start()
+    assert file.read_bytes() == whole[: len(whole) // 2]
+    result = invoke("run", str(tmp_path / "p.yaml"))
+    assert result.exit_code == 2
+    [line] = result.stderr.splitlines()
+    assert line.startswith(f"holdfast: {file}: ")
+
+
+def test_keep_takes_effect_at_a_start(tmp_path: Path) -> None:
+    with Appliance(config(tmp_path)) as appliance:
+        for other in (keeping(1), {"holding_registers": 100}, keeping(file="other.redb")):
+            with pytest.raises(ReloadRefused, match=r"memories\.plant: keep changed"):
+                appliance.reload(config(tmp_path, plant=other))
+        both = {"plant": keeping(), "new": keeping()}
+        with pytest.raises(ReloadRefused, match=r"memories\.new: added with keep or replicate"):
+            appliance.reload(config(tmp_path, **both))
+        assert appliance.reload(config(tmp_path)) == []
+
+
+@pytest.mark.parametrize(
+    ("keep", "problem"),
+    [
+        ("{file: none/x.redb}", "memories.plant.keep.file: found 'none/x.redb', whose folder does"),
+        ("{file: .}", "memories.plant.keep.file: found '.', which is a folder"),
+        (
+            "{file: x.redb, sync: -1}",
+            "memories.plant.keep.sync: found -1, allowed: a number from 0 to 3600",
+        ),
+        ("{file: x.redb, snyc: 0}", "memories.plant.keep.snyc: unknown key, allowed: file, sync"),
+        ("{sync: 0}", "memories.plant.keep.file: missing, allowed: text"),
+    ],
+)
+def test_settings_are_checked(tmp_path: Path, keep: str, problem: str) -> None:
+    text = f"memories:\n  plant: {{coils: 8, keep: {keep}}}\nlisteners: {written(UNUSED)}\n"
+    [found] = Folder(tmp_path).problems(text)
+    assert problem in found
+
+
+def test_memories_in_one_file_have_the_same_sync(tmp_path: Path) -> None:
+    memories = {"plant": keeping(0), "other": keeping(1)}
+    [found] = Folder(tmp_path).problems(written({"memories": memories, "listeners": UNUSED}))
+    assert "memories.other.keep.sync: found 1, allowed: 0, as plant has for the file" in found
+
+
+LISTENERS = """
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:0
+    rules: [{sources: [127.0.0.0/8], units: {1: plant, 2: volatile}, access: read-write}]
+  sender:
+    type: raw-ingest
+    bind: 127.0.0.1:0
+    format: v1
+    rules: [{sources: [127.0.0.0/8], units: {1: plant}, areas: [holding_registers]}]
+rest: {bind: "127.0.0.1:0", sources: [127.0.0.0/8], tokens: none}
+metrics: {bind: "127.0.0.1:0", sources: [127.0.0.0/8]}
+"""
+
+
+class Plant:
+    """A running `holdfast run` whose disk can be full."""
+
+    def __init__(self, folder: Path, sync: float) -> None:
+        memories = {"plant": keeping(sync), "volatile": {"holding_registers": 100}}
+        self.file = folder / "p.yaml"
+        self.file.write_text(f"memories: {written(memories)}\n{LISTENERS}")
+        self.command = RunCommand(self.file)
+        self.scada = self.command.wait_until_it_serves()
+        self.greeting = self.command.greeting
+
+    def port(self, name: str) -> int:
+        found = re.search(rf"^ *{name} .*127\.0\.0\.1:([0-9]+)", self.greeting, re.MULTILINE)
+        assert found is not None, self.greeting
+        return int(found[1])
+
+    def disk(self, *, full: bool) -> None:
+        """Lets no file of the process grow or be written, or lets it again."""
+        pid = self.command.process.pid
+        _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (0 if full else hard, hard))
+
+    def until_logged(self, text: str) -> None:
+        log = self.command.process.stderr
+        assert log is not None
+        assert any(text in line for line in iter(log.readline, ""))
+
+    def modbus(self, pdu: str, unit: int = 1) -> str:
+        with wire.Connection(self.scada) as connection:
+            return connection.ask(bytes.fromhex(pdu), unit).hex()
+
+    def rest(self, *commands: tuple[str, int]) -> tuple[int, str]:
+        body = [
+            {"memory": memory, "area": "holding_registers", "address": 3, "values": [value]}
+            for memory, value in commands
+        ]
+        request = urllib.request.Request(
+            f"http://127.0.0.1:{self.port('rest')}/api/v1/ingest",
+            json.dumps(body if len(body) > 1 else body[0]).encode(),
+            {"Content-Type": "application/json"},
+        )
+        try:
+            with urllib.request.urlopen(request, timeout=wire.DEADLINE) as answer:
+                return answer.status, json.load(answer)["status"]
+        except urllib.error.HTTPError as error:
+            return error.code, json.load(error)["reason"]
+
+    def packet(self, value: int) -> bytes:
+        with socket.create_connection(("127.0.0.1", self.port("sender"))) as sender:
+            sender.settimeout(wire.DEADLINE)
+            sender.sendall(bytes.fromhex("52490103000100030001") + value.to_bytes(2, "big"))
+            return sender.recv(16)
+
+    def metric(self, name: str) -> float:
+        url = f"http://127.0.0.1:{self.port('metrics')}/metrics"
+        with urllib.request.urlopen(url, timeout=wire.DEADLINE) as answer:
+            lines = answer.read().decode().splitlines()
+        [value] = [line.rpartition(" ")[2] for line in lines if line.startswith(f"{name}{{")]
+        return float(value)
+
+
+@pytest.fixture
+def plant(tmp_path: Path, request: pytest.FixtureRequest) -> Any:
+    made = Plant(tmp_path, request.param)
+    yield made
+    made.command.process.kill()
+    made.command.process.communicate()
+
+
+@pytest.mark.parametrize("plant", [0], indirect=True)
+def test_with_a_full_disk_no_write_is_confirmed_and_none_is_carried_out(plant: Plant) -> None:
+    assert plant.modbus("0600030007") == "0600030007"
+    assert plant.packet(8) == b"\0"
+    assert plant.rest(("plant", 9)) == (200, "accepted")
+    plant.disk(full=True)
+    assert plant.modbus("0600030001") == "8604"
+    assert plant.modbus("10000300010200ff") == "9004"
+    assert plant.modbus("16000300000001") == "9604"
+    assert plant.modbus("170003000100030001020001") == "9704"
+    assert plant.packet(1) == b"\1"
+    assert plant.rest(("plant", 1)) == (503, "not_stored")
+    assert plant.modbus("0300030001") == "03020009"
+    # Other memories are not concerned.
+    assert plant.modbus("0600030001", unit=2) == "0600030001"
+    assert plant.metric("holdfast_memory_file_failing") == 1
+    plant.disk(full=False)
+    wire.until(lambda: plant.modbus("060003000a") == "060003000a", "it recovers by itself")
+    wire.until(lambda: plant.metric("holdfast_memory_file_failing") == 0, "it says so")
+    assert plant.metric("holdfast_memory_file_refused_total") >= 6
+    plant.command.process.kill()
+    plant.command.process.communicate()
+    again = RunCommand(plant.file)
+    try:
+        plant.scada = again.wait_until_it_serves()
+        assert plant.modbus("0300030001") == "0302000a"
+        code, log = again.end(signal.SIGTERM)
+    finally:
+        again.process.kill()
+    assert code == 0
+    assert " info memory_file file=" in log
+
+
+@pytest.mark.parametrize("plant", [0], indirect=True)
+def test_a_batch_is_one_step_or_none(plant: Plant) -> None:
+    assert plant.rest(("plant", 1), ("volatile", 1)) == (400, "not_one_step")
+    assert plant.rest(("plant", 1), ("plant", 2)) == (200, "accepted")
+    assert plant.modbus("0300030001") == "03020002"
+    assert plant.modbus("0300030001", unit=2) == "03020000"
+
+
+@pytest.mark.parametrize("plant", [0.05], indirect=True)
+def test_with_sync_above_0_a_memory_goes_on_without_its_disk(plant: Plant) -> None:
+    plant.disk(full=True)
+    assert plant.modbus("0600030007") == "0600030007"
+    plant.until_logged("error memory_file_failing")
+    assert plant.metric("holdfast_memory_file_failing") == 1
+    assert plant.rest(("plant", 8), ("volatile", 8)) == (200, "accepted")
+    plant.disk(full=False)
+    plant.until_logged("info memory_file_back")
+    assert plant.metric("holdfast_memory_file_failing") == 0
+    assert plant.command.end(signal.SIGTERM)[0] == 0
+    with Appliance(load(plant.file)) as again:
+        assert again.memories["plant"].read("holding_registers", 3, 1) == [8]
+
+
+def test_a_mirror_is_kept_too(tmp_path: Path) -> None:
+    source = holdfast.Memory(holding_registers=10)
+    with holdfast.Server({1: source}, bind="127.0.0.1:0", access="read-write") as device:
+        host, port = device.address
+        read = {"area": "holding_registers", "address": 0, "count": 10}
+        read |= {"into": {"memory": "plant", "area": "holding_registers", "address": 0}}
+        meter = {"url": f"tcp://{host}:{port}", "unit": 1, "interval": 0.02, "reads": [read]}
+        parts = {"memories": {"plant": keeping()}, "devices": {"meter": meter}, "listeners": UNUSED}
+        (tmp_path / "p.yaml").write_text(written(parts))
+        source.write("holding_registers", 0, [42])
+        with Appliance(load(tmp_path / "p.yaml")) as appliance:
+            memory = appliance.memories["plant"]
+            wire.until(lambda: memory.read("holding_registers", 0, 1) == [42], "it is mirrored")
+    with Appliance(config(tmp_path)) as again:
+        assert again.memories["plant"].read("holding_registers", 0, 1) == [42]

@@ -1,0 +1,81 @@
+"""`holdfast log status` and `holdfast log replay --follow`, beside a running appliance."""
+
+from __future__ import annotations
+
+import signal
+from typing import TYPE_CHECKING
+
+import pytest
+
+from support import wire
+from support.brokers import NatsServer, free_port
+from support.cli import RunCommand, answer, invoke
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+CONFIGURATION = """
+memories: {{plant: {{holding_registers: 100, replicate: {{log: site}}}}}}
+logs: {{site: {{servers: ["{url}"], node: scada-a, write_timeout: 10}}}}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:0
+    rules: [{{sources: [127.0.0.0/8], units: {{1: plant}}, access: read-write}}]
+"""
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[NatsServer]:
+    (tmp_path / "server").mkdir()
+    server = NatsServer(tmp_path / "server")
+    yield server
+    server.kill()
+
+
+@pytest.fixture
+def node(tmp_path: Path, server: NatsServer) -> Iterator[RunCommand]:
+    file = tmp_path / "plant.yaml"
+    file.write_text(CONFIGURATION.format(url=server.url))
+    command = RunCommand(file)
+    yield command
+    command.process.kill()
+    command.process.communicate()
+
+
+def test_a_signal_ends_a_start_that_waits_for_the_log(tmp_path: Path) -> None:
+    file = tmp_path / "a plant.yaml"
+    file.write_text(CONFIGURATION.format(url=f"nats://127.0.0.1:{free_port()}"))
+    command = RunCommand(file)
+    try:
+        log = command.process.stderr
+        assert log is not None
+        assert any("log_joining log=site" in line for line in iter(log.readline, ""))
+        code, more = command.end(signal.SIGTERM)
+    finally:
+        command.process.kill()
+    assert (code, more) == (0, "")
+
+
+def test_the_nodes_of_a_log_are_shown(node: RunCommand, server: NatsServer, tmp_path: Path) -> None:
+    file = str(tmp_path / "plant.yaml")
+    with wire.Connection(node.wait_until_it_serves()) as connection:
+        connection.ask(bytes.fromhex("060003002a"))
+        status = answer("log", "status", file)["logs"]["site"]
+        assert (status["phase"], status["connected"], status["steps"]) == ("running", True, 1)
+        lines = invoke("log", "status", file).stdout.splitlines()
+        assert lines[0] == f"log site: running, connected to {server.url.removeprefix('nats://')}"
+        assert lines[2] == "  writes of this node: 1 done, 0 not sent, 0 not confirmed"
+        assert lines[3].split()[:3] == ["node", "last", "message"]
+        assert lines[4].split()[0] == "scada-a"
+        server.kill()
+        wire.until(lambda: invoke("log", "status", file).exit_code == 3, "the log is away")
+        assert connection.ask(bytes.fromhex("060003002b")) == bytes.fromhex("8606")
+    lines = invoke("log", "status", file).stdout.splitlines()
+    assert lines[0] == "log site: running, not connected"
+    assert lines[2] == "  writes of this node: 1 done, 1 not sent, 0 not confirmed"
+    assert lines[3].startswith("  last error: ")
+    assert node.end(signal.SIGTERM)[0] == 0
+    result = invoke("log", "status", file)
+    assert (result.exit_code, result.stdout) == (1, "")

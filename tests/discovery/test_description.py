@@ -1,0 +1,178 @@
+"""A device is described as tags that do not overlap."""
+
+from __future__ import annotations
+
+import dataclasses
+import random
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import holdfast
+from holdfast import values
+from holdfast.client.tag_reading import TagReader
+from holdfast.config.tag_files.read import load_tags
+from holdfast.config.tag_files.write import tags_as_yaml
+from holdfast.discovery import description, sunspec
+from holdfast.discovery.address_search import LimitReached, Survey
+from holdfast.discovery.description import Description
+from holdfast.tags.scale import RegisterScale
+from support import cli, plant_data, sunspec_device
+from support.cases import examples
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from holdfast.discovery.description import Described
+    from support.running import Serve
+
+
+def described(server: holdfast.Server, **options: Any) -> Description:
+    """Describes unit 1 of a server, with one read."""
+    found = Description(1, Survey(**options))
+    with holdfast.SyncClient(cli.url(server)) as client:
+        description.describe(found, client, reads=1, every=1, delay=0)
+    description.conclude(found)
+    return found
+
+
+def types(found: Description) -> dict[str, tuple[str, str]]:
+    return {each.tag.name: (each.tag.type, each.tag.order) for each in found.tags}
+
+
+def test_values_of_a_device_are_recognised(serve: Serve) -> None:
+    memory = holdfast.Memory(coils=(5, 3), holding_registers=60, input_registers=(30001, 3))
+    volts = [each for v in (230.1, 231.4, 229.8) for each in values.encode(v, "float32", "CDAB")]
+    memory.write("holding_registers", 0, [*volts, *values.encode(1234567, "uint32", "CDAB")])
+    memory.write("holding_registers", 40, [455, 65481, *values.encode("PUMP-01", "string:8")])
+    memory.write("input_registers", 30001, [215, 1013, 48])
+    found = described(serve({1: memory}))
+    assert types(found) == {
+        "co_5": ("bool", "ABCD"),
+        "co_6": ("bool", "ABCD"),
+        "co_7": ("bool", "ABCD"),
+        "hr_0": ("float32", "CDAB"),
+        "hr_2": ("float32", "CDAB"),
+        "hr_4": ("float32", "CDAB"),
+        "hr_6": ("uint32", "CDAB"),
+        "hr_8": ("uint16[32]", "ABCD"),
+        "hr_40": ("uint16", "ABCD"),
+        "hr_41": ("int16", "ABCD"),
+        "hr_42": ("string:8", "ABCD"),
+        "hr_46": ("uint16[14]", "ABCD"),
+        "ir_30001": ("uint16", "ABCD"),
+        "ir_30002": ("uint16", "ABCD"),
+        "ir_30003": ("uint16", "ABCD"),
+    }
+    sure = {each.tag.name: each.confidence for each in found.tags}
+    assert sure["hr_0"] > 0.9
+    assert sure["hr_8"] == 0.3
+    assert found.orders["CDAB"] > 0.9
+
+
+def test_sunspec_is_decoded_and_not_guessed(serve: Serve) -> None:
+    registers = sunspec_device.registers(sunspec_device.common(), sunspec_device.inverter())
+    memory = holdfast.Memory(holding_registers=(40000, 200))
+    memory.write("holding_registers", 40000, registers)
+    memory.write("holding_registers", 40000 + len(registers), [455])
+    found = described(serve({1: memory}), areas=["holding_registers"])
+    tags = {each.tag.name: each.tag for each in found.tags}
+    current = tags["inverter_three_phase_A"]
+    assert (current.address, current.unit) == (40072, "A")
+    assert current.null == {0xFFFF}
+    assert isinstance(current.scale, RegisterScale)
+    assert current.span == range(40072, 40077)
+    assert current.with_scale(-1).value(215) == 21.5
+    assert not current.writable
+    assert tags["inverter_three_phase_St"].state(4) == "MPPT"
+    assert "inverter_three_phase_PPVphAB" not in tags
+    behind = 40000 + len(registers)
+    assert tags[f"hr_{behind}"].type == "uint16"
+    assert not any(name.startswith("hr_400") for name in tags)
+
+
+def test_a_sunspec_value_follows_its_scale_factor(serve: Serve, tmp_path: Path) -> None:
+    registers = sunspec_device.registers(sunspec_device.inverter())
+    power, factor = 40004 + 12, 40004 + 13
+    memory = holdfast.Memory(holding_registers=(40000, len(registers)))
+    memory.write("holding_registers", 40000, registers)
+    memory.write("holding_registers", power, [4320, 0])
+    server = serve({1: memory})
+    found = described(server, areas=["holding_registers"])
+    file = tmp_path / "inverter.yaml"
+    file.write_text(tags_as_yaml(each.tag for each in found.tags), encoding="utf-8")
+    reader = TagReader([load_tags(file)["inverter_three_phase_W"]])
+    with holdfast.SyncClient(cli.url(server)) as client:
+        for number, exponent, expected in ((4320, 0, 4320), (432, 1, 4320), (15, 0xFFFF, 1.5)):
+            memory.write("holding_registers", power, [number, exponent])
+            [reading] = reader.read(client)
+            assert (reading.value, reading.error) == (expected, None)
+        memory.write("holding_registers", factor, [0x8000])
+        [reading] = reader.read(client)
+        assert reading.value is None
+        assert "10^-32768, allowed: exponents from -10 to 10" in str(reading.error)
+
+
+def test_a_scale_factor_that_is_too_far_leaves_the_raw_number() -> None:
+    far = sunspec.Point(
+        name="far",
+        address=200,
+        type="int16",
+        scale=0.1,
+        scaled_by="X_SF",
+        scaled_at=40,
+        unit="W",
+        label="",
+        can_be_written=False,
+        states={},
+        missing=None,
+        value=7,
+    )
+    near = dataclasses.replace(far, name="near", address=164)
+    model = sunspec.Model(160, "mppt", "", 2, 300, (near, far))
+    spec = sunspec.SunSpec(0, (model,), is_complete=True)
+    found = Description(1, Survey(["holding_registers"]), sunspec=spec)
+    description.conclude(found)
+    first, second = (each.tag for each in found.tags)
+    assert (first.name, first.unit, first.span) == ("mppt_near", "W", range(40, 165))
+    assert (second.name, second.unit, second.scale) == ("mppt_far_raw", "", 1)
+    assert "no scale from X_SF, which is at 40" in second.description
+
+
+def overlaps(tags: list[Described]) -> bool:
+    ends: dict[str, int] = {}
+    for each in tags:
+        if each.tag.address < ends.get(each.tag.area, 0):
+            return True
+        ends[each.tag.area] = each.tag.end
+    return False
+
+
+@given(st.integers(0, 10_000), st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=60))
+@settings(max_examples=examples(30))
+def test_tags_cover_every_address_once(seed: int, noise: list[int]) -> None:
+    chosen = random.Random(seed)
+    registers = [*plant_data.sample(chosen).reads[0], *noise, *[0] * chosen.randint(0, 90)]
+    found = Description(1, Survey(["holding_registers", "coils"]))
+    found.reads["holding_registers", range(7, 7 + len(registers))] = [registers]
+    found.reads["coils", range(300)] = [[1, 0, 1] * 100]
+    description.conclude(found)
+    assert not overlaps(found.tags)
+    sizes = {"holding_registers": len(registers), "coils": 300}
+    for area, size in sizes.items():
+        assert sum(each.tag.count for each in found.tags if each.tag.area == area) == size
+    assert len({each.tag.name for each in found.tags}) == len(found.tags)
+    assert all(0 <= each.confidence <= 1 for each in found.tags)
+
+
+def test_what_was_seen_is_described_if_the_search_ends_early(serve: Serve) -> None:
+    memory = holdfast.Memory(holding_registers=10)
+    memory.write("holding_registers", 0, [455, 2150, 1])
+    found = Description(1, Survey(["holding_registers"], max_requests=30))
+    with holdfast.SyncClient(cli.url(serve({1: memory}))) as client, pytest.raises(LimitReached):
+        description.describe(found, client, reads=3, every=1, delay=0)
+    description.conclude(found)
+    assert found.tags[0].values == (455,)
+    assert found.survey.areas[0].state == "partly"

@@ -1,0 +1,243 @@
+"""The text that publishes many messages at once, with the real server."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, cast
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from nats.errors import Error, ProtocolError
+
+from holdfast.net.nats import Outbox, SafeClient, batch, tolerant_client
+from holdfast.scanner.messages.types import Answer
+from support.nats_bus import Caller
+from support.wire import until as wire_until
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from support.brokers import NatsServer
+
+
+def test_texts_are_messages_in_their_order(nats: NatsServer, caller: Caller) -> None:
+    inbox = caller.listen("wire.>")
+    texts = [
+        batch.message(f"wire.{number}", Answer(success=True, count=number)) for number in range(500)
+    ]
+    texts.append(batch.text("wire.größe", '"größe"'.encode()))
+    caller.do(batch.send(caller.client, b"".join(texts), len(texts)))
+    found = [inbox.next() for _ in texts]
+    assert found[:-1] == [{"success": True, "count": number} for number in range(500)]
+    assert found[-1] == "größe"
+    assert "error" not in nats.log.lower()
+
+
+def test_texts_mix_with_what_the_client_publishes_itself(caller: Caller) -> None:
+    inbox = caller.listen("wire.>")
+
+    async def mixed() -> None:
+        for number in range(100):
+            await batch.send(caller.client, batch.text("wire.a", b"%d" % number) * 2, 2)
+            await caller.client.publish("wire.b", b"%d" % number)
+
+    caller.do(mixed())
+    expected = [number for number in range(100) for _ in range(3)]
+    assert [inbox.next() for _ in expected] == expected
+
+
+def test_a_batch_larger_than_all_buffers_arrives(caller: Caller) -> None:
+    inbox = caller.listen("wire.>")
+    payload = b'"%b"' % (b"x" * 1000)
+    text = batch.text("wire.a", payload)
+    caller.do(batch.send(caller.client, text * 5000, 5000))
+    for _ in range(5000):
+        assert len(inbox.next()) == 1000
+
+
+def test_what_waits_when_the_connection_breaks_goes_with_the_next(own_nats: NatsServer) -> None:
+    with Caller(own_nats.url) as caller:
+        inbox = caller.listen("wire.>")
+        own_nats.kill()
+        wire_until(lambda: not caller.client.is_connected, "the connection is lost")
+        caller.do(batch.send(caller.client, batch.text("wire.a", b"1") * 10, 10))
+        own_nats.start()
+        assert [inbox.next() for _ in range(10)] == [1] * 10
+
+
+@pytest.fixture
+def sender(nats: NatsServer) -> Iterator[tuple[Caller, SafeClient]]:
+    """A client of the product, and its caller."""
+    client = SafeClient()
+    with Caller(nats.url, client) as caller:
+        yield caller, client
+
+
+def test_what_a_node_may_send_is_sent_before_anything_else_runs(
+    sender: tuple[Caller, SafeClient],
+) -> None:
+    """What waits in a process that is stopped would be sent when it goes on, by a former owner."""
+    caller, client = sender
+    left: list[int] = []
+
+    async def work() -> None:
+        loop = asyncio.get_running_loop()
+
+        def may_send() -> bool:
+            loop.call_soon(lambda: left.append(batch.unsent(client)))
+            return True
+
+        outbox = Outbox(may_send=may_send, at_once=True)
+        outbox.connected(client)
+        running = asyncio.create_task(outbox.run())
+        for number in range(100):
+            outbox.put([("a", batch.text("wire.a", b"%d" % number))])
+            while outbox.sent <= number:
+                await asyncio.sleep(0)
+        running.cancel()
+
+    inbox = caller.listen("wire.>")
+    caller.do(work())
+    assert [inbox.next() for _ in range(100)] == list(range(100))
+    assert left == [0] * 100
+
+
+def test_a_node_waits_for_what_its_client_has_not_sent(
+    sender: tuple[Caller, SafeClient],
+) -> None:
+    caller, client = sender
+
+    async def work() -> None:
+        outbox = Outbox(at_once=True)
+        outbox.connected(client)
+        running = asyncio.create_task(outbox.run())
+        await client.publish("wire.a", b"1")
+        outbox.put([("a", batch.text("wire.a", b"2"))])
+        while not outbox.sent:
+            await asyncio.sleep(0)
+        running.cancel()
+
+    inbox = caller.listen("wire.>")
+    caller.do(work())
+    assert [inbox.next() for _ in range(2)] == [1, 2]
+
+
+class _Heard(SafeClient):
+    """A client that notes what the server sends, and receives what a test puts into `reader`."""
+
+    def __init__(self, *, requires_tls: bool = False) -> None:
+        super().__init__(requires_tls=requires_tls)
+        self.heard: list[Any] = []
+        self.reader = self.transport._io_reader = asyncio.StreamReader()
+
+    async def receive(self, data: bytes) -> None:
+        """Does with these bytes what the client does with what it reads."""
+        self.reader.feed_data(data)
+        await self._ps.parse(await self.transport.read(2 * tolerant_client.MAX_LINE_BYTES))
+
+    async def _process_msg(self, *arguments: Any) -> None:
+        self.heard.append(arguments)
+
+    async def _process_ping(self) -> None:
+        self.heard.append("ping")
+
+    async def _process_pong(self) -> None:
+        self.heard.append("pong")
+
+    async def _process_err(self, err_msg: str) -> None:
+        self.heard.append(err_msg)
+
+    async def _process_info(self, info: Any, initial_connection: bool = False) -> None:
+        assert not initial_connection
+        self.heard.append(info)
+
+
+LINES = (
+    b'PING\r\nMSG a.b 1 2\r\n\r\n\r\nMSG a\x0bb\xff 12\t_I.\x0c  5\r\nMSG 1\r\nINFO {"a": "b"} \r\n'
+    b"HMSG c 3 12 13\r\nNATS/1.0\r\n\r\nx\r\n+OK\r\n"
+    b"HMSG c 3 r 7 7\r\ngarbage\r\n-ERR 'Some Thing'\r\n-ERR Oh\xff\r\n-ERR\r\n"
+    b"PONG\r\nMSG d 4 0\r\n\r\n"
+)
+MESSAGES = [
+    (1, b"a.b", b"", b"\r\n", b""),
+    (12, b"a\x0bb\xff", b"_I.\x0c", b"MSG 1", b""),
+    (3, b"c", b"", b"x", b"NATS/1.0\r\n\r\n"),
+    (3, b"c", b"r", b"", b"garbage"),
+    (4, b"d", b"", b"", b""),
+]
+OTHERS = ["ping", {"a": "b"}, "'some thing'", "'oh\\xff'", "'no reason given'", "pong"]
+
+
+@given(st.lists(st.integers(0, len(LINES)), max_size=40))
+def test_what_the_server_sends_is_taken_apart_wherever_it_is_cut(cuts: list[int]) -> None:
+    async def heard() -> list[Any]:
+        client = _Heard()
+        for start, end in pairwise(sorted({0, *cuts, len(LINES)})):
+            await client.receive(LINES[start:end])
+        return client.heard
+
+    found = asyncio.run(heard())
+    assert [each for each in found if isinstance(each, tuple)] == MESSAGES
+    assert [each for each in found if not isinstance(each, tuple)] == OTHERS
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"HELLO",
+        b"MSG a",
+        b"MSG a b 1",
+        b"MSG a 1 x",
+        b"HMSG a 1 2",
+        b"INFO {",
+        b"INFO 1",
+        b"",
+        b"x" * (tolerant_client.MAX_LINE_BYTES + 1),
+    ],
+)
+def test_a_line_that_no_server_sends_ends_the_connection(line: bytes) -> None:
+    async def parse() -> None:
+        await _Heard().receive(line + b"\r" + b"\n" * (len(line) < tolerant_client.MAX_LINE_BYTES))
+
+    with pytest.raises(ProtocolError):
+        asyncio.run(parse())
+
+
+def test_a_first_line_that_is_too_long_is_an_error_of_nats() -> None:
+    async def begin() -> None:
+        client = _Heard()
+        client.reader.feed_data(b"INFO " + b" " * 2**18)
+        await client.transport.readline()
+
+    with pytest.raises(Error, match="too long"):
+        asyncio.run(begin())
+
+
+def test_a_message_after_the_answer_to_a_ping_was_sent_after_the_ping() -> None:
+    """Also when both arrive together, and though the client knows nothing of the ping."""
+
+    async def ages() -> tuple[_Heard, list[float]]:
+        client = _Heard()
+        found: list[float] = []
+
+        async def note(*_: Any) -> None:
+            found.append(client._build_message(1, b"a", b"", b"", None).sent_after)
+
+        client._process_msg = note  # type: ignore[method-assign]
+        client.transport._io_writer = cast("Any", _Sink())
+        client.transport.ping()
+        client.transport.write(b"PING\r\n")
+        message = b"MSG a 1 0\r\n\r\n"
+        await client.receive(b"PONG\r\n".join([message] * 3))
+        return client, found
+
+    client, [first, second, third] = asyncio.run(ages())
+    assert -math.inf == first < second < third == client.transport.pinged
+    assert client.heard == ["pong"]
+
+
+class _Sink:
+    def write(self, data: bytes) -> None: ...
