@@ -19,7 +19,7 @@ ifneq ($(OS),Windows_NT)
 export PATH := $(CURDIR)/.cache/toolchain/bin:$(PATH)
 endif
 
-.PHONY: build run test test-python test-rust test-slow explore fuzz proof torture lint audit no-std format bench docs site \
+.PHONY: build run test test-python test-rust test-again test-slow explore fuzz proof torture lint audit no-std format bench docs site \
   pictures dist dist-check lock clean deb container release-check
 .DELETE_ON_ERROR:
 
@@ -35,6 +35,10 @@ test: .venv/core.stamp .venv/dev.stamp
 PYTEST := $(BIN)/pytest -n 6 --dist worksteal
 test-python: .venv/core.stamp .venv/dev.stamp
 	$(PYTEST) --slow without
+
+# The Python cases that failed in the last run, or all of them if none did, and all Rust cases.
+test-again: .venv/core.stamp .venv/dev.stamp test-rust
+	$(PYTEST) --slow without --last-failed
 
 # What the Rust tests print is kept, and shown if one fails.
 RUST_LOG := .cache/test-rust.log
