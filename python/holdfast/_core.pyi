@@ -1466,3 +1466,19 @@ def plan_blocks(
     A request is an area, an address, a count, the indexes of its fields, and the number of bits or
     registers outside all fields. Raises `ValueError` for a field that no request may read.
     """
+
+YamlEvent = tuple[
+    Literal["plain", "quoted", "list", "mapping", "end", "alias"],
+    int,
+    int,
+    int | None,
+    str | None,
+    str | None,
+]
+
+def yaml_events(text: str, most: int) -> list[YamlEvent] | None:
+    """The events of a YAML document of at most `most` values; more end it early.
+
+    An event is what it is, its line and column from 1, the anchor that it has or names, its tag
+    and its text. `None` for text that is not YAML, has several documents, or nests deeper than 255.
+    """

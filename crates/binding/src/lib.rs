@@ -27,6 +27,7 @@ mod poller;
 mod raw_ingest;
 mod server_tls;
 mod write_queue;
+mod yaml;
 
 use pyo3::prelude::*;
 
@@ -70,6 +71,8 @@ mod _core {
     use super::server_tls::{ServerTls, https_server_tls};
     #[pymodule_export]
     use super::write_queue::WriteQueue;
+    #[pymodule_export]
+    use super::yaml::yaml_events;
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

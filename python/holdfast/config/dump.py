@@ -5,20 +5,20 @@ The functions take plain data, not models.
 
 from __future__ import annotations
 
-import io
 import re
-import sys
-from collections.abc import Iterable
+from collections.abc import Iterator
+from functools import lru_cache
+from math import isfinite, isnan
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap, CommentedSeq
-from ruamel.yaml.nodes import ScalarNode
-from ruamel.yaml.representer import RoundTripRepresenter
-from ruamel.yaml.scalarstring import DoubleQuotedScalarString
+import msgspec
 
 from holdfast.config.text.source import scalar
+
+WIDTH = 100
+"""What is longer on one line has a line for each entry."""
+INDENT = 2
 
 NULL_IS_SAID = frozenset({"max_connections_per_source"})
 """Keys whose `None` is written as null; other keys without a value are omitted."""
@@ -28,6 +28,9 @@ AS_WRITTEN = frozenset({"options"})
 
 PLAIN = re.compile(r"[A-Za-z0-9_./]([A-Za-z0-9_./+%@-]|:(?=[^ ])| (?=[^ ]))*", re.ASCII)
 """Text that is safe without quotes anywhere in YAML; all other text is quoted."""
+
+ESCAPED = re.compile("[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
+"""What JSON leaves as it is between quotes, and YAML does not allow or may take as a line break."""
 
 
 def effective(model: dict[Any, Any]) -> dict[Any, Any]:
@@ -49,60 +52,56 @@ def _plain(value: object) -> object:
 
 def to_yaml(data: dict[str, Any]) -> str:
     """The YAML text of a mapping; small, deeply nested values are on one line."""
-    yaml = YAML()
-    yaml.Representer = _Representer
-    yaml.width = 100
-    yaml.indent(mapping=2, sequence=4, offset=2)
-    out = io.StringIO()
-    yaml.dump({key: _styled(value, depth=1) for key, value in data.items()}, out)
-    return out.getvalue()
+    lines = (line for key, value in data.items() for line in _entry(f"{_text(key)}:", value, 0))
+    return "".join(f"{line}\n" for line in lines)
 
 
-def on_one_line(data: dict[str, Any]) -> str:
-    """The YAML text of a mapping on one line: `{area: coils, address: 3}`."""
-    yaml = YAML()
-    yaml.Representer = _Representer
-    yaml.width = sys.maxsize
-    out = io.StringIO()
-    yaml.dump(_flowing(data), out)
-    return out.getvalue().strip()
-
-
-def _flowing(value: object) -> object:
+def on_one_line(value: object) -> str:
+    """The YAML text of a value on one line: `{area: coils, address: 3}`."""
     if isinstance(value, dict):
-        mapping = CommentedMap((_styled(k, 0), _flowing(v)) for k, v in value.items())
-        mapping.fa.set_flow_style()
-        return mapping
+        pairs = (f"{_text(key)}: {on_one_line(each)}" for key, each in value.items())
+        return f"{{{', '.join(pairs)}}}"
     if isinstance(value, list):
-        items = CommentedSeq(map(_flowing, value))
-        items.fa.set_flow_style()
-        return items
-    return _styled(value, 0)
+        return f"[{', '.join(map(on_one_line, value))}]"
+    return _text(value)
 
 
-class _Representer(RoundTripRepresenter):
-    def represent_null(self, data: None) -> ScalarNode:  # noqa: ARG002
-        return self.represent_scalar("tag:yaml.org,2002:null", "null")
+def _entry(start: str, value: object, depth: int) -> Iterator[str]:
+    """The lines of a value after `start`, which is its key and a colon, or the dash of a list."""
+    if not isinstance(value, dict | list) or not value:
+        yield f"{start} {on_one_line(value)}"
+        return
+    inside = value.values() if isinstance(value, dict) else value
+    if depth > 0 and not any(isinstance(item, dict | list) for item in inside):
+        line = f"{start} {on_one_line(value)}"
+        if len(line) + INDENT * depth <= WIDTH:
+            yield line
+            return
+    starts = [f"{_text(key)}:" for key in value] if isinstance(value, dict) else ["-"] * len(value)
+    entries = zip(starts, inside, strict=True)
+    lines = (line for each in entries for line in _entry(*each, depth + 1))
+    # The first key of a mapping follows the dash.
+    yield f"- {next(lines)}" if start == "-" else start
+    for line in lines:
+        yield f"{' ' * INDENT}{line}"
 
 
-_Representer.add_representer(type(None), _Representer.represent_null)
-
-
-def _styled(value: object, depth: int) -> object:
+def _text(value: object) -> str:
+    """The YAML text of a scalar."""
     if isinstance(value, str):
-        plain = PLAIN.fullmatch(value) is not None and scalar(value) == value
-        return value if plain else DoubleQuotedScalarString(value)
-    if isinstance(value, dict):
-        mapping = CommentedMap((_styled(k, 0), _styled(v, depth + 1)) for k, v in value.items())
-        return _on_one_line(mapping, value.values(), depth)
-    if isinstance(value, list):
-        return _on_one_line(CommentedSeq(_styled(v, depth + 1) for v in value), value, depth)
-    return value
+        return _quoted_if_needed(value)
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float) and not isfinite(value):
+        return ".nan" if isnan(value) else ".inf" if value > 0 else "-.inf"
+    return str(value)
 
 
-def _on_one_line(
-    node: CommentedMap | CommentedSeq, items: Iterable[object], depth: int
-) -> CommentedMap | CommentedSeq:
-    if depth > 1 and not any(isinstance(item, dict | list) for item in items):
-        node.fa.set_flow_style()
-    return node
+@lru_cache(4096)
+def _quoted_if_needed(text: str) -> str:
+    if PLAIN.fullmatch(text) and scalar(text) == text:
+        return text
+    quoted = msgspec.json.encode(text).decode()
+    return ESCAPED.sub(lambda found: f"\\u{ord(found[0]):04X}", quoted)

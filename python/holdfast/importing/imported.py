@@ -46,8 +46,7 @@ class Imported:
         if self.notes:
             lines += ["Left out, changed or to be checked:", *map(str, self.notes)]
         comments = "".join(f"# {' '.join(line.splitlines())}\n" for line in lines)
-        body = "".join(f"{line.rstrip()}\n" for line in to_yaml(self.data).splitlines())
-        return f"{comments}\n{body}"
+        return f"{comments}\n{to_yaml(self.data)}"
 
 
 class NotImportable(ConfigError):

@@ -10,26 +10,30 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from enum import Enum
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from ruamel.yaml import YAML
-from ruamel.yaml.composer import Composer, ComposerError
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.nodes import MappingNode, ScalarNode, SequenceNode
-from ruamel.yaml.parser import Parser
-from ruamel.yaml.reader import ReaderError
-from ruamel.yaml.scanner import Scanner
+from ruamel.yaml.error import MarkedYAMLError, StringMark, YAMLError
+from ruamel.yaml.events import (
+    AliasEvent,
+    DocumentStartEvent,
+    MappingEndEvent,
+    MappingStartEvent,
+    ScalarEvent,
+    SequenceEndEvent,
+    SequenceStartEvent,
+)
 
+from holdfast._core import yaml_events
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.runtime import bounded_files
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
-    from ruamel.yaml.nodes import Node
+    from holdfast._core import YamlEvent
 
 Key: TypeAlias = str | int
 KeyPath: TypeAlias = tuple[Key, ...]
@@ -51,6 +55,8 @@ _WORDS: Final[dict[str, bool | None]] = {
 }
 _INTEGER = re.compile(r"[-+]?[0-9]{1,400}|0o[0-7]{1,400}|0x[0-9a-fA-F]{1,400}", re.ASCII)
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", re.ASCII)
+_NOT_ALLOWED = re.compile("[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Characters that YAML does not allow (5.1), which the parser of the core lets pass."""
 _SPECIAL = re.compile(r"(?P<inf>[-+]?\.(inf|Inf|INF))|\.(nan|NaN|NAN)")
 
 
@@ -182,13 +188,11 @@ def read_bytes(path: Path, file: str, max_bytes: int = MAX_BYTES) -> bytes:
 
 def parse(text: str, file: str) -> tuple[Document, list[Problem]]:
     """Returns the document and its problems. Raises `ConfigError` if the YAML is not valid."""
+    if found := _NOT_ALLOWED.search(text):
+        line = text[: found.start()].count("\n") + 1
+        raise _error(file, f"the character U+{ord(found[0]):04X} is not allowed in YAML", line)
     try:
-        reader = _Reader()
-        data, spot = reader.value(_compose(text), ())
-    except ReaderError as error:
-        line = text[: error.position].count("\n") + 1
-        message = f"the character U+{error.character:04X} is not allowed in YAML"
-        raise _error(file, message, line) from None
+        reader = _Reader(yaml_events(text, MAX_WRITTEN) or _slow_events(text))
     except MarkedYAMLError as error:
         raise ConfigError(file, [_syntax(error, file)]) from None
     except YAMLError as error:
@@ -197,6 +201,7 @@ def parse(text: str, file: str) -> tuple[Document, list[Problem]]:
         raise _error(file, f"more than {MAX_WRITTEN} keys and values, the limit") from None
     except RecursionError:
         raise _error(file, "not a configuration: nested too deeply") from None
+    data, spot = reader.document
     if spot.values > MAX_VALUES:
         message = f"found {spot.values} values with aliases expanded, allowed: up to {MAX_VALUES}"
         raise ConfigError(file, [Problem(file, 1, 1, "", message)])
@@ -211,50 +216,32 @@ class _TooMany(Exception):
     """A file has too many keys and values."""
 
 
-class _Scanner(Scanner):
-    """Looks once whether the next token is complete, not at each check: saves a fifth."""
+def _slow_events(text: str) -> Iterator[YamlEvent]:
+    """The events of text that the core refuses, or an exception that says what is wrong with it.
 
-    _next: object = None
-
-    def check_token(self, *choices: type) -> bool:
-        if not self.tokens or self.tokens[0] is not self._next:
-            while self.need_more_tokens():
-                self.fetch_more_tokens()
-            self._next = self.tokens[0] if self.tokens else None
-        return bool(self.tokens) and (not choices or isinstance(self._next, choices))
-
-
-class _Parser(Parser):
-    """Keeps its scanner and resolver, which are properties of properties."""
-
-    scanner = cached_property(lambda parser: parser.loader.scanner)
-    resolver = cached_property(lambda parser: parser.loader.resolver)
-
-
-class _Composer(Composer):
-    """Stops at a file with too many keys and values."""
-
-    parser = cached_property(lambda composer: composer.loader.parser)
-    resolver = cached_property(lambda composer: composer.loader.resolver)
-
-    def __init__(self, loader: Any = None) -> None:
-        super().__init__(loader)
-        self._left = MAX_WRITTEN
-
-    def compose_node(self, parent: Node | None, index: object) -> Node | None:
-        self._left -= 1
-        if self._left < 0:
-            raise _TooMany
-        node: Node | None = super().compose_node(parent, index)
-        return node
-
-
-def _compose(text: str) -> Node | None:
-    yaml = YAML(typ="safe", pure=True)
-    yaml.Scanner, yaml.Parser, yaml.Composer = _Scanner, _Parser, _Composer
-    yaml.composer.warn_double_anchors = False
-    node: Node | None = yaml.compose(text)
-    return node
+    This parser also accepts a `}` left of the key above it, which many write, and nests deeper.
+    """
+    documents = 0
+    for event in YAML(typ="safe", pure=True).parse(text):
+        mark = event.start_mark
+        at = mark.line + 1, mark.column + 1
+        match event:
+            case ScalarEvent():
+                what = "plain" if event.style is None else "quoted"
+                yield what, *at, event.anchor, event.tag, event.value
+            case SequenceStartEvent():
+                yield "list", *at, event.anchor, event.tag, None
+            case MappingStartEvent():
+                yield "mapping", *at, event.anchor, event.tag, None
+            case SequenceEndEvent() | MappingEndEvent():
+                yield "end", *at, None, None, None
+            case AliasEvent():
+                yield "alias", *at, event.anchor, None, None
+            case DocumentStartEvent() if documents:
+                found = "expected a single document in the stream, but found another document"
+                raise MarkedYAMLError(problem=found, problem_mark=mark)
+            case DocumentStartEvent():
+                documents += 1
 
 
 PLAIN_REASONS = {
@@ -280,93 +267,121 @@ def _syntax(error: MarkedYAMLError, file: str) -> Problem:
     start = error.context_mark
     if reason in PLAIN_REASONS:
         reason = PLAIN_REASONS[reason]
-    elif error.context and isinstance(error, ComposerError):  # Two documents: one sentence.
-        reason = f"{error.context}, {reason}"
     elif error.context and start and mark and start.line != mark.line:
         reason += f", {error.context} that starts in line {start.line + 1}"
     return Problem(file, line, column, "", f"not YAML: {reason}")
 
 
 class _Reader:
-    """Converts nodes into data. A node that several aliases name is converted once."""
+    """Makes data of the events of one document."""
 
-    def __init__(self) -> None:
+    def __init__(self, events: Iterable[YamlEvent]) -> None:
         self.mistakes: list[tuple[Place, KeyPath, str]] = []
-        self._done: dict[int, tuple[Any, _Spot]] = {}
-        self._open: set[int] = set()
+        self._events = iter(events)
+        self._left = MAX_WRITTEN
+        self._anchors: dict[int | str, tuple[Any, _Spot] | None] = {}
+        """What an anchor names, `None` while its value is being read."""
+        first = next(self._events, None)
+        empty = None, _Spot(Place(1, 1), kind=_Kind.SCALAR)
+        self.document: Final = empty if first is None else self._value(first, ())
+        next(self._events, None)  # Raises what follows the document and is not allowed there.
 
-    def value(self, node: Node | None, path: KeyPath) -> tuple[Any, _Spot]:
-        if node is None:
-            return None, _Spot(Place(1, 1), kind=_Kind.SCALAR)
-        if id(node) in self._open:
-            self._add(node, path, "an alias inside its own anchor is not allowed")
-            return None, _Spot(_place(node), kind=_Kind.SCALAR)
-        if id(node) not in self._done:
-            self._open.add(id(node))
-            self._done[id(node)] = self._read(node, path)
-            self._open.discard(id(node))
-        return self._done[id(node)]
+    def _value(self, event: YamlEvent, path: KeyPath) -> tuple[Any, _Spot]:
+        self._left -= 1
+        if self._left < 0:
+            raise _TooMany
+        what, _, _, anchor, _, _ = event
+        if what == "alias":
+            assert anchor is not None, "each alias names an anchor"
+            return self._aliased(event, anchor, path)
+        if anchor is None:
+            return self._new_value(event, path)
+        self._anchors[anchor] = None
+        value = self._anchors[anchor] = self._new_value(event, path)
+        return value
 
-    def _read(self, node: Node, path: KeyPath) -> tuple[Any, _Spot]:
-        kind = str(node.tag).removeprefix(_TAG)
-        if isinstance(node, MappingNode) and kind == "map":
-            return self._mapping(node, path)
-        if isinstance(node, SequenceNode) and kind == "seq":
-            return self._list(node, path)
-        empty = isinstance(node, ScalarNode) and node.style is None and node.value == ""
-        spot = _Spot(_place(node), _NO_CHILDREN, _Kind.EMPTY if empty else _Kind.SCALAR)
-        if isinstance(node, ScalarNode):
+    def _aliased(self, event: YamlEvent, anchor: int | str, path: KeyPath) -> tuple[Any, _Spot]:
+        if anchor not in self._anchors:
+            mark = StringMark("", 0, event[1] - 1, event[2] - 1, "", 0)
+            raise MarkedYAMLError(problem=f"found undefined alias {anchor!r}", problem_mark=mark)
+        value = self._anchors[anchor]
+        if value is not None:
+            return value
+        return self._refused(event, path, "an alias inside its own anchor is not allowed")
+
+    def _new_value(self, event: YamlEvent, path: KeyPath) -> tuple[Any, _Spot]:
+        what, line, column, _, tag, text = event
+        if text is not None:
+            kind = "" if tag is None and what == "plain" else (tag or "!").removeprefix(_TAG)
             try:
-                return scalar(node.value, kind), spot
+                data = text if kind == "!" else scalar(text, kind)
             except ValueError as error:
-                self._add(node, path, str(error))
-                return None, spot
-        self._add(node, path, f"the tag {node.tag!r} is not allowed")
-        return None, spot
+                return self._refused(event, path, str(error))
+            empty = text == "" and what == "plain"
+            form = _Kind.EMPTY if empty else _Kind.SCALAR
+            return data, _Spot(Place(line, column), _NO_CHILDREN, form)
+        value = self._list(event, path) if what == "list" else self._mapping(event, path)
+        if tag in (None, "!", f"{_TAG}seq" if what == "list" else f"{_TAG}map"):
+            return value
+        return self._refused(event, path, f"the tag {tag!r} is not allowed")
 
-    def _list(self, node: SequenceNode, path: KeyPath) -> tuple[Any, _Spot]:
-        spot = _Spot(_place(node), kind=_Kind.LIST)
-        data = []
-        for index, item in enumerate(node.value):
-            value, child = self.value(item, (*path, index))
-            data.append(value)
-            spot.children[index] = (_place(item), child)
+    def _list(self, start: YamlEvent, path: KeyPath) -> tuple[Any, _Spot]:
+        spot = _Spot(_place(start), kind=_Kind.LIST)
+        data: list[Any] = []
+        for event in self._until_end():
+            value, child = self._value(event, (*path, len(data)))
+            spot.children[len(data)] = (_place(event), child)
             spot.values += child.values
+            data.append(value)
         return data, spot
 
-    def _mapping(self, node: MappingNode, path: KeyPath) -> tuple[Any, _Spot]:
-        spot = _Spot(_place(node))
+    def _mapping(self, start: YamlEvent, path: KeyPath) -> tuple[Any, _Spot]:
+        spot = _Spot(_place(start))
         data: dict[Key, Any] = {}
-        for key_node, value_node in node.value:
-            key = self._key(key_node, path)
-            if key is None:
-                continue
+        for event in self._until_end():
+            key = self._key(event, path)
             if key in data:
                 first = spot.children[key][0].line
                 name = str(key) if isinstance(key, int) else show(key)
-                self._add(key_node, path, f"{name} is given twice, first in line {first}")
+                self._add(event, path, f"{name} is given twice, first in line {first}")
+                key = None
+            known = len(self.mistakes)
+            value, child = self._value(next(self._events), path if key is None else (*path, key))
+            if key is None:
+                del self.mistakes[known:]
                 continue
-            data[key], child = self.value(value_node, (*path, key))
-            spot.children[key] = (_place(key_node), child)
+            data[key] = value
+            spot.children[key] = (_place(event), child)
             spot.values += child.values
         return data, spot
 
-    def _key(self, node: Node, path: KeyPath) -> Key | None:
-        key = self._read(node, path)[0] if isinstance(node, ScalarNode) else ()
-        if isinstance(node, ScalarNode) and node.value == "null":
+    def _until_end(self) -> Iterator[YamlEvent]:
+        """The events of a list, or of the keys of a mapping, until it ends."""
+        while (event := next(self._events))[0] != "end":
+            yield event
+
+    def _key(self, event: YamlEvent, path: KeyPath) -> Key | None:
+        known = len(self.mistakes)
+        key, spot = self._value(event, path)
+        if event[-1] == "null":
             return "null"  # No mapping has a key that is nothing, but tags have one of that name.
         if isinstance(key, str) or type(key) is int:
             return key
-        found = (
-            f"the key {node.value}" if isinstance(node, ScalarNode) else "a list or mapping as key"
-        )
-        self._add(
-            node, path, f"found {found}, allowed: text or an integer; quote it to make it text"
-        )
+        if spot.kind in (_Kind.MAPPING, _Kind.LIST):
+            del self.mistakes[known:]
+            found = "a list or mapping as key"
+        else:
+            found = f"the key {event[-1] or ''}"
+        allowed = "text or an integer; quote it to make it text"
+        self._add(event, path, f"found {found}, allowed: {allowed}")
         return None
 
-    def _add(self, node: Node, path: KeyPath, message: str) -> None:
-        self.mistakes.append((_place(node), path, message))
+    def _refused(self, event: YamlEvent, path: KeyPath, message: str) -> tuple[None, _Spot]:
+        self._add(event, path, message)
+        return None, _Spot(_place(event), kind=_Kind.SCALAR)
+
+    def _add(self, event: YamlEvent, path: KeyPath, message: str) -> None:
+        self.mistakes.append((_place(event), path, message))
 
 
 def scalar(text: str, kind: str = "") -> str | int | float | bool | None:
@@ -389,5 +404,6 @@ def scalar(text: str, kind: str = "") -> str | int | float | bool | None:
     return text
 
 
-def _place(node: Node) -> Place:
-    return Place(node.start_mark.line + 1, node.start_mark.column + 1)
+def _place(event: YamlEvent) -> Place:
+    _, line, column, *_ = event
+    return Place(line, column)
