@@ -24,7 +24,7 @@ BLOCKS = [
 ]
 SCALARS = (
     st.text()
-    | st.sampled_from(["null", "1", "1e3", "on", "0x1F", "- a", "a: b", "#", ".inf", "~", "a\u2028b"])
+    | st.sampled_from(["null", "1", "1e3", "on", "0x1F", "- a", "a: b", "#", ".inf", "~"])
     | st.integers()
     | st.floats(allow_nan=False)
     | st.booleans()
