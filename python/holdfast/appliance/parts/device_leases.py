@@ -33,18 +33,20 @@ _ENDING_S = 2.0
 
 def leased(config: Config) -> dict[str, str]:
     """The logs of devices that only one node polls, by device."""
-    found: dict[str, str] = {}
-    for name, device in config.devices.items():
-        if not device.is_polled:
-            continue
-        memories = [read.into.memory for read in device.reads if read.into is not None]
-        if device.status is not None:
-            memories.append(device.status.memory)
-        for memory in memories:
-            replicate = config.memories[memory].replicate
-            if replicate is not None:
-                found.setdefault(name, replicate.log)
-    return found
+    logs = ((device, _log_of(config, device)) for device in config.devices)
+    return {device: log for device, log in logs if log is not None}
+
+
+def _log_of(config: Config, name: str) -> str | None:
+    """The log of the first replicated memory that a device is read into."""
+    device = config.devices[name]
+    if not device.is_polled:
+        return None
+    memories = [read.into.memory for read in device.reads if read.into is not None]
+    if device.status is not None:
+        memories.append(device.status.memory)
+    replicated = (config.memories[memory].replicate for memory in memories)
+    return next((each.log for each in replicated if each is not None), None)
 
 
 def key_of(config: Config, device: str) -> str:
@@ -65,7 +67,7 @@ class DeviceLeases(Part):
 
     def fence(self, device: str, config: Config) -> _core.Fence | None:
         """The fence of a device; `None` if every node polls it."""
-        log = leased(config).get(device)
+        log = _log_of(config, device)
         return None if log is None else self._of_log[log].leases.fence(key_of(config, device))
 
     def prepare(self, plan: Plan) -> Callable[[], None]:
