@@ -12,18 +12,6 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, StringMark, YAMLError
-from ruamel.yaml.events import (
-    AliasEvent,
-    DocumentStartEvent,
-    MappingEndEvent,
-    MappingStartEvent,
-    ScalarEvent,
-    SequenceEndEvent,
-    SequenceStartEvent,
-)
-
 from holdfast._core import yaml_events
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError, Problem
@@ -192,11 +180,7 @@ def parse(text: str, file: str) -> tuple[Document, list[Problem]]:
         line = text[: found.start()].count("\n") + 1
         raise _error(file, f"the character U+{ord(found[0]):04X} is not allowed in YAML", line)
     try:
-        reader = _Reader(yaml_events(text, MAX_WRITTEN) or _slow_events(text))
-    except MarkedYAMLError as error:
-        raise ConfigError(file, [_syntax(error, file)]) from None
-    except YAMLError as error:
-        raise _error(file, f"not YAML: {error}") from None
+        reader = _Reader(yaml_events(text, MAX_WRITTEN) or _slow_events(text, file))
     except _TooMany:
         raise _error(file, f"more than {MAX_WRITTEN} keys and values, the limit") from None
     except RecursionError:
@@ -216,60 +200,10 @@ class _TooMany(Exception):
     """A file has too many keys and values."""
 
 
-def _slow_events(text: str) -> Iterator[YamlEvent]:
-    """The events of text that the core refuses, or an exception that says what is wrong with it.
+def _slow_events(text: str, file: str) -> Iterator[YamlEvent]:
+    from holdfast.config.text import slow_yaml  # Few files need it, and its library takes 30 ms.
 
-    This parser also accepts a `}` left of the key above it, which many write, and nests deeper.
-    """
-    documents = 0
-    for event in YAML(typ="safe", pure=True).parse(text):
-        mark = event.start_mark
-        at = mark.line + 1, mark.column + 1
-        match event:
-            case ScalarEvent():
-                what = "plain" if event.style is None else "quoted"
-                yield what, *at, event.anchor, event.tag, event.value
-            case SequenceStartEvent():
-                yield "list", *at, event.anchor, event.tag, None
-            case MappingStartEvent():
-                yield "mapping", *at, event.anchor, event.tag, None
-            case SequenceEndEvent() | MappingEndEvent():
-                yield "end", *at, None, None, None
-            case AliasEvent():
-                yield "alias", *at, event.anchor, None, None
-            case DocumentStartEvent() if documents:
-                found = "expected a single document in the stream, but found another document"
-                raise MarkedYAMLError(problem=found, problem_mark=mark)
-            case DocumentStartEvent():
-                documents += 1
-
-
-PLAIN_REASONS = {
-    "found character '\\t' that cannot start any token": "a tab indents this line, allowed: spaces",
-    "expected <block end>, but found '<block mapping start>'": (
-        "indented unlike the keys above it, allowed: keys of one mapping begin in the same column"
-    ),
-    "expected <block end>, but found '-'": (
-        "indented unlike the entries above it, allowed: those of a list begin in the same column"
-    ),
-    "mapping values are not allowed here": (
-        "a `:` where no key can be: indented further than the keys above it, or a text with `: `, "
-        "which needs quotes"
-    ),
-}
-"""What errors of the YAML parser mean that come from indentation, in words of those who write."""
-
-
-def _syntax(error: MarkedYAMLError, file: str) -> Problem:
-    mark = error.problem_mark or error.context_mark
-    line, column = (mark.line + 1, mark.column + 1) if mark else (None, None)
-    reason = error.problem or error.context or "invalid syntax"
-    start = error.context_mark
-    if reason in PLAIN_REASONS:
-        reason = PLAIN_REASONS[reason]
-    elif error.context and start and mark and start.line != mark.line:
-        reason += f", {error.context} that starts in line {start.line + 1}"
-    return Problem(file, line, column, "", f"not YAML: {reason}")
+    return slow_yaml.events(text, file)
 
 
 class _Reader:
@@ -301,9 +235,6 @@ class _Reader:
         return value
 
     def _aliased(self, event: YamlEvent, anchor: int | str, path: KeyPath) -> tuple[Any, _Spot]:
-        if anchor not in self._anchors:
-            mark = StringMark("", 0, event[1] - 1, event[2] - 1, "", 0)
-            raise MarkedYAMLError(problem=f"found undefined alias {anchor!r}", problem_mark=mark)
         value = self._anchors[anchor]
         if value is not None:
             return value

@@ -1,0 +1,99 @@
+"""The parser of YAML for text that the core refuses: it says in words what is wrong.
+
+It also accepts a `}` left of the key that it belongs to, which many write, and nests deeper.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import (
+    AliasEvent,
+    DocumentStartEvent,
+    MappingEndEvent,
+    MappingStartEvent,
+    ScalarEvent,
+    SequenceEndEvent,
+    SequenceStartEvent,
+)
+
+from holdfast.config.text.problems import ConfigError, Problem
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from holdfast._core import YamlEvent
+
+PLAIN_REASONS = {
+    "found character '\\t' that cannot start any token": "a tab indents this line, allowed: spaces",
+    "expected <block end>, but found '<block mapping start>'": (
+        "indented unlike the keys above it, allowed: keys of one mapping begin in the same column"
+    ),
+    "expected <block end>, but found '-'": (
+        "indented unlike the entries above it, allowed: those of a list begin in the same column"
+    ),
+    "mapping values are not allowed here": (
+        "a `:` where no key can be: indented further than the keys above it, or a text with `: `, "
+        "which needs quotes"
+    ),
+}
+"""What errors of the YAML parser mean that come from indentation, in words of those who write."""
+
+
+def _syntax(error: MarkedYAMLError, file: str) -> Problem:
+    mark = error.problem_mark or error.context_mark
+    line, column = (mark.line + 1, mark.column + 1) if mark else (None, None)
+    reason = error.problem or error.context or "invalid syntax"
+    start = error.context_mark
+    if reason in PLAIN_REASONS:
+        reason = PLAIN_REASONS[reason]
+    elif error.context and start and mark and start.line != mark.line:
+        reason += f", {error.context} that starts in line {start.line + 1}"
+    return Problem(file, line, column, "", f"not YAML: {reason}")
+
+
+def events(text: str, file: str) -> Iterator[YamlEvent]:
+    """The events of the only document of a text. Raises `ConfigError`."""
+    try:
+        yield from _events(text)
+    except MarkedYAMLError as error:
+        raise ConfigError(file, [_syntax(error, file)]) from None
+    except YAMLError as error:
+        raise ConfigError(file, [Problem(file, None, None, "", f"not YAML: {error}")]) from None
+
+
+def _events(text: str) -> Iterator[YamlEvent]:
+    documents = 0
+    anchors: set[str | None] = {None}
+    for event in YAML(typ="safe", pure=True).parse(text):
+        mark = event.start_mark
+        at = mark.line + 1, mark.column + 1
+        anchor = getattr(event, "anchor", None)
+        if isinstance(event, AliasEvent) and anchor not in anchors:
+            found = f"found undefined alias {anchor!r}"
+            raise MarkedYAMLError(problem=found, problem_mark=mark)
+        anchors.add(anchor)
+        match event:
+            case ScalarEvent():
+                yield (
+                    "plain" if event.style is None else "quoted",
+                    *at,
+                    anchor,
+                    event.tag,
+                    event.value,
+                )
+            case SequenceStartEvent():
+                yield "list", *at, anchor, event.tag, None
+            case MappingStartEvent():
+                yield "mapping", *at, anchor, event.tag, None
+            case SequenceEndEvent() | MappingEndEvent():
+                yield "end", *at, None, None, None
+            case AliasEvent():
+                yield "alias", *at, anchor, None, None
+            case DocumentStartEvent() if documents:
+                found = "expected a single document in the stream, but found another document"
+                raise MarkedYAMLError(problem=found, problem_mark=mark)
+            case DocumentStartEvent():
+                documents += 1
