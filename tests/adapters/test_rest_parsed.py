@@ -246,6 +246,26 @@ def test_a_request_with_another_head_is_not_parsed(rig: Rig, line: Line) -> None
         assert rig.parsed == parsed
 
 
+def test_a_long_head_is_not_remembered(rig: Rig, line: Line) -> None:
+    for _ in range(3):
+        line.socket.sendall(web.post(TEXT.encode(), f"X-New: {'1' * 2048}"))
+        assert line.answer().status == 200
+    assert rig.parsed == 0
+
+
+def test_refused_requests_displace_no_head(rig: Rig, line: Line) -> None:
+    """There is room for 64. Good ones may displace each other; all are answered."""
+    for number in range(200):
+        line.socket.sendall(web.head("GET", f"/none/{number}"))
+        assert line.answer().status == 404
+    assert line.ask(TEXT.encode()).status == 200
+    assert rig.parsed == 1
+    for number in range(200):
+        line.socket.sendall(web.post(TEXT.encode(), f"X-New: {number}"))
+        assert line.answer().status == 200
+    assert [line.ask(TEXT.encode()).status for _ in range(2)] == [200, 200]
+
+
 def test_no_write_of_a_batch_is_carried_out_without_its_record(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
