@@ -52,6 +52,7 @@ __all__ = [
     "BatchRefused",
     "BlockingClient",
     "Caller",
+    "Commands",
     "Connection",
     "Endpoint",
     "Engine",
@@ -69,6 +70,7 @@ __all__ = [
     "MemoryFile",
     "MirrorAge",
     "OutOfRange",
+    "ParsedWrites",
     "Passage",
     "PolledDevice",
     "Poller",
@@ -360,6 +362,49 @@ class WriteQueue:
     def dropped(self) -> int:
         """How many writes were dropped because the queue was full."""
 
+@final
+class Commands:
+    """Parses JSON commands of a source, of at most `most` bytes.
+
+    `targets` are what it may write: name of a memory, the same in JSON, the memory, and areas.
+    """
+
+    def __new__(
+        cls, targets: Sequence[tuple[str, bytes, Memory, Sequence[Area]]], most: int
+    ) -> Commands: ...
+
+@final
+class ParsedWrites:
+    """Writes of several requests, which the core has parsed and checked.
+
+    They are of commands in the form that nearly all have: one object, text without escapes,
+    integers. What has another form, or is refused, comes as a request.
+    """
+
+    @property
+    def handler(self) -> Callable[[ParsedWrites], Callable[[], object]]:
+        """The function that takes them, and returns the second step."""
+
+    def lines(self, before: bytes, after: bytes) -> list[bytes]:
+        """The lines of the audit log, in JSON, without time and place in the chain.
+
+        Each begins with `before`, the address of the peer, and `after`.
+        """
+
+    def write(self) -> list[tuple[str, int]]:
+        """Carries them out in their order, each in one step of its own.
+
+        Returns the memory of each that was carried out, and how many values it has.
+        """
+
+    def respond(
+        self, status: int, headers: Sequence[tuple[bytes, bytes]], bodies: Sequence[bytes]
+    ) -> None:
+        """Answers those that were carried out, as `HttpExchange.respond` does."""
+
+    def requests(self) -> list[tuple[Any, ...]]:
+        """Takes the requests of the others, as those of `HttpServer.take`."""
+
 class BatchRefused(ValueError):
     """A write of a batch is refused. Nothing has changed."""
 
@@ -401,11 +446,22 @@ class Batch:
             tuple[Memory, Area, int, Iterable[int]] | tuple[Memory, Area, int, Iterable[int], bool]
         ],
     ) -> Batch:
-        """Checks the writes.
+        """Checks the form of the writes, and their ranges.
 
         Raises `BatchRefused` for the first write with an invalid area, number of values or range,
         else for the first invalid value. An exception from the iterable `writes` takes precedence
         over errors in later writes, and over errors in values.
+        """
+
+    def check(self) -> None:
+        """Checks what can be known before the write. Raises `BatchRefused`."""
+
+    def lines(
+        self, origin: bytes, names: Sequence[bytes], outcome: str, sequence: int | None = None
+    ) -> list[bytes]:
+        """The lines of the audit log for the writes, in JSON, without time and place in the chain.
+
+        `origin` is the beginning of each line, `names` are those of the memories in JSON.
         """
 
     @property
@@ -535,13 +591,20 @@ class HttpServer:
     def detach(self) -> int:
         """The handle of a socket that is readable when there is something to take."""
 
-    def take(self) -> tuple[list[tuple[Any, ...]], list[tuple[int, str, Any]]]:
-        """Takes new requests, and what has happened to others.
+    def take(
+        self, most: int
+    ) -> tuple[list[list[ParsedWrites | tuple[Any, ...]]], list[tuple[int, str, Any]]]:
+        """Takes new requests, in batches of at most `most`, and what has happened to others.
 
-        A request is its exchange, method, path, query, headers, peer, version, body, and the
-        subject, serial number and role of its client's certificate. The body is `None` while it
-        arrives. What has happened is a number, a word and a value: `body` (bytes), `late` (bytes
-        that have arrived), `too_large`, `broken`, `gone` or `room`.
+        A request is its exchange, head, peer, length, body, and the subject, serial number and role
+        of its client's certificate. The body is `None` while it arrives, the length if the head
+        does not say it. A head is method, path, query, version, headers without Content-Length, and
+        a dictionary for what handlers find out about it: equal heads are mostly the same object.
+        Requests whose head has `commands` in its dictionary, `Commands` and a handler, are parsed:
+        those that follow each other come as one `ParsedWrites`.
+
+        What has happened is a number, a word and a value: `body` (bytes), `late` (bytes that have
+        arrived), `too_large`, `broken`, `gone` or `room`.
         """
 
     def flush(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import http.client
 import json
 import logging
 import socket
@@ -21,7 +22,7 @@ from holdfast.appliance import Appliance
 from holdfast.appliance.parts.mirrors import Mirrors
 from holdfast.appliance.reload import ReloadIncomplete, ReloadRefused, restart_reasons
 from holdfast.config import load
-from support import wire
+from support import web, wire
 from support.certificates import Certificates, Issued, named
 from support.config_folder import written
 from support.running import endpoint, log_events
@@ -604,6 +605,44 @@ def test_services_come_change_and_go(rig: Rig) -> None:
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(address, 10)
     assert rig.appliance.diagnostics.stats()["adapters"] == {}
+
+
+@pytest.mark.parametrize("change", [{"name": "other", "secret": "new"}, {"areas": ("coils",)}])
+def test_a_token_has_its_new_rights_before_the_next_request(
+    rig: Rig, change: dict[str, Any]
+) -> None:
+    """Also where the server knows the head of the request, which is the same as before."""
+
+    def rest(name: str = "scada", secret: str = "old", **more: Any) -> Settings:
+        token = web.token(name, secret, **{"memories": ("plant",), **more})
+        return {"bind": "127.0.0.1:0", "sources": ["127.0.0.1"], "tokens": [token]}
+
+    areas = ("holding_registers",)
+    rig.start(plant(rest=rest(areas=areas)))
+    wire.until(lambda: answers(rig), "REST answers")
+    body = json.dumps(web.command("holding_registers", 7, [42], "plant")).encode()
+    request = web.post(body, "Authorization: Bearer old")
+
+    def asked(line: socket.socket) -> int | None:
+        """The status of the next request; `None` if the connection has ended."""
+        try:
+            line.sendall(request)
+            reply = http.client.HTTPResponse(line)
+            reply.begin()
+            reply.read()
+        except OSError:
+            return None
+        return reply.status
+
+    with socket.create_connection(rig.address("rest"), wire.DEADLINE) as line:
+        assert [asked(line) for _ in range(3)] == [200] * 3
+        rig.reload(plant(rest=rest(**{"areas": areas, **change})))
+        refused = 403 if "areas" in change else 401
+        assert asked(line) in (refused, None)
+    wire.until(lambda: answers(rig), "REST answers again")
+    for _ in range(3):
+        with socket.create_connection(rig.address("rest"), wire.DEADLINE) as line:
+            assert asked(line) == refused
 
 
 def test_an_http_address_in_use_is_refused(rig: Rig, connect: Connect) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any, cast
 
+import msgspec
 import pytest
 
 import holdfast
@@ -177,7 +178,7 @@ class OpeningAudit:
         self.write_all(group)
 
     def write_all(self, lines: Any, *, done: bool = False) -> None:  # noqa: ARG002
-        self.outcomes += [line["outcome"] for line in lines]
+        self.outcomes += [msgspec.json.decode(line)["outcome"] for line in lines]
 
 
 def test_a_write_that_was_checked_before_the_gate_opened_is_refused_after_it(

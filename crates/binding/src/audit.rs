@@ -1,15 +1,41 @@
-//! Converts writes into the dictionaries of the audit log.
+//! Converts writes into the dictionaries of the audit log, and those of JSON commands into its lines.
+
+use std::io::Write as _;
 
 use holdfast_engine::packet_area::of_packet;
 use holdfast_engine::server::reports::audit::{Record, Written};
-use holdfast_memory::Area;
+use holdfast_memory::{Area, Write};
 use holdfast_protocol::pdu::{ExceptionCode, Request};
 use holdfast_protocol::raw_ingest::{Format, Header};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::listed::listed;
+use crate::listed::{items, listed};
 use crate::peer;
+
+/// The line of one write of a command, in JSON. `origin` is its beginning, `name` that of the memory.
+pub fn line(
+    origin: &[u8],
+    name: &[u8],
+    &Write { area, address, count, bytes }: &Write<'_>,
+    outcome: &str,
+    sequence: Option<u64>,
+) -> Vec<u8> {
+    let mut line =
+        [origin, b",\"memory\":", name, b",\"area\":\"", area.name().as_bytes()].concat();
+    line.extend_from_slice(format!("\",\"address\":{address},\"values\":").as_bytes());
+    for (index, value) in items(area, count, bytes).enumerate() {
+        line.push(if index == 0 { b'[' } else { b',' });
+        // A vector takes whatever is written.
+        let _ = write!(line, "{value}");
+    }
+    let _ = write!(line, "],\"outcome\":\"{outcome}\"");
+    if let Some(sequence) = sequence {
+        let _ = write!(line, ",\"log_sequence\":{sequence}");
+    }
+    line.push(b'}');
+    line
+}
 
 pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, PyDict>> {
     let line = PyDict::new(py);

@@ -6,8 +6,10 @@
 use holdfast_memory::{Access, Area, Memory as Core, Refusal, Refused, Write};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyList, PyString, PyTuple};
+use pyo3::pybacked::PyBackedBytes;
+use pyo3::types::{PyBytes, PyList, PyString, PyTuple};
 
+use crate::audit;
 use crate::memory::{Memory, Unfit, integer, is_text, item, put};
 
 pyo3::create_exception!(
@@ -39,17 +41,17 @@ pub struct Batch {
     access: Access,
 }
 
-struct Checked {
-    memory: Py<Memory>,
-    area: Area,
-    address: u16,
-    count: usize,
+pub struct Checked {
+    pub memory: Py<Memory>,
+    pub area: Area,
+    pub address: u16,
+    pub count: usize,
 }
 
 #[pymethods]
 impl Batch {
     #[new]
-    fn new(py: Python<'_>, writes: &Bound<'_, PyAny>) -> PyResult<Batch> {
+    fn new(writes: &Bound<'_, PyAny>) -> PyResult<Batch> {
         let writes: Vec<Pending<'_>> = (writes.try_iter()?.enumerate())
             .map(|(command, write)| Pending::new(command, &write?))
             .collect::<PyResult<_>>()?;
@@ -66,10 +68,29 @@ impl Batch {
         let writes = writes.into_iter().map(|Pending { memory, area, address, count, .. }| {
             Checked { memory: memory.unbind(), area, address, count }
         });
-        let batch = Batch { writes: writes.collect(), bytes, access };
-        holdfast_memory::check_across(access, &batch.packed())
-            .map_err(|error| refused(py, error))?;
-        Ok(batch)
+        Ok(Batch { writes: writes.collect(), bytes, access })
+    }
+
+    /// Checks what can be known before the memories are locked.
+    fn check(&self, py: Python<'_>) -> PyResult<()> {
+        let checked = holdfast_memory::check_across(self.access, &self.packed());
+        checked.map_err(|error| refused(py, error))
+    }
+
+    /// The lines of the audit log for its writes, without time and place: `origin` is the beginning of
+    /// each, `names` are those of the memories in JSON.
+    #[pyo3(signature = (origin, names, outcome, sequence=None))]
+    fn lines<'py>(
+        &self,
+        py: Python<'py>,
+        origin: &[u8],
+        names: Vec<PyBackedBytes>,
+        outcome: &str,
+        sequence: Option<u64>,
+    ) -> Vec<Bound<'py, PyBytes>> {
+        let names: Vec<&[u8]> = names.iter().map(|name| &**name).collect();
+        let lines = self.records(origin, &names, outcome, sequence);
+        lines.iter().map(|line| PyBytes::new(py, line)).collect()
     }
 
     /// Whether `write` can still refuse it: a journal, or because a memory is not sealed.
@@ -82,14 +103,39 @@ impl Batch {
     /// Writes all values atomically. Returns their number, and the sequence of the step if a log has
     /// carried it out.
     fn write(&self, py: Python<'_>) -> PyResult<(usize, Option<u64>)> {
-        let packed = self.packed();
-        let sequence = py.detach(|| holdfast_memory::write_across(self.access, &packed));
-        let count = self.writes.iter().map(|write| write.count).sum();
-        Ok((count, sequence.map_err(|error| refused(py, error))?))
+        self.carry_out(py).map_err(|error| refused(py, error))
     }
 }
 
 impl Batch {
+    /// One write; `None` if it is refused.
+    pub fn of(write: Checked, bytes: Vec<u8>) -> Option<Batch> {
+        let batch = Batch { writes: vec![write], bytes, access: Access::Ingest };
+        holdfast_memory::check_across(batch.access, &batch.packed()).ok()?;
+        Some(batch)
+    }
+
+    /// Returns the number of values, and the sequence of the step if a log has carried it out.
+    pub fn carry_out(&self, py: Python<'_>) -> Result<(usize, Option<u64>), Refused> {
+        let packed = self.packed();
+        let sequence = py.detach(|| holdfast_memory::write_across(self.access, &packed))?;
+        Ok((self.writes.iter().map(|write| write.count).sum(), sequence))
+    }
+
+    /// The lines of the audit log, without time and place.
+    pub fn records(
+        &self,
+        origin: &[u8],
+        names: &[&[u8]],
+        outcome: &str,
+        sequence: Option<u64>,
+    ) -> Vec<Vec<u8>> {
+        let writes = self.packed().into_iter().zip(names);
+        writes
+            .map(|((_, write), name)| audit::line(origin, name, &write, outcome, sequence))
+            .collect()
+    }
+
     fn packed(&self) -> Vec<(&Core, Write<'_>)> {
         let mut rest = &self.bytes[..];
         let mut packed = Vec::with_capacity(self.writes.len());

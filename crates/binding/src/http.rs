@@ -1,4 +1,4 @@
-//! `HttpServer` and `HttpExchange`: requests of HTTP, for an event loop.
+//! `HttpServer`: requests of HTTP, for an event loop.
 
 use std::collections::BTreeMap;
 use std::net::TcpListener;
@@ -8,25 +8,27 @@ use std::time::Duration;
 use bytes::Bytes;
 use holdfast_engine::http::{
     Event, Exchange, HttpServer as CoreServer, HttpSettings, Refusal, RefusalBody, RequestHead,
-    ResponseHead, Sent, bind,
+    ResponseHead, bind,
 };
-use holdfast_engine::server::{ConnectionLimits, Peer};
+use holdfast_engine::server::ConnectionLimits;
 use holdfast_engine::tls::server::Protocol;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
+use pyo3::intern;
 use pyo3::prelude::*;
-use pyo3::pybacked::PyBackedBytes;
 use pyo3::types::{PyBytes, PyDict, PyList, PyTuple};
 
 use crate::arguments::{address, network, os_error, os_text, time_to_wait};
+use crate::command::{Commands, ParsedWrite, ParsedWrites};
 use crate::engine::{dict, event_fields};
+use crate::exchange::{Answers, Headers, HttpExchange, request, response_head};
+use crate::heads::Heads;
 use crate::heartbeat;
 use crate::link::handle;
 use crate::listener::limits;
-use crate::peer;
 use crate::server_tls::ServerTls;
 
-/// Names and values of headers.
-type Headers = Vec<(PyBackedBytes, PyBackedBytes)>;
+/// The key under which a handler keeps, with a head, what parses the body and who takes the result.
+const COMMANDS: &str = "commands";
 
 /// A TCP socket that listens.
 #[pyclass(frozen, module = "holdfast")]
@@ -75,6 +77,8 @@ impl ListeningSocket {
 #[pyclass(frozen, module = "holdfast")]
 pub struct HttpServer {
     core: CoreServer,
+    heads: Heads,
+    answers: Arc<Answers>,
 }
 
 #[pymethods]
@@ -113,7 +117,11 @@ impl HttpServer {
             tls: tls.map(|tls| tls.of(Protocol::Http)).transpose()?,
             refusals: bodies(&refusals)?,
         };
-        Ok(HttpServer { core: CoreServer::new(settings)? })
+        Ok(HttpServer {
+            core: CoreServer::new(settings)?,
+            heads: Heads::default(),
+            answers: Arc::default(),
+        })
     }
 
     /// Begins to serve, in a thread of its own.
@@ -127,13 +135,17 @@ impl HttpServer {
         Ok(handle(wakes.ok_or_else(|| PyRuntimeError::new_err("the socket has been detached"))?))
     }
 
-    /// Takes new requests, and what has happened to others since.
-    fn take<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyList>, Bound<'py, PyList>)> {
-        let (requests, events) = (PyList::empty(py), PyList::empty(py));
+    /// Takes new requests, in batches of at most `most`, and what has happened to others since.
+    fn take<'py>(
+        &self,
+        py: Python<'py>,
+        most: usize,
+    ) -> PyResult<(Vec<Bound<'py, PyList>>, Bound<'py, PyList>)> {
+        let (mut requests, events) = (Vec::new(), PyList::empty(py));
         for event in self.core.take() {
             let (number, kind, value) = match event {
                 Event::Request { exchange, head, body } => {
-                    requests.append(request(py, exchange, &head, body)?)?;
+                    requests.push((exchange, head, body));
                     continue;
                 }
                 Event::Body { number, body } => {
@@ -149,7 +161,12 @@ impl HttpServer {
             };
             events.append((number, kind, value))?;
         }
-        Ok((requests, events))
+        let mut batches = Vec::new();
+        let mut requests = requests.into_iter().peekable();
+        while requests.peek().is_some() {
+            batches.push(self.batch(py, requests.by_ref().take(most))?);
+        }
+        Ok((batches, events))
     }
 
     /// Sends the responses since the last call.
@@ -218,97 +235,45 @@ impl HttpServer {
     }
 }
 
-#[pyclass(frozen, module = "holdfast")]
-pub struct HttpExchange {
-    core: Arc<Exchange>,
-}
-
-#[pymethods]
-impl HttpExchange {
-    #[getter]
-    fn number(&self) -> u64 {
-        self.core.number
-    }
-
-    fn receive(&self, most: usize) {
-        self.core.receive(most);
-    }
-
-    fn respond(&self, status: u16, headers: Headers, body: &[u8], closes: bool) -> PyResult<()> {
-        let head = response_head(status, &headers)?;
-        self.core.respond(head, Bytes::copy_from_slice(body), closes);
-        Ok(())
-    }
-
-    fn begin(&self, status: u16, headers: Headers) -> PyResult<()> {
-        self.core.begin(response_head(status, &headers)?);
-        Ok(())
-    }
-
-    /// Whether the data were taken; `None` if the client is gone.
-    fn send(&self, data: &[u8]) -> Option<bool> {
-        match self.core.send(Bytes::copy_from_slice(data)) {
-            Sent::Taken => Some(true),
-            Sent::Full => Some(false),
-            Sent::Gone => None,
+impl HttpServer {
+    /// The requests of a batch, in their order. Commands that follow each other and have one handler are
+    /// parsed here, and become one item.
+    fn batch<'py>(
+        &self,
+        py: Python<'py>,
+        requests: impl Iterator<Item = (Arc<Exchange>, Box<RequestHead>, Option<Bytes>)>,
+    ) -> PyResult<Bound<'py, PyList>> {
+        let items = PyList::empty(py);
+        let mut parsed: Option<(Bound<'py, PyAny>, Vec<ParsedWrite>)> = None;
+        for (core, head, body) in requests {
+            let exchange = HttpExchange { core, answers: Arc::clone(&self.answers) };
+            let (known, kept) = self.heads.of(py, &head.parts)?;
+            let write = match (&body, kept.get_item(intern!(py, COMMANDS))?) {
+                (Some(body), Some(given)) => {
+                    let (commands, handler): (PyRef<'_, Commands>, _) = given.extract()?;
+                    commands.parsed(py, body).map(|parsed| (handler, parsed))
+                }
+                _ => None,
+            };
+            let next = write.as_ref().map(|(handler, _): &(Bound<'py, PyAny>, _)| handler);
+            let ends = |of: &Bound<'py, PyAny>| !next.is_some_and(|next| next.is(of));
+            if let Some((handler, writes)) = parsed.take_if(|(handler, _)| ends(handler)) {
+                items.append(ParsedWrites::new(handler.unbind(), writes))?;
+            }
+            match (write, body) {
+                (Some((handler, (name, shown, batch))), Some(body)) => {
+                    let known = known.unbind();
+                    let (_, writes) = parsed.get_or_insert_with(|| (handler, Vec::new()));
+                    writes.push(ParsedWrite { exchange, head, known, body, name, shown, batch });
+                }
+                (_, body) => items.append(request(py, exchange, known, &head, body)?)?,
+            }
         }
+        if let Some((handler, writes)) = parsed {
+            items.append(ParsedWrites::new(handler.unbind(), writes))?;
+        }
+        Ok(items)
     }
-
-    fn end(&self, is_complete: bool) {
-        self.core.end(is_complete);
-    }
-
-    /// There will be no response: the connection is cut off.
-    fn abandon(&self) {
-        self.core.abandon();
-    }
-}
-
-impl Drop for HttpExchange {
-    fn drop(&mut self) {
-        self.core.abandon();
-    }
-}
-
-fn response_head(status: u16, headers: &Headers) -> PyResult<ResponseHead> {
-    let headers = headers.iter().map(|(name, value)| (&name[..], &value[..]));
-    ResponseHead::new(status, headers).map_err(|error| PyValueError::new_err(error.to_string()))
-}
-
-/// Exchange, method, path, query, headers, peer, version, body, and the identity of the client.
-fn request<'py>(
-    py: Python<'py>,
-    exchange: Arc<Exchange>,
-    head: &RequestHead,
-    body: Option<Bytes>,
-) -> PyResult<Bound<'py, PyTuple>> {
-    let parts = &head.parts;
-    let headers = PyList::empty(py);
-    for (name, value) in &parts.headers {
-        let name = PyBytes::new(py, name.as_str().as_bytes());
-        headers.append((name, PyBytes::new(py, value.as_bytes())))?;
-    }
-    let version = if parts.version == CoreServer::HTTP_10 { "1.0" } else { "1.1" };
-    let query = parts.uri.query().unwrap_or_default();
-    let body = body.map(|body| PyBytes::new(py, &body));
-    (
-        HttpExchange { core: exchange },
-        parts.method.as_str(),
-        parts.uri.path(),
-        PyBytes::new(py, query.as_bytes()),
-        headers,
-        peer::text(head.peer.address),
-        version,
-        body,
-        identity(&head.peer),
-    )
-        .into_pyobject(py)
-}
-
-/// Subject, serial number and role of the certificate of a client.
-fn identity(peer: &Peer) -> Option<(&str, &str, &str)> {
-    let certificate = peer.certificate.as_ref()?;
-    Some((&certificate.subject, &certificate.serial, &certificate.role))
 }
 
 /// The bodies of refusals, from their names, headers and bodies.

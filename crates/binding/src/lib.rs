@@ -8,10 +8,13 @@ mod audit;
 mod batch;
 mod channel;
 mod client;
+mod command;
 mod connection;
 mod engine;
+mod exchange;
 mod fence;
 mod following;
+mod heads;
 mod heartbeat;
 mod http;
 mod limits;
@@ -42,15 +45,19 @@ mod _core {
     #[pymodule_export]
     use super::client::{BlockingClient, Endpoint, Request};
     #[pymodule_export]
+    use super::command::{Commands, ParsedWrites};
+    #[pymodule_export]
     use super::connection::{Attempt, Connection};
     #[pymodule_export]
     use super::engine::Engine;
+    #[pymodule_export]
+    use super::exchange::HttpExchange;
     #[pymodule_export]
     use super::fence::Fence;
     #[pymodule_export]
     use super::following::Follower;
     #[pymodule_export]
-    use super::http::{HttpExchange, HttpServer, ListeningSocket};
+    use super::http::{HttpServer, ListeningSocket};
     #[pymodule_export]
     use super::link::{Caller, Link, Passage, Route};
     #[pymodule_export]

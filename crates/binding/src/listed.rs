@@ -1,8 +1,19 @@
-//! The bytes of a memory as a Python list.
+//! The bytes of a memory as values, and as a Python list.
 
 use holdfast_memory::Area;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
+
+/// The values of `count` items of an area.
+pub fn items(area: Area, count: usize, bytes: &[u8]) -> impl ExactSizeIterator<Item = u16> + '_ {
+    (0..count).map(move |index| {
+        if area.is_bits() {
+            u16::from(bytes[index / 8] >> (index % 8) & 1)
+        } else {
+            u16::from_be_bytes([bytes[index * 2], bytes[index * 2 + 1]])
+        }
+    })
+}
 
 /// The values of `count` items of an area.
 pub fn listed<'py>(
@@ -11,10 +22,5 @@ pub fn listed<'py>(
     count: usize,
     bytes: &[u8],
 ) -> PyResult<Bound<'py, PyList>> {
-    if area.is_bits() {
-        PyList::new(py, (0..count).map(|index| bytes[index / 8] >> (index % 8) & 1))
-    } else {
-        let registers = bytes.chunks_exact(2);
-        PyList::new(py, registers.map(|pair| u16::from_be_bytes([pair[0], pair[1]])))
-    }
+    PyList::new(py, items(area, count, bytes))
 }

@@ -419,9 +419,14 @@ pub enum Unfit {
     Type,
 }
 
+/// The largest value of an area.
+pub const fn largest(area: Area) -> u16 {
+    if area.is_bits() { 1 } else { u16::MAX }
+}
+
 /// Extracts and checks one value of an area.
 pub fn item(area: Area, value: &Bound<'_, PyAny>) -> Result<u16, Unfit> {
-    let most = if area.is_bits() { 1 } else { u16::MAX };
+    let most = largest(area);
     if let Ok(integer) = value.cast_exact::<PyInt>()
         && let Ok(number) = integer.extract::<u16>()
         && number <= most

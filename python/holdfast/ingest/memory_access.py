@@ -18,8 +18,9 @@ import msgspec
 from holdfast import _core
 from holdfast.events import log_lines
 from holdfast.events.audit import Unrecorded
+from holdfast.events.audit.chain import encoded
 from holdfast.ingest.counts import Counts
-from holdfast.ingest.recording import Recording, values_of
+from holdfast.ingest.recording import Recording, origin_around, values_of
 from holdfast.ingest.refusals import (
     KEEPING,
     Refused,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
     from holdfast._core import Follower, Memory, Passage
     from holdfast.events.audit import Audit
+    from holdfast.events.audit.log import Group
     from holdfast.events.throttle import Throttle
 
 _KEYS = {"memory", "area", "address", "values"}
@@ -136,6 +138,30 @@ class MemoryAccess:
         Writes that begin before others are carried out get into the audit log together.
         """
         return self._begin(partial(_decoded, body), grant, peer)
+
+    def commands(self, grant: Grant, most: int) -> _core.Commands:
+        """Parses commands of at most `most` bytes, for `begin_parsed`.
+
+        It has the memories that exist now.
+        """
+        targets = [
+            (name, encoded(name), memory, [area for area in AREAS if area in grant.areas])
+            for name, memory in self.memories.items()
+            if grant.writes and name in grant.memories
+        ]
+        return _core.Commands(targets, most)
+
+    def begin_parsed(self, writes: _core.ParsedWrites, grant: Grant) -> Callable[[], list[Written]]:
+        """Records writes that were parsed and checked, those of several requests together.
+
+        Returns the function that carries them out, and returns the results of those that were
+        carried out. With the others, nothing has happened: `begin` takes them, and says why.
+        """
+        group = None
+        if self._audit is not None:
+            lines = writes.lines(*origin_around(self.name, grant.name))
+            group = self._audit.queue(map(msgspec.Raw, lines))
+        return partial(self._finish_parsed, writes, group)
 
     def read(
         self, memory: str, area: str, address: int, count: int, grant: Grant, peer: str
@@ -242,6 +268,22 @@ class MemoryAccess:
             raise
         return partial(self._finish, begun, peer)
 
+    def _finish_parsed(self, writes: _core.ParsedWrites, group: Group | None) -> list[Written]:
+        try:
+            if self._audit is not None and group is not None:
+                self._audit.write_group(group)
+        except Unrecorded:
+            return []
+        written = [Written(1, count, memory) for memory, count in writes.write()]
+        with self._lock:
+            self._counts.accepted += len(written)
+            self._counts.values += sum(each.values for each in written)
+        return written
+
+    def _origin(self, grant: Grant, peer: str) -> bytes:
+        before, after = origin_around(self.name, grant.name)
+        return before + encoded(peer) + after
+
     def _finish(self, begun: Begun, peer: str) -> Written:
         try:
             return self._finished(begun)
@@ -255,17 +297,18 @@ class MemoryAccess:
         if not batch:
             raise Refused("malformed", "the batch is empty")
         begun = Begun(batch, single, grant)
-        if self._audit is not None:
-            origin = {"listener": self.name, "peer": peer, "source": grant.name}
-            begun.recording = Recording(self._audit, origin, batch)
         try:
             # Commands are checked one by one: native code stops at the first refused command.
             begun.writes = _core.Batch(
                 self._checked(command, grant, None if single else index)  # type: ignore[misc]
                 for index, command in enumerate(batch)
             )
+            if self._audit is not None:
+                origin, memories = self._origin(grant, peer), [each["memory"] for each in batch]
+                begun.recording = Recording(self._audit, origin, memories, begun.writes)
+            begun.writes.check()
             if begun.recording is not None:
-                begun.recording.begin(begun.writes.is_refusable)
+                begun.recording.begin()
         except Unrecorded:
             raise unrecorded(begun.command) from None
         except _core.BatchRefused as refused:

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from holdfast.events.audit.chain import encoded
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from holdfast._core import Batch
     from holdfast.events.audit import Audit
     from holdfast.events.audit.log import Group
+
+
+MAX_ORIGINS = 64
+"""Beginnings of lines that are kept."""
 
 
 class Recording:
@@ -19,23 +29,22 @@ class Recording:
     it: only then the outcome is known, and the sequence in a log.
     """
 
-    __slots__ = ("_audit", "_commands", "_group", "_origin")
+    __slots__ = ("_audit", "_group", "_memories", "_origin", "_writes")
 
-    def __init__(
-        self, audit: Audit, origin: Mapping[str, object], commands: Sequence[Mapping[str, Any]]
-    ) -> None:
-        """`origin`: the fields of each line that say who sends the commands, and through what."""
+    def __init__(self, audit: Audit, origin: bytes, memories: Sequence[str], writes: Batch) -> None:
+        """`origin` is the beginning of each line: who sends the commands, and through what.
+
+        `memories` are the names of the memories of `writes`.
+        """
         self._audit = audit
         self._origin = origin
-        self._commands = commands
+        self._memories = memories
+        self._writes = writes
         self._group: Group | None = None
 
-    def begin(self, is_later: bool) -> None:
-        """The commands were checked. Raises `Unrecorded`.
-
-        `is_later`: whether the outcome is known only later.
-        """
-        if is_later:
+    def begin(self) -> None:
+        """The commands were checked. Raises `Unrecorded`."""
+        if self._writes.is_refusable:
             self._audit.require()
         else:
             self._group = self._audit.queue(self._lines("done"))
@@ -54,23 +63,18 @@ class Recording:
         """Nobody knows whether the commands will be carried out."""
         self._audit.write_all(self._lines("not_confirmed"), done=True)
 
-    def _lines(self, outcome: str, sequence: int | None = None) -> list[dict[str, object]]:
-        lines = [
-            {
-                **self._origin,
-                "function": "write",
-                "memory": command["memory"],
-                "area": command["area"],
-                "address": command["address"],
-                "values": list(map(int, values_of(command))),
-                "outcome": outcome,
-            }
-            for command in self._commands
-        ]
-        if sequence is not None:
-            for line in lines:
-                line["log_sequence"] = sequence
-        return lines
+    def _lines(self, outcome: str, sequence: int | None = None) -> list[msgspec.Raw]:
+        names = [encoded(name) for name in self._memories]
+        lines = self._writes.lines(self._origin, names, outcome, sequence)
+        return [msgspec.Raw(line) for line in lines]
+
+
+@lru_cache(MAX_ORIGINS)
+def origin_around(listener: str, source: str) -> tuple[bytes, bytes]:
+    """The beginning of a line before and after its peer, in JSON."""
+    before = encoded({"listener": listener})[:-1] + b',"peer":'
+    after = b"," + encoded({"source": source, "function": "write"})[1:-1]
+    return before, after
 
 
 def values_of(command: Mapping[str, Any]) -> Any:

@@ -288,7 +288,7 @@ async fn handled(
         Some(_) if is_here => upload.whole().await,
         _ => None,
     };
-    let head = Box::new(RequestHead { parts, peer });
+    let head = Box::new(RequestHead { parts, peer, len });
     exchange.notify(Event::Request { exchange: Arc::clone(&exchange), head, body: whole });
     let parts = (Arc::clone(&exchange), line.clone());
     let response = match upload.ordered(&front, &exchange).await {

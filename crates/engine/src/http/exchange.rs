@@ -18,6 +18,8 @@ use crate::server::Peer;
 pub struct RequestHead {
     pub parts: Parts,
     pub peer: Peer,
+    /// The length of the body, if the head says it.
+    pub len: Option<u64>,
 }
 
 /// A response without its body.

@@ -20,6 +20,8 @@ mod portion;
 mod refusal;
 mod server;
 
+pub use hyper::http::request::Parts;
+
 pub use exchange::{Event, Exchange, RequestHead, ResponseHead, Sent};
 pub use front::HttpSettings;
 pub use refusal::{Refusal, RefusalBody};

@@ -139,7 +139,7 @@ class App(Application):
         answer = response(kind.encode(), encode(cast("CollectorRegistry", registry)))
         if gzip_accepted(accepted(b"accept-encoding")):
             answer.body = gzip.compress(answer.body)
-            answer.headers.append((b"content-encoding", b"gzip"))
+            answer.headers = (*answer.headers, (b"content-encoding", b"gzip"))
         return answer
 
 

@@ -6,7 +6,7 @@ The memory access checks everything about memories. A request that is refused he
 from __future__ import annotations
 
 import asyncio
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
@@ -19,12 +19,21 @@ from holdfast.net.http import events
 from holdfast.net.http.application import Application, json_response
 from holdfast.net.http.fields import malformed
 from holdfast.net.http.origin import Origins
-from holdfast.net.http.requests import BadRequest, Request, Response, shown
+from holdfast.net.http.requests import (
+    COMMANDS,
+    JSON,
+    BadRequest,
+    Request,
+    Response,
+    response,
+    shown,
+)
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
+    from holdfast._core import Commands, ParsedWrites
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.sessions import SessionControl
     from holdfast.config import RestConfig
@@ -32,6 +41,9 @@ if TYPE_CHECKING:
     from holdfast.net.http.operations import Later, Operation
 
     Given: TypeAlias = Mapping[str, Any]
+
+MAX_ANSWERS = 64
+"""Answers to writes that are kept: sources write the same ranges again and again."""
 
 INGEST = "/api/v1/ingest"
 ANYONE = "anyone"
@@ -83,6 +95,7 @@ class App(Application):
         if not tokens:
             everything = Grant(ANYONE, frozenset(memory_access.memories), frozenset(AREAS))
             self._grants = {ANYONE: everything}
+        self._parsing: dict[str, tuple[Commands, Callable[[ParsedWrites], object]]] = {}
         self._managers = {token.name for token in tokens if token.manage}
         self._streams = ChangeStreams(settings.max_connections)
 
@@ -111,10 +124,32 @@ class App(Application):
     def ingest(self, request: Request, body: bytes) -> Response | Later:
         """Writes one command or a batch."""
         access, grant = self._memory_access, self._grants[request.who]
+        if COMMANDS not in request.kept:
+            # From now on, the core parses what comes with this head.
+            request.kept[COMMANDS] = self._parser(grant)
         if access.may_wait:
             return _written(partial(access.ingest, body, grant, request.peer))
         finish = access.begin(body, grant, request.peer)
-        return lambda: json_response(finish().answer())
+        return lambda: response(JSON, _answer(finish()))
+
+    def _parser(self, grant: Grant) -> tuple[Commands, Callable[[ParsedWrites], object]]:
+        """What parses the commands of a token, and carries them out."""
+        known = self._parsing.get(grant.name)
+        if known is None:
+            commands = self._memory_access.commands(grant, self.max_body)
+            known = commands, partial(self._ingest_parsed, grant)
+            self._parsing[grant.name] = known
+        return known
+
+    def _ingest_parsed(self, grant: Grant, writes: ParsedWrites) -> Callable[[], None]:
+        """Writes the commands of several requests, which the core has parsed."""
+        finish = self._memory_access.begin_parsed(writes, grant)
+
+        def second_step() -> None:
+            answers = [_answer(written) for written in finish()]
+            writes.respond(200, response(JSON, b"").headers, answers)
+
+        return second_step
 
     def read(self, request: Request, given: Given) -> Response:
         """Reads a range."""
@@ -184,7 +219,12 @@ class App(Application):
 
 async def _written(ingest: Callable[[], Written]) -> Response:
     """Writes in a thread of its own, because the write can wait."""
-    return json_response((await asyncio.to_thread(ingest)).answer())
+    return response(JSON, _answer(await asyncio.to_thread(ingest)))
+
+
+@lru_cache(MAX_ANSWERS)
+def _answer(written: Written) -> bytes:
+    return msgspec.json.encode(written.answer())
 
 
 def _ranges(given: Given) -> list[tuple[str, int, int]]:

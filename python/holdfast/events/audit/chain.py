@@ -8,7 +8,7 @@ the `prev` of line 2. A chain goes on in the next file, and after a restart.
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
 
@@ -26,15 +26,14 @@ encoded = msgspec.json.Encoder().encode
 """Returns the fields of a line as JSON."""
 
 
-class Record(NamedTuple):
-    """What a line says: its time, and its other fields as JSON."""
+Record: TypeAlias = tuple[str, bytes]
+"""What a line says: its time, and its other fields as JSON."""
 
-    time: str
-    body: bytes
 
-    def unchained(self) -> bytes:
-        """The line without a place in the chain: for copies of lines that the file lacks."""
-        return b'{"time":"%b","seq":null,"prev":null,%b\n' % (self.time.encode(), self.body[1:])
+def unchained(record: Record) -> bytes:
+    """The line without a place in the chain: for copies of lines that the file lacks."""
+    time, body = record
+    return b'{"time":"%b","seq":null,"prev":null,%b\n' % (time.encode(), body[1:])
 
 
 class End(NamedTuple):
@@ -44,17 +43,18 @@ class End(NamedTuple):
     digest: str | None = None
 
 
-def chained(end: End, records: Iterable[Record]) -> tuple[list[bytes], list[End]]:
-    """The lines that follow, each with its line feed, and the end of the chain after each."""
-    lines, ends = [], []
+def chained(end: End, records: Iterable[Record]) -> tuple[list[bytes], list[str]]:
+    """The lines that follow, each with its line feed and its digest."""
+    lines, digests = [], []
     seq, digest = end
     for time, body in records:
-        prev, seq = "null" if digest is None else f'"{digest}"', seq + 1
+        seq += 1
+        prev = "null" if digest is None else f'"{digest}"'
         line = f'{{"time":"{time}","seq":{seq},"prev":{prev},'.encode() + body[1:] + b"\n"
         digest = digest_of(line)
         lines.append(line)
-        ends.append(End(seq, digest))
-    return lines, ends
+        digests.append(digest)
+    return lines, digests
 
 
 def digest_of(line: bytes) -> str:

@@ -10,17 +10,22 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from holdfast.events import log_lines
-from holdfast.events.audit.chain import BREAK, End, Record, chained, encoded
+from holdfast.events.audit.chain import BREAK, End, Record, chained, encoded, unchained
 from holdfast.events.audit.file import AuditFile
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
+    import msgspec
+
     from holdfast.events.audit.copies import Copies
+
+    Line: TypeAlias = Mapping[str, object] | msgspec.Raw
+    """The fields of a line, also as JSON."""
 
 
 class Unrecorded(Exception):
@@ -68,7 +73,7 @@ class Audit:
         """Writes one line: the time, its place in the chain, then the fields."""
         self.write_all([fields])
 
-    def write_all(self, lines: Iterable[Mapping[str, object]], *, done: bool = False) -> None:
+    def write_all(self, lines: Iterable[Line], *, done: bool = False) -> None:
         """Writes lines, all with the present time.
 
         After lines that could not be written, a line with their number comes first. But if the log
@@ -85,7 +90,7 @@ class Audit:
             else:
                 self._lose(records[stored:])
 
-    def queue(self, lines: Iterable[Mapping[str, object]]) -> Group:
+    def queue(self, lines: Iterable[Line]) -> Group:
         """Queues the lines of a write that is about to be carried out, for `write_group`.
 
         Lines that are queued before that call are written together: a call of the system costs
@@ -105,7 +110,7 @@ class Audit:
             if group is self._group:
                 self._group = Group()
                 now = log_lines.timestamp(time.time())
-                records = [Record(now, body) for body in group.bodies]
+                records = [(now, body) for body in group.bodies]
                 stored = self._store(records, together=self.closed)
                 if stored < len(records):
                     group.is_refused = self.closed
@@ -183,13 +188,13 @@ class Audit:
             each.close()
 
     @staticmethod
-    def _records(lines: Iterable[Mapping[str, object]]) -> list[Record]:
+    def _records(lines: Iterable[Line]) -> list[Record]:
         now = log_lines.timestamp(time.time())
-        return [Record(now, encoded(fields)) for fields in lines]
+        return [(now, encoded(fields)) for fields in lines]
 
     def _store(self, records: list[Record], *, together: bool = False) -> int:
         """Stores records after all that wait. Returns how many of them were stored."""
-        reports: list[Mapping[str, object]] = []
+        reports: list[Line] = []
         if self._closed:
             return 0
         if self._file is not None:
@@ -214,7 +219,7 @@ class Audit:
 
     def _append(self, records: list[Record], *, together: bool) -> int:
         """Appends records to the file, then sends their copies. Returns how many were stored."""
-        lines, ends = chained(self._end, records)
+        lines, digests = chained(self._end, records)
         written = 0
         if self._file is None:
             written = len(lines)
@@ -227,7 +232,7 @@ class Audit:
             else:
                 self._set_failing(False)
         if written:
-            self._end = ends[written - 1]
+            self._end = End(self._end.seq + written, digests[written - 1])
         self._send(lines[:written])
         return written
 
@@ -239,7 +244,7 @@ class Audit:
         """Counts lines that the file lacks. Their copies have no place in the chain."""
         self._failed += len(records)
         self._missing += len(records)
-        self._send([record.unchained() for record in records])
+        self._send([unchained(record) for record in records])
 
     def _fail(self) -> None:
         """Reports the present exception."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
@@ -25,6 +25,17 @@ if TYPE_CHECKING:
 
 MAX_QUERIES = 64
 """Parsed queries that are kept."""
+
+JUDGED = "judged"
+"""The key of the judgement in `Request.kept`."""
+
+
+class _Judged(NamedTuple):
+    """A head without fault, by the tokens and rules of an application, which never change."""
+
+    operation: Operation[Any]
+    who: str
+    parameters: Given
 
 
 class Application:
@@ -107,25 +118,35 @@ class Application:
     # Steps.
 
     def _answer(self, request: Request) -> Response | Later:
-        self.origins.check_host(request)
-        operation = self.routes.get(request.path)
-        if operation is None:
-            raise BadRequest("not_found", self.nowhere(request.path))
-        head = request.method == "HEAD" and operation.method == "GET" and operation.has_head
-        if request.method != operation.method and not head:
-            return self._other_method(request, operation)
-        if not operation.is_open:
-            self.origins.check(request)
-            request.who = request.owner(self._tokens) if self._tokens else self._anyone
+        judged = request.kept.get(JUDGED)
+        if judged is None:
+            self.origins.check_host(request)
+            operation = self.routes.get(request.path)
+            if operation is None:
+                raise BadRequest("not_found", self.nowhere(request.path))
+            head = request.method == "HEAD" and operation.method == "GET" and operation.has_head
+            if request.method != operation.method and not head:
+                return self._other_method(request, operation)
+            judged = request.kept[JUDGED] = self._judged(request, operation)
+        operation, request.who, parameters = judged
         if operation.body is None:
-            fields = operation.parameters
-            parameters = self._parameters(request.path, request.query) if fields else {}
             return operation.handler(self, request, parameters)
-        self.check_type(request)
         body = request.arrived(self.max_body)
         if body is None:
             return self._arriving(operation, operation.body, request)
         return operation.handler(self, request, operation.body.parse(request, body))
+
+    def _judged(self, request: Request, operation: Operation[Any]) -> _Judged:
+        """Judges all of a head but the length of the body. Raises `BadRequest`."""
+        if not operation.is_open:
+            self.origins.check(request)
+            request.who = request.owner(self._tokens) if self._tokens else self._anyone
+        parameters: Given = {}
+        if operation.body is not None:
+            self.check_type(request)
+        elif operation.parameters:
+            parameters = self._parameters(request.path, request.query)
+        return _Judged(operation, request.who, parameters)
 
     def _parsed(self, path: str, query: bytes) -> Given:
         return from_query(query, self.routes[path].parameters)
@@ -141,16 +162,16 @@ class Application:
 
     def _other_method(self, request: Request, operation: Operation[Any]) -> Response:
         if request.method == "OPTIONS":
-            answer = Response(204, headers=list(SAFE))
+            answer = Response(204, headers=SAFE)
         else:
             error = BadRequest("method_not_allowed", self.not_allowed(operation))
             answer = self._refusal(request, error)
-        answer.headers.append((b"allow", operation.methods.encode()))
+        answer.headers = (*answer.headers, (b"allow", operation.methods.encode()))
         return answer
 
     def _refusal(self, request: Request, error: Exception) -> Response:
         answer = self.refused(request, error)
-        answer.headers += headers_with(answer.status)
+        answer.headers = (*answer.headers, *headers_with(answer.status))
         answer.closes = answer.status in UNREAD or request.header(b"expect") is not None
         return answer
 

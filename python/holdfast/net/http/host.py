@@ -11,10 +11,11 @@ import contextlib
 import socket
 import time
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import unquote
 
-from holdfast._core import HttpServer
+from holdfast._core import HttpServer, ParsedWrites
 from holdfast.events import log_lines
 from holdfast.net import event_loop
 from holdfast.net.addresses import joined, parse_address
@@ -30,7 +31,7 @@ from holdfast.net.http.requests import (
 from holdfast.runtime.heartbeat import PERIOD_S, Heartbeat
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Collection, Mapping
+    from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
 
     from holdfast._core import HttpExchange, ListeningSocket
     from holdfast.net.addresses import Network
@@ -211,25 +212,26 @@ class Host:
 
     def _take(self, server: HttpServer, loop: asyncio.AbstractEventLoop) -> None:
         """Takes a batch of requests, and what has happened to others."""
-        requests, events = server.take()
-        for first in range(0, len(requests), REQUESTS_PER_BATCH):
-            second: list[tuple[_HostRequest, SecondStep]] = []
-            for arguments in requests[first : first + REQUESTS_PER_BATCH]:
-                request = _HostRequest(*arguments)
-                if (step := self._begin(request, loop)) is not None:
-                    second.append((request, step))
-            for request, step in second:
-                self._respond(request, self._stepped(request, step))
+        batches, events = server.take(REQUESTS_PER_BATCH)
+        for batch in batches:
+            second = [step for each in batch if (step := self._begin(each, loop)) is not None]
+            for step in second:
+                step()
             server.flush()
         for number, kind, value in events:
             waiting = self._open.get(number)
             if waiting is not None:
                 waiting.note(kind, value)
-        if not requests and not events:
+        if not batches and not events:
             self._log_events(server)
 
-    def _begin(self, request: _HostRequest, loop: asyncio.AbstractEventLoop) -> SecondStep | None:
+    def _begin(
+        self, item: ParsedWrites | tuple[Any, ...], loop: asyncio.AbstractEventLoop
+    ) -> Callable[[], None] | None:
         """Calls the handler. Returns its second step, if it has one."""
+        if isinstance(item, ParsedWrites):
+            return self._begin_parsed(item, loop)
+        request = _HostRequest(*item)
         try:
             outcome = self.handler(request)
         except Exception as error:
@@ -238,18 +240,45 @@ class Host:
             self._respond(request, outcome)
             return None
         if callable(outcome):
-            return outcome
+            return partial(self._second_step, request, outcome)
         self._open[request.exchange.number] = request
         task = loop.create_task(self._answer(request, outcome))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return None
 
-    def _stepped(self, request: _HostRequest, step: SecondStep) -> Response:
+    def _second_step(self, request: _HostRequest, step: SecondStep) -> None:
         try:
-            return step()
+            answer = step()
         except Exception as error:
-            return self._failed(request, error)
+            answer = self._failed(request, error)
+        self._respond(request, answer)
+
+    def _begin_parsed(
+        self, writes: ParsedWrites, loop: asyncio.AbstractEventLoop
+    ) -> Callable[[], None]:
+        """Calls the handler of writes that the core has parsed. It answers those it carries out."""
+        carry_out: Callable[[], object] | None = None
+        with self._logged():
+            carry_out = writes.handler(writes)
+
+        def second_step() -> None:
+            with self._logged():
+                if carry_out is not None:
+                    carry_out()
+            for each in writes.requests():
+                if (step := self._begin(each, loop)) is not None:
+                    step()
+
+        return second_step
+
+    @contextlib.contextmanager
+    def _logged(self) -> Iterator[None]:
+        """Logs an error: what was not carried out then takes the way of other requests."""
+        try:
+            yield
+        except Exception:
+            log_lines.problem("request_failed", listener=self.name, peer="-")
 
     async def _answer(self, request: _HostRequest, outcome: Awaitable[Response | None]) -> None:
         """Waits for the response of a handler, and sends it."""
@@ -351,12 +380,9 @@ class _HostRequest(Request):
     def __init__(
         self,
         exchange: HttpExchange,
-        method: str,
-        path: str,
-        query: bytes,
-        headers: Headers,
+        head: tuple[str, str, bytes, str, Headers, dict[str, Any]],
         peer: str,
-        version: str,
+        length: int | None,
         whole: bytes | None,
         identity: tuple[str, str, str] | None,
     ) -> None:
@@ -366,6 +392,7 @@ class _HostRequest(Request):
         self._is_gone = False
         self._when_gone: Callable[[], object] | None = None
         self._waiter: asyncio.Future[tuple[str, Any]] | None = None
+        method, path, query, version, headers, kept = head
         super().__init__(
             method,
             unquote(path) if "%" in path else path,
@@ -374,7 +401,9 @@ class _HostRequest(Request):
             peer,
             version=version,
             whole=whole,
+            length=length,
             identity=None if identity is None else Identity(*identity),
+            kept=kept,
         )
 
     def note(self, kind: str, value: Any) -> None:

@@ -12,21 +12,29 @@ import json
 import re
 from collections.abc import Awaitable, Callable
 from dataclasses import KW_ONLY, dataclass, field
-from typing import TYPE_CHECKING, TypeAlias
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 
 from holdfast.runtime.text import clip
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
 Headers: TypeAlias = list[tuple[bytes, bytes]]
 """Names in lower case, and values."""
 
 JSON = b"application/json"
 
-SAFE: Headers = [(b"cache-control", b"no-store"), (b"x-content-type-options", b"nosniff")]
+COMMANDS = "commands"
+"""The key in `Request.kept` of `Commands`, which the core then parses bodies with, and the function
+that gets its `ParsedWrites` and returns the second step. What is not parsed comes as a request."""
+
+MAX_KINDS = 64
+"""Headers of responses that are kept."""
+
+SAFE = ((b"cache-control", b"no-store"), (b"x-content-type-options", b"nosniff"))
 """Headers of every response: no caching, no guessing of content types."""
 
 _JSON = re.compile(rb'application/json[ \t]*(;[ \t]*charset="?utf-?8"?[ \t]*)?', re.I)
@@ -66,14 +74,20 @@ class Response:
 
     status: int
     body: bytes = b""
-    headers: Headers = field(default_factory=list)
+    headers: Sequence[tuple[bytes, bytes]] = ()
     closes: bool = False
     """Whether the host closes the connection then. It reads on until the peer has the response."""
 
 
 def response(kind: bytes, body: bytes, *more: tuple[bytes, bytes], status: int = 200) -> Response:
     """Returns a response with a body of this content type."""
-    return Response(status, body, [(b"content-type", kind), *SAFE, *more])
+    return Response(status, body, _headers(kind, more))
+
+
+@lru_cache(MAX_KINDS)
+def _headers(kind: bytes, more: tuple[tuple[bytes, bytes], ...]) -> Sequence[tuple[bytes, bytes]]:
+    # The same tuple each time: the core then knows what it has.
+    return ((b"content-type", kind), *SAFE, *more)
 
 
 def rejection(status: int, reason: str, detail: str, word: str = "rejected") -> Response:
@@ -92,6 +106,7 @@ class Request:
     query: bytes
     """The part behind `?`, as it was sent."""
     headers: Headers
+    """Without Content-Length."""
     peer: str
     """The address of the client as text: `10.0.0.9:51200`."""
     _: KW_ONLY
@@ -99,9 +114,14 @@ class Request:
     """The version of HTTP, `1.0` or `1.1`."""
     whole: bytes | None = b""
     """The body, if it has arrived together with the head; `None` while it still arrives."""
+    length: int | None = None
+    """The length of the body, if the head says it."""
     identity: Identity | None = None
     who: str = "-"
     """The name of the token's owner; `-` until the token was checked."""
+    kept: dict[str, Any] = field(default_factory=dict)
+    """What an application has found out about the head. Requests of a server whose heads are equal
+    have it in common, whoever sends them; a server that starts anew knows nothing."""
     _by_name: dict[bytes, list[bytes]] | None = field(default=None, init=False, repr=False)
 
     # What a host provides.
@@ -139,8 +159,8 @@ class Request:
 
         A body that is too large by its length is refused before it arrives.
         """
-        size = self.header(b"content-length")
-        if len(self.whole or b"") > most or (size is not None and int(size) > most):
+        size = self.length if self.whole is None else len(self.whole)
+        if size is not None and size > most:
             raise BadRequest("too_large", f"the body has more than {most} bytes")
         return self.whole
 

@@ -1,0 +1,262 @@
+//! `Commands` and `ParsedWrites`: JSON commands in their plain form, which nearly all have: one object,
+//! without escapes in its text, and integers as values.
+//!
+//! Nothing is refused here: what has another form, or can't be carried out, takes the way of all other
+//! commands.
+
+use std::collections::HashMap;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use bytes::Bytes;
+use holdfast_engine::http::RequestHead;
+use holdfast_memory::Area;
+use pyo3::prelude::*;
+use pyo3::pybacked::PyBackedBytes;
+use pyo3::types::{PyBytes, PyString, PyTuple};
+
+use crate::batch::{Batch, Checked};
+use crate::exchange::{HttpExchange, request};
+use crate::memory::{Memory, largest, named, put};
+use crate::peer;
+
+/// The digits of the largest register.
+const MAX_DIGITS: usize = 5;
+
+/// What a source may write: the areas of each memory, and the most bytes of a command.
+#[pyclass(frozen, module = "holdfast")]
+pub struct Commands {
+    targets: HashMap<String, Target>,
+    most: usize,
+}
+
+/// The name of a memory, the same in JSON, the memory, and areas.
+type Given<'py> = (Bound<'py, PyString>, Vec<u8>, Py<Memory>, Vec<String>);
+
+struct Target {
+    name: Py<PyString>,
+    /// The name in JSON.
+    shown: Bytes,
+    memory: Py<Memory>,
+    areas: Vec<Area>,
+}
+
+#[pymethods]
+impl Commands {
+    #[new]
+    fn new(targets: Vec<Given<'_>>, most: usize) -> PyResult<Commands> {
+        let targets = targets.into_iter().map(|(name, shown, memory, areas)| {
+            let areas = areas.iter().map(|area| named(area)).collect::<PyResult<_>>()?;
+            let key = name.to_str()?.to_owned();
+            Ok((key, Target { name: name.unbind(), shown: shown.into(), memory, areas }))
+        });
+        Ok(Commands { targets: targets.collect::<PyResult<_>>()?, most })
+    }
+}
+
+impl Commands {
+    /// The memory's name, the same in JSON, and the write, if the command has the plain form and is granted, and its
+    /// memory takes it at once.
+    pub fn parsed(&self, py: Python<'_>, body: &[u8]) -> Option<(Py<PyString>, Bytes, Batch)> {
+        if body.len() > self.most {
+            return None;
+        }
+        let Command { memory, area, address, values } = Command::parse(body)?;
+        let target = self.targets.get(memory)?;
+        let area = target.areas.iter().copied().find(|known| known.name() == area)?;
+        let (core, count) = (&target.memory.get().core, values.len());
+        if core.has_journal() || !core.span(area).holds(address, count) {
+            return None;
+        }
+        let mut bytes = vec![0; area.byte_len(count)];
+        for (index, value) in values.into_iter().enumerate() {
+            put(area, &mut bytes, index, (value <= largest(area)).then_some(value)?);
+        }
+        let memory = target.memory.clone_ref(py);
+        let batch = Batch::of(Checked { memory, area, address, count }, bytes)?;
+        Some((target.name.clone_ref(py), target.shown.clone(), batch))
+    }
+}
+
+/// The write of a request.
+pub struct ParsedWrite {
+    pub exchange: HttpExchange,
+    pub head: Box<RequestHead>,
+    /// The head as the host knows it.
+    pub known: Py<PyTuple>,
+    pub body: Bytes,
+    pub name: Py<PyString>,
+    /// The name in JSON.
+    pub shown: Bytes,
+    pub batch: Batch,
+}
+
+/// Writes of several requests, which were checked.
+#[pyclass(frozen, module = "holdfast")]
+pub struct ParsedWrites {
+    /// The function that carries them out.
+    #[pyo3(get)]
+    handler: Py<PyAny>,
+    writes: Mutex<Writes>,
+}
+
+#[derive(Default)]
+struct Writes {
+    open: Vec<ParsedWrite>,
+    /// Those that were carried out.
+    done: Vec<ParsedWrite>,
+}
+
+impl ParsedWrites {
+    pub fn new(handler: Py<PyAny>, open: Vec<ParsedWrite>) -> ParsedWrites {
+        ParsedWrites { handler, writes: Mutex::new(Writes { open, done: Vec::new() }) }
+    }
+
+    fn writes(&self) -> MutexGuard<'_, Writes> {
+        self.writes.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[pymethods]
+impl ParsedWrites {
+    /// The lines of the audit log, without time and place. Each begins with the first part, the address
+    /// of the peer, and the second part.
+    fn lines<'py>(&self, py: Python<'py>, before: &[u8], after: &[u8]) -> Vec<Bound<'py, PyBytes>> {
+        let writes = self.writes();
+        let lines = writes.open.iter().map(|write| {
+            let peer = peer::text(write.head.peer.address);
+            let origin = [before, b"\"", peer.as_bytes(), b"\"", after].concat();
+            let lines = write.batch.records(&origin, &[&write.shown], "done", None);
+            PyBytes::new(py, &lines.concat())
+        });
+        lines.collect()
+    }
+
+    /// Carries out the writes, one after the other. Returns the memory of each that was carried out, and
+    /// the number of its values.
+    fn write(&self, py: Python<'_>) -> Vec<(Py<PyString>, usize)> {
+        let mut writes = self.writes();
+        let mut written = Vec::with_capacity(writes.open.len());
+        for write in std::mem::take(&mut writes.open) {
+            match write.batch.carry_out(py) {
+                Ok((count, _)) => {
+                    written.push((write.name.clone_ref(py), count));
+                    writes.done.push(write);
+                }
+                Err(_) => writes.open.push(write),
+            }
+        }
+        written
+    }
+
+    /// Answers the requests whose writes were carried out.
+    fn respond(
+        &self,
+        status: u16,
+        headers: &Bound<'_, PyAny>,
+        bodies: Vec<PyBackedBytes>,
+    ) -> PyResult<()> {
+        let done = std::mem::take(&mut self.writes().done);
+        for (write, body) in done.iter().zip(bodies) {
+            write.exchange.respond(status, headers, &body, false)?;
+        }
+        Ok(())
+    }
+
+    /// Takes the requests whose writes were not carried out, as those of other commands.
+    fn requests<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyTuple>>> {
+        let open = std::mem::take(&mut self.writes().open);
+        let requests =
+            open.into_iter().map(|ParsedWrite { exchange, head, known, body, .. }| {
+                request(py, exchange, known.into_bound(py), &head, Some(body))
+            });
+        requests.collect()
+    }
+}
+
+/// A command in its plain form.
+struct Command<'a> {
+    memory: &'a str,
+    area: &'a str,
+    address: u16,
+    values: Vec<u16>,
+}
+
+impl<'a> Command<'a> {
+    fn parse(body: &'a [u8]) -> Option<Command<'a>> {
+        let (mut memory, mut area, mut address, mut values) = (None, None, None, None);
+        let mut text = Text(body);
+        text.takes(b'{')?;
+        loop {
+            let key = text.word()?;
+            text.takes(b':')?;
+            match key {
+                "memory" if memory.is_none() => memory = Some(text.word()?),
+                "area" if area.is_none() => area = Some(text.word()?),
+                "address" if address.is_none() => address = Some(text.number()?),
+                "values" if values.is_none() => values = Some(text.numbers()?),
+                _ => return None,
+            }
+            if text.takes(b',').is_none() {
+                break;
+            }
+        }
+        text.takes(b'}')?;
+        text.trim();
+        text.0.is_empty().then_some(())?;
+        Some(Command { memory: memory?, area: area?, address: address?, values: values? })
+    }
+}
+
+/// JSON that was not read yet.
+struct Text<'a>(&'a [u8]);
+
+impl<'a> Text<'a> {
+    fn trim(&mut self) {
+        while let [b' ' | b'\t' | b'\n' | b'\r', rest @ ..] = self.0 {
+            self.0 = rest;
+        }
+    }
+
+    fn takes(&mut self, byte: u8) -> Option<()> {
+        self.trim();
+        self.0 = self.0.strip_prefix(&[byte])?;
+        Some(())
+    }
+
+    /// A text of printable ASCII without escapes.
+    fn word(&mut self) -> Option<&'a str> {
+        self.takes(b'"')?;
+        let is_plain = |byte: &u8| matches!(byte, b' '..=b'~') && !matches!(byte, b'"' | b'\\');
+        let len = self.0.iter().take_while(|byte| is_plain(byte)).count();
+        let (word, rest) = self.0.split_at(len);
+        self.0 = rest.strip_prefix(b"\"")?;
+        str::from_utf8(word).ok()
+    }
+
+    /// An integer without a sign, a fraction or an exponent: what follows it is no part of a number.
+    fn number(&mut self) -> Option<u16> {
+        self.trim();
+        let digits = self.0.iter().take_while(|byte| byte.is_ascii_digit()).count();
+        let (number, rest) = self.0.split_at(digits);
+        if digits > MAX_DIGITS || (digits > 1 && number.starts_with(b"0")) {
+            return None;
+        }
+        if matches!(rest, [b'.' | b'e' | b'E', ..]) {
+            return None;
+        }
+        self.0 = rest;
+        str::from_utf8(number).ok()?.parse().ok()
+    }
+
+    fn numbers(&mut self) -> Option<Vec<u16>> {
+        self.takes(b'[')?;
+        let mut numbers = Vec::new();
+        loop {
+            numbers.push(self.number()?);
+            if self.takes(b',').is_none() {
+                self.takes(b']')?;
+                return Some(numbers);
+            }
+        }
+    }
+}
