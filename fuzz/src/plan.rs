@@ -50,7 +50,7 @@ fn read(parts: &[u8], max_registers: u8, max_bits: u16) -> (Vec<Field>, PlanLimi
         let area = Area::ALL[usize::from(part[0] >> 3) % Area::ALL.len()];
         let [address, count] = [1, 3].map(|at| u16::from_be_bytes([part[at], part[at + 1]]));
         let start = u32::from(address);
-        let stretch = Stretch { area, start, end: start + u32::from(count) };
+        let stretch = Stretch { area, start, end: start + u32::from(count.max(1)) };
         match part[0] % 8 {
             0 => limits.readable.push(stretch),
             1 => limits.forbidden.push(stretch),
