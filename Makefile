@@ -45,7 +45,7 @@ RUST_LOG := .cache/test-rust.log
 test-rust: $(TOOLCHAIN)
 	@cargo test --locked --quiet $(CRATES) --lib --tests > $(RUST_LOG) 2>&1 && \
 	  cargo test --locked --quiet $(CRATES) --doc >> $(RUST_LOG) 2>&1 && \
-	  cargo test --locked --quiet --manifest-path $(FUZZ) --target-dir target/fuzz --tests >> $(RUST_LOG) 2>&1 || \
+	  cargo test --locked --quiet --manifest-path $(FUZZ) --target-dir target --tests >> $(RUST_LOG) 2>&1 || \
 	  { cat $(RUST_LOG); exit 1; }
 	@awk '/^test result/ {passed += $$4} END {print "Rust: " passed " passed"}' $(RUST_LOG)
 
@@ -63,30 +63,34 @@ explore: .venv/core.stamp .venv/dev.stamp
 	PROPTEST_CASES=5000 cargo test --locked --quiet $(CRATES) --lib --tests; rust=$$?; \
 	HOLDFAST_EXPLORE=1 $(BIN)/pytest -m hypothesis && exit $$rust
 
-# Puts the faults of tests/conformance/mutations.toml into the program, one after the other: the test of each must
-# fail. Takes an hour; changes files of the checkout meanwhile, and restores them.
-proof: .venv/core.stamp .venv/dev.stamp
-	$(BIN)/python tests/conformance/mutate.py
+# Looks for faults of the program and of its tests for HOURS: planted faults, fuzzing, new cases, hostile devices,
+# mutants. Writes .cache/proof/report.md. Changes files of the checkout meanwhile, and restores them.
+CARGO_MUTANTS := 27.1.0
+HOURS ?= 4
+proof: .venv/core.stamp .venv/dev.stamp .cache/tools/cargo-mutants-$(CARGO_MUTANTS).stamp
+	$(BIN)/python tools/proof.py $(HOURS)
 
 # Looks for inputs that break a check of fuzz/src for SECONDS, and keeps those that reach new code in .cache/fuzz.
-# One that fails is printed and kept in fuzz/artifacts. Commit it to fuzz/corpus with the mend.
-CARGO_FUZZ := 0.13.2
+# One that fails is printed and kept in fuzz/artifacts. Commit it to fuzz/corpus with the mend. No sanitizer watches
+# memory: the crates forbid unsafe code.
 TARGET ?= request
 SECONDS ?= 60
-fuzz: .cache/tools/cargo-fuzz-$(CARGO_FUZZ).stamp
-	@cargo +nightly --version > /dev/null 2>&1 || \
-	  { echo "fuzzing needs nightly Rust: rustup toolchain install nightly"; exit 1; }
+COVERED := -Cpasses=sancov-module $(foreach each,level=4 inline-8bit-counters pc-table trace-compares,\
+  -Cllvm-args=-sanitizer-coverage-$(each))
+fuzz: $(TOOLCHAIN)
 	@[ -d fuzz/corpus/$(TARGET) ] || { echo "TARGET is $(TARGET), allowed:" $(notdir $(wildcard fuzz/corpus/*)); exit 1; }
-	@mkdir -p .cache/fuzz/$(TARGET)
-	PATH="$(CURDIR)/.cache/tools/bin:$$PATH" cargo +nightly fuzz run --target-dir target/fuzz --features libfuzzer $(TARGET) \
-	  .cache/fuzz/$(TARGET) fuzz/corpus/$(TARGET) -- -max_total_time=$(SECONDS)
+	@mkdir -p .cache/fuzz/$(TARGET) fuzz/artifacts/$(TARGET)
+	host=$$(rustc --print host-tuple) && RUSTFLAGS="$(COVERED)" cargo build --locked --quiet --release --manifest-path $(FUZZ) \
+	  --target-dir target/fuzz --target $$host --features libfuzzer --bin $(TARGET) && \
+	  target/fuzz/$$host/release/$(TARGET) .cache/fuzz/$(TARGET) fuzz/corpus/$(TARGET) -timeout=10 \
+	  -artifact_prefix=fuzz/artifacts/$(TARGET)/ -max_total_time=$(SECONDS)
 
 lint: no-std .venv/core.stamp .venv/dev.stamp
 	cargo fmt --check
 	cargo fmt --check --manifest-path $(NO_STD)
 	cargo fmt --check --manifest-path $(PEERS)/rust/Cargo.toml
 	cargo fmt --check --manifest-path $(FUZZ)
-	cargo clippy --locked --quiet --manifest-path $(FUZZ) --target-dir target/fuzz --lib --tests -- -D warnings
+	cargo clippy --locked --quiet --manifest-path $(FUZZ) --target-dir target --lib --tests -- -D warnings
 	cargo clippy --locked --quiet --workspace --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets --no-default-features -- -D warnings

@@ -5,24 +5,35 @@
 
 pub mod ascii;
 pub mod client;
-/// The codec of steps alone: its crate brings the clients of a log and a database.
-#[path = "../../crates/journal/src/encoding.rs"]
-mod encoding;
+pub mod file;
+pub mod hello;
+pub mod http;
+#[path = "../../crates/journal/tests/support/mod.rs"]
+mod journal_support;
+pub mod log;
 pub mod mbap;
+pub mod plan;
 pub mod raw_ingest;
 pub mod request;
 pub mod response;
 pub mod rtu;
 pub mod step;
+#[path = "../../crates/engine/src/tls/hello.rs"]
+mod tls_hello;
 
 /// A check.
 pub type Check = fn(&[u8]);
 
 /// All checks, with the names of their targets.
-pub const TARGETS: [(&str, Check); 8] = [
+pub const TARGETS: [(&str, Check); 13] = [
     ("ascii", ascii::check),
     ("client", client::check),
+    ("file", file::check),
+    ("hello", hello::check),
+    ("http", http::check),
+    ("log", log::check),
     ("mbap", mbap::check),
+    ("plan", plan::check),
     ("raw_ingest", raw_ingest::check),
     ("request", request::check),
     ("response", response::check),

@@ -2,9 +2,8 @@
 
 use std::sync::Arc;
 
+use holdfast_journal::encoding;
 use holdfast_memory::{Access, Area, Layout, Memory, Refusal, Span};
-
-use crate::encoding;
 
 /// The first address and the size of each area, for each memory.
 const SPANS: [[(u16, u32); 4]; 2] =
@@ -12,13 +11,7 @@ const SPANS: [[(u16, u32); 4]; 2] =
 
 /// What is decoded is encoded to the same bytes, and its memories can carry it out.
 pub fn check(data: &[u8]) {
-    let members = SPANS.map(|spans| {
-        let layout =
-            Area::ALL.into_iter().zip(spans).fold(Layout::default(), |layout, (area, span)| {
-                layout.with(area, Span::new(span.0, span.1).expect("a span within the addresses"))
-            });
-        Arc::new(Memory::new(layout, None).expect("memory for a few items"))
-    });
+    let members = members();
     let Ok(step) = encoding::decode(data, &members) else { return };
     let mut bytes = Vec::new();
     encoding::encode(&step, &mut bytes);
@@ -27,4 +20,15 @@ pub fn check(data: &[u8]) {
         // No memory is sealed.
         assert_eq!((step.access, refused.refusal), (Access::Restore, Refusal::Unsealed));
     }
+}
+
+/// The memories of a step.
+pub(crate) fn members() -> [Arc<Memory>; 2] {
+    SPANS.map(|spans| {
+        let layout =
+            Area::ALL.into_iter().zip(spans).fold(Layout::default(), |layout, (area, span)| {
+                layout.with(area, Span::new(span.0, span.1).expect("a span within the addresses"))
+            });
+        Arc::new(Memory::new(layout, None).expect("memory for a few items"))
+    })
 }

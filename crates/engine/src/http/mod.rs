@@ -13,6 +13,8 @@ mod connection;
 mod cuts;
 mod exchange;
 mod front;
+#[cfg(any(test, feature = "fuzz"))]
+pub mod in_memory;
 mod inbox;
 mod line;
 mod output;

@@ -272,6 +272,11 @@ fn by_cost(
                 break;
             }
             next_start = Some(start);
+            // What lies inside earlier fields costs nothing beside them. In a block without them, the
+            // space that they fill would be a gap.
+            if from > 0 && field.end() <= ends[from - 1] {
+                continue;
+            }
             let cost = best[from].0 + request + item * f64::from(end - start);
             // With equal costs, the longer block wins: it saves requests.
             if cost <= cheapest.0 {
@@ -399,6 +404,16 @@ mod tests {
         let [left, right] = halves(&fields, &right).unwrap();
         assert_eq!(spans(&[left.clone(), right]), [(2, 2), (9, 1)]);
         assert_eq!(halves(&fields, &left), None);
+    }
+
+    #[test]
+    fn a_field_inside_another_is_read_with_it() {
+        let area = Area::HoldingRegisters;
+        let cuts = vec![Cut { area, address: 5 }];
+        let limits = PlanLimits { max_registers: 10, cuts, ..PlanLimits::default() };
+        let fields = [field(0, 10), field(2, 1), field(8, 4)];
+        let strategy = Strategy::Cost { request: 1.0, item: 0.0 };
+        assert_eq!(spans(&plan(&fields, &limits, strategy).unwrap()), [(0, 10), (8, 4)]);
     }
 
     #[test]

@@ -22,6 +22,8 @@ mod error;
 mod follower;
 mod layout;
 mod parts;
+#[cfg(feature = "fuzz")]
+pub mod replica;
 mod settings;
 mod shared;
 mod state;

@@ -20,11 +20,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-ROOT = Path(__file__).resolve().parents[2]
-LIST = Path(__file__).with_name("mutations.toml")
+ROOT = Path(__file__).resolve().parents[1]
+LIST = ROOT / "tests" / "conformance" / "mutations.toml"
 CORE = ROOT / "python" / "holdfast" / "_core.abi3.so"
 BUILT = ROOT / "target" / "debug" / "lib_core.so"
-TIMEOUT_S = 600
+TIMEOUT_S = 3600
+"""For each command of a fault."""
+
 FAILED = 1
 """What pytest returns if a test fails."""
 
@@ -61,20 +63,36 @@ def outcome(test: str, *, rust: bool) -> str:
         # A process that has the old file open keeps it.
         CORE.unlink()
         shutil.copy(BUILT, CORE)
-    code = done(sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", test)
+    return run_tests(test)
+
+
+def run_tests(*tests: str) -> str:
+    """Whether Python tests pass with the files as they are."""
+    code = done(sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests)
     return {0: "passes", FAILED: "fails"}.get(code, "is not there")
 
 
 @contextmanager
-def mutated(file: Path, old: str, new: str) -> Iterator[bool]:
-    """Puts a fault in; yields whether its place was found."""
-    text = file.read_text()
+def mutated(file: Path, text: str) -> Iterator[None]:
+    """Gives a file another text. An end from outside restores it too."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(FAILED))
+    before = file.read_bytes()
     try:
-        if text.count(old) == 1:
-            file.write_text(text.replace(old, new))
-        yield text.count(old) == 1
+        file.write_text(text, encoding="utf-8")
+        yield
     finally:
-        file.write_text(text)
+        file.write_bytes(before)
+
+
+def verdict(fault: dict[str, str]) -> str:
+    """What the test of a fault finds."""
+    file = ROOT / fault["file"]
+    text = file.read_text(encoding="utf-8")
+    if text.count(fault["old"]) != 1:
+        return "the place is gone"
+    with mutated(file, text.replace(fault["old"], fault["new"])):
+        found = outcome(fault["test"], rust=file.suffix == ".rs")
+    return {"fails": "killed", "passes": "SURVIVED"}.get(found, found)
 
 
 def main(words: list[str]) -> int:
@@ -82,22 +100,18 @@ def main(words: list[str]) -> int:
     every = tomllib.loads(LIST.read_text())["mutation"]
     chosen = [each for each in every if all(word in each["row"] for word in words)]
     verdicts = Counter[str]()
-    # An end from outside restores the files too.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(FAILED))
     saved = CORE.read_bytes()
     try:
         for each in chosen:
-            is_rust = each["file"].endswith(".rs")
-            with mutated(ROOT / each["file"], each["old"], each["new"]) as is_in:
-                found = outcome(each["test"], rust=is_rust) if is_in else "the place is gone"
-            verdict = {"fails": "killed", "passes": "SURVIVED"}.get(found, found)
-            verdicts[verdict] += 1
-            print(f"{verdict:16} {each['row']}  ({each['test'].split('::')[-1].split()[-1]})")
+            found = verdict(each)
+            verdicts[found] += 1
+            print(f"{found:16} {each['row']}  ({each['test'].split('::')[-1].split()[-1]})")
             sys.stdout.flush()
     finally:
         CORE.unlink()
         CORE.write_bytes(saved)
-    print(", ".join(f"{count} {verdict}" for verdict, count in verdicts.items()))
+    found = ", ".join(f"{count} {each}" for each, count in verdicts.items())
+    print(f"{len(every)} faults: {found}")
     return int(verdicts.total() != verdicts["killed"])
 
 
