@@ -13,7 +13,7 @@ import pytest
 from nats.errors import Error
 
 from holdfast.net.mqtt.dialing import dial
-from holdfast.net.mqtt.waiting import Waiter
+from holdfast.net.mqtt.selector import Waiter
 from holdfast.net.nats import SafeClient, Servers
 from holdfast.net.secure_channel import TlsRefused
 from holdfast.net.tls import Tls

@@ -13,7 +13,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from holdfast.events import log_lines
 from holdfast.net.mqtt.dialing import CONNACK_TIMEOUT_S, dial
-from holdfast.net.mqtt.waiting import Ended, Waiter
+from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secret_file import read_password
 from holdfast.net.secure_channel import failure_text
 from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES, Connection
