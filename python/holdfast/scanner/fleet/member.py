@@ -26,7 +26,7 @@ from holdfast.runtime.heartbeat import Heartbeat
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.fleet.assignment import partition_of
 from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
-from holdfast.scanner.fleet.fleet import Fleet
+from holdfast.scanner.fleet.partition_leases import PartitionLeases
 from holdfast.scanner.jetstream.entries import requests as stored_requests
 from holdfast.scanner.jetstream.entries import restored
 from holdfast.scanner.placement import Changed, Placement
@@ -78,7 +78,7 @@ class FleetMember(Placement):
         start_thread: StartThread,
     ) -> None:
         """`connect` makes a connection for the leases alone, `start_thread` starts their thread."""
-        self.fleet = Fleet(
+        self.fleet = PartitionLeases(
             settings,
             terms,
             about,

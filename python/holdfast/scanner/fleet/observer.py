@@ -14,8 +14,8 @@ from nats.js.errors import NotFoundError
 
 from holdfast.net.nats import ANSWERING, connected_once, nats_reason
 from holdfast.replication.leases import LEASE_TIMES, Holding, LeaseBucket
-from holdfast.scanner.fleet.fleet import NODE, PARTITION, leases_of
 from holdfast.scanner.fleet.nodes import subject
+from holdfast.scanner.fleet.partition_leases import NODE, PARTITION, leases_of
 
 if TYPE_CHECKING:
     from types import TracebackType

@@ -48,7 +48,7 @@ def leases_of(fleet: str) -> str:
     return f"holdfast_fleet_{fleet}"
 
 
-class Fleet:
+class PartitionLeases:
     """A node. `gained` and `lost` are called with partitions, in the event loop of `start`.
 
     The leases are held by a thread of their own: this loop may be busy for seconds.
