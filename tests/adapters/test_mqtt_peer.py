@@ -13,7 +13,7 @@ import pytest
 
 from holdfast.adapters.mqtt import adapter, answers, connection, inbox
 from holdfast.ingest import MemoryAccess
-from holdfast.net.mqtt import dialing
+from holdfast.net.mqtt import connect
 from holdfast.net.mqtt.stream import BrokerSocket
 from support import mqtt_peer as mqtt
 from support import wire
@@ -606,7 +606,7 @@ class Jammed(socket.socket):
 def test_nothing_piles_up_while_the_broker_does_not_read(
     rig: Rig, fake5: FakeBroker, monkeypatch: pytest.MonkeyPatch, qos: int
 ) -> None:
-    dial, read = dialing.dial, connection.BrokerConnection.read_more
+    dial, read = connect.dial, connection.BrokerConnection.read_more
     most = {"packets": 0, "answers": 0}
 
     def dial_one_that_jams(*arguments: Any) -> BrokerSocket:

@@ -12,7 +12,7 @@ from holdfast.adapters.mqtt.connection import BrokerConnection
 from holdfast.adapters.mqtt.inbox import Filters, Inbox, Values
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
-from holdfast.net.mqtt.dialing import CONNACK_TIMEOUT_S, dial
+from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S, dial
 from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secret_file import read_password
 from holdfast.net.secure_channel import failure_text

@@ -12,7 +12,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 
 from holdfast.events import log_lines
-from holdfast.net.mqtt.dialing import CONNACK_TIMEOUT_S, dial
+from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S, dial
 from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secret_file import read_password
 from holdfast.net.secure_channel import failure_text
