@@ -17,7 +17,7 @@ from support.config_folder import Folder
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from holdfast.config import GatewayConfig, NatsConfig
+    from holdfast.config.models.services import GatewayConfig, NatsConfig
 
 HASH = "0123456789abcdef" * 4
 NATS = """\

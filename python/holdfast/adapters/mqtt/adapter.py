@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
 
-    from holdfast.config import MappedTag, MappingConfig, MqttConfig, SubscriptionConfig
+    from holdfast.config.models.root import MappedTag
+    from holdfast.config.models.services import MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.ingest import MemoryAccess
     from holdfast.net.mqtt.stream import BrokerSocket
     from holdfast.runtime.stop import Stop

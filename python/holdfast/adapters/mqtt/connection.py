@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from paho.mqtt.reasoncodes import ReasonCode
 
     from holdfast.adapters.mqtt.inbox import Inbox
-    from holdfast.config import MappingConfig, MqttConfig, SubscriptionConfig
+    from holdfast.config.models.services import MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.net.mqtt.packets import Publish
     from holdfast.net.mqtt.stream import BrokerSocket
 

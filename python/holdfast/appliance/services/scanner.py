@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from holdfast.appliance.services.services import Services
-    from holdfast.config import Config, NatsConfig
+    from holdfast.config import Config
+    from holdfast.config.models.services import NatsConfig
     from holdfast.config.models.tags import ProfileConfig
     from holdfast.scanner import Settings
 
