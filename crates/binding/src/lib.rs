@@ -11,7 +11,7 @@ mod client;
 mod connection;
 mod engine;
 mod fence;
-mod following;
+mod follower;
 mod heartbeat;
 mod http;
 mod limits;
@@ -47,7 +47,7 @@ mod _core {
     #[pymodule_export]
     use super::fence::Fence;
     #[pymodule_export]
-    use super::following::Follower;
+    use super::follower::Follower;
     #[pymodule_export]
     use super::http::{HttpExchange, HttpServer, ListeningSocket};
     #[pymodule_export]
