@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from nats.errors import Error
 
-from holdfast.replication.leases import LEASE_TIMES, LeaseTimes
+from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.scanner.fleet.partition_leases import PARTITION, leases_of
 from support import wire
 from support.cli import invoke

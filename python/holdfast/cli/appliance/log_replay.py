@@ -24,7 +24,7 @@ from holdfast.cli.options.option import config_argument, flag, json_option, opti
 from holdfast.cli.signals import Signals
 from holdfast.cli.terminal_text import print_json
 from holdfast.events import log_lines
-from holdfast.net.nats import ANSWERING
+from holdfast.net.nats.connection import ANSWERING
 from holdfast.net.nats_server import ServerUnusable
 from holdfast.runtime.text import listing
 from holdfast.server import Server

@@ -56,26 +56,20 @@ from holdfast.config.values.scanning import (
 from holdfast.events import log_lines
 from holdfast.net import event_loop
 from holdfast.net.allow_list import AllowedNetwork
-from holdfast.net.nats_pings import PING_INTERVAL_S, PINGS_OUTSTANDING
+from holdfast.net.nats.connection import Ping, Servers
+from holdfast.net.nats.pings import PING_INTERVAL_S, PINGS_OUTSTANDING
 from holdfast.net.nats_server import HOST, ServerUnusable, TemporaryServer
 from holdfast.runtime.bounded_files import FileWork
 from holdfast.runtime.interpreter import spare_what_stays
 from holdfast.runtime.standstill import WallClock
-from holdfast.scanner import (
-    Defaults,
-    FleetRefused,
-    FleetSettings,
-    Ping,
-    Scanner,
-    ScannerLimits,
-    Servers,
-    Settings,
-)
+from holdfast.scanner.fleet.agreement import FleetRefused
 from holdfast.scanner.jetstream.entry_subscriptions import BUCKET
 from holdfast.scanner.messages.schema import json_schema
 from holdfast.scanner.polling import device_tls as tls_check
 from holdfast.scanner.polling.allowed_devices import PRIVATE
-from holdfast.scanner.settings import places
+from holdfast.scanner.service import Scanner
+from holdfast.scanner.settings import FleetSettings, Settings, places
+from holdfast.scanner.subscriptions.rules import Defaults, ScannerLimits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -22,7 +22,7 @@ from nats.errors import Error
 from nats.js.errors import NoStreamResponseError
 
 from holdfast import _core
-from holdfast.net.nats import nats_reason
+from holdfast.net.nats.connection import nats_reason
 from holdfast.replication.leases.bucket import (
     SETTLED,
     Entry,

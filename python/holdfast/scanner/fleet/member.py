@@ -18,8 +18,8 @@ from nats.js.errors import NoStreamResponseError
 
 from holdfast.client.url import connection_of
 from holdfast.events import log_lines
-from holdfast.net.nats import nats_reason
-from holdfast.replication.leases import Outdated
+from holdfast.net.nats.connection import nats_reason
+from holdfast.replication.leases.bucket import Outdated
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
 from holdfast.runtime.heartbeat import Heartbeat
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast import _core
-    from holdfast.replication.leases import Connect, StartThread
+    from holdfast.replication.leases.thread import Connect, StartThread
     from holdfast.scanner.fleet.agreement import Terms
     from holdfast.scanner.messages.types import SubscribeRequest
     from holdfast.scanner.placement import DeviceHost, SubscriptionHost

@@ -16,7 +16,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from holdfast.events import log_lines
-from holdfast.replication.leases import Leases, LeaseThread, Relay
+from holdfast.replication.leases.leases import Leases
+from holdfast.replication.leases.thread import LeaseThread, Relay
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms, digest
 from holdfast.scanner.fleet.assignment import assigned
 from holdfast.scanner.settings import FleetSettings
@@ -25,7 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from holdfast import _core
-    from holdfast.replication.leases import Connect, Holding, StartThread
+    from holdfast.replication.leases.bucket import Holding
+    from holdfast.replication.leases.thread import Connect, StartThread
 
 NODE = "node."
 PARTITION = "partition."

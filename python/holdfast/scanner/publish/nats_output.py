@@ -13,7 +13,8 @@ import msgspec
 from nats.errors import Error
 
 from holdfast.net.event_loop import EventLoop
-from holdfast.net.nats import SafeClient, nats_reason
+from holdfast.net.nats.connection import nats_reason
+from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.outputs.sending import Receiver, soon_after
 from holdfast.polling.faults import fault_text, is_exception
 from holdfast.scanner.dialects import DIALECTS
