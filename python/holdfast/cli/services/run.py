@@ -26,7 +26,7 @@ from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.item import MODICON
 from holdfast.cli.options.option import config_argument
 from holdfast.cli.services.reloader import Reloader
-from holdfast.cli.signals import Interrupted, Signals
+from holdfast.cli.signals import SIGNAL_INTERVAL_S, Interrupted, Signals
 from holdfast.cli.terminal_text import ranges_shown
 from holdfast.config.checks.rights import unit_rights
 from holdfast.config.fingerprint import files_of
@@ -55,8 +55,6 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 # A signal is noticed within this time.
-SIGNAL_INTERVAL_S = 0.2
-
 OTHER_FILES = 128
 """Open files that are not connections: listeners, metrics requests, the interpreter's files."""
 

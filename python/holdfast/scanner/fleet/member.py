@@ -20,6 +20,7 @@ from holdfast.client.url import connection_of
 from holdfast.events import log_lines
 from holdfast.net.nats.connection import nats_reason
 from holdfast.replication.leases.bucket import Outdated
+from holdfast.replication.leases.leases import FIRST_RETRY_S, MAX_RETRY_S
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
 from holdfast.runtime.heartbeat import Heartbeat
@@ -44,10 +45,6 @@ if TYPE_CHECKING:
     from holdfast.scanner.settings import FleetSettings
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
-
-FIRST_RETRY_S = 0.5
-MAX_RETRY_S = 2.0
-"""The pauses after failures to open the buckets."""
 
 ADOPT_RETRY_S = 10.0
 """Between attempts to carry out a subscription of another node that is refused here."""

@@ -38,7 +38,7 @@ MAX_CONCURRENT_HANDOVERS = 4
 DEVICE_STOP_TIMEOUT_S = 5.0
 """Time to wait for polls and writes of a partition before it is given back."""
 
-SETTLE_S = 0.05
+GATHER_S = 0.05
 """Time in which changes are gathered before partitions are placed anew."""
 
 CHECK_INTERVAL_S = 0.5
@@ -204,7 +204,7 @@ class PartitionLeases:
         self._named_since = time.monotonic()
         while not self.leases.since(key):
             self._check_name()
-            await asyncio.sleep(SETTLE_S)
+            await asyncio.sleep(GATHER_S)
         log_lines.write(
             logging.INFO,
             "fleet_joined",
@@ -235,7 +235,7 @@ class PartitionLeases:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(CHECK_INTERVAL_S):
                     await self._has_changed.wait()
-            await asyncio.sleep(SETTLE_S)
+            await asyncio.sleep(GATHER_S)
             self._has_changed.clear()
             self._check_name()
             nodes = self.nodes
