@@ -11,7 +11,7 @@ mod client;
 mod connection;
 mod engine;
 mod fence;
-mod follower;
+mod following;
 mod heartbeat;
 mod http;
 mod limits;
@@ -47,7 +47,7 @@ mod _core {
     #[pymodule_export]
     use super::fence::Fence;
     #[pymodule_export]
-    use super::follower::Follower;
+    use super::following::Follower;
     #[pymodule_export]
     use super::http::{HttpExchange, HttpServer, ListeningSocket};
     #[pymodule_export]
