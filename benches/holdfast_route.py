@@ -13,7 +13,9 @@ poller = _core.Poller([])
 url, in_flight, reads = sys.argv[1:]
 coalesce = reads == "together"
 link = poller.link("device", endpoint(parse(url)), in_flight=int(in_flight), coalesce=coalesce)
-rule = _core.Rule({1: link.route("device")}, sources=["127.0.0.1"], access="read-write")
+rule = _core.Rule(
+    {1: link.route("device", timeout=1.0)}, sources=["127.0.0.1"], access="read-write"
+)
 engine = _core.Engine(
     [_core.Listener("front", "127.0.0.1:0", [rule], STREAM_DEFAULTS)],
     identity=[(0, "Holdfast"), (1, "HF"), (2, "1")],

@@ -9,7 +9,9 @@ import asyncio
 import resource
 import sys
 
-from holdfast.scanner import FleetSettings, Scanner, Servers, Settings
+from holdfast.net.nats.connection import Servers
+from holdfast.scanner.service import Scanner
+from holdfast.scanner.settings import FleetSettings, Settings
 
 hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
 resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

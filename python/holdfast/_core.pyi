@@ -36,9 +36,13 @@ from holdfast.types import (
 __all__ = [
     "ADDRESSES",
     "AREAS",
+    "CONTACTS_PER_LAG",
     "EXCEPTIONS",
     "FAULTS",
     "FUNCTIONS",
+    "LINK_QUEUE",
+    "MAX_IN_FLIGHT",
+    "MAX_LAG",
     "MAX_LATENESS",
     "MAX_PDU",
     "OTHER_READS",
@@ -46,7 +50,10 @@ __all__ = [
     "RETRY_PAUSES",
     "SUB_FUNCTIONS",
     "TLS_REASONS",
+    "UNMEASURED_COST_MS",
+    "WHEN_BEHIND",
     "WRITE_FILE_RECORD",
+    "WRITE_TIMEOUT",
     "Attempt",
     "Batch",
     "BatchRefused",
@@ -134,6 +141,27 @@ MAX_LATENESS: Final[float]
 
 RETRY_PAUSES: Final[tuple[float, float]]
 """The first and the longest pause after failures, in seconds, where a device has no others."""
+
+UNMEASURED_COST_MS: Final[tuple[float, float]]
+"""The costs of a request and of a register until a device with `max_gap: auto` is measured."""
+
+MAX_IN_FLIGHT: Final[int]
+"""The most requests in flight on one connection."""
+
+LINK_QUEUE: Final[tuple[int, int]]
+"""How many requests may wait for a link that has no other number, and the most that can."""
+
+WRITE_TIMEOUT: Final[float]
+"""The seconds until a write that a log has not confirmed is answered, where it has no others."""
+
+CONTACTS_PER_LAG: Final[int]
+"""How often a node of a log without writes has contact with it, in the time of `max_lag`."""
+
+WHEN_BEHIND: Final[Literal["serve", "refuse"]]
+"""What happens to reads of a node that is behind, where the log says nothing else."""
+
+MAX_LAG: Final[float]
+"""The seconds without contact until a node of a log is behind, where the log has no others."""
 
 class OutOfRange(IndexError):
     """The range is not inside the area. Nothing was read or written."""
@@ -1233,8 +1261,8 @@ class PolledDevice:
         reads: Sequence[tuple[Area, int, int, tuple[Memory, Area, int] | None]],
         max_gap: int | None = None,
         cost: tuple[float, float] | None = None,
-        max_registers: int = 125,
-        max_bits: int = 2000,
+        max_registers: int = ...,
+        max_bits: int = ...,
         readable: Sequence[tuple[Area, int, int]] | None = None,
         forbidden: Sequence[tuple[Area, int, int]] | None = None,
         forward: Sequence[tuple[Endpoint, Forward]] | None = None,
@@ -1289,7 +1317,7 @@ class Link:
     def name(self) -> str:
         """The name that it was created with."""
 
-    def route(self, name: str, *, unit: int | None = None, timeout: float = 1.0) -> Route:
+    def route(self, name: str, *, timeout: float, unit: int | None = None) -> Route:
         """A target for the units of a `Rule`: their requests go to `unit` of this link.
 
         Without `unit`, they keep their unit id. `timeout` is in seconds, from the moment when a
@@ -1432,7 +1460,7 @@ class Poller:
         endpoint: Endpoint,
         *,
         in_flight: int | None = 1,
-        queue: int = 256,
+        queue: int | None = None,
         coalesce: bool = True,
         cache: float = 0.0,
         preferred: Sequence[str] | None = None,
@@ -1441,11 +1469,11 @@ class Poller:
         """The connection or serial line to an address, for the requests of listeners.
 
         Devices at the same address share it. The first call for an address decides its settings:
-        `queue` is the most requests of listeners that wait, with `coalesce` one request answers
-        equal reads that wait at the same time, for `cache` seconds a reply answers equal reads,
-        reads of the addresses in `preferred` go before those of others, and `retry` are the first
-        and the longest pause after failures (default: `RETRY_PAUSES`). Raises `ValueError`, and
-        `RuntimeError` after `stop`.
+        `queue` is the most requests of listeners that wait (default: `LINK_QUEUE`), with `coalesce`
+        one request answers equal reads that wait at the same time, for `cache` seconds a reply
+        answers equal reads, reads of the addresses in `preferred` go before those of others, and
+        `retry` are the first and the longest pause after failures (default: `RETRY_PAUSES`). Raises
+        `ValueError`, and `RuntimeError` after `stop`.
         """
 
     def known_link(self, name: str, endpoint: Endpoint) -> Link | None:
@@ -1519,8 +1547,8 @@ def plan_blocks(
     *,
     max_gap: int | None = None,
     cost: tuple[float, float] | None = None,
-    max_registers: int = 125,
-    max_bits: int = 2000,
+    max_registers: int = ...,
+    max_bits: int = ...,
     readable: Sequence[tuple[Area, int, int]] | None = None,
     forbidden: Sequence[tuple[Area, int, int]] | None = None,
 ) -> list[tuple[Area, int, int, list[int], int]]:

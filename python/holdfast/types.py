@@ -16,6 +16,9 @@ BitArea: TypeAlias = Literal["coils", "discrete_inputs"]
 RegisterArea: TypeAlias = Literal["holding_registers", "input_registers"]
 BIT_AREAS: tuple[BitArea, ...] = get_args(BitArea)
 REGISTER_AREAS: tuple[RegisterArea, ...] = get_args(RegisterArea)
+SHORT_AREAS: dict[str, Area] = dict(zip(("co", "di", "hr", "ir"), AREAS, strict=True))
+"""The areas by their short names."""
+SHORT_OF: dict[Area, str] = {area: short for short, area in SHORT_AREAS.items()}
 
 Ranges: TypeAlias = "list[tuple[Area, int, int]]"
 """Areas, first addresses and counts."""

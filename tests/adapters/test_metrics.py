@@ -20,7 +20,8 @@ from holdfast.adapters.metrics import Metrics
 from holdfast.appliance.parts.devices import Devices
 from holdfast.appliance.parts.mirrors import Mirrors
 from holdfast.appliance.services.supervision import Supervisor
-from holdfast.config import Config, MetricsConfig
+from holdfast.config import Config
+from holdfast.config.models.services import MetricsConfig
 from holdfast.net.http.health import Check
 from holdfast.net.http.port import listen
 from support import web, wire

@@ -600,7 +600,7 @@ import json, sys, time
 import holdfast
 from holdfast.adapters import Stop
 from holdfast.adapters.mqtt import Mqtt
-from holdfast.config import MqttConfig
+from holdfast.config.models.services import MqttConfig
 from holdfast.ingest import MemoryAccess
 
 class Blocked(MemoryAccess):

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.adapters.mqtt import adapter, connection, inbox
+from holdfast.adapters.mqtt import adapter, answers, connection, inbox
 from holdfast.ingest import MemoryAccess
-from holdfast.net.mqtt import dialing
+from holdfast.net.mqtt import connect
 from holdfast.net.mqtt.stream import BrokerSocket
 from support import mqtt_peer as mqtt
 from support import wire
@@ -606,7 +606,7 @@ class Jammed(socket.socket):
 def test_nothing_piles_up_while_the_broker_does_not_read(
     rig: Rig, fake5: FakeBroker, monkeypatch: pytest.MonkeyPatch, qos: int
 ) -> None:
-    dial, read = dialing.dial, connection.BrokerConnection.read_more
+    dial, read = connect.dial, connection.BrokerConnection.read_more
     most = {"packets": 0, "answers": 0}
 
     def dial_one_that_jams(*arguments: Any) -> BrokerSocket:
@@ -638,11 +638,11 @@ def test_nothing_piles_up_while_the_broker_does_not_read(
 
         assert running.status()["answers_dropped"] > 0
         assert (
-            connection.MAX_WAITING_PACKETS
+            answers.MAX_WAITING_ANSWERS
             <= most["packets"]
-            <= connection.MAX_UNSENT_PACKETS + connection.MAX_WAITING_PACKETS
+            <= connection.MAX_UNSENT_PACKETS + answers.MAX_WAITING_ANSWERS
         )
-        assert most["answers"] <= connection.MAX_WAITING_PACKETS
+        assert most["answers"] <= answers.MAX_WAITING_ANSWERS
 
         Jammed.jam.clear()  # the broker reads again, and things go on
         for _ in range(5000 if qos else 0):

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.net.mqtt import dialing
 from support import wire
 from support.certificates import Certificates
 from support.mqtt_rig import Rig, command, settings, text
@@ -201,7 +200,7 @@ def test_it_ends_at_once_in_a_handshake_that_goes_nowhere(
             running.stop(1.0)
             assert running.status()["last_error"] is None
 
-        monkeypatch.setattr(dialing, "CONNECT_TIMEOUT_S", 0.1)
+        monkeypatch.setattr("holdfast.net.mqtt.connect.CONNECT_TIMEOUT_S", 0.1)
         assert "no answer" in error(rig.run(settings(url, tls={"ca_file": authority.ca})))
 
 

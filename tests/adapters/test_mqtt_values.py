@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.appliance import Appliance
-from holdfast.config import MappedTag, MqttConfig
+from holdfast.config.models.root import MappedTag
+from holdfast.config.models.services import MqttConfig
 from holdfast.tags import Tag
 from support import wire
 from support.config_folder import Folder, written

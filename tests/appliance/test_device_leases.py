@@ -19,7 +19,7 @@ import pytest
 from holdfast.appliance import Appliance
 from holdfast.client.url import connection_of, parse
 from holdfast.config import ConfigError, load
-from holdfast.replication.leases import LEASE_TIMES, LeaseTimes
+from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from support import wire
 from support.brokers import NatsServer
 from support.cli import RunCommand, invoke
@@ -39,7 +39,7 @@ RUN = f"""
 import sys
 from holdfast.appliance import Appliance
 from holdfast.config import load
-from holdfast.replication.leases import LeaseTimes
+from holdfast.replication.leases.times import LeaseTimes
 with Appliance(load(sys.argv[1]), lease_times={BRIEF}) as appliance:
     while True:
         appliance.log_events(1.0)

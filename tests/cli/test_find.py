@@ -204,7 +204,7 @@ def test_unit_ids_stay_known_if_the_device_goes_away() -> None:
         (("plc1",), "type 'holdfast find tcp://plc1'."),
         (("tcp://a", "10.0.0.1"), "Give one URL or one serial line, or several networks."),
         (("10.0.0.1", "--units", "1-300"), "'1-300' is not a unit id or FIRST-LAST"),
-        (("10.0.0.1", "--rate", "0"), "0 is not in the range"),
+        (("10.0.0.1", "--rate", "0"), "found 0, allowed: 0.1 to 1000"),
         (("/dev/ttyX", "--baud", "fast"), "'fast' is not a list of bauds, as in 9600,19200."),
         (("/dev/ttyX", "--parity", "mark"), "'mark' is not a list of none, even, odd."),
         (("/dev/ttyX", "--units", "0-3"), "Unit id 0 is the broadcast on a serial line"),

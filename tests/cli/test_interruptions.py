@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from holdfast import SyncClient
 from holdfast.cli.signals import Interrupted, interruptions
+from support.cli import invoke
 
 if TYPE_CHECKING:
     from holdfast.cli.signals import Signals
@@ -57,3 +60,18 @@ def test_handlers_are_as_before_when_the_command_ends() -> None:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def test_a_command_that_is_interrupted_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_arguments: object, **_more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(SyncClient, "read", interrupted)
+    read = ("read", "tcp://127.0.0.1:1", "hr", "0")
+    result = invoke(*read)
+    assert (result.exit_code, result.output) == (1, "holdfast: interrupted\n")
+    result = invoke(*read, "--json")
+    assert (result.exit_code, json.loads(result.output)) == (
+        1,
+        {"ok": False, "reason": "interrupted", "detail": "interrupted"},
+    )

@@ -177,8 +177,8 @@ def test_only_ascii_is_shown_where_there_is_no_more(url: str) -> None:
         (("--range", "5-4"), "'5-4' is not FIRST-LAST, as in 0-999, up to 65535."),
         (("--range", "0-65536"), "'0-65536' is not FIRST-LAST"),
         (("--range", "-4"), "'-4' is not FIRST-LAST"),
-        (("--max-quantity", "0"), "0 is not in the range x>=1."),
-        (("--step", "0"), "0 is not in the range x>=1."),
+        (("--max-quantity", "0"), "found 0, allowed: 1 or more."),
+        (("--step", "0"), "found 0, allowed: 1 or more."),
     ],
 )
 def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:

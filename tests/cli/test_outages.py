@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.appliance import control
-from holdfast.net.nats import connected_once
-from holdfast.scanner import Servers
+from holdfast.net.nats.connection import Servers, connected_once
 from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
 from support import wire
 from support.brokers import NatsServer, free_port

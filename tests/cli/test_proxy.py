@@ -158,8 +158,8 @@ def test_a_port_that_is_taken_is_one_line_and_exit_code_1() -> None:
          "machines: name the clients that may connect with --source NETWORK."),
         ([NOBODY, "--source", "10.0.0.1/8"], "Error: Invalid value for '--source': found "
          "'10.0.0.1/8', which has host bits set: the network is 10.0.0.0/8."),
-        ([NOBODY, "--unit", "256"], "Error: Invalid value for '--unit': 256 is not in the range "
-         "0<=x<=255."),
+        ([NOBODY, "--unit", "256"], "Error: Invalid value for '--unit': found 256, allowed: 0 to "
+         "255."),
         (["rtu:///dev/none", "--unit", "248"], "Error: --unit on a serial line is 1 to 247, not "
          "248."),
         ([NOBODY, "--timeout", "0"], "Error: Invalid value for '--timeout': '0' is not a time, as "

@@ -327,7 +327,7 @@ def test_a_modicon_number_names_area_and_address(
             ("hr", "0", "--timeout", "0"),
             "'0' is not a time, as in 500ms, 2s or 2 (seconds): more than 0, up to 86400 s.",
         ),
-        (("hr", "0", "--unit", "256"), "256 is not in the range 0<=x<=255."),
+        (("hr", "0", "--unit", "256"), "found 256, allowed: 0 to 255."),
     ],
 )
 def test_wrong_usage_is_told(words: tuple[str, ...], told: str) -> None:

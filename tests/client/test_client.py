@@ -482,7 +482,8 @@ REFUSED: list[tuple[str, tuple[Any, ...], dict[str, Any], type[Exception], str]]
     ("call_function", (0,), {}, ValueError, "function is 0, allowed: 1 to 127"),
     ("call_function", (128,), {}, ValueError, "function is 128"),
     ("call_function", (65, bytes(253)), {}, ValueError, "length of data is 253, allowed: 0 to 252"),
-    ("read", ("coil", 0, "bool"), {}, ValueError, 'unknown area "coil"'),
+    ("read", ("coil", 0, "bool"), {}, ValueError, "area is 'coil', .* did you mean 'coils'"),
+    ("read", ("HR", 0, "int16"), {}, ValueError, "did you mean 'holding_registers'"),
     ("read", ("coils", 0, "uint16"), {}, ValueError, "allowed in coils: bool"),
     ("read", ("holding_registers", 0, "int24"), {}, ValueError, "int24"),
     ("read", ("holding_registers", 0, "int32", "ACBD"), {}, ValueError, "ACBD"),
@@ -490,7 +491,7 @@ REFUSED: list[tuple[str, tuple[Any, ...], dict[str, Any], type[Exception], str]]
     ("read", ("holding_registers", 65535, "int32"), {}, ValueError, "the last address is 65535"),
     ("write", ("holding_registers", 0, 1 << 15, "int16"), {}, ValueError, "32768"),
     ("write", ("holding_registers", 0, 1.5, "int16"), {}, ValueError, "1.5"),
-    ("write", ("input_registers", 0, 1, "int16"), {}, ValueError, "can be written"),
+    ("write", ("input_registers", 0, 1, "int16"), {}, ValueError, "allowed: coils, holding"),
     ("write", ("coils", 0, 5, "uint16"), {}, ValueError, "allowed in coils: bool"),
     ("write", ("holding_registers", 0, [True] * 2, "bit:3[2]"), {}, ValueError, "allowed: one bit"),
 ]

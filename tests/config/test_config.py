@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 import pytest
 from hypothesis import given, settings
 
+from holdfast._core import UNMEASURED_COST_MS
 from holdfast.client.url import Receiver, parse
-from holdfast.config import (
-    AuditConfig,
-    Config,
-    DestinationConfig,
-    DeviceConfig,
-    InitialRun,
+from holdfast.config import Config, json_schema, load, planning
+from holdfast.config.dump import effective
+from holdfast.config.initial_values import InitialRun
+from holdfast.config.models.devices import DestinationConfig, DeviceConfig, ReadConfig
+from holdfast.config.models.listeners import (
     Listener,
     ModbusAsciiListener,
     ModbusAsciiOverTcpListener,
@@ -24,20 +24,12 @@ from holdfast.config import (
     ModbusRtuOverUdpListener,
     ModbusTcpListener,
     ModbusUdpListener,
-    MqttConfig,
     RawIngestListener,
-    ReadConfig,
-    RestConfig,
     RtuSerialConfig,
-    Seal,
     SerialRuleConfig,
-    Span,
-    TokenConfig,
-    json_schema,
-    load,
-    planning,
 )
-from holdfast.config.dump import effective
+from holdfast.config.models.memories import Seal, Span
+from holdfast.config.models.services import AuditConfig, MqttConfig, RestConfig, TokenConfig
 from support.cases import examples
 from support.config_folder import written
 from support.configurations import configurations
@@ -431,7 +423,7 @@ def test_a_device_has_the_documented_defaults(loaded: Callable[..., Config]) -> 
 
 def test_a_device_with_an_automatic_gap_is_planned_by_costs(loaded: Callable[..., Config]) -> None:
     rules = planning.rules(device_of(loaded, ", max_gap: auto"))
-    assert (rules["max_gap"], rules["cost"]) == (None, planning.UNMEASURED_COST_MS)
+    assert (rules["max_gap"], rules["cost"]) == (None, UNMEASURED_COST_MS)
 
 
 @pytest.mark.parametrize(

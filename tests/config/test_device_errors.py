@@ -423,6 +423,27 @@ def test_values_that_are_stale_between_two_polls_are_a_warning(
     assert all(part in each for part, each in zip(told, warnings, strict=True)), warnings
 
 
+@pytest.mark.parametrize(("after", "told"), [(2, True), (2.5, False)])
+def test_values_that_are_stale_on_other_nodes_are_a_warning(
+    folder: Folder, after: float, told: bool
+) -> None:
+    text = f"""
+memories: {{plant: {{holding_registers: 8, replicate: {{log: site}}}}}}
+logs: {{site: {{servers: ["nats://127.0.0.1"], node: a, max_lag: 10}}}}
+rest: {{bind: "127.0.0.1:0", sources: [127.0.0.0/8], tokens: none}}
+devices:
+  meter:
+    url: tcp://192.0.2.9
+    interval: 1
+    stale: {{after: {after}}}
+    reads:
+      - {{area: holding_registers, address: 0, count: 2,
+          into: {{memory: plant, area: holding_registers, address: 0}}}}
+"""
+    message = "devices.meter.stale.after: found 2, which is less than 2.5 (max_lag / 4 of"
+    assert [message in each for each in folder.warnings(text)] == ([True] if told else [])
+
+
 def test_stale_has_no_effect_without_a_place_in_memory(folder: Folder) -> None:
     into = "        into: {memory: plant, area: input_registers, address: 100}\n"
     forward = "    forward: [{url: 'raw://a:1', unit: 1}]\n"

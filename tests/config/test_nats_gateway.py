@@ -11,13 +11,14 @@ from holdfast.appliance.services.scanner import scanner_settings
 from holdfast.client.url import Tls
 from holdfast.config.values.scanning import written_pollable
 from holdfast.gateway import GatewayLimits
-from holdfast.scanner import Defaults, Ping, ScannerLimits, Servers
+from holdfast.net.nats.connection import Ping, Servers
+from holdfast.scanner.subscriptions.rules import Defaults, ScannerLimits
 from support.config_folder import Folder
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from holdfast.config import GatewayConfig, NatsConfig
+    from holdfast.config.models.services import GatewayConfig, NatsConfig
 
 HASH = "0123456789abcdef" * 4
 NATS = """\

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.client.url import Tolerance, parse
-from holdfast.config import LinkConfig, ModbusTcpListener, RouteConfig, UnitMemoryConfig
+from holdfast.config.models.links import LinkConfig
+from holdfast.config.models.listeners import ModbusTcpListener, RouteConfig, UnitMemoryConfig
 from support.config_folder import Folder
 
 if TYPE_CHECKING:

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.config import ModbusTcpListener, RangeConfig, RouteConfig, UnitMemoryConfig
 from holdfast.config.checks.rights import together
+from holdfast.config.models.devices import RangeConfig
+from holdfast.config.models.listeners import ModbusTcpListener, RouteConfig, UnitMemoryConfig
 from support.config_folder import Folder
 
 if TYPE_CHECKING:

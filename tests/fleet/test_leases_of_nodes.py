@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.replication.leases import LEASE_TIMES, LeaseTimes
-from holdfast.scanner import FleetSettings
+from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.scanner.fleet import member as members
+from holdfast.scanner.settings import FleetSettings
 from support import wire
 from support.fleet_nodes import FLEET, prepare
 from support.judges import Judges

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.replication.leases import LEASE_TIMES
+from holdfast.replication.leases.times import LEASE_TIMES
 from support import nats_cluster, wire
 from support.fleet_nodes import Commands, Nodes, Published, are_polled, known, subscribed
 from support.judges import Judges

@@ -14,9 +14,12 @@ import pytest
 from nats.errors import TimeoutError as NoAnswer
 
 from holdfast.config.values.scanning import parse_pollable
-from holdfast.replication.leases import LEASE_TIMES, LeaseTimes
-from holdfast.scanner import FleetRefused, FleetSettings, Scanner, Servers, Settings
+from holdfast.net.nats.connection import Servers
+from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.scanner.fleet import reports
+from holdfast.scanner.fleet.agreement import FleetRefused
+from holdfast.scanner.service import Scanner
+from holdfast.scanner.settings import FleetSettings, Settings
 from holdfast.scanner.subscriptions.key import SubscriptionKey
 from support import wire
 from support.cli import invoke

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
-from holdfast.net.nats import Outbox, batch
+from holdfast.net.nats import batch
+from holdfast.net.nats.outbox import Outbox
 from holdfast.scanner.fleet.agreement import Terms
 
 

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import TimeoutError as NatsTimeout
 
-from holdfast.net.nats import Broker, Ping, Servers
-from holdfast.replication.leases import LeaseBucket, Leases, LeaseTimes, Outdated
-from holdfast.replication.leases.bucket import SETTLED
+from holdfast.net.nats.connection import Broker, Ping, Servers
+from holdfast.replication.leases.bucket import SETTLED, LeaseBucket, Outdated
+from holdfast.replication.leases.leases import Leases
+from holdfast.replication.leases.times import LeaseTimes
 from support import wire
 from support.brokers import NatsServer
 from support.leases import ENDLESS, LASTING, SHORT, make_settled

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.net.nats import Broker, Ping, Servers
-from holdfast.replication.leases import Leases, LeaseThread, LeaseTimes, Relay
+from holdfast.net.nats.connection import Broker, Ping, Servers
+from holdfast.replication.leases.leases import Leases
+from holdfast.replication.leases.thread import LeaseThread, Relay
+from holdfast.replication.leases.times import LeaseTimes
 from holdfast.runtime import tasks
 from support import wire
 from support.brokers import NatsServer

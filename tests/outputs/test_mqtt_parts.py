@@ -10,8 +10,8 @@ import pytest
 
 from holdfast.config.values.topics import TopicNames
 from holdfast.net.mqtt.packets import parse_publish
+from holdfast.net.mqtt.selector import Waiter
 from holdfast.net.mqtt.stream import BrokerSocket, Packets
-from holdfast.net.mqtt.waiting import Waiter
 from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES
 from holdfast.outputs.mqtt.messages import Delivery, Message, packed, packed_topic
 from holdfast.runtime.stop import Stop

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from holdfast.net.nats.connection import Servers
 from holdfast.outputs import Buffer, Sending
 from holdfast.outputs import sending as module
 from holdfast.polling.faults import NO_CONNECTION
 from holdfast.runtime.stop import Stop
-from holdfast.scanner import Servers
 from holdfast.scanner.publish import nats_output as output_module
 from holdfast.scanner.publish.nats_output import NatsOutput
 from support import wire

@@ -12,7 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nats.errors import Error, ProtocolError
 
-from holdfast.net.nats import Outbox, SafeClient, batch, tolerant_client
+from holdfast.net.nats import batch, tolerant_client
+from holdfast.net.nats.outbox import Outbox
+from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.scanner.messages.types import Answer
 from support.nats_bus import Caller
 from support.wire import until as wire_until

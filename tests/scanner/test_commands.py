@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.scanner import ScannerLimits
 from holdfast.scanner.commands import value
 from holdfast.scanner.errors import Refused
+from holdfast.scanner.subscriptions.rules import ScannerLimits
 from holdfast.scanner.subscriptions.tag import Tag
 from support import wire
 from support.fake_device import FakeDevice, exception, registers

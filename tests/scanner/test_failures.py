@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.net.nats import MAX_PAUSE
+from holdfast.net.nats.connection import MAX_PAUSE
 from holdfast.scanner.jetstream.availability import State
 from holdfast.scanner.subscriptions import device as devices
 from support import wire

@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.client.url import NetworkTarget
-from holdfast.net.nats import Outbox
 from holdfast.net.nats import outbox as outboxes
-from holdfast.scanner import ScannerLimits, Settings
+from holdfast.net.nats.outbox import Outbox
 from holdfast.scanner.commands import Commands
 from holdfast.scanner.dialects import TENTACLE
 from holdfast.scanner.errors import Moved
@@ -22,6 +21,7 @@ from holdfast.scanner.messages.types import BrowseRequest, HeartbeatMetadata, Se
 from holdfast.scanner.placement import Placement
 from holdfast.scanner.publish.publisher import Publisher
 from holdfast.scanner.reports.browse import browsed
+from holdfast.scanner.settings import Settings
 from holdfast.scanner.subscriptions.device import (
     ScannedDevice,
     Source,
@@ -32,6 +32,7 @@ from holdfast.scanner.subscriptions.groups import Group, grouped
 from holdfast.scanner.subscriptions.health import Health
 from holdfast.scanner.subscriptions.plan import Plan
 from holdfast.scanner.subscriptions.registry import Registry
+from holdfast.scanner.subscriptions.rules import ScannerLimits
 from holdfast.scanner.subscriptions.tag import Tag
 from holdfast.tags.decoding import Places, decoder
 
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast.config.values.scanning import Publish
-    from holdfast.net.nats import SafeClient
+    from holdfast.net.nats.tolerant_client import SafeClient
     from holdfast.types import PolledBlock
 
 TARGET = NetworkTarget("tcp", "127.0.0.1", 502)

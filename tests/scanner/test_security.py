@@ -13,8 +13,10 @@ import pytest
 from nats.errors import NoRespondersError
 
 from holdfast.net.nats import connection as broker
+from holdfast.net.nats.connection import Servers
 from holdfast.net.tls import Tls
-from holdfast.scanner import Scanner, Servers, Settings
+from holdfast.scanner.service import Scanner
+from holdfast.scanner.settings import Settings
 from support import wire
 from support.brokers import NatsServer
 from support.certificates import Certificates

@@ -12,7 +12,8 @@ import pytest
 
 import holdfast
 from holdfast.events import log_lines
-from holdfast.scanner import Ping, presence
+from holdfast.net.nats.connection import Ping
+from holdfast.scanner import presence
 from holdfast.scanner.jetstream import heartbeat
 from support import wire
 from support.brokers import NatsServer
@@ -91,7 +92,7 @@ def test_a_log_that_may_not_be_published_causes_no_flood(
     )
     server = NatsServer(tmp_path, "-c", str(file))
     try:
-        from holdfast.scanner import Servers
+        from holdfast.net.nats.connection import Servers
 
         url = server.url.replace("nats://", "nats://a:b@")
         scanner = run_scanner(servers=Servers((url,)))

@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
+from holdfast.net.nats.connection import Servers
 from holdfast.polling.write_ttl import WRITE_TTL_S
-from holdfast.scanner import FleetSettings, Servers, Settings
 from holdfast.scanner import late_commands as module
 from holdfast.scanner.fleet.nodes import Command, subject
+from holdfast.scanner.settings import FleetSettings, Settings
 from support import wire
 from support.fake_device import FakeDevice, registers
 from support.fleet_nodes import FLEET, prepare, subscribed, wanted

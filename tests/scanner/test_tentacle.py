@@ -9,8 +9,9 @@ import pytest
 
 import holdfast
 from holdfast import _core
-from holdfast.scanner import Defaults, Settings
 from holdfast.scanner.dialects import DIALECTS
+from holdfast.scanner.settings import Settings
+from holdfast.scanner.subscriptions.rules import Defaults
 from support import wire
 from support.nats_bus import leaving, logged, subscription, tag
 from support.tentacle import (

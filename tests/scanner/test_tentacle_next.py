@@ -9,13 +9,13 @@ import msgspec
 import pytest
 
 import holdfast
-from holdfast.scanner import Defaults
 from holdfast.scanner.dialects import DIALECTS, tentacle_next
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
 from holdfast.scanner.jetstream.store import BUCKET as KEPT
 from holdfast.scanner.messages.decoding import Adjustments, decode_lenient
 from holdfast.scanner.messages.types import SubscribeRequest
+from holdfast.scanner.subscriptions.rules import Defaults
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 from nats.errors import Error
 
-from holdfast.replication.leases import LEASE_TIMES, LeaseTimes
-from holdfast.scanner.fleet.fleet import PARTITION, leases_of
+from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
+from holdfast.scanner.fleet.partition_leases import PARTITION, leases_of
 from support import wire
 from support.cli import invoke
 from support.leases import make_settled

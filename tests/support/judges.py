@@ -12,7 +12,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from holdfast.net.closing import close
+from holdfast.net.server_close import close
 
 if TYPE_CHECKING:
     from types import TracebackType

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from nats.aio.client import Client
 
-from holdfast.replication.leases import LeaseBucket, LeaseTimes
+from holdfast.replication.leases.bucket import LeaseBucket
+from holdfast.replication.leases.times import LeaseTimes
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

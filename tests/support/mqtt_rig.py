@@ -19,7 +19,7 @@ from paho.mqtt.properties import Properties
 import holdfast
 from holdfast.adapters import Stop
 from holdfast.adapters.mqtt import Mqtt
-from holdfast.config import MqttConfig
+from holdfast.config.models.services import MqttConfig
 from holdfast.ingest import MemoryAccess
 from support import wire
 from support.brokers import Mosquitto
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-    from holdfast.config import MappedTag
+    from holdfast.config.models.root import MappedTag
     from holdfast.types import Area
 
 

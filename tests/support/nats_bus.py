@@ -20,8 +20,10 @@ from nats.aio.client import Client
 from nats.js.errors import NotFoundError
 
 from holdfast.config.values.scanning import parse_pollable
-from holdfast.scanner import Scanner, Servers, Settings
+from holdfast.net.nats.connection import Servers
 from holdfast.scanner.jetstream.store import BUCKET
+from holdfast.scanner.service import Scanner
+from holdfast.scanner.settings import Settings
 from support import wire
 from support.brokers import NatsServer
 

@@ -9,12 +9,12 @@ from holdfast.scanner.fleet.placement import FleetPlacement
 if TYPE_CHECKING:
     from nats.aio.client import Client
 
-    from holdfast.net.nats import Broker
-    from holdfast.scanner import Scanner
+    from holdfast.net.nats.connection import Broker
     from holdfast.scanner.fleet.member import FleetMember
     from holdfast.scanner.polling.allowed_devices import AllowedDevices
     from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.presence import Presence
+    from holdfast.scanner.service import Scanner
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.ttl import SubscriptionTtls
 

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from holdfast.scanner import Settings
+    from holdfast.scanner.settings import Settings
 
 SCAN = """
 import asyncio, pickle, sys
 from holdfast.events import log_lines
-from holdfast.scanner import FleetRefused, Scanner
+from holdfast.scanner.fleet.agreement import FleetRefused
+from holdfast.scanner.service import Scanner
 
 async def scan():
     await Scanner(pickle.loads(bytes.fromhex(sys.argv[1]))).run()

@@ -19,7 +19,7 @@ from holdfast.adapters.rest import Rest
 from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.services.supervision import Supervisor
-from holdfast.config import RestConfig
+from holdfast.config.models.services import RestConfig
 from holdfast.net.http.host import STOP_TIMEOUT_S
 from holdfast.net.http.port import listen
 from support import wire

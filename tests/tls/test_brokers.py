@@ -12,9 +12,10 @@ from urllib.parse import urlparse
 import pytest
 from nats.errors import Error
 
-from holdfast.net.mqtt.dialing import dial
-from holdfast.net.mqtt.waiting import Waiter
-from holdfast.net.nats import SafeClient, Servers
+from holdfast.net.mqtt.connect import dial
+from holdfast.net.mqtt.selector import Waiter
+from holdfast.net.nats.connection import Servers
+from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.net.secure_channel import TlsRefused
 from holdfast.net.tls import Tls
 from holdfast.runtime.stop import Stop

@@ -11,7 +11,7 @@ import pytest
 
 import holdfast
 from holdfast.adapters.metrics import Metrics
-from holdfast.config import MetricsConfig
+from holdfast.config.models.services import MetricsConfig
 from holdfast.gateway import Gateway, Settings
 from holdfast.net.http.health import Check
 from holdfast.net.http.port import listen

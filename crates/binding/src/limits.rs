@@ -1,10 +1,13 @@
 //! Constants of the module: areas, functions and their limits, names of exceptions, device faults,
-//! reasons of TLS failures, the latest replies, the usual pauses after failures.
+//! reasons of TLS failures, the latest replies, the usual pauses after failures, the cost of requests,
+//! what links and logs have if nothing else is configured.
 //! Python takes them from here and keeps no list of its own.
 
-use holdfast_engine::link::Fault;
+use holdfast_engine::link::{Fault, InFlight, LinkSettings};
+use holdfast_engine::poller::UNMEASURED_COST_MS;
 use holdfast_engine::server::rights::functions::{OTHER_READS, WRITE_FILE_RECORD, is_served};
 use holdfast_engine::tls::TlsFailure;
+use holdfast_journal::log::{CONTACTS_PER_LAG, MAX_LAG, WHEN_BEHIND, WRITE_TIMEOUT};
 use holdfast_memory::{Area, Span};
 use holdfast_protocol::client::MAX_LATENESS;
 use holdfast_protocol::pdu::{self, ExceptionCode, Function, SubFunction, limit};
@@ -44,7 +47,14 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("TLS_REASONS", PyTuple::new(py, TlsFailure::REASONS)?)?;
     module.add("MAX_LATENESS", MAX_LATENESS.as_secs_f64())?;
     let Retry { first, most, .. } = Retry::default();
-    module.add("RETRY_PAUSES", (first.as_secs_f64(), most.as_secs_f64()))
+    module.add("RETRY_PAUSES", (first.as_secs_f64(), most.as_secs_f64()))?;
+    module.add("UNMEASURED_COST_MS", UNMEASURED_COST_MS)?;
+    module.add("MAX_IN_FLIGHT", InFlight::MAX)?;
+    module.add("LINK_QUEUE", LinkSettings::QUEUE)?;
+    module.add("WRITE_TIMEOUT", WRITE_TIMEOUT.as_secs_f64())?;
+    module.add("WHEN_BEHIND", WHEN_BEHIND.name())?;
+    module.add("CONTACTS_PER_LAG", CONTACTS_PER_LAG)?;
+    module.add("MAX_LAG", MAX_LAG.as_secs_f64())
 }
 
 /// The area that a function reads or writes, if any, and the most items per request: read, written.

@@ -21,16 +21,12 @@ use crate::arguments::{byte, seconds, within};
 use crate::client::{Endpoint, Reply, Request, exception};
 use crate::memory::named;
 
-/// The most requests in flight at one address.
-const MAX_IN_FLIGHT: usize = 1024;
-
-/// The most requests that wait for one address.
-const MAX_QUEUE: usize = 65_535;
-
 /// The number of requests in flight; `None` is `auto`.
 pub(crate) fn in_flight(number: Option<i128>) -> PyResult<InFlight> {
     Ok(match number {
-        Some(number) => InFlight::Fixed(within("in_flight", number, 1..=MAX_IN_FLIGHT)? as u16),
+        Some(number) => {
+            InFlight::Fixed(within("in_flight", number, 1..=InFlight::MAX.into())? as u16)
+        }
         None => InFlight::Auto,
     })
 }
@@ -46,7 +42,7 @@ pub(crate) fn settings(
     name: String,
     endpoint: &Endpoint,
     (number, pauses): (Option<i128>, Option<(f64, f64)>),
-    queue: i128,
+    queue: Option<i128>,
     coalesce: bool,
     cache: f64,
     preferred: Vec<String>,
@@ -55,12 +51,13 @@ pub(crate) fn settings(
         let invalid = || PyValueError::new_err(format!("preferred: {text} is not an IP address"));
         text.parse::<IpAddr>().map(|peer| peer.to_canonical()).map_err(|_| invalid())
     };
+    let (usual, most) = LinkSettings::QUEUE;
     Ok(LinkSettings {
         name,
         endpoint: endpoint.core.clone(),
         in_flight: in_flight(number)?,
         retry: retry(pauses)?,
-        queue: within("queue", queue, 1..=MAX_QUEUE)?,
+        queue: queue.map_or(Ok(usual), |queue| within("queue", queue, 1..=most))?,
         coalesce,
         cache: seconds("cache", cache)?,
         preferred: preferred.into_iter().map(parsed).collect::<PyResult<_>>()?,
@@ -74,8 +71,8 @@ pub struct Link {
 
 #[pymethods]
 impl Link {
-    #[pyo3(signature = (name, *, unit=None, timeout=1.0))]
-    fn route(&self, name: &str, unit: Option<i128>, timeout: f64) -> PyResult<Route> {
+    #[pyo3(signature = (name, *, timeout, unit=None))]
+    fn route(&self, name: &str, timeout: f64, unit: Option<i128>) -> PyResult<Route> {
         let core = CoreRoute {
             name: name.into(),
             link: Arc::clone(&self.core),

@@ -69,8 +69,8 @@ impl Log {
             settings.write_timeout = seconds("write_timeout", write_timeout)?;
         }
         if let Some(when_behind) = when_behind {
-            let allowed = [("serve", WhenBehind::Serve), ("refuse", WhenBehind::Refuse)];
-            settings.when_behind = word("when_behind", when_behind, &allowed)?;
+            settings.when_behind =
+                word("when_behind", when_behind, &WhenBehind::ALL.map(|each| (each.name(), each)))?;
         }
         if let Some(max_lag) = max_lag {
             settings.max_lag = seconds("max_lag", max_lag)?;

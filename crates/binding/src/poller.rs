@@ -10,6 +10,7 @@ use holdfast_engine::poller::{
     self, Batch, BlockSettings, Destination, DeviceSettings, DeviceState, ForwardSettings, Poll,
     Polled, Poller as Core, PollerError, ReadSettings, StatusSettings,
 };
+use holdfast_protocol::pdu::limit;
 use holdfast_runtime::Retry;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
@@ -21,6 +22,9 @@ use crate::fence::Fence;
 use crate::heartbeat;
 use crate::link::{self, Link, Passage};
 use crate::memory::{Memory, named};
+
+const MAX_REGISTERS: i128 = limit::READ_REGISTERS as i128;
+const MAX_BITS: i128 = limit::READ_BITS as i128;
 
 /// An area, its first address, and the one behind its last.
 type Range = (String, u32, u32);
@@ -50,7 +54,7 @@ pub struct PolledDevice {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl PolledDevice {
     #[new]
-    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, report=None, fields=None, release=false, measured=false, retry=None, jitter=true, fence=None))]
+    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=MAX_REGISTERS, max_bits=MAX_BITS, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, report=None, fields=None, release=false, measured=false, retry=None, jitter=true, fence=None))]
     fn new(
         name: String,
         endpoint: PyRef<'_, Endpoint>,
@@ -160,14 +164,14 @@ impl Poller {
         Results { core: self.core.receiver() }
     }
 
-    #[pyo3(signature = (name, endpoint, *, in_flight=1, queue=256, coalesce=true, cache=0.0, preferred=None, retry=None))]
+    #[pyo3(signature = (name, endpoint, *, in_flight=1, queue=None, coalesce=true, cache=0.0, preferred=None, retry=None))]
     #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
     fn link(
         &self,
         name: String,
         endpoint: PyRef<'_, Endpoint>,
         in_flight: Option<i128>,
-        queue: i128,
+        queue: Option<i128>,
         coalesce: bool,
         cache: f64,
         preferred: Option<Vec<String>>,
@@ -181,7 +185,7 @@ impl Poller {
 
     fn known_link(&self, name: String, endpoint: PyRef<'_, Endpoint>) -> PyResult<Option<Link>> {
         let settings =
-            link::settings(name, &endpoint, (Some(1), None), 256, true, 0.0, Vec::new())?;
+            link::settings(name, &endpoint, (Some(1), None), None, true, 0.0, Vec::new())?;
         let known = self.core.known_link(settings).map_err(raised)?;
         Ok(known.map(|core| Link { core }))
     }
@@ -275,7 +279,7 @@ fn raised(error: PollerError) -> PyErr {
 
 /// Plans the requests that read all fields.
 #[pyfunction]
-#[pyo3(signature = (fields, *, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None))]
+#[pyo3(signature = (fields, *, max_gap=None, cost=None, max_registers=MAX_REGISTERS, max_bits=MAX_BITS, readable=None, forbidden=None))]
 pub fn plan_blocks(
     fields: Vec<(String, i128, i128)>,
     max_gap: Option<i128>,
@@ -360,8 +364,9 @@ fn limits(
             .collect::<PyResult<Vec<Stretch>>>()
     };
     Ok(PlanLimits {
-        max_registers: within("max_registers", max_registers, 1..=125)? as u16,
-        max_bits: within("max_bits", max_bits, 1..=2000)? as u16,
+        max_registers: within("max_registers", max_registers, 1..=limit::READ_REGISTERS.into())?
+            as u16,
+        max_bits: within("max_bits", max_bits, 1..=limit::READ_BITS.into())? as u16,
         readable: stretches(readable)?,
         forbidden: stretches(forbidden)?,
         cuts: Vec::new(),

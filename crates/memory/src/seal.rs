@@ -1,6 +1,7 @@
 //! The seal of a memory: which bit opens it, when it closes again, and whose accesses it refuses.
 
-use crate::area::Area;
+use crate::area::{Area, Layout};
+use crate::bits;
 use crate::error::Refusal;
 use crate::operation::{Access, Write};
 
@@ -35,6 +36,18 @@ impl Gate {
             GateMode::Once => was_sealed && !bit,
             GateMode::Level => !bit,
         }
+    }
+
+    /// Whether the memory is sealed after a restart with these contents of this layout, whose age is
+    /// unknown. A gate that opens once is closed again, and its bit becomes 0: the next write would open
+    /// it otherwise.
+    pub fn seals_restored(self, layout: Layout, areas: &mut [Box<[u8]>; 4]) -> bool {
+        let offset = usize::from(self.address - layout.span(self.area).start());
+        let area = &mut areas[self.area.index()];
+        if self.mode == GateMode::Once {
+            bits::copy_in(area, offset, 1, &[0]);
+        }
+        self.seals(true, bits::get(area, offset))
     }
 }
 

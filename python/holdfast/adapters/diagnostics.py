@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 if TYPE_CHECKING:
     from holdfast.polling import Reading
 
+HEALTH = ("unknown", "ok", "error", "stale", "disabled", "standby")
+"""How a device can be."""
+
 
 class DiagnosticsSource(Protocol):
     """Snapshots of counters and states. Thread-safe; plain data without secrets."""

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
     from holdfast.adapters import Adapter, MemoryAccess
-    from holdfast.config import AdapterConfig
+    from holdfast.config.models.services import AdapterConfig
 
 
 class UnknownAdapter(ValueError):

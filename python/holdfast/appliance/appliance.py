@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from holdfast.appliance.services.supervision import Supervisor
     from holdfast.config import Config
-    from holdfast.replication.leases import LeaseTimes
+    from holdfast.replication.leases.times import LeaseTimes
 
 CHECK_INTERVAL_S = 1.0
 """The time between checks of all parts for what is to be logged."""

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 from holdfast.net.tls import NO_FILES
 
 if TYPE_CHECKING:
-    from holdfast.config import ClientTlsConfig
-    from holdfast.config.models.services import NatsServersConfig
+    from holdfast.config.models.services import ClientTlsConfig, NatsServersConfig
     from holdfast.net.nats.connection import Servers
     from holdfast.net.tls import Tls
 

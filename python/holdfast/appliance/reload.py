@@ -10,7 +10,10 @@ from holdfast.runtime.bounded_files import answered
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from holdfast.config import Config, DeviceConfig, LinkConfig, MemoryConfig
+    from holdfast.config import Config
+    from holdfast.config.models.devices import DeviceConfig
+    from holdfast.config.models.links import LinkConfig
+    from holdfast.config.models.memories import MemoryConfig
 
 
 class ReloadRefused(Exception):

@@ -197,6 +197,10 @@ class Program(SuggestingGroup):
             if as_json:
                 raise _WrongUsage(error) from error
             raise
+        except (KeyboardInterrupt, click.Abort):
+            if as_json:
+                answers.print_wrong("interrupted", "interrupted")
+            fail("interrupted", is_printed=as_json)
         except ModuleNotFoundError as error:
             reason = extras.missing_for(error)
             if reason is None:

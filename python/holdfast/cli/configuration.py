@@ -14,8 +14,10 @@ from holdfast.appliance.services.services import https
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.terminal_text import show_problems
 from holdfast.client.endpoint import check_files, endpoint, receiver_endpoint
-from holdfast.config import HTTP_SERVICES, ConfigError, tls_of
+from holdfast.config import ConfigError
 from holdfast.config.loader import loaded, unanswered
+from holdfast.config.models.listeners import tls_of
+from holdfast.config.models.services import HTTP_SERVICES
 from holdfast.config.text.report import Report
 from holdfast.runtime.bounded_files import NotAnswered, answered
 
@@ -23,7 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
-    from holdfast.config import Config, HttpsConfig, ServerTlsConfig
+    from holdfast.config import Config
+    from holdfast.config.models.server_tls import HttpsConfig, ServerTlsConfig
     from holdfast.config.text.source import KeyPath
     from holdfast.net.tls import Tls
 

@@ -41,6 +41,10 @@ def ending_signals() -> Iterator[signal.Signals]:
             yield number
 
 
+SIGNAL_INTERVAL_S = 0.2
+"""A command that waits for something else looks for signals this often."""
+
+
 class Interrupted(BaseException):
     """A signal came before the service was ready."""
 

@@ -20,7 +20,8 @@ from holdfast.values.digits import shortest
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from holdfast.config import ConfigError, Problem, RangeConfig
+    from holdfast.config import ConfigError, Problem
+    from holdfast.config.models.devices import RangeConfig
     from holdfast.config.models.listeners import ExceptionStatusConfig
     from holdfast.importing import Note
 

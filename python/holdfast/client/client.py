@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Self
 
+from holdfast._core import MAX_IN_FLIGHT
 from holdfast.client.async_operations import AsyncOperations
 from holdfast.client.async_transports import AsyncConnection, ThreadedConnection
 from holdfast.client.base import DEFAULT_TIMEOUT_S
 from holdfast.client.endpoint import endpoint
-from holdfast.client.url import IN_FLIGHT, MAX_IN_FLIGHT, NetworkTarget
+from holdfast.client.url import IN_FLIGHT, NetworkTarget
 from holdfast.values.integers import as_integer
 
 if TYPE_CHECKING:

@@ -23,7 +23,8 @@ from holdfast.protocol import (
     READ_RECORDS,
     WRITE_LIMITS,
 )
-from holdfast.types import BIT_AREAS
+from holdfast.runtime.text import listing, suggestion
+from holdfast.types import AREAS, BIT_AREAS, SHORT_AREAS, WRITABLE_AREAS
 from holdfast.values.codec import codec_for
 from holdfast.values.errors import UnknownType
 from holdfast.values.integers import as_integer
@@ -216,6 +217,7 @@ def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) 
 
 def read_typed(area: Area, address: int, kind: str, order: str, encoding: str | None) -> Steps[Any]:
     """Reads a typed value, or an array of values."""
+    _check_area(area, AREAS)
     if str(kind).isdigit() and area in READ_LIMITS:  # As other libraries are called, with a count.
         raise UnknownType(
             f"type is {kind}, allowed: the name of a type, as in 'uint16[{kind}]'; for {kind} "
@@ -240,8 +242,7 @@ def write_typed(
     """Writes a typed value: one bit or register with functions 5 and 6, several with 15 and 16; one
     bit of a register with function 22, which keeps the other bits.
     """
-    if area not in WRITE_LIMITS:
-        raise ValueError(f"area is {area!r}, only {' and '.join(WRITE_LIMITS)} can be written")
+    _check_area(area, WRITABLE_AREAS)
     codec = codec_for(area, kind, order, encoding)
     raw = codec.encode(value)
     if codec.type.base == "bit":
@@ -255,6 +256,14 @@ def write_typed(
         yield Request.write_coil(address, bool(raw[0]))
     else:
         yield Request.write_register(address, raw[0])
+
+
+def _check_area(area: Area, allowed: Sequence[Area]) -> None:
+    """Raises `ValueError` for an area that can't be read or written, or does not exist."""
+    if area in allowed:
+        return
+    meant = SHORT_AREAS.get(str(area).lower(), area)
+    raise ValueError(f"area is {area!r}, allowed: {listing(allowed)}{suggestion(meant, allowed)}")
 
 
 def identify() -> Steps[Identification]:

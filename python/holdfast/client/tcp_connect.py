@@ -6,6 +6,7 @@ Each address gets a share of the remaining time, so that one dead address does n
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 import time
 from typing import TYPE_CHECKING
@@ -36,14 +37,9 @@ async def connected(candidates: Sequence[SocketAddress], deadline: float) -> soc
     loop = asyncio.get_running_loop()
     for others, (family, address) in _countdown(candidates):
         try:
-            connection = socket.socket(family)
-            try:
-                _prepare(connection)
+            with _prepared(family) as connection:
                 async with asyncio.timeout((deadline - loop.time()) / (others + 1)):
                     await loop.sock_connect(connection, address)
-            except BaseException:
-                connection.close()
-                raise
             return connection
         except OSError:
             if not others:
@@ -56,15 +52,10 @@ def connected_sync(host: str, port: int, deadline: float) -> socket.socket:
     candidates = CONFIGURED.wait_for(host, port, remaining_s(deadline))
     for others, (family, address) in _countdown(candidates):
         try:
-            connection = socket.socket(family)
-            try:
-                _prepare(connection)
+            with _prepared(family) as connection:
                 connection.settimeout(remaining_s(deadline) / (others + 1))
                 connection.connect(address)
                 connection.setblocking(False)
-            except BaseException:
-                connection.close()
-                raise
             return connection
         except OSError:
             if not others:
@@ -77,9 +68,17 @@ def _countdown(candidates: Sequence[SocketAddress]) -> Iterator[tuple[int, Socke
     return zip(reversed(range(len(candidates))), candidates, strict=True)
 
 
-def _prepare(connection: socket.socket) -> None:
-    connection.setblocking(False)
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+@contextlib.contextmanager
+def _prepared(family: int) -> Iterator[socket.socket]:
+    """A socket, which is closed if connecting fails."""
+    connection = socket.socket(family)
+    try:
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        yield connection
+    except BaseException:
+        connection.close()
+        raise
 
 
 def remaining_s(deadline: float) -> float:

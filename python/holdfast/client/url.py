@@ -37,9 +37,6 @@ SECURE = ("tls", "raw+tls")
 IN_FLIGHT: tuple[Transport, ...] = ("tcp", "tls")
 """The transports that allow several requests in flight."""
 
-MAX_IN_FLIGHT = 1024
-"""The most requests in flight on one connection."""
-
 FORMS = (
     "tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502, "
     "rtu+udp://host:502, ascii+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"

@@ -8,24 +8,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict
 
-from holdfast._core import plan_blocks
+from holdfast._core import UNMEASURED_COST_MS, plan_blocks
 from holdfast.protocol import READ_BITS, READ_REGISTERS
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from holdfast.config import DeviceConfig, RangeConfig
+    from holdfast.config.models.devices import DeviceConfig, RangeConfig
     from holdfast.types import Area
 
 Field: TypeAlias = "tuple[Area, int, int]"
 """An area, an address and a count."""
 
 Preset: TypeAlias = Literal["none", "max_insert"]
-
-UNMEASURED_COST_MS = (10.0, 1.0)
-"""The costs of a request and of a register until a device with `max_gap: auto` is measured. They
-read gaps of up to 10, as the default of `max_gap` for tags does."""
 
 BITS = 16
 """Bits that count as one register."""

@@ -18,7 +18,7 @@ from holdfast.errors import ModbusException
 from holdfast.protocol import READ_LIMITS
 from holdfast.tags import Tag
 from holdfast.tags.scale import RegisterScale
-from holdfast.types import BIT_AREAS
+from holdfast.types import BIT_AREAS, SHORT_OF
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
@@ -29,14 +29,6 @@ if TYPE_CHECKING:
     from holdfast.discovery.segments import Habit, Value
     from holdfast.discovery.sunspec import Model, Point, SunSpec
     from holdfast.types import Area
-
-SHORT = {
-    "coils": "co",
-    "discrete_inputs": "di",
-    "holding_registers": "hr",
-    "input_registers": "ir",
-}
-"""What the names of tags begin with."""
 
 SINGLE_BITS = 64
 """Ranges of more bits become tags of many bits each."""
@@ -288,7 +280,7 @@ def _bits(area: Area, extent: range, contents: Sequence[Sequence[int]]) -> Itera
         )
         reasons = ("changes",) if any(each != found[0] for each in found) else ()
         address = extent.start + first
-        tag = Tag(f"{SHORT[area]}_{address}", area, address, kind)
+        tag = Tag(f"{SHORT_OF[area]}_{address}", area, address, kind)
         yield Described(tag, 1.0, found, reasons)
 
 
@@ -296,7 +288,7 @@ def _tag(
     area: Area, address: int, kind: str, order: str, confidence: float, reasons: Sequence[str]
 ) -> Tag:
     text = f"confidence {confidence:.2f}{': ' if reasons else ''}{', '.join(reasons)}"
-    return Tag(f"{SHORT[area]}_{address}", area, address, kind, order, description=text)
+    return Tag(f"{SHORT_OF[area]}_{address}", area, address, kind, order, description=text)
 
 
 def _of_sunspec(found: SunSpec) -> Iterator[Described]:

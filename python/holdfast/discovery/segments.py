@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 from holdfast import values
 from holdfast.discovery import clock_fields, plausibility, text_fields
 from holdfast.values import ConversionError
+from holdfast.values.orders import SWAPPED_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -113,9 +114,6 @@ MIXED = 4.0
 """The common orders, and how rare it is that a value has one that is not that of its device: a
 single register between long values would else be half of one in the other order.
 """
-
-SWAPPED_BYTES = ("BADC", "DCBA")
-"""The orders of devices that may also swap the bytes of single registers."""
 
 TRUST = {"float32": 1.4, "int32": 0.65, "string": 0.6, "uint16": 0.76}
 OTHER_TRUST = 0.78

@@ -115,11 +115,10 @@ class RequestedDevice:
             return Failed("timeout", self._timed_out())
         if not isinstance(error, ConnectionLost):
             return Failed("invalid_reply", str(error))
-        reason, detail = "connection_lost", str(error)
-        if not error.maybe_sent:
-            self.maybe_sent, reason = False, "no_connection"
-            if isinstance(error, ConnectFailed | TlsFailed):  # With the host as requested.
-                detail = f"can't connect to {self.host}:{self.port}: {error.detail}"
+        reason, detail = "connection_lost" if error.maybe_sent else "no_connection", str(error)
+        unsent = (ConnectFailed,) if error.maybe_sent else (ConnectFailed, TlsFailed)
+        if isinstance(error, unsent):  # With the host as requested.
+            detail = f"can't connect to {self.host}:{self.port}: {error.detail}"
         return Failed("tls_failed" if isinstance(error, TlsFailed) else reason, detail)
 
     async def attempt(self, call: Callable[[Client], Awaitable[Result]]) -> Result:

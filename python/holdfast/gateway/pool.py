@@ -143,7 +143,14 @@ class _PoolTurns(Turns):
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
         """Sends a request when its turn comes. Raises the errors of a client, and `Unusable`."""
-        device = self._device
+        earlier = self.is_sent
+        try:
+            return await self._call(self._device, request, unit, timeout)
+        except ConnectionLost as error:
+            self.is_sent = error.maybe_sent = earlier or error.maybe_sent
+            raise
+
+    async def _call(self, device: _Device, request: Request, unit: int, timeout: float) -> Any:
         if device.in_flight < device.most:
             device.in_flight += 1
             self.is_sent = True
@@ -283,7 +290,10 @@ class Pool:
         try:
             if close:
                 device.doubtful = False
-                await device.transport.close()
+                try:
+                    await device.transport.close()
+                except Exception:
+                    device.doubtful = True  # The next request closes it, or gets the error.
             while device.waiting:
                 now = device.waiting[0]
                 if all(caller.done() for caller in now.callers):

@@ -116,7 +116,10 @@ class Turns:
         """Whether the turn of a request has come, so that the device may have received it."""
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
-        """Sends a request when its turn comes. Raises `QueueFull` and the errors of a client."""
+        """Sends a request when its turn comes. Raises `QueueFull` and the errors of a client.
+
+        A `ConnectionLost` is of all requests of this caller: one before may have been sent.
+        """
         raise NotImplementedError
 
     async def close(self) -> None:
@@ -143,11 +146,11 @@ class _LinkTurns(Turns):
         except asyncio.CancelledError:
             self.is_sent |= self._calls.caller.withdraw(ticket)
             raise
+        if isinstance(result, ConnectionLost):
+            sent = result.maybe_sent = self.is_sent or (sent and result.maybe_sent)
         self.is_sent |= sent
         if not isinstance(result, ModbusError):
             return result
-        if isinstance(result, ConnectionLost) and not sent:
-            result.maybe_sent = False
         if isinstance(result, ModbusException) and broadcast:
             raise InvalidResponse(f"the peer answered a broadcast with {result}")
         raise result

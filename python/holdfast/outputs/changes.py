@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
-from holdfast.tags.changing import differs
+from holdfast.tags.deadband import differs
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from nats.errors import Error, NoRespondersError
 
 from holdfast.net import event_loop
-from holdfast.net.nats import connected_once, nats_reason
+from holdfast.net.nats.connection import connected_once, nats_reason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
     from nats.aio.msg import Msg
 
-    from holdfast.net.nats import SafeClient, Servers
+    from holdfast.net.nats.connection import Servers
+    from holdfast.net.nats.tolerant_client import SafeClient
 
     T = TypeVar("T")
 

@@ -11,6 +11,9 @@ import random
 JITTER = 0.25
 """With jitter, a pause is up to this fraction shorter at random."""
 
+PROVEN_S = 60.0
+"""What has run for so long has started well: its next pause is the first again."""
+
 _MAX_DOUBLINGS = 31
 
 

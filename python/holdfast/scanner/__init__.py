@@ -16,22 +16,3 @@ is alone and a node of a fleet.
 * `reports`: the answers to `browse` and `variables`
 * `fleet`: scanners that share their devices
 """
-
-from __future__ import annotations
-
-from holdfast.net.nats.connection import Ping, Servers
-from holdfast.scanner.fleet.agreement import FleetRefused
-from holdfast.scanner.service import Scanner
-from holdfast.scanner.settings import FleetSettings, Settings
-from holdfast.scanner.subscriptions.rules import Defaults, ScannerLimits
-
-__all__ = [
-    "Defaults",
-    "FleetRefused",
-    "FleetSettings",
-    "Ping",
-    "Scanner",
-    "ScannerLimits",
-    "Servers",
-    "Settings",
-]

@@ -13,7 +13,7 @@ from holdfast.scanner.service import Scanner
 
 if TYPE_CHECKING:
     from holdfast._core import Poller
-    from holdfast.replication.leases import StartThread
+    from holdfast.replication.leases.thread import StartThread
     from holdfast.runtime.stop import Stop
     from holdfast.scanner.settings import Settings
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from holdfast._core import Poller
     from holdfast.net.nats.connection import Handler
     from holdfast.net.nats.tolerant_client import SafeClient
-    from holdfast.replication.leases import StartThread
+    from holdfast.replication.leases.thread import StartThread
     from holdfast.scanner.settings import Settings
 
 STOP_STEP_TIMEOUT_S = 2.0

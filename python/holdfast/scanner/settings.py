@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from holdfast.config.values.scanning import PARTITIONS, written_pollable
 from holdfast.net.nats.connection import MAX_PAUSE, Ping, Servers
 from holdfast.net.tls import NO_FILES, Tls
-from holdfast.replication.leases import LEASE_TIMES, LeaseTimes
+from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.runtime.standstill import STANDSTILL_S
 from holdfast.scanner.dialects import DIALECTS
 from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes

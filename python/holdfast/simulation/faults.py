@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 from holdfast.net.addresses import holds, parse_address
-from holdfast.net.closing import close
+from holdfast.net.server_close import close
 from holdfast.runtime.tasks import end
 
 if TYPE_CHECKING:

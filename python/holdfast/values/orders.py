@@ -39,6 +39,8 @@ FOUR = {
     "BADC": Order(swapped=True),
     "CDAB": Order(swapped=True, reversed=True),
 }
+SWAPPED_BYTES = ("BADC", "DCBA")
+"""The orders that also swap the bytes of a single register."""
 EIGHT = {
     "ABCDEFGH": FOUR["ABCD"],
     "HGFEDCBA": FOUR["DCBA"],

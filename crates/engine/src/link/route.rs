@@ -35,6 +35,11 @@ pub struct LinkSettings {
     pub preferred: Vec<IpAddr>,
 }
 
+impl LinkSettings {
+    /// The most requests that wait, unless a link has another number, and the most it can have.
+    pub const QUEUE: (usize, usize) = (256, 65_535);
+}
+
 counters! {
     /// Requests since the start, without those of the poller.
     pub struct LinkCounters {

@@ -3,6 +3,10 @@
 /// The number of answers that an estimate requires.
 const MIN_SAMPLES: u32 = 100;
 
+/// Milliseconds per request and per register of a device that is not measured yet. They read gaps of up
+/// to 10.
+pub const UNMEASURED_COST_MS: (f64, f64) = (10.0, 1.0);
+
 /// Linear regression of round trip time by size: a constant per request, and a slope per 16 bits.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Samples {

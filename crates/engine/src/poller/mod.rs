@@ -26,6 +26,7 @@ mod turn;
 mod unanswered_polls;
 mod write_through;
 
+pub use cost::UNMEASURED_COST_MS;
 pub use destination::Destination;
 pub use device::{DeviceSettings, ReadSettings};
 pub use forwarding::{ForwardCounters, ForwardFailure, ForwardSettings};

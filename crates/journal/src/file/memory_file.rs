@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use holdfast_memory::{Contents, GateMode, Memory};
+use holdfast_memory::{Contents, Memory};
 
 use super::before_reply::BeforeReply;
 use super::disk::Disk;
@@ -127,7 +127,11 @@ impl MemoryFile {
             } else {
                 let set_aside = store.image().set_aside_of(name);
                 warnings.extend(stored.resizings(set_aside, memory.layout()));
-                memory.restore(&sealed_again(&stored.with(set_aside), memory));
+                let mut areas = stored.with(set_aside).resized(memory.layout());
+                let sealed = memory
+                    .gate()
+                    .is_some_and(|gate| gate.seals_restored(memory.layout(), &mut areas));
+                memory.restore(&Contents { areas, sealed });
             }
             loaded.push(name.clone());
         }
@@ -311,23 +315,6 @@ fn check(members: &[Member]) -> Result<(), FileError> {
         }
     }
     Ok(())
-}
-
-/// The contents of a memory from the file. Their age is unknown: a memory with a gate that
-/// opens once is sealed again, and its gate bit is 0, because the next write would open it otherwise.
-fn sealed_again(stored: &StoredMemory, memory: &Memory) -> Contents {
-    let mut areas = stored.resized(memory.layout());
-    let Some(gate) = memory.gate() else { return Contents { areas, sealed: false } };
-    let bit = usize::from(gate.address - memory.span(gate.area).start());
-    let (byte, mask) = (&mut areas[gate.area as usize][bit / 8], 1 << (bit % 8));
-    let sealed = match gate.mode {
-        GateMode::Once => {
-            *byte &= !mask;
-            true
-        }
-        GateMode::Level => *byte & mask == 0,
-    };
-    Contents { areas, sealed }
 }
 
 /// The note of the log, if the file has the contents of its memories; `None` if it has none yet.

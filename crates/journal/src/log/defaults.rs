@@ -10,6 +10,14 @@ use super::shared::MAX_QUEUE_STEPS;
 use super::stream::connection::CONNECT_TIMEOUT;
 use super::stream::server_lag::MAX_CUT_OFF;
 
+/// Until a write is answered that the log has not confirmed.
+pub const WRITE_TIMEOUT: Duration = Duration::from_secs(1);
+
+pub const WHEN_BEHIND: WhenBehind = WhenBehind::Serve;
+
+/// Without contact to the log, until the node is behind.
+pub const MAX_LAG: Duration = Duration::from_secs(5);
+
 impl Settings {
     pub fn new(name: &str, node: &str, urls: Vec<String>) -> Settings {
         Settings {
@@ -22,9 +30,9 @@ impl Settings {
                 connect_timeout: CONNECT_TIMEOUT,
             },
             replicas: 1,
-            write_timeout: Duration::from_secs(1),
-            when_behind: WhenBehind::Serve,
-            max_lag: Duration::from_secs(5),
+            write_timeout: WRITE_TIMEOUT,
+            when_behind: WHEN_BEHIND,
+            max_lag: MAX_LAG,
             snapshot_steps: SNAPSHOT_STEPS,
             snapshot_after: SNAPSHOT_AFTER,
             digest_every: DIGEST_EVERY,

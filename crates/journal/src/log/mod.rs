@@ -38,9 +38,10 @@ use std::time::Duration;
 use holdfast_memory::{Journal, Memory};
 
 pub use clock::time_since_boot;
+pub use defaults::{MAX_LAG, WHEN_BEHIND, WRITE_TIMEOUT};
 pub use error::LogError;
 pub use follower::{Follower, Next, Record, Until};
-pub use settings::{Login, Servers, Settings, Tls, WhenBehind};
+pub use settings::{CONTACTS_PER_LAG, Login, Servers, Settings, Tls, WhenBehind};
 pub use shared::Checkpoint;
 pub use status::{Digest, Event, Node, Phase, Status};
 pub use stream::message::Origin;

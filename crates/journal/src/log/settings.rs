@@ -49,6 +49,17 @@ pub enum WhenBehind {
     Refuse,
 }
 
+impl WhenBehind {
+    pub const ALL: [WhenBehind; 2] = [WhenBehind::Serve, WhenBehind::Refuse];
+
+    pub const fn name(self) -> &'static str {
+        match self {
+            WhenBehind::Serve => "serve",
+            WhenBehind::Refuse => "refuse",
+        }
+    }
+}
+
 #[derive(Debug, Clone)]
 pub struct Settings {
     /// The name of the log: all nodes with this name share the same contents.
@@ -124,7 +135,7 @@ impl Settings {
 
     /// How often a node without writes proves its contact with the log.
     pub(super) fn tick(&self) -> Duration {
-        self.max_lag / 4
+        self.max_lag / CONTACTS_PER_LAG
     }
 
     /// How long a session may have no contact before another one is tried.
@@ -132,6 +143,9 @@ impl Settings {
         (self.tick() * 3).max(Duration::from_secs(2))
     }
 }
+
+/// In this part of `max_lag`, a node without writes has contact with the log once.
+pub const CONTACTS_PER_LAG: u32 = 4;
 
 const MAX_NAME_CHARS: usize = 64;
 

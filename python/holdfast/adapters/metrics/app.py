@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
     from holdfast.adapters.diagnostics import DiagnosticsSource
-    from holdfast.config import MetricsConfig
+    from holdfast.config.models.services import MetricsConfig
     from holdfast.net.http.health import HealthSource
     from holdfast.net.http.https import Https
     from holdfast.net.http.port import ListeningSocket

@@ -12,6 +12,7 @@ from prometheus_client.core import (
 )
 
 from holdfast import __version__
+from holdfast.adapters.diagnostics import HEALTH
 from holdfast.tags.text import plain
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from holdfast.net.http.health import HealthSource
 
 STATES = ("running", "failed", "stopped")
-HEALTH = ("unknown", "ok", "error", "stale", "disabled", "standby")
 OUTCOMES = ("valid", "exceptions", "timeouts", "transport_errors")
 """The outcomes of requests to a device."""
 EXPIRIES = (

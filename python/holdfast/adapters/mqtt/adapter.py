@@ -12,8 +12,8 @@ from holdfast.adapters.mqtt.connection import BrokerConnection
 from holdfast.adapters.mqtt.inbox import Filters, Inbox, Values
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
-from holdfast.net.mqtt.dialing import CONNACK_TIMEOUT_S, dial
-from holdfast.net.mqtt.waiting import Ended, Waiter
+from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S, dial
+from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secret_file import read_password
 from holdfast.net.secure_channel import failure_text
 from holdfast.runtime.backoff import Backoff
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
 
-    from holdfast.config import MappedTag, MappingConfig, MqttConfig, SubscriptionConfig
+    from holdfast.config.models.root import MappedTag
+    from holdfast.config.models.services import MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.ingest import MemoryAccess
     from holdfast.net.mqtt.stream import BrokerSocket
     from holdfast.runtime.stop import Stop

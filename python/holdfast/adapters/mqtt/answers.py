@@ -13,14 +13,16 @@ import msgspec
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from holdfast.adapters.mqtt.connection import MAX_WAITING_PACKETS
-
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast.adapters.mqtt.connection import BrokerConnection
     from holdfast.adapters.mqtt.inbox import Filters, Values
     from holdfast.net.mqtt.packets import Publish
+
+
+MAX_WAITING_ANSWERS = 100
+"""Limit of unsent packets, and of unacknowledged answers. Above it answers are dropped."""
 
 
 class Answers:
@@ -59,11 +61,14 @@ class Answers:
             return False
         payload = msgspec.json.encode(answer)
         size = len(payload) + len(response_topic) + len(message.correlation or b"")
-        if link.connection.unsent >= MAX_WAITING_PACKETS or not link.takes(size):
+        if link.connection.unsent >= MAX_WAITING_ANSWERS or not link.takes(size):
+            return False
+        qos = min(message.qos, 1, link.most_qos)
+        if qos and link.unacknowledged >= MAX_WAITING_ANSWERS:
             return False
         properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
         properties.ContentType = "application/json"
         if message.correlation is not None:
             properties.CorrelationData = message.correlation
-        qos = min(message.qos, 1, link.most_qos)
-        return link.answer(topic, payload, qos, properties)
+        link.answer(topic, payload, qos, properties)
+        return True

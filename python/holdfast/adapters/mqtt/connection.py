@@ -29,15 +29,12 @@ if TYPE_CHECKING:
     from paho.mqtt.reasoncodes import ReasonCode
 
     from holdfast.adapters.mqtt.inbox import Inbox
-    from holdfast.config import MappingConfig, MqttConfig, SubscriptionConfig
+    from holdfast.config.models.services import MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.net.mqtt.packets import Publish
     from holdfast.net.mqtt.stream import BrokerSocket
 
 SESSION_EXPIRY_S = 3600
 """Seconds that the broker keeps the session while this client is disconnected. MQTT 5 only."""
-
-MAX_WAITING_PACKETS = 100
-"""Limit of unsent packets. Above it answers are dropped."""
 
 MAX_UNSENT_PACKETS = 1000
 """Limit of unsent packets, mostly acknowledgements. Above it nothing is read from the broker."""
@@ -140,16 +137,18 @@ class BrokerConnection(BrokerClient):
         """Returns whether the broker accepts a message of this size, plus packet overhead."""
         return self._largest_sent is None or size + 64 <= self._largest_sent
 
-    def answer(self, topic: str, payload: bytes, qos: int, properties: Properties) -> bool:
-        """Publishes a message. Returns false if too many wait."""
+    @property
+    def unacknowledged(self) -> int:
+        """Answers that wait for an acknowledgement, or for that of others."""
+        return len(self._on_the_way) + len(self._waiting)
+
+    def answer(self, topic: str, payload: bytes, qos: int, properties: Properties) -> None:
+        """Publishes a message, with QoS 1 when the broker has acknowledged others."""
         if not qos:
             self.publish(topic, payload, 0, properties=properties)
-            return True
-        if len(self._on_the_way) + len(self._waiting) >= MAX_WAITING_PACKETS:
-            return False
+            return
         self._waiting.append(_Pending(topic, payload, properties))
         self._send_waiting()
-        return True
 
     def _send_waiting(
         self,

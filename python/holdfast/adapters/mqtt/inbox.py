@@ -23,7 +23,8 @@ from holdfast.values import ConversionError, codec_for
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from holdfast.config import MappedTag, SubscriptionConfig
+    from holdfast.config.models.root import MappedTag
+    from holdfast.config.models.services import SubscriptionConfig
     from holdfast.ingest import MemoryAccess
     from holdfast.net.mqtt.packets import Publish
 

@@ -12,7 +12,7 @@ from holdfast.net.http.host import STOP_TIMEOUT_S, ConnectionLimits, Host
 if TYPE_CHECKING:
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.sessions import SessionControl
-    from holdfast.config import RestConfig
+    from holdfast.config.models.services import RestConfig
     from holdfast.ingest import MemoryAccess
     from holdfast.net.http.https import Https
     from holdfast.net.http.port import ListeningSocket

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from holdfast._core import Commands, ParsedWrites
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.sessions import SessionControl
-    from holdfast.config import RestConfig
+    from holdfast.config.models.services import RestConfig
     from holdfast.ingest import MemoryAccess, Written
     from holdfast.net.http.operations import Later, Operation
 

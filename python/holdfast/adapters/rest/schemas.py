@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from holdfast.adapters.diagnostics import HEALTH
 from holdfast.adapters.rest.refusals import REFUSALS
 from holdfast.net.http.schemas import (
     COUNT,
@@ -164,8 +165,6 @@ _THREAD = object_of(
         | {"description": "Processor time in seconds, if the system provides it"},
     }
 )
-_HEALTH = ["unknown", "ok", "error", "stale", "disabled", "standby"]
-
 _DIAGNOSTICS: dict[str, Schema] = {
     "Sessions": object_of({"sessions": array_of(ref("Session"))}),
     "Session": object_of(
@@ -203,7 +202,7 @@ _DIAGNOSTICS: dict[str, Schema] = {
                 "connections, frames",
             ),
             "devices": map_of(
-                object_of({"health": {"enum": _HEALTH}}, is_open=True),
+                object_of({"health": {"enum": list(HEALTH)}}, is_open=True),
                 "By name of the device: health, seconds since the last valid response, requests "
                 "by outcome, polls, reads, packets forwarded",
             ),

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
     from holdfast._core import Engine
     from holdfast.appliance.parts.part import Plan
-    from holdfast.config import AuditConfig, Config
+    from holdfast.config import Config
+    from holdfast.config.models.services import AuditConfig
     from holdfast.types import ThreadHeartbeat
 
 # The most writes that are moved to the audit log at once.

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from holdfast.appliance.parts.part import Part
 from holdfast.client.url import NetworkTarget
-from holdfast.config import HTTP_SERVICES, tls_of
+from holdfast.config.models.listeners import tls_of
+from holdfast.config.models.services import HTTP_SERVICES
 from holdfast.events import log_lines
 from holdfast.runtime import extras
 
@@ -18,7 +19,8 @@ if TYPE_CHECKING:
 
     from holdfast.appliance.parts.part import Plan
     from holdfast.client.url import Target
-    from holdfast.config import ClientTlsConfig, Config
+    from holdfast.config import Config
+    from holdfast.config.models.services import ClientTlsConfig
     from holdfast.config.text.source import KeyPath
     from holdfast.net.certificates.expiry import Expiry
     from holdfast.net.tls import Tls

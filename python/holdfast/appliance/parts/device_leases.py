@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from holdfast.appliance.parts.part import Plan
     from holdfast.appliance.parts.shared_logs import SharedLogs
     from holdfast.config import Config
-    from holdfast.replication.leases import LeaseTimes
+    from holdfast.replication.leases.times import LeaseTimes
     from holdfast.types import ThreadHeartbeat
 
 _ENDING_S = 2.0
@@ -128,7 +128,9 @@ class _LogLeases:
 
     def __post_init__(self) -> None:
         # Only an appliance with logs loads the client of NATS.
-        from holdfast.replication.leases import LEASE_TIMES, Leases, LeaseThread
+        from holdfast.replication.leases.leases import Leases
+        from holdfast.replication.leases.thread import LeaseThread
+        from holdfast.replication.leases.times import LEASE_TIMES
 
         settings = self.config.logs[self.log]
         self.leases = Leases(
@@ -209,6 +211,6 @@ class _LogLeases:
                     log_lines.write(logging.WARNING, "device_not_polled", **fields)
 
     async def _connect(self, connected: Callable[[Any], None]) -> None:
-        from holdfast.net.nats import Broker, Ping
+        from holdfast.net.nats.connection import Broker, Ping
 
         await Broker(self._servers, {}, connected, Ping(), name="holdfast leases").run()

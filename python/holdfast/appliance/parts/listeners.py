@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from holdfast import _core
 from holdfast.appliance.parts.native_listeners import identity, listener
 from holdfast.appliance.parts.part import Part
-from holdfast.config import ModbusAsciiListener, ModbusRtuListener, tls_of
+from holdfast.config.models.listeners import ModbusAsciiListener, ModbusRtuListener, tls_of
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
 from holdfast.server.fork import close_in_children
@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
     from holdfast.appliance.parts.audit import NoAudit
     from holdfast.appliance.parts.part import Plan
-    from holdfast.config import Config, GatewayConfig, Listener, MetricsConfig, RestConfig
+    from holdfast.config import Config
+    from holdfast.config.models.listeners import Listener
+    from holdfast.config.models.services import GatewayConfig, MetricsConfig, RestConfig
     from holdfast.types import ThreadHeartbeat
 
 # All other events of a listener are limited in number, and warnings except `secured`.

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
     from holdfast._core import Memory
     from holdfast.appliance.parts.part import Plan
-    from holdfast.config import Config, MemoryConfig
+    from holdfast.config import Config
+    from holdfast.config.models.memories import MemoryConfig
 
 
 class UnusableFile(OSError):

@@ -21,8 +21,13 @@ if TYPE_CHECKING:
 
     from holdfast._core import Memory
     from holdfast.client.url import Target
-    from holdfast.config import Config, DestinationConfig
-    from holdfast.config.models.devices import BlockConfig, ForwardConfig, StatusConfig
+    from holdfast.config import Config
+    from holdfast.config.models.devices import (
+        BlockConfig,
+        DestinationConfig,
+        ForwardConfig,
+        StatusConfig,
+    )
     from holdfast.types import Area, Forward, StatusBlock
 
 FIRST_POLL_SPREAD_S = 10.0

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal, assert_never, cast
 
 from holdfast import _core
-from holdfast.config import (
+from holdfast.config.checks.rights import items, together, unit_rights
+from holdfast.config.models.listeners import (
     ModbusAsciiListener,
     ModbusAsciiOverTcpListener,
     ModbusRtuListener,
@@ -17,7 +18,6 @@ from holdfast.config import (
     RawIngestListener,
     SecureRawRuleConfig,
 )
-from holdfast.config.checks.rights import items, together, unit_rights
 from holdfast.server import Identity
 from holdfast.server.options import RAW_INGEST_DEFAULTS, STREAM_DEFAULTS
 
@@ -26,17 +26,17 @@ if TYPE_CHECKING:
 
     from holdfast._core import Memory
     from holdfast.appliance.parts.native_devices import Links
-    from holdfast.config import (
-        Config,
-        IdentityConfig,
+    from holdfast.config import Config
+    from holdfast.config.checks.rights import UnitRights
+    from holdfast.config.models.listeners import (
         Listener,
+        RawCompatConfig,
         RawRuleConfig,
         RuleConfig,
         SerialRuleConfig,
-        ServerTlsConfig,
     )
-    from holdfast.config.checks.rights import UnitRights
-    from holdfast.config.models.listeners import RawCompatConfig
+    from holdfast.config.models.root import IdentityConfig
+    from holdfast.config.models.server_tls import ServerTlsConfig
     from holdfast.server.options import (
         DatagramOptions,
         RawIngestOptions,

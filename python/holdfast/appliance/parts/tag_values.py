@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from holdfast._core import Results
-    from holdfast.config import Config, DeviceConfig
+    from holdfast.config import Config
+    from holdfast.config.models.devices import DeviceConfig
     from holdfast.config.models.outputs import Output
     from holdfast.outputs import Receiver
     from holdfast.outputs.stored import Stored

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from holdfast.appliance.services.services import Services
-    from holdfast.config import Config, GatewayConfig
+    from holdfast.config import Config
+    from holdfast.config.models.services import GatewayConfig
     from holdfast.config.models.tags import ProfileConfig
     from holdfast.gateway import Settings
 

@@ -12,9 +12,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from holdfast.appliance.services.services import Services
-    from holdfast.config import Config, NatsConfig
+    from holdfast.config import Config
+    from holdfast.config.models.services import NatsConfig
     from holdfast.config.models.tags import ProfileConfig
-    from holdfast.scanner import Settings
+    from holdfast.scanner.settings import Settings
 
 
 class ScannerService(Service):
@@ -42,7 +43,9 @@ def scanner_settings(
     settings: NatsConfig, profiles: Mapping[str, ProfileConfig] | None = None
 ) -> Settings:
     """Returns the settings of the scanner."""
-    from holdfast.scanner import Defaults, FleetSettings, Ping, ScannerLimits, Settings
+    from holdfast.net.nats.connection import Ping
+    from holdfast.scanner.settings import FleetSettings, Settings
+    from holdfast.scanner.subscriptions.rules import Defaults, ScannerLimits
 
     fleet, given = settings.fleet, settings.defaults
     return Settings(

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from holdfast.appliance.parts.devices import Devices
     from holdfast.appliance.parts.part import Plan
     from holdfast.appliance.services.supervision import Supervisor
-    from holdfast.config import Config, GatewayConfig, HttpsConfig, MetricsConfig, RestConfig
+    from holdfast.config import Config
+    from holdfast.config.models.server_tls import HttpsConfig
+    from holdfast.config.models.services import GatewayConfig, MetricsConfig, RestConfig
     from holdfast.net.http.health import HealthSource
     from holdfast.net.http.https import Https
     from holdfast.types import ThreadHeartbeat

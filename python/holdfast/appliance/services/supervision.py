@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.config.fingerprint import fingerprint
 from holdfast.events import log_lines
-from holdfast.runtime.backoff import Backoff
+from holdfast.runtime.backoff import PROVEN_S, Backoff
 from holdfast.runtime.heartbeat import Heartbeat
 from holdfast.runtime.stop import Stop
 
@@ -32,9 +32,6 @@ if TYPE_CHECKING:
 FIRST_PAUSE_S = 1.0
 MAX_PAUSE_S = 60.0
 """The pause before a failed adapter restarts. Each failure doubles it, up to the maximum."""
-
-PROVEN_S = 60.0
-"""After running at least this long, the pauses start from the first again."""
 
 STOP_TIMEOUT_S = 5.0
 """How long to wait for an adapter to stop."""

@@ -16,7 +16,7 @@ from holdfast.cli.options.option import flag, json_option, option, parsed_by
 from holdfast.cli.terminal_text import counted, print_json, table
 from holdfast.config.values.scanning import PREFIX, parse_member
 from holdfast.net import event_loop
-from holdfast.scanner import Servers
+from holdfast.net.nats.connection import Servers
 from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
 
 _HEAD = ("node", "state", "partitions", "devices", "tags", "scans/s", "missed", "version")

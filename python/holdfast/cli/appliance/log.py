@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from holdfast.config.models.logs import SharedLogConfig
-    from holdfast.scanner import Servers
+    from holdfast.net.nats.connection import Servers
 
 FOLDER = click.Path(path_type=Path)
 

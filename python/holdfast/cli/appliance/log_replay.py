@@ -21,10 +21,10 @@ from holdfast.cli.exit_codes import fail
 from holdfast.cli.options.logs import chosen_log, log_option
 from holdfast.cli.options.network import bind_option, unbindable
 from holdfast.cli.options.option import config_argument, flag, json_option, option
-from holdfast.cli.signals import Signals
+from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.cli.terminal_text import print_json
 from holdfast.events import log_lines
-from holdfast.net.nats import ANSWERING
+from holdfast.net.nats.connection import ANSWERING
 from holdfast.net.nats_server import ServerUnusable
 from holdfast.runtime.text import listing
 from holdfast.server import Server
@@ -32,9 +32,6 @@ from holdfast.server import Server
 if TYPE_CHECKING:
     from holdfast.config.values.ip_addresses import Bind
     from holdfast.types import LogRecord
-
-SIGNAL_INTERVAL_S = 0.1
-"""A signal is noticed within this time."""
 
 MAX_SEQUENCE = 2**64 - 1
 MAX_TIME_NS = 2**63 - 1

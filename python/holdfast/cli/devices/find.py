@@ -11,7 +11,7 @@ from holdfast.cli.devices.find_hosts import find_hosts
 from holdfast.cli.devices.find_line import find_line
 from holdfast.cli.devices.find_units import find_units
 from holdfast.cli.options.duration import Duration, time_option, timeout_option
-from holdfast.cli.options.option import flag, json_option, number_option, option
+from holdfast.cli.options.option import DecimalNumber, flag, json_option, number_option, option
 from holdfast.cli.options.units import unit_ids
 from holdfast.cli.options.url import SERIAL_DEVICE, checked_url
 from holdfast.client.url import SerialTarget, parse
@@ -32,7 +32,7 @@ MAX_ADDRESSES = 1024
 MAX_ADDRESSES_LARGE = 65_536
 
 LINE_TIMEOUT_S = 0.5
-RATES = click.FloatRange(0.1, 1000)
+RATES = DecimalNumber(0.1, 1000)
 _PARITIES = "SERIAL: parities to try, always with one stop bit."
 _UNITS_HELP = (
     "Unit ids to ask, as in 1-10,255.  [default: 1, 255 and 0 of each host of a NETWORK, "

@@ -25,7 +25,7 @@ from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_BITS, READ_REGISTERS
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from holdfast.config import DeviceConfig
+    from holdfast.config.models.devices import DeviceConfig
     from holdfast.config.planning import Block, Field, Plan, Rules
     from holdfast.types import Area
 

@@ -21,7 +21,7 @@ from holdfast.cli.options.device import unit_option
 from holdfast.cli.options.duration import Duration, every_option
 from holdfast.cli.options.network import bind_option, require_source, source_option, unbindable
 from holdfast.cli.options.option import FILE, file_option, option, parsed_by
-from holdfast.cli.signals import Signals
+from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.cli.tags.files import tags_of
 from holdfast.net.addresses import LOOPBACK, joined, reachable
 from holdfast.runtime.text import suggestion
@@ -38,9 +38,6 @@ if TYPE_CHECKING:
     from holdfast.net.addresses import Network
     from holdfast.simulation.generators import Generator
     from holdfast.tags import TagList
-
-SIGNAL_INTERVAL_S = 0.1
-"""A signal is noticed within this time."""
 
 MAX_EXCEPTION = 0xFF
 DEFAULT_EXCEPTION = 4

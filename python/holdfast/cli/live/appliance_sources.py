@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
 from holdfast.cli.live.sources import Unreadable, Unwatchable, WatchedRange, within
-from holdfast.config import ModbusTcpListener
 from holdfast.config.checks.rights import items, matching, together
+from holdfast.config.models.listeners import ModbusTcpListener
 from holdfast.net.addresses import joined, parse_address, reachable
 from holdfast.net.certificates.own import own_der
 from holdfast.protocol import READ_FUNCTIONS
@@ -20,8 +20,9 @@ from holdfast.types import AREAS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from holdfast.config import Config, RestConfig
+    from holdfast.config import Config
     from holdfast.config.checks.rights import UnitRights
+    from holdfast.config.models.services import RestConfig
     from holdfast.config.values.ip_addresses import Bind
 
 

@@ -15,16 +15,14 @@ from click.shell_completion import CompletionItem
 
 from holdfast.cli.options.option import Command, flag
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
-from holdfast.runtime.text import suggestion
-from holdfast.types import AREAS
+from holdfast.runtime.text import listing, suggestion
+from holdfast.types import AREAS, SHORT_AREAS, SHORT_OF
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from holdfast.types import Area
 
-SHORT: dict[str, Area] = dict(zip(("co", "di", "hr", "ir"), AREAS, strict=True))
-SHORT_OF = {area: short for short, area in SHORT.items()}
 MODICON: dict[str, Area] = dict(zip("0143", AREAS, strict=True))
 """The first digits of Modicon numbers."""
 
@@ -88,13 +86,14 @@ def span(text: str, last: int = LAST_ADDRESS) -> range | None:
 def area_of(text: str) -> Area:
     """Parses the name of an area, a short form or an unambiguous prefix, in any case."""
     name = re.sub("[^a-z]", "", text.lower())
-    if name in SHORT:
-        return SHORT[name]
+    if name in SHORT_AREAS:
+        return SHORT_AREAS[name]
     found = [area for area in AREAS if name and area.replace("_", "").startswith(name)]
     if len(found) == 1 and re.fullmatch("[A-Za-z_ -]+", text):
         return found[0]
-    near = suggestion(text.lower().replace("-", "_"), (*AREAS, *SHORT))
-    raise click.UsageError(f"{text!r} is not an area, allowed: {', '.join((*AREAS, *SHORT))}{near}")
+    known = (*AREAS, *SHORT_AREAS)
+    near = suggestion(text.lower().replace("-", "_"), known)
+    raise click.UsageError(f"{text!r} is not an area, allowed: {listing(known)}{near}")
 
 
 def areas_of(text: str) -> tuple[Area, ...]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from holdfast.runtime.text import listing, suggestion
+from holdfast.runtime.text import clip, listing, suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
@@ -44,11 +44,40 @@ def flag(names: str, help: str, default: bool = False) -> Callable[[Command], Co
     )
 
 
+class WholeNumber(click.IntRange):
+    """A whole number within limits."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Parses the number."""
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter:
+            self.fail(_out_of_range(self, value), param, ctx)
+
+
+class DecimalNumber(click.FloatRange):
+    """A number within limits."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Parses the number."""
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter:
+            self.fail(_out_of_range(self, value), param, ctx)
+
+
+def _out_of_range(limits: click.IntRange | click.FloatRange, value: object) -> str:
+    most = "or more" if limits.max is None else f"to {limits.max}"
+    return f"found {clip(str(value))}, allowed: {limits.min} {most}."
+
+
 def number_option(
     names: str, help: str, least: int = 1, most: int | None = None, default: int | None = None
 ) -> Callable[[Command], Command]:
     """Adds an option for a number from `least` to `most`."""
-    return option(names, "N", help, click.IntRange(least, most), default)
+    return option(names, "N", help, WholeNumber(least, most), default)
 
 
 def choice(

@@ -6,15 +6,16 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
+from holdfast._core import MAX_IN_FLIGHT
 from holdfast.cli.options.device import unit_option, usable
 from holdfast.cli.options.duration import Duration, time_option, timeout_option
+from holdfast.cli.options.log_lines import log_format_option
 from holdfast.cli.options.network import bind_option, require_source, source_option
 from holdfast.cli.options.option import choice, option, parsed_by
-from holdfast.cli.options.output import log_format_option
 from holdfast.cli.options.url import checked_url
 from holdfast.cli.services.run import serve
 from holdfast.client.endpoint import endpoint
-from holdfast.client.url import MAX_IN_FLIGHT, SerialTarget, parse
+from holdfast.client.url import SerialTarget, parse
 from holdfast.config import Config
 from holdfast.config.values.scalars import MAX_TIME, MIN_TIME
 from holdfast.net.addresses import LOOPBACK, joined, reachable

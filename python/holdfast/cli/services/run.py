@@ -26,11 +26,12 @@ from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.item import MODICON
 from holdfast.cli.options.option import config_argument
 from holdfast.cli.services.reloader import Reloader
-from holdfast.cli.signals import Interrupted, Signals
+from holdfast.cli.signals import SIGNAL_INTERVAL_S, Interrupted, Signals
 from holdfast.cli.terminal_text import ranges_shown
-from holdfast.config import GatewayConfig, ModbusTcpListener, RouteConfig, UnitMemoryConfig
 from holdfast.config.checks.rights import unit_rights
 from holdfast.config.fingerprint import files_of
+from holdfast.config.models.listeners import ModbusTcpListener, RouteConfig, UnitMemoryConfig
+from holdfast.config.models.services import GatewayConfig
 from holdfast.config.values.scanning import written_pollable
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined, reachable
@@ -45,21 +46,15 @@ if TYPE_CHECKING:
 
     from holdfast.appliance.parts.listeners import ListenAddress
     from holdfast.appliance.windows_service.control import ServiceControl
-    from holdfast.config import (
-        Config,
-        DeviceConfig,
-        NatsConfig,
-        RawRuleConfig,
-        RuleConfig,
-        SerialRuleConfig,
-    )
+    from holdfast.config import Config
     from holdfast.config.checks.rights import UnitRights
+    from holdfast.config.models.devices import DeviceConfig
+    from holdfast.config.models.listeners import RawRuleConfig, RuleConfig, SerialRuleConfig
     from holdfast.config.models.outputs import Output
+    from holdfast.config.models.services import NatsConfig
     from holdfast.types import Area
 
 # A signal is noticed within this time.
-SIGNAL_INTERVAL_S = 0.2
-
 OTHER_FILES = 128
 """Open files that are not connections: listeners, metrics requests, the interpreter's files."""
 

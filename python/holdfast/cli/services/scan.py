@@ -15,8 +15,10 @@ from holdfast import __version__
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.old_spellings import hint
 from holdfast.cli.options.duration import Duration, time_option, timeout_option
+from holdfast.cli.options.log_lines import log_format_option, log_level_option
 from holdfast.cli.options.nats import DEFAULT_URL, nats_options, without_secrets
 from holdfast.cli.options.option import (
+    DecimalNumber,
     choice,
     flag,
     number_option,
@@ -24,10 +26,9 @@ from holdfast.cli.options.option import (
     parsed_by,
     schema_option,
 )
-from holdfast.cli.options.output import log_format_option
 from holdfast.cli.options.tls import DEVICES, tls_options
-from holdfast.cli.services.run import SIGNAL_INTERVAL_S, raise_open_file_limit
-from holdfast.cli.signals import Signals
+from holdfast.cli.services.run import raise_open_file_limit
+from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.config.fingerprint import fingerprint
 from holdfast.config.values.scanning import (
     MAX_DEADBAND,
@@ -55,26 +56,20 @@ from holdfast.config.values.scanning import (
 from holdfast.events import log_lines
 from holdfast.net import event_loop
 from holdfast.net.allow_list import AllowedNetwork
-from holdfast.net.nats_pings import PING_INTERVAL_S, PINGS_OUTSTANDING
+from holdfast.net.nats.connection import Ping, Servers
+from holdfast.net.nats.pings import PING_INTERVAL_S, PINGS_OUTSTANDING
 from holdfast.net.nats_server import HOST, ServerUnusable, TemporaryServer
 from holdfast.runtime.bounded_files import FileWork
 from holdfast.runtime.interpreter import spare_what_stays
 from holdfast.runtime.standstill import WallClock
-from holdfast.scanner import (
-    Defaults,
-    FleetRefused,
-    FleetSettings,
-    Ping,
-    Scanner,
-    ScannerLimits,
-    Servers,
-    Settings,
-)
+from holdfast.scanner.fleet.agreement import FleetRefused
 from holdfast.scanner.jetstream.entry_subscriptions import BUCKET
 from holdfast.scanner.messages.schema import json_schema
 from holdfast.scanner.polling import device_tls as tls_check
 from holdfast.scanner.polling.allowed_devices import PRIVATE
-from holdfast.scanner.settings import places
+from holdfast.scanner.service import Scanner
+from holdfast.scanner.settings import FleetSettings, Settings, places
+from holdfast.scanner.subscriptions.rules import Defaults, ScannerLimits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -99,7 +94,6 @@ class _Timeout(Duration):
         return super().convert(text, param, ctx)
 
 
-LEVELS = ("debug", "info", "warning", "error")
 FOLDER = click.Path(file_okay=False, path_type=Path)
 TIMEOUTS = _Timeout(MIN_TIMEOUT / 1000, MAX_TIMEOUT / 1000)
 INTERVALS = Duration(MIN_SCAN_RATE / 1000, MAX_SCAN_RATE / 1000)
@@ -123,7 +117,7 @@ _PARTITIONS = "Parts of the devices in a fleet: 20 times the number of scanners,
 @choice("--writes", _WRITES, get_args(Writes), "tags")
 @timeout_option(f"{TIMEOUT}ms", "Default timeout of a Modbus request.", TIMEOUTS)
 @choice("--publish", "Default: publish each value, or changes.", get_args(Publish), "scan")
-@option("--deadband", "NUMBER", _DEADBAND, click.FloatRange(0, MAX_DEADBAND), 0.0)
+@option("--deadband", "NUMBER", _DEADBAND, DecimalNumber(0, MAX_DEADBAND), 0.0)
 @time_option("--every", "Default interval between scans.", f"{SCAN_RATE}ms", INTERVALS)
 @flag("--strict", "Refuse requests with unknown keys or inexact values, instead of adjusting them.")
 @time_option("--ping-interval", "Interval of pings to NATS.", f"{PING_INTERVAL_S:g}", PINGS)
@@ -136,7 +130,7 @@ _PARTITIONS = "Parts of the devices in a fleet: 20 times the number of scanners,
 @tls_options("device", "device_tls", DEVICES, " for devices")
 @number_option("--max-devices", "Devices of all subscribers.", default=ScannerLimits.devices)
 @number_option("--max-tags", "Tags of all devices.", default=ScannerLimits.tags)
-@choice("--log-level", "Least level of events in the log.", LEVELS, "info")
+@log_level_option
 @log_format_option
 @schema_option("Print the JSON Schema of all messages and exit.", json_schema)
 def scan(

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.cli.options import item
-from holdfast.cli.options.item import SHORT_OF
 from holdfast.runtime.text import suggestion
 from holdfast.tags import Tag, TagError, TagList
-from holdfast.types import BIT_AREAS
+from holdfast.types import BIT_AREAS, SHORT_OF
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from holdfast._core import CONTACTS_PER_LAG
 from holdfast.config.allowed_words import allowed
 from holdfast.config.checks.common import given, items, until_invalid
 from holdfast.config.checks.memories import area_of, check_memory
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
         ReadConfig,
         StatusConfig,
     )
+    from holdfast.config.models.root import Config
     from holdfast.config.text.source import KeyPath
 
 MAX_OF_A_PACKET = MAX_WORD
@@ -229,6 +231,19 @@ def warn_of_devices(scope: Scope) -> None:
             scope.report.warn(where, message)
 
 
+def _stale_elsewhere(config: Config, device: DeviceConfig) -> Iterator[str]:
+    """On a node that does not poll the device, values are as old as its contact with the log."""
+    assert device.stale is not None
+    memories = [config.memories[read.into.memory] for read in device.reads if read.into is not None]
+    for log in dict.fromkeys(each.replicate.log for each in memories if each.replicate is not None):
+        contact = config.logs[log].max_lag / CONTACTS_PER_LAG
+        if device.stale.after < contact:
+            yield (
+                f"found {device.stale.after:g}, which is less than {contact:g} (max_lag / "
+                f"{CONTACTS_PER_LAG} of logs.{log}): values are stale on nodes that do not poll it"
+            )
+
+
 def _warnings(scope: Scope, path: KeyPath, device: DeviceConfig) -> Iterator[tuple[KeyPath, str]]:
     if not given(device, *TAKING_TIME):
         for key in given(device, *_OF_POLLING):
@@ -250,6 +265,8 @@ def _warnings(scope: Scope, path: KeyPath, device: DeviceConfig) -> Iterator[tup
             after, interval = (*path, "stale", "after"), (*path, "interval")
             found = f"found {scope.report.raw(after)}, which is not more than interval, "
             yield after, f"{found}{scope.report.raw(interval)}: values are stale between two polls"
+        for message in _stale_elsewhere(scope.config, device):
+            yield (*path, "stale", "after"), message
     if device.readable and not device.max_gap:
         yield (*path, "readable"), "has no effect: gaps are read only with max_gap"
     for index, read in enumerate(device.reads):

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationInfo, model_validator
 
-from holdfast._core import RETRY_PAUSES
+from holdfast._core import MAX_IN_FLIGHT, RETRY_PAUSES
 from holdfast.client.base import DEFAULT_TIMEOUT_S
 from holdfast.client.url import (
     MAX_CLOSE_AFTER,
-    MAX_IN_FLIGHT,
     MAX_PAUSE_S,
     MAX_RETRIES,
     RECEIVER_TIMEOUT_S,

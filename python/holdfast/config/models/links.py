@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from holdfast._core import LINK_QUEUE
 from holdfast.client.base import DEFAULT_TIMEOUT_S
 from holdfast.client.url import Target, parse
 from holdfast.config.models.base import Model
@@ -18,8 +19,6 @@ from holdfast.config.values.scalars import (
     NotNull,
     PeerAddress,
 )
-
-MAX_QUEUE = 65535
 
 
 class LinkConfig(Model):
@@ -35,7 +34,7 @@ class LinkConfig(Model):
     """How to treat devices that deviate from the standard; in place of these options of the URL."""
     retry: RetryConfig = RetryConfig()
     """When devices that can't be reached or do not answer are tried again."""
-    queue: Annotated[int, Field(ge=1, le=MAX_QUEUE)] = 256
+    queue: Annotated[int, Field(ge=1, le=LINK_QUEUE[1])] = LINK_QUEUE[0]
     """The most requests that wait; more are answered with exception 06."""
     priority: dict[PeerAddress, Literal["high"]] = Field(default={}, json_schema_extra=PEER_KEYS)
     """Clients whose reads go before those of others, by IP address."""

@@ -42,6 +42,7 @@ from holdfast.config.values.scalars import (
     Text,
     UnitId,
 )
+from holdfast.events import FORMAT, LEVEL, Format, Level
 from holdfast.server.identity import Identity
 from holdfast.tags import Tag, TagList
 from holdfast.values.orders import DEFAULT_ORDER
@@ -86,9 +87,9 @@ class MappedTag(NamedTuple):
 class LogConfig(Model):
     """Log level and log format."""
 
-    level: Literal["debug", "info", "warning", "error"] = "info"
+    level: Level = LEVEL
     """The lowest level that is logged."""
-    format: Literal["text", "json", "ecs"] = "text"
+    format: Format = FORMAT
     """text: lines for people. json: one JSON object per line, for programs. ecs: the same in the
     names of the Elastic Common Schema, for a SIEM."""
 

@@ -19,6 +19,7 @@ from holdfast.config.values.scalars import is_name
 from holdfast.config.values.tag_scale import FORMS, PLACE_KEYS
 from holdfast.runtime.text import listing, suggestion
 from holdfast.tags import TagList
+from holdfast.types import AREAS, SHORT_AREAS
 
 if TYPE_CHECKING:
     from holdfast.config.models.tags import ProfileConfig
@@ -33,12 +34,7 @@ COLUMNS = (
 MORE_COLUMNS = ("min", "max", "deadband", "round", "encoding", "null")
 """Columns that a file can have if it names its columns."""
 
-_SHORT = {
-    **dict.fromkeys(("co", "coil"), "coils"),
-    **dict.fromkeys(("di", "discrete"), "discrete_inputs"),
-    **dict.fromkeys(("hr", "holding"), "holding_registers"),
-    **dict.fromkeys(("ir", "input"), "input_registers"),
-}
+_SHORT = SHORT_AREAS | dict(zip(("coil", "discrete", "holding", "input"), AREAS, strict=True))
 """Names of areas that lists of manufacturers have."""
 
 _TEXT = ("name", "type", "order", "unit", "description", "encoding", "round")

@@ -12,7 +12,7 @@ from holdfast.config.tag_files.read import COLUMNS
 from holdfast.tags import Tag
 from holdfast.tags.scale import RegisterScale
 from holdfast.tags.tag import default_type
-from holdfast.values.orders import DEFAULT_ORDER
+from holdfast.values.orders import DEFAULT_ORDER, SWAPPED_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
 _PLAIN = ("encoding", "scale", "offset", "unit", "writable", "min", "max", "deadband", "round")
 """Keys that are written if they are not the default."""
-
-SWAPPED_BYTES = ("BADC", "DCBA")
-"""The orders that differ in a single register from the others."""
 
 
 def tags_as_yaml(tags: Iterable[Tag]) -> str:

@@ -20,8 +20,8 @@ from nats.errors import Error
 
 from holdfast.events import log_lines
 from holdfast.net.nats.credentials import Credentials
+from holdfast.net.nats.pings import PING_INTERVAL_S, PINGS_OUTSTANDING
 from holdfast.net.nats.tolerant_client import SafeClient
-from holdfast.net.nats_pings import PING_INTERVAL_S, PINGS_OUTSTANDING
 from holdfast.net.secret_file import read_secret
 from holdfast.net.secure_channel import SecureChannel, failure_text
 from holdfast.net.tls import NO_FILES, Tls

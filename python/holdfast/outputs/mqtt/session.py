@@ -12,8 +12,8 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 
 from holdfast.events import log_lines
-from holdfast.net.mqtt.dialing import CONNACK_TIMEOUT_S, dial
-from holdfast.net.mqtt.waiting import Ended, Waiter
+from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S, dial
+from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secret_file import read_password
 from holdfast.net.secure_channel import failure_text
 from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES, Connection
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags
     from paho.mqtt.properties import Properties
 
-    from holdfast.config import BrokerConfig
+    from holdfast.config.models.services import BrokerConfig
     from holdfast.net.mqtt.packets import Publish
     from holdfast.net.mqtt.stream import BrokerSocket
 

@@ -22,7 +22,7 @@ from nats.errors import Error
 from nats.js.errors import NoStreamResponseError
 
 from holdfast import _core
-from holdfast.net.nats import nats_reason
+from holdfast.net.nats.connection import nats_reason
 from holdfast.replication.leases.bucket import (
     SETTLED,
     Entry,
@@ -286,7 +286,7 @@ class Leases:
             self._made_at = identity.created
             self.seen.clear()
             self.is_read = False
-            self._may_settle_at = time.monotonic() + self.times.ttl_s
+            self._may_settle_at = time.monotonic() + self.times.settle_s
 
     @property
     def _latest(self) -> int:
@@ -377,7 +377,7 @@ class Leases:
         until = sent + self.times.hold_s
         self._held[key] = _Held(revision, holding, revision, until)
         clean = entry is not None and entry.is_given_back
-        self.fence(key).open(until, settle=0.0 if clean else self.times.ttl_s)
+        self.fence(key).open(until, settle=0.0 if clean else self.times.settle_s)
         self._watcher.taken(key)
 
     async def _read(self, bucket: LeaseBucket, key: str) -> None:

@@ -24,6 +24,12 @@ class LeaseTimes:
         assert 0 < self.renewal_s < self.hold_s < self.ttl_s, "each time leaves room for the next"
 
     @property
+    def settle_s(self) -> float:
+        """After a lease was taken that was not given back, nothing is sent to a device for so long:
+        its holder may still use it. The same for all leases after their bucket was lost."""
+        return self.ttl_s
+
+    @property
     def server_ttl_s(self) -> int:
         """The TTL of a key, of which servers accept only whole numbers: not before `ttl_s`."""
         return math.ceil(self.ttl_s)

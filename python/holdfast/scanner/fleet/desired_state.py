@@ -13,7 +13,7 @@ import msgspec
 from nats.errors import Error
 
 from holdfast.events import log_lines
-from holdfast.replication.leases import KeyBucket, Outdated
+from holdfast.replication.leases.bucket import KeyBucket, Outdated
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms
 
 if TYPE_CHECKING:

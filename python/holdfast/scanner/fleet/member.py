@@ -18,15 +18,16 @@ from nats.js.errors import NoStreamResponseError
 
 from holdfast.client.url import connection_of
 from holdfast.events import log_lines
-from holdfast.net.nats import nats_reason
-from holdfast.replication.leases import Outdated
+from holdfast.net.nats.connection import nats_reason
+from holdfast.replication.leases.bucket import Outdated
+from holdfast.replication.leases.leases import FIRST_RETRY_S, MAX_RETRY_S
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
 from holdfast.runtime.heartbeat import Heartbeat
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.fleet.assignment import partition_of
 from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
-from holdfast.scanner.fleet.fleet import Fleet
+from holdfast.scanner.fleet.partition_leases import PartitionLeases
 from holdfast.scanner.jetstream.entries import requests as stored_requests
 from holdfast.scanner.jetstream.entries import restored
 from holdfast.scanner.placement import Changed, Placement
@@ -37,17 +38,13 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast import _core
-    from holdfast.replication.leases import Connect, StartThread
+    from holdfast.replication.leases.thread import Connect, StartThread
     from holdfast.scanner.fleet.agreement import Terms
     from holdfast.scanner.messages.types import SubscribeRequest
     from holdfast.scanner.placement import DeviceHost, SubscriptionHost
     from holdfast.scanner.settings import FleetSettings
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
-
-FIRST_RETRY_S = 0.5
-MAX_RETRY_S = 2.0
-"""The pauses after failures to open the buckets."""
 
 ADOPT_RETRY_S = 10.0
 """Between attempts to carry out a subscription of another node that is refused here."""
@@ -78,7 +75,7 @@ class FleetMember(Placement):
         start_thread: StartThread,
     ) -> None:
         """`connect` makes a connection for the leases alone, `start_thread` starts their thread."""
-        self.fleet = Fleet(
+        self.fleet = PartitionLeases(
             settings,
             terms,
             about,

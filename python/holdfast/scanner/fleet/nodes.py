@@ -13,7 +13,7 @@ from nats.errors import Error, NoRespondersError
 from nats.errors import TimeoutError as NoAnswer
 
 from holdfast.events import log_lines
-from holdfast.net.nats import nats_reason
+from holdfast.net.nats.connection import nats_reason
 from holdfast.scanner.errors import Moved, Refused
 from holdfast.scanner.reports.variables import joined
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from nats.aio.msg import Msg
 
-    from holdfast.replication.leases import Holding
+    from holdfast.replication.leases.bucket import Holding
     from holdfast.scanner.fleet.member import FleetMember
     from holdfast.scanner.placement import CommandHost, ReportHost
     from holdfast.scanner.subscriptions.device import ScannedDevice

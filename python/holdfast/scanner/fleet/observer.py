@@ -12,17 +12,18 @@ import msgspec
 from nats.errors import Error, NoRespondersError
 from nats.js.errors import NotFoundError
 
-from holdfast.net.nats import ANSWERING, connected_once, nats_reason
-from holdfast.replication.leases import LEASE_TIMES, Holding, LeaseBucket
-from holdfast.scanner.fleet.fleet import NODE, PARTITION, leases_of
+from holdfast.net.nats.connection import ANSWERING, connected_once, nats_reason
+from holdfast.replication.leases.bucket import Holding, LeaseBucket
+from holdfast.replication.leases.times import LEASE_TIMES
 from holdfast.scanner.fleet.nodes import subject
+from holdfast.scanner.fleet.partition_leases import NODE, PARTITION, leases_of
 
 if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
     from holdfast.net.nats.connection import Servers
-    from holdfast.replication.leases import Entry
+    from holdfast.replication.leases.bucket import Entry
 
 CHECK_INTERVAL_S = 0.05
 """Time between two looks at a node that leaves."""

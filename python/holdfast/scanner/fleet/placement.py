@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast.net.nats.connection import Handler
-    from holdfast.replication.leases import StartThread
+    from holdfast.replication.leases.thread import StartThread
     from holdfast.scanner.placement import (
         CommandHost,
         ReportHandlers,

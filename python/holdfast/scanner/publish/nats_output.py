@@ -13,7 +13,8 @@ import msgspec
 from nats.errors import Error
 
 from holdfast.net.event_loop import EventLoop
-from holdfast.net.nats import SafeClient, nats_reason
+from holdfast.net.nats.connection import MAX_PENDING_BYTES, nats_reason
+from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.outputs.sending import Receiver, soon_after
 from holdfast.polling.faults import fault_text, is_exception
 from holdfast.scanner.dialects import DIALECTS
@@ -38,9 +39,6 @@ CHECK_INTERVAL_S = 0.05
 """Time between checks whether the connection has ended."""
 
 CLOSE_TIMEOUT_S = 1.0
-
-MAX_PENDING_BYTES = 64 * 2**20
-"""The limit of nats-py's send buffer in bytes, far above one step."""
 
 _encode = msgspec.json.Encoder().encode
 

@@ -17,7 +17,7 @@ from holdfast.net.nats import batch
 from holdfast.scanner.dialects import TENTACLE, Dialect
 from holdfast.scanner.messages.types import Data
 from holdfast.scanner.subscriptions.groups import Group
-from holdfast.tags.changing import differs
+from holdfast.tags.deadband import differs
 from holdfast.tags.decoding import Places, Undecoded, decoder
 
 if TYPE_CHECKING:

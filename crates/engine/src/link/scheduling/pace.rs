@@ -30,6 +30,10 @@ pub enum InFlight {
     Auto,
 }
 
+impl InFlight {
+    pub const MAX: u16 = 1024;
+}
+
 /// Hands out the places of a link.
 pub(in crate::link) struct Pace {
     places: Rc<Places>,

@@ -13,7 +13,6 @@ use std::mem;
 use std::pin::{Pin, pin};
 use std::sync::Arc;
 use std::task::{Context, Poll};
-use std::time::Duration;
 
 use holdfast_protocol::pdu;
 use tokio::sync::watch;
@@ -21,6 +20,7 @@ use tokio::task::yield_now;
 use tokio::time::{Instant, Sleep, sleep_until};
 
 use crate::server::connections::admission::Ticket;
+use crate::server::connections::deadlines::{Deadlines, Exchange, Expired, NO_DEADLINE, Timeouts};
 use crate::server::connections::fair_share::{Share, WORK_OF_READ};
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::peer::Peer;
@@ -53,9 +53,6 @@ const READS_PER_TURN: u32 = 4;
 /// The most reads of the remaining input before a connection ends: a peer may go on sending.
 const MAX_LAST_READS: usize = 64;
 
-/// A timer without a deadline fires after this time.
-pub(crate) const NO_DEADLINE: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
-
 struct Scratch {
     input: Box<[u8]>,
     output: Box<[u8]>,
@@ -66,18 +63,6 @@ thread_local! {
         input: vec![0; INPUT_BYTES].into_boxed_slice(),
         output: vec![0; OUTPUT_BYTES].into_boxed_slice(),
     });
-}
-
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Timeouts {
-    /// The longest time without a request. `None`: no limit.
-    pub(crate) idle: Option<Duration>,
-    /// The longest time from the first byte of a request to its last, and for a peer to read its
-    /// replies.
-    pub(crate) request: Duration,
-    /// The longest time between two reads of a request. After that, the request is discarded, and the
-    /// next byte starts a frame; `None` where silence means nothing.
-    pub(crate) frame: Option<Duration>,
 }
 
 /// What a connection may do, and how long it may take.
@@ -92,25 +77,14 @@ pub(crate) type Renewal = Box<dyn Fn() -> Option<Terms> + Send + Sync>;
 pub(crate) struct Connection<F: Framing, S> {
     stream: S,
     answering: Answering<F>,
-    timeouts: Timeouts,
+    deadlines: Deadlines,
     renewal: Renewal,
     ticket: Ticket,
     /// Bytes queued for the peer.
     unsent: Vec<u8>,
-    last_request: Instant,
-    arrival: Arrival,
     /// Reads since other tasks last ran.
     reads_in_turn: u32,
     share: Share,
-}
-
-/// What has arrived of the next request.
-#[derive(Debug, Clone, Copy)]
-enum Arrival {
-    /// Nothing: the peer is idle.
-    Nothing,
-    /// The beginning of a request or of a TLS record, or bytes that are discarded until a silence.
-    Partial { begun: Instant, last_read: Instant },
 }
 
 /// The state that replies depend on.
@@ -155,16 +129,13 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     ) -> Connection<F, S> {
         let share = Share::of(peer.ip());
         let answering = Answering::new(context, peer, unit_server, rights);
-        let last_request = Instant::now();
         Connection {
             stream,
             answering,
-            timeouts,
+            deadlines: Deadlines::new(timeouts),
             renewal,
             ticket,
             unsent: Vec::new(),
-            last_request,
-            arrival: Arrival::Nothing,
             reads_in_turn: 0,
             share,
         }
@@ -174,8 +145,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     pub(crate) fn begin_with(&mut self, received: &[u8]) {
         if !received.is_empty() {
             self.answering.keep(received);
-            let begun = self.last_request;
-            self.arrival = Arrival::Partial { begun, last_read: begun };
+            self.deadlines.begin();
         }
     }
 
@@ -206,7 +176,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         // With a peer that never pauses, the branch for `stop` would never run.
         let flooded = stop.clone();
         let mut stopping = pin!(stop.wait_for(|stop| *stop));
-        let mut alarm = pin!(sleep_until(self.last_request + NO_DEADLINE));
+        let mut alarm = pin!(sleep_until(Instant::now() + NO_DEADLINE));
         loop {
             if let Err(end) = self.send_unsent().await {
                 return Some(end);
@@ -291,7 +261,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
                 broken = answered.broken;
                 self.note_times(&answered);
             } else {
-                self.last_request = Instant::now();
+                self.deadlines.note_request(Instant::now());
             }
             if len > 0 {
                 self.stream.send(&output[..len], &mut self.unsent)?;
@@ -305,7 +275,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     fn renew(&mut self) -> Result<(), Kind> {
         if self.ticket.take_outdated() {
             let Terms { rights, timeouts } = (self.renewal)().ok_or(Kind::RightsRevoked)?;
-            (self.answering.rights, self.timeouts) = (rights, timeouts);
+            (self.answering.rights, self.deadlines.timeouts) = (rights, timeouts);
             // Other rights refuse other requests: each first one is reported again.
             self.answering.reported = Reported::default();
         }
@@ -316,28 +286,23 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     fn note_times(&mut self, answered: &Answered) {
         let now = Instant::now();
         if answered.requests > 0 {
-            self.last_request = now;
+            self.deadlines.note_request(now);
             self.ticket.touch(now.into_std());
         }
         self.share.charge((answered.requests + answered.discarded) as u32);
         let is_at_start = F::is_at_start(&self.answering.before);
         if self.answering.partial_len == 0 && is_at_start && !self.stream.is_amid_record() {
-            self.arrival = Arrival::Nothing;
-            return;
+            return self.deadlines.note_complete();
         }
         // Bytes that are discarded until a silence do not put off the end of the connection.
         let is_new = answered.requests > 0 || answered.consumed > 0 && is_at_start;
-        let begun = match self.arrival {
-            Arrival::Partial { begun, .. } if !is_new => begun,
-            _ => now,
-        };
-        self.arrival = Arrival::Partial { begun, last_read: now };
+        self.deadlines.note_partial(now, is_new);
     }
 
     /// Waits for the peer to read its replies.
     async fn send_unsent(&mut self) -> Result<(), Kind> {
         if !self.unsent.is_empty() {
-            let time_limit = self.timeouts.request;
+            let time_limit = self.deadlines.timeouts.request;
             stream::send_all(self.stream.socket(), &self.unsent, time_limit).await?;
             // Frees the buffer of a slow peer: most connections never need one.
             self.unsent = Vec::new();
@@ -345,36 +310,20 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         Ok(())
     }
 
-    /// When and why the connection ends.
-    fn end(&self) -> (Instant, Kind) {
-        let is_amid_request = self.answering.partial_len > 0 || self.stream.is_amid_record();
-        // Bytes that are discarded do not put off the end for want of requests.
-        let idle = self.timeouts.idle.filter(|_| !is_amid_request && !self.answering.is_waiting());
-        let idle = (self.last_request + idle.unwrap_or(NO_DEADLINE), Kind::Idle);
-        let Arrival::Partial { begun, .. } = self.arrival else { return idle };
-        let request = (begun + self.timeouts.request, Kind::RequestTimeout);
-        if is_amid_request || request.0 < idle.0 { request } else { idle }
-    }
-
-    /// When a silence ends a frame.
-    fn frame_end(&self) -> Option<Instant> {
-        match self.arrival {
-            Arrival::Nothing => None,
-            Arrival::Partial { last_read, .. } => {
-                self.timeouts.frame.map(|frame| last_read + frame)
-            }
+    fn exchange(&self) -> Exchange {
+        if self.answering.partial_len > 0 || self.stream.is_amid_record() {
+            Exchange::Request
+        } else if self.answering.is_waiting() {
+            Exchange::Replies
+        } else {
+            Exchange::Idle
         }
-    }
-
-    fn deadline(&self) -> Instant {
-        let (end, _) = self.end();
-        self.frame_end().map_or(end, |frame_end| frame_end.min(end))
     }
 
     /// Moves the alarm to an earlier time. A later deadline is set when the alarm fires: requests
     /// are much more frequent than alarms.
     fn set_alarm(&self, alarm: Pin<&mut Sleep>) {
-        let deadline = self.deadline();
+        let deadline = self.deadlines.next(self.exchange());
         if deadline < alarm.deadline() || alarm.is_elapsed() {
             alarm.reset(deadline);
         }
@@ -382,24 +331,19 @@ impl<F: Framing, S: Stream> Connection<F, S> {
 
     /// Discards the beginning of a request that nothing followed, or ends the connection.
     fn on_alarm(&mut self) -> Result<(), Kind> {
-        let (now, (end, kind)) = (Instant::now(), self.end());
-        if now < self.deadline() {
-            return Ok(());
-        }
-        if self.share.is_waiting() {
-            // What the peer has sent is not read yet: it is not to blame for silence.
-            self.last_request = now;
-            if let Arrival::Partial { .. } = self.arrival {
-                self.arrival = Arrival::Partial { begun: now, last_read: now };
+        let now = Instant::now();
+        match self.deadlines.expired(now, self.exchange()) {
+            Expired::Nothing => {}
+            Expired::Frame | Expired::Connection(_) if self.share.is_waiting() => {
+                self.deadlines.restart(now);
             }
-            return Ok(());
+            Expired::Frame => {
+                self.answering.discard_partial();
+                self.deadlines.note_complete();
+            }
+            Expired::Connection(kind) => return Err(kind),
         }
-        if self.frame_end().is_some_and(|frame_end| frame_end < end) {
-            self.answering.discard_partial();
-            self.arrival = Arrival::Nothing;
-            return Ok(());
-        }
-        Err(kind)
+        Ok(())
     }
 
     /// Answers what the system has already received, then ends. The engine drops connections whose
@@ -632,6 +576,7 @@ impl<F: Framing> Answering<F> {
 #[cfg(test)]
 mod tests {
     use std::net::SocketAddr;
+    use std::time::Duration;
 
     use holdfast_memory::{Area, Contents, Layout, Memory, Span};
     use holdfast_protocol::frame::{ascii, mbap, rtu};

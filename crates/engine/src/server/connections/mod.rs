@@ -3,6 +3,7 @@
 pub(crate) mod admission;
 pub(crate) mod closing;
 pub(crate) mod connection;
+pub(crate) mod deadlines;
 pub(crate) mod fair_share;
 pub(crate) mod listener;
 pub(crate) mod live;

@@ -9,7 +9,8 @@ use tokio::sync::watch;
 use tokio::time::{Instant, timeout_at};
 
 use crate::server::connections::admission::{ConnectionLimits, Ticket};
-use crate::server::connections::connection::{Connection, NO_DEADLINE, Renewal, Terms, Timeouts};
+use crate::server::connections::connection::{Connection, Renewal, Terms};
+use crate::server::connections::deadlines::Timeouts;
 use crate::server::connections::listener::{Admitted, ListenerContext, Service, set_options};
 use crate::server::connections::live::Live;
 use crate::server::connections::peer::Peer;
@@ -213,9 +214,8 @@ impl ModbusStream {
                     return raw.serve_packets(context, raw.sending(admitted), renewal, stop).await;
                 }
             }
-            let is_new = admitted.received.is_empty();
-            let time_limit = if is_new { self.timeouts.idle } else { Some(self.timeouts.request) };
-            let deadline = begun + time_limit.unwrap_or(NO_DEADLINE);
+            let is_partial = !admitted.received.is_empty();
+            let (deadline, end) = self.timeouts.first_request(begun, is_partial);
             let readable = tokio::select! {
                 readable = timeout_at(deadline, admitted.stream.readable()) => readable,
                 _ = stop.wait_for(|stop| *stop) => return context.ended(Kind::Closed, peer),
@@ -224,8 +224,7 @@ impl ModbusStream {
             let mut chunk = [0; DECISIVE_BYTES];
             let missing = DECISIVE_BYTES - admitted.received.len();
             match readable {
-                Err(_) if is_new => return context.ended(Kind::Idle, peer),
-                Err(_) => return context.ended(Kind::RequestTimeout, peer),
+                Err(_) => return context.ended(end, peer),
                 Ok(Err(_)) => return context.ended(Kind::Closed, peer),
                 Ok(Ok(())) => match admitted.stream.try_read(&mut chunk[..missing]) {
                     Ok(0) => return context.ended(Kind::Closed, peer),

@@ -22,16 +22,13 @@ use crate::log::parts::node::{CHECK_INTERVAL, Node};
 use crate::log::parts::sender::Publisher;
 use crate::log::state::{Applied, digest_of};
 use crate::log::status::{Event, Phase};
-use crate::log::stream::connection::{Connected, connect};
+use crate::log::stream::connection::{Connected, REQUEST_TIMEOUT, connect};
 use crate::log::stream::messages::Messages;
 use crate::log::stream::raw_message::Received;
 use crate::log::stream::store::{DIGEST_KEY_PREFIX, SNAPSHOT_KEY, Store, parsed};
 
 /// The most further messages that are applied before steps are sent.
 const MAX_FURTHER_MESSAGES: usize = 255;
-
-/// How long requests to JetStream may take.
-const REQUEST_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// The shortest heartbeat that a consumer is asked for.
 const MIN_HEARTBEAT: Duration = Duration::from_millis(200);

@@ -18,9 +18,11 @@ const MAX_WAITING_COMMANDS: usize = 4096;
 /// How long one attempt to connect may take.
 pub(in crate::log) const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// How often the connection is tried, and how long requests may take.
+/// How often the connection is tried.
 const PING_INTERVAL: Duration = Duration::from_secs(2);
-const REQUEST_TIMEOUT: Duration = Duration::from_secs(3);
+
+/// How long requests may take, to JetStream too.
+pub(in crate::log) const REQUEST_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// After its end, a client waits for this time before it connects again. It is dropped before.
 const NO_RECONNECT_DELAY: Duration = Duration::from_secs(86_400);

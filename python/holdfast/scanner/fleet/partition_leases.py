@@ -16,7 +16,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from holdfast.events import log_lines
-from holdfast.replication.leases import Leases, LeaseThread, Relay
+from holdfast.replication.leases.leases import Leases
+from holdfast.replication.leases.thread import LeaseThread, Relay
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms, digest
 from holdfast.scanner.fleet.assignment import assigned
 from holdfast.scanner.settings import FleetSettings
@@ -25,7 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from holdfast import _core
-    from holdfast.replication.leases import Connect, Holding, StartThread
+    from holdfast.replication.leases.bucket import Holding
+    from holdfast.replication.leases.thread import Connect, StartThread
 
 NODE = "node."
 PARTITION = "partition."
@@ -36,7 +38,7 @@ MAX_CONCURRENT_HANDOVERS = 4
 DEVICE_STOP_TIMEOUT_S = 5.0
 """Time to wait for polls and writes of a partition before it is given back."""
 
-SETTLE_S = 0.05
+GATHER_S = 0.05
 """Time in which changes are gathered before partitions are placed anew."""
 
 CHECK_INTERVAL_S = 0.5
@@ -48,7 +50,7 @@ def leases_of(fleet: str) -> str:
     return f"holdfast_fleet_{fleet}"
 
 
-class Fleet:
+class PartitionLeases:
     """A node. `gained` and `lost` are called with partitions, in the event loop of `start`.
 
     The leases are held by a thread of their own: this loop may be busy for seconds.
@@ -202,7 +204,7 @@ class Fleet:
         self._named_since = time.monotonic()
         while not self.leases.since(key):
             self._check_name()
-            await asyncio.sleep(SETTLE_S)
+            await asyncio.sleep(GATHER_S)
         log_lines.write(
             logging.INFO,
             "fleet_joined",
@@ -233,7 +235,7 @@ class Fleet:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(CHECK_INTERVAL_S):
                     await self._has_changed.wait()
-            await asyncio.sleep(SETTLE_S)
+            await asyncio.sleep(GATHER_S)
             self._has_changed.clear()
             self._check_name()
             nodes = self.nodes

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from holdfast.net.closing import TURNS, close
+from holdfast.net.server_close import TURNS, close
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="asyncio does not tell what it has accepted")

@@ -14,7 +14,7 @@ from holdfast.net.resolver import CONFIGURED
 from holdfast.net.secure_channel import SecureChannel
 
 if TYPE_CHECKING:
-    from holdfast.net.mqtt.waiting import Waiter
+    from holdfast.net.mqtt.selector import Waiter
     from holdfast.net.resolver import SocketAddress
     from holdfast.net.tls import Tls
 

@@ -1,0 +1,95 @@
+"""The pool of connections, with connections that fail."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from holdfast._core import Request
+from holdfast.client.url import NetworkTarget
+from holdfast.errors import ConnectFailed, ConnectionLost, RequestTimeout
+from holdfast.gateway import pool
+from holdfast.gateway.device_route import Route
+from holdfast.gateway.pool import Pool
+from holdfast.gateway.sharing import Turns
+from support import wire
+
+READ = Request.read("coils", 0, 1)
+
+
+class Failing:
+    """Raises the errors one after the other, then answers. Its first close waits, then fails."""
+
+    late, longest_late = 0, 0.0
+
+    def __init__(self, *outcomes: Any) -> None:
+        self.outcomes = list(outcomes)
+        self.is_closing, self.may_fail = asyncio.Event(), asyncio.Event()
+
+    async def call(self, request: Request, unit: int, timeout: float) -> Any:  # noqa: ARG002
+        outcome = self.outcomes.pop(0)
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    async def close(self) -> None:
+        if not self.is_closing.is_set():
+            self.is_closing.set()
+            await self.may_fail.wait()
+            raise OSError("it can't be closed")
+
+
+def failing_pool(transport: Failing, dialed: list[NetworkTarget]) -> Pool:
+    def dial(target: NetworkTarget, _in_flight: int) -> Failing:
+        dialed.append(target)
+        return transport
+
+    return Pool(most=1, in_flight=1, idle=60, longest=60, dial=dial)
+
+
+def test_requests_behind_a_connection_that_can_not_be_closed_are_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pool, "CHECK_INTERVAL_S", 0)
+    target = NetworkTarget("udp", "127.0.0.1", 502)
+    route = Route(target, (target,))
+
+    async def run() -> Any:
+        transport = Failing(RequestTimeout("no reply"), [7])
+        pool = failing_pool(transport, [])
+        with pytest.raises(RequestTimeout):
+            await pool.run(route, 60, lambda turns: turns.call(READ, 1, 60))
+        await transport.is_closing.wait()
+        waiting = asyncio.create_task(pool.run(route, 60, lambda turns: turns.call(READ, 1, 60)))
+        await asyncio.sleep(0)
+        transport.may_fail.set()
+        return await waiting
+
+    assert asyncio.run(asyncio.wait_for(run(), wire.DEADLINE)) == [7]
+
+
+def test_a_call_of_which_a_part_was_sent_is_not_repeated_elsewhere() -> None:
+    """Its later part found no connection."""
+    first, second = (NetworkTarget("tcp", f"127.0.0.{number}", 502) for number in (1, 2))
+    dialed: list[NetworkTarget] = []
+
+    async def call(turns: Turns) -> None:
+        await turns.call(READ, 1, 60)
+        try:
+            await turns.call(READ, 1, 60)
+        finally:
+            assert turns.is_sent
+
+    async def run(*outcomes: Any) -> bool:
+        transport = Failing(*outcomes)
+        transport.may_fail.set()
+        pool = failing_pool(transport, dialed)
+        with pytest.raises(ConnectionLost) as error:
+            await pool.run(Route(first, (first, second)), 60, call)
+        return error.value.maybe_sent
+
+    refused = ConnectFailed("tcp://127.0.0.1:502", "refused")
+    assert asyncio.run(asyncio.wait_for(run([7], refused), wire.DEADLINE))
+    assert dialed == [first]
