@@ -274,9 +274,18 @@ def server_identity(answer: ServerId) -> Identity:
     return Identity((("server_id", text),)) if len(text) >= 3 else Identity()
 
 
-def ignores_unit(client: SyncClient, unit_ids: Iterable[int]) -> bool:
-    """Whether a device answers a unit id that is rare and was not asked: it may ignore unit ids."""
-    return UNUSUAL_UNIT not in unit_ids and probe(client, UNUSUAL_UNIT).answers
+def ignores_unit(client: SyncClient, asked: Sequence[Unit], *, is_line: bool) -> bool:
+    """Whether a device probably ignores the unit id: it answers all, also a rare one.
+
+    On a line, each unit id is a device of its own.
+    """
+    if is_line or len(asked) < 2 or not all(unit.answers for unit in asked):
+        return False
+    # With all unit ids of the standard asked, there is no rare one left to ask.
+    if len(asked) >= MAX_SERIAL_UNIT:
+        return True
+    is_left = all(unit.unit != UNUSUAL_UNIT for unit in asked)
+    return is_left and probe(client, UNUSUAL_UNIT).answers
 
 
 def line_settings(bauds: Sequence[int], parities: Sequence[Parity]) -> list[LineSettings]:

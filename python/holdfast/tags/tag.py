@@ -11,11 +11,10 @@ from typing import Any, Literal, TypeAlias
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_LIMITS, WRITE_LIMITS
 from holdfast.tags.base import BaseTag, Marker, Scaled, TagError
 from holdfast.tags.scale import Linear, RegisterScale
-from holdfast.tags.writing import unwritable
+from holdfast.tags.writing import raw_of, unwritable
 from holdfast.types import AREAS, BIT_AREAS, Area
 from holdfast.values import (
     ConversionError,
-    DoesNotFit,
     UnknownEncoding,
     UnknownOrder,
     codec_for,
@@ -199,7 +198,7 @@ class Tag(BaseTag):
         if type(raw) is Scaled:
             return raw.value
         if isinstance(self.scale, RegisterScale):
-            raise ValueError(self._unscaled)
+            raise ValueError(self.unscaled)
         return self._value(raw, self._linear)
 
     def scaled(self, raw: Any, content: Any) -> Scaled:
@@ -227,7 +226,8 @@ class Tag(BaseTag):
         return replace(self, scale=replace(self.scale, source=source))
 
     @property
-    def _unscaled(self) -> str:
+    def unscaled(self) -> str:
+        """What stands in the way while the scale is in a register that was not read."""
         assert isinstance(self.scale, RegisterScale)
         return f"the scale is in {self.scale.where}, which has to be read first"
 
@@ -262,45 +262,7 @@ class Tag(BaseTag):
         `max`. `default_round` is for a tag without `round`. A number that stands for a state is
         never rounded. Floating-point registers take the nearest number.
         """
-        if hasattr(value, "tolist"):
-            value = value.tolist()
-        if isinstance(value, list | tuple):
-            return [self.raw(item, default_round=default_round) for item in value]
-        if isinstance(value, str) and self.states:
-            value = self._named(value)
-        if not self.is_number:
-            return value
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise DoesNotFit(f"{value!r} is not a number")
-        if not math.isfinite(value):
-            raise DoesNotFit(f"{value} is not a finite number")
-        if isinstance(self.scale, RegisterScale):
-            raise DoesNotFit(self._unscaled)
-        self._check_limits(value, f"{value} is")
-        if self.is_float:
-            return value if self._linear.is_identity else float(self._linear.number(value))
-        exact = self._linear.number(value)
-        if exact.denominator == 1:
-            return exact.numerator
-        steps = f"steps of {abs(self.scale)}"
-        if not self.is_stepped or (self.round or default_round) == "exact":
-            raise DoesNotFit(f"{value} is between two values of the registers, allowed: {steps}")
-        nearest = round(exact)
-        rounded = self._linear.value(nearest)
-        self._check_limits(rounded, f"{value} is {rounded} in {steps},")
-        return nearest
-
-    def _check_limits(self, value: float, found: str) -> None:
-        least, most = self.min, self.max
-        if (least is not None and value < least) or (most is not None and value > most):
-            allowed = f"{'' if least is None else least} to {'' if most is None else most}"
-            raise DoesNotFit(f"{found} outside {allowed.strip()}")
-
-    def _named(self, name: str) -> int:
-        for value, known in self.states.items():
-            if known == name:
-                return value
-        raise DoesNotFit(f"{name!r} is no state, allowed: {', '.join(self.states.values())}")
+        return raw_of(self, value, self._linear, default_round)
 
 
 _KEYS = {UnknownOrder: "order", UnknownEncoding: "encoding"}

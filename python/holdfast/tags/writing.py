@@ -1,28 +1,20 @@
-"""What can be written, and how text becomes a value to write."""
+"""What a write puts into the registers of a tag, and what can't be written."""
 
 from __future__ import annotations
 
-import base64
-import binascii
 import math
-import re
-from decimal import Decimal
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from holdfast.protocol import WRITE_LIMITS
-from holdfast.runtime.text import quote
+from holdfast.tags.scale import RegisterScale
 from holdfast.types import BIT_AREAS
-from holdfast.values.digits import FLOATS
+from holdfast.values import DoesNotFit
 
 if TYPE_CHECKING:
+    from holdfast.tags.scale import Linear
+    from holdfast.tags.tag import Rounding, Tag
     from holdfast.types import Area
     from holdfast.values.types import Type
-
-BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
-
-_NUMBER = re.compile(r"[+-]?([0-9]{1,400}(\.[0-9]{0,400})?|\.[0-9]{1,400})([eE][+-]?[0-9]{1,3})?")
 
 
 def unwritable(area: Area, type: Type, named: str) -> str | None:
@@ -39,58 +31,46 @@ def unwritable(area: Area, type: Type, named: str) -> str | None:
     return None
 
 
-def from_text(text: str, type: Type, named: str) -> Any:
-    """Parses a text to a value of a type, which may still be outside its range.
-
-    Raises `ValueError`. `named` is the type as messages call it.
-    """
-    if type.count is not None:
-        return _array(text, type, named)
-    if type.base == "string":
-        return text
-    if type.base == "bytes":
-        return _bytes(text, named)
-    if type.base in ("bool", "bit"):
-        return _boolean(text, named)
-    return _number(text.strip(), named, type.base in FLOATS)
-
-
-def _boolean(text: str, named: str) -> bool:
-    # Not `True`: programs take other words for false than for true, and a guess can start a motor.
-    found = BOOLEANS.get(text)
-    if found is None:
-        raise ValueError(f"{quote(text)} is not a valid {named}, allowed: true, false, 1 and 0")
-    return found
-
-
-def _number(text: str, named: str, is_float: bool) -> int | float:
-    if _NUMBER.fullmatch(text) is None:
-        raise ValueError(f"{quote(text)} is not a valid {named}, allowed: a JSON number")
-    if is_float:
-        number = float(text)
-        if math.isinf(number):
-            raise ValueError(f"{quote(text)} does not fit {named}")
-        return number
-    exact = Decimal(text)
-    if exact.adjusted() > 20 or exact != exact.to_integral_value():
-        raise ValueError(f"{quote(text)} is not a valid {named}")
-    return int(exact)
+def raw_of(tag: Tag, value: Any, linear: Linear, default_round: Rounding) -> Any:
+    """What the registers have to hold, see `Tag.raw`; `linear` is the scale of the tag."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [raw_of(tag, item, linear, default_round) for item in value]
+    if isinstance(value, str) and tag.states:
+        value = _named(tag, value)
+    if not tag.is_number:
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise DoesNotFit(f"{value!r} is not a number")
+    if not math.isfinite(value):
+        raise DoesNotFit(f"{value} is not a finite number")
+    if isinstance(tag.scale, RegisterScale):
+        raise DoesNotFit(tag.unscaled)
+    _check_limits(tag, value, f"{value} is")
+    if tag.is_float:
+        return value if linear.is_identity else float(linear.number(value))
+    exact = linear.number(value)
+    if exact.denominator == 1:
+        return exact.numerator
+    steps = f"steps of {abs(tag.scale)}"
+    if not tag.is_stepped or (tag.round or default_round) == "exact":
+        raise DoesNotFit(f"{value} is between two values of the registers, allowed: {steps}")
+    nearest = round(exact)
+    rounded = linear.value(nearest)
+    _check_limits(tag, rounded, f"{value} is {rounded} in {steps},")
+    return nearest
 
 
-def _bytes(text: str, named: str) -> bytes:
-    try:
-        return base64.b64decode(text.strip(), validate=True)
-    except (binascii.Error, ValueError):
-        raise ValueError(f"{quote(text)} is not a valid {named}, allowed: base64") from None
+def _check_limits(tag: Tag, value: float, found: str) -> None:
+    least, most = tag.min, tag.max
+    if (least is not None and value < least) or (most is not None and value > most):
+        allowed = f"{'' if least is None else least} to {'' if most is None else most}"
+        raise DoesNotFit(f"{found} outside {allowed.strip()}")
 
 
-def _array(text: str, type: Type, named: str) -> list[Any]:
-    try:
-        items = msgspec.json.decode(text)
-    except (msgspec.DecodeError, RecursionError):
-        items = None
-    if not isinstance(items, list):
-        raise ValueError(f"{quote(text)} is not a valid {named}, allowed: a JSON array")
-    if type.base == "bytes":
-        return [_bytes(item, named) if isinstance(item, str) else item for item in items]
-    return items
+def _named(tag: Tag, name: str) -> int:
+    for value, known in tag.states.items():
+        if known == name:
+            return value
+    raise DoesNotFit(f"{name!r} is no state, allowed: {', '.join(tag.states.values())}")

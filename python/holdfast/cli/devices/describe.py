@@ -126,7 +126,7 @@ def describe(
         plan = _Plan(settings, times, every, output, None if everything else MAX_LINES)
         run = _Run(url, asked, plan, report)
         with device.connect(url, asked[0], timeout) as client:
-            why = run.carry_out(client, ignores_possible=not is_line)
+            why = run.carry_out(client, is_line=is_line)
         run.end(why)
     if why is not None:
         fail(f"{url}: {why}", is_printed=as_json)
@@ -167,9 +167,9 @@ class _Run:
     def _to_describe(self) -> list[int]:
         return self._answering[:1] if self._ignores else self._answering
 
-    def carry_out(self, client: SyncClient, *, ignores_possible: bool) -> Ended | None:
+    def carry_out(self, client: SyncClient, *, is_line: bool) -> Ended | None:
         """Asks unit ids, and describes those that answer. Returns why it ended early, or `None`."""
-        why = self._attempt(lambda: self._ask(client, ignores_possible=ignores_possible))
+        why = self._attempt(lambda: self._ask(client, is_line=is_line))
         lines = units_lines(self._url, self._asked, self._seen, self._ignores)
         self._report.text(*lines)
         if why is not None:
@@ -202,7 +202,7 @@ class _Run:
     def _attempt(self, work: Callable[[], None]) -> Ended | None:
         return self._report.attempt(work, self._url, lambda: self._answering)
 
-    def _ask(self, client: SyncClient, *, ignores_possible: bool) -> None:
+    def _ask(self, client: SyncClient, *, is_line: bool) -> None:
         asked = self._asked
         with self._report.progress("Asking", len(asked), lambda: ""):
             for unit in device_search.units(client, asked, delay=self._plan.settings.delay):
@@ -213,8 +213,8 @@ class _Run:
                         self._report.text(f"Unit {unit.unit} answers.")
                         about = dict(unit.identity.objects)
                         self._report.entry({"unit": unit.unit, "identification": about})
-        if ignores_possible and 1 < len(asked) == len(self._answering):
-            self._ignores = device_search.ignores_unit(client, asked)
+        if len(asked) == len(self._seen):
+            self._ignores = device_search.ignores_unit(client, self._seen, is_line=is_line)
 
     def _describe(self, unit: _UnitReport, client: SyncClient) -> None:
         survey = unit.found.survey

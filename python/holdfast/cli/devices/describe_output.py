@@ -37,7 +37,7 @@ def units_lines(
         + f"; not asked: {number_ranges(unasked) + ' and ' if unasked else ''}all others"
     )
     if ignores:
-        yield "It also answers a rare unit id: it probably ignores them. One is described."
+        yield "It answers every unit id: it probably ignores them. One is described."
 
 
 def head_lines(found: Description) -> list[str]:

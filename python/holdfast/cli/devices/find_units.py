@@ -16,12 +16,10 @@ from holdfast.cli.signals import interruptions
 from holdfast.cli.terminal_text import number_ranges
 from holdfast.client.url import SerialTarget, parse
 from holdfast.discovery import device_search
-from holdfast.protocol import MAX_SERIAL_UNIT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from holdfast.client import SyncClient
     from holdfast.discovery.device_search import Unit
 
 ROW = "{:>4}  {:7}  {}"
@@ -30,7 +28,8 @@ ROW = "{:>4}  {:7}  {}"
 
 def find_units(url: str, asked: Sequence[int], timeout: float, delay: float, as_json: bool) -> None:
     """Finds unit ids, prints them, and exits with 1 if there are none."""
-    if isinstance(parse(url), SerialTarget):
+    is_line = isinstance(parse(url), SerialTarget)
+    if is_line:
         refuse_broadcast(asked)
     if sys.stderr.isatty():
         most = len(asked) * (timeout + delay)
@@ -49,7 +48,7 @@ def find_units(url: str, asked: Sequence[int], timeout: float, delay: float, as_
                         if unit.answers:
                             _print(unit, report, is_first=_count(found) == 1)
                         report.advance(len(found))
-                ignores = _ignores(client, url, found)
+                ignores = device_search.ignores_unit(client, found, is_line=is_line)
 
         with device.connect(url, asked[0], timeout) as client:
             why = report.attempt(search, url, lambda: _count(found))
@@ -76,15 +75,6 @@ def _print(unit: Unit, report: Report, *, is_first: bool) -> None:
     head = terminal_text.styled(ROW.format("unit", "answer", "identification"), bold=True)
     report.text(*([head] if is_first else []), row)
     report.entry(unit_to_json(unit))
-
-
-def _ignores(client: SyncClient, url: str, found: Sequence[Unit]) -> bool:
-    """Whether the device probably ignores the unit id: it answers all, also a rare one."""
-    if isinstance(parse(url), SerialTarget) or len(found) < 2 or _count(found) < len(found):
-        return False
-    asked = [each.unit for each in found]
-    # With all unit ids of the standard asked, there is no rare one left to ask.
-    return len(asked) >= MAX_SERIAL_UNIT or device_search.ignores_unit(client, asked)
 
 
 def _count(found: Iterable[Unit]) -> int:

@@ -33,7 +33,7 @@ NODE = "node."
 PARTITION = "partition."
 
 MAX_CONCURRENT_HANDOVERS = 4
-"""Partitions that are handed over at once."""
+"""Partitions that a node gives back at once, while it goes on."""
 
 DEVICE_STOP_TIMEOUT_S = 5.0
 """Time to wait for polls and writes of a partition before it is given back."""
