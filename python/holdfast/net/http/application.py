@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from functools import lru_cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from holdfast.net.http.operations import Body, Given, Later
     from holdfast.net.http.origin import Origins
     from holdfast.net.http.requests import Request, SecondStep
-
-MAX_QUERIES = 64
-"""Parsed queries that are kept."""
 
 JUDGED = "judged"
 """The key of the judgement in `Request.kept`."""
@@ -61,8 +58,6 @@ class Application:
         self._anyone = anyone
         self.max_body = max_body
         self._document = self._page = b""
-        # Those who poll send the same query again and again.
-        self._parameters = lru_cache(MAX_QUERIES)(self._parsed)
 
     def __call__(self, request: Request) -> Response | Later:
         """Answers one request; at once, unless its body still arrives or something must wait."""
@@ -145,11 +140,8 @@ class Application:
         if operation.body is not None:
             self.check_type(request)
         elif operation.parameters:
-            parameters = self._parameters(request.path, request.query)
+            parameters = from_query(request.query, operation.parameters)
         return _Judged(operation, request.who, parameters)
-
-    def _parsed(self, path: str, query: bytes) -> Given:
-        return from_query(query, self.routes[path].parameters)
 
     async def _arriving(
         self, operation: Operation[Any], body: Body, request: Request
