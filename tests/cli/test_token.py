@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from holdfast.cli import main
 from holdfast.config import load
-from holdfast.config.text.source import parse
+from holdfast.config.text.yaml_document import parse
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,8 +11,8 @@ import pytest
 
 from holdfast.config import Config, ConfigError, Problem, load
 from holdfast.config.loader import checked
-from holdfast.config.text import source
-from holdfast.config.text.source import parse, table
+from holdfast.config.text import yaml_document
+from holdfast.config.text.yaml_document import parse, table
 from support.config_folder import Folder
 from support.paths import EXAMPLES
 
@@ -495,7 +495,7 @@ def test_values_without_end_are_refused(folder: Folder) -> None:
 def test_too_many_values_are_refused_before_they_take_memory(
     folder: Folder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(source, "MAX_WRITTEN", 30)
+    monkeypatch.setattr(yaml_document, "MAX_WRITTEN", 30)
     text = MEMORIES + LISTENERS
     assert folder.problems(text) == ["p.yaml: more than 30 keys and values, the limit"]
     monkeypatch.undo()

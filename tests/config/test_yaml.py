@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from holdfast._core import yaml_events
 from holdfast.config import ConfigError
 from holdfast.config.dump import to_yaml
-from holdfast.config.text import source
-from holdfast.config.text.source import parse
+from holdfast.config.text import yaml_document
+from holdfast.config.text.yaml_document import parse
 from support.paths import DOCS, EXAMPLES
 
 FILES = sorted(EXAMPLES.rglob("*.yaml"))
@@ -53,15 +53,15 @@ def places(text: str) -> list[tuple[object, ...]]:
 
 @pytest.mark.parametrize("text", [*(file.read_text() for file in FILES), *BLOCKS])
 def test_both_parsers_find_the_same(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert yaml_events(text, source.MAX_WRITTEN) is not None
+    assert yaml_events(text, yaml_document.MAX_WRITTEN) is not None
     fast = places(text)
-    monkeypatch.setattr(source, "yaml_events", lambda _text, _most: None)
+    monkeypatch.setattr(yaml_document, "yaml_events", lambda _text, _most: None)
     assert places(text) == fast
 
 
 def test_a_brace_may_be_left_of_its_key() -> None:
     text = "memories:\n  plant: {coils: 8,\n}\n"
-    assert yaml_events(text, source.MAX_WRITTEN) is None
+    assert yaml_events(text, yaml_document.MAX_WRITTEN) is None
     assert parse(text, "file")[0].data == {"memories": {"plant": {"coils": 8}}}
 
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from holdfast.cli import main
 from holdfast.config import load
 from holdfast.config.dump import to_yaml
-from holdfast.config.text.source import parse
+from holdfast.config.text.yaml_document import parse
 from holdfast.importing import NotImportable, read_mma
 from holdfast.importing.function_rights import ALL, SOURCE, touching
 from holdfast.importing.notes import Desk

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from holdfast.config import Config
     from holdfast.config.models.server_tls import HttpsConfig, ServerTlsConfig
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.net.tls import Tls
 
 

@@ -14,7 +14,7 @@ from holdfast.runtime.text import either, listing
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from holdfast.config.text.source import Key, KeyPath
+    from holdfast.config.text.yaml_document import Key, KeyPath
 
 Node: TypeAlias = dict[str, Any]
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
     from holdfast.config.text.report import Report
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
 
 _KEY = "[key]"
 _NO_KIND = ("union_tag_invalid", "union_tag_not_found")

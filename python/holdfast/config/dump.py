@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from holdfast.config.text.source import scalar
+from holdfast.config.text.yaml_document import scalar
 
 WIDTH = 100
 """What is longer on one line has a line for each entry."""

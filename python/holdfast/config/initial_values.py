@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-from holdfast.config.text import source
+from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.protocol import ADDRESSES, MAX_WORD
@@ -52,8 +52,8 @@ class _Given(NamedTuple):
 
 def read(path: Path, file: str) -> str:
     """Reads a file of initial values; messages call it `file`. Raises `ConfigError`."""
-    max_bytes = MAX_CSV_BYTES if path.suffix.lower() == ".csv" else source.MAX_BYTES
-    return source.read_text(path, file, "YAML or CSV", max_bytes)
+    max_bytes = MAX_CSV_BYTES if path.suffix.lower() == ".csv" else yaml_document.MAX_BYTES
+    return yaml_document.read_text(path, file, "YAML or CSV", max_bytes)
 
 
 def parse(
@@ -159,7 +159,7 @@ def _integer(text: str) -> int | str:
 
 
 def _yaml(text: str, judge: _Judge) -> Iterator[_Given]:
-    document, problems = source.parse(text, judge.file)
+    document, problems = yaml_document.parse(text, judge.file)
     judge.problems += problems
     if document.data is None:
         return
@@ -177,7 +177,10 @@ def _yaml(text: str, judge: _Judge) -> Iterator[_Given]:
 
 
 def _cells(
-    document: source.Document, area: source.Key, address: source.Key, values: object
+    document: yaml_document.Document,
+    area: yaml_document.Key,
+    address: yaml_document.Key,
+    values: object,
 ) -> Iterator[_Given]:
     many = isinstance(values, list) and isinstance(address, int)
     for index, value in enumerate(values if many and isinstance(values, list) else [values]):

@@ -30,7 +30,7 @@ from holdfast.config.checks.tags import check_tags
 from holdfast.config.checks.units import warn_of_routes
 from holdfast.config.models.root import Config
 from holdfast.config.tag_files.profiles import ProfileFiles
-from holdfast.config.text import source
+from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import shape, show
 from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.config.text.report import Report
@@ -46,13 +46,13 @@ def load(path: Path | str) -> Config:
     return loaded(path)[0]
 
 
-def loaded(path: Path | str) -> tuple[Config, source.Document]:
+def loaded(path: Path | str) -> tuple[Config, yaml_document.Document]:
     """Reads a configuration, as `load` does. Returns it with its document."""
     file = str(path)
 
-    def work() -> tuple[Config, source.Document]:
-        content = source.read_bytes(Path(path), file)
-        document, problems = source.parse(source.decoded(content, file), file)
+    def work() -> tuple[Config, yaml_document.Document]:
+        content = yaml_document.read_bytes(Path(path), file)
+        document, problems = yaml_document.parse(yaml_document.decoded(content, file), file)
         config = checked(document, problems, Path(path).absolute().parent)
         return config.with_sha256(hashlib.sha256(content).hexdigest()), document
 
@@ -67,7 +67,7 @@ def unanswered(error: bounded_files.NotAnswered) -> Problem:
     return Problem(str(error.filename), None, None, "", f"can't be read: {error.strerror}")
 
 
-def checked(document: source.Document, problems: list[Problem], folder: Path) -> Config:
+def checked(document: yaml_document.Document, problems: list[Problem], folder: Path) -> Config:
     """The configuration of a document that has these problems. It names files from `folder`.
 
     Raises `ConfigError` with these problems, and all others.

@@ -8,7 +8,7 @@ from holdfast.config.text.messages import show
 from holdfast.config.values.ip_addresses import Bind, parse_bind
 
 if TYPE_CHECKING:
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.importing.notes import Choices, Desk
 
 FORM = "a port, :port or address:port with an IP address"

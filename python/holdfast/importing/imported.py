@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from holdfast.config.dump import to_yaml
-from holdfast.config.text import source
+from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError
 from holdfast.importing.notes import Desk, Note
@@ -63,9 +63,9 @@ class Source:
     def __init__(self, path: Path | str) -> None:
         """Raises `ConfigError` for a file that can't be read."""
         self.file = str(path)
-        text = source.read_text(Path(path), self.file)
+        text = yaml_document.read_text(Path(path), self.file)
         try:
-            document, found = source.parse(text, self.file)
+            document, found = yaml_document.parse(text, self.file)
         except ConfigError as error:
             raise ConfigError(self.file, _without_secrets(text, error.problems)) from None
         self._problems = _without_secrets(text, found)

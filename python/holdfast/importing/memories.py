@@ -10,7 +10,7 @@ from holdfast.runtime.text import listing
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.importing.notes import Desk
     from holdfast.importing.sections import Section
 

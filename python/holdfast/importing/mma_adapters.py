@@ -20,7 +20,7 @@ from holdfast.runtime.text import all_of, listing
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.config.values.ip_addresses import Bind
     from holdfast.importing.sections import Section
     from holdfast.types import Area

@@ -17,7 +17,7 @@ from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, WRITING_CODES
 from holdfast.runtime.text import listing, suggestion
 
 if TYPE_CHECKING:
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.config.values.ip_addresses import Bind
 
 DEFAULT_CONNECTIONS = 32

@@ -15,7 +15,7 @@ from holdfast.importing.sections import Section, section
 from holdfast.protocol import LAST_ADDRESS, MAX_UNIT
 
 if TYPE_CHECKING:
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.importing.peers import Peers
     from holdfast.net.addresses import Network
 

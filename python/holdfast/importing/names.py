@@ -10,7 +10,7 @@ from holdfast.config.values.scalars import NAME_FORM
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.importing.notes import Desk
 
 MAX_LENGTH = 64

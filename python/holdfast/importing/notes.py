@@ -13,7 +13,7 @@ from holdfast.config.text.report import Report
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from holdfast.config.text.source import Document, KeyPath
+    from holdfast.config.text.yaml_document import Document, KeyPath
     from holdfast.types import Area
 
 

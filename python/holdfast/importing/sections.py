@@ -14,7 +14,7 @@ from holdfast.runtime.text import either, suggestion
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.importing.notes import Desk
 
 _TRUE = ("yes", "Yes", "YES", "on", "On", "ON")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from holdfast.client.url import Target
     from holdfast.config import Config
     from holdfast.config.models.services import ClientTlsConfig
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.net.certificates.expiry import Expiry
     from holdfast.net.tls import Tls
 

@@ -15,7 +15,7 @@ from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.option import flag, json_option, option
 from holdfast.cli.terminal_text import print_json
 from holdfast.config.dump import PLAIN
-from holdfast.config.text.source import scalar
+from holdfast.config.text.yaml_document import scalar
 from holdfast.config.values.scalars import NAME_FORM, is_name
 
 SECRET_BYTES = 32

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.base import Model
     from holdfast.config.models.root import Config
     from holdfast.config.text.report import Report
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
 
 T = TypeVar("T")
 

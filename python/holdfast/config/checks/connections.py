@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from holdfast.client.url import NetworkTarget, Target
     from holdfast.config.checks.common import Scope
     from holdfast.config.models.links import LinkConfig
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.config.values.ip_addresses import Bind
     from holdfast.net.allow_list import AllowEntry
     from holdfast.net.tls import Tls

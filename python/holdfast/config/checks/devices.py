@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         StatusConfig,
     )
     from holdfast.config.models.root import Config
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
 
 MAX_OF_A_PACKET = MAX_WORD
 """The maximum number of values in one raw ingest packet."""

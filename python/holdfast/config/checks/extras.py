@@ -9,7 +9,7 @@ from holdfast.runtime import extras
 
 if TYPE_CHECKING:
     from holdfast.config.checks.common import Scope
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.runtime.extras import Extra
 
 SECTIONS: dict[str, Extra] = {"logs": "nats", "mqtt": "mqtt", "nats": "nats"}

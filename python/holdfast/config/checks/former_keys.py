@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from holdfast.config.text.report import Report
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
 
 _NO_LIMIT = "an address waits only while others do: delete the key"
 _PER_SECOND = ("max_requests_per_source", "max_writes_per_source")

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.listeners import Listener, Target
     from holdfast.config.models.services import RestConfig
     from holdfast.config.text.report import Report
-    from holdfast.config.text.source import Key, KeyPath
+    from holdfast.config.text.yaml_document import Key, KeyPath
     from holdfast.config.values.unit_keys import UnitKey
 
     AnyRule: TypeAlias = RuleConfig | SerialRuleConfig | RawRuleConfig

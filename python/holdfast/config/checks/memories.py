@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.root import Config
     from holdfast.config.models.services import SubscriptionConfig, TokenConfig
     from holdfast.config.text.report import Report
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.types import Area
 
     SealedGrant: TypeAlias = SubscriptionConfig | TokenConfig

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.outputs import NatsOutputConfig
     from holdfast.config.models.services import NatsServersConfig
     from holdfast.config.text.report import Report
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
 
 
 _IDENTITIES = ("username", "token_file", "credentials_file")

@@ -20,7 +20,7 @@ from holdfast.config.values.topics import TAG
 if TYPE_CHECKING:
     from holdfast.config.checks.common import Scope
     from holdfast.config.models.outputs import Output
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
 
 
 def check_outputs(scope: Scope) -> None:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
         RestConfig,
     )
     from holdfast.config.text.report import Report
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
 
 
 _USERS_OF_MEMORIES = ("rest", "mqtt", "adapters")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from holdfast.config.models.devices import DeviceConfig, RangeConfig
     from holdfast.config.models.tags import TagConfig
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
 
 
 def check_profiles(scope: Scope) -> dict[str, dict[str, Tag]]:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.server_tls import HttpsConfig, ServerTlsConfig
     from holdfast.config.models.services import ClientTlsConfig
     from holdfast.config.text.report import Report
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
 
 CLIENT_FILES = ("ca_file", "cert_file", "key_file")
 SERVER_FILES = (*CLIENT_FILES, "key_passphrase_file", "client_ca_file", "crl_file")

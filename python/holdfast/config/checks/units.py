@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.devices import RangeConfig
     from holdfast.config.models.listeners import ExceptionStatusConfig, Target
     from holdfast.config.models.root import Config
-    from holdfast.config.text.source import Key, KeyPath
+    from holdfast.config.text.yaml_document import Key, KeyPath
     from holdfast.config.values.unit_keys import UnitKey
     from holdfast.types import Access
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from holdfast.config.text.report import Report
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
 
 _ANY = {"tags": {"any": {"area": "coils", "address": 0}}}
 """In place of a profile that could not be read, so that its users are checked all the same."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config import build
 from holdfast.config.checks.common import Scope
 from holdfast.config.checks.tags import check_profiles
-from holdfast.config.text import source
+from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.config.text.report import Report
@@ -23,7 +23,7 @@ from holdfast.types import AREAS, SHORT_AREAS
 
 if TYPE_CHECKING:
     from holdfast.config.models.tags import ProfileConfig
-    from holdfast.config.text.source import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath
 
 KINDS = (".yaml", ".yml", ".csv")
 COLUMNS = (
@@ -53,7 +53,7 @@ def parse_tags(text: str, file: str, *, is_csv: bool) -> TagList:
 def load_profile(path: Path, file: str) -> ProfileConfig:
     """Reads a profile; messages call it `file`. Raises `ConfigError` with every problem."""
     name = path.stem if is_name(path.stem) else "tags"
-    text = source.read_text(path, file, "YAML or CSV")
+    text = yaml_document.read_text(path, file, "YAML or CSV")
     return _profile(text, file, name, path.parent, is_csv=path.suffix.lower() == ".csv")
 
 
@@ -61,7 +61,7 @@ def _profile(text: str, file: str, name: str, folder: Path, *, is_csv: bool) -> 
     if is_csv:
         document, problems = _csv(text, file)
     else:
-        document, problems = source.parse(text, file)
+        document, problems = yaml_document.parse(text, file)
     if not isinstance(document.data, dict):
         message = f"found {show(document.data)}, allowed: a mapping with the keys order, tags"
         raise ConfigError(file, problems or [Problem(file, 1, 1, "", message)])
@@ -108,7 +108,7 @@ class _Table:
             self.lines["tags", name] = line
 
 
-def _csv(text: str, file: str) -> tuple[source.Document, list[Problem]]:
+def _csv(text: str, file: str) -> tuple[yaml_document.Document, list[Problem]]:
     table, columns = _Table(file), list[str]()
     sample = next((line for line in text.splitlines() if line.strip() and line[0] != "#"), "")
     separator = ";" if sample.count(";") > sample.count(",") else ","
@@ -127,7 +127,7 @@ def _csv(text: str, file: str) -> tuple[source.Document, list[Problem]]:
                 table.take(rows.line_num, columns, cells)
     except csv.Error as error:
         table.refuse(rows.line_num, f"not CSV: {error}")
-    document = source.table(file, {"tags": table.tags}, table.lines)
+    document = yaml_document.table(file, {"tags": table.tags}, table.lines)
     return document, table.problems
 
 
@@ -155,15 +155,15 @@ def _cell(key: str, cell: str) -> Any:
         words = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
         return words.get(cell.lower(), cell)
     if key == "null":
-        return [source.scalar(part.strip()) for part in cell.split("|")]
-    return source.scalar(cell)
+        return [yaml_document.scalar(part.strip()) for part in cell.split("|")]
+    return yaml_document.scalar(cell)
 
 
 def _scale(cell: str) -> Any:
     """A scale: a number, or `exponent W_SF`, `factor hr 12 uint16` for one in a register."""
     form, *words = cell.split()
     if form.lower() not in FORMS or not words:
-        return source.scalar(cell)
+        return yaml_document.scalar(cell)
     if len(words) == 1:
         return {"from": words[0], "as": form.lower()}
     if len(words) > len(PLACE_KEYS):

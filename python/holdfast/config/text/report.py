@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.text.problems import Problem
 
 if TYPE_CHECKING:
-    from holdfast.config.text.source import Document, Key, KeyPath
+    from holdfast.config.text.yaml_document import Document, Key, KeyPath
 
 
 @dataclass
