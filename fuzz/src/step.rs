@@ -29,6 +29,7 @@ pub(crate) fn members() -> [Arc<Memory>; 2] {
             Area::ALL.into_iter().zip(spans).fold(Layout::default(), |layout, (area, span)| {
                 layout.with(area, Span::new(span.0, span.1).expect("a span within the addresses"))
             });
+        let layout = layout.with(Area::File(4), Span::new(0, 30).expect("records of a file"));
         Arc::new(Memory::new(layout, None).expect("memory for a few items"))
     })
 }

@@ -40,19 +40,19 @@ __all__ = [
     "EXCEPTIONS",
     "FAULTS",
     "FUNCTIONS",
+    "LAST_RECORD",
     "LINK_QUEUE",
     "MAX_IN_FLIGHT",
     "MAX_LAG",
     "MAX_LATENESS",
     "MAX_PDU",
-    "OTHER_READS",
     "READ_RECORDS",
     "RETRY_PAUSES",
     "SUB_FUNCTIONS",
     "TLS_REASONS",
     "UNMEASURED_COST_MS",
     "WHEN_BEHIND",
-    "WRITE_FILE_RECORD",
+    "WRITE_RECORDS",
     "WRITE_TIMEOUT",
     "Attempt",
     "Batch",
@@ -119,12 +119,12 @@ SUB_FUNCTIONS: Final[tuple[tuple[int, str, bool], ...]]
 """Each sub-function of function 8: code, name, and whether it changes the device."""
 
 READ_RECORDS: Final[int]
+WRITE_RECORDS: Final[int]
+LAST_RECORD: Final[int]
 """Maximum number of file records that one request reads."""
 
-OTHER_READS: Final[tuple[int, ...]]
 """Functions of the standard that only read, and that memories do not serve."""
 
-WRITE_FILE_RECORD: Final[int]
 """The function that writes file records, which memories do not serve."""
 
 EXCEPTIONS: Final[dict[int, str]]
@@ -171,8 +171,9 @@ class Memory:
     """Four areas of bits and 16-bit registers, of fixed size, initially 0.
 
     An area is a size (addresses from 0), or start and size; an omitted area does not exist.
-    `start + size` is at most 65536. Every read sees a whole write or none of it, and a refused
-    write changes nothing. Methods are thread-safe.
+    `start + size` is at most 65536. `files` maps numbers of files, 1 to 65535, to their numbers of
+    records, 1 to 10000; `read` and `write` have them as the areas `file:NUMBER`. Every read sees a
+    whole write or none of it, and a refused write changes nothing. Methods are thread-safe.
 
     `seal` is the gate bit, in coils or discrete inputs. Modbus clients receive exception 06 until a
     write other than by Modbus sets that bit to 1: permanently (`once`), or while it is 1 (`level`).
@@ -187,11 +188,16 @@ class Memory:
         discrete_inputs: Extent | None = None,
         holding_registers: Extent | None = None,
         input_registers: Extent | None = None,
+        files: Mapping[int, int] | None = None,
         seal: Seal | None = None,
     ) -> Memory: ...
     @property
     def areas(self) -> dict[Area, range]:
         """The addresses of each area that exists."""
+
+    @property
+    def files(self) -> dict[int, int]:
+        """The number of records of each file."""
 
     @property
     def sealed(self) -> bool:
@@ -205,7 +211,7 @@ class Memory:
     def seal_changes(self) -> tuple[int, int]:
         """How often the seal opened, and how often it closed again."""
 
-    def read(self, area: Area, address: int, count: int) -> list[int]:
+    def read(self, area: str, address: int, count: int) -> list[int]:
         """Reads `count` bits (0 or 1) or registers (0 to 65535) from `address`, as one snapshot.
 
         Raises `OutOfRange` outside the area, `ValueError` for an unknown area or a count below 1,
@@ -225,10 +231,10 @@ class Memory:
         outside its area.
         """
 
-    def read_many(self, ranges: Sequence[tuple[Area, int, int]]) -> list[list[int]]:
+    def read_many(self, ranges: Sequence[tuple[str, int, int]]) -> list[list[int]]:
         """Reads several ranges (area, address, count) as one snapshot. Raises like `read`."""
 
-    def write(self, area: Area, address: int, values: Iterable[int]) -> None:
+    def write(self, area: str, address: int, values: Iterable[int]) -> None:
         """Writes bits (0, 1, False, True) or registers (integers 0 to 65535) in one step.
 
         Raises `OutOfRange` outside the area, `ValueError` for no values, a value out of range or an
@@ -237,7 +243,7 @@ class Memory:
         carry out a write that it did not confirm in time.
         """
 
-    def write_many(self, writes: Sequence[tuple[Area, int, Iterable[int]]]) -> None:
+    def write_many(self, writes: Sequence[tuple[str, int, Iterable[int]]]) -> None:
         """Writes to several ranges (area, address, values) in one step.
 
         Where two overlap, the later one wins. Raises the errors of `write`; an error in one write
@@ -514,7 +520,8 @@ class Rule:
     certificate without a role, `None` is any role. `narrowed` are units with rights of their own:
     access, functions, denied functions, and the ranges that they may read and write, each an area,
     its first address and a count; `None` is everything. `exception_status` is where units have the
-    eight bits that function 7 reads: area and address. Other units do not have the function.
+    eight bits that function 7 reads: area and address. `fifo` are the addresses where units have
+    the queues that function 24 reads. Other units do not have these functions.
 
     Raises `ValueError` for an invalid source or access.
     """
@@ -530,6 +537,7 @@ class Rule:
         roles: Sequence[str] | None = None,
         narrowed: Mapping[int, NarrowedRights] | None = None,
         exception_status: Mapping[int, tuple[BitArea, int]] | None = None,
+        fifo: Mapping[int, Sequence[int]] | None = None,
     ) -> Rule: ...
 
 @final

@@ -42,7 +42,7 @@ class Function(NamedTuple):
     writes: bool
     """Whether it changes bits or registers."""
     area: Area | None
-    """The area that it accesses; `None` for functions of the device itself."""
+    """The area that it accesses; `None` for functions of the device itself, of files and queues."""
     most_read: int
     """Maximum number of bits or registers that it reads, 0 if it reads none."""
     most_written: int
@@ -60,8 +60,11 @@ MAX_CODE = 0x7F
 READ_RECORDS = _core.READ_RECORDS
 """Maximum number of file records that one request reads."""
 
-OTHER_READS = _core.OTHER_READS
-"""Functions that only devices have, and that change nothing."""
+WRITE_RECORDS = _core.WRITE_RECORDS
+"""Maximum number of file records that one request writes."""
+
+LAST_RECORD = _core.LAST_RECORD
+"""The greatest number of a record in a file."""
 
 READ_EXCEPTION_STATUS = 7
 """Memories have this function only where the bits that it reads are set."""
@@ -69,7 +72,15 @@ READ_EXCEPTION_STATUS = 7
 GET_COMM_EVENT_LOG = 12
 """Memories have this function only on listeners with an event log."""
 
-WRITE_FILE_RECORD = _core.WRITE_FILE_RECORD
+FILE_FUNCTIONS = frozenset({20, 21})
+"""Memories have these functions only if they have files."""
+
+READ_FIFO_QUEUE = 24
+"""Memories have this function only if they have queues."""
+
+OPTIONAL_CODES = {READ_EXCEPTION_STATUS, GET_COMM_EVENT_LOG, *FILE_FUNCTIONS, READ_FIFO_QUEUE}
+"""Functions that memories have only with settings of their own."""
+
 WRITING_CODES = tuple(each.code for each in FUNCTIONS if each.writes)
 
 BROADCAST_CODES = tuple(each.code for each in FUNCTIONS if each.writes and not each.most_read)

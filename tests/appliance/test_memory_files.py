@@ -212,8 +212,8 @@ metrics: {bind: "127.0.0.1:0", sources: [127.0.0.0/8]}
 class Plant:
     """A running `holdfast run` whose disk can be full."""
 
-    def __init__(self, folder: Path, sync: float) -> None:
-        memories = {"plant": keeping(sync), "volatile": {"holding_registers": 100}}
+    def __init__(self, folder: Path, sync: float, **more: Any) -> None:
+        memories = {"plant": keeping(sync, **more), "volatile": {"holding_registers": 100}}
         self.file = folder / "p.yaml"
         self.file.write_text(f"memories: {written(memories)}\n{LISTENERS}")
         self.command = RunCommand(self.file)
@@ -349,3 +349,69 @@ def test_a_mirror_is_kept_too(tmp_path: Path) -> None:
             wire.until(lambda: memory.read("holding_registers", 0, 1) == [42], "it is mirrored")
     with Appliance(config(tmp_path)) as again:
         assert again.memories["plant"].read("holding_registers", 0, 1) == [42]
+
+
+WITH_FILES: Settings = {"files": {4: 300}, "fifo": [10]}
+
+
+@pytest.mark.parametrize("sync", [0, 1])
+def test_files_are_kept_as_areas_are(tmp_path: Path, sync: float) -> None:
+    settings = config(tmp_path, plant=keeping(sync, **WITH_FILES))
+    with Appliance(settings) as appliance:
+        appliance.memories["plant"].write("file:4", 299, [7])
+    other = config(tmp_path, plant=keeping(sync, files={1: 5, 4: 10}))
+    with Appliance(other) as appliance:
+        assert appliance.memories["plant"].files == {1: 5, 4: 10}
+    with Appliance(settings) as appliance:
+        assert appliance.memories["plant"].read("file:4", 299, 1) == [7]
+
+
+def test_records_that_were_confirmed_survive_a_kill(tmp_path: Path) -> None:
+    made = Plant(tmp_path, 0, **WITH_FILES)
+    try:
+        write = "150906000400070001aaaa"
+        assert made.modbus(write) == write
+        assert made.modbus("0600" + "0a0001") == "0600" + "0a0001"
+        made.command.process.kill()
+        made.command.process.communicate()
+        again = RunCommand(made.file)
+        try:
+            made.scada = again.wait_until_it_serves()
+            assert made.modbus("140706000400070001") == "14040306aaaa"
+            assert made.modbus("18000a") == "180004" + "00010000"
+        finally:
+            again.process.kill()
+            again.process.communicate()
+    finally:
+        made.command.process.kill()
+        made.command.process.communicate()
+
+
+def test_files_are_verified_exported_and_imported(tmp_path: Path) -> None:
+    settings = config(tmp_path, plant=keeping(0, **WITH_FILES))
+    with Appliance(settings) as appliance:
+        appliance.memories["plant"].write("file:4", 7, [8, 9])
+    file, values = str(tmp_path / "plant.redb"), tmp_path / "values.yaml"
+    assert "plant: file:4 0 to 299, 2 not 0" in invoke("memory", "verify", file).stdout
+    assert "file:4,8,9" in invoke("memory", "export", file).stdout
+    assert invoke("memory", "export", file, "--output", str(values)).exit_code == 0
+    text = values.read_text()
+    assert "file:4:\n  7: [8, 9]\n" in text
+    values.write_text(text.replace("[8, 9]", "[1, 2]"))
+    assert invoke("memory", "import", file, str(values)).exit_code == 0
+    with Appliance(settings) as appliance:
+        assert appliance.memories["plant"].read("file:4", 6, 4) == [0, 1, 2, 0]
+
+
+def test_initial_values_may_be_of_files(tmp_path: Path) -> None:
+    (tmp_path / "first.csv").write_text("area,address,value\nfile:4,299,5\n")
+    plant = {"coils": 1, "files": {4: 300}, "initial": "first.csv"}
+    with Appliance(config(tmp_path, plant=plant)) as appliance:
+        assert appliance.memories["plant"].read("file:4", 298, 2) == [0, 5]
+
+
+def test_files_change_at_a_start_only(tmp_path: Path) -> None:
+    with Appliance(config(tmp_path, plant={"coils": 1, "files": {4: 300}})) as appliance:
+        other = config(tmp_path, plant={"coils": 1, "files": {4: 301}})
+        with pytest.raises(ReloadRefused, match=r"memories\.plant: "):
+            appliance.reload(other)

@@ -103,6 +103,19 @@ def test_a_write_to_one_node_is_read_from_all(node: Callable[..., Appliance]) ->
     wire.until(lambda: register(one) == 0x2F, "the first node has it")
 
 
+def test_files_and_queues_are_those_of_all_nodes(node: Callable[..., Appliance]) -> None:
+    one, two = (node(name, files={4: 300, 7: 2}, fifo=[3]) for name in "ab")
+    both = "1514" + "06000400070002aaaabbbb" + "0600070001" + "0001cccc"
+    assert ask(one, both) == both
+    assert ask(one, both.replace("0600070001", "0600070002")) == "9502"
+    assert ask(one, "0600030001") == "0600030001"
+    wire.until(lambda: register(two) == 1, "the other node has it")
+    read = "140e" + "06000400070002" + "06000700010001"
+    for each in (one, two):
+        assert ask(each, read) == "140a" + "0506aaaabbbb" + "0306cccc"
+        assert ask(each, "180003") == "180004" + "00010000"
+
+
 def ingest(appliance: Appliance, *commands: tuple[str, int]) -> int:
     """Writes by REST: a register of each memory. Returns the HTTP status."""
     batch = [

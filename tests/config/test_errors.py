@@ -50,7 +50,7 @@ def changed(old: str, new: str, text: str = GOOD) -> str:
 AREA = "an integer from 1 to 65536 or a mapping with the keys start, size"
 SOURCE = "a network or an address, as in 10.0.0.0/24, 10.0.0.7 or fd00::/64"
 BIND = "address:port with an IP address, as in 127.0.0.1:502 or [::1]:502"
-CODES = "1, 2, 3, 4, 5, 6, 7, 8, 11, 12, 15, 16, 17, 22, 23 or 43"
+CODES = "1, 2, 3, 4, 5, 6, 7, 8, 11, 12, 15, 16, 17, 20, 21, 22, 23, 24 or 43"
 TOP = (
     "memories, logs, identity, listeners, profiles, devices, links, rest, mqtt, nats, gateway, "
     "outputs, adapters, metrics, audit, log, reload, workers"
@@ -115,6 +115,33 @@ RULE = "listeners.scada.rules[0]"
             "coils: 8",
             "coils: 8, seal: {area: coils, address: 1, mode: twice}",
             "2: memories.plant.seal.mode: found 'twice', allowed: once or level",
+        ),
+        (
+            "coils: 8",
+            "coils: 8, files: {0: 1}",
+            "2: memories.plant.files.0: found 0, allowed: a file number from 1 to 65535",
+        ),
+        (
+            "coils: 8",
+            "coils: 8, files: {4: 10001}",
+            "2: memories.plant.files.4: found 10001, allowed: an integer from 1 to 10000",
+        ),
+        (
+            "coils: 8",
+            "coils: 8, fifo: [9]",
+            "2: memories.plant.fifo[0]: found 9, allowed: those of a count and a register after "
+            "it, of 0 to 9",
+        ),
+        (
+            "coils: 8",
+            "coils: 8, fifo: [3, 3]",
+            "2: memories.plant.fifo[1]: found 3 again, allowed: once",
+        ),
+        (
+            "holding_registers: 10",
+            "fifo: [3]",
+            "2: memories.plant.fifo[0]: found 3, allowed: none: the memory has no "
+            "holding_registers",
         ),
         (
             "coils: 8",

@@ -290,7 +290,7 @@ def test_a_rule_without_a_route_takes_only_functions_of_memories(folder: Folder,
     units = changed(', 7: {route: drive}, "20-40": {route: bus}', "")
     assert told(folder, f"{units}        {key}: [3, 65]\n") == [
         f"14: listeners.scada.rules[0].{key}[1]: found 65, allowed: 1, 2, 3, 4, 5, 6, 7, 8, 11, "
-        "12, 15, 16, 17, 22, 23 or 43"
+        "12, 15, 16, 17, 20, 21, 22, 23, 24 or 43"
     ]
 
 

@@ -28,6 +28,10 @@ listeners:
     bind: 127.0.0.1:5020
     rules:
 """
+FILES = """\
+  files: {coils: 1, files: {4: 10}}
+  queues: {holding_registers: 9, fifo: [3]}
+"""
 UNIT = "{memory: plant, access: read-only, functions: [3, 8]}"
 STATUS = "1: {memory: plant, exception_status: {area: coils, address: 0}}"
 RANGES = (
@@ -115,8 +119,9 @@ def test_the_first_rule_that_names_a_unit_decides_for_it(folder: Folder) -> None
         **dict.fromkeys((1, 5, 6, 7), "read-only"),
         **dict.fromkeys((2, 3, 4, 9), "read-write"),
     }
-    assert 3 in units[2].codes(event_log=False)
-    assert not {5, 6, 15, 16, 22, 23} & set(units[1].codes(event_log=False))
+    memories = folder.config(HEAD + first).memories
+    assert 3 in units[2].codes(memories, event_log=False)
+    assert not {5, 6, 15, 16, 22, 23} & set(units[1].codes(memories, event_log=False))
 
 
 @pytest.mark.parametrize(
@@ -146,9 +151,9 @@ def test_the_first_rule_that_names_a_unit_decides_for_it(folder: Folder) -> None
          "functions[1]: found 3 again, allowed: once"),
         ("1: {memory: plant, functions: []}", "access: read-only",
          "functions: found an empty list, allowed: a list with at least one entry"),
-        ("1: {memory: plant, functions: [20]}", "access: read-only",
-         "functions[0]: found 20, allowed: 1, 2, 3, 4, 5, 6, 7, 8, 11, 12, 15, 16, 17, 22, 23 "
-         "or 43"),
+        ("1: {memory: plant, functions: [65]}", "access: read-only",
+         "functions[0]: found 65, allowed: 1, 2, 3, 4, 5, 6, 7, 8, 11, 12, 15, 16, 17, 20, 21, 22, "
+         "23, 24 or 43"),
         ("1: {memory: plant, functions: [3], deny: [4]}", "access: read-only",
          "deny: found together with functions, allowed: only one of them"),
         ("1: {memory: plant, read: []}", "access: read-only",
@@ -246,14 +251,34 @@ def test_a_function_that_no_unit_has_is_a_warning(folder: Folder) -> None:
     assert folder.warnings(HEAD + routed) == []
 
 
+def test_functions_of_files_and_queues_that_no_memory_has_are_warnings(folder: Folder) -> None:
+    text = HEAD + rule("1: plant", "access: read-write, functions: [3, 20, 21, 24]")
+    place = "p.yaml:11: listeners.scada.rules[0].functions"
+    assert folder.warnings(text) == [
+        f"{place}[1]: function 20 has no effect: no memory of the rule has files",
+        f"{place}[2]: function 21 has no effect: no memory of the rule has files",
+        f"{place}[3]: function 24 has no effect: no memory of the rule has fifo",
+    ]
+    with_both = text.replace("{coils: 8,", "{coils: 8, files: {4: 10}, fifo: [100],")
+    assert folder.warnings(with_both) == []
+
+
 def test_the_codes_of_a_unit_are_those_that_it_has(folder: Folder) -> None:
     units = rights(folder, HEAD + rule(f"{STATUS}, 2: plant, 3: {{route: drive}}"))
 
-    special = {7, 12}
-    assert special.intersection(units[1].codes(event_log=False)) == {7}
-    assert special.intersection(units[1].codes(event_log=True)) == {7, 12}
-    assert special.intersection(units[2].codes(event_log=True)) == {12}
-    assert special.intersection(units[3].codes(event_log=False)) == {7, 12}
+    special = {7, 12, 20, 21, 24}
+
+    def codes(unit: int, memory: str = "plant", *, event_log: bool = False) -> set[int]:
+        config = folder.config(HEAD.replace("devices:", f"{FILES}devices:") + rule("1: plant"))
+        memories = {"plant": config.memories[memory]}
+        return special.intersection(units[unit].codes(memories, event_log=event_log))
+
+    assert codes(1) == {7}
+    assert codes(1, event_log=True) == {7, 12}
+    assert codes(2, event_log=True) == {12}
+    assert codes(2, "files") == {20, 21}
+    assert codes(2, "queues") == {24}
+    assert codes(3) == special
 
 
 # What never matches

@@ -27,6 +27,10 @@ WRITES: dict[str, tuple[dict[str, Any], bytes]] = {
         {"address": 3, "andMask": 0xFFF0, "orMask": 5},
         bytes.fromhex("16 0003 fff0 0005"),
     ),
+    "/write/file": (
+        {"file": 4, "record": 7, "values": [7]},
+        bytes.fromhex("15 09 06 0004 0007 0001 0007"),
+    ),
 }
 
 

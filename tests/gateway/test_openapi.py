@@ -73,10 +73,17 @@ def serving(compat: Compat | None = None, **limits: float) -> Iterator[Running]:
         return ["127.0.0.1"]
 
     memory = holdfast.Memory(
-        coils=65536, discrete_inputs=1000, holding_registers=65536, input_registers=1000
+        coils=65536,
+        discrete_inputs=1000,
+        holding_registers=65536,
+        input_registers=1000,
+        files={4: 100},
+    )
+    rule = holdfast.Rule(
+        {1: memory, 0: memory}, sources=["127.0.0.1"], access="read-write", fifo={1: [1246]}
     )
     with (
-        holdfast.Server({1: memory, 0: memory}, bind="127.0.0.1:0", access="read-write") as server,
+        holdfast.Server(bind="127.0.0.1:0", rules=[rule]) as server,
         gateways.running(
             allow=["0.0.0.0/0:*"],
             resolve=anybody,

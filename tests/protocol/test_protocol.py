@@ -37,21 +37,25 @@ FUNCTIONS = [
     (15, "Write Multiple Coils", True, COILS, 0, 1968),
     (16, "Write Multiple Registers", True, HOLDING_REGISTERS, 0, 123),
     (17, "Report Server ID", False, None, 0, 0),
+    (20, "Read File Record", False, None, 0, 0),
+    (21, "Write File Record", True, None, 0, 0),
     (22, "Mask Write Register", True, HOLDING_REGISTERS, 0, 1),
     (23, "Read/Write Multiple Registers", True, HOLDING_REGISTERS, 125, 121),
+    (24, "Read FIFO Queue", False, None, 0, 0),
     (43, "Encapsulated Interface Transport", False, None, 0, 0),
 ]
 
 
 def test_the_functions_are_those_of_the_standard() -> None:
     assert [tuple(each) for each in protocol.FUNCTIONS] == FUNCTIONS
-    assert protocol.WRITING_CODES == server_model.WRITES == (5, 6, 15, 16, 22, 23)
-    assert protocol.BROADCAST_CODES == (5, 6, 15, 16, 22)
+    assert protocol.WRITING_CODES == server_model.WRITES == (5, 6, 15, 16, 21, 22, 23)
+    assert protocol.BROADCAST_CODES == (5, 6, 15, 16, 21, 22)
 
 
 @pytest.mark.parametrize("function", protocol.FUNCTIONS, ids=lambda each: each.name)
 def test_a_function_writes_if_it_has_something_to_write(function: protocol.Function) -> None:
-    assert function.writes == (function.most_written > 0)
+    of_files = function.code in protocol.FILE_FUNCTIONS
+    assert of_files or function.writes == (function.most_written > 0)
     assert (function.area is None) == (function.most_read == function.most_written == 0)
 
 

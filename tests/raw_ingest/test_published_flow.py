@@ -100,7 +100,7 @@ def read_a_coil(appliance: Appliance) -> bytes:
 
 def held(appliance: Appliance, *areas: str) -> list[list[int]]:
     memory = appliance.memories["plant-1"]
-    return [memory.read(area, START, len(STORED)) for area in areas]  # type: ignore[arg-type]
+    return [memory.read(area, START, len(STORED)) for area in areas]
 
 
 def test_a_sealed_memory_is_restored_over_one_connection(

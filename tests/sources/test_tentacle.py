@@ -93,10 +93,10 @@ def test_every_function_code_and_datatype_of_the_type_is_published(
             tag = {"id": id, "address": address, "functionCode": function, "datatype": kind}
             tags.append(tag | {"byteOrder": "ABCD", "writable": function == "holding"})
             expected[id] = value, datatype
-            memory.write(area, address, registers)  # type: ignore[arg-type]
+            memory.write(area, address, registers)
         address += len(registers)
     for area, function in (("coils", "coil"), ("discrete_inputs", "discrete")):
-        memory.write(area, 3, [1])  # type: ignore[arg-type]
+        memory.write(area, 3, [1])
         tags.append({"id": function, "address": 3, "functionCode": function, "datatype": "boolean"})
         expected[function] = True, "boolean"
     data = caller.listen("modbus.data.pump-skid")

@@ -71,7 +71,8 @@ def rtu_length(received: bytes) -> int | None:
     if code == 43:
         return identification_length(received)
     fixed = {5: 8, 6: 8, 7: 5, 11: 8, 15: 8, 16: 8, 22: 10}
-    end = fixed.get(code, 5 + received[2])
+    of_queue = {24: 6 + int.from_bytes(received[2:4], "big")}
+    end = (fixed | of_queue).get(code, 5 + received[2])
     return end if len(received) >= end else None
 
 

@@ -20,7 +20,7 @@ NO_SUCH_UNIT = 0x0B
 
 BITS = ("coils", "discrete_inputs")
 READ = {1: "coils", 2: "discrete_inputs", 3: "holding_registers", 4: "input_registers"}
-WRITES = (5, 6, 15, 16, 22, 23)
+WRITES = (5, 6, 15, 16, 21, 22, 23)
 SUB_FUNCTIONS = (0, 1, 2, 3, 4, *range(0x0A, 0x13), 0x14)
 CHANGES_STATE = (1, 3, 4, 0x0A, 0x14)
 COUNTERS = range(0x0B, 0x13)

@@ -8,7 +8,7 @@ use holdfast_memory::{Area, Write};
 use holdfast_protocol::pdu::{ExceptionCode, Request};
 use holdfast_protocol::raw_ingest::{Format, Header};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyDict, PyList};
 
 use crate::listed::{items, listed};
 use crate::peer;
@@ -92,6 +92,17 @@ fn request(line: &Bound<'_, PyDict>, pdu: &[u8], passed_on: bool) -> PyResult<()
             line.set_item("address", address)?;
             line.set_item("and_mask", and_mask)?;
             return line.set_item("or_mask", or_mask);
+        }
+        Ok(Request::WriteFileRecord(written)) => {
+            let records = PyList::empty(line.py());
+            for (range, values) in written.iter() {
+                let each = PyDict::new(line.py());
+                each.set_item("area", Area::File(range.file()).name())?;
+                each.set_item("address", range.record())?;
+                each.set_item("values", values.iter().collect::<Vec<_>>())?;
+                records.append(each)?;
+            }
+            return line.set_item("records", records);
         }
         _ if passed_on => {
             let hex: String = pdu.iter().map(|byte| format!("{byte:02x}")).collect();

@@ -59,6 +59,7 @@ impl Request {
             holdfast_memory::Area::InputRegisters => {
                 CoreRequest::ReadInputRegisters(range(address, count)?)
             }
+            holdfast_memory::Area::File(_) => unreachable!("it is one of the four areas"),
         }))
     }
 

@@ -5,7 +5,6 @@
 
 use holdfast_engine::link::{Fault, InFlight, LinkSettings};
 use holdfast_engine::poller::UNMEASURED_COST_MS;
-use holdfast_engine::server::rights::functions::{OTHER_READS, WRITE_FILE_RECORD, is_served};
 use holdfast_engine::tls::TlsFailure;
 use holdfast_journal::log::{CONTACTS_PER_LAG, MAX_LAG, WHEN_BEHIND, WRITE_TIMEOUT};
 use holdfast_memory::{Area, Span};
@@ -20,17 +19,16 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("ADDRESSES", Span::MAX_SIZE)?;
     module.add("MAX_PDU", pdu::MAX_LEN)?;
     module.add("READ_RECORDS", limit::READ_RECORDS)?;
+    module.add("WRITE_RECORDS", limit::WRITE_RECORDS)?;
+    module.add("LAST_RECORD", limit::LAST_RECORD)?;
     module.add("AREAS", PyTuple::new(py, Area::ALL.map(Area::name))?)?;
-    let served = (0..=u8::MAX).filter(|code| is_served(*code));
-    let functions = served.filter_map(Function::from_code).map(|function| {
+    let functions = (0..=u8::MAX).filter_map(Function::from_code).map(|function| {
         let (area, most_read, most_written) = use_of(function);
         let area = area.map(Area::name);
         let (code, name) = (function.code(), function.name());
         (code, name, function.is_write(), area, most_read, most_written)
     });
     module.add("FUNCTIONS", PyTuple::new(py, functions.collect::<Vec<_>>())?)?;
-    module.add("OTHER_READS", PyTuple::new(py, OTHER_READS)?)?;
-    module.add("WRITE_FILE_RECORD", WRITE_FILE_RECORD)?;
     let sub_functions = (0..=u16::MAX).filter_map(SubFunction::from_code);
     let sub_functions = sub_functions.map(|each| (each.code(), each.name(), each.changes_state()));
     module.add("SUB_FUNCTIONS", PyTuple::new(py, sub_functions.collect::<Vec<_>>())?)?;

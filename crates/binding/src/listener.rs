@@ -54,7 +54,8 @@ type Narrow = (String, Option<Vec<i128>>, Option<Vec<i128>>, Limits);
 /// certificate without a role, `None` is any role. `narrowed` are units with rights of their own:
 /// access, functions, denied functions, and the ranges that they may read and write, each an area,
 /// its first address and a count; `None` is everything. `exception_status` is where units have the
-/// eight bits that function 7 reads: area and address. Other units do not have the function.
+/// eight bits that function 7 reads: area and address. `fifo` are the addresses where units have
+/// the queues that function 24 reads. Other units do not have these functions.
 ///
 /// Raises `ValueError` for an invalid source or access.
 #[pyclass(frozen, module = "holdfast")]
@@ -65,7 +66,7 @@ pub struct Rule {
 #[pymethods]
 impl Rule {
     #[new]
-    #[pyo3(signature = (units, *, sources, access, functions=None, deny=None, roles=None, narrowed=None, exception_status=None))]
+    #[pyo3(signature = (units, *, sources, access, functions=None, deny=None, roles=None, narrowed=None, exception_status=None, fifo=None))]
     #[expect(clippy::too_many_arguments, reason = "they are keywords of Python")]
     fn new(
         units: &Bound<'_, PyMapping>,
@@ -76,6 +77,7 @@ impl Rule {
         roles: Option<Vec<String>>,
         narrowed: Option<BTreeMap<i128, Narrow>>,
         exception_status: Option<BTreeMap<i128, (String, i128)>>,
+        fifo: Option<BTreeMap<i128, Vec<i128>>>,
     ) -> PyResult<Rule> {
         let access = word("access", access, &ACCESS)?;
         let functions = self::functions(functions, deny)?;
@@ -86,18 +88,26 @@ impl Rule {
                 functions: self::functions(functions, deny)?,
                 ranges: Ranges::new(ranges(read)?, ranges(write)?),
                 exception_status: None,
+                queues: Box::default(),
             };
             Ok((byte("unit id", unit)?, narrowed))
         });
         let mut narrowed = narrowed.collect::<PyResult<BTreeMap<u8, Narrowed>>>()?;
+        let of_rule = || Narrowed {
+            access,
+            functions: functions.clone(),
+            ranges: Ranges::default(),
+            exception_status: None,
+            queues: Box::default(),
+        };
         for (unit, (area, address)) in exception_status.unwrap_or_default() {
-            let own = narrowed.entry(byte("unit id", unit)?).or_insert_with(|| Narrowed {
-                access,
-                functions: functions.clone(),
-                ranges: Ranges::default(),
-                exception_status: None,
-            });
+            let own = narrowed.entry(byte("unit id", unit)?).or_insert_with(of_rule);
             own.exception_status = Some(bits(&area, address)?);
+        }
+        for (unit, addresses) in fifo.unwrap_or_default() {
+            let own = narrowed.entry(byte("unit id", unit)?).or_insert_with(of_rule);
+            let address = |address| Ok(within("address", address, 0..=65_535)? as u16);
+            own.queues = addresses.into_iter().map(address).collect::<PyResult<_>>()?;
         }
         let (mut memories, mut elsewhere) = (Vec::new(), Vec::new());
         for item in units.items()?.iter() {
@@ -358,8 +368,9 @@ fn ranges(given: Option<Vec<Range>>) -> PyResult<Option<Vec<Items>>> {
 
 /// Eight bits, from an address of an area of bits.
 fn bits(area: &str, address: i128) -> PyResult<(Area, u16)> {
-    let area =
-        word("area", area, &[Area::Coils, Area::DiscreteInputs].map(|area| (area.name(), area)))?;
+    let allowed = [Area::Coils, Area::DiscreteInputs].map(|area| (area.name(), area));
+    let allowed = allowed.each_ref().map(|(name, area)| (&**name, *area));
+    let area = word("area", area, &allowed)?;
     Ok((area, within("address", address, 0..=65_528)? as u16))
 }
 

@@ -1,15 +1,18 @@
 //! `Memory`: converts between Python values and bytes in memory.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use holdfast_memory::{
     Access, Area, Freshness, Gate, GateMode, Layout, Memory as Core, Mirrored, Read, Refusal, Span,
     Write,
 };
+use holdfast_protocol::pdu::limit;
 use pyo3::exceptions::{PyIndexError, PyOSError, PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyByteArray, PyBytes, PyDict, PyInt, PyList, PyString};
 
+use crate::arguments::within;
 use crate::listed::listed;
 use crate::mirror_age::MirrorAge;
 use crate::write_queue::WriteQueue;
@@ -44,8 +47,9 @@ enum Seal {
 /// Four areas of bits and 16-bit registers, of fixed size, initially 0.
 ///
 /// An area is a size (addresses from 0), or start and size; an omitted area does not exist.
-/// `start + size` is at most 65536. Every read sees a whole write or none of it, and a refused
-/// write changes nothing. Methods are thread-safe.
+/// `start + size` is at most 65536. `files` maps numbers of files, 1 to 65535, to their numbers of
+/// records, 1 to 10000; `read` and `write` have them as the areas `file:NUMBER`. Every read sees a
+/// whole write or none of it, and a refused write changes nothing. Methods are thread-safe.
 ///
 /// `seal` is the gate bit, in coils or discrete inputs. Modbus clients receive exception 06 until a
 /// write other than by Modbus sets that bit to 1: permanently (`once`), or while it is 1 (`level`).
@@ -59,12 +63,13 @@ pub struct Memory {
 #[pymethods]
 impl Memory {
     #[new]
-    #[pyo3(signature = (*, coils=None, discrete_inputs=None, holding_registers=None, input_registers=None, seal=None))]
+    #[pyo3(signature = (*, coils=None, discrete_inputs=None, holding_registers=None, input_registers=None, files=None, seal=None))]
     fn new(
         coils: Option<Extent>,
         discrete_inputs: Option<Extent>,
         holding_registers: Option<Extent>,
         input_registers: Option<Extent>,
+        files: Option<BTreeMap<i128, i128>>,
         seal: Option<Seal>,
     ) -> PyResult<Memory> {
         let extents = [coils, discrete_inputs, holding_registers, input_registers];
@@ -78,6 +83,14 @@ impl Memory {
             let span = Span::new(start, size)
                 .map_err(|error| PyValueError::new_err(format!("{}: {error}", area.name())))?;
             layout = layout.with(area, span);
+        }
+        for (number, records) in files.unwrap_or_default() {
+            let number = within("file", number, 1..=usize::from(u16::MAX))? as u16;
+            let most = usize::from(limit::LAST_RECORD) + 1;
+            let records = within("number of records", records, 1..=most)? as u32;
+            let span =
+                Span::new(0, records).map_err(|error| PyValueError::new_err(error.to_string()))?;
+            layout = layout.with(Area::File(number), span);
         }
         let gate = seal.map(gate).transpose()?;
         let core = Core::new(layout, gate)
@@ -98,6 +111,17 @@ impl Memory {
             }
         }
         Ok(areas)
+    }
+
+    /// The number of records of each file.
+    #[getter]
+    fn files(&self) -> BTreeMap<u16, u32> {
+        let layout = self.core.layout();
+        let files = layout.areas().filter_map(|area| match area {
+            Area::File(number) => Some((number, layout.span(area).size())),
+            _ => None,
+        });
+        files.collect()
     }
 
     /// Reserves ranges (area, address, count) for the poller; others can't write them any more.
@@ -245,7 +269,9 @@ impl Memory {
     fn __repr__(&self, py: Python<'_>) -> PyResult<String> {
         let areas = self.areas(py)?;
         let areas = areas.iter().map(|(name, range)| format!("{name}={range}"));
-        Ok(format!("<Memory {}>", areas.collect::<Vec<_>>().join(" ")))
+        let files = self.files();
+        let files = files.iter().map(|(number, records)| format!("file:{number}={records}"));
+        Ok(format!("<Memory {}>", areas.chain(files).collect::<Vec<_>>().join(" ")))
     }
 }
 
@@ -260,7 +286,7 @@ pub(crate) struct Range {
 impl Range {
     /// A range to read. Its bytes are 0 until then.
     pub(crate) fn new(memory: &Core, area: &str, address: i128, count: i128) -> PyResult<Range> {
-        let area = named(area)?;
+        let area = area_or_file(area)?;
         if count < 1 {
             return Err(PyValueError::new_err(format!("count is {count}, at least 1 is allowed")));
         }
@@ -278,7 +304,7 @@ impl Range {
         address: i128,
         values: &Bound<'_, PyAny>,
     ) -> PyResult<Range> {
-        let items = numbers(named(area)?, values)?;
+        let items = numbers(area_or_file(area)?, values)?;
         let mut range =
             Range::new(memory, area, address, items.len() as i128).map_err(|error| {
                 if items.is_empty() { PyValueError::new_err("values are empty") } else { error }
@@ -322,6 +348,10 @@ pub fn named(area: &str) -> PyResult<Area> {
         let known = Area::ALL.map(Area::name).join(", ");
         PyValueError::new_err(format!("unknown area {area:?}, allowed: {known}"))
     })
+}
+
+fn area_or_file(name: &str) -> PyResult<Area> {
+    Area::file_from_name(name).map_or_else(|| named(name), Ok)
 }
 
 fn gate(seal: Seal) -> PyResult<Gate> {

@@ -8,7 +8,6 @@ use holdfast_journal::file::{
     FileError, FileOnDisk, Member, MemoryFile as Core, Options, Source, read, release,
 };
 use holdfast_journal::log::{Checkpoint, Log as CoreLog};
-use holdfast_memory::Area;
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
@@ -120,10 +119,10 @@ pub fn read_memory_file(
             _ => continue,
         };
         let areas = PyDict::new(py);
-        for (area, bytes) in Area::ALL.into_iter().zip(&kept.areas) {
+        for area in kept.layout.areas() {
             let span = kept.layout.span(area);
             if span.size() > 0 {
-                let values = (span.start(), span.size(), PyBytes::new(py, bytes));
+                let values = (span.start(), span.size(), PyBytes::new(py, kept.bytes_of(area)));
                 areas.set_item(area.name(), values)?;
             }
         }

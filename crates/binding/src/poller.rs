@@ -1,5 +1,6 @@
 //! `PolledDevice` and `Poller`: polling, its results and counters; `plan_blocks`: plans.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
@@ -43,7 +44,7 @@ type StatusBlock = (String, u16, String, bool);
 type Forward = (String, String, u16, f64, Vec<(String, u16)>, Option<(u16, StatusBlock)>);
 
 /// Area, address, count, indexes of fields, number of items that no field covers.
-type PlannedBlock = (&'static str, u16, u16, Vec<usize>, u32);
+type PlannedBlock = (Cow<'static, str>, u16, u16, Vec<usize>, u32);
 
 #[pyclass(frozen, module = "holdfast")]
 pub struct PolledDevice {
@@ -379,7 +380,7 @@ type Taken<'py> = (Vec<PollResult<'py>>, Vec<(u64, u16)>);
 /// Device name, scheduled time in seconds, and blocks: area, address, count, bytes or fault, and
 /// seconds since 1970.
 type PollResult<'py> = (String, f64, Vec<ReportedBlock<'py>>);
-type ReportedBlock<'py> = (&'static str, u16, u16, Option<Bound<'py, PyBytes>>, u16, f64);
+type ReportedBlock<'py> = (Cow<'static, str>, u16, u16, Option<Bound<'py, PyBytes>>, u16, f64);
 
 fn reported<'py>(py: Python<'py>, poll: &Poll) -> PyResult<PollResult<'py>> {
     let blocks = poll.blocks.iter().map(|block| {

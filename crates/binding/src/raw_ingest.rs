@@ -46,7 +46,7 @@ pub fn encode_raw_ingest<'py>(
     crc: &str,
 ) -> PyResult<Bound<'py, PyBytes>> {
     let format = packet_format(format, crc)?;
-    let area = in_packet(named(area)?);
+    let area = in_packet(named(area)?).expect("it is one of the four areas");
     let count = NonZeroU16::new(count).ok_or_else(|| PyValueError::new_err("count is 0"))?;
     let header = Header { area, target, address, count };
     PyBytes::new_with(py, format.packet_len(&header), |packet| {

@@ -1,5 +1,6 @@
 //! `WriteQueue`: the writes to a memory.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use holdfast_memory::{Access, WriteQueue as CoreQueue};
@@ -10,7 +11,7 @@ use crate::arguments::seconds;
 use crate::listed::listed;
 
 /// Area, address, values, and whether a Modbus client wrote them.
-type Written<'py> = (&'static str, u16, Bound<'py, PyList>, bool);
+type Written<'py> = (Cow<'static, str>, u16, Bound<'py, PyList>, bool);
 
 #[pyclass(frozen, module = "holdfast")]
 pub struct WriteQueue {

@@ -12,11 +12,13 @@ pub fn of_packet(area: raw_ingest::Area) -> Area {
     }
 }
 
-pub fn in_packet(area: Area) -> raw_ingest::Area {
-    match area {
+/// `None` for a file: packets have no code for it.
+pub fn in_packet(area: Area) -> Option<raw_ingest::Area> {
+    Some(match area {
         Area::Coils => raw_ingest::Area::Coils,
         Area::DiscreteInputs => raw_ingest::Area::DiscreteInputs,
         Area::HoldingRegisters => raw_ingest::Area::HoldingRegisters,
         Area::InputRegisters => raw_ingest::Area::InputRegisters,
-    }
+        Area::File(_) => return None,
+    })
 }

@@ -76,6 +76,7 @@ impl Setup {
         let span = Span::new(0, 100).unwrap();
         let layout =
             Area::ALL.into_iter().fold(Layout::default(), |layout, area| layout.with(area, span));
+        let layout = layout.with(Area::File(4), span);
         let memory = Arc::new(Memory::new(layout, None).unwrap());
         let journal = Arc::<Manual>::default();
         memory.keep_in(Arc::clone(&journal) as Arc<dyn Journal>, 0);
@@ -218,11 +219,15 @@ fn packet(address: u16, value: u16) -> Vec<u8> {
 fn each_write_is_answered_when_it_is_carried_out() {
     let setup = Setup::new();
     let mut client = setup.connect(0);
-    let cases: [(&[u8], &[u8]); 6] = [
+    let cases: [(&[u8], &[u8]); 7] = [
         (&[5, 0, 1, 0xFF, 0], &[5, 0, 1, 0xFF, 0]),
         (&[6, 0, 1, 0, 0x12], &[6, 0, 1, 0, 0x12]),
         (&[15, 0, 2, 0, 9, 2, 0xFF, 1], &[15, 0, 2, 0, 9]),
         (&[16, 0, 2, 0, 2, 4, 1, 2, 3, 4], &[16, 0, 2, 0, 2]),
+        (
+            &[21, 18, 6, 0, 4, 0, 7, 0, 1, 1, 1, 6, 0, 4, 0, 9, 0, 1, 2, 2],
+            &[21, 18, 6, 0, 4, 0, 7, 0, 1, 1, 1, 6, 0, 4, 0, 9, 0, 1, 2, 2],
+        ),
         (&[22, 0, 1, 0, 0xF2, 0, 0x25], &[22, 0, 1, 0, 0xF2, 0, 0x25]),
         (&[23, 0, 1, 0, 2, 0, 2, 0, 1, 2, 9, 9], &[23, 4, 0, 0x17, 9, 9]),
     ];

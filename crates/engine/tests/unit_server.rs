@@ -55,6 +55,7 @@ fn within(memory: &Arc<Memory>, read: &[(u16, u32)], write: &[(u16, u32)]) -> Pe
         functions: Functions::Except(vec![4]),
         ranges: Ranges::new(items(read), items(write)),
         exception_status: None,
+        queues: Box::default(),
     };
     PeerRights::new(&Rule {
         sources: Vec::new(),
@@ -149,6 +150,7 @@ fn a_broadcast_reaches_a_memory_by_the_unit_that_may_write() {
         functions: Functions::All,
         ranges: Ranges::default(),
         exception_status: None,
+        queues: Box::default(),
     };
     let rights = PeerRights::new(&Rule {
         sources: Vec::new(),
@@ -321,6 +323,7 @@ fn with_status(memory: &Arc<Memory>, functions: Functions, read: Option<Vec<Item
         functions,
         ranges: Ranges::new(read, None),
         exception_status: Some((Area::Coils, 4)),
+        queues: Box::default(),
     };
     PeerRights::new(&Rule {
         sources: Vec::new(),
@@ -446,5 +449,176 @@ fn function_12_is_refused_where_a_rule_denies_it() {
     });
     for unit_id in [7, 9] {
         assert_eq!(ask(&unit_server, &rights, unit_id, EVENT_LOG).unwrap(), [0x8C, 1]);
+    }
+}
+
+/// Unit 7 has files 4 and 3 and two queues, unit 8 only the files.
+fn with_files(seal: Option<Gate>) -> (Arc<Memory>, PeerRights) {
+    let span = |size| Span::new(0, size).unwrap();
+    let layout = Layout::default()
+        .with(Area::HoldingRegisters, span(1250))
+        .with(Area::Coils, span(1))
+        .with(Area::File(4), span(10_000))
+        .with(Area::File(3), span(11));
+    let memory = Arc::new(Memory::new(layout, seal).unwrap());
+    let own = Narrowed {
+        access: AccessMode::ReadWrite,
+        functions: Functions::All,
+        ranges: Ranges::default(),
+        exception_status: None,
+        queues: Box::new([1246, 100]),
+    };
+    let rights = with_own(&memory, own);
+    (memory, rights)
+}
+
+fn with_own(memory: &Arc<Memory>, own: Narrowed) -> PeerRights {
+    PeerRights::new(&Rule {
+        sources: Vec::new(),
+        roles: None,
+        units: vec![(7, Arc::clone(memory)), (8, Arc::clone(memory))],
+        elsewhere: Vec::new(),
+        access: AccessMode::ReadWrite,
+        functions: Functions::All,
+        narrowed: vec![(7, own)],
+    })
+}
+
+fn fill(memory: &Memory, area: Area, address: u16, values: &[u16]) {
+    let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_be_bytes()).collect();
+    let write = Write { area, address, count: values.len(), bytes: &bytes };
+    memory.write(Access::Ingest, write).unwrap();
+}
+
+#[test]
+fn functions_20_and_21_answer_as_the_examples_of_the_standard_do() {
+    let ((memory, rights), unit_server) = (with_files(None), unit_server());
+    fill(&memory, Area::File(4), 1, &[0x0DFE, 0x0020]);
+    fill(&memory, Area::File(3), 9, &[0x33CD, 0x0040]);
+    let read = [20, 0x0E, 6, 0, 4, 0, 1, 0, 2, 6, 0, 3, 0, 9, 0, 2];
+    let answer = [20, 0x0C, 5, 6, 0x0D, 0xFE, 0x00, 0x20, 5, 6, 0x33, 0xCD, 0x00, 0x40];
+    assert_eq!(ask(&unit_server, &rights, 7, &read).unwrap(), answer);
+    let write = [21, 0x0D, 6, 0, 4, 0, 7, 0, 3, 0x06, 0xAF, 0x04, 0xBE, 0x10, 0x0D];
+    assert_eq!(ask(&unit_server, &rights, 8, &write).unwrap(), write);
+    let written = ask(&unit_server, &rights, 8, &[20, 7, 6, 0, 4, 0, 7, 0, 3]).unwrap();
+    assert_eq!(written, [20, 8, 7, 6, 0x06, 0xAF, 0x04, 0xBE, 0x10, 0x0D]);
+}
+
+#[test]
+fn files_are_refused_as_the_diagrams_of_the_standard_say() {
+    let ((memory, rights), unit_server) = (with_files(None), unit_server());
+    for (request, code) in [
+        // The byte count.
+        (&[20, 0][..], 3),
+        (&[20, 6, 6, 0, 4, 0, 1, 0], 3),
+        (&[20, 8, 6, 0, 4, 0, 1, 0, 2], 3),
+        (&[20, 7, 6, 0, 4, 0, 1, 0, 2, 0], 3),
+        (&[21, 7, 6, 0, 4, 0, 1, 0, 0], 3),
+        (&[21, 9, 6, 0, 4, 0, 1, 0, 2, 1, 1], 3),
+        // 122 records do not fit into a reply.
+        (&[20, 7, 6, 0, 4, 0, 1, 0, 122], 3),
+        // The reference type, the file and the record.
+        (&[20, 7, 7, 0, 4, 0, 1, 0, 2], 2),
+        (&[20, 7, 6, 0, 0, 0, 1, 0, 2], 2),
+        (&[20, 7, 6, 0, 5, 0, 1, 0, 2], 2),
+        (&[20, 7, 6, 0, 4, 0x27, 0x10, 0, 1], 2),
+        (&[20, 7, 6, 0, 4, 0x27, 0x0F, 0, 2], 2),
+        (&[20, 7, 6, 0, 3, 0, 10, 0, 2], 2),
+        (&[20, 7, 6, 0, 4, 0, 1, 0, 0], 2),
+        (&[21, 9, 5, 0, 4, 0, 1, 0, 1, 1, 1], 2),
+        (&[21, 9, 6, 0, 3, 0, 11, 0, 1, 1, 1], 2),
+    ] {
+        let refused = [request[0] | 0x80, code];
+        assert_eq!(ask(&unit_server, &rights, 7, request).unwrap(), refused, "{request:?}");
+    }
+    assert_eq!(memory.writes(), 0);
+}
+
+#[test]
+fn several_records_are_written_together_or_not_at_all() {
+    let ((memory, rights), unit_server) = (with_files(None), unit_server());
+    let both = [21, 18, 6, 0, 4, 0, 7, 0, 1, 1, 1, 6, 0, 3, 0, 10, 0, 1, 2, 2];
+    assert_eq!(ask(&unit_server, &rights, 7, &both).unwrap(), both);
+    assert_eq!(memory.writes(), 1);
+    let mut beyond = both;
+    (beyond[9], beyond[15]) = (9, 11);
+    assert_eq!(ask(&unit_server, &rights, 7, &beyond).unwrap(), [0x95, 2]);
+    let read = [20, 14, 6, 0, 4, 0, 7, 0, 1, 6, 0, 3, 0, 10, 0, 1];
+    assert_eq!(ask(&unit_server, &rights, 7, &read).unwrap(), [20, 8, 3, 6, 1, 1, 3, 6, 2, 2]);
+    assert_eq!(memory.writes(), 1);
+}
+
+#[test]
+fn a_unit_without_files_or_queues_does_not_have_their_functions() {
+    let (plain, unit_server) = (memory(10), unit_server());
+    let rights = rights(&[(7, &plain)], AccessMode::ReadWrite);
+    for request in [&[20][..], &[20, 7, 6, 0, 4, 0, 1, 0, 2], &[21], &[24, 0, 0]] {
+        assert_eq!(ask(&unit_server, &rights, 7, request).unwrap(), [request[0] | 0x80, 1]);
+    }
+    let (_, rights) = with_files(None);
+    assert_eq!(ask(&unit_server, &rights, 8, &[24, 4, 0xDE]).unwrap(), [0x98, 1]);
+    assert_eq!(ask(&unit_server, &rights, 9, &[20, 0]).unwrap(), [0x94, 0x0B]);
+}
+
+#[test]
+fn function_24_answers_as_the_example_of_the_standard_does() {
+    let ((memory, rights), unit_server) = (with_files(None), unit_server());
+    fill(&memory, Area::HoldingRegisters, 1246, &[2, 0x01B8, 0x1284]);
+    let read = [24, 4, 0xDE];
+    let answer = [24, 0, 6, 0, 2, 0x01, 0xB8, 0x12, 0x84];
+    for _ in 0..2 {
+        assert_eq!(ask(&unit_server, &rights, 7, &read).unwrap(), answer, "it stays as it is");
+    }
+    let queue = [24, 0, 100];
+    assert_eq!(ask(&unit_server, &rights, 7, &queue).unwrap(), [24, 0, 2, 0, 0]);
+    fill(&memory, Area::HoldingRegisters, 100, &[31]);
+    let full = ask(&unit_server, &rights, 7, &queue).unwrap();
+    assert_eq!((&full[..5], full.len()), (&[24, 0, 64, 0, 31][..], 67));
+    for count in [32, u16::MAX] {
+        fill(&memory, Area::HoldingRegisters, 100, &[count]);
+        assert_eq!(ask(&unit_server, &rights, 7, &queue).unwrap(), [0x98, 3]);
+    }
+    // 1250 does not exist.
+    fill(&memory, Area::HoldingRegisters, 1246, &[4]);
+    assert_eq!(ask(&unit_server, &rights, 7, &read).unwrap(), [0x98, 2]);
+    assert_eq!(ask(&unit_server, &rights, 7, &[24, 4, 0xDF]).unwrap(), [0x98, 2], "not a queue");
+    assert_eq!(ask(&unit_server, &rights, 7, &[24, 4]).unwrap(), [0x98, 3]);
+}
+
+#[test]
+fn files_and_queues_have_the_checks_of_other_reads_and_writes() {
+    let unit_server = unit_server();
+    let write = &[21, 9, 6, 0, 4, 0, 7, 0, 1, 1, 1][..];
+    let (read, queue) = (&[20, 7, 6, 0, 4, 0, 7, 0, 1][..], &[24, 0, 100][..]);
+    let gate = Gate { area: Area::Coils, address: 0, mode: GateMode::Level };
+    let (_, rights) = with_files(Some(gate));
+    for request in [read, write, queue] {
+        assert_eq!(ask(&unit_server, &rights, 7, request).unwrap(), [request[0] | 0x80, 6]);
+    }
+    let (memory, _) = with_files(None);
+    let items = |area, address, count| vec![Items { area, address, count }];
+    let own = |access, functions, read, write| {
+        let (queues, ranges) = (Box::new([100]), Ranges::new(read, write));
+        let own = Narrowed { access, functions, ranges, exception_status: None, queues };
+        with_own(&memory, own)
+    };
+    let registers = |address, count| items(Area::HoldingRegisters, address, count);
+    let file = |address, count| items(Area::File(4), address, count);
+    let (only_reads, writes) = (AccessMode::ReadOnly, AccessMode::ReadWrite);
+    let denied = Functions::Except(vec![20, 24]);
+    let all = Functions::All;
+    for (rights, codes) in [
+        (own(only_reads, all.clone(), None, None), [0, 1, 0]),
+        (own(writes, denied, None, None), [1, 0, 1]),
+        (own(writes, all.clone(), Some(registers(100, 32)), Some(registers(0, 9))), [2, 2, 0]),
+        (own(writes, all.clone(), Some(registers(100, 31)), None), [2, 0, 2]),
+        (own(writes, all.clone(), Some(file(7, 1)), Some(file(6, 2))), [0, 0, 2]),
+        (own(writes, all, Some(file(8, 9)), Some(file(0, 7))), [2, 2, 2]),
+    ] {
+        for (request, code) in [read, write, queue].into_iter().zip(codes) {
+            let reply = ask(&unit_server, &rights, 7, request).unwrap();
+            let refused = [request[0] | 0x80, code];
+            assert!(if code == 0 { reply[0] == request[0] } else { reply == refused }, "{reply:?}");
+        }
     }
 }

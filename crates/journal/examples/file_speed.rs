@@ -110,7 +110,8 @@ fn main() {
         let bytes = (number as u16 ^ (number >> 16) as u16).to_be_bytes();
         let address = (number.wrapping_mul(2_654_435_761) >> 16) as u16 % REGISTERS;
         let area = Area::HoldingRegisters;
-        let operation = Operation::Write(Write { area, address, count: 1, bytes: &bytes });
+        let write = Write { area, address, count: 1, bytes: &bytes };
+        let operation = Operation::Write(std::slice::from_ref(&write));
         let done = Box::new(move |outcome: holdfast_memory::Outcome| {
             outcome.expect("the write is stored");
             drop(sender);

@@ -113,7 +113,7 @@ fn next(
             next(&again, address, &count, &stop, &running);
         }
     });
-    memory.submit(Access::Client, Operation::Write(write), done).unwrap();
+    memory.submit(Access::Client, Operation::Write(&[write]), done).unwrap();
 }
 
 async fn bare_latency(context: &jetstream::Context) -> Duration {

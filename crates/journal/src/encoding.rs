@@ -1,7 +1,7 @@
 //! Steps as bytes, so that a file or a log can hold them.
 //!
 //! An encoded step begins with its version. Numbers are little-endian. The number of bytes of a
-//! range follows from its area and count.
+//! range follows from its area and count. A file is area 4, followed by its number.
 
 use std::sync::Arc;
 
@@ -10,6 +10,9 @@ use thiserror::Error;
 
 /// The version that [`encode`] writes. Others are not decoded.
 pub const VERSION: u8 = 1;
+
+/// The number of a file as an area.
+const FILE: u8 = Area::File(0).index() as u8;
 
 /// In the order of their numbers.
 const ACCESSES: [Access; 4] = [Access::Client, Access::Ingest, Access::Mirror, Access::Restore];
@@ -73,7 +76,10 @@ fn encode_write(write: &StepWrite, out: &mut Vec<u8>) {
 
 fn encode_place(member: u16, area: Area, address: u16, out: &mut Vec<u8>) {
     out.extend_from_slice(&member.to_le_bytes());
-    out.push(area as u8);
+    out.push(area.index() as u8);
+    if let Area::File(number) = area {
+        out.extend_from_slice(&number.to_le_bytes());
+    }
     out.extend_from_slice(&address.to_le_bytes());
 }
 
@@ -166,7 +172,13 @@ impl<'a> Rest<'a> {
 
     fn place(&mut self) -> Result<(u16, Area, u16), DecodeError> {
         let member = self.u16()?;
-        let area = self.one_of(&Area::ALL, "the area")?;
+        let area = match self.byte()? {
+            FILE => Area::File(self.u16()?),
+            found => {
+                let area = Area::ALL.get(usize::from(found)).copied();
+                area.ok_or(DecodeError::Unknown { what: "the area", found })?
+            }
+        };
         Ok((member, area, self.u16()?))
     }
 

@@ -14,6 +14,17 @@ use proptest::sample::select;
 const SPANS: [[(u16, u32); 4]; 2] =
     [[(0, 65_536), (7, 20), (100, 300), (0, 1)], [(0, 9), (0, 0), (65_530, 6), (3, 70)]];
 
+/// Files of both memories, with their numbers of records.
+const FILES: [(u16, u32); 2] = [(4, 300), (u16::MAX, 1)];
+
+fn span(member: u16, area: Area) -> (u16, u32) {
+    let file = |number| FILES.iter().find(|(other, _)| *other == number).unwrap().1;
+    match area {
+        Area::File(number) => (0, file(number)),
+        area => SPANS[usize::from(member)][area.index()],
+    }
+}
+
 fn members() -> Vec<Arc<Memory>> {
     SPANS
         .map(|spans| {
@@ -21,6 +32,9 @@ fn members() -> Vec<Arc<Memory>> {
                 Area::ALL.into_iter().zip(spans).fold(Layout::default(), |layout, (area, span)| {
                     layout.with(area, Span::new(span.0, span.1).unwrap())
                 });
+            let layout = FILES.iter().fold(layout, |layout, (number, records)| {
+                layout.with(Area::File(*number), Span::new(0, *records).unwrap())
+            });
             Arc::new(Memory::new(layout, None).unwrap())
         })
         .to_vec()
@@ -32,12 +46,9 @@ fn access() -> impl Strategy<Value = Access> {
 
 /// A range inside an area: member, area, address, count.
 fn range(member: u16, areas: &'static [Area]) -> impl Strategy<Value = (u16, Area, u16, usize)> {
-    let existing = areas
-        .iter()
-        .filter(|area| SPANS[usize::from(member)][**area as usize].1 > 0)
-        .collect::<Vec<_>>();
+    let existing = areas.iter().filter(|area| span(member, **area).1 > 0).collect::<Vec<_>>();
     select(existing).prop_flat_map(move |area| {
-        let (start, size) = SPANS[usize::from(member)][*area as usize];
+        let (start, size) = span(member, *area);
         (0..size, 0..size).prop_map(move |(one, other)| {
             let (first, last) = (one.min(other), one.max(other));
             (member, *area, start + first as u16, (last - first + 1) as usize)
@@ -45,8 +56,15 @@ fn range(member: u16, areas: &'static [Area]) -> impl Strategy<Value = (u16, Are
     })
 }
 
-const ALL: &[Area] = &Area::ALL;
-const REGISTERS: &[Area] = &[Area::HoldingRegisters, Area::InputRegisters];
+const ALL: &[Area] = &[
+    Area::Coils,
+    Area::DiscreteInputs,
+    Area::HoldingRegisters,
+    Area::InputRegisters,
+    Area::File(4),
+    Area::File(u16::MAX),
+];
+const REGISTERS: &[Area] = &[Area::HoldingRegisters, Area::InputRegisters, Area::File(4)];
 
 fn write_to(member: u16) -> impl Strategy<Value = StepWrite> {
     range(member, ALL).prop_flat_map(|(member, area, address, count)| {

@@ -9,9 +9,10 @@ use holdfast_journal::file::{
     Disk, FileError, FileOnDisk, MemoryFile, Options, read_from, release,
 };
 use holdfast_memory::{
-    Access, Area, Freshness, Gate, GateMode, Layout, Memory, Mirrored, Refusal, Span, Write,
+    Access, Area, Freshness, Gate, GateMode, Layout, Memory, Mirrored, Read, Refusal, Span, Write,
     write_across,
 };
+use redb::{Database, ReadableDatabase, TableDefinition};
 use support::sim::SimDisk;
 use support::{
     REGISTERS, at_once, contents, get, keep, layout, member, memory, set, submit, until,
@@ -32,7 +33,7 @@ fn contents_survive_a_restart() {
         let path = folder(&format!("restart{}", sync.as_secs())).join("memories.redb");
         let disk = Arc::new(FileOnDisk::new(&path));
         let layout = layout(9, 1000);
-        let (one, two) = (memory(layout, None), memory(layout, None));
+        let (one, two) = (memory(layout.clone(), None), memory(layout.clone(), None));
         let file = keep(&disk, &[("one", &one), ("two", &two)], Options::new(sync)).unwrap();
         assert!(file.loaded().is_empty());
         set(&one, 999, 7).unwrap();
@@ -47,7 +48,7 @@ fn contents_survive_a_restart() {
             assert_eq!(set(&one, 0, 1), REFUSED);
             assert_eq!(get(&one, 0), 0);
         }
-        let (one, two) = (memory(layout, None), memory(layout, None));
+        let (one, two) = (memory(layout.clone(), None), memory(layout.clone(), None));
         let members = vec![member("one", &one), member("two", &two)];
         let file = MemoryFile::open(disk, members, Options::new(sync)).unwrap();
         assert_eq!(file.loaded(), ["one", "two"]);
@@ -324,7 +325,7 @@ fn a_resized_area_keeps_the_addresses_of_both() {
         .with(Area::Coils, span(10, 5))
         .with(Area::DiscreteInputs, span(0, 8));
     for round in 0..2 {
-        let one = memory(after, None);
+        let one = memory(after.clone(), None);
         let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
         for address in 120..1120 {
             assert_eq!(get(&one, address), if address < 150 { address } else { 0 });
@@ -351,7 +352,7 @@ fn a_resized_area_keeps_the_addresses_of_both() {
 fn what_was_cut_comes_back_with_its_addresses() {
     let disk = Arc::new(SimDisk::default());
     let whole = layout(40, 600);
-    let one = memory(whole, None);
+    let one = memory(whole.clone(), None);
     let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
     for address in 0..600 {
         set(&one, address, address + 1).unwrap();
@@ -372,7 +373,7 @@ fn what_was_cut_comes_back_with_its_addresses() {
     ] {
         keep(&disk, &[("one", &memory(other, None))], at_once()).unwrap();
     }
-    let again = memory(whole, None);
+    let again = memory(whole.clone(), None);
     let file = keep(&disk, &[("one", &again)], at_once()).unwrap();
     assert_eq!(contents(&again), expected);
     let back = "had no addresses and now has addresses 0-39: no address is kept, \
@@ -384,6 +385,69 @@ fn what_was_cut_comes_back_with_its_addresses() {
     assert!(file.warnings().is_empty());
     file.stop().unwrap();
     assert_eq!(read_from(&*disk).unwrap().len(), 1);
+}
+
+const VERSION_OF: TableDefinition<&str, u64> = TableDefinition::new("holdfast");
+
+/// The version of the format of a file.
+fn format_of(disk: &SimDisk) -> u64 {
+    let path = folder("format").join("copy.redb");
+    std::fs::write(&path, disk.bytes()).unwrap();
+    let database = Database::open(&path).unwrap();
+    let about = database.begin_read().unwrap().open_table(VERSION_OF).unwrap();
+    about.get("format").unwrap().unwrap().value()
+}
+
+#[test]
+fn older_programs_read_a_file_until_a_memory_in_it_has_files() {
+    let disk = Arc::new(SimDisk::default());
+    let plain = || memory(layout(3, 5), None);
+    keep(&disk, &[("one", &plain())], at_once()).unwrap().stop().unwrap();
+    assert_eq!(format_of(&disk), 1);
+    let with_file = layout(3, 5).with(Area::File(4), Span::new(0, 2).unwrap());
+    let two = memory(with_file, None);
+    keep(&disk, &[("one", &plain()), ("two", &two)], at_once()).unwrap().stop().unwrap();
+    assert_eq!(format_of(&disk), 2);
+}
+
+#[test]
+fn files_keep_their_records_and_what_is_cut_comes_back() {
+    let disk = Arc::new(SimDisk::default());
+    let files = |files: &[(u16, u32)]| {
+        let layout = files.iter().fold(layout(0, 1), |layout, (number, records)| {
+            layout.with(Area::File(*number), Span::new(0, *records).unwrap())
+        });
+        memory(layout, None)
+    };
+    let record = |memory: &Memory, number: u16, record: u16| {
+        let mut out = [0; 2];
+        let read = Read { area: Area::File(number), address: record, count: 1, out: &mut out };
+        memory.read(Access::Client, read).map(|()| u16::from_be_bytes(out))
+    };
+    let one = files(&[(4, 10_000), (7, 3)]);
+    let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+    for (number, address, value) in [(4, 0, 1), (4, 9999, 2), (7, 2, 3)] {
+        let bytes = u16::to_be_bytes(value);
+        let write = Write { area: Area::File(number), address, count: 1, bytes: &bytes };
+        one.write(Access::Client, write).unwrap();
+    }
+    file.stop().unwrap();
+    // The files before and between others change their places.
+    let other = files(&[(1, 500), (4, 5), (6, 1), (7, 4)]);
+    let file = keep(&disk, &[("one", &other)], at_once()).unwrap();
+    assert_eq!((record(&other, 4, 0), record(&other, 7, 2)), (Ok(1), Ok(3)));
+    assert_eq!(record(&other, 4, 5), Err(Refusal::OutOfRange));
+    let expected = "one: file:4 had addresses 0-9999 and now has addresses 0-4: addresses 0-4 are \
+                    kept, addresses 5-9999 are set aside";
+    assert!(file.warnings().iter().any(|warning| warning == expected), "{:?}", file.warnings());
+    file.stop().unwrap();
+    let again = files(&[(4, 10_000), (7, 3)]);
+    keep(&disk, &[("one", &again)], at_once()).unwrap().stop().unwrap();
+    assert_eq!(contents(&again), contents(&one));
+    let stored = read_from(&*disk).unwrap();
+    let stored = stored.iter().find(|stored| stored.name == "one").unwrap();
+    assert_eq!(stored.bytes_of(Area::File(7)), [0, 0, 0, 0, 0, 3]);
+    assert!(stored.bytes_of(Area::File(1)).is_empty());
 }
 
 #[test]

@@ -202,8 +202,8 @@ fn files_of_newer_releases_are_refused() {
         let found = database.begin_read().unwrap().open_table(ABOUT).unwrap();
         assert_eq!(found.get("format").unwrap().unwrap().value(), version);
     };
-    set_version(2);
-    let expected = "the file is of a newer release: its format version is 2, allowed: 1";
+    set_version(3);
+    let expected = "the file is of a newer release: its format version is 3, allowed: 2";
     assert_eq!(refusal(&path), expected);
     set_version(0);
     assert!(refusal(&path).contains("damaged"));

@@ -285,7 +285,7 @@ fn a_thread_that_panics_leaves_nobody_waiting() {
     let bytes = [0, 1];
     let write = Write { area: REGISTERS, address: 1, count: 1, bytes: &bytes };
     let panicking = Box::new(|_| panic!("a receiver that panics"));
-    one.submit(Access::Ingest, Operation::Write(write), panicking).unwrap();
+    one.submit(Access::Ingest, Operation::Write(&[write]), panicking).unwrap();
     let behind = submit(&one, 2, 1);
     disk.hold(false);
     first.recv().unwrap().unwrap();

@@ -18,6 +18,8 @@ use support::{contents, keep};
 #[derive(Debug, Clone)]
 struct Shape {
     spans: [(u16, u32); 4],
+    /// How many records the files of [`FILES`] have.
+    files: [u32; 3],
     gate: Option<(u16, GateMode)>,
 }
 
@@ -30,6 +32,9 @@ enum Event {
     Reopen { shapes: [Shape; 2], cleanly: bool },
 }
 
+/// Numbers of files.
+const FILES: [u16; 3] = [1, 4, u16::MAX];
+
 impl Shape {
     fn memory(&self) -> Arc<Memory> {
         let layout = Area::ALL
@@ -38,6 +43,9 @@ impl Shape {
             .fold(Layout::default(), |layout, (area, (start, size))| {
                 layout.with(area, Span::new(start, size).unwrap())
             });
+        let layout = FILES.into_iter().zip(self.files).fold(layout, |layout, (number, records)| {
+            layout.with(Area::File(number), Span::new(0, records).unwrap())
+        });
         let (start, size) = self.spans[0];
         let gate = self.gate.filter(|_| size > 0).map(|(address, mode)| Gate {
             area: Area::Coils,
@@ -114,7 +122,7 @@ fn items(memory: &Memory) -> HashMap<(Area, u16), u16> {
         memory.read(Access::Ingest, Read { area, address, count: 1, out: &mut *out }).unwrap();
         ((area, address), out.iter().fold(0, |value, byte| value << 8 | u16::from(*byte)))
     };
-    Area::ALL.into_iter().flat_map(addresses).map(value).collect()
+    memory.layout().areas().flat_map(addresses).map(value).collect()
 }
 
 /// The items of a memory, also those that it had before.
@@ -153,11 +161,13 @@ fn shape() -> impl Strategy<Value = Shape> {
     ];
     let mode = prop_oneof![Just(GateMode::Once), Just(GateMode::Level)];
     let gate = prop::option::weighted(0.3, (0..700_u16, mode));
-    (prop::array::uniform4(span), gate).prop_map(|(spans, gate)| Shape { spans, gate })
+    let records = prop_oneof![Just(0), Just(1), 0..700_u32];
+    let shape = (prop::array::uniform4(span), prop::array::uniform3(records), gate);
+    shape.prop_map(|(spans, files, gate)| Shape { spans, files, gate })
 }
 
 fn area() -> impl Strategy<Value = Area> {
-    prop::sample::select(Area::ALL.to_vec())
+    prop::sample::select([&Area::ALL[..], &FILES.map(Area::File)].concat())
 }
 
 fn address() -> impl Strategy<Value = u16> {

@@ -7,19 +7,23 @@ use std::sync::mpsc::{Receiver, channel};
 
 use holdfast_journal::file::{MemoryFile, Options, read_from};
 use holdfast_memory::{
-    Access, Area, CarriedOut, Contents, Gate, GateMode, Memory, Operation, Outcome, Write,
+    Access, Area, CarriedOut, Contents, Gate, GateMode, Memory, Operation, Outcome, Span, Write,
     write_across,
 };
 use support::sim::SimDisk;
 use support::{REGISTERS, Random, at_once, contents, keep, layout, memory, rounds, set, until};
 
 const COUNT: u64 = 400;
+const FILE: Area = Area::File(9);
 
 type Memories = [Arc<Memory>; 2];
 
 fn memories() -> Memories {
     let gate = Gate { area: Area::Coils, address: 70, mode: GateMode::Level };
-    [memory(layout(200, COUNT as u32), None), memory(layout(100, 50), Some(gate))]
+    let with_file = layout(200, COUNT as u32).with(FILE, Span::new(0, COUNT as u32).unwrap());
+    let before = Span::new(0, 100).unwrap();
+    let with_files = with_file.with(Area::File(2), before);
+    [memory(with_files, None), memory(layout(100, 50), Some(gate))]
 }
 
 fn open(disk: &Arc<SimDisk>, memories: &Memories) -> Option<MemoryFile> {
@@ -38,30 +42,36 @@ fn random_step(random: &mut Random) -> AnyStep {
     let most = if random.one_in(4) { 123 } else { 3 };
     let count = 1 + random.below(most);
     let bytes = (0..count * 2).map(|_| random.below(256) as u8).collect();
-    AnyStep { first: (address, bytes), kind: random.below(4) }
+    AnyStep { first: (address, bytes), kind: random.below(5) }
 }
 
-fn operation(step: &AnyStep) -> Operation<'_> {
+fn write_of(step: &AnyStep) -> Write<'_> {
     let (address, bytes) = (step.first.0, &step.first.1);
-    let write = Write { area: REGISTERS, address, count: bytes.len() / 2, bytes };
+    let area = if step.kind == 4 { FILE } else { REGISTERS };
+    Write { area, address, count: bytes.len() / 2, bytes }
+}
+
+fn operation<'a>(step: &'a AnyStep, write: &'a Write<'a>) -> Operation<'a> {
+    let (address, bytes, write) = (step.first.0, &step.first.1, std::slice::from_ref(write));
     match step.kind {
         0 => {
             let and_mask = u16::from_be_bytes([bytes[0], bytes[1]]);
             Operation::Mask { area: REGISTERS, address, and_mask, or_mask: 0x5aa5 }
         }
-        1 => Operation::WriteThenRead { write, area: REGISTERS, address: 0, count: 4 },
+        1 => Operation::WriteThenRead { write: write[0], area: REGISTERS, address: 0, count: 4 },
         _ => Operation::Write(write),
     }
 }
 
 /// Carries out a step on memories without a journal.
 fn on_model(model: &Memories, step: &AnyStep) {
-    match operation(step) {
-        Operation::Write(write) if step.kind == 3 => {
+    let write = write_of(step);
+    match operation(step, &write) {
+        Operation::Write(_) if step.kind == 3 => {
             let bits = Write { area: Area::Coils, address: 65, count: 8, bytes: &write.bytes[..1] };
             write_across(Access::Ingest, &[(&model[0], write), (&model[1], bits)]).unwrap();
         }
-        Operation::Write(write) => model[0].write(Access::Ingest, write).unwrap(),
+        Operation::Write(writes) => model[0].write_many(Access::Ingest, writes).unwrap(),
         Operation::Mask { area, address, and_mask, or_mask } => {
             model[0].mask_write(Access::Ingest, area, address, and_mask, or_mask).unwrap();
         }
@@ -75,7 +85,7 @@ fn submit(memories: &Memories, step: &AnyStep) -> Receiver<Outcome> {
     if step.kind == 3 {
         let (memories, step) = (memories.clone(), step.clone());
         std::thread::spawn(move || {
-            let Operation::Write(write) = operation(&step) else { unreachable!() };
+            let write = write_of(&step);
             let bits = Write { area: Area::Coils, address: 65, count: 8, bytes: &write.bytes[..1] };
             let both = [(&*memories[0], write), (&*memories[1], bits)];
             let _ = sender.send(write_across(Access::Ingest, &both).map(|_| CarriedOut::default()));
@@ -83,7 +93,7 @@ fn submit(memories: &Memories, step: &AnyStep) -> Receiver<Outcome> {
         return receiver;
     }
     let done = Box::new(move |outcome| drop(sender.send(outcome)));
-    memories[0].submit(Access::Ingest, operation(step), done).unwrap();
+    memories[0].submit(Access::Ingest, operation(step, &write_of(step)), done).unwrap();
     receiver
 }
 

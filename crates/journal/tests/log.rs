@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use futures_util::StreamExt;
 use holdfast_journal::log::{Follower, LogError, Next, Phase, Settings, Until};
 use holdfast_memory::{
-    Access, Action, Freshness, Memory, Mirrored, Operation, Read, Refusal, Step, StepWrite, Write,
-    write_across,
+    Access, Action, Area, Freshness, Memory, Mirrored, Operation, Read, Refusal, Refused, Span,
+    Step, StepWrite, Write, write_across,
 };
 use nodes::process::{Answer, Process};
 use nodes::{Node, REGISTERS, Server, cluster, memory_of, until};
@@ -37,6 +37,32 @@ fn two_nodes_agree_on_a_register() {
     b.write(3, 8).unwrap();
     assert_eq!(b.read(3), Ok(8));
     until("the first node has it", || a.read(3) == Ok(8));
+}
+
+#[test]
+fn files_are_shared_as_areas_are() {
+    let server = Server::new();
+    let memory = |records| {
+        let layout = memory_of(1).layout().clone();
+        let layout = layout.with(Area::File(4), Span::new(0, records).unwrap());
+        Arc::new(Memory::new(layout, None).unwrap())
+    };
+    let [a, b] = ["a", "b"].map(|name| Node::with(memory(600), &[&server], name, |_| {}));
+    a.start();
+    let bytes = [7; 4];
+    let records = |address| Write { area: Area::File(4), address, count: 2, bytes: &bytes };
+    a.memory.write_many(Access::Client, &[records(0), records(598)]).unwrap();
+    let refused = Refused { index: 1, refusal: Refusal::OutOfRange };
+    assert_eq!(a.memory.write_many(Access::Client, &[records(5), records(599)]), Err(refused));
+    // It has the records from a snapshot, or from the steps.
+    b.start();
+    b.until_applied(a.status().last_sequence);
+    assert_eq!(a.all(), b.all());
+    assert_eq!(b.all()[b.all().len() - 1200..][..4], [7; 4]);
+    assert_eq!(a.status().steps, 1, "what is refused is no step");
+    let other = Node::with(memory(601), &[&server], "c", |_| {});
+    let error = other.try_start().unwrap_err().to_string();
+    assert!(error.contains("file:4 0+600 in the log"), "{error}");
 }
 
 #[test]
@@ -91,7 +117,7 @@ fn writes_given_away_together_are_carried_out_in_their_order() {
         let write = Write { area: REGISTERS, address: 0, count: 1, bytes: &bytes };
         let sender = sender.clone();
         let done = Box::new(move |outcome| sender.send((value, outcome)).unwrap());
-        a.memory.submit(Access::Client, Operation::Write(write), done).unwrap();
+        a.memory.submit(Access::Client, Operation::Write(&[write]), done).unwrap();
     }
     let mut before = 0;
     for value in 0..2000 {

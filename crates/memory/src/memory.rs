@@ -1,11 +1,12 @@
 //! The memory: reads and writes under one lock.
 
+use std::ops::Range;
 use std::ptr;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use std::time::Duration;
 
-use crate::area::{Area, Layout, Span};
+use crate::area::{Area, FILES, Layout, Span};
 use crate::batch::{self, Run};
 use crate::bits;
 use crate::error::{LayoutError, Refusal, Refused};
@@ -24,7 +25,7 @@ enum Ranges {
     All,
 }
 
-/// Four areas of fixed size behind one lock.
+/// Four areas and any number of files, of fixed size, behind one lock.
 #[derive(Debug)]
 pub struct Memory {
     /// Locks of several memories are taken in the order of their ranks, so that two writers cannot
@@ -41,14 +42,16 @@ pub struct Memory {
 /// A copy of what a memory contains.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Contents {
-    /// The bytes of all areas, in the order of [`Area::ALL`].
-    pub areas: [Box<[u8]>; 4],
+    /// The bytes of the areas, in the order of [`Area::ALL`]; then, if there are files, those of all of
+    /// them, in the order of their numbers.
+    pub areas: Vec<Box<[u8]>>,
     pub sealed: bool,
 }
 
 #[derive(Debug)]
 struct Content {
-    areas: [Box<[u8]>; 4],
+    /// As those of [`Contents`]; without files, the last is empty.
+    areas: [Box<[u8]>; FILES + 1],
     /// Any of [`SEALED`], [`GUARDED`] and [`AGING`]. With none of them, an access needs no further checks.
     access_flags: u8,
     /// How many times the seal opened, and how many times it closed again.
@@ -82,13 +85,14 @@ impl Memory {
             if !area.is_bits() {
                 return Err(LayoutError::GateNotABit);
             }
-            if layout.span(area).offset(address, 1).is_none() {
+            if !layout.span(area).holds(address, 1) {
                 return Err(LayoutError::GateOutside { address });
             }
         }
-        let areas = Area::ALL.map(|area| {
-            vec![0; area.byte_len(layout.span(area).size() as usize)].into_boxed_slice()
-        });
+        let mut areas: [Box<[u8]>; FILES + 1] = Default::default();
+        for (area, len) in areas.iter_mut().zip(layout.byte_lens()) {
+            *area = vec![0; len].into_boxed_slice();
+        }
         Ok(Memory {
             rank: NEXT_RANK.fetch_add(1, Ordering::Relaxed),
             layout,
@@ -105,12 +109,12 @@ impl Memory {
         })
     }
 
-    pub const fn span(&self, area: Area) -> Span {
+    pub fn span(&self, area: Area) -> Span {
         self.layout.span(area)
     }
 
-    pub const fn layout(&self) -> Layout {
-        self.layout
+    pub const fn layout(&self) -> &Layout {
+        &self.layout
     }
 
     pub const fn gate(&self) -> Option<Gate> {
@@ -240,9 +244,10 @@ impl Memory {
         let Some((journal, member)) = self.journal.get() else { panic!("there is no journal") };
         let member = *member;
         let action = match operation {
-            Operation::Write(write) => {
-                self.writable(access, &[write], Ranges::Unreserved).map_err(Refused::alone)?;
-                Action::Write(vec![StepWrite::new(member, &write)])
+            Operation::Write(writes) => {
+                let valid = self.writable(access, writes, Ranges::Unreserved);
+                valid.map_err(|refused| refused.refusal)?;
+                Action::Write(writes.iter().map(|write| StepWrite::new(member, write)).collect())
             }
             Operation::Mask { area, address, and_mask, or_mask } => {
                 self.maskable(access, area, address, Ranges::Unreserved)?;
@@ -269,11 +274,14 @@ impl Memory {
     pub fn contents(memories: &[Arc<Memory>]) -> Vec<Contents> {
         let mut ranked: Vec<(usize, &Arc<Memory>)> = memories.iter().enumerate().collect();
         ranked.sort_by_key(|(_, memory)| memory.rank);
-        let locked: Vec<_> = ranked.iter().map(|(at, memory)| (*at, memory.shared())).collect();
+        let locked: Vec<_> =
+            ranked.iter().map(|(at, memory)| (*at, memory, memory.shared())).collect();
         let mut copies: Vec<(usize, Contents)> = locked
             .iter()
-            .map(|(at, content)| {
-                (*at, Contents { areas: content.areas.clone(), sealed: content.sealed() })
+            .map(|(at, memory, content)| {
+                let areas = if memory.layout.has_files() { FILES + 1 } else { FILES };
+                let areas = content.areas[..areas].to_vec();
+                (*at, Contents { areas, sealed: content.sealed() })
             })
             .collect();
         copies.sort_by_key(|(at, _)| *at);
@@ -283,6 +291,14 @@ impl Memory {
     /// How many writes were carried out: equal numbers mean equal contents.
     pub fn writes(&self) -> u64 {
         self.shared().writes
+    }
+
+    /// Copies some of the bytes of an area, by its index.
+    ///
+    /// # Panics
+    /// There are no such bytes.
+    pub fn bytes(&self, area: usize, range: Range<usize>) -> Vec<u8> {
+        self.shared().areas[area][range].to_vec()
     }
 
     /// Puts other contents in place of the present ones. Observers don't see it.
@@ -350,7 +366,7 @@ impl Memory {
         }
         for read in reads {
             let Read { area, address, count, ref mut out } = *read;
-            let offset = usize::from(address - self.span(area).start());
+            let offset = self.layout.offset_inside(area, address);
             content.copy_out(offset, Read { area, address, count, out });
         }
         Ok(())
@@ -374,7 +390,7 @@ impl Memory {
         if seen != Some(content.writes) {
             for read in reads {
                 let Read { area, address, count, ref mut out } = *read;
-                let offset = usize::from(address - self.span(area).start());
+                let offset = self.layout.offset_inside(area, address);
                 content.copy_out(offset, Read { area, address, count, out });
             }
         }
@@ -383,10 +399,10 @@ impl Memory {
 
     /// Checks a range, without the lock.
     pub(crate) fn holds(&self, area: Area, address: u16, count: usize) -> Result<(), Refusal> {
-        match self.span(area).holds(address, count) {
+        match self.layout.offset(area, address, count) {
             _ if count == 0 => Err(Refusal::WrongLength),
-            true => Ok(()),
-            false => Err(Refusal::OutOfRange),
+            Some(_) => Ok(()),
+            None => Err(Refusal::OutOfRange),
         }
     }
 
@@ -549,7 +565,7 @@ impl Memory {
         address: u16,
         ranges: Ranges,
     ) -> Result<usize, Refusal> {
-        match self.span(area).offset(address, 1) {
+        match self.layout.offset(area, address, 1) {
             _ if area.is_bits() => Err(Refusal::NotRegisters),
             offset => {
                 let offset = offset.ok_or(Refusal::OutOfRange)?;
@@ -563,7 +579,7 @@ impl Memory {
         if read.count == 0 || read.out.len() != read.area.byte_len(read.count) {
             return Err(Refusal::WrongLength);
         }
-        self.span(read.area).offset(read.address, read.count).ok_or(Refusal::OutOfRange)
+        self.layout.offset(read.area, read.address, read.count).ok_or(Refusal::OutOfRange)
     }
 
     /// Checks writes, without the lock.
@@ -577,7 +593,7 @@ impl Memory {
             let fits = write.count > 0 && write.bytes.len() == write.area.byte_len(write.count);
             let refusal = if !fits {
                 Refusal::WrongLength
-            } else if self.span(write.area).offset(write.address, write.count).is_none() {
+            } else if self.layout.offset(write.area, write.address, write.count).is_none() {
                 Refusal::OutOfRange
             } else if access == Access::Client && self.gate.is_some_and(|gate| gate.is_in(write)) {
                 Refusal::GateBit
@@ -617,7 +633,7 @@ impl Memory {
     fn copy_in(&self, content: &mut Content, write: &Write<'_>) {
         let span = self.span(write.area);
         debug_assert!(span.holds(write.address, write.count), "{write:?} is outside {span:?}");
-        let offset = usize::from(write.address - span.start());
+        let offset = self.layout.offset_inside(write.area, write.address);
         let area = &mut content.areas[write.area.index()];
         if write.area.is_bits() {
             bits::copy_in(area, offset, write.count, write.bytes);

@@ -41,7 +41,7 @@ impl Gate {
     /// Whether the memory is sealed after a restart with these contents of this layout, whose age is
     /// unknown. A gate that opens once is closed again, and its bit becomes 0: the next write would open
     /// it otherwise.
-    pub fn seals_restored(self, layout: Layout, areas: &mut [Box<[u8]>; 4]) -> bool {
+    pub fn seals_restored(self, layout: &Layout, areas: &mut [Box<[u8]>]) -> bool {
         let offset = usize::from(self.address - layout.span(self.area).start());
         let area = &mut areas[self.area.index()];
         if self.mode == GateMode::Once {

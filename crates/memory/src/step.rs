@@ -80,9 +80,20 @@ pub trait Journal: fmt::Debug + Send + Sync {
 /// A write to one memory that is carried out later.
 #[derive(Debug, Clone, Copy)]
 pub enum Operation<'a> {
-    Write(Write<'a>),
-    Mask { area: Area, address: u16, and_mask: u16, or_mask: u16 },
-    WriteThenRead { write: Write<'a>, area: Area, address: u16, count: usize },
+    /// Where two overlap, the later one wins.
+    Write(&'a [Write<'a>]),
+    Mask {
+        area: Area,
+        address: u16,
+        and_mask: u16,
+        or_mask: u16,
+    },
+    WriteThenRead {
+        write: Write<'a>,
+        area: Area,
+        address: u16,
+        count: usize,
+    },
 }
 
 impl StepWrite {

@@ -13,7 +13,7 @@ use proptest::prelude::*;
 /// One value per address. A missing address is outside the area.
 #[derive(Debug, Clone, PartialEq, Default)]
 struct Model {
-    areas: [BTreeMap<u16, u16>; 4],
+    areas: BTreeMap<Area, BTreeMap<u16, u16>>,
     gate: Option<Gate>,
     sealed: bool,
 }
@@ -65,19 +65,19 @@ fn unpack(area: Area, count: usize, bytes: &[u8]) -> Vec<u16> {
 
 impl Model {
     fn new(layout: &Layout, gate: Option<Gate>) -> Model {
-        let areas = Area::ALL.map(|area| {
+        let areas = layout.areas().map(|area| {
             let span = layout.span(area);
-            let end = u32::from(span.start()) + span.size();
-            (u32::from(span.start())..end).map(|address| (address as u16, 0)).collect()
+            let addresses = u32::from(span.start())..span.end();
+            (area, addresses.map(|address| (address as u16, 0)).collect())
         });
-        Model { areas, gate, sealed: gate.is_some() }
+        Model { areas: areas.collect(), gate, sealed: gate.is_some() }
     }
 
     fn addresses(&self, area: Area, address: u16, count: usize) -> Result<Vec<u16>, Refusal> {
         let addresses = (0..count).map(|index| u16::try_from(usize::from(address) + index));
         let addresses: Result<Vec<u16>, _> = addresses.collect();
         let addresses = addresses.map_err(|_| Refusal::OutOfRange)?;
-        let known = &self.areas[area as usize];
+        let known = self.areas.get(&area).ok_or(Refusal::OutOfRange)?;
         let inside = addresses.iter().all(|address| known.contains_key(address));
         if inside { Ok(addresses) } else { Err(Refusal::OutOfRange) }
     }
@@ -99,7 +99,7 @@ impl Model {
     ) -> Result<Vec<u16>, Refusal> {
         self.admit(access)?;
         let addresses = self.addresses(area, address, count)?;
-        Ok(addresses.iter().map(|address| self.areas[area as usize][address]).collect())
+        Ok(addresses.iter().map(|address| self.areas[&area][address]).collect())
     }
 
     fn write(&mut self, access: Access, writes: &[Values]) -> Result<(), Refusal> {
@@ -127,20 +127,17 @@ impl Model {
         for Values { area, address, values } in writes {
             for (index, value) in values.iter().enumerate() {
                 let value = if area.is_bits() { value & 1 } else { *value };
-                self.areas[*area as usize].insert(address + index as u16, value);
+                self.areas.get_mut(area).unwrap().insert(address + index as u16, value);
             }
         }
         if let (Access::Ingest | Access::Restore, Some(gate)) = (access, self.gate) {
-            let open = self.areas[gate.area as usize][&gate.address] == 1;
+            let open = self.areas[&gate.area][&gate.address] == 1;
             self.sealed = !open && (gate.mode == GateMode::Level || self.sealed);
         }
     }
 
     fn contents(&self) -> Vec<Vec<u16>> {
-        LAYOUT
-            .iter()
-            .map(|&(area, ..)| self.areas[area as usize].values().copied().collect())
-            .collect()
+        LAYOUT.iter().map(|&(area, ..)| self.areas[&area].values().copied().collect()).collect()
     }
 }
 
@@ -185,8 +182,15 @@ fn model_write_across(
     Ok(())
 }
 
-const LAYOUT: [(Area, u16, u32); 3] =
-    [(Area::Coils, 3, 40), (Area::DiscreteInputs, 0, 21), (Area::HoldingRegisters, 65_500, 36)];
+const LAYOUT: [(Area, u16, u32); 6] = [
+    (Area::Coils, 3, 40),
+    (Area::DiscreteInputs, 0, 21),
+    (Area::HoldingRegisters, 65_500, 36),
+    // Not in the order of their numbers.
+    (Area::File(4), 0, 33),
+    (Area::File(1), 0, 1),
+    (Area::File(u16::MAX), 5, 20),
+];
 
 fn layout() -> Layout {
     LAYOUT.iter().fold(Layout::default(), |layout, &(area, start, size)| {
@@ -216,7 +220,8 @@ fn contents(memory: &Memory) -> Vec<Vec<u16>> {
 }
 
 fn a_range() -> impl Strategy<Value = (Area, u16, usize)> {
-    let area = prop::sample::select(Area::ALL.to_vec());
+    let files = [1, 2, 4, u16::MAX].map(Area::File);
+    let area = prop::sample::select([&Area::ALL[..], &files].concat());
     let address = prop_oneof![4 => 0..45u16, 4 => 65_495..=65_535u16, 1 => any::<u16>()];
     (area, address, 1..42usize)
 }
@@ -244,6 +249,10 @@ fn a_bad_write() -> impl Strategy<Value = (usize, Values)> {
         Just((Area::DiscreteInputs, 21, 1)),
         Just((Area::HoldingRegisters, 65_535, 2)),
         Just((Area::HoldingRegisters, 65_500, 0)),
+        Just((Area::File(2), 0, 1)),
+        Just((Area::File(1), 0, 2)),
+        Just((Area::File(u16::MAX), 4, 2)),
+        Just((Area::File(u16::MAX), 24, 2)),
     ];
     (0..3usize, place).prop_map(|(which, (area, address, count))| {
         (which, Values { area, address, values: vec![1; count] })
@@ -410,6 +419,20 @@ fn a_span_beyond_the_last_address_is_refused() {
 }
 
 #[test]
+fn an_area_has_its_name_back() {
+    for area in Area::ALL {
+        assert_eq!(Area::from_name(&area.name()), Some(area));
+    }
+    for file in [1, 10, u16::MAX].map(Area::File) {
+        assert_eq!(Area::file_from_name(&file.name()), Some(file));
+        assert_eq!(Area::from_name(&file.name()), None);
+    }
+    for name in ["file", "file:", "file:01", "file:+1", "file:65536", "file:0", "File:1", ""] {
+        assert_eq!(Area::file_from_name(name), None, "{name}");
+    }
+}
+
+#[test]
 fn a_gate_outside_its_area_is_refused() {
     let gate = |area, address| Some(Gate { area, address, mode: GateMode::Once });
     assert!(Memory::new(layout(), gate(Area::Coils, 2)).is_err());
@@ -443,7 +466,7 @@ fn reserved_ranges_are_settled_when_a_step_is_given_to_the_journal() {
     let write = Write { area: Area::Coils, address: 12, count: 1, bytes: &[1] };
     let never = || -> Done { Box::new(|_| panic!("nothing is submitted")) };
     for access in [Access::Client, Access::Ingest] {
-        let refused = memory.submit(access, Operation::Write(write), never());
+        let refused = memory.submit(access, Operation::Write(&[write]), never());
         assert_eq!(refused, Err(Refusal::Mirrored));
         assert_eq!(memory.write(access, write), Err(Refusal::Mirrored));
     }

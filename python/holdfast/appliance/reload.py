@@ -95,7 +95,8 @@ def restart_reasons(before: Config, now: Config) -> Iterator[str]:
 
 
 def _layout(settings: MemoryConfig) -> object:
-    return {area: (span.start, span.size) for area, span in settings.areas().items()}, settings.seal
+    areas = {area: (span.start, span.size) for area, span in settings.areas().items()}
+    return areas, settings.files, settings.seal
 
 
 def _differs(before: DeviceConfig | LinkConfig | None, now: object, keys: set[str]) -> bool:

@@ -17,7 +17,7 @@ from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.protocol import ADDRESSES, MAX_WORD
 from holdfast.runtime.text import extent, listing, suggestion
-from holdfast.types import AREAS, BIT_AREAS, Area
+from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -32,9 +32,9 @@ Cell: TypeAlias = tuple[str, int]
 
 
 class InitialRun(NamedTuple):
-    """Consecutive values of one area, from `address` on."""
+    """Consecutive values of one area, or of a file (`file:4`), from `address` on."""
 
-    area: Area
+    area: str
     address: int
     values: tuple[int, ...]
 
@@ -57,12 +57,12 @@ def read(path: Path, file: str) -> str:
 
 
 def parse(
-    text: str, file: str, areas: Mapping[Area, range | None], gate: Cell | None
+    text: str, file: str, areas: Mapping[str, range | None], gate: Cell | None
 ) -> tuple[tuple[InitialRun, ...], list[Problem]]:
     """Returns the values of a file as runs, and the problems of the file.
 
-    `areas` are the areas of the memory; addresses of `None` allow any address. `gate` is the gate
-    bit of the seal, which must stay 0.
+    `areas` are the areas and files of the memory; addresses of `None` allow any address. `gate` is
+    the gate bit of the seal, which must stay 0.
     """
     judge = _Judge(file, areas, gate)
     try:
@@ -80,10 +80,10 @@ class _Judge:
     """Checks values one by one and keeps the valid ones."""
 
     file: str
-    areas: Mapping[Area, range | None]
+    areas: Mapping[str, range | None]
     gate: Cell | None
     problems: list[Problem] = field(default_factory=list)
-    kept: dict[Area, dict[int, tuple[int, int]]] = field(default_factory=dict)
+    kept: dict[str, dict[int, tuple[int, int]]] = field(default_factory=dict)
 
     def refuse(self, line: int, column: int | None, key: str, message: str) -> None:
         """Adds a problem of this file."""
@@ -98,7 +98,7 @@ class _Judge:
         else:
             self.kept.setdefault(area, {})[address] = (value, given.line)
 
-    def _judged(self, given: _Given) -> tuple[Area, int, int]:
+    def _judged(self, given: _Given) -> tuple[str, int, int]:
         area = next((area for area in self.areas if area == given.area), None)
         if area is None:
             lacking = ", which this memory does not have" if given.area in AREAS else ""
@@ -115,7 +115,7 @@ class _Judge:
             raise ValueError(f"duplicate {area} {address}, first in line {line}")
         return area, address, value
 
-    def _value(self, area: Area, address: int, value: object) -> int:
+    def _value(self, area: str, address: int, value: object) -> int:
         most, to = (1, "or") if area in BIT_AREAS else (MAX_WORD, "to")
         if type(value) is not int or not 0 <= value <= most:
             raise ValueError(f"found {show(value)}, allowed in {area}: 0 {to} {most}")

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any
 from holdfast.gateway import assets, port_of_call
 from holdfast.gateway.app import App
 from holdfast.gateway.endpoint import EXAMPLE, TARGET, never
-from holdfast.gateway.endpoints import address_map, diagnostics, identify, read, tag_lists, write
+from holdfast.gateway.endpoints import (
+    address_map,
+    diagnostics,
+    files,
+    identify,
+    read,
+    tag_lists,
+    write,
+)
 from holdfast.gateway.fields import timeout
 from holdfast.gateway.refusals import DEVICE, FAILURE, REFUSALS
 from holdfast.gateway.schemas import SCHEMAS
@@ -29,6 +37,7 @@ if TYPE_CHECKING:
 ENDPOINTS: tuple[Endpoint, ...] = (
     *read.ENDPOINTS,
     *write.ENDPOINTS,
+    *files.ENDPOINTS,
     *diagnostics.ENDPOINTS,
     *identify.ENDPOINTS,
 )

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.text.messages import show
 from holdfast.protocol import (
     FUNCTIONS,
-    GET_COMM_EVENT_LOG,
-    READ_EXCEPTION_STATUS,
+    OPTIONAL_CODES,
     WRITING_CODES,
 )
 from holdfast.runtime.text import listing
@@ -21,9 +20,7 @@ if TYPE_CHECKING:
 SOURCE = frozenset({1, 2, 3, 4, 5, 6, 15, 16})
 """Functions that the source supports; it refuses all others."""
 
-_SERVED = [
-    each for each in FUNCTIONS if each.code not in (READ_EXCEPTION_STATUS, GET_COMM_EVENT_LOG)
-]
+_SERVED = [each for each in FUNCTIONS if each.code not in OPTIONAL_CODES]
 """What a listener serves without settings that no source has."""
 
 ALL = frozenset(each.code for each in _SERVED)

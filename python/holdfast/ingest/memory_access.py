@@ -170,7 +170,7 @@ class MemoryAccess:
         try:
             target = self._granted(memory, area, address, grant)
             try:
-                values = target.read(area, address, count)  # type: ignore[arg-type]
+                values = target.read(area, address, count)
             except (_core.OutOfRange, ValueError):  # A count below 1 is a `ValueError`.
                 raise self._out_of_range(memory, area, address, count) from None
             except OSError as error:

@@ -61,7 +61,7 @@ class SimulatedDevice:
         chosen = {**_of_scales(everything), **chosen}
         writable = [tag for tag in tags if tag.writable]
         kept = {place for tag in writable for place in _places(tag)}
-        self.memory = Memory(**_extents(everything), seal=None)
+        self.memory = Memory(**_extents(everything))
         self._registers: dict[Area, dict[int, int]] = {area: {} for area in AREAS}
         self._written = _spans((tag.area, range(tag.address, tag.end)) for tag in writable)
         self._readable = _spans((tag.area, tag.span) for tag in everything)
@@ -264,9 +264,9 @@ def _places(tag: Tag) -> set[tuple[Area, int]]:
     return {(tag.area, address) for address in range(tag.address, tag.end)}
 
 
-def _extents(tags: Sequence[Tag]) -> dict[Area, tuple[int, int]]:
+def _extents(tags: Sequence[Tag]) -> dict[str, Any]:
     """Start and size of each area."""
-    found = {}
+    found: dict[str, Any] = {}
     for area in AREAS:
         own = [tag for tag in tags if tag.area == area]
         if own:

@@ -574,6 +574,7 @@ impl Device {
                 Range::new(address, quantity).map(Request::ReadHoldingRegisters)
             }
             Area::InputRegisters => Range::new(address, quantity).map(Request::ReadInputRegisters),
+            Area::File(_) => return Err(Fault::Unplanned),
         };
         // The limits of a device are at most those of a request, and every block is within them.
         let request = EncodedRequest::new(&request.expect("a block is a valid request"));
@@ -664,7 +665,7 @@ impl Device {
                 state.count_unstored();
             }
         });
-        memory.submit(access, Operation::Write(write), done)
+        memory.submit(access, Operation::Write(&[write]), done)
     }
 
     fn publish_status(&self) {

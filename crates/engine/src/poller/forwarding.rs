@@ -28,6 +28,9 @@ use crate::tls::client::ClientTls;
 /// The longest pause before a receiver that is down is tried again.
 const MAX_PAUSE: Duration = Duration::from_secs(10);
 
+/// Why a block has an area that packets have too.
+const NO_FILES: &str = "files of devices are not polled";
+
 /// Bytes per read of a socket.
 const CHUNK_BYTES: usize = 1024;
 
@@ -168,7 +171,7 @@ impl Forward {
     ) {
         let address = self.settings.address(area, address);
         let address = address.expect("offsets are checked when the device is made");
-        let area = in_packet(area);
+        let area = in_packet(area).expect(NO_FILES);
         let header = Header { area, target: self.settings.target, address, count };
         self.queue(Content::Read(read), &header, bytes);
     }
@@ -186,7 +189,7 @@ impl Forward {
             return;
         }
         let header = Header {
-            area: in_packet(block.area),
+            area: in_packet(block.area).expect(NO_FILES),
             target: *target,
             address: block.address().expect("the block is checked when the device is made"),
             count: const { NonZeroU16::new(STATUS_BLOCK_LEN).unwrap() },

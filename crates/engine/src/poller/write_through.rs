@@ -305,7 +305,7 @@ impl PassedWrite {
             let kept = Box::new(|outcome: Outcome| {
                 let _ = done.send(outcome);
             });
-            let submitted = self.memory.submit(Access::Mirror, Operation::Write(write), kept);
+            let submitted = self.memory.submit(Access::Mirror, Operation::Write(&[write]), kept);
             let _ = outcome.await;
             submitted
         } else {

@@ -8,7 +8,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_memory::{Access, Action, Area, Memory, Outcome, Read, Refusal, Step};
+use holdfast_memory::{Action, Area, Memory, Outcome, Refusal, Step};
 
 use super::error::FileError;
 use super::image::{Changes, PAGE_BYTES, Page};
@@ -34,7 +34,7 @@ impl BeforeReply {
         retry: Duration,
     ) -> BeforeReply {
         let shadow = |memory: &Arc<Memory>| {
-            let shadow = Memory::new(memory.layout(), memory.gate());
+            let shadow = Memory::new(memory.layout().clone(), memory.gate());
             Arc::new(shadow.expect("the memory has this layout and gate"))
         };
         let shadows = memories.iter().map(shadow).collect();
@@ -81,11 +81,10 @@ impl BeforeReply {
     /// Notes the pages that a step writes.
     fn touch(&self, step: &Step, touched: &mut BTreeSet<Place>) {
         let mut note = |member: u16, area: Area, address: u16, count: usize| {
-            let memory = &self.shadows[usize::from(member)];
-            let first = usize::from(address - memory.span(area).start());
-            let items = items_of_a_page(area);
-            let numbers = first / items..=(first + count - 1) / items;
-            touched.extend(numbers.map(|number| Place { member, area, number: number as u16 }));
+            let written = self.shadows[usize::from(member)].layout().bytes(area, address, count);
+            let (area, bytes) = written.expect("a step is valid for its memories");
+            let numbers = bytes.start / PAGE_BYTES..=(bytes.end - 1) / PAGE_BYTES;
+            touched.extend(numbers.map(|number| Place { member, area, number }));
         };
         match &step.action {
             Action::Write(writes) => {
@@ -103,14 +102,9 @@ impl BeforeReply {
     /// A page of a shadow, unless it is in the file already.
     fn changed(&self, Place { member, area, number }: Place) -> Option<Page> {
         let (shadow, memory) = (&self.shadows[usize::from(member)], self.ids[usize::from(member)]);
-        let (span, items) = (shadow.span(area), items_of_a_page(area));
-        let first = usize::from(number) * items;
-        let count = items.min(span.size() as usize - first);
-        let mut bytes = vec![0; area.byte_len(count)];
-        let address = span.start() + first as u16;
-        let read = Read { area, address, count, out: &mut bytes };
-        shadow.read(Access::Ingest, read).expect("the page is in the area");
-        let page = Page { memory, area: area as u8, number, bytes };
+        let (first, len) = (number * PAGE_BYTES, shadow.layout().byte_lens()[area]);
+        let bytes = shadow.bytes(area, first..len.min(first + PAGE_BYTES));
+        let page = Page { memory, area, number, bytes };
         (!self.store.image().has(&page)).then_some(page)
     }
 
@@ -125,10 +119,6 @@ impl BeforeReply {
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Place {
     member: u16,
-    area: Area,
-    number: u16,
-}
-
-fn items_of_a_page(area: Area) -> usize {
-    if area.is_bits() { PAGE_BYTES * 8 } else { PAGE_BYTES / 2 }
+    area: usize,
+    number: usize,
 }

@@ -1,5 +1,7 @@
 //! What a file contains: memories, in pages.
 
+use std::ops::Range;
+
 use holdfast_memory::{Area, Contents, Layout, Span};
 
 use super::error::FileError;
@@ -15,17 +17,24 @@ pub struct StoredMemory {
     /// Its number in the file.
     pub(super) id: u16,
     pub layout: Layout,
-    /// The bytes of all areas, in the order of [`Area::ALL`].
-    pub areas: [Box<[u8]>; 4],
+    /// The bytes of its areas and files, as those of [`Contents`].
+    pub areas: Vec<Box<[u8]>>,
 }
 
 /// A page to store.
 #[derive(Debug, Clone)]
 pub(super) struct Page {
     pub memory: u16,
-    pub area: u8,
-    pub number: u16,
+    /// The index of the area, see [`Contents::areas`].
+    pub area: usize,
+    pub number: usize,
     pub bytes: Vec<u8>,
+}
+
+/// The key of a page in the file. Files may have more pages than a number has values: then their pages are
+/// those of further areas.
+pub(super) fn page_key(memory: u16, area: usize, number: usize) -> (u16, u8, u16) {
+    (memory, (area + (number >> u16::BITS)) as u8, number as u16)
 }
 
 /// What a transaction changes.
@@ -59,28 +68,40 @@ pub(super) struct Image {
 impl StoredMemory {
     /// A memory of zeros.
     pub(super) fn new(name: &str, id: u16, layout: Layout) -> StoredMemory {
-        let areas = Area::ALL.map(|area| zeros(area, layout.span(area)));
+        let areas = zeros(&layout);
         StoredMemory { name: name.to_owned(), id, layout, areas }
     }
 
-    pub(super) fn pages(&self) -> impl Iterator<Item = (u8, u16, &[u8])> {
+    /// The bytes of an area or a file.
+    pub fn bytes_of(&self, area: Area) -> &[u8] {
+        place_of(area, &self.layout).map_or(&[], |(index, bytes)| &self.areas[index][bytes])
+    }
+
+    /// The index of the area, the number and the bytes of each page.
+    pub(super) fn pages(&self) -> impl Iterator<Item = (usize, usize, &[u8])> {
         (0..).zip(&self.areas).flat_map(|(area, bytes)| {
             (0..).zip(bytes.chunks(PAGE_BYTES)).map(move |(number, page)| (area, number, page))
         })
     }
 
     /// The contents for another layout: addresses that both have keep their items.
-    pub(super) fn resized(&self, layout: Layout) -> [Box<[u8]>; 4] {
-        Area::ALL.map(|area| {
-            let (old, new) = (self.layout.span(area), layout.span(area));
-            let from = &self.areas[area as usize];
-            if old == new {
-                return from.clone();
+    pub(super) fn resized(&self, layout: &Layout) -> Vec<Box<[u8]>> {
+        if self.layout == *layout {
+            return self.areas.clone();
+        }
+        let mut areas = zeros(layout);
+        self.copy_into(&mut areas, layout);
+        areas
+    }
+
+    /// Copies the items of the addresses that another layout has too.
+    pub(super) fn copy_into(&self, areas: &mut [Box<[u8]>], layout: &Layout) {
+        for area in layout.areas() {
+            if let Some((index, bytes)) = place_of(area, layout) {
+                let (old, new) = (self.layout.span(area), layout.span(area));
+                copy_shared(area, self.bytes_of(area), old, &mut areas[index][bytes], new);
             }
-            let mut bytes = zeros(area, new);
-            copy_shared(area, from, old, &mut bytes, new);
-            bytes
-        })
+        }
     }
 }
 
@@ -117,9 +138,9 @@ impl Image {
 
     /// Whether a page is in the file as it is.
     pub fn has(&self, page: &Page) -> bool {
-        let from = usize::from(page.number) * PAGE_BYTES;
+        let from = page.number * PAGE_BYTES;
         self.numbered(page.memory).is_some_and(|stored| {
-            stored.areas[usize::from(page.area)][from..from + page.bytes.len()] == *page.bytes
+            stored.areas[page.area][from..from + page.bytes.len()] == *page.bytes
         })
     }
 
@@ -137,8 +158,8 @@ impl Image {
         for page in changes.pages {
             let stored = self.memories.iter_mut().find(|stored| stored.id == page.memory);
             let Some(stored) = stored else { unreachable!("pages are of memories in the file") };
-            let from = usize::from(page.number) * PAGE_BYTES;
-            let area = &mut stored.areas[usize::from(page.area)];
+            let from = page.number * PAGE_BYTES;
+            let area = &mut stored.areas[page.area];
             area[from..from + page.bytes.len()].copy_from_slice(&page.bytes);
         }
     }
@@ -162,11 +183,15 @@ impl Image {
     }
 }
 
-/// The record of a memory: its number, and start and size of each area.
-pub(super) fn encode(id: u16, layout: Layout) -> Vec<u8> {
+/// The record of a memory: its number, start and size of each area, and number, start and size of each
+/// file.
+pub(super) fn encode(id: u16, layout: &Layout) -> Vec<u8> {
     let mut record = id.to_be_bytes().to_vec();
-    for area in Area::ALL {
+    for area in layout.areas() {
         let span = layout.span(area);
+        if let Area::File(number) = area {
+            record.extend(number.to_be_bytes());
+        }
         record.extend(span.start().to_be_bytes());
         record.extend(span.size().to_be_bytes());
     }
@@ -177,24 +202,40 @@ pub(super) fn encode(id: u16, layout: Layout) -> Vec<u8> {
 /// [`FileError::Damaged`]
 pub(super) fn decode(name: &str, record: &[u8]) -> Result<StoredMemory, FileError> {
     let invalid = || FileError::damaged(format!("the layout of memory {name} is invalid"));
-    let (id, mut spans) = record.split_first_chunk().ok_or_else(invalid)?;
-    let mut layout = Layout::default();
-    for area in Area::ALL {
-        let (start, rest) = spans.split_first_chunk().ok_or_else(invalid)?;
-        let (size, rest) = rest.split_first_chunk().ok_or_else(invalid)?;
+    let (id, mut rest) = record.split_first_chunk().ok_or_else(invalid)?;
+    let (mut layout, mut areas, mut last) = (Layout::default(), Area::ALL.into_iter(), 0);
+    loop {
+        let area = match areas.next() {
+            Some(area) => area,
+            None if rest.is_empty() => break,
+            None => {
+                let (number, tail) = rest.split_first_chunk().ok_or_else(invalid)?;
+                rest = tail;
+                let number = u16::from_be_bytes(*number);
+                if number <= last {
+                    return Err(invalid());
+                }
+                last = number;
+                Area::File(number)
+            }
+        };
+        let (start, tail) = rest.split_first_chunk().ok_or_else(invalid)?;
+        let (size, tail) = tail.split_first_chunk().ok_or_else(invalid)?;
         let span = Span::new(u16::from_be_bytes(*start), u32::from_be_bytes(*size));
         layout = layout.with(area, span.map_err(|_| invalid())?);
-        spans = rest;
+        rest = tail;
     }
-    if spans.is_empty() {
-        Ok(StoredMemory::new(name, u16::from_be_bytes(*id), layout))
-    } else {
-        Err(invalid())
-    }
+    Ok(StoredMemory::new(name, u16::from_be_bytes(*id), layout))
 }
 
-pub(super) fn zeros(area: Area, span: Span) -> Box<[u8]> {
-    vec![0; area.byte_len(span.size() as usize)].into_boxed_slice()
+fn zeros(layout: &Layout) -> Vec<Box<[u8]>> {
+    layout.byte_lens().into_iter().map(|len| vec![0; len].into_boxed_slice()).collect()
+}
+
+/// Where the bytes of a whole area or file are.
+fn place_of(area: Area, layout: &Layout) -> Option<(usize, Range<usize>)> {
+    let span = layout.span(area);
+    layout.bytes(area, span.start(), span.size() as usize)
 }
 
 pub(super) fn start(span: Span) -> u32 {

@@ -329,7 +329,7 @@ fn note_of(image: &Image, members: &[Member]) -> Result<Option<Vec<u8>>, FileErr
         return Err(FileError::OfLog(text));
     };
     for (Member { name, memory }, stored) in all() {
-        if stored.is_none_or(|stored| stored.layout != memory.layout()) {
+        if stored.is_none_or(|stored| stored.layout != *memory.layout()) {
             let text = format!("the file has other areas of memory {name}: {advice}");
             return Err(FileError::OfLog(text));
         }
@@ -356,7 +356,7 @@ fn first_changes(
         let id = id_of(stored)?;
         ids.push(id);
         // The same layout: only pages that differ are stored.
-        if stored.is_some_and(|stored| stored.layout == layout) {
+        if stored.is_some_and(|stored| stored.layout == *layout) {
             changes.pages.extend(image.differing(id, &contents));
             continue;
         }
@@ -367,7 +367,7 @@ fn first_changes(
                 None => changes.removed.extend(set_aside.map(|old| (old.name.clone(), old.id))),
             }
         }
-        let areas = contents.areas;
+        let (areas, layout) = (contents.areas, layout.clone());
         changes.memories.push(StoredMemory { name: name.clone(), id, layout, areas });
     }
     Ok((changes, ids))

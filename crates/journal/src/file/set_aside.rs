@@ -1,13 +1,14 @@
 //! What is set aside when a memory becomes smaller: values at addresses that it does not have any more.
 //! They come back when it has these addresses again.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use holdfast_memory::{Area, Layout, Span};
 
 use super::disk::Disk;
 use super::error::FileError;
-use super::image::{Changes, Image, StoredMemory, copy_shared, overlap, start, zeros};
+use super::image::{Changes, Image, StoredMemory, overlap, start};
 use super::store::Store;
 
 /// Ends the name of a record with what was cut from a memory. Names of memories have no colon.
@@ -22,15 +23,12 @@ impl StoredMemory {
     /// This memory, and around it what was cut from it. Addresses between the two have zeros.
     pub(super) fn with(&self, set_aside: Option<&StoredMemory>) -> StoredMemory {
         let Some(set_aside) = set_aside else { return self.clone() };
-        let mut layout = self.layout;
-        for area in Area::ALL {
+        let mut layout = self.layout.clone();
+        for area in set_aside.layout.areas() {
             layout = layout.with(area, around(self.layout.span(area), set_aside.layout.span(area)));
         }
-        let mut areas = set_aside.resized(layout);
-        for (area, bytes) in Area::ALL.into_iter().zip(&mut areas) {
-            let from = &self.areas[area as usize];
-            copy_shared(area, from, self.layout.span(area), bytes, layout.span(area));
-        }
+        let mut areas = set_aside.resized(&layout);
+        self.copy_into(&mut areas, &layout);
         StoredMemory { name: self.name.clone(), id: self.id, layout, areas }
     }
 
@@ -39,29 +37,32 @@ impl StoredMemory {
     pub(super) fn cut(
         &self,
         set_aside: Option<&StoredMemory>,
-        other: Layout,
+        other: &Layout,
         id: u16,
     ) -> Option<StoredMemory> {
         let mut layout = Layout::default();
-        for area in Area::ALL {
+        for area in self.known(set_aside) {
             layout = layout.with(area, self.lacking(set_aside, other, area));
         }
-        if Area::ALL.iter().all(|area| layout.span(*area).size() == 0) {
+        if layout.areas().all(|area| layout.span(area).size() == 0) {
             return None;
         }
-        let mut areas = self.with(set_aside).resized(layout);
-        for (area, bytes) in Area::ALL.into_iter().zip(&mut areas) {
-            let has = other.span(area);
-            copy_shared(area, &zeros(area, has), has, bytes, layout.span(area));
-        }
+        let mut areas = self.with(set_aside).resized(&layout);
+        StoredMemory::new("", 0, other.clone()).copy_into(&mut areas, &layout);
         Some(StoredMemory { name: format!("{}{SET_ASIDE}", self.name), id, layout, areas })
+    }
+
+    /// The areas, and the files that are known.
+    fn known(&self, set_aside: Option<&StoredMemory>) -> BTreeSet<Area> {
+        let stored = [Some(self), set_aside].into_iter().flatten();
+        stored.flat_map(|stored| stored.layout.areas()).collect()
     }
 
     /// The addresses that another layout lacks, of those that are known; perhaps with some of its own
     /// in between.
-    fn lacking(&self, set_aside: Option<&StoredMemory>, other: Layout, area: Area) -> Span {
-        let known = [Some(self), set_aside].into_iter().flatten();
-        let lacking = known.flat_map(|stored| outside(stored.layout.span(area), other.span(area)));
+    fn lacking(&self, set_aside: Option<&StoredMemory>, other: &Layout, area: Area) -> Span {
+        let stored = [Some(self), set_aside].into_iter().flatten();
+        let lacking = stored.flat_map(|stored| outside(stored.layout.span(area), other.span(area)));
         lacking.fold(Span::default(), around)
     }
 
@@ -70,11 +71,13 @@ impl StoredMemory {
     pub(super) fn resizings(
         &self,
         set_aside: Option<&StoredMemory>,
-        layout: Layout,
+        layout: &Layout,
     ) -> Vec<String> {
         let name = &self.name;
         let (mut sentences, mut lacking) = (Vec::new(), Vec::new());
-        for area in Area::ALL {
+        let mut known = self.known(set_aside);
+        known.extend(layout.areas());
+        for area in known {
             let (old, new) = (self.layout.span(area), layout.span(area));
             let spans = outside(self.lacking(set_aside, layout, area), new);
             if !spans.is_empty() {

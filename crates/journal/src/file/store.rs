@@ -11,11 +11,13 @@ use redb::{
 
 use super::disk::Disk;
 use super::error::FileError;
-use super::image::{self, Changes, Image, Page, StoredMemory};
+use super::image::{self, Changes, Image, Page, StoredMemory, page_key};
 use super::status::Status;
 
-/// The version of the format.
-pub const VERSION: u64 = 1;
+/// The newest version of the format: a memory may have files.
+pub const VERSION: u64 = 2;
+/// The version of a file while no memory in it has had files: older programs read it.
+const WITHOUT_FILES: u64 = 1;
 
 const ABOUT: TableDefinition<&str, u64> = TableDefinition::new("holdfast");
 const FORMAT: &str = "format";
@@ -165,7 +167,7 @@ fn create(disk: &dyn Disk, image: &Image, replace: bool) -> Result<Database, Fil
 fn create_beside(disk: &dyn Disk, image: &Image, replace: bool) -> Result<Database, FileError> {
     let database = disk.create(&builder())?;
     let transaction = database.begin_write()?;
-    transaction.open_table(ABOUT)?.insert(FORMAT, VERSION)?;
+    transaction.open_table(ABOUT)?.insert(FORMAT, WITHOUT_FILES)?;
     let memories = image.memories().to_vec();
     let note = image.note().cloned().map(Some);
     write(&transaction, &Changes { memories, note, ..Changes::default() })?;
@@ -188,17 +190,20 @@ fn write(transaction: &WriteTransaction, changes: &Changes) -> Result<(), FileEr
         records.remove(&**name)?;
         pages.retain_in((*id, 0, 0)..=(*id, u8::MAX, u16::MAX), |_, _| false)?;
     }
+    if changes.memories.iter().any(|stored| stored.layout.has_files()) {
+        transaction.open_table(ABOUT)?.insert(FORMAT, VERSION)?;
+    }
     for stored in &changes.memories {
-        let record = image::encode(stored.id, stored.layout);
+        let record = image::encode(stored.id, &stored.layout);
         records.insert(&*stored.name, &*with_checksum(stored.name.as_bytes(), &record))?;
         pages.retain_in((stored.id, 0, 0)..=(stored.id, u8::MAX, u16::MAX), |_, _| false)?;
         for (area, number, bytes) in stored.pages() {
-            let key = (stored.id, area, number);
+            let key = page_key(stored.id, area, number);
             pages.insert(key, &*with_checksum(&place(key), bytes))?;
         }
     }
     for Page { memory, area, number, bytes } in &changes.pages {
-        let key = (*memory, *area, *number);
+        let key = page_key(*memory, *area, *number);
         pages.insert(key, &*with_checksum(&place(key), bytes))?;
     }
     Ok(())
@@ -214,7 +219,7 @@ fn contents(database: &Database) -> Result<Image, FileError> {
         about => about?,
     };
     match about.get(FORMAT)?.map(|version| version.value()) {
-        Some(VERSION) => {}
+        Some(WITHOUT_FILES..=VERSION) => {}
         Some(found) if found > VERSION => {
             return Err(FileError::Newer { found, allowed: VERSION });
         }
@@ -237,7 +242,7 @@ fn contents(database: &Database) -> Result<Image, FileError> {
     for stored in &mut memories {
         for (area, bytes) in (0..).zip(&mut stored.areas) {
             for (number, page) in (0..).zip(bytes.chunks_mut(image::PAGE_BYTES)) {
-                let key = (stored.id, area, number);
+                let key = page_key(stored.id, area, number);
                 let damaged =
                     |what| FileError::damaged(format!("{what} {number} of memory {}", stored.name));
                 let Some(entry) = entries.next() else { return Err(damaged("there is no page")) };

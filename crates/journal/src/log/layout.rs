@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use holdfast_memory::{Area, Gate, GateMode, LayoutError, Memory};
+use holdfast_memory::{Gate, GateMode, LayoutError, Memory};
 
 /// A line for each memory, in the order of their names: name, areas with first address and size,
 /// seal.
@@ -14,7 +14,7 @@ pub(super) fn fingerprint(members: &[(String, Arc<Memory>)]) -> String {
 }
 
 fn described(memory: &Memory) -> String {
-    let areas = Area::ALL.into_iter().filter(|area| memory.span(*area).size() > 0);
+    let areas = memory.layout().areas().filter(|area| memory.span(*area).size() > 0);
     let mut parts: Vec<String> = areas
         .map(|area| {
             let span = memory.span(area);
@@ -56,7 +56,8 @@ pub(super) fn difference(log: &str, here: &str) -> Option<String> {
 /// # Errors
 /// Never for the layout of a memory that exists.
 pub(super) fn copies(members: &[Arc<Memory>]) -> Result<Vec<Arc<Memory>>, LayoutError> {
-    let copy = |memory: &Arc<Memory>| Memory::new(memory.layout(), memory.gate()).map(Arc::new);
+    let copy =
+        |memory: &Arc<Memory>| Memory::new(memory.layout().clone(), memory.gate()).map(Arc::new);
     members.iter().map(copy).collect()
 }
 

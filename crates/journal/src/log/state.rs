@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use aws_lc_rs::digest::{SHA256, digest};
-use holdfast_memory::{Area, CarriedOut, Contents, Memory, Outcome, Step};
+use holdfast_memory::{CarriedOut, Contents, Memory, Outcome, Step};
 use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
 
@@ -232,22 +232,18 @@ impl<'a> Rest<'a> {
             [1] if memory.gate().is_some() => true,
             _ => return None,
         };
-        let mut area = |area: Area| {
-            let expected = area.byte_len(memory.span(area).size() as usize);
+        let area = |expected: usize| {
             let fits = self.u32()? as usize == expected;
             fits.then(|| self.take(expected)).flatten().map(Box::from)
         };
-        let [coils, inputs, holding, input] = Area::ALL;
-        Some(Contents {
-            areas: [area(coils)?, area(inputs)?, area(holding)?, area(input)?],
-            sealed,
-        })
+        let areas = memory.layout().byte_lens().into_iter().map(area).collect::<Option<_>>()?;
+        Some(Contents { areas, sealed })
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use holdfast_memory::{Layout, Span};
+    use holdfast_memory::{Area, Layout, Span};
 
     use super::*;
 

@@ -192,7 +192,7 @@ fn write(memory: &Memory, id: String, address: u16, value: u16) {
         Ok(_) => answer(&answered, "ok 0"),
         Err(refused) => refuse(&answered, refused.refusal),
     });
-    if let Err(refusal) = memory.submit(Access::Client, Operation::Write(write), done) {
+    if let Err(refusal) = memory.submit(Access::Client, Operation::Write(&[write]), done) {
         refuse(&id, refusal);
     }
 }

@@ -96,7 +96,7 @@ pub fn submit(memory: &Memory, address: u16, value: u16) -> Receiver<Outcome> {
     let write = Write { area: REGISTERS, address, count: 1, bytes: &bytes };
     let answer = sender.clone();
     let done = Box::new(move |outcome| drop(answer.send(outcome)));
-    if let Err(refusal) = memory.submit(Access::Ingest, Operation::Write(write), done) {
+    if let Err(refusal) = memory.submit(Access::Ingest, Operation::Write(&[write]), done) {
         sender.send(Err(Refused { index: 0, refusal })).unwrap();
     }
     receiver

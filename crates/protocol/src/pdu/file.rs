@@ -1,5 +1,7 @@
 //! Functions 20 and 21: records of files (V1.1b3, 6.14 and 6.15).
 
+use core::ops::RangeInclusive;
+
 use super::{Buffer, ExceptionCode, Registers, RequestError, limit};
 
 /// Of each range in a request: reference type, file, record, number of records.
@@ -10,6 +12,10 @@ const REFERENCE_TYPE: u8 = 6;
 
 /// Of each range in a reply: its length and the reference type.
 const REPLY_HEAD_LEN: usize = 2;
+
+/// The fewest bytes behind the byte count of a request: one range, of function 21 with one record.
+const MIN_READ_BYTES: usize = HEAD_LEN;
+const MIN_WRITE_BYTES: usize = HEAD_LEN + 2;
 
 /// Records of a file, each of one register.
 ///
@@ -130,7 +136,7 @@ impl<'a> FileRanges<'a> {
     }
 
     pub(super) fn parse(body: &'a [u8]) -> Result<FileRanges<'a>, ExceptionCode> {
-        let ranges = FileRanges { bytes: counted(body, limit::READ_FILE_BYTES)? };
+        let ranges = FileRanges { bytes: counted(body, MIN_READ_BYTES..=limit::READ_FILE_BYTES)? };
         let (heads, rest) = ranges.bytes.as_chunks();
         if !rest.is_empty() {
             return Err(ExceptionCode::IllegalDataValue);
@@ -254,7 +260,8 @@ impl<'a> FileRecords<'a> {
     }
 
     pub(super) fn parse(body: &'a [u8]) -> Result<FileRecords<'a>, ExceptionCode> {
-        let records = FileRecords { bytes: counted(body, limit::WRITE_FILE_BYTES)? };
+        let records =
+            FileRecords { bytes: counted(body, MIN_WRITE_BYTES..=limit::WRITE_FILE_BYTES)? };
         let mut rest = records.bytes;
         while !rest.is_empty() {
             let (_, _, tail) = next(rest)?;
@@ -293,11 +300,13 @@ fn next(bytes: &[u8]) -> Result<Written<'_>, ExceptionCode> {
     Ok((range, records, tail))
 }
 
-/// Parses a byte count of 1 to `max`, and exactly that many bytes.
-fn counted(body: &[u8], max: usize) -> Result<&[u8], ExceptionCode> {
+/// Parses an allowed byte count, and exactly that many bytes.
+fn counted(body: &[u8], allowed: RangeInclusive<usize>) -> Result<&[u8], ExceptionCode> {
     match body {
-        [count, bytes @ ..] if usize::from(*count) == bytes.len() => {
-            checked(bytes.len(), max).map(|()| bytes).or(Err(ExceptionCode::IllegalDataValue))
+        [count, bytes @ ..]
+            if usize::from(*count) == bytes.len() && allowed.contains(&bytes.len()) =>
+        {
+            Ok(bytes)
         }
         _ => Err(ExceptionCode::IllegalDataValue),
     }

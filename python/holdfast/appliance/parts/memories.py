@@ -141,6 +141,7 @@ def empty(settings: MemoryConfig) -> Memory:
     seal = settings.seal
     return _core.Memory(
         **{area: (span.start, span.size) for area, span in settings.areas().items()},
+        files=settings.files,
         seal=None if seal is None else (seal.area, seal.address, seal.mode),
     )
 

@@ -87,12 +87,12 @@ def listener(
             )
             if secure is not None:
                 stream["max_handshakes"] = secure.max_handshakes
-            rules = [_rule(rule, memories, links) for rule in settings.rules]
+            rules = [_rule(rule, config, memories, links) for rule in settings.rules]
             return _core.Listener(name, str(settings.bind), rules, cast("StreamOptions", stream))
         case ModbusUdpListener() | ModbusRtuOverUdpListener():
             framing = "mbap" if isinstance(settings, ModbusUdpListener) else "rtu"
             datagrams = dict(settings) | {"framing": framing}
-            rules = [_rule(rule, memories, links) for rule in settings.rules]
+            rules = [_rule(rule, config, memories, links) for rule in settings.rules]
             return _core.Listener.udp(
                 name, str(settings.bind), rules, cast("DatagramOptions", datagrams)
             )
@@ -101,7 +101,7 @@ def listener(
             mode = "rtu" if isinstance(settings, ModbusRtuListener) else "ascii"
             line = {"silence": None, "data_bits": 8} | dict(settings) | dict(settings.serial)
             line |= {"mode": mode}
-            rule = _serial_rule(settings.rules, memories, links)
+            rule = _serial_rule(settings.rules, config, memories, links)
             return _core.Listener.serial(
                 name, settings.serial.device, rule, cast("SerialOptions", line)
             )
@@ -165,7 +165,9 @@ def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
     )
 
 
-def _rule(rule: RuleConfig, memories: Mapping[str, Memory], links: Links) -> _core.Rule:
+def _rule(
+    rule: RuleConfig, config: Config, memories: Mapping[str, Memory], links: Links
+) -> _core.Rule:
     own = {
         unit: rights
         for unit, rights in unit_rights(rule)
@@ -182,11 +184,15 @@ def _rule(rule: RuleConfig, memories: Mapping[str, Memory], links: Links) -> _co
         roles=getattr(rule, "roles", None),
         narrowed={unit: _narrowed(rights) for unit, rights in own.items()},
         exception_status=_exception_status(dict(unit_rights(rule))),
+        fifo=_fifo(config, dict(unit_rights(rule))),
     )
 
 
 def _serial_rule(
-    rules: Sequence[SerialRuleConfig], memories: Mapping[str, Memory], links: Links
+    rules: Sequence[SerialRuleConfig],
+    config: Config,
+    memories: Mapping[str, Memory],
+    links: Links,
 ) -> _core.Rule:
     """The rule of a serial line, which is that of all rules together."""
     units = together(rules)
@@ -196,6 +202,7 @@ def _serial_rule(
         access=rules[0].access,
         narrowed={unit: _narrowed(rights) for unit, rights in units.items()},
         exception_status=_exception_status(units),
+        fifo=_fifo(config, units),
     )
 
 
@@ -223,6 +230,11 @@ def _narrowed(rights: UnitRights) -> NarrowedRights:
 def _exception_status(units: Mapping[int, UnitRights]) -> dict[int, tuple[BitArea, int]]:
     given = {unit: rights.exception_status for unit, rights in units.items()}
     return {unit: (bits.area, bits.address) for unit, bits in given.items() if bits is not None}
+
+
+def _fifo(config: Config, units: Mapping[int, UnitRights]) -> dict[int, tuple[int, ...]]:
+    of = {unit: config.memories[each.memory].fifo for unit, each in units.items() if each.memory}
+    return {unit: addresses for unit, addresses in of.items() if addresses}
 
 
 def _raw_rule(rule: RawRuleConfig, config: Config, memories: Mapping[str, Memory]) -> _core.RawRule:

@@ -30,6 +30,8 @@ from holdfast.runtime.text import listing
 from holdfast.server import Server
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from holdfast.config.values.ip_addresses import Bind
     from holdfast.types import LogRecord
 
@@ -153,7 +155,7 @@ def _tell(
     kept = [
         (name, area, address, value)
         for name, memory in (memories if values else ())
-        for area, addresses in memory.areas.items()
+        for area, addresses in _areas_and_files(memory)
         for address, value in zip(
             addresses, memory.read(area, addresses.start, len(addresses)), strict=True
         )
@@ -168,6 +170,12 @@ def _tell(
     click.echo(f"sequence {found['sequence']}, digest {found['digest']}")
     for name, area, address, value in kept:
         click.echo(f"{name} {area} {address}: {value}")
+
+
+def _areas_and_files(memory: _core.Memory) -> Iterator[tuple[str, range]]:
+    yield from memory.areas.items()
+    for number, records in memory.files.items():
+        yield f"file:{number}", range(records)
 
 
 def _line(file: Path, record: LogRecord, *, as_json: bool) -> str:

@@ -94,8 +94,8 @@ def import_(file: Path, values: Path, name: str | None, merge: bool) -> None:
     areas = _chosen(found, name, file)
     try:
         text = read(values, str(values))
-        spans = {area: kept.addresses for area, kept in areas.items()}
-        runs, problems = parse(text, str(values), dict(spans), None)
+        spans: dict[str, range | None] = {area: kept.addresses for area, kept in areas.items()}
+        runs, problems = parse(text, str(values), spans, None)
     except ConfigError as error:
         runs, problems = (), list(error.problems)
     if problems:

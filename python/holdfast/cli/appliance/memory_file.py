@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 
+FILE = "file:"
+"""Before the number of a file, in the place of an area."""
+
+
 class KeptArea(NamedTuple):
     """The values of an area, from its first address on."""
 
@@ -48,11 +52,13 @@ def replace(file: Path, memory: str, runs: Iterable[InitialRun], *, merge: bool)
     Raises `OSError` for a file that can't be used, and `OutOfRange`.
     """
     areas = contents(file)[memory]
-    spans: Any = {area: (kept.start, len(kept.values)) for area, kept in areas.items()}
-    made = _core.Memory(**spans)
+    sizes = {area: len(kept.values) for area, kept in areas.items()}
+    files = {int(area.removeprefix(FILE)): sizes.pop(area) for area in areas if _is_file(area)}
+    spans: Any = {area: (areas[area].start, size) for area, size in sizes.items()}
+    made = _core.Memory(**spans, files=files)
     opened = _core.MemoryFile(str(file), [(memory, made)], 1.0)
     try:
-        writes: list[tuple[Area, int, Sequence[int]]] = []
+        writes: list[tuple[str, int, Sequence[int]]] = []
         if not merge:
             zeros = ((area, kept.start, [0] * len(kept.values)) for area, kept in areas.items())
             writes += zeros
@@ -93,6 +99,10 @@ def yaml_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]:
             run.append(value)
         if run:
             yield f"  {first}: {run}"
+
+
+def _is_file(area: str) -> bool:
+    return area.startswith(FILE)
 
 
 def _values(area: Area, size: int, data: bytes) -> list[int]:

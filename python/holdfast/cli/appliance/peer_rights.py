@@ -46,13 +46,13 @@ def as_text(config: Config, peer: Peer) -> str:
     for name, listener in config.listeners.items():
         place = f"{listener.type}  {_place(listener)}"
         lines += [*([""] if lines else []), f"{styled(name, bold=True)}  {place}"]
-        lines += [f"  {line}" for line in _rights_lines(listener, peer)]
+        lines += [f"  {line}" for line in _rights_lines(config, listener, peer)]
     return "\n".join(lines or ["no listeners"])
 
 
 def as_data(config: Config, peer: Peer) -> dict[str, Any]:
     """The rights of the peer for JSON."""
-    listeners = {name: _data(listener, peer) for name, listener in config.listeners.items()}
+    listeners = {name: _data(config, listener, peer) for name, listener in config.listeners.items()}
     return {"address": str(peer.address), "role": peer.role, "listeners": listeners}
 
 
@@ -91,7 +91,7 @@ def _without_packets(listener: RawIngestListener, peer: Peer) -> str:
     return "no_packets" if matching(listener.rules, peer.address) else "disconnected"
 
 
-def _rights_lines(listener: Listener, peer: Peer) -> list[str]:
+def _rights_lines(config: Config, listener: Listener, peer: Peer) -> list[str]:
     packets = _packet_rule(listener, peer)
     if isinstance(listener, RawIngestListener):
         if packets is None:
@@ -99,7 +99,7 @@ def _rights_lines(listener: Listener, peer: Peer) -> list[str]:
         return _packet_lines(packets)
     outcome, rights = _rights(listener, peer)
     lines = [_outcomes(peer)[outcome]] if outcome != "served" else []
-    rows = [_row(units, each, listener.event_log) for units, each in _joined(rights)]
+    rows = [_row(config, units, each, listener.event_log) for units, each in _joined(rights)]
     lines += table(HEAD, rows) if rows else []
     return lines if packets is None else [*lines, "Raw Ingest packets:", *_packet_lines(packets)]
 
@@ -124,10 +124,10 @@ def _joined(rights: dict[int, UnitRights]) -> Iterator[tuple[str, UnitRights]]:
         yield number_ranges(units), each
 
 
-def _row(units: str, rights: UnitRights, event_log: bool) -> tuple[str, ...]:
+def _row(config: Config, units: str, rights: UnitRights, event_log: bool) -> tuple[str, ...]:
     to = f"memory {rights.memory}" if rights.route is None else f"route {rights.route}"
     writes = NOTHING if rights.access == "read-only" else _limits(rights.write)
-    codes = number_ranges(rights.codes(event_log=event_log))
+    codes = number_ranges(rights.codes(config.memories, event_log=event_log))
     return units, to, rights.access, codes, _limits(rights.read), writes
 
 
@@ -142,7 +142,7 @@ def _packet_lines(rule: RawRuleConfig) -> list[str]:
     return table(("unit", "to", "writes"), rows)
 
 
-def _data(listener: Listener, peer: Peer) -> dict[str, Any]:
+def _data(config: Config, listener: Listener, peer: Peer) -> dict[str, Any]:
     where = {"type": listener.type, "at": _place(listener)}
     rule = _packet_rule(listener, peer)
     packets = [] if rule is None else _packets_data(rule)
@@ -150,7 +150,9 @@ def _data(listener: Listener, peer: Peer) -> dict[str, Any]:
         outcome = _without_packets(listener, peer) if rule is None else "served"
         return {**where, "outcome": outcome, "units": packets}
     outcome, rights = _rights(listener, peer)
-    units = [_unit_data(unit, each, listener.event_log) for unit, each in sorted(rights.items())]
+    units = [
+        _unit_data(config, unit, each, listener.event_log) for unit, each in sorted(rights.items())
+    ]
     found = {**where, "outcome": outcome, "units": units}
     return {**found, "packets": packets} if packets else found
 
@@ -161,13 +163,13 @@ def _packets_data(rule: RawRuleConfig) -> list[dict[str, Any]]:
     return [*units, *({"memory": name, "areas": areas} for name in rule.memories)]
 
 
-def _unit_data(unit: int, rights: UnitRights, event_log: bool) -> dict[str, Any]:
+def _unit_data(config: Config, unit: int, rights: UnitRights, event_log: bool) -> dict[str, Any]:
     to = {"memory": rights.memory} if rights.route is None else {"route": rights.route}
     return {
         "unit": unit,
         **to,
         "access": rights.access,
-        "functions": rights.codes(event_log=event_log),
+        "functions": rights.codes(config.memories, event_log=event_log),
         "read": _ranges_data(rights.read),
         "write": _ranges_data(rights.write),
     }

@@ -24,7 +24,6 @@ from holdfast.protocol import (
     MAX_CODE,
     MAX_SERIAL_UNIT,
     MAX_UNIT,
-    OTHER_READS,
     WRITING_CODES,
 )
 from holdfast.types import Access
@@ -148,7 +147,7 @@ def _check(
     if isinstance(target, SerialTarget) and unit is not None and not 1 <= unit <= MAX_SERIAL_UNIT:
         raise click.UsageError(f"--unit on a serial line is 1 to {MAX_SERIAL_UNIT}, not {unit}.")
     for code in functions or () if access == "read-only" else ():
-        if code in WRITING_CODES or code not in (*CODES, *OTHER_READS):
+        if code in WRITING_CODES or code not in CODES:
             raise click.UsageError(f"--functions {code} may write: omit it, or --access read-only.")
 
 

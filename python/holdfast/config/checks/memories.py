@@ -38,6 +38,8 @@ def check_memories(scope: Scope) -> None:
         for path, memory in items(("memories",), scope.config.memories):
             _check_areas(scope, path, memory)
             with until_invalid():
+                _check_fifo(scope, (*path, "fifo"), memory)
+            with until_invalid():
                 _check_initial(scope, path, memory)
             with until_invalid():
                 if memory.id is not None:
@@ -79,6 +81,16 @@ def _check_areas(scope: Scope, path: KeyPath, memory: MemoryConfig) -> None:
         scope.report.add_key(path, f"no area, allowed: at least one of {listing(AREAS)}")
 
 
+def _check_fifo(scope: Scope, path: KeyPath, memory: MemoryConfig) -> None:
+    refuse_repeats(path, memory.fifo, scope.report)
+    there = layout(memory).get("holding_registers", range(0))
+    for where, address in items(path, memory.fifo):
+        if there is not None and not (address in there and address + 1 in there):
+            allowed = f"those of a count and a register after it, of {extent(there)}"
+            allowed = allowed if len(there) > 1 else "none: the memory has no holding_registers"
+            scope.report.add(where, f"found {address}, allowed: {allowed}")
+
+
 def _gate(
     scope: Scope, path: KeyPath, seal: Seal, areas: dict[Area, range | None]
 ) -> initial_values.Cell | None:
@@ -118,7 +130,10 @@ def _check_initial(scope: Scope, path: KeyPath, memory: MemoryConfig) -> None:
     except ConfigError as error:
         report.add(path, f"found {show(file)}, which {error.problems[0].message}")
         return
-    runs, problems = initial_values.parse(text, shown, areas, gate)
+    places: dict[str, range | None] = {area: areas[area] for area in areas}
+    with until_invalid():
+        places |= {f"file:{number}": range(records) for number, records in memory.files.items()}
+    runs, problems = initial_values.parse(text, shown, places, gate)
     memory.with_initial_values(runs)
     report.elsewhere += problems
 

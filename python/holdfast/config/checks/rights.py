@@ -15,14 +15,13 @@ from holdfast.net.addresses import holds
 from holdfast.protocol import (
     CODES,
     GET_COMM_EVENT_LOG,
-    OTHER_READS,
+    OPTIONAL_CODES,
     READ_EXCEPTION_STATUS,
-    WRITE_FILE_RECORD,
     WRITING_CODES,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
 
     from holdfast.config.models.devices import RangeConfig
     from holdfast.config.models.listeners import (
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
         RuleConfig,
         SerialRuleConfig,
     )
+    from holdfast.config.models.memories import MemoryConfig
     from holdfast.net.addresses import Address
     from holdfast.types import Access, Area
 
@@ -62,17 +62,14 @@ class UnitRights:
         """Whether some addresses may not be read or written."""
         return self.read is not None or self.write is not None
 
-    def codes(self, *, event_log: bool) -> list[int]:
+    def codes(self, memories: Mapping[str, MemoryConfig], *, event_log: bool) -> list[int]:
         """All function codes that are allowed, on a listener with or without an event log."""
-        known = dict.fromkeys(CODES)
-        if self.route is not None:
-            known |= dict.fromkeys((*OTHER_READS, WRITE_FILE_RECORD))
-            known |= dict.fromkeys(self.functions or ())
+        if self.memory is None:
+            known = {*CODES, *(self.functions or ())}
         else:
-            if self.exception_status is None:
-                known.pop(READ_EXCEPTION_STATUS)
-            if not event_log:
-                known.pop(GET_COMM_EVENT_LOG)
+            known = set(CODES) - OPTIONAL_CODES | memories[self.memory].functions
+            known |= {READ_EXCEPTION_STATUS} if self.exception_status else set()
+            known |= {GET_COMM_EVENT_LOG} if event_log else set()
         return [code for code in sorted(known) if self.allows(code)]
 
     def allows(self, code: int) -> bool:
@@ -83,7 +80,7 @@ class UnitRights:
         return self.access == "read-write" or code in _READING
 
 
-_READING = frozenset(CODES).difference(WRITING_CODES).union(OTHER_READS)
+_READING = frozenset(CODES).difference(WRITING_CODES)
 
 
 def unit_rights(rule: AnyRule) -> Iterator[tuple[int, UnitRights]]:

@@ -20,12 +20,13 @@ from holdfast.config.text.messages import show
 from holdfast.config.values.unit_keys import parse_unit_key, unit_ids
 from holdfast.protocol import (
     CODES,
+    FILE_FUNCTIONS,
     GET_COMM_EVENT_LOG,
     MAX_CODE,
     MAX_SERIAL_UNIT,
     MAX_UNIT,
-    OTHER_READS,
     READ_EXCEPTION_STATUS,
+    READ_FIFO_QUEUE,
     WRITING_CODES,
 )
 from holdfast.runtime.text import either, extent, listing, suggestion
@@ -78,7 +79,7 @@ def warn_of_rights(scope: Scope, path: KeyPath, rights: Rule | Unit, access: Acc
         if code in WRITING_CODES:
             message = f"function {code} has no effect: it writes, and access is read-only"
             scope.report.warn(where, message)
-        elif code not in (*CODES, *OTHER_READS):
+        elif code not in CODES:
             message = f"function {code} has no effect: it may write, and access is read-only"
             scope.report.warn(where, message)
 
@@ -180,6 +181,11 @@ def warn_of_missing(scope: Scope, path: KeyPath, rule: Rule, *, event_log: bool)
     missing = {} if event_log else {GET_COMM_EVENT_LOG: "the listener has no event_log"}
     if not any(isinstance(unit, UnitMemoryConfig) and unit.exception_status for unit in units):
         missing[READ_EXCEPTION_STATUS] = "no unit has an exception_status"
+    memories = (unit for unit in units if not isinstance(unit, RouteConfig))
+    names = {unit if isinstance(unit, str) else unit.memory for unit in memories}
+    there = frozenset[int]().union(*(scope.config.memories[name].functions for name in names))
+    missing |= dict.fromkeys(FILE_FUNCTIONS - there, "no memory of the rule has files")
+    missing |= dict.fromkeys({READ_FIFO_QUEUE} - there, "no memory of the rule has fifo")
     for index, code in enumerate(rule.functions or ()):
         if code in missing:
             message = f"function {code} has no effect: {missing[code]}"

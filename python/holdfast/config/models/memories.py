@@ -4,16 +4,30 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import BeforeValidator, Field, PrivateAttr, model_validator
+from pydantic import BeforeValidator, Field, PrivateAttr, Strict, model_validator
 
 from holdfast.config.initial_values import InitialRun
 from holdfast.config.models.base import Model
-from holdfast.config.values.scalars import FilePath, Name, NotNull, whole_number
-from holdfast.protocol import ADDRESSES, LAST_ADDRESS
+from holdfast.config.values.scalars import (
+    FILE_KEYS,
+    FileNumber,
+    FilePath,
+    Name,
+    NotNull,
+    whole_number,
+)
+from holdfast.protocol import (
+    ADDRESSES,
+    FILE_FUNCTIONS,
+    LAST_ADDRESS,
+    LAST_RECORD,
+    READ_FIFO_QUEUE,
+)
 from holdfast.types import AREAS, Area, BitArea
 
 Size = Annotated[int, Field(ge=1, le=ADDRESSES)]
 Register = Annotated[int, Field(ge=0, le=LAST_ADDRESS)]
+Records = Annotated[int, Field(ge=1, le=LAST_RECORD + 1)]
 
 
 class Span(Model):
@@ -77,7 +91,7 @@ class ReplicateConfig(Model):
 
 
 class MemoryConfig(Model):
-    """Four areas of bits and registers. An omitted area does not exist."""
+    """Four areas of bits and registers, and files. An omitted area does not exist."""
 
     id: Annotated[Register | None, NotNull()] = None
     """The memory id of raw ingest packets of format crc; unique."""
@@ -89,6 +103,16 @@ class MemoryConfig(Model):
     """Holding registers, read and written by Modbus: a size, or start and size."""
     input_registers: Extent = None
     """Input registers, read by Modbus: a size, or start and size."""
+    files: dict[FileNumber, Records] = Field(
+        default={}, json_schema_extra=FILE_KEYS, exclude_if=lambda v: not v
+    )
+    """Files, read and written by functions 20 and 21: their numbers, and how many records of one
+    register each has. Default: none; functions 20 and 21 are exception 01."""
+    fifo: Annotated[tuple[Register, ...], Strict(False)] = Field(
+        default=(), json_schema_extra={"uniqueItems": True}, exclude_if=lambda v: not v
+    )
+    """Holding registers at which function 24 reads a queue: the register counts those after it
+    that belong to the queue, up to 31. Default: none; function 24 is exception 01."""
     seal: Annotated[Seal | None, NotNull()] = None
     """Seals the memory at the start, until its gate bit is 1."""
     initial: Annotated[FilePath | None, NotNull()] = None
@@ -116,3 +140,9 @@ class MemoryConfig(Model):
         """The areas that exist."""
         spans = ((area, getattr(self, area)) for area in AREAS)
         return {area: span for area, span in spans if span is not None}
+
+    @property
+    def functions(self) -> frozenset[int]:
+        """The functions that the memory has because of its files and queues."""
+        of_files = FILE_FUNCTIONS if self.files else frozenset[int]()
+        return of_files | ({READ_FIFO_QUEUE} if self.fifo else frozenset())

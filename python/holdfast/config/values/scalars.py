@@ -333,6 +333,7 @@ UnitIds = Annotated[int | str, Parsed(_key_of(0, MAX_UNIT))]
 SerialUnitIds = Annotated[int | str, Parsed(_key_of(1, MAX_SERIAL_UNIT, NOT_ON_A_LINE))]
 RawUnitId = Annotated[int, Parsed(_id_of("a unit id", 0, MAX_WORD), type="integer")]
 ObjectId = Annotated[int, Parsed(_id_of("an object id", 128, 255), type="integer")]
+FileNumber = Annotated[int, Parsed(_id_of("a file number", 1, MAX_WORD), type="integer")]
 FunctionCode = Annotated[
     int, Parsed(_id_of("a function code", 1, MAX_CODE), type="integer", minimum=1, maximum=MAX_CODE)
 ]
@@ -413,6 +414,7 @@ UNIT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_BYTE}$"}}
 UNITS_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_BYTE}(-{_BYTE})?$"}}
 SERIAL_UNITS_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_SERIAL}(-{_SERIAL})?$"}}
 RAW_UNIT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_WORD}$"}}
+FILE_KEYS: JsonDict = {"propertyNames": {"pattern": f"^(?!0$){_WORD}$"}}
 PEER_KEYS: JsonDict = {"propertyNames": {"pattern": "^[0-9a-fA-F.:]+$"}}
 OBJECT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_HIGH_BYTE}$"}}
 ADAPTER_KEYS: JsonDict = {

@@ -5,6 +5,7 @@ use holdfast_memory::{Access, Area, Memory, Operation, Outcome, Write};
 use holdfast_protocol::pdu::{self, ExceptionCode, Request, reply};
 
 use crate::link::{PendingReply, Reply, ReplyTo, confirmation, exception, pending_reply};
+use crate::server::requests::file_records;
 use crate::server::requests::memory_operations::{exception_of, writing};
 
 /// Gives a write to the journal.
@@ -27,18 +28,20 @@ pub(in crate::server) fn submit(
     let registers = Area::HoldingRegisters;
     match request {
         Request::WriteSingleCoil { address, value } => {
-            give(Operation::Write(writing(Area::Coils, address, 1, &[u8::from(value)])))
+            give(Operation::Write(&[writing(Area::Coils, address, 1, &[u8::from(value)])]))
         }
         Request::WriteSingleRegister { address, value } => {
-            give(Operation::Write(writing(registers, address, 1, &value.to_be_bytes())))
+            give(Operation::Write(&[writing(registers, address, 1, &value.to_be_bytes())]))
         }
         Request::WriteMultipleCoils { address, bits } => {
             let write = writing(Area::Coils, address, bits.quantity(), bits.as_bytes());
-            give(Operation::Write(write))
+            give(Operation::Write(&[write]))
         }
         Request::WriteMultipleRegisters { address, registers: new } => {
-            give(Operation::Write(writing(registers, address, new.quantity(), new.as_bytes())))
+            let write = writing(registers, address, new.quantity(), new.as_bytes());
+            give(Operation::Write(&[write]))
         }
+        Request::WriteFileRecord(records) => give(Operation::Write(&file_records::writes(records))),
         Request::MaskWriteRegister { address, and_mask, or_mask } => {
             give(Operation::Mask { area: registers, address, and_mask, or_mask })
         }

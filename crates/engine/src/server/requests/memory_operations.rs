@@ -1,6 +1,6 @@
 //! What requests ask of a memory, and the exceptions that its refusals become.
 
-use holdfast_memory::{Area, Read, Refusal, Write};
+use holdfast_memory::{Area, Memory, Read, Refusal, Write};
 use holdfast_protocol::pdu::{ExceptionCode, Range};
 
 #[inline]
@@ -32,5 +32,14 @@ pub(in crate::server) fn exception_of(refusal: Refusal) -> ExceptionCode {
         }
         Refusal::NotOneStep => unreachable!("a request writes to one memory"),
         Refusal::Unsealed => unreachable!("clients never restore"),
+    }
+}
+
+/// The refusal of a request outside the ranges of a peer: a sealed memory is busy for every request.
+pub(in crate::server) fn out_of_ranges(memory: &Memory) -> ExceptionCode {
+    if memory.sealed() {
+        ExceptionCode::ServerDeviceBusy
+    } else {
+        ExceptionCode::IllegalDataAddress
     }
 }

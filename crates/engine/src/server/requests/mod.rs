@@ -1,5 +1,8 @@
-//! What answers a request: order of checks, memory, journal, listen only mode, identity.
+//! What answers a request: order of checks, memory, journal, files, queues, listen only mode,
+//! identity.
 
+pub(crate) mod fifo_queue;
+pub(crate) mod file_records;
 pub mod identity;
 pub(crate) mod journaled_write;
 pub(crate) mod listen_only;

@@ -21,9 +21,9 @@ use crate::server::connections::live::Live;
 use crate::server::reports::comm_events::{CommEvents, Received};
 use crate::server::reports::counters::{Bus, Counters, FrameCounters};
 use crate::server::requests::identity::Identity;
-use crate::server::requests::journaled_write;
 use crate::server::requests::listen_only::ListenOnly;
-use crate::server::requests::memory_operations::{exception_of, reading, writing};
+use crate::server::requests::memory_operations::{exception_of, out_of_ranges, reading, writing};
+use crate::server::requests::{fifo_queue, file_records, journaled_write};
 use crate::server::rights::functions::is_write;
 use crate::server::rights::policy::{Elsewhere, NOT_ALLOWED, PeerRights};
 
@@ -395,9 +395,11 @@ impl UnitServer {
                 let len = reply::server_id(&[unit_id], true, text, reply);
                 Ok(len.expect("the text of an identity fits into a reply"))
             }
-            Request::ReadFileRecord(_)
-            | Request::WriteFileRecord(_)
-            | Request::ReadFifoQueue { .. } => Err(ExceptionCode::IllegalFunction),
+            Request::ReadFileRecord(ranges) => file_records::read(memory, ranges, reply),
+            Request::WriteFileRecord(records) => file_records::write(memory, records, reply),
+            Request::ReadFifoQueue { address } => {
+                fifo_queue::read(rights, unit_id, memory, address, reply)
+            }
             Request::ReadDeviceIdentification { code, object_id } => {
                 self.identity.get().card(unit_id).objects.reply(code, object_id, reply)
             }
@@ -442,15 +444,6 @@ fn outside(rights: &PeerRights, unit_id: u8, request: &[u8]) -> bool {
     rights
         .ranges(unit_id)
         .is_some_and(|ranges| Request::parse(request).is_ok_and(|request| !ranges.allow(&request)))
-}
-
-/// The refusal of such a request: a sealed memory is busy for every request.
-fn out_of_ranges(memory: &Memory) -> ExceptionCode {
-    if memory.sealed() {
-        ExceptionCode::ServerDeviceBusy
-    } else {
-        ExceptionCode::IllegalDataAddress
-    }
 }
 
 // Not inlined, the parts of `out` are loaded before their stores are done: 2 % of a server's rate.

@@ -2,18 +2,6 @@
 
 use holdfast_protocol::pdu::{Function, Request};
 
-/// Functions of the standard that only read, and that memories do not serve (V1.1b3, 6): file records,
-/// FIFO queue.
-pub const OTHER_READS: [u8; 2] = [20, 24];
-
-/// The function of the standard that writes file records (V1.1b3, 6.15).
-pub const WRITE_FILE_RECORD: u8 = 21;
-
-/// Whether memories serve a function. Only devices know the others.
-pub fn is_served(code: u8) -> bool {
-    Function::from_code(code).is_some() && !OTHER_READS.contains(&code) && code != WRITE_FILE_RECORD
-}
-
 /// What answers the requests to a unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::server) enum Answerer {
@@ -21,22 +9,25 @@ pub(in crate::server) enum Answerer {
     Memory {
         /// Whether function 7 has bits to read.
         exception_status: bool,
+        /// Whether functions 20 and 21 have files.
+        files: bool,
+        /// Whether function 24 has queues.
+        queues: bool,
     },
 }
 
 impl Answerer {
     pub(in crate::server) const PLAIN_MEMORY: Answerer =
-        Answerer::Memory { exception_status: false };
+        Answerer::Memory { exception_status: false, files: false, queues: false };
 
     fn knows(self, code: u8) -> bool {
-        match self {
-            Answerer::Device => true,
-            Answerer::Memory { exception_status }
-                if code == Function::ReadExceptionStatus.code() =>
-            {
-                exception_status
-            }
-            Answerer::Memory { .. } => is_served(code),
+        let Answerer::Memory { exception_status, files, queues } = self else { return true };
+        match Function::from_code(code) {
+            None => false,
+            Some(Function::ReadExceptionStatus) => exception_status,
+            Some(Function::ReadFileRecord | Function::WriteFileRecord) => files,
+            Some(Function::ReadFifoQueue) => queues,
+            Some(_) => true,
         }
     }
 }
@@ -98,7 +89,7 @@ fn is_allowed(code: u8, functions: &Functions, access: AccessMode, answerer: Ans
         }
 }
 
-/// Whether a request writes, also to a file of a device.
+/// Whether a request writes.
 #[inline]
 pub(in crate::server) fn is_write(request: &[u8]) -> bool {
     let code = request.first().copied().unwrap_or_default();

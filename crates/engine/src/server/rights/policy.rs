@@ -40,6 +40,8 @@ pub struct Narrowed {
     pub ranges: Ranges,
     /// Area and address of the eight bits that function 7 reads; with `None`, the unit does not have it.
     pub exception_status: Option<(Area, u16)>,
+    /// The holding registers that function 24 finds a queue at; without any, the unit does not have it.
+    pub queues: Box<[u16]>,
 }
 
 /// Where requests to a unit go that its memory does not answer.
@@ -149,8 +151,9 @@ struct UnitRights {
     functions: Codes,
     access: AccessMode,
     /// `None` if there is no limit.
-    ranges: Option<Ranges>,
+    ranges: Option<Box<Ranges>>,
     exception_status: Option<(Area, u16)>,
+    queues: Box<[u16]>,
 }
 
 impl PeerRights {
@@ -181,16 +184,23 @@ impl PeerRights {
                     continue;
                 }
                 let narrowed = rule.narrowed.iter().find(|(narrowed, _)| *narrowed == unit);
-                let (access, allowed, ranges, exception_status) = match narrowed {
-                    None => (rule.access, &rule.functions, None, None),
+                let (access, allowed, ranges, exception_status, queues) = match narrowed {
+                    None => (rule.access, &rule.functions, None, None, Box::default()),
                     Some((_, own)) => {
-                        let ranges = (!own.ranges.is_everything()).then(|| own.ranges.clone());
-                        (own.access, &own.functions, ranges, own.exception_status)
+                        let limited = !own.ranges.is_everything();
+                        let ranges = limited.then(|| Box::new(own.ranges.clone()));
+                        let queues = own.queues.clone();
+                        (own.access, &own.functions, ranges, own.exception_status, queues)
                     }
                 };
+                let has_files = |memory: &Arc<Memory>| memory.layout().has_files();
                 let answerer = match elsewhere {
                     Some(Elsewhere::Device(_)) => Answerer::Device,
-                    _ => Answerer::Memory { exception_status: exception_status.is_some() },
+                    _ => Answerer::Memory {
+                        exception_status: exception_status.is_some(),
+                        files: memory.as_ref().is_some_and(has_files),
+                        queues: !queues.is_empty(),
+                    },
                 };
                 let codes = Codes::of(allowed, access, answerer);
                 functions = functions.with(match answerer {
@@ -210,6 +220,7 @@ impl PeerRights {
                     access,
                     ranges,
                     exception_status,
+                    queues,
                 });
             }
             if rule.units.is_empty() && rule.elsewhere.is_empty() {
@@ -240,12 +251,17 @@ impl PeerRights {
     /// The ranges that requests to a unit id must be inside, if they are limited.
     #[inline]
     pub(crate) fn ranges(&self, unit_id: u8) -> Option<&Ranges> {
-        self.unit(unit_id)?.ranges.as_ref()
+        self.unit(unit_id)?.ranges.as_deref()
     }
 
     /// Where the eight bits are that function 7 reads from the memory of a unit id.
     pub(crate) fn exception_status(&self, unit_id: u8) -> Option<(Area, u16)> {
         self.unit(unit_id)?.exception_status
+    }
+
+    /// Whether function 24 finds a queue at a holding register of the memory of a unit id.
+    pub(crate) fn has_queue(&self, unit_id: u8, address: u16) -> bool {
+        self.unit(unit_id).is_some_and(|unit| unit.queues.contains(&address))
     }
 
     /// The exception for a request that the peer may not send to this unit: its function is not allowed (writes

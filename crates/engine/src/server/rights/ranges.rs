@@ -1,7 +1,7 @@
 //! The ranges that a peer may read and write.
 
 use holdfast_memory::Area;
-use holdfast_protocol::pdu::Request;
+use holdfast_protocol::pdu::{FileRange, Request};
 
 use crate::items::{Items, touched};
 
@@ -23,9 +23,24 @@ impl Ranges {
 
     /// Whether a request reads and writes only inside the ranges.
     pub(crate) fn allow(&self, request: &Request<'_>) -> bool {
-        let (read, written) = touched(request);
-        read.is_none_or(|items| self.allow_read(items))
-            && written.is_none_or(|items| is_inside(items, &self.write))
+        let of_file = |range: FileRange| Items {
+            area: Area::File(range.file()),
+            address: range.record(),
+            count: range.quantity().into(),
+        };
+        match request {
+            Request::ReadFileRecord(ranges) => {
+                ranges.iter().all(|range| self.allow_read(of_file(range)))
+            }
+            Request::WriteFileRecord(records) => {
+                records.iter().all(|(range, _)| is_inside(of_file(range), &self.write))
+            }
+            _ => {
+                let (read, written) = touched(request);
+                read.is_none_or(|items| self.allow_read(items))
+                    && written.is_none_or(|items| is_inside(items, &self.write))
+            }
+        }
     }
 
     pub(crate) fn allow_read(&self, items: Items) -> bool {
@@ -39,9 +54,7 @@ fn is_inside(items: Items, ranges: &Option<Vec<Items>>) -> bool {
 
 /// Joins ranges that meet, so that a request may cross from one into the other.
 fn joined(mut ranges: Vec<Items>) -> Vec<Items> {
-    ranges.sort_by_key(|range| {
-        (Area::ALL.iter().position(|area| *area == range.area), range.address)
-    });
+    ranges.sort_by_key(|range| (range.area, range.address));
     let mut all: Vec<Items> = Vec::new();
     for range in ranges {
         match all.last_mut() {

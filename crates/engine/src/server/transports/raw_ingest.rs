@@ -359,7 +359,7 @@ impl RawIngest {
             let _ = done.send(outcome);
         });
         memory
-            .submit(Access::Ingest, Operation::Write(writing(&header, payload)), kept)
+            .submit(Access::Ingest, Operation::Write(&[writing(&header, payload)]), kept)
             .map_err(refusal)?;
         let outcome = outcome.await.map_err(|_| Refusal::NotConfirmed)?;
         let done = outcome.map_err(|refused| refusal(refused.refusal))?;

@@ -26,7 +26,6 @@ use crate::server::reports::refused_request::{RefusedRequest, Reported};
 use crate::server::requests::unit_server::{
     ASCII_DELIMITER, UnitServer, UnitSettings, changed_delimiter,
 };
-use crate::server::rights::functions::is_served;
 use crate::server::rights::policy::{PeerRights, Rule};
 use crate::server::transports::framing::{Framing, Rtu};
 
@@ -298,9 +297,7 @@ impl ModbusSerial {
     async fn broadcast(&self, context: &ListenerContext, request: &[u8]) {
         let function = Function::from_pdu(request);
         let wanted = function.is_some_and(|function| {
-            function.is_write()
-                && is_served(function.code())
-                && function != Function::ReadWriteMultipleRegisters
+            function.is_write() && function != Function::ReadWriteMultipleRegisters
         });
         if !wanted {
             self.unit_server.counters.frames.other_unit.add();
