@@ -23,6 +23,7 @@ use super::exchange::{Abandoned, Event, Exchange, Order, RequestHead, ResponseHe
 use super::front::Front;
 use super::line::{SharedLine, Verdict, Wire};
 use super::output::Output;
+use super::portion::MAX_HEADER_BYTES;
 use super::refusal::{Refusal, RefusalBody};
 use crate::server::Peer;
 use crate::server::connections::admission::Ticket;
@@ -31,9 +32,6 @@ use crate::server::connections::listener::{Admitted, KEEPALIVE, set_options};
 use crate::server::reports::event::Kind;
 use crate::server::transports::secure::secured;
 use crate::server::transports::stream::Stream;
-
-/// The largest header of a request, in bytes.
-const MAX_HEADER_BYTES: usize = 65_536;
 
 /// How long a peer is read after its last response.
 const LINGER: Duration = Duration::from_secs(2);

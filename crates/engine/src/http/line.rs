@@ -242,7 +242,12 @@ impl Line {
 
     /// How many of the bytes that were received hyper may read.
     fn allowed(&mut self) -> usize {
-        self.portion.len(&self.held[self.taken..])
+        let received = &self.held[self.taken..];
+        let len = self.portion.len(received);
+        // After the end, a part of a header is all that there is.
+        let is_head = matches!(self.portion, Portion::Head(_));
+        let is_part = is_head && len == 0 && !self.portion.is_without_end();
+        if self.is_ended && is_part { received.len() } else { len }
     }
 
     /// hyper has read bytes.
@@ -411,6 +416,11 @@ impl Read for Wire {
             if line.portion.is_over() {
                 // The next request has to wait. The task is polled when the response is complete.
                 return Poll::Pending;
+            }
+            if line.portion.is_without_end() {
+                // hyper would take all that follows for the rest of the header.
+                line.front.ended(Kind::BrokenRequest, line.peer.clone());
+                return Poll::Ready(Err(io::ErrorKind::InvalidData.into()));
             }
             if line.is_ended {
                 return Poll::Ready(Ok(()));

@@ -1,6 +1,9 @@
 //! Which received bytes belong to the current request. hyper judges whether they are valid; here, only
 //! their end matters.
 
+/// The largest header of a request, in bytes.
+pub(super) const MAX_HEADER_BYTES: usize = 65_536;
+
 /// What of a request is still to come.
 #[derive(Debug)]
 pub(super) enum Portion {
@@ -26,10 +29,18 @@ impl Portion {
     /// Leaves out the first bytes, which hyper has read.
     pub(super) fn skip(&mut self, len: usize) {
         match self {
-            Portion::Head(end) => end.search.skip(len),
+            Portion::Head(end) => {
+                end.is_begun |= len > 0;
+                end.search.skip(len);
+            }
             Portion::Body(left) => *left -= len as u64,
             Portion::Chunks(end) => end.search.skip(len),
         }
+    }
+
+    /// Whether hyper has all of a header, and still no request.
+    pub(super) fn is_without_end(&self) -> bool {
+        matches!(self, Portion::Head(end) if end.search.found == Some(0))
     }
 
     /// Whether all of the request has been read.
@@ -65,6 +76,8 @@ pub(super) struct HeadEnd {
     has_lines: bool,
     has_length: bool,
     has_coding: bool,
+    /// Whether hyper has read a part of it.
+    is_begun: bool,
 }
 
 const LENGTH: &[u8] = b"content-length:";
@@ -72,15 +85,13 @@ const CODING: &[u8] = b"transfer-encoding:";
 
 impl HeadEnd {
     fn find(&mut self, bytes: &[u8]) -> usize {
-        if self.search.found == Some(0) && !self.has_lines {
-            // hyper ignores empty lines before a request: there was no header so far.
-            *self = HeadEnd::default();
-        }
         while self.search.found.is_none()
             && let Some(byte) = bytes.get(self.search.searched)
         {
             self.search.searched += 1;
             match byte {
+                // Empty lines before a request belong to it.
+                b'\n' if self.line.is_empty() && !self.has_lines => {}
                 b'\n' if self.line.is_empty() => self.search.found = Some(self.search.searched),
                 b'\n' => self.end_line(),
                 b'\r' => {}
@@ -88,7 +99,18 @@ impl HeadEnd {
                 _ => {}
             }
         }
-        self.search.found.unwrap_or(bytes.len())
+        match self.search.found {
+            Some(found) => found,
+            None if self.is_awaited(bytes) => 0,
+            None => bytes.len(),
+        }
+    }
+
+    /// Whether hyper gets nothing before the end has arrived. Once it has read a part of a header, it looks for
+    /// the end by other rules, and judges the rest later. What can't be a request is refused at once.
+    fn is_awaited(&self, bytes: &[u8]) -> bool {
+        let first = bytes.iter().find(|byte| !matches!(byte, b'\r' | b'\n'));
+        !self.is_begun && bytes.len() <= MAX_HEADER_BYTES && first.is_none_or(u8::is_ascii_graphic)
     }
 
     fn end_line(&mut self) {
