@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_LIMITS, WRITE_LIMITS
-from holdfast.tags.base import BaseTag, Marker, Scaled, TagError
+from holdfast.tags.base import Marker, Scaled, TagError
 from holdfast.tags.scale import Linear, RegisterScale
-from holdfast.tags.writing import raw_of, unwritable
+from holdfast.tags.writing import Rounding, WritableTag, unwritable
 from holdfast.types import AREAS, BIT_AREAS, Area
 from holdfast.values import (
     ConversionError,
@@ -26,12 +26,6 @@ from holdfast.values.integers import as_integer
 from holdfast.values.orders import DEFAULT_ORDER
 from holdfast.values.types import Type, parsed
 
-Rounding: TypeAlias = Literal["nearest", "exact"]
-"""What happens to a value between two values of the registers: rounded, or refused."""
-
-INTEGERS = ("int", "uint", "bcd")
-"""What the names of integer types begin with."""
-
 
 def default_type(area: Area) -> str:
     """The type of a tag that names none."""
@@ -39,7 +33,7 @@ def default_type(area: Area) -> str:
 
 
 @dataclass(frozen=True)
-class Tag(BaseTag):
+class Tag(WritableTag):
     """A tag. Raises `TagError`.
 
     A value is scale × number + offset, where the number is what the registers hold.
@@ -169,21 +163,6 @@ class Tag(BaseTag):
         return source
 
     @property
-    def is_float(self) -> bool:
-        """Whether the registers hold floating-point numbers."""
-        return self.of_type.base in FLOATS
-
-    @property
-    def is_number(self) -> bool:
-        """Whether the values are numbers, and not bits or text."""
-        return self.is_float or self.of_type.base.startswith(INTEGERS)
-
-    @property
-    def is_stepped(self) -> bool:
-        """Whether the values are numbers in steps of `scale`, and not names."""
-        return self.is_number and not self.is_float and not self.states
-
-    @property
     def unwritable(self) -> str | None:
         """Why no Modbus request can write the tag; `None` if one can."""
         if self.area not in WRITE_LIMITS:
@@ -225,12 +204,6 @@ class Tag(BaseTag):
             raise TagError("scale", f"the tag {self.scale.name!r} does not exist in this list")
         return replace(self, scale=replace(self.scale, source=source))
 
-    @property
-    def unscaled(self) -> str:
-        """What stands in the way while the scale is in a register that was not read."""
-        assert isinstance(self.scale, RegisterScale)
-        return f"the scale is in {self.scale.where}, which has to be read first"
-
     def _has_no_value(self, raw: Any) -> bool:
         return all(map(self.is_null, raw)) if type(raw) is list else self.is_null(raw)
 
@@ -254,15 +227,6 @@ class Tag(BaseTag):
     def state(self, value: Any) -> str | None:
         """The name of a value, if it has one."""
         return self.states.get(value) if isinstance(value, int) else None
-
-    def raw(self, value: Any, *, default_round: Rounding = "exact") -> Any:
-        """What the registers have to hold for a value, or for the name of one.
-
-        Raises `DoesNotFit` for a value that they can't hold, and for one below `min` or above
-        `max`. `default_round` is for a tag without `round`. A number that stands for a state is
-        never rounded. Floating-point registers take the nearest number.
-        """
-        return raw_of(self, value, self._linear, default_round)
 
 
 _KEYS = {UnknownOrder: "order", UnknownEncoding: "encoding"}

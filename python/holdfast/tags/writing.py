@@ -3,18 +3,107 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from holdfast.protocol import WRITE_LIMITS
+from holdfast.tags.base import BaseTag
 from holdfast.tags.scale import RegisterScale
 from holdfast.types import BIT_AREAS
 from holdfast.values import DoesNotFit
+from holdfast.values.digits import FLOATS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from holdfast.tags.scale import Linear
-    from holdfast.tags.tag import Rounding, Tag
     from holdfast.types import Area
     from holdfast.values.types import Type
+
+Rounding: TypeAlias = Literal["nearest", "exact"]
+"""What happens to a value between two values of the registers: rounded, or refused."""
+
+INTEGERS = ("int", "uint", "bcd")
+"""What the names of integer types begin with."""
+
+
+class WritableTag(BaseTag):
+    """A tag as writes see it."""
+
+    of_type: Type
+    scale: float | RegisterScale
+    min: float | None
+    max: float | None
+    states: Mapping[int, str]
+    round: Rounding | None
+    _linear: Linear
+
+    @property
+    def is_float(self) -> bool:
+        """Whether the registers hold floating-point numbers."""
+        return self.of_type.base in FLOATS
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the values are numbers, and not bits or text."""
+        return self.is_float or self.of_type.base.startswith(INTEGERS)
+
+    @property
+    def is_stepped(self) -> bool:
+        """Whether the values are numbers in steps of `scale`, and not names."""
+        return self.is_number and not self.is_float and not self.states
+
+    @property
+    def unscaled(self) -> str:
+        """What stands in the way while the scale is in a register that was not read."""
+        assert isinstance(self.scale, RegisterScale)
+        return f"the scale is in {self.scale.where}, which has to be read first"
+
+    def raw(self, value: Any, *, default_round: Rounding = "exact") -> Any:
+        """What the registers have to hold for a value, or for the name of one.
+
+        Raises `DoesNotFit` for a value that they can't hold, and for one below `min` or above
+        `max`. `default_round` is for a tag without `round`. A number that stands for a state is
+        never rounded. Floating-point registers take the nearest number.
+        """
+        if hasattr(value, "tolist"):
+            value = value.tolist()
+        if isinstance(value, list | tuple):
+            return [self.raw(item, default_round=default_round) for item in value]
+        if isinstance(value, str) and self.states:
+            value = self._named(value)
+        if not self.is_number:
+            return value
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise DoesNotFit(f"{value!r} is not a number")
+        if not math.isfinite(value):
+            raise DoesNotFit(f"{value} is not a finite number")
+        if isinstance(self.scale, RegisterScale):
+            raise DoesNotFit(self.unscaled)
+        self._check_limits(value, f"{value} is")
+        if self.is_float:
+            return value if self._linear.is_identity else float(self._linear.number(value))
+        exact = self._linear.number(value)
+        if exact.denominator == 1:
+            return exact.numerator
+        steps = f"steps of {abs(self.scale)}"
+        if not self.is_stepped or (self.round or default_round) == "exact":
+            raise DoesNotFit(f"{value} is between two values of the registers, allowed: {steps}")
+        nearest = round(exact)
+        rounded = self._linear.value(nearest)
+        self._check_limits(rounded, f"{value} is {rounded} in {steps},")
+        return nearest
+
+    def _check_limits(self, value: float, found: str) -> None:
+        least, most = self.min, self.max
+        if (least is not None and value < least) or (most is not None and value > most):
+            allowed = f"{'' if least is None else least} to {'' if most is None else most}"
+            raise DoesNotFit(f"{found} outside {allowed.strip()}")
+
+    def _named(self, name: str) -> int:
+        for value, known in self.states.items():
+            if known == name:
+                return value
+        raise DoesNotFit(f"{name!r} is no state, allowed: {', '.join(self.states.values())}")
 
 
 def unwritable(area: Area, type: Type, named: str) -> str | None:
@@ -29,48 +118,3 @@ def unwritable(area: Area, type: Type, named: str) -> str | None:
         kind = "coils" if area in BIT_AREAS else "registers"
         return f"{named} has {type.registers} {kind}, one request writes at most {most}"
     return None
-
-
-def raw_of(tag: Tag, value: Any, linear: Linear, default_round: Rounding) -> Any:
-    """What the registers have to hold, see `Tag.raw`; `linear` is the scale of the tag."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [raw_of(tag, item, linear, default_round) for item in value]
-    if isinstance(value, str) and tag.states:
-        value = _named(tag, value)
-    if not tag.is_number:
-        return value
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise DoesNotFit(f"{value!r} is not a number")
-    if not math.isfinite(value):
-        raise DoesNotFit(f"{value} is not a finite number")
-    if isinstance(tag.scale, RegisterScale):
-        raise DoesNotFit(tag.unscaled)
-    _check_limits(tag, value, f"{value} is")
-    if tag.is_float:
-        return value if linear.is_identity else float(linear.number(value))
-    exact = linear.number(value)
-    if exact.denominator == 1:
-        return exact.numerator
-    steps = f"steps of {abs(tag.scale)}"
-    if not tag.is_stepped or (tag.round or default_round) == "exact":
-        raise DoesNotFit(f"{value} is between two values of the registers, allowed: {steps}")
-    nearest = round(exact)
-    rounded = linear.value(nearest)
-    _check_limits(tag, rounded, f"{value} is {rounded} in {steps},")
-    return nearest
-
-
-def _check_limits(tag: Tag, value: float, found: str) -> None:
-    least, most = tag.min, tag.max
-    if (least is not None and value < least) or (most is not None and value > most):
-        allowed = f"{'' if least is None else least} to {'' if most is None else most}"
-        raise DoesNotFit(f"{found} outside {allowed.strip()}")
-
-
-def _named(tag: Tag, name: str) -> int:
-    for value, known in tag.states.items():
-        if known == name:
-            return value
-    raise DoesNotFit(f"{name!r} is no state, allowed: {', '.join(tag.states.values())}")
