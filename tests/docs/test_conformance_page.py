@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from typing import TYPE_CHECKING
 
 import pytest
@@ -134,3 +135,9 @@ def test_what_holds_has_a_test_and_the_tests_exist() -> None:
             problems.append(f"{place}: {holds!r} is no verdict")
     assert problems == []
     assert len(pages) == 4
+
+
+def test_each_planted_fault_has_its_place() -> None:
+    planted = tomllib.loads((TESTS / "conformance" / "mutations.toml").read_text())["mutation"]
+    counts = {each["row"]: (ROOT / each["file"]).read_text().count(each["old"]) for each in planted}
+    assert {row: count for row, count in counts.items() if count != 1} == {}
