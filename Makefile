@@ -61,7 +61,9 @@ explore: export PROPTEST_RNG_SEED := $(shell date +%s)
 explore: .venv/core.stamp .venv/dev.stamp
 	@echo PROPTEST_RNG_SEED=$$PROPTEST_RNG_SEED
 	PROPTEST_CASES=5000 cargo test --locked --quiet $(CRATES) --lib --tests; rust=$$?; \
-	HOLDFAST_EXPLORE=1 $(BIN)/pytest -m hypothesis && exit $$rust
+	cargo run --locked --quiet --release --manifest-path $(FUZZ) --target-dir target/fuzz --bin random -- \
+	  $$PROPTEST_RNG_SEED 60; random=$$?; \
+	HOLDFAST_EXPLORE=1 $(BIN)/pytest -m hypothesis && exit $$(( rust || random ))
 
 # Looks for faults of the program and of its tests for HOURS: planted faults, fuzzing, new cases, hostile devices,
 # mutants. Writes .cache/proof/report.md. Changes files of the checkout meanwhile, and restores them.
@@ -90,7 +92,7 @@ lint: no-std .venv/core.stamp .venv/dev.stamp
 	cargo fmt --check --manifest-path $(NO_STD)
 	cargo fmt --check --manifest-path $(PEERS)/rust/Cargo.toml
 	cargo fmt --check --manifest-path $(FUZZ)
-	cargo clippy --locked --quiet --manifest-path $(FUZZ) --target-dir target --lib --tests -- -D warnings
+	cargo clippy --locked --quiet --manifest-path $(FUZZ) --target-dir target --lib --bins --tests -- -D warnings
 	cargo clippy --locked --quiet --workspace --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets --no-default-features -- -D warnings

@@ -31,6 +31,7 @@ from holdfast.types import (
     ThreadHeartbeat,
     TlsFiles,
     WhenFull,
+    YamlEvent,
 )
 
 __all__ = [
@@ -98,6 +99,7 @@ __all__ = [
     "read_memory_file",
     "release_memory_file",
     "write_disabled_status",
+    "yaml_events",
 ]
 
 __version__: str
@@ -1566,18 +1568,8 @@ def plan_blocks(
     registers outside all fields. Raises `ValueError` for a field that no request may read.
     """
 
-YamlEvent = tuple[
-    Literal["plain", "quoted", "list", "mapping", "end", "alias"],
-    int,
-    int,
-    int | None,
-    str | None,
-    str | None,
-]
-
 def yaml_events(text: str, most: int) -> list[YamlEvent] | None:
     """The events of a YAML document of at most `most` values; more end it early.
 
-    An event is what it is, its line and column from 1, the anchor that it has or names, its tag
-    and its text. `None` for text that is not YAML, has several documents, or nests deeper than 255.
+    `None` for text that is not YAML, has several documents, or nests deeper than 255.
     """

@@ -103,6 +103,16 @@ TlsFiles: TypeAlias = (
 )
 """Files of trusted authorities, of a certificate, and of its key."""
 
+YamlEvent: TypeAlias = tuple[
+    Literal["plain", "quoted", "list", "mapping", "end", "alias"],
+    int,
+    int,
+    int | str | None,
+    str | None,
+    str | None,
+]
+"""What it is, its line and column from 1, the anchor that it has or names, its tag and its text."""
+
 ThreadHeartbeat: TypeAlias = tuple[str, float, int | None]
 """A thread's name, seconds since its last heartbeat, and its number in the system, if known."""
 

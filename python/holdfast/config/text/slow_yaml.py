@@ -24,7 +24,7 @@ from holdfast.config.text.problems import ConfigError, Problem
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from holdfast._core import YamlEvent
+    from holdfast.types import YamlEvent
 
 PLAIN_REASONS = {
     "found character '\\t' that cannot start any token": "a tab indents this line, allowed: spaces",

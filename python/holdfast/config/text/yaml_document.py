@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
-    from holdfast._core import YamlEvent
+    from holdfast.types import YamlEvent
 
 Key: TypeAlias = str | int
 KeyPath: TypeAlias = tuple[Key, ...]
