@@ -67,6 +67,29 @@ class FileSnapshot:
         }
         return {file: change for file, change in found.items() if change is not None}
 
+    def not_taken_over(
+        self, before: FileSnapshot | None, now: FileSnapshot
+    ) -> dict[Path, str] | None:
+        """Why the changes since this snapshot are not taken over, by file; `None` if they are.
+
+        `before` is the look before `now`. Files that were renamed into place are taken over if
+        nothing has changed since that look, and no file was written in place.
+        """
+        changed = self.changed(now)
+        is_steady = before is not None and before.states == now.states
+        is_written = "written" in changed.values()
+        if is_steady and "replaced" in changed.values() and not is_written:
+            return None
+        reasons: dict[Path, str] = {}
+        for file, change in changed.items():
+            if change == "written":
+                reasons[file] = "written in place, not renamed"
+            elif change == "replaced" and is_written:
+                reasons[file] = "replaced, but another file was written in place"
+            elif change == "removed" and is_steady:
+                reasons[file] = "removed"
+        return reasons
+
     def _state(self, file: Path, hold: bool) -> State | None:
         held: _Held | None = None
         if hold and _PATH_ONLY:

@@ -170,19 +170,10 @@ class Reloader:
         before, self._last_snapshot = self._last_snapshot, now
         if self._loaded_files is None:
             self._loaded_files = now
-        changed = self._loaded_files.changed(now)
-        is_steady = before is not None and before.states == now.states
-        is_written = "written" in changed.values()
-        if is_steady and "replaced" in changed.values() and not is_written:
-            return True
-        for file, change in changed.items():
-            if change == "written":
-                self._log_once(file, "written in place, not renamed")
-            elif change == "replaced" and is_written:
-                self._log_once(file, "replaced, but another file was written in place")
-            elif change == "removed" and is_steady:
-                self._log_once(file, "removed")
-        return False
+        reasons = self._loaded_files.not_taken_over(before, now)
+        for file, reason in (reasons or {}).items():
+            self._log_once(file, reason)
+        return reasons is None
 
     def _log_once(self, file: Path | str, reason: str | None) -> None:
         """Logs a change that is not taken over; once until the next reload."""
