@@ -10,13 +10,18 @@ use std::env;
 use std::fs;
 use std::panic::catch_unwind;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
-use std::time::{Duration, Instant};
+use std::process::{self, ExitCode};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use holdfast_fuzz::{Check, TARGETS};
 
 /// Inputs between two looks at the clock.
 const BATCH: u64 = 256;
+
+/// A check that takes longer than this has failed.
+const TOO_LONG: Duration = Duration::from_secs(10);
 
 const MAX_CHANGES: usize = 6;
 const MAX_LEN: usize = 1024;
@@ -44,25 +49,49 @@ fn main() -> ExitCode {
 }
 
 /// Runs one check for this time. Whether it held for all inputs.
-fn passes(root: &Path, name: &str, check: Check, seed: u64, time: Duration) -> bool {
+fn passes(root: &Path, name: &'static str, check: Check, seed: u64, time: Duration) -> bool {
     let found = root.join("../.cache/fuzz").join(name);
     let corpus = [inputs(&root.join("corpus").join(name)), inputs(&found)].concat();
     assert!(!corpus.is_empty(), "each target has a corpus");
+    let artifacts = root.join("artifacts").join(name);
+    let current = Arc::new(Mutex::new(Vec::new()));
+    let watched = Arc::clone(&current);
+    let folder = artifacts.clone();
+    let watchdog = thread::spawn(move || end_if_stuck(&watched, &folder, name));
     let mut random = Random(seed | 1);
-    let (start, mut count) = (Instant::now(), 0);
-    while start.elapsed() < time {
+    let start = Instant::now();
+    let (mut count, mut holds) = (0_u64, true);
+    while holds && start.elapsed() < time {
         for _ in 0..BATCH {
             let input = random.changed(&corpus);
+            current.lock().expect("no check holds it").clone_from(&input);
             count += 1;
             if catch_unwind(|| check(&input)).is_err() {
-                let kept = kept(&root.join("artifacts").join(name), &input, seed, count);
-                println!("{name}: FAILED for {}", kept.display());
-                return false;
+                println!("{name}: FAILED for {}", kept(&artifacts, &input).display());
+                holds = false;
+                break;
             }
         }
     }
+    drop(current);
+    watchdog.join().expect("a look at an input does not fail");
     println!("{name}: {count} inputs in {} s, seed {seed}", start.elapsed().as_secs());
-    true
+    holds
+}
+
+/// Ends the program if one input takes too long.
+fn end_if_stuck(current: &Arc<Mutex<Vec<u8>>>, folder: &Path, name: &str) {
+    let (mut seen, mut since) = (Vec::new(), Instant::now());
+    while Arc::strong_count(current) > 1 {
+        thread::sleep(Duration::from_millis(200));
+        let now = current.lock().expect("no check holds it").clone();
+        if now != seen {
+            (seen, since) = (now, Instant::now());
+        } else if since.elapsed() > TOO_LONG {
+            println!("{name}: FAILED, takes too long for {}", kept(folder, &seen).display());
+            process::exit(1);
+        }
+    }
 }
 
 fn inputs(folder: &Path) -> Vec<Vec<u8>> {
@@ -72,8 +101,9 @@ fn inputs(folder: &Path) -> Vec<Vec<u8>> {
     paths.iter().map(|path| fs::read(path).expect("a file that can be read")).collect()
 }
 
-fn kept(folder: &Path, input: &[u8], seed: u64, count: u64) -> PathBuf {
-    let path = folder.join(format!("random-{seed}-{count}"));
+fn kept(folder: &Path, input: &[u8]) -> PathBuf {
+    let time = SystemTime::now().duration_since(UNIX_EPOCH).expect("a time after 1970");
+    let path = folder.join(format!("random-{}", time.as_nanos()));
     fs::create_dir_all(folder).expect("a folder for inputs that fail");
     fs::write(&path, input).expect("space for an input");
     path

@@ -143,8 +143,8 @@ enum Part {
     Extension(u64),
     /// Data, and the line end behind them.
     Data(u64),
-    /// A line of the trailer: its length so far.
-    Trailer(usize),
+    /// A line of the trailer: its length so far, and whether a CR was last. For hyper, only CR and LF end it.
+    Trailer(usize, bool),
 }
 
 impl Default for Part {
@@ -177,7 +177,7 @@ impl ChunksEnd {
                 return passed;
             }
             Part::Size(size) | Part::Extension(size) if byte == b'\n' => match size {
-                0 => Part::Trailer(0),
+                0 => Part::Trailer(0, false),
                 size => Part::Data(size.saturating_add(LINE_END)),
             },
             Part::Size(size) => match char::from(byte).to_digit(16) {
@@ -185,14 +185,13 @@ impl ChunksEnd {
                 None => Part::Extension(size),
             },
             Part::Extension(size) => Part::Extension(size),
-            Part::Trailer(len) => match byte {
-                b'\n' if len == 0 => {
-                    self.is_over = true;
-                    Part::Trailer(0)
+            Part::Trailer(len, was_cr) => match byte {
+                b'\n' if was_cr => {
+                    self.is_over = len == 0;
+                    Part::Trailer(0, false)
                 }
-                b'\n' => Part::Trailer(0),
-                b'\r' => Part::Trailer(len),
-                _ => Part::Trailer(len + 1),
+                b'\r' => Part::Trailer(len, true),
+                _ => Part::Trailer(len + 1, false),
             },
         };
         1
@@ -230,6 +229,7 @@ mod tests {
         for body in [
             "0\r\n\r\n",
             "3\r\nabc\r\n0\r\n\r\n",
+            "0\r\nX: y\n\r\nZ: \n\n\r\n\r\n",
             "3;x=\"1\"\r\n0\r\n\r\n1A\r\nabcdefghijklmnopqrstuvwxyz\r\n000\r\nX: y\r\n\r\n",
         ] {
             let bytes = format!("{body}GET / HTTP/1.1\r\n\r\n");
