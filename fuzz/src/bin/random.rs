@@ -79,7 +79,7 @@ fn passes(root: &Path, name: &'static str, check: Check, seed: u64, time: Durati
     holds
 }
 
-/// Ends the program if one input takes too long.
+/// Ends the program if one input takes too long. It looks now and then: a check that never ends signals nothing.
 fn end_if_stuck(current: &Arc<Mutex<Vec<u8>>>, folder: &Path, name: &str) {
     let (mut seen, mut since) = (Vec::new(), Instant::now());
     while Arc::strong_count(current) > 1 {

@@ -180,6 +180,7 @@ def parse(text: str, file: str) -> tuple[Document, list[Problem]]:
         line = text[: found.start()].count("\n") + 1
         raise _error(file, f"the character U+{ord(found[0]):04X} is not allowed in YAML", line)
     try:
+        # Text without a value has no events, from either parser.
         reader = _Reader(yaml_events(text, MAX_WRITTEN) or _slow_events(text, file))
     except _TooMany:
         raise _error(file, f"more than {MAX_WRITTEN} keys and values, the limit") from None
