@@ -12,7 +12,6 @@ import asyncio
 import contextlib
 import logging
 import time
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from holdfast.events import log_lines
@@ -20,6 +19,7 @@ from holdfast.replication.leases.leases import Leases
 from holdfast.replication.leases.thread import LeaseThread, Relay
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms, digest
 from holdfast.scanner.fleet.assignment import assigned
+from holdfast.scanner.fleet.handover import Handover
 from holdfast.scanner.settings import FleetSettings
 
 if TYPE_CHECKING:
@@ -31,12 +31,6 @@ if TYPE_CHECKING:
 
 NODE = "node."
 PARTITION = "partition."
-
-MAX_CONCURRENT_HANDOVERS = 4
-"""Partitions that a node gives back at once, while it goes on."""
-
-DEVICE_STOP_TIMEOUT_S = 5.0
-"""Time to wait for polls and writes of a partition before it is given back."""
 
 GATHER_S = 0.05
 """Time in which changes are gathered before partitions are placed anew."""
@@ -82,8 +76,6 @@ class PartitionLeases:
         self._lost = lost
         self._is_leaving = False
         self._has_changed = asyncio.Event()
-        self._ending: dict[str, asyncio.Task[None]] = {}
-        self._may_end = asyncio.Semaphore(MAX_CONCURRENT_HANDOVERS)
         self._started = int(time.time() * 1000)
         self._named_since = time.monotonic()
         """When no other process had the name of this node, the last time."""
@@ -103,6 +95,7 @@ class PartitionLeases:
             withheld=withheld,
         )
         self._thread = LeaseThread(self.leases, connect, "holdfast-leases", start_thread)
+        self._handover = Handover(self._thread, self._settle)
 
     @property
     def nodes(self) -> list[str]:
@@ -258,19 +251,10 @@ class PartitionLeases:
         target = assigned(self.settings.partitions, nodes, held)
         mine = {f"{PARTITION}{each}" for each, node in target.items() if node == self.node}
         self._thread.want([f"{NODE}{self.node}", *mine])
-        for key in self.leases.held:
-            if key.startswith(PARTITION) and key not in mine and key not in self._ending:
-                task = asyncio.create_task(self._give_back(key, self._may_end))
-                self._ending[key] = task
-                task.add_done_callback(partial(self._ended, key))
+        self._handover.begin(key for key in self._held_partitions() if key not in mine)
 
-    def _ended(self, key: str, _: object) -> None:
-        self._ending.pop(key, None)
-
-    async def _give_back(self, key: str, may_end: asyncio.Semaphore) -> None:
-        async with may_end:
-            await self._thread.give_back(key, DEVICE_STOP_TIMEOUT_S)
-        self._settle(key)
+    def _held_partitions(self) -> list[str]:
+        return [key for key in self.leases.held if key.startswith(PARTITION)]
 
     async def leave(self) -> None:
         """Hands all partitions over, and ends the lease of the node."""
@@ -279,9 +263,7 @@ class PartitionLeases:
         self._thread.want([])
         node = f"{NODE}{self.node}"
         await self._thread.renew_now(node)
-        keys = [key for key in self.leases.held if key.startswith(PARTITION)]
-        may_end = asyncio.Semaphore(len(keys))
-        await asyncio.gather(*(self._give_back(key, may_end) for key in keys))
+        await self._handover.at_once(self._held_partitions())
         await self._thread.give_back(node, 0.0)
         log_lines.write(logging.INFO, "fleet_left", fleet=self.settings.name, node=self.node)
 
