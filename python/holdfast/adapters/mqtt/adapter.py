@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from holdfast.adapters.mqtt.answers import Answers
 from holdfast.adapters.mqtt.connection import BrokerConnection
 from holdfast.adapters.mqtt.inbox import Filters, Inbox, Values
+from holdfast.adapters.mqtt.subscriptions import Subscriptions
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
 from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S, dial
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from paho.mqtt.reasoncodes import ReasonCode
 
     from holdfast.config.models.root import MappedTag
-    from holdfast.config.models.services import MappingConfig, MqttConfig, SubscriptionConfig
+    from holdfast.config.models.services import MqttConfig
     from holdfast.ingest import MemoryAccess
     from holdfast.net.mqtt.stream import BrokerSocket
     from holdfast.runtime.stop import Stop
@@ -70,9 +71,7 @@ class Mqtt:
         values = Values(mapped or {})
         self._inbox = Inbox(memory_access, filters, values, self._broker)
         self._answers = Answers(filters, values)
-        self._topics = [_Topic(entry) for entry in settings.subscriptions]
-        self._topics += [_Topic(entry) for entry in settings.map]
-        self._subscribing: dict[int, _Topic] = {}
+        self._subscriptions = Subscriptions(settings)
         self._unreleased = _UNRELEASED.setdefault((self._broker, settings.client_id), set())
         self._failures = _Failures(self._broker)
         self._connected_at: float | None = None
@@ -93,10 +92,7 @@ class Mqtt:
             "connected": self._connected_at is not None,
             "broker": self._broker,
             "version": self._settings.version,
-            "topics": [
-                {"topic": topic.entry.topic, "qos": topic.entry.qos, "granted": topic.granted}
-                for topic in self._topics
-            ],
+            "topics": self._subscriptions.status(),
             "last_error": self._last_error,
             "received": self._inbox.received,
             "reconnects": max(0, self._connects - 1),
@@ -168,8 +164,7 @@ class Mqtt:
         """Logs the end of a connection or attempt. Returns the seconds that it was connected."""
         began, self._connected_at = self._connected_at, None
         reason = self._ending or "the broker closed the connection"
-        for topic in self._topics:
-            topic.granted = None
+        self._subscriptions.ended()
         if reason != "stopped":
             self._last_error = reason
         if began is not None:
@@ -194,38 +189,19 @@ class Mqtt:
             return
         link.accepted(properties)
         self._failures.forget()
-        resumed = flags.session_present
-        if not resumed:
+        is_resumed = flags.session_present
+        if not is_resumed:
             self._unreleased.clear()
-            for topic in self._topics:
-                topic.known = None
         log_lines.write(
             logging.INFO,
             "mqtt_connected",
             broker=self._broker,
             version=self._settings.version,
-            session="resumed" if resumed else "new",
+            session="resumed" if is_resumed else "new",
         )
-        self._subscribing.clear()
-        for topic in self._topics:
-            self._subscribe(link, topic, resumed=resumed)
+        self._subscriptions.begin(link, is_resumed=is_resumed)
         self._connects += 1
         self._connected_at = time.monotonic()
-
-    def _subscribe(self, link: BrokerConnection, topic: _Topic, *, resumed: bool) -> None:
-        """Subscribes to a topic, again if the session was resumed.
-
-        With MQTT 3.1.1 it skips a topic that this process subscribed to in the resumed session,
-        because the broker would send retained messages again. With MQTT 5 the retain handling
-        option prevents that.
-        """
-        again = resumed and topic.known is not None
-        if again and self._settings.version != "5":
-            topic.granted = topic.known
-            return
-        identifier = link.ask_for(topic.entry, again=again)
-        if identifier is not None:
-            self._subscribing[identifier] = topic
 
     def _on_subscribe(
         self,
@@ -235,21 +211,17 @@ class Mqtt:
         reasons: list[ReasonCode],
         _properties: Properties | None,
     ) -> None:
-        topic = self._subscribing.pop(identifier, None)
-        if topic is None or not reasons:
+        refused = self._subscriptions.answered(identifier, reasons)
+        if refused is None:
             return
-        reason = reasons[0]
-        if not reason.is_failure:
-            topic.granted = topic.known = reason.value
-            return
-        topic.granted = topic.known = None
-        self._last_error = f"subscription {topic.entry.topic} refused: {reason}"
+        reason = str(reasons[0])
+        self._last_error = f"subscription {refused} refused: {reason}"
         log_lines.write(
             logging.ERROR,
             "mqtt_subscription_refused",
             broker=self._broker,
-            topic=topic.entry.topic,
-            reason=str(reason),
+            topic=refused,
+            reason=reason,
         )
 
     def _on_disconnect(
@@ -268,17 +240,6 @@ class Mqtt:
             self._ending = "the connection was lost"
         else:
             self._ending = str(reason)
-
-
-class _Topic:
-    """A subscription and the quality of service that the broker granted."""
-
-    def __init__(self, entry: SubscriptionConfig | MappingConfig) -> None:
-        self.entry = entry
-        self.granted: int | None = None
-        """In this connection."""
-        self.known: int | None = None
-        """In this session, as far as this process knows."""
 
 
 class _Failures:

@@ -13,8 +13,6 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
-from paho.mqtt.subscribeoptions import SubscribeOptions
-
 from holdfast.adapters.mqtt.inbox import MAX_PAYLOAD_BYTES
 from holdfast.ingest import KEEPING
 from holdfast.net.mqtt.client import BrokerClient
@@ -29,7 +27,7 @@ if TYPE_CHECKING:
     from paho.mqtt.reasoncodes import ReasonCode
 
     from holdfast.adapters.mqtt.inbox import Inbox
-    from holdfast.config.models.services import MappingConfig, MqttConfig, SubscriptionConfig
+    from holdfast.config.models.services import MqttConfig
     from holdfast.net.mqtt.packets import Publish
     from holdfast.net.mqtt.stream import BrokerSocket
 
@@ -113,25 +111,6 @@ class BrokerConnection(BrokerClient):
         self._most_on_the_way = min(most, _MAX_UNACKNOWLEDGED)
         self._largest_sent = getattr(properties, "MaximumPacketSize", None)
         self.most_qos = min(getattr(properties, "MaximumQoS", 1), 1)
-
-    def ask_for(
-        self, subscription: SubscriptionConfig | MappingConfig, *, again: bool
-    ) -> int | None:
-        """Sends SUBSCRIBE and returns its packet identifier, `None` when it could not be sent.
-
-        With `again`, the broker does not send retained messages a second time (MQTT 5).
-        """
-        if not self._five:
-            return self.subscribe(subscription.topic, subscription.qos)[1]
-        options = SubscribeOptions(
-            qos=subscription.qos,
-            retainHandling=(
-                SubscribeOptions.RETAIN_SEND_IF_NEW_SUB
-                if again
-                else SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
-            ),
-        )
-        return self.subscribe(subscription.topic, options=options)[1]
 
     def takes(self, size: int) -> bool:
         """Returns whether the broker accepts a message of this size, plus packet overhead."""

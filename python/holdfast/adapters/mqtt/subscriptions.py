@@ -1,0 +1,90 @@
+"""What the adapter subscribes to: when again, and when with retained messages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from paho.mqtt.reasoncodes import ReasonCode
+
+    from holdfast.adapters.mqtt.connection import BrokerConnection
+    from holdfast.config.models.services import MappingConfig, MqttConfig, SubscriptionConfig
+
+
+@dataclass
+class _Topic:
+    """A subscription and the quality of service that the broker granted."""
+
+    entry: SubscriptionConfig | MappingConfig
+    granted: int | None = None
+    """In this connection."""
+    known: int | None = None
+    """In this session, as far as this process knows."""
+
+
+class Subscriptions:
+    """The topics of one adapter, over all its connections."""
+
+    def __init__(self, settings: MqttConfig) -> None:
+        self._is_version_5 = settings.version == "5"
+        self._topics = [_Topic(entry) for entry in settings.subscriptions]
+        self._topics += [_Topic(entry) for entry in settings.map]
+        self._unanswered: dict[int, _Topic] = {}
+        """By the packet identifier of SUBSCRIBE."""
+
+    def status(self) -> list[dict[str, object]]:
+        """Each topic with the quality of service that was requested and granted."""
+        return [
+            {"topic": topic.entry.topic, "qos": topic.entry.qos, "granted": topic.granted}
+            for topic in self._topics
+        ]
+
+    def begin(self, link: BrokerConnection, *, is_resumed: bool) -> None:
+        """Subscribes over a new connection, in a session that is new or resumed."""
+        self._unanswered.clear()
+        for topic in self._topics:
+            if not is_resumed:
+                topic.known = None
+            self._subscribe(link, topic)
+
+    def _subscribe(self, link: BrokerConnection, topic: _Topic) -> None:
+        """Subscribes, so that no retained message comes twice in a session.
+
+        With MQTT 5, an option of SUBSCRIBE prevents that. With MQTT 3.1.1, a topic is skipped that
+        this process subscribed to in the session before.
+        """
+        entry = topic.entry
+        if self._is_version_5:
+            retained = (
+                SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
+                if topic.known is None
+                else SubscribeOptions.RETAIN_SEND_IF_NEW_SUB
+            )
+            options = SubscribeOptions(qos=entry.qos, retainHandling=retained)
+            identifier = link.subscribe(entry.topic, options=options)[1]
+        elif topic.known is None:
+            identifier = link.subscribe(entry.topic, entry.qos)[1]
+        else:
+            topic.granted = topic.known
+            return
+        if identifier is not None:
+            self._unanswered[identifier] = topic
+
+    def answered(self, identifier: int, reasons: Iterable[ReasonCode]) -> str | None:
+        """Takes the broker's answer to SUBSCRIBE; returns the topic if it refused it."""
+        topic = self._unanswered.pop(identifier, None)
+        reason = next(iter(reasons), None)
+        if topic is None or reason is None:
+            return None
+        topic.granted = topic.known = None if reason.is_failure else reason.value
+        return topic.entry.topic if reason.is_failure else None
+
+    def ended(self) -> None:
+        """Forgets what was granted in the connection that has ended."""
+        for topic in self._topics:
+            topic.granted = None
