@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::parts::comparer::DIGEST_EVERY;
-use super::parts::recovery::REJOIN_AFTER;
+use super::parts::rejoin::REJOIN_AFTER;
 use super::parts::snapshotter::{SNAPSHOT_AFTER, SNAPSHOT_STEPS};
 use super::settings::{Login, Servers, Settings, WhenBehind};
 use super::shared::MAX_QUEUE_STEPS;

@@ -33,9 +33,9 @@ pub(in crate::log) async fn join(node: &mut Node, store: &Store) -> Result<u64, 
     }
     // The next message was removed behind a snapshot: this node was away for too long.
     let is_gone = first > place.sequence + 1;
-    if !is_known || is_gone || node.recovery.needs_snapshot() {
+    if !is_known || is_gone || node.rejoin.needs_snapshot() {
         load(node, store, end.sequence).await?;
-        node.recovery.reloaded();
+        node.rejoin.reloaded();
     }
     node.applier.joined(id);
     // What was applied last is read again, to see that it is still the same.
@@ -74,7 +74,7 @@ async fn load(node: &mut Node, store: &Store, last: u64) -> Result<(), End> {
         ));
     }
     // A node whose contents were wrong does not trust what it has stored itself.
-    let distrusted = (!node.recovery.is_right()).then(|| node.settings.node.clone());
+    let distrusted = (!node.rejoin.contents_are_right()).then(|| node.settings.node.clone());
     let order = load_order(&pointer, distrusted.as_deref());
     let (shared, mut state) = (node.shared.clone(), node.applier.begin_load());
     let loading = load_good(store, order, revision, &shared, &mut state);

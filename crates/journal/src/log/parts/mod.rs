@@ -7,7 +7,7 @@ pub(crate) mod in_flight;
 pub(crate) mod join;
 pub(crate) mod node;
 pub(crate) mod note;
-pub(crate) mod recovery;
+pub(crate) mod rejoin;
 pub(crate) mod sender;
 pub(crate) mod session;
 pub(crate) mod snapshotter;

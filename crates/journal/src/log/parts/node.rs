@@ -6,7 +6,7 @@
 //! | [`Sender`] | what is sent, and the outcome that writers see |
 //! | [`Snapshotter`] | when a snapshot is taken and stored |
 //! | [`Comparer`] | whether digests of nodes agree |
-//! | [`Recovery`] | whether the contents are right |
+//! | [`Rejoin`] | whether the contents are right |
 //! | [`ServerLag`] | whether the servers have lost messages |
 //!
 //! The parts do not know each other. A session passes on what one of them finds out.
@@ -20,7 +20,7 @@ use crate::log::error::{End, LogError};
 use crate::log::parts::applier::Applier;
 use crate::log::parts::comparer::Comparer;
 use crate::log::parts::note::Note;
-use crate::log::parts::recovery::Recovery;
+use crate::log::parts::rejoin::Rejoin;
 use crate::log::parts::sender::Sender;
 use crate::log::parts::snapshotter::Snapshotter;
 use crate::log::settings::Settings;
@@ -40,7 +40,7 @@ pub(in crate::log) struct Node {
     pub(in crate::log) sender: Sender,
     pub(in crate::log) snapshotter: Snapshotter,
     pub(in crate::log) comparer: Comparer,
-    pub(in crate::log) recovery: Recovery,
+    pub(in crate::log) rejoin: Rejoin,
     pub(in crate::log) lag: ServerLag,
 }
 
@@ -56,7 +56,7 @@ impl Node {
             sender: Sender::new(&settings, &shared),
             snapshotter: Snapshotter::new(&settings, &shared),
             comparer: Comparer::new(&settings, &shared),
-            recovery: Recovery::new(&settings, &shared),
+            rejoin: Rejoin::new(&settings, &shared),
             lag: ServerLag::new(settings.max_cut_off),
             fingerprint,
             settings,
@@ -81,12 +81,12 @@ impl Node {
     /// The contents are wrong: the next session loads a snapshot.
     pub(in crate::log) fn drop_contents(&mut self, error: LogError) {
         self.comparer.forget();
-        self.recovery.drop_contents(error);
+        self.rejoin.drop_contents(error);
     }
 
     /// What the file is to keep, unless the contents are wrong or not there yet.
     pub(in crate::log) fn checkpoint(&self) -> Option<Checkpoint> {
-        self.applier.checkpoint().filter(|_| self.recovery.is_right())
+        self.applier.checkpoint().filter(|_| self.rejoin.contents_are_right())
     }
 
     /// What has to be done in time, whatever this node waits for: the file is given what it asks for, and

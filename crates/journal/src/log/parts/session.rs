@@ -174,7 +174,7 @@ impl<'n> Session<'n> {
         let last_start = node.applier.state().last_start(&node.settings.node);
         node.sender.ensure_start(last_start)?;
         node.sender.resend(publisher).await?;
-        let compares = !node.recovery.is_right();
+        let compares = !node.rejoin.contents_are_right();
         let counter = node.sender.send_probe(publisher, compares, self.began).await?;
         self.catch_up = CatchUp::Announced { counter };
         Ok(())
@@ -215,11 +215,11 @@ impl<'n> Session<'n> {
             return;
         }
         self.catch_up = CatchUp::CaughtUp;
-        let Node { shared, applier, recovery, .. } = &mut *self.node;
+        let Node { shared, applier, rejoin, .. } = &mut *self.node;
         shared.open(self.publisher.max_steps_bytes());
         let sequence = applier.sequence();
         shared.event(Event::new("log_caught_up", &[("sequence", &sequence.to_string())]));
-        if recovery.caught_up(sequence) {
+        if rejoin.caught_up(sequence) {
             shared.update(|view| {
                 view.phase = Phase::Running;
                 view.last_error = None;
@@ -241,12 +241,12 @@ impl<'n> Session<'n> {
 
     /// Draws the consequences of a comparison.
     fn judge(&mut self, sequence: u64, verdict: Verdict) -> Result<(), End> {
-        let Node { snapshotter, comparer, recovery, .. } = &mut *self.node;
+        let Node { snapshotter, comparer, rejoin, .. } = &mut *self.node;
         match verdict {
             Verdict::Alone => {}
             Verdict::Agrees => {
                 snapshotter.store(&self.background, sequence);
-                recovery.confirm(sequence);
+                rejoin.confirm(sequence);
                 comparer.show(sequence, true);
             }
             Verdict::Differs(other) => {
@@ -299,14 +299,14 @@ impl<'n> Session<'n> {
     }
 
     fn replayed(&mut self, sequence: u64, digest: Result<String, String>) -> Result<(), End> {
-        let Node { snapshotter, comparer, recovery, .. } = &mut *self.node;
+        let Node { snapshotter, comparer, rejoin, .. } = &mut *self.node;
         match comparer.replayed(sequence, digest)? {
             Replayed::Agrees => {
                 snapshotter.store(&self.background, sequence);
-                recovery.confirm(sequence);
+                rejoin.confirm(sequence);
             }
             Replayed::Unknown => snapshotter.store(&self.background, sequence),
-            Replayed::Failed => recovery.postpone(),
+            Replayed::Failed => rejoin.postpone(),
         }
         // If that was it, it is being stored.
         snapshotter.drop_disputed();
@@ -330,13 +330,13 @@ impl<'n> Session<'n> {
         }
         self.prove_contact(now).await?;
         self.send_waiting().await?;
-        let Node { applier, snapshotter, recovery, .. } = &mut *self.node;
+        let Node { applier, snapshotter, rejoin, .. } = &mut *self.node;
         snapshotter.store_undisputed(&self.background, now);
         // Only a node that is up to date and sure of its contents takes a snapshot.
-        if recovery.is_right() && self.catch_up == CatchUp::CaughtUp {
+        if rejoin.contents_are_right() && self.catch_up == CatchUp::CaughtUp {
             snapshotter.consider(&self.background, applier.state(), now);
         }
-        if let Some(sequence) = recovery.overdue(now) {
+        if let Some(sequence) = rejoin.overdue(now) {
             self.replay(sequence);
         }
         Ok(())

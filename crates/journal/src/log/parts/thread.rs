@@ -27,7 +27,7 @@ pub(in crate::log) fn run(mut node: Node) {
             }
             End::Fatal(error) => {
                 node.sender.expire_all();
-                if !node.recovery.may_rejoin(&error) {
+                if !node.rejoin.may_rejoin(&error) {
                     return fail(&node, error);
                 }
                 node.drop_contents(error);
@@ -65,8 +65,8 @@ fn run_session(node: &mut Node) -> (End, bool) {
 /// The log can't go on.
 fn fail(node: &Node, error: LogError) {
     // What the file is to keep has to be right. All other errors are about the log, not the contents.
-    let is_right = !matches!(error, LogError::Differs { .. });
-    node.shared.give_last_checkpoint(node.checkpoint().filter(|_| is_right));
+    let contents_are_right = !matches!(error, LogError::Differs { .. });
+    node.shared.give_last_checkpoint(node.checkpoint().filter(|_| contents_are_right));
     node.shared.fail(error);
 }
 

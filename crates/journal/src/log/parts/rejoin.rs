@@ -14,7 +14,7 @@ use crate::log::status::Event;
 pub(in crate::log) const REJOIN_AFTER: Duration = Duration::from_secs(24 * 3600);
 
 /// Whether the contents of this node are right.
-pub(in crate::log) struct Recovery {
+pub(in crate::log) struct Rejoin {
     settings: Arc<Settings>,
     shared: Arc<Shared>,
     contents: Contents,
@@ -33,13 +33,13 @@ enum Contents {
     Comparing { sequence: u64, since: Instant },
 }
 
-impl Recovery {
-    pub(in crate::log) fn new(settings: &Arc<Settings>, shared: &Arc<Shared>) -> Recovery {
+impl Rejoin {
+    pub(in crate::log) fn new(settings: &Arc<Settings>, shared: &Arc<Shared>) -> Rejoin {
         let (settings, shared) = (Arc::clone(settings), Arc::clone(shared));
-        Recovery { settings, shared, contents: Contents::Right, last: None }
+        Rejoin { settings, shared, contents: Contents::Right, last: None }
     }
 
-    pub(in crate::log) fn is_right(&self) -> bool {
+    pub(in crate::log) fn contents_are_right(&self) -> bool {
         matches!(self.contents, Contents::Right)
     }
 
@@ -65,19 +65,19 @@ impl Recovery {
 
     /// A snapshot has replaced the contents. What was compared before is void.
     pub(in crate::log) fn reloaded(&mut self) {
-        if !self.is_right() {
+        if !self.contents_are_right() {
             self.contents = Contents::Reloaded;
         }
     }
 
     /// The node has applied all that the log had. Returns whether it serves from now on.
     pub(in crate::log) fn caught_up(&mut self, sequence: u64) -> bool {
-        let is_right = self.is_right();
+        let contents_are_right = self.contents_are_right();
         // Each session compares anew: a digest from an earlier one proves nothing about what came since.
-        if !is_right {
+        if !contents_are_right {
             self.contents = Contents::Comparing { sequence, since: Instant::now() };
         }
-        is_right
+        contents_are_right
     }
 
     /// The contents were right at this sequence. The node serves again, if that shows it for those that it
@@ -117,10 +117,10 @@ impl Recovery {
 mod tests {
     use super::*;
 
-    fn recovery() -> Recovery {
+    fn rejoin() -> Rejoin {
         let settings = Arc::new(Settings::new("site", "a", Vec::new()));
         let shared = Arc::new(Shared::new(&settings));
-        Recovery::new(&settings, &shared)
+        Rejoin::new(&settings, &shared)
     }
 
     fn differs() -> LogError {
@@ -129,37 +129,37 @@ mod tests {
 
     #[test]
     fn contents_that_were_wrong_are_right_after_a_comparison_behind_all_that_the_log_had() {
-        let mut recovery = recovery();
-        recovery.drop_contents(differs());
-        assert!(recovery.needs_snapshot());
-        recovery.reloaded();
-        assert!(!recovery.needs_snapshot());
-        recovery.confirm(10);
-        assert!(!recovery.is_right(), "the node has not caught up");
-        assert!(!recovery.caught_up(10));
-        recovery.confirm(9);
-        assert!(!recovery.is_right(), "a comparison before it has caught up");
-        recovery.confirm(10);
-        assert!(recovery.is_right());
+        let mut rejoin = rejoin();
+        rejoin.drop_contents(differs());
+        assert!(rejoin.needs_snapshot());
+        rejoin.reloaded();
+        assert!(!rejoin.needs_snapshot());
+        rejoin.confirm(10);
+        assert!(!rejoin.contents_are_right(), "the node has not caught up");
+        assert!(!rejoin.caught_up(10));
+        rejoin.confirm(9);
+        assert!(!rejoin.contents_are_right(), "a comparison before it has caught up");
+        rejoin.confirm(10);
+        assert!(rejoin.contents_are_right());
     }
 
     #[test]
     fn a_comparison_is_void_when_a_snapshot_replaces_the_contents_again() {
-        let mut recovery = recovery();
-        recovery.drop_contents(differs());
-        recovery.reloaded();
-        recovery.caught_up(10);
-        recovery.reloaded();
-        recovery.confirm(10);
-        assert!(!recovery.is_right());
+        let mut rejoin = rejoin();
+        rejoin.drop_contents(differs());
+        rejoin.reloaded();
+        rejoin.caught_up(10);
+        rejoin.reloaded();
+        rejoin.confirm(10);
+        assert!(!rejoin.contents_are_right());
     }
 
     #[test]
     fn only_a_node_that_has_not_rejoined_lately_rejoins() {
-        let mut recovery = recovery();
-        assert!(!recovery.may_rejoin(&LogError::NameTaken("a".to_owned())));
-        assert!(recovery.may_rejoin(&differs()));
-        recovery.drop_contents(differs());
-        assert!(!recovery.may_rejoin(&differs()));
+        let mut rejoin = rejoin();
+        assert!(!rejoin.may_rejoin(&LogError::NameTaken("a".to_owned())));
+        assert!(rejoin.may_rejoin(&differs()));
+        rejoin.drop_contents(differs());
+        assert!(!rejoin.may_rejoin(&differs()));
     }
 }
