@@ -10,8 +10,7 @@ use std::time::Duration;
 use holdfast_protocol::raw_ingest;
 
 use crate::server::connections::peer::Peer;
-use crate::server::reports::refused_request::writes;
-use crate::server::rights::functions::only_reads;
+use crate::server::rights::functions::{is_write, only_reads};
 
 /// The most bytes in the queue.
 const MAX_QUEUE_BYTES: usize = 32 << 20;
@@ -118,7 +117,7 @@ impl Auditor {
     /// Permits a request to a memory. `None` if it writes and can't be recorded.
     pub(crate) fn permit(&self, request: &[u8]) -> Option<Permit> {
         match self.unrecordable {
-            Unrecordable::Refuse if writes(request) => self.take_room(request.len()),
+            Unrecordable::Refuse if is_write(request) => self.take_room(request.len()),
             _ => Some(Permit::default()),
         }
     }
@@ -157,7 +156,7 @@ impl Auditor {
         (request, reply): (&[u8], &[u8]),
         permit: Option<Permit>,
     ) {
-        if writes(request) {
+        if is_write(request) {
             let answered = Forwarded { route: None, request, reply, log_sequence: None };
             self.send(record(listener, peer, unit_id, answered), permit);
         }

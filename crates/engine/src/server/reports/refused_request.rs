@@ -3,8 +3,9 @@
 
 use std::sync::atomic::{AtomicU8, Ordering};
 
-use holdfast_protocol::pdu::{ExceptionCode, Function};
+use holdfast_protocol::pdu::ExceptionCode;
 
+use crate::server::rights::functions::is_write;
 use crate::server::rights::policy::PeerRights;
 
 /// A refused request.
@@ -55,7 +56,7 @@ impl RefusedRequest {
         }
         let code = ExceptionCode::from_code(exception)?;
         let why = match code {
-            ExceptionCode::ServerDeviceBusy if writes(request) => Why::Sealed,
+            ExceptionCode::ServerDeviceBusy if is_write(request) => Why::Sealed,
             // With a memory, it is the device whose values the memory has that does not answer.
             ExceptionCode::GatewayTargetFailedToRespond if rights.memory(unit_id).is_none() => {
                 Why::Unit
@@ -87,10 +88,6 @@ impl RefusedRequest {
         let function_code = request.first().copied().unwrap_or_default();
         RefusedRequest { unit_id, function_code, why }
     }
-}
-
-pub(super) fn writes(request: &[u8]) -> bool {
-    Function::from_pdu(request).is_some_and(Function::is_write)
 }
 
 /// The reasons that were reported for a connection or line: each is reported once.

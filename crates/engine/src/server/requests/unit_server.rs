@@ -1,11 +1,12 @@
-//! Turns a request PDU into its reply: the behaviour of all units of a listener, on every
-//! transport.
+//! Turns a request PDU into its reply: the behaviour of all units of a listener. On a serial line
+//! (`transports/serial.rs`), units that are not there are silent, and nothing answers a broadcast.
 //!
 //! The checks run in this order: the function is known and allowed (exception 01), the unit is
 //! mapped (0B), form, quantity and value are right (03), a write can be recorded (04), the memory is
 //! not sealed (06), the range is inside its area (02), what it mirrors is not stale (0B). The last three
-//! are checked in `holdfast_memory::Memory`, under its lock. A denied function is refused before the unit is looked up, so that a peer without rights cannot discover
-//! units. A unit in listen only mode never answers.
+//! are checked in `holdfast_memory::Memory`, under its lock. A denied function is refused before the unit
+//! is looked up, so that a peer without rights cannot discover units. A unit in listen only mode never
+//! answers.
 
 use std::sync::Arc;
 
