@@ -1,7 +1,7 @@
 //! One device: its schedule, plan and results.
 //!
 //! A poll is due by its schedule ([`super::schedule`]); a silent unit is polled less and less often,
-//! with one request, until it answers ([`super::unanswered_polls`]). A poll begins after the block at which the
+//! with one request, until it answers ([`super::poll_pause`]). A poll begins after the block at which the
 //! previous one failed, so that a block that is never answered does not block the others.
 //!
 //! When settings change, a new device replaces the old one between two polls. It keeps the schedule
@@ -29,15 +29,15 @@ use super::forwarding::{Forward, ForwardSettings};
 use super::learned::{Learned, Unreadable};
 use super::panic_guard::{Panicked, catch};
 use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
+use super::poll_pause::PollPause;
 use super::results::{BlockResult, Poll, Results};
 use super::schedule::Schedule;
 use super::search;
 use super::state::DeviceState;
 use super::status::StatusSettings;
 use super::turn::Turn;
-use super::unanswered_polls::UnansweredPolls;
 use crate::client::Endpoint;
-use crate::link::{Fault, Fence, InFlight, Link, Permit, Priority, Stage};
+use crate::link::{Fault, Fence, InFlight, Link, Permit, Priority};
 
 /// The longest interval between writes of the status block.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
@@ -104,7 +104,7 @@ pub(super) struct Device {
     first: Cell<usize>,
     strategy: Cell<Strategy>,
     samples: Cell<Samples>,
-    unanswered_polls: UnansweredPolls,
+    poll_pause: PollPause,
     schedule: Schedule,
 }
 
@@ -204,7 +204,7 @@ impl Device {
             first: Cell::new(0),
             strategy: Cell::new(settings.strategy),
             samples: Cell::default(),
-            unanswered_polls: UnansweredPolls::default(),
+            poll_pause: PollPause::default(),
             schedule: Schedule::new(settings.interval),
             settings,
             state,
@@ -268,7 +268,7 @@ impl Device {
                         continue;
                     }
                 },
-                () = self.fenced() => continue,
+                () = self.settings.fenced() => continue,
                 () = sleep_until(self.schedule.next()) => {}
             }
             let due = self.schedule.begin_poll();
@@ -289,9 +289,7 @@ impl Device {
             self.turn.polls(false);
             self.publish_status();
             self.state.counters.missed.add_many(self.schedule.skip_until(Instant::now()));
-            if let Some(until) =
-                self.unanswered_polls.after_poll(self.link.retry_at(), self.link.retry)
-            {
+            if let Some(until) = self.poll_pause.after_poll(self.link.retry_at(), self.link.retry) {
                 // Polls that are skipped on purpose do not count as missed. An exact pause ends when it
                 // ends, and the schedule begins anew then.
                 if self.link.retry.jitter {
@@ -308,9 +306,7 @@ impl Device {
 
     /// Waits while another node polls the device. Returns the device that replaces it meanwhile.
     async fn stand_by(&self, inbox: &Inbox) -> Option<Box<Device>> {
-        if let Some(fence) = &self.settings.fence
-            && (fence.stage() != Stage::Open || self.settled(fence).is_some())
-        {
+        if self.settings.must_stand_by() {
             self.link.release();
             self.state.set_standby(true);
             self.publish_status();
@@ -320,48 +316,23 @@ impl Device {
                     message = inbox.next() => if let Message::Successor(successor) = message {
                         return Some(successor);
                     },
-                    () = self.admitted(fence) => break,
+                    () = self.settings.admitted() => break,
                 }
             }
         }
         // The device before this one may have stood by, with another fence.
         if self.state.stands_by() {
             self.state.set_standby(false);
-            self.unanswered_polls.end();
+            self.poll_pause.end();
             self.schedule.begin_now();
         }
         None
     }
 
-    /// Waits until the device may be polled.
-    async fn admitted(&self, fence: &Fence) {
-        loop {
-            fence.opened().await;
-            let Some(at) = self.settled(fence) else { return };
-            tokio::select! {
-                () = fence.ended() => {}
-                () = sleep_until(at.into()) => {}
-            }
-        }
-    }
-
-    /// When a device that accepts one connection may be connected to: that of a former holder may last.
-    fn settled(&self, fence: &Fence) -> Option<std::time::Instant> {
-        self.settings.release.then(|| fence.settled(self.settings.timeout)).flatten()
-    }
-
-    /// Waits until no poll may begin.
-    async fn fenced(&self) {
-        match &self.settings.fence {
-            None => pending().await,
-            Some(fence) => fence.ended().await,
-        }
-    }
-
     /// Ends the pause of a device that does not answer.
     fn wake(&self) {
-        if self.unanswered_polls.is_delaying() {
-            self.unanswered_polls.end();
+        if self.poll_pause.is_delaying() {
+            self.poll_pause.end();
             self.schedule.begin_at(Instant::now());
         }
     }
@@ -377,8 +348,8 @@ impl Device {
         if !Rc::ptr_eq(&before.link, &self.link) || old.unit_id != new.unit_id {
             return self.schedule.begin_now();
         }
-        self.schedule.follow(&before.schedule, before.unanswered_polls.is_delaying());
-        self.unanswered_polls = before.unanswered_polls;
+        self.schedule.follow(&before.schedule, before.poll_pause.is_delaying());
+        self.poll_pause = before.poll_pause;
         if old.limits == new.limits {
             self.learned.replace(before.learned.take());
             self.learned().keep(&self.fields);
@@ -485,7 +456,7 @@ impl Device {
         if self.settings.release {
             self.link.release();
         }
-        self.unanswered_polls.note(fault.is_some() && !answered);
+        self.poll_pause.note(fault.is_some() && !answered);
         let unstored = self.state.take_unstored().then_some(Fault::Unstored);
         match fault.or(unstored) {
             None => self.state.good(),
@@ -583,7 +554,7 @@ impl Device {
         counters.requests.add();
         let began = Instant::now();
         let priority =
-            if self.unanswered_polls.is_doubtful() { Priority::Doubtful } else { Priority::Usual };
+            if self.poll_pause.is_doubtful() { Priority::Doubtful } else { Priority::Usual };
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
         let fence = self.settings.fence.as_ref();
         let permit = Permit { fence: fence.cloned(), until: None };

@@ -15,15 +15,16 @@ mod learned;
 mod mirror_age;
 mod panic_guard;
 pub mod plan;
+mod poll_pause;
 mod results;
 mod roster;
 mod schedule;
 mod search;
+mod standby;
 mod state;
 mod status;
 mod thread;
 mod turn;
-mod unanswered_polls;
 mod write_through;
 
 pub use cost::UNMEASURED_COST_MS;

@@ -10,14 +10,14 @@ use tokio::time::Instant;
 const DEAD_AFTER_POLLS: u32 = 3;
 
 #[derive(Default)]
-pub(super) struct UnansweredPolls {
+pub(super) struct PollPause {
     /// Consecutive ones.
     count: Cell<u32>,
     /// Whether the next poll is delayed because the device does not answer.
     is_delaying: Cell<bool>,
 }
 
-impl UnansweredPolls {
+impl PollPause {
     /// A poll has ended, with or without an answer.
     pub(super) fn note(&self, was_silent: bool) {
         let unanswered = if was_silent { self.count.get().saturating_add(1) } else { 0 };
@@ -66,7 +66,7 @@ mod tests {
     fn pauses_begin_with_the_third_poll_without_an_answer_and_double() {
         let (first, most) = (Duration::from_secs(1), Duration::from_secs(4));
         let retry = Retry { first, most, jitter: false };
-        let polls = UnansweredPolls::default();
+        let polls = PollPause::default();
         let pauses = [false, true, true, true, true, true, true].map(|was_silent| {
             polls.note(was_silent);
             let until = polls.after_poll(None, retry);

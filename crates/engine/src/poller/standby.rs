@@ -1,0 +1,45 @@
+//! When a node polls a device that several nodes share: while the fence of its lease is open, and once nothing that
+//! the former holder has sent can arrive any more.
+
+use std::future::pending;
+use std::time::Instant;
+
+use tokio::time::sleep_until;
+
+use crate::link::{Fence, Stage};
+use crate::poller::device::DeviceSettings;
+
+impl DeviceSettings {
+    /// Whether another node may poll the device now, or may still be connected to it.
+    pub(super) fn must_stand_by(&self) -> bool {
+        self.fence
+            .as_deref()
+            .is_some_and(|fence| fence.stage() != Stage::Open || self.settled(fence).is_some())
+    }
+
+    /// Waits until the device may be polled.
+    pub(super) async fn admitted(&self) {
+        let Some(fence) = &self.fence else { return };
+        loop {
+            fence.opened().await;
+            let Some(at) = self.settled(fence) else { return };
+            tokio::select! {
+                () = fence.ended() => {}
+                () = sleep_until(at.into()) => {}
+            }
+        }
+    }
+
+    /// When a device that accepts one connection may be connected to: that of a former holder may last.
+    fn settled(&self, fence: &Fence) -> Option<Instant> {
+        self.release.then(|| fence.settled(self.timeout)).flatten()
+    }
+
+    /// Waits until no poll may begin.
+    pub(super) async fn fenced(&self) {
+        match &self.fence {
+            None => pending().await,
+            Some(fence) => fence.ended().await,
+        }
+    }
+}
