@@ -23,7 +23,7 @@ from holdfast.cli import main
 from holdfast.cli.services.gateway import _greeting_text
 from holdfast.client.url import NetworkTarget
 from holdfast.config.values.allow_entries import parse_allowed
-from holdfast.gateway import Settings, tokens
+from holdfast.gateway import Settings, token_file
 from support import cli, gateways, web, wire
 from support.fake_device import FakeDevice, registers
 from support.gateways import PLC, Dialed, Names
@@ -356,7 +356,7 @@ def test_a_token_file_has_a_name_and_a_hash_on_a_line(tmp_path: Path) -> None:
     file = tmp_path / "tokens"
     bare = hashlib.sha256(b"other").hexdigest()
     file.write_text(f"# who may ask\n\n{made.stdout}{bare} # no name\n")
-    assert tokens.load(file) == [*TOKENS, ("token-4", bytes.fromhex(bare))]
+    assert token_file.load(file) == [*TOKENS, ("token-4", bytes.fromhex(bare))]
 
 
 def test_a_token_line_shows_its_secret_once() -> None:
@@ -383,8 +383,8 @@ def test_a_token_line_shows_its_secret_once() -> None:
 def test_what_is_no_token_file_is_refused(tmp_path: Path, text: str, says: str) -> None:
     file = tmp_path / "tokens"
     file.write_text(text)
-    with pytest.raises(tokens.WrongTokens) as raised:
-        tokens.load(file)
+    with pytest.raises(token_file.WrongTokens) as raised:
+        token_file.load(file)
     assert says in str(raised.value)
     assert SECRET not in str(raised.value)
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast.config.models.services import Compat
-    from holdfast.gateway.tokens import Token
+    from holdfast.gateway.token_file import Token
     from holdfast.net.addresses import Network
     from holdfast.net.allow_list import AllowedNetwork
     from holdfast.net.tls import Tls

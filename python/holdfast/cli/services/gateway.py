@@ -20,7 +20,7 @@ from holdfast.config import Config
 from holdfast.config.models.services import Compat
 from holdfast.config.values.allow_entries import parse_allowed
 from holdfast.config.values.host_names import parse_host_name
-from holdfast.gateway import tokens
+from holdfast.gateway import token_file
 from holdfast.net.addresses import LOOPBACK, joined, reachable, unbracketed
 from holdfast.protocol import PORT
 from holdfast.types import Access
@@ -114,14 +114,14 @@ def gateway(
     serve(load(), _greeting, named="gateway", load=load, retries_ports=False)
 
 
-def _tokens(file: Path) -> tuple[tokens.Token, ...]:
+def _tokens(file: Path) -> tuple[token_file.Token, ...]:
     try:
-        return tuple(tokens.load(file))
+        return tuple(token_file.load(file))
     except OSError as error:
         raise click.BadParameter(
             f"{file}: {error.strerror or error}", param_hint="'--tokens'"
         ) from error
-    except tokens.WrongTokens as error:
+    except token_file.WrongTokens as error:
         raise click.BadParameter(str(error), param_hint="'--tokens'") from error
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 
 from holdfast.net.http import openapi_page as page
+from holdfast.net.http.bearer import owner
 from holdfast.net.http.fields import from_query
 from holdfast.net.http.openapi import html_answer, json_answer
 from holdfast.net.http.operations import Operation
@@ -135,7 +136,7 @@ class Application:
         """Judges all of a head but the length of the body. Raises `BadRequest`."""
         if not operation.is_open:
             self.origins.check(request)
-            request.who = request.owner(self._tokens) if self._tokens else self._anyone
+            request.who = owner(request, self._tokens) if self._tokens else self._anyone
         parameters: Given = {}
         if operation.body is not None:
             self.check_type(request)

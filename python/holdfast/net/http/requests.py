@@ -6,8 +6,6 @@ its reason to a status code.
 
 from __future__ import annotations
 
-import hashlib
-import hmac
 import json
 import re
 from collections.abc import Awaitable, Callable
@@ -20,7 +18,7 @@ import msgspec
 from holdfast.runtime.text import clip
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
 Headers: TypeAlias = list[tuple[bytes, bytes]]
 """Names in lower case, and values."""
@@ -206,27 +204,6 @@ class Request:
         coding = self.header(b"content-encoding")
         if coding is not None and coding.lower() != b"identity":
             raise BadRequest("not_json", f"Content-Encoding is {_found(coding)}, allowed: none")
-
-    def owner(self, tokens: Iterable[tuple[str, bytes]]) -> str:
-        """Returns the name of the request's token. Raises `BadRequest` if there is none.
-
-        `tokens` are names and SHA-256 hashes.
-        """
-        found = self.values(b"authorization")
-        if len(found) != 1:
-            detail = "more than one Authorization header" if found else "no Authorization header"
-            raise BadRequest("unauthorized", f"{detail}, required: Authorization: Bearer TOKEN")
-        scheme, _, secret = found[0].partition(b" ")
-        if scheme.lower() != b"bearer":
-            raise BadRequest("unauthorized", "Authorization is not of the form Bearer TOKEN")
-        digest = hashlib.sha256(secret.strip()).digest()
-        owner = None
-        for name, known in tokens:  # Compares all of them, so the time reveals nothing.
-            if hmac.compare_digest(known, digest):
-                owner = name
-        if owner is None:
-            raise BadRequest("unauthorized", "unknown token")
-        return owner
 
 
 SecondStep: TypeAlias = Callable[[], Response]
