@@ -77,6 +77,14 @@ def test_records_of_a_file_and_a_queue_are_read() -> None:
     assert [pdu[-2:] for pdu in asked[-3:]] == ["79", "79", "3a"]
 
 
+def test_after_an_error_of_a_file_no_search_of_addresses_is_suggested() -> None:
+    with FakeDevice(lambda pdu: exception(pdu, 2)) as device:
+        told = f"holdfast: {device.url}: exception 02 (Illegal Data Address)"
+        assert failure("read", device.url, "file:4:0") == [told]
+        assert failure("read", device.url, "fifo:7") == [told]
+        assert failure("write", device.url, "file:4:0", "1") == [told]
+
+
 def test_a_file_that_does_not_exist_is_told() -> None:
     with FakeDevice(lambda pdu: exception(pdu, 2)) as device:
         told = answer("read", device.url, "file:4:0", "--unit", "3", code=1)

@@ -44,9 +44,12 @@ if TYPE_CHECKING:
     from holdfast.client import SyncClient
     from holdfast.discovery.device_search import Unit
 
-UNITS = "1-10,255"
-LINE_UNITS = "1-10"
-_UNITS_HELP = f"Unit ids to ask, as in 1-10,255.  [default: {UNITS}; {LINE_UNITS} on a serial line]"
+LINE_UNITS = device_search.LINE_UNITS
+UNITS = (*LINE_UNITS, 255)
+_UNITS_HELP = (
+    f"Unit ids to ask, as in 1-10,255.  [default: {number_ranges(UNITS)}; "
+    f"{number_ranges(LINE_UNITS)} on a serial line]"
+)
 MAX_LINES = 60
 """The most lines of tags in the text; a file and JSON have all tags."""
 
@@ -116,7 +119,7 @@ def describe(
     Exit codes: 0 done; 1 no unit id answered, or the search ended early; 2 wrong usage.
     """
     is_line = isinstance(parse(url), SerialTarget)
-    asked = units or unit_ids(LINE_UNITS if is_line else UNITS)
+    asked = units or (LINE_UNITS if is_line else UNITS)
     if is_line:
         refuse_broadcast(asked)
     if output is not None and output.exists() and not force:

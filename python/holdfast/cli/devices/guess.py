@@ -10,7 +10,7 @@ import click
 
 from holdfast.cli import terminal_text
 from holdfast.cli.live import schedule
-from holdfast.cli.options import device, item
+from holdfast.cli.options import device, device_errors, item
 from holdfast.cli.options.duration import every_option
 from holdfast.cli.options.item import modicon_option, words_argument
 from holdfast.cli.options.option import flag, json_option, number_option, option
@@ -90,7 +90,7 @@ def guess(
             for _ in schedule.ticks(every, times):
                 found.append(device.read_raw(client, place.area, place.address, size))
         except ModbusError as error:
-            device.fail(error, url, fields if as_json else None)
+            device_errors.fail(error, url, fields if as_json else None)
         except ValueError as error:
             raise click.UsageError(str(error)) from error
     guesses = type_guess.guess(found, like=like, anywhere=anywhere, now=time.time())

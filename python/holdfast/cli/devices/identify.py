@@ -9,7 +9,7 @@ import click
 
 from holdfast.cli import terminal_text
 from holdfast.cli.exit_codes import ExitCode
-from holdfast.cli.options import device
+from holdfast.cli.options import device, device_errors
 from holdfast.cli.options.option import json_option
 from holdfast.cli.options.url import url_argument
 from holdfast.cli.terminal_text import print_json
@@ -47,7 +47,7 @@ def identify(url: str, unit: int, timeout: float, as_json: bool) -> None:
             "ok": bool(said),
             "target": url,
             "unit": unit,
-            **(device.problem(identification) if not said else {}),
+            **(device_errors.problem(identification) if not said else {}),
             "identification": answer_to_json(identification, _identification),
             "server_id": answer_to_json(server_id, _server_id),
         }
@@ -74,7 +74,7 @@ def answer_to_json(
 ) -> dict[str, object]:
     """An answer, or its error, for JSON."""
     if isinstance(answer, ModbusError):
-        return {"ok": False, **device.problem(answer)}
+        return {"ok": False, **device_errors.problem(answer)}
     return {"ok": True, **made(answer)}
 
 

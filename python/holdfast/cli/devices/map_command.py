@@ -14,7 +14,7 @@ from holdfast.cli import terminal_text
 from holdfast.cli.devices import coverage
 from holdfast.cli.devices.search_report import Ended, RangeReport, Report, ended_to_json
 from holdfast.cli.exit_codes import fail
-from holdfast.cli.options import device
+from holdfast.cli.options import device, device_errors
 from holdfast.cli.options.option import json_option
 from holdfast.cli.options.search import announced, planned, survey_options
 from holdfast.cli.options.url import url_argument
@@ -92,7 +92,7 @@ def map_(
         if not as_json:
             for each in survey.areas:
                 for failure in (*each.failures, each.given_up):
-                    device.hint(failure, url)
+                    device_errors.hint(failure, url)
     if why is not None:
         fail(f"{url}: {why}", is_printed=as_json)
 

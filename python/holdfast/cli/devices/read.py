@@ -13,7 +13,7 @@ from holdfast.cli.devices import device_items
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.live import schedule
 from holdfast.cli.old_spellings import hint
-from holdfast.cli.options import device, item
+from holdfast.cli.options import device, device_errors, item
 from holdfast.cli.options.duration import every_option
 from holdfast.cli.options.item import modicon_option, words_argument
 from holdfast.cli.options.option import json_option, number_option
@@ -132,7 +132,9 @@ def read(
         except ModbusError as error:
             place = query.place if isinstance(query, _Query) else None
             of_modicon = item.modicon_hint(place) if place and _is_absent(error) else None
-            device.print_error(error, url, fields if as_json else None, of_modicon)
+            shown = fields if as_json else None
+            is_in_area = place is not None
+            device_errors.print_error(error, url, shown, of_modicon, is_in_area=is_in_area)
             if place and isinstance(error, RequestTimeout):
                 device.await_late_reply(client, place.area, place.address)
             sys.exit(ExitCode.FAILED)
@@ -301,9 +303,9 @@ def _again(
                 code = ExitCode.FAILED
                 if fields is None:
                     lines.wrong(error)
-                    device.hint(error, url)
+                    device_errors.hint(error, url)
                 else:
-                    print_json({"ok": False, **fields, **_now(), **device.problem(error)})
+                    print_json({"ok": False, **fields, **_now(), **device_errors.problem(error)})
                 continue
             if fields is None:
                 lines.reading(raw)

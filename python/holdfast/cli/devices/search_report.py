@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.cli import terminal_text
-from holdfast.cli.options import device
+from holdfast.cli.options import device_errors
 from holdfast.cli.progress import bar
 from holdfast.cli.signals import Interrupted
 from holdfast.discovery.address_search import LimitReached
@@ -104,8 +104,8 @@ class Report:
             return Ended("limit", f"{error}; --max-requests sets the limit")
         except ModbusError as error:
             if isinstance(error, ConnectFailed) and not found():
-                device.fail(error, target, {"target": target} if self.is_json else None)
-            return Ended(**device.problem(error))  # type: ignore[arg-type]
+                device_errors.fail(error, target, {"target": target} if self.is_json else None)
+            return Ended(**device_errors.problem(error))  # type: ignore[arg-type]
         except Interrupted:
             return INTERRUPTED
         return None

@@ -10,7 +10,7 @@ import click
 from holdfast.cli import terminal_text
 from holdfast.cli.devices.identify import answer_of, answer_to_json, listed
 from holdfast.cli.exit_codes import ExitCode
-from holdfast.cli.options import device
+from holdfast.cli.options import device, device_errors
 from holdfast.cli.options.option import json_option
 from holdfast.cli.options.url import url_argument
 from holdfast.cli.terminal_text import print_json
@@ -48,7 +48,11 @@ def status(url: str, unit: int, timeout: float, as_json: bool) -> None:
             "ok": ok,
             "target": url,
             "unit": unit,
-            **(device.problem(outputs) if not ok and isinstance(outputs, ModbusError) else {}),
+            **(
+                device_errors.problem(outputs)
+                if not ok and isinstance(outputs, ModbusError)
+                else {}
+            ),
             "exception_status": answer_to_json(outputs, lambda found: {"outputs": found}),
             "event_counter": answer_to_json(
                 counter, lambda found: {"busy": found[0], "events": found[1]}

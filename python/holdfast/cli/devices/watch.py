@@ -16,7 +16,7 @@ from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.live import schedule, sources
 from holdfast.cli.live.changes import Tracker
 from holdfast.cli.live.sources import Unreadable, Unwatchable, WatchedRange
-from holdfast.cli.options import device, item
+from holdfast.cli.options import device, device_errors, item
 from holdfast.cli.options.duration import every_option
 from holdfast.cli.options.item import modicon_option, words_argument
 from holdfast.cli.options.option import json_option, number_option, option, require_known
@@ -124,7 +124,7 @@ def watch(
 
             view = View(source, first, every, note)
             view.run(times)
-            device.hint(view.error, source.url)
+            device_errors.hint(view.error, source.url)
         else:
             click.echo(f"watching {source.where}{f'; {note}' if note else ''}", err=True)
             _lines(source, first, every, times, as_json)

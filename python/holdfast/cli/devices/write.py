@@ -14,7 +14,7 @@ from holdfast._core import Request
 from holdfast.cli import terminal_text
 from holdfast.cli.devices import device_items
 from holdfast.cli.exit_codes import ExitCode
-from holdfast.cli.options import device, item
+from holdfast.cli.options import device, device_errors, item
 from holdfast.cli.options.item import modicon_option, words_argument
 from holdfast.cli.options.option import flag, json_option
 from holdfast.cli.options.value import typed, typed_options
@@ -154,17 +154,19 @@ def _carry_out(
             job.write(client)
         except ModbusError as error:
             refused = isinstance(error, ModbusException) and len(job.requests) == 1
-            device.fail(error, url, fields | {"maybe_written": not refused} if as_json else None)
+            shown = fields | {"maybe_written": not refused} if as_json else None
+            device_errors.fail(error, url, shown, is_in_area=isinstance(job, _Job))
         try:
             differing = job.differing(client) if verify else {}
         except ModbusError as error:
             if not as_json:
                 click.echo(f"{job.summary}; could not be read back", err=True)
-            device.fail(error, url, fields | {"maybe_written": True} if as_json else None)
+            shown = fields | {"maybe_written": True} if as_json else None
+            device_errors.fail(error, url, shown, is_in_area=isinstance(job, _Job))
     if as_json:
         verified = {"verified": not differing} if verify else {}
         wrong = [f"{at}: wrote {was}, read back {now}" for at, (was, now) in differing.items()]
-        print_json({"ok": not differing, **fields, **verified, **device.differs(wrong)})
+        print_json({"ok": not differing, **fields, **verified, **device_errors.differs(wrong)})
     else:
         click.echo(job.summary + ("" if not verify or differing else "; read back alike") + ".")
         for address, (was, now) in differing.items():

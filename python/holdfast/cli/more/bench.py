@@ -12,7 +12,7 @@ import click
 
 from holdfast.cli import terminal_text
 from holdfast.cli.exit_codes import ExitCode
-from holdfast.cli.options import device, item
+from holdfast.cli.options import device, device_errors, item
 from holdfast.cli.options.duration import time_option
 from holdfast.cli.options.item import modicon_option, words_argument
 from holdfast.cli.options.option import json_option, number_option
@@ -95,7 +95,7 @@ def bench(
         ):
             asyncio.run(load.run(advance and (lambda load: advance(int(10 * load.elapsed)))))
     except ModbusError as error:
-        device.fail(error, url, fields if as_json else None)
+        device_errors.fail(error, url, fields if as_json else None)
     answered = load.latencies.count > 0
     if as_json:
         wrong = {} if answered else {"reason": "timeout", "detail": "no reply"}

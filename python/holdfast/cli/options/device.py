@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-import sys
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options.duration import timeout_option
 from holdfast.cli.options.option import Command, number_option, option_group
-from holdfast.cli.terminal_text import print_json
 from holdfast.client import SyncClient
 from holdfast.client.base import MAX_TIMEOUT_S
 from holdfast.errors import (
-    ConnectionLost,
-    InvalidResponse,
     ModbusError,
     ModbusException,
-    RequestTimeout,
 )
-from holdfast.protocol import ILLEGAL_ADDRESS, LAST_ADDRESS, MAX_UNIT, TARGET_SILENT
+from holdfast.protocol import ILLEGAL_ADDRESS, LAST_ADDRESS, MAX_UNIT
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator
 
     from holdfast.cli.options.item import Place
     from holdfast.types import Area
@@ -37,13 +31,6 @@ TIMEOUTS_S = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, MAX_TIMEOUT_S)
 
 MEASURED_TIMEOUTS = 4
 """A late reply is measured up to this many times the timeout, as long as it may raise that."""
-
-REASONS: tuple[tuple[type[ModbusError], str], ...] = (
-    (ModbusException, "exception"),
-    (RequestTimeout, "timeout"),
-    (ConnectionLost, "connection"),
-    (InvalidResponse, "invalid"),
-)
 
 
 def unit_option(default: int | None = 1, help: str = UNIT) -> Callable[[Command], Command]:
@@ -118,53 +105,3 @@ def existing(client: SyncClient, place: Place, most: int) -> int:
             size -= 1
         else:
             return size
-
-
-def problem(error: object) -> dict[str, object]:
-    """An error for JSON."""
-    reasons = (word for kind, word in REASONS if isinstance(error, kind))
-    reason = next(reasons, "connection" if isinstance(error, OSError) else "failed")
-    code = {"code": error.code} if isinstance(error, ModbusException) else {}
-    return {"reason": reason, **code, "detail": str(error)}
-
-
-def differs(wrong: Sequence[str]) -> dict[str, object]:
-    """The error of values that were read back otherwise than written, for JSON."""
-    return {"reason": "differs", "detail": "; ".join(wrong)} if wrong else {}
-
-
-HINTS = {
-    ILLEGAL_ADDRESS: "'holdfast describe map {}' finds the addresses that exist",
-    TARGET_SILENT: "'holdfast find {}' finds the unit ids that answer",
-}
-"""What to do after an exception of a device at a URL, by its code."""
-
-
-def hint(error: object, url: str) -> None:
-    """Prints what to do after an error, or the code of an exception, once in a command."""
-    code = error.code if isinstance(error, ModbusException) else error
-    if not isinstance(code, int) or code not in HINTS:
-        return
-    told: set[int] = click.get_current_context().meta.setdefault(f"{__name__}.told", set())
-    if code not in told:
-        told.add(code)
-        click.echo(f"hint: {HINTS[code].format(url)}", err=True)
-
-
-def fail(error: ModbusError, url: str, answer: Mapping[str, object] | None) -> NoReturn:
-    """Prints an error and exits with 1; with `answer`, as JSON on standard output."""
-    print_error(error, url, answer)
-    sys.exit(ExitCode.FAILED)
-
-
-def print_error(
-    error: ModbusError, url: str, answer: Mapping[str, object] | None, first: str | None = None
-) -> None:
-    """Prints an error and hints; with `answer`, as JSON on standard output."""
-    if answer is not None:
-        print_json({"ok": False, **answer, **problem(error)})
-        return
-    click.echo(f"holdfast: {url}: {error}", err=True)
-    if first is not None:
-        click.echo(f"hint: {first}", err=True)
-    hint(error, url)

@@ -10,7 +10,7 @@ import click
 from holdfast.cli import answers, terminal_text
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.live import schedule
-from holdfast.cli.options import device
+from holdfast.cli.options import device_errors
 from holdfast.cli.tags import recording
 from holdfast.cli.terminal_text import print_json
 from holdfast.errors import ModbusError, RequestTimeout
@@ -51,7 +51,7 @@ def read_tags(source: TagSource, form: Form, every: float | None, times: int | N
                 _show(source, readings)
             if form == "text" or (form == "csv" and every is None):
                 for each in readings:
-                    device.hint(each.error, source.url)
+                    device_errors.hint(each.error, source.url)
             if every is None:
                 _listen(source, readings)
     except KeyboardInterrupt:
@@ -88,7 +88,7 @@ def _to_json(source: TagSource, readings: Sequence[Reading], timed: bool) -> dic
 def problem(error: Error) -> dict[str, object]:
     """The error of a tag for JSON."""
     if isinstance(error, ModbusError):
-        return device.problem(error)
+        return device_errors.problem(error)
     return {"reason": "undecodable", "detail": str(error)}
 
 

@@ -9,7 +9,7 @@ import click
 
 from holdfast.cli import terminal_text
 from holdfast.cli.exit_codes import ExitCode
-from holdfast.cli.options import device
+from holdfast.cli.options import device, device_errors
 from holdfast.cli.tags.read import value_shown
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.tag_writing import prepared
@@ -42,7 +42,7 @@ def write_tags(
             writes = _prepared(of, texts, client)
         except ModbusError as error:
             fields = {"target": of.url, "unit": of.unit, "written": [], "maybe_written": False}
-            device.fail(error, of.url, fields if as_json else None)
+            device_errors.fail(error, of.url, fields if as_json else None)
         for at, write in enumerate(writes):
             try:
                 write.send(client)
@@ -56,7 +56,7 @@ def write_tags(
         names = [write.tag.name for write in writes]
         answer = {"ok": not differing, "target": of.url, "unit": of.unit, "written": names}
         wrong = [f"{name}: read back {now}" for name, now in differing.items()]
-        print_json({**answer, **verified, **device.differs(wrong)})
+        print_json({**answer, **verified, **device_errors.differs(wrong)})
     elif verify and not differing:
         click.echo("Read back alike.")
     if differing:
@@ -112,7 +112,7 @@ def _differing(
         fields = {"target": of.url, "unit": of.unit, "written": names, "maybe_written": True}
         if not as_json:
             click.echo("Could not be read back.", err=True)
-        device.fail(error, of.url, fields if as_json else None)
+        device_errors.fail(error, of.url, fields if as_json else None)
     return {
         name: value_shown(write.tag, now)
         for name, (write, (is_alike, now)) in found.items()
@@ -135,11 +135,11 @@ def _fail(
             "not_written": names[at + 1 :],
             "maybe_written": maybe,
         }
-        device.fail(error, of.url, fields)
+        device_errors.fail(error, of.url, fields)
     click.echo(f"holdfast: {of.url}: {names[at]}: {error}", err=True)
     if maybe:
         click.echo(f"hint: {names[at]} was possibly written", err=True)
-    device.hint(error, of.url)
+    device_errors.hint(error, of.url)
     if names[at + 1 :]:
         click.echo(f"Not written: {', '.join(names[at + 1 :])}", err=True)
     sys.exit(ExitCode.FAILED)

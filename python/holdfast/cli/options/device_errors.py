@@ -1,0 +1,94 @@
+"""What commands print after an error of a device: its text, its JSON, and a hint what to do."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, NoReturn
+
+import click
+
+from holdfast.cli.exit_codes import ExitCode
+from holdfast.cli.terminal_text import print_json
+from holdfast.errors import (
+    ConnectionLost,
+    InvalidResponse,
+    ModbusError,
+    ModbusException,
+    RequestTimeout,
+)
+from holdfast.protocol import ILLEGAL_ADDRESS, TARGET_SILENT
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+REASONS: tuple[tuple[type[ModbusError], str], ...] = (
+    (ModbusException, "exception"),
+    (RequestTimeout, "timeout"),
+    (ConnectionLost, "connection"),
+    (InvalidResponse, "invalid"),
+)
+
+
+def problem(error: object) -> dict[str, object]:
+    """An error for JSON."""
+    reasons = (word for kind, word in REASONS if isinstance(error, kind))
+    reason = next(reasons, "connection" if isinstance(error, OSError) else "failed")
+    code = {"code": error.code} if isinstance(error, ModbusException) else {}
+    return {"reason": reason, **code, "detail": str(error)}
+
+
+def differs(wrong: Sequence[str]) -> dict[str, object]:
+    """The error of values that were read back otherwise than written, for JSON."""
+    return {"reason": "differs", "detail": "; ".join(wrong)} if wrong else {}
+
+
+HINTS = {
+    ILLEGAL_ADDRESS: "'holdfast describe map {}' finds the addresses that exist",
+    TARGET_SILENT: "'holdfast find {}' finds the unit ids that answer",
+}
+"""What to do after an exception of a device at a URL, by its code."""
+
+
+def hint(error: object, url: str) -> None:
+    """Prints what to do after an error, or the code of an exception, once in a command."""
+    code = error.code if isinstance(error, ModbusException) else error
+    if not isinstance(code, int) or code not in HINTS:
+        return
+    told: set[int] = click.get_current_context().meta.setdefault(f"{__name__}.told", set())
+    if code not in told:
+        told.add(code)
+        click.echo(f"hint: {HINTS[code].format(url)}", err=True)
+
+
+def fail(
+    error: ModbusError,
+    url: str,
+    answer: Mapping[str, object] | None,
+    *,
+    is_in_area: bool = True,
+) -> NoReturn:
+    """Prints an error as `print_error` does, and exits with 1."""
+    print_error(error, url, answer, is_in_area=is_in_area)
+    sys.exit(ExitCode.FAILED)
+
+
+def print_error(
+    error: ModbusError,
+    url: str,
+    answer: Mapping[str, object] | None,
+    first: str | None = None,
+    *,
+    is_in_area: bool = True,
+) -> None:
+    """Prints an error and hints, `first` before others; with `answer`, as JSON on standard output.
+
+    `is_in_area`: whether it concerns an area, not records of a file or a queue.
+    """
+    if answer is not None:
+        print_json({"ok": False, **answer, **problem(error)})
+        return
+    click.echo(f"holdfast: {url}: {error}", err=True)
+    if first is not None:
+        click.echo(f"hint: {first}", err=True)
+    if is_in_area:
+        hint(error, url)
