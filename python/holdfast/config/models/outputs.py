@@ -23,7 +23,7 @@ from holdfast.config.values.scalars import (
     integral,
 )
 from holdfast.config.values.scanning import DIALECT, PREFIX, Dialect
-from holdfast.config.values.topics import TopicNames
+from holdfast.config.values.topic_names import TopicNames
 from holdfast.config.values.urls import HttpTarget, parse_http
 
 MAX_VALUES = 1_000_000

@@ -1,4 +1,4 @@
-"""MQTT topics: filters, and the names that an MQTT output uses."""
+"""MQTT topics: filters, names and templates, and whether each is valid."""
 
 from __future__ import annotations
 
@@ -7,11 +7,7 @@ import re
 from holdfast.config.text.messages import show
 from holdfast.net.mqtt import MAX_TEXT
 
-BASE = "plant"
 DEVICE, TAG = "{device}", "{tag}"
-
-SET, REPLY = "set", "reply"
-"""The levels after the topic of a tag for commands, and for replies to them."""
 
 
 def parse_topic_filter(text: object) -> str:
@@ -55,37 +51,3 @@ def parse_topic_template(text: object) -> str:
     if levels.count(DEVICE) != 1 or levels.count(TAG) > 1:
         raise ValueError(f"found {show(template)}, allowed: {DEVICE} once, {TAG} at most once")
     return template
-
-
-class TopicNames:
-    """The names of topics, from a template. Names of devices and tags are safe in topics."""
-
-    def __init__(self, template: str | None, status: str | None, *, whole_device: bool) -> None:
-        if template is None:
-            template = f"{BASE}/{DEVICE}" if whole_device else f"{BASE}/{DEVICE}/{TAG}"
-        self.template = template
-        first = template.partition("{")[0].rstrip("/")
-        self.status = status or "/".join([*([first] if first else []), "holdfast", "status"])
-        """The topic of the output itself."""
-
-    def of_device(self, device: str) -> str:
-        """The topic of a device, for templates without tag."""
-        return self.template.replace(DEVICE, device)
-
-    def of_tag(self, device: str, tag: str) -> str:
-        """The topic of a tag."""
-        topic = self.of_device(device)
-        return topic.replace(TAG, tag) if TAG in self.template else f"{topic}/{tag}"
-
-    def of_commands(self, device: str, tag: str) -> str:
-        """The topic that commands for a tag are sent to."""
-        return f"{self.of_tag(device, tag)}/{SET}"
-
-    def of_availability(self, device: str) -> str:
-        """The topic that is online while a device answers."""
-        return f"{self.status}/{device}"
-
-    def is_of_device(self, topic: str, device: str) -> bool:
-        """Whether a topic can be one of the values of a device."""
-        own = re.escape(self.of_device(device)).replace(re.escape(TAG), "[^/]+")
-        return re.fullmatch(own, topic) is not None

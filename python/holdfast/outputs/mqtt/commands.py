@@ -9,14 +9,14 @@ import msgspec
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from holdfast.config.values.topics import REPLY
+from holdfast.config.values.topic_names import REPLY
 from holdfast.outputs.mqtt.messages import NO_PROPERTIES, Message, packed_topic
 from holdfast.outputs.site import CommandOutcomes, NotWritten
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from holdfast.config.values.topics import TopicNames
+    from holdfast.config.values.topic_names import TopicNames
     from holdfast.net.mqtt.packets import Publish
     from holdfast.outputs.mqtt.messages import Delivery
     from holdfast.outputs.mqtt.session import Session

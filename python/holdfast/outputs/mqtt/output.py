@@ -6,6 +6,7 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING
 
+from holdfast.outputs.mqtt.availability import OFFLINE, ONLINE, Availability
 from holdfast.outputs.mqtt.commands import Commands
 from holdfast.outputs.mqtt.home_assistant import Discovery
 from holdfast.outputs.mqtt.messages import Message, packed_topic
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     from holdfast.runtime.stop import Stop
     from holdfast.tags import Tag
 
-ONLINE, OFFLINE = b"online", b"offline"
-
 
 class MqttOutput(BrokerReceiver):
     """Publishes readings."""
@@ -38,8 +37,7 @@ class MqttOutput(BrokerReceiver):
         self._messages: Sequence[Message] = ()
         self._commands = Commands(name, self._broker, self._topics, site)
         self._tags: dict[str, set[str]] = {}
-        self._answering: dict[str, bool] = {}
-        self._answers = -1
+        self._availability = Availability(self._topics, site)
         self._discovery = None if settings.discovery is None else Discovery(name, settings)
         self._entities: dict[str, bytes] = {}
         self._found: deque[str] = deque()
@@ -73,7 +71,7 @@ class MqttOutput(BrokerReceiver):
 
     def close(self) -> None:
         """Publishes that this output is offline, and ends the connection."""
-        self._disconnect(self._status(OFFLINE))
+        self._disconnect(self._availability.of_output(OFFLINE))
 
     def status(self) -> dict[str, object]:
         """The broker and the connection."""
@@ -83,7 +81,7 @@ class MqttOutput(BrokerReceiver):
         return Session(
             self._settings,
             self._client_id,
-            self._status(OFFLINE),
+            self._availability.of_output(OFFLINE),
             self._on_message,
             stop,
             qos=self._settings.qos,
@@ -92,9 +90,10 @@ class MqttOutput(BrokerReceiver):
 
     def _greet(self, session: Session) -> None:
         """Publishes what a broker may have lost, or has never had."""
-        self._answering, self._answers, self._revision = {}, -1, -1
+        self._availability.begin()
+        self._revision = -1
         self._entities = {}
-        session.publish([self._status(ONLINE)])
+        session.publish([self._availability.of_output(ONLINE)])
         if self._connects > 1:
             self._site.refresh()
 
@@ -120,8 +119,7 @@ class MqttOutput(BrokerReceiver):
         gone = dict.fromkeys(self._topics_of(self._tags) - self._topics_of(names), b"")
         self._tags = names
         self._publish(session, gone)
-        for device in self._answering.keys() - names:
-            del self._answering[device]
+        self._availability.keep(names.keys())
         if self._discovery is None:
             return
         if not self._entities:
@@ -168,27 +166,8 @@ class MqttOutput(BrokerReceiver):
             session.close(last)
 
     def _publish_availability(self, session: Session, *, answering: bool) -> None:
-        """Publishes devices that stopped answering before values, the others after them."""
-        now = self._site.answers
-        if now == self._answers:
-            return
-        found = self._site.answering()
-        changed = [
-            device
-            for device, answers in found.items()
-            if answers is answering and self._answering.get(device) is not answers
-        ]
-        self._answering.update(dict.fromkeys(changed, answering))
-        # A device that has just stopped answering is for the next call, before its values.
-        if all(self._answering.get(device) is answers for device, answers in found.items()):
-            self._answers = now
-        payload = ONLINE if answering else OFFLINE
-        topics = [self._topics.of_availability(device) for device in changed]
-        if topics:
-            session.publish([Message(packed_topic(topic), payload, True) for topic in topics])
-
-    def _status(self, payload: bytes) -> Message:
-        return Message(packed_topic(self._topics.status), payload, True)
+        if changed := self._availability.changed(answering=answering):
+            session.publish(changed)
 
     def _on_message(self, message: Publish, is_retained: bool) -> None:
         """Takes a message of the broker. Called by the thread of the connection."""

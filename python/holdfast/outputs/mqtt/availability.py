@@ -1,0 +1,61 @@
+"""What an MQTT output says of itself and of devices: online, or offline. All of it is retained."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holdfast.outputs.mqtt.messages import Message, packed_topic
+
+if TYPE_CHECKING:
+    from collections.abc import Set
+
+    from holdfast.config.values.topic_names import TopicNames
+    from holdfast.outputs.site import Site
+
+ONLINE, OFFLINE = b"online", b"offline"
+
+
+class Availability:
+    """What was published of one output and its devices."""
+
+    def __init__(self, names: TopicNames, site: Site) -> None:
+        self._names, self._site = names, site
+        self._answering: dict[str, bool] = {}
+        """Of each device, whether it answered when that was published last."""
+        self._answers = -1
+        """The number of answers of the site at which all was published."""
+
+    def of_output(self, payload: bytes) -> Message:
+        """The message about the output itself; with `OFFLINE` it is also the will."""
+        return Message(packed_topic(self._names.status), payload, True)
+
+    def begin(self) -> None:
+        """Forgets what was published: a broker may have lost it."""
+        self._answering, self._answers = {}, -1
+
+    def keep(self, devices: Set[str]) -> None:
+        """Forgets all other devices."""
+        for device in self._answering.keys() - devices:
+            del self._answering[device]
+
+    def changed(self, *, answering: bool) -> list[Message]:
+        """Messages of devices that have begun to answer, or stopped, since the last.
+
+        Those of devices that have stopped belong before values, the others after them.
+        """
+        now = self._site.answers
+        if now == self._answers:
+            return []
+        found = self._site.answering()
+        changed = [
+            device
+            for device, answers in found.items()
+            if answers is answering and self._answering.get(device) is not answers
+        ]
+        self._answering.update(dict.fromkeys(changed, answering))
+        # A device that has just stopped answering is for the next call, before its values.
+        if all(self._answering.get(device) is answers for device, answers in found.items()):
+            self._answers = now
+        payload = ONLINE if answering else OFFLINE
+        topics = map(self._names.of_availability, changed)
+        return [Message(packed_topic(topic), payload, True) for topic in topics]
