@@ -37,7 +37,7 @@ STEADY = 1.0
 """Seconds without a change of the memory by more than `NOISE`, after which it counts as steady."""
 
 NOISE = 64 * 1024
-SOURCE = common.python("poller_source.py")
+SOURCE = common.python("devices.py")
 READ = bytes.fromhex("0001 0000 0006 01 03 0000 000a")
 MAX_READ = bytes.fromhex("0001 0000 0006 01 03 0000 007d")
 TAG = Tag("tag", "holding_registers", 0, "float32")

@@ -19,7 +19,7 @@ def main() -> None:
     parser = common.parser(__doc__, seconds=3, rounds=5)
     parser.add_argument("--devices", type=int, default=DEVICES)
     options = common.parsed(parser)
-    with common.started("device", common.python("poller_source.py"), options.core) as server:
+    with common.started("device", common.python("devices.py"), options.core) as server:
         port = server.address.rpartition(":")[2]
         rounds: list[common.Round] = []
         for index in range(options.rounds):

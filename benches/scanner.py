@@ -38,7 +38,7 @@ class Bench:
     def __init__(self, options: argparse.Namespace, stack: ExitStack, *fleet: str) -> None:
         """With the name of a `fleet`, the scanner is its only node."""
         core, other = options.core, options.other
-        devices = common.started("devices", common.python("scanner_devices.py"), other)
+        devices = common.started("devices", common.python("devices.py"), other)
         self.devices = stack.enter_context(devices)
         self.nats = stack.enter_context(
             common.started("nats", common.python("scanner_nats.py"), other)

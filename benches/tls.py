@@ -8,6 +8,7 @@ core, their clients the other. Certificates have keys on the curve P-256.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import json
 import re
@@ -95,7 +96,7 @@ def make_certificates(folder: Path) -> None:
 
 @contextlib.contextmanager
 def openssl_server(folder: Path, core: int) -> Iterator[tuple[str, int]]:
-    """Runs OpenSSL's server, which requires a client certificate. Yields its address and its pid."""
+    """Runs OpenSSL's server, which requires client certificates. Yields address and pid."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     files = ["-cert", "server.pem", "-key", "server.key", "-CAfile", "ca.pem", "-Verify", "2"]
@@ -132,7 +133,7 @@ def rounds_of_handshakes(
     folder: Path,
     version: str,
     way: str,
-    options: common.argparse.Namespace,
+    options: argparse.Namespace,
 ) -> list[Round]:
     """Measures both servers in turns."""
     rounds: list[Round] = []
@@ -162,9 +163,7 @@ def rounds_of_handshakes(
     return rounds
 
 
-def rounds_of_reads(
-    holdfast: Server, folder: Path, options: common.argparse.Namespace
-) -> list[Round]:
+def rounds_of_reads(holdfast: Server, folder: Path, options: argparse.Namespace) -> list[Round]:
     """Measures one request in flight over TLS and over TCP, in turns."""
     files = f"ca={folder}/ca.pem&cert={folder}/panel.pem&key={folder}/panel.key"
     urls = {
