@@ -27,7 +27,7 @@ BUILD = ROOT / "build" / "dist"
 DIST = ROOT / "dist"
 MINGW = "x86_64-w64-mingw32-gcc"
 STAMP = 1_000_000_000
-"""The time of all files in the source distribution: the same source makes the same file."""
+"""The time of all files in what is made: the same source makes the same file."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,15 @@ def wheel(system: System, folder: Path) -> Path:
     """Builds the wheel of a system. Raises `Skipped`."""
     needs_target(system.target)
     options = ["--release", "--strip", "--locked", "--target", system.target]
-    variables = {"CARGO_NET_OFFLINE": "true", "CARGO_TARGET_DIR": str(ROOT / "target" / "dist")}
+    target = ROOT / "target" / "dist"
+    variables = {
+        "CARGO_NET_OFFLINE": "true",
+        "CARGO_TARGET_DIR": str(target),
+        # The same source makes the same file, wherever it lies.
+        "SOURCE_DATE_EPOCH": str(STAMP),
+        "RUSTFLAGS": f"--remap-path-prefix={folder}=. --remap-path-prefix={target}=target",
+        "CFLAGS": f"-ffile-prefix-map={folder}=. -ffile-prefix-map={target}=target",
+    }
     if system.policy:
         options += ["--zig", "--compatibility", system.policy]
         variables["CARGO_ZIGBUILD_ZIG_PATH"] = str(zig())
