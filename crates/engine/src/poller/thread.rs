@@ -385,7 +385,7 @@ async fn run_commands(
     mut commands: mpsc::UnboundedReceiver<Command>,
     mut passed: mpsc::UnboundedReceiver<PassedWrite>,
 ) {
-    let mut links: HashMap<Address, rc::Weak<Link>> = HashMap::new();
+    let mut links = Links::default();
     let mut running: HashMap<String, Running> = HashMap::new();
     let mut fences = Fences::default();
     let mut started = 0;
@@ -405,15 +405,14 @@ async fn run_commands(
         match command {
             Command::Stop => return,
             Command::Serve(settings, shared, calls) => {
-                let link =
-                    link_to(&settings.endpoint, (settings.in_flight, settings.retry), &mut links);
+                let link = links.to(&settings.endpoint, (settings.in_flight, settings.retry));
                 spawn_local(serve(link, *settings, shared, calls));
             }
             Command::Remove(name) => {
                 let removed = running.remove(&name);
                 debug_assert!(removed.is_some(), "{SAME_AS_LIST}");
                 drop(removed);
-                links.retain(|_, link| link.strong_count() > 0);
+                links.device_left();
             }
             Command::Add(planned, polled) => {
                 let phase = schedule::first_poll(planned.settings.start_within, started);
@@ -421,14 +420,14 @@ async fn run_commands(
                 fences.watch(planned.settings.fence.as_ref());
                 let name = planned.settings.name.clone();
                 let DeviceSettings { endpoint, in_flight, retry, .. } = &planned.settings;
-                let link = link_to(endpoint, (*in_flight, *retry), &mut links);
+                let link = links.to(endpoint, (*in_flight, *retry));
                 let device = Running::start(*planned, polled, link, phase);
                 let before = running.insert(name, device);
                 debug_assert!(before.is_none(), "{SAME_AS_LIST}");
             }
             Command::Replace { name, device: planned, polled, at_once } => {
                 let DeviceSettings { endpoint, in_flight, retry, .. } = &planned.settings;
-                let link = link_to(endpoint, (*in_flight, *retry), &mut links);
+                let link = links.to(endpoint, (*in_flight, *retry));
                 let before = running.remove(&name);
                 debug_assert!(before.is_some(), "{SAME_AS_LIST}");
                 fences.watch(planned.settings.fence.as_ref());
@@ -442,7 +441,7 @@ async fn run_commands(
                     _ => Running::start(*planned, polled, link, Duration::ZERO),
                 };
                 running.insert(name, device);
-                links.retain(|_, link| link.strong_count() > 0);
+                links.device_left();
             }
             Command::Write { device, ticket, request, until, to } => match running.get(&device) {
                 Some(device) => device.write(ticket, request, until, to),
@@ -588,18 +587,32 @@ fn made(planned: Planned, polled: Polled, to: (Rc<Link>, Rc<Turn>)) -> (Device, 
     (Device::new(planned, polled.state, to, forwards), tasks)
 }
 
-/// The link to an address, shared by all that ask for it.
-fn link_to(
-    endpoint: &Endpoint,
-    (in_flight, retry): (InFlight, Retry),
-    links: &mut HashMap<Address, rc::Weak<Link>>,
-) -> Rc<Link> {
-    let known = links.entry(address(endpoint)).or_default();
-    known.upgrade().unwrap_or_else(|| {
-        let link = Link::new(endpoint.clone(), in_flight, retry);
-        *known = Rc::downgrade(&link);
-        link
-    })
+/// The links to all addresses, each shared by all that ask for it.
+#[derive(Default)]
+struct Links {
+    by_address: HashMap<Address, rc::Weak<Link>>,
+    /// How often a device has left its link since those without devices were removed.
+    departures: usize,
+}
+
+impl Links {
+    fn to(&mut self, endpoint: &Endpoint, (in_flight, retry): (InFlight, Retry)) -> Rc<Link> {
+        let known = self.by_address.entry(address(endpoint)).or_default();
+        known.upgrade().unwrap_or_else(|| {
+            let link = Link::new(endpoint.clone(), in_flight, retry);
+            *known = Rc::downgrade(&link);
+            link
+        })
+    }
+
+    /// A device has left its link. Removing links looks at all of them, so it waits until it may find many.
+    fn device_left(&mut self) {
+        self.departures += 1;
+        if 2 * self.departures >= self.by_address.len() {
+            self.by_address.retain(|_, link| link.strong_count() > 0);
+            self.departures = 0;
+        }
+    }
 }
 
 /// The key of a shared link: its address, and its TLS identity.
