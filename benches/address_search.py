@@ -14,8 +14,9 @@ from random import Random
 from typing import TypeAlias
 
 from holdfast.client.requests import carry_out
-from holdfast.discovery.address_search import AreaMap, Outcome, Probe, Survey
+from holdfast.discovery.address_search import Outcome, Probe, Survey
 from holdfast.protocol import ADDRESSES, ILLEGAL_ADDRESS, ILLEGAL_FUNCTION, ILLEGAL_VALUE
+from holdfast.types import Area
 
 Device: TypeAlias = Callable[[Probe], Outcome]
 
@@ -25,10 +26,11 @@ SHORT = (
 )
 """Short ranges at the places of real maps."""
 
-SEARCHES: dict[str, dict[str, bool]] = {
-    "samples": {},
-    "--sparse": {"dense": False},
-    "--exact": {"exact": True},
+AREAS: tuple[Area, ...] = ("holding_registers",)
+SEARCHES: dict[str, Callable[[], Survey]] = {
+    "samples": lambda: Survey(AREAS),
+    "--sparse": lambda: Survey(AREAS, dense=False),
+    "--exact": lambda: Survey(AREAS, exact=True),
 }
 
 
@@ -55,9 +57,9 @@ def main() -> None:
 
 def searched(device: Device, search: str) -> list[int]:
     """The requests of a search, and how many ranges and addresses it finds."""
-    survey = Survey(["holding_registers"], **SEARCHES[search])
+    survey = SEARCHES[search]()
     carry_out(survey.steps(), device)
-    found: AreaMap = survey.areas[0]
+    [found] = survey.areas
     return [found.requests, len(found.ranges), found.addresses]
 
 

@@ -38,8 +38,8 @@ pub struct Connection {
     filled: PyBuffer<u8>,
 }
 
-/// The bytes that are received at once: sixteen long replies.
-const BUFFER_LEN: usize = 4096;
+/// The bytes that are received at once: seven of the longest replies.
+const BUFFER_LEN: usize = 2048;
 
 struct State {
     core: Core,
@@ -233,41 +233,14 @@ impl Connection {
         self.buffer.clone_ref(py)
     }
 
-    /// Processes so many bytes of the buffer.
+    /// Processes so many bytes of the buffer, and completes the requests that they answer.
     #[pyo3(signature = (len, /))]
     fn buffer_updated(&self, py: Python<'_>, len: usize) -> PyResult<()> {
         let mut copy = std::mem::take(&mut self.state().copy);
         let copied = self.filled.copy_to_slice(py, &mut copy);
-        let done =
-            copied.and_then(|()| self.data_received(py, copy.get(..len).unwrap_or_default()));
+        let done = copied.and_then(|()| self.process(py, copy.get(..len).unwrap_or_default()));
         self.state().copy = copy;
         done
-    }
-
-    /// Processes received bytes, and completes the requests that they answer.
-    #[pyo3(signature = (data, /))]
-    fn data_received(&self, py: Python<'_>, data: &[u8]) -> PyResult<()> {
-        let now = clock(self.time.bind(py).call0()?.extract()?)?;
-        let mut state = self.state();
-        let was_handshaking = state.is_handshaking();
-        let completed = self.complete(py, &mut state, |core, tls, ending, add| {
-            let Some(tls) = tls else {
-                return core.receive(data, now, |done| add(ending, done));
-            };
-            let received = tls.receive(data);
-            core.receive(&tls.plain, now, |done| add(ending, done));
-            if received.is_err() || tls.has_ended() {
-                *ending =
-                    received.err().map(|(failure, maybe_sent)| Ending::Tls(failure, maybe_sent));
-                core.close(Closed::ByPeer, |done| add(ending, done));
-            }
-        });
-        let has_changed = was_handshaking || state.core.closed().is_some();
-        let owner = state.owner.as_ref().filter(|_| has_changed);
-        let changed = owner.map(|owner| owner.changed.clone_ref(py));
-        drop(state);
-        settle(py, completed)?;
-        changed.map_or(Ok(()), |changed| changed.call0(py).map(|_| ()))
     }
 
     /// Ends the requests whose timeout has expired. When to call it again; `None` for no request.
@@ -400,6 +373,31 @@ impl Connection {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Processes received bytes.
+    fn process(&self, py: Python<'_>, data: &[u8]) -> PyResult<()> {
+        let now = clock(self.time.bind(py).call0()?.extract()?)?;
+        let mut state = self.state();
+        let was_handshaking = state.is_handshaking();
+        let completed = self.complete(py, &mut state, |core, tls, ending, add| {
+            let Some(tls) = tls else {
+                return core.receive(data, now, |done| add(ending, done));
+            };
+            let received = tls.receive(data);
+            core.receive(&tls.plain, now, |done| add(ending, done));
+            if received.is_err() || tls.has_ended() {
+                *ending =
+                    received.err().map(|(failure, maybe_sent)| Ending::Tls(failure, maybe_sent));
+                core.close(Closed::ByPeer, |done| add(ending, done));
+            }
+        });
+        let has_changed = was_handshaking || state.core.closed().is_some();
+        let owner = state.owner.as_ref().filter(|_| has_changed);
+        let changed = owner.map(|owner| owner.changed.clone_ref(py));
+        drop(state);
+        settle(py, completed)?;
+        changed.map_or(Ok(()), |changed| changed.call0(py).map(|_| ()))
+    }
+
     /// Collects what `work` completes.
     fn complete(
         &self,
@@ -451,13 +449,15 @@ type Completed = (Py<PyAny>, PyResult<Py<PyAny>>);
 fn settle(py: Python<'_>, completed: Vec<Completed>) -> PyResult<()> {
     for (future, outcome) in completed {
         let future = future.bind(py);
-        if future.call_method0(intern!(py, "done"))?.is_truthy()? {
-            continue;
-        }
-        match outcome {
-            Ok(value) => future.call_method1(intern!(py, "set_result"), (value,))?,
-            Err(error) => future.call_method1(intern!(py, "set_exception"), (error,))?,
+        let delivered = match outcome {
+            Ok(value) => future.call_method1(intern!(py, "set_result"), (value,)),
+            Err(error) => future.call_method1(intern!(py, "set_exception"), (error,)),
         };
+        if let Err(error) = delivered
+            && !future.call_method0(intern!(py, "cancelled"))?.is_truthy()?
+        {
+            return Err(error);
+        }
     }
     Ok(())
 }

@@ -345,8 +345,8 @@ class _Protocol(asyncio.BufferedProtocol):
         self._alarm: asyncio.TimerHandle | None = None
         self._transport: asyncio.Transport | None = None
         # Without a function of Python in between.
-        self.get_buffer = core.get_buffer  # type: ignore[method-assign]
-        self.buffer_updated = core.buffer_updated  # type: ignore[method-assign]
+        self.get_buffer = core.get_buffer  # type: ignore[assignment, method-assign]
+        self.buffer_updated = core.buffer_updated  # type: ignore[assignment, method-assign]
 
     @property
     def is_ready(self) -> bool:
