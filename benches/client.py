@@ -2,7 +2,8 @@
 
 The Holdfast server has one core, the measured client the other. The order of the clients rotates,
 so that changes of the machine's speed affect all alike. Ratios compare results of the same round;
-figures are the medians of all rounds. Every reply is checked: register N holds N.
+figures are the medians of all rounds. Every reply is checked: register N holds N. `--loop` and
+`--against` compare event loops and versions.
 """
 
 from __future__ import annotations
@@ -16,13 +17,15 @@ import tempfile
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import common
 from common import Result, TurnFailed
 
 import holdfast
+from holdfast.net import event_loop
 
+LOOPS = {"asyncio": asyncio.new_event_loop, "uvloop": event_loop.fastest}
 SHAPES = [(1, 1), (1, 16), (16, 1), (64, 1)]
 """The number of connections, and of concurrent calls on each."""
 QUANTITY = 10
@@ -42,6 +45,8 @@ def main() -> None:
         print(json.dumps(turn(*sys.argv[2:])))
         return
     parser = common.parser(__doc__, seconds=1, rounds=9)
+    parser.add_argument("--loop", choices=LOOPS, default="asyncio", help="default asyncio")
+    parser.add_argument("--against", type=Path, help="another checkout, whose Client is measured")
     options = common.parsed(parser)
     results = []
     with tempfile.TemporaryDirectory() as folder:
@@ -59,8 +64,12 @@ def main() -> None:
                 title = f"{connections} connections, {at_once} concurrent calls on each, asyncio"
                 shape = (server.address, connections, at_once)
                 commands = {
-                    name: common.python("client.py", "turn", name, *shape) for name in ASYNCIO
+                    name: common.python("client.py", "turn", name, options.loop, *shape)
+                    for name in ASYNCIO
                 }
+                if options.against:
+                    interpreter = options.against / ".venv" / "bin" / "python"
+                    commands["Client before"] = [str(interpreter), *commands["Client"][1:]]
                 if at_once > 1:
                     del commands["asyncio itself"]
                 results.append(measure(title, commands, options))
@@ -122,9 +131,11 @@ def turn(name: str, address: str, *numbers: str) -> Result:
     *shape, seconds = numbers
     if name in BLOCKING:
         return blocking_turn(BLOCKING[name](host, int(port)), float(seconds))
-    connections, at_once = map(int, shape)
+    loop, *counts = shape
+    connections, at_once = map(int, counts)
     made = ASYNCIO[name](host, int(port), connections)
-    return asyncio.run(asyncio_turn(made, at_once, float(seconds)))
+    with asyncio.Runner(loop_factory=LOOPS[loop]) as runner:
+        return runner.run(asyncio_turn(made, at_once, float(seconds)))
 
 
 def checked(registers: Sequence[int]) -> None:
@@ -210,8 +221,7 @@ class Bare(asyncio.Protocol):
     """The upper limit of asyncio: a request and a future, without a check of the reply."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self.transport = transport
+        self.transport = cast("asyncio.Transport", transport)  # Those of uvloop have no such base.
         self.loop = asyncio.get_running_loop()
 
     def data_received(self, _: bytes) -> None:

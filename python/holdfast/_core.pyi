@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from asyncio import AbstractEventLoop, Future
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from os import PathLike
 from typing import Any, Final, Literal, Self, final
@@ -1050,16 +1051,37 @@ class BlockingClient:
 
 @final
 class Connection:
-    """The protocol of a client's TCP connection, with or without TLS. The caller owns the socket.
+    """The protocol of a client's TCP connection, with or without TLS, for an event loop. The owner
+    has the socket.
 
-    Times are those of the owner's clock, in seconds. Completed requests are tickets, each with a
-    result, a `ModbusError`, or an `Attempt` when the request may be sent again.
+    Times are those of the loop. The future of a request gets its result, a `ModbusError`, or an
+    `Attempt` when the request may be sent again.
     """
 
-    def __new__(cls, endpoint: Endpoint, now: float, last: Connection | None = None) -> Connection:
+    def __new__(
+        cls,
+        endpoint: Endpoint,
+        event_loop: AbstractEventLoop,
+        last: Connection | None = None,
+    ) -> Connection:
         """A connection that follows the `last` one to this endpoint, which has ended: late replies
         to requests of that one are recognized.
         """
+
+    def opened(
+        self,
+        write: Callable[[bytes], object],
+        flush_soon: Callable[[], object],
+        wake_at: Callable[[float], object],
+        changed: Callable[[], object],
+    ) -> None:
+        """The socket is open. `write` sends bytes; `flush_soon` has `flush` called in this turn of
+        the loop, `wake_at` has `advance` called then. `changed` is called after received bytes if
+        the handshake went on or the connection has ended.
+        """
+
+    def detach(self) -> None:
+        """Drops the references to these methods."""
 
     @property
     def is_ready(self) -> bool:
@@ -1072,29 +1094,30 @@ class Connection:
         timeout: float,
         now: float,
         attempt: Attempt | None = None,
-    ) -> int:
-        """Queues a request; its ticket. Raises why the connection has ended."""
+    ) -> Future[Any]:
+        """Sends a request: at once if no other is pending, else with others of this turn of the
+        loop. Raises why the connection has ended.
+        """
 
-    def outgoing(self) -> bytes:
-        """The bytes to send now."""
+    def flush(self) -> None:
+        """Writes the bytes to send now."""
 
-    def receive(self, data: bytes, now: float) -> list[tuple[int, Any]]:
-        """Processes received bytes. Returns the completed requests."""
+    def get_buffer(self, size: int, /) -> bytearray:
+        """Where the loop puts received bytes."""
 
-    def advance(self, now: float) -> list[tuple[int, Any]]:
-        """Ends requests whose deadline has passed, and returns them."""
+    def buffer_updated(self, len: int, /) -> None:
+        """Processes so many received bytes."""
 
-    @property
-    def deadline(self) -> float | None:
-        """The next time to call `advance`."""
+    def advance(self) -> float | None:
+        """Ends requests whose deadline has passed. Returns the next time to call it."""
 
-    def cancel(self, ticket: int) -> None:
-        """Drops a request. Its reply, if one arrives, is counted."""
+    def cancel(self, future: Future[Any]) -> None:
+        """Drops a request whose caller no longer waits. Its reply, if one arrives, is counted."""
 
-    def close(self) -> list[tuple[int, Any]]:
-        """Closes the connection and ends all requests. `outgoing` may still have bytes to send."""
+    def close(self) -> None:
+        """Closes the connection and ends all requests. `flush` may still write bytes."""
 
-    def lost(self, error: str | None = None) -> list[tuple[int, Any]]:
+    def lost(self, error: str | None = None) -> None:
         """Reports the end of the network connection; `error` is `None` for a regular close."""
 
     @property

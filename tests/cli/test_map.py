@@ -105,6 +105,17 @@ def test_exact_finds_what_samples_miss() -> None:
     assert fast["requests"] < 30 < exact["requests"] < 220
 
 
+def test_sparse_reads_fewer_samples_and_says_how_far_they_are_apart() -> None:
+    with FakeDevice(lambda pdu: exception(pdu, 2)) as device:
+        options = ("--areas", "hr", "--range", "0-999", "--sparse")
+        found = answer("describe", "map", device.url, *options)
+        shown = invoke("describe", "map", device.url, *options).stdout
+        usage_error("describe", "map", device.url, "--sparse", "--exact")
+    # Multiples of 50 and of 256 below 1000, and 1, 10, 20 and 999.
+    assert found["requests"] == 20 + 3 + 4
+    assert "Samples are 50 apart below 10000, 256 above." in shown
+
+
 def test_reads_stay_within_what_is_allowed() -> None:
     with FakeDevice(registers) as device:
         options = ("--areas", "ir,hr", "--range", "0x10-99", "--max-quantity", "7")

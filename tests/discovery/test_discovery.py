@@ -205,6 +205,33 @@ def test_the_order_costs_no_more_reads_than_that_of_the_addresses(
     assert found.requests <= by_address
 
 
+@pytest.mark.parametrize(
+    ("layout", "largest", "dense", "sparse"),
+    [
+        (
+            [range(first, first + count) for first, count in SHORT_RANGES],
+            2000,
+            (2323, 16),
+            (704, 11),
+        ),
+        ([range(500), range(1000, 1300), range(5000, 5700)], 64, (2064, 3), (624, 3)),
+        ([range(at, at + 1) for at in range(0, 400, 2)], 2000, (2508, 200), (971, 200)),
+        ([range(65536)], 2000, (532, 1), (532, 1)),
+        ([range(65536)], 32, (2059, 1), (2059, 1)),
+        ([range(40000, 40180)], 2000, (2164, 1), (599, 1)),
+        ([], 2000, (2161, 0), (577, 0)),
+    ],
+    ids=["short", "small blocks", "single", "everything", "32 at once", "sunspec", "empty"],
+)
+def test_a_search_takes_its_requests_and_finds_its_ranges(
+    layout: list[range], largest: int, dense: tuple[int, int], sparse: tuple[int, int]
+) -> None:
+    truth = device(layout, largest=largest)
+    for expected, found in ((dense, mapped(truth)), (sparse, mapped(truth, dense=False))):
+        assert (found.requests, len(found.ranges)) == expected
+        assert all(each in layout for each in found.ranges)
+
+
 def test_ranges_are_findings_before_the_search_goes_on() -> None:
     survey = Survey(["coils", "holding_registers", "input_registers"])
     truth = device([range(300, 320), range(40000, 40100)])

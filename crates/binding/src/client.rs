@@ -500,10 +500,7 @@ impl Reply {
                 let bit = |index: usize| bits[index / 8] >> (index % 8) & 1 == 1;
                 PyList::new(py, (0..quantity).map(bit))?.into_any()
             }
-            Reply::Registers(registers) => {
-                let (pairs, _) = registers.as_chunks::<2>();
-                PyList::new(py, pairs.iter().map(|pair| u16::from_be_bytes(*pair)))?.into_any()
-            }
+            Reply::Registers(registers) => words(py, &registers)?,
             Reply::Written => py.None().into_bound(py),
             Reply::Bytes(data) => PyBytes::new(py, &data).into_any(),
             Reply::EventCounter(busy, events) => (busy, events).into_pyobject(py)?.into_any(),
@@ -525,6 +522,20 @@ impl Reply {
             }
         })
     }
+}
+
+/// A response as a Python object.
+pub(crate) fn value<'py>(py: Python<'py>, response: Response<'_>) -> PyResult<Bound<'py, PyAny>> {
+    match response {
+        // Most are registers: without a copy.
+        Response::Registers(registers) => words(py, registers.as_bytes()),
+        other => Reply::new(other).into_python(py),
+    }
+}
+
+fn words<'py>(py: Python<'py>, registers: &[u8]) -> PyResult<Bound<'py, PyAny>> {
+    let (pairs, _) = registers.as_chunks::<2>();
+    Ok(PyList::new(py, pairs.iter().map(|pair| u16::from_be_bytes(*pair)))?.into_any())
 }
 
 /// The Python exception of an error, as an object.

@@ -1,6 +1,7 @@
-//! `Connection`: the client side of a TCP connection, with or without TLS. The caller owns the
-//! socket.
+//! `Connection`: the client side of a TCP connection, with or without TLS, for an event loop. The loop owns
+//! the socket; replies go straight to the futures of their requests.
 
+use std::collections::VecDeque;
 use std::hash::{BuildHasher, RandomState};
 use std::io;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -11,26 +12,57 @@ use holdfast_engine::tls::TlsFailure;
 use holdfast_protocol::client::{
     Attempt as CoreAttempt, Closed, Connection as Core, Done, Failure, Ticket, Transport,
 };
+use pyo3::buffer::PyBuffer;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::PyBytes;
+use pyo3::types::{PyByteArray, PyBytes};
+use pyo3::{PyTraverseError, PyVisit, intern};
 
 use crate::arguments::{byte, seconds};
 use crate::channel::Tls;
-use crate::client::{Endpoint, Reply, Request, exception, raised};
+use crate::client::{Endpoint, Request, exception, raised, value};
+use crate::memory::Integer;
 
+/// No call into Python is made while its state is locked, but for those that make objects: the callee could
+/// come back.
 #[pyclass(frozen, module = "holdfast")]
 pub struct Connection {
     state: Mutex<State>,
     /// The URL of the peer.
     to: String,
+    /// `create_future` and `time` of the loop.
+    create_future: Py<PyAny>,
+    time: Py<PyAny>,
+    /// Received bytes, until they are processed.
+    buffer: Py<PyByteArray>,
+    filled: PyBuffer<u8>,
 }
+
+/// The bytes that are received at once: seven of the longest replies.
+const BUFFER_LEN: usize = 2048;
 
 struct State {
     core: Core,
     tls: Option<Tls>,
     /// Why I/O or TLS ended the connection.
     ending: Option<Ending>,
+    /// The futures of the requests that somebody waits for, in the order of their tickets.
+    waiting: VecDeque<(u64, Py<PyAny>)>,
+    owner: Option<Owner>,
+    /// Whether a request waits for a write at the end of this turn of the loop.
+    flushes: bool,
+    /// When the owner calls `advance`.
+    wakes_at: f64,
+    /// The bytes of the buffer.
+    copy: Box<[u8]>,
+}
+
+/// What the owner of the socket gave: methods.
+struct Owner {
+    write: Py<PyAny>,
+    flush_soon: Py<PyAny>,
+    wake_at: Py<PyAny>,
+    changed: Py<PyAny>,
 }
 
 /// A request that failed may be sent again.
@@ -60,16 +92,13 @@ enum Ending {
     Io(String),
 }
 
-/// Tickets of completed requests, each with a result or an exception.
-type Completed<'py> = Vec<(u64, Bound<'py, PyAny>)>;
-
 #[pymethods]
 impl Connection {
     #[new]
-    #[pyo3(signature = (endpoint, now, last=None))]
+    #[pyo3(signature = (endpoint, event_loop, last=None))]
     fn new(
         endpoint: PyRef<'_, Endpoint>,
-        now: f64,
+        event_loop: &Bound<'_, PyAny>,
         last: Option<PyRef<'_, Connection>>,
     ) -> PyResult<Connection> {
         let Place::Tcp { tls, .. } = &endpoint.core.place else {
@@ -82,126 +111,193 @@ impl Connection {
                 raised(ClientError::Tls { to: to.clone(), failure, maybe_sent: false })
             })?),
         };
-        let now = clock(now)?;
+        let time = event_loop.getattr("time")?;
+        let now = clock(time.call0()?.extract()?)?;
         let core = Core::tolerant(Transport::Tcp, endpoint.core.tolerance, now);
         // The keys of a hasher are random.
         let mut core = core.unpredictable(RandomState::new().hash_one(0));
         if let Some(last) = last {
             core.follow(last.state().core.take_past(now));
         }
-        Ok(Connection { state: Mutex::new(State { core, tls, ending: None }), to })
+        let state = State {
+            core,
+            tls,
+            ending: None,
+            waiting: VecDeque::new(),
+            owner: None,
+            flushes: false,
+            wakes_at: f64::INFINITY,
+            copy: Box::new([0; BUFFER_LEN]),
+        };
+        let create_future = event_loop.getattr("create_future")?.unbind();
+        let (time, state) = (time.unbind(), Mutex::new(state));
+        let buffer = PyByteArray::new(event_loop.py(), &[0; BUFFER_LEN]);
+        let filled = PyBuffer::get(&buffer)?;
+        Ok(Connection { state, to, create_future, time, buffer: buffer.unbind(), filled })
+    }
+
+    /// Takes the methods of the owner of the socket.
+    fn opened(
+        &self,
+        write: Py<PyAny>,
+        flush_soon: Py<PyAny>,
+        wake_at: Py<PyAny>,
+        changed: Py<PyAny>,
+    ) {
+        self.state().owner = Some(Owner { write, flush_soon, wake_at, changed });
+    }
+
+    /// Forgets them: the socket is closed.
+    fn detach(&self) {
+        let owner = self.state().owner.take();
+        drop(owner);
     }
 
     /// Whether requests can be sent: the connection is open, and any TLS handshake is complete.
     #[getter]
     fn is_ready(&self) -> bool {
         let state = self.state();
-        let agreed = state.tls.as_ref().is_none_or(|tls| !tls.is_handshaking());
-        agreed && state.core.closed().is_none()
+        !state.is_handshaking() && state.core.closed().is_none()
     }
 
-    /// Queues a request; its ticket.
+    /// Sends a request, at once if no other is pending; the future of its result.
     #[pyo3(signature = (request, unit, timeout, now, attempt=None))]
-    fn send(
+    fn send<'py>(
         &self,
-        request: PyRef<'_, Request>,
-        unit: i128,
+        py: Python<'py>,
+        request: &Request,
+        unit: Integer,
         timeout: f64,
         now: f64,
-        attempt: Option<PyRef<'_, Attempt>>,
-    ) -> PyResult<u64> {
-        let (unit, timeout) = (byte("unit", unit)?, seconds("timeout", timeout)?);
+        attempt: Option<&Attempt>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let (unit, within) = (byte("unit", unit.0)?, seconds("timeout", timeout)?);
         let attempt = attempt.map_or_else(Default::default, |attempt| attempt.core);
+        let future = self.create_future.bind(py).call0()?;
         let mut state = self.state();
         if !state.core.has_room() {
             return Err(PyRuntimeError::new_err("the device takes one request at a time"));
         }
-        match state.core.send_again(unit, &request.encoded, timeout, attempt, clock(now)?) {
-            Ok(ticket) => Ok(ticket.0),
-            Err(why) => Err(raised(self.error(&state.ending, why.failure(), timeout))),
+        let ticket =
+            match state.core.send_again(unit, &request.encoded, within, attempt, clock(now)?) {
+                Ok(ticket) => ticket.0,
+                Err(why) => return Err(raised(self.error(&state.ending, why.failure(), within))),
+            };
+        let is_alone = state.waiting.is_empty();
+        state.waiting.push_back((ticket, future.clone().unbind()));
+        let held = if state.core.is_held() { state.core.deadline() } else { None };
+        let deadline = held.map_or(now + timeout, |until| until.as_secs_f64());
+        let wakes_sooner = deadline < state.wakes_at;
+        if wakes_sooner {
+            state.wakes_at = deadline;
         }
-    }
-
-    /// Takes the bytes to send now.
-    fn outgoing<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
-        let State { core, tls, .. } = &mut *self.state();
-        let plain = core.outgoing();
-        let bytes = match tls {
-            None => PyBytes::new(py, plain),
-            Some(tls) => {
-                tls.send(plain);
-                let bytes = PyBytes::new(py, &tls.out);
-                tls.out.clear();
-                bytes
+        let flushes_soon = !is_alone && !std::mem::replace(&mut state.flushes, !is_alone);
+        if wakes_sooner || flushes_soon {
+            let owner = state
+                .owner
+                .as_ref()
+                .map(|owner| (owner.wake_at.clone_ref(py), owner.flush_soon.clone_ref(py)));
+            drop(state);
+            if let Some((wake_at, flush_soon)) = owner {
+                if wakes_sooner {
+                    wake_at.call1(py, (deadline,))?;
+                }
+                if flushes_soon {
+                    flush_soon.call0(py)?;
+                }
             }
-        };
-        let len = plain.len();
-        core.sent(len);
-        bytes
-    }
-
-    /// Processes received bytes and returns the requests that they complete.
-    fn receive<'py>(&self, py: Python<'py>, data: &[u8], now: f64) -> PyResult<Completed<'py>> {
-        let now = clock(now)?;
-        let State { core, tls, ending } = &mut *self.state();
-        let mut completed = Completions::new(py);
-        let Some(tls) = tls else {
-            core.receive(data, now, |done| completed.add(self, ending, done));
-            return completed.all;
-        };
-        let received = tls.receive(data);
-        core.receive(&tls.plain, now, |done| completed.add(self, ending, done));
-        if received.is_err() || tls.has_ended() {
-            *ending = received.err().map(|(failure, maybe_sent)| Ending::Tls(failure, maybe_sent));
-            core.close(Closed::ByPeer, |done| completed.add(self, ending, done));
+        } else {
+            drop(state);
         }
-        completed.all
-    }
-
-    /// Ends the requests whose timeout has expired.
-    fn advance<'py>(&self, py: Python<'py>, now: f64) -> PyResult<Completed<'py>> {
-        let State { core, ending, .. } = &mut *self.state();
-        let mut completed = Completions::new(py);
-        core.advance(clock(now)?, |done| completed.add(self, ending, done));
-        completed.all
-    }
-
-    /// When to call `advance`.
-    #[getter]
-    fn deadline(&self) -> Option<f64> {
-        self.state().core.deadline().map(|deadline| deadline.as_secs_f64())
-    }
-
-    /// Drops a request. A late reply to it is counted.
-    fn cancel(&self, ticket: u64) {
-        self.state().core.cancel(Ticket(ticket));
-    }
-
-    /// Ends the connection and all its requests. `outgoing` may still have bytes to send.
-    fn close<'py>(&self, py: Python<'py>) -> PyResult<Completed<'py>> {
-        let State { core, tls, ending } = &mut *self.state();
-        let mut completed = Completions::new(py);
-        core.close(Closed::BySelf, |done| completed.add(self, ending, done));
-        if let Some(tls) = tls {
-            tls.end();
+        if is_alone {
+            self.flush(py)?;
         }
-        completed.all
+        Ok(future)
+    }
+
+    /// Writes what is to be sent now.
+    fn flush(&self, py: Python<'_>) -> PyResult<()> {
+        let mut state = self.state();
+        state.flushes = false;
+        let write = state.owner.as_ref().map(|owner| owner.write.clone_ref(py));
+        if let Some((write, outgoing)) = write.zip(state.outgoing(py)) {
+            drop(state);
+            write.call1(py, (outgoing,))?;
+        }
+        Ok(())
+    }
+
+    /// Where the loop puts received bytes.
+    #[pyo3(signature = (_size, /))]
+    fn get_buffer(&self, py: Python<'_>, _size: i64) -> Py<PyByteArray> {
+        self.buffer.clone_ref(py)
+    }
+
+    /// Processes so many bytes of the buffer, and completes the requests that they answer.
+    #[pyo3(signature = (len, /))]
+    fn buffer_updated(&self, py: Python<'_>, len: usize) -> PyResult<()> {
+        let mut copy = std::mem::take(&mut self.state().copy);
+        let copied = self.filled.copy_to_slice(py, &mut copy);
+        let done = copied.and_then(|()| self.process(py, copy.get(..len).unwrap_or_default()));
+        self.state().copy = copy;
+        done
+    }
+
+    /// Ends the requests whose timeout has expired. When to call it again; `None` for no request.
+    fn advance(&self, py: Python<'_>) -> PyResult<Option<f64>> {
+        let now = clock(self.time.bind(py).call0()?.extract()?)?;
+        let mut state = self.state();
+        let completed = self.complete(py, &mut state, |core, _, ending, add| {
+            core.advance(now, |done| add(ending, done));
+        });
+        drop(state);
+        settle(py, completed)?;
+        // Requests that the caller of an ended one has sent meanwhile are among them.
+        let mut state = self.state();
+        let deadline = state.core.deadline().map(|deadline| deadline.as_secs_f64());
+        state.wakes_at = deadline.unwrap_or(f64::INFINITY);
+        Ok(deadline)
+    }
+
+    /// Drops a request whose caller no longer waits. A late reply to it is counted.
+    fn cancel(&self, future: &Bound<'_, PyAny>) {
+        let mut state = self.state();
+        if let Some(at) = state.waiting.iter().position(|(_, other)| other.is(future))
+            && let Some((ticket, _)) = state.waiting.remove(at)
+        {
+            state.core.cancel(Ticket(ticket));
+        }
+    }
+
+    /// Ends the connection and all its requests. `flush` may still have bytes to write.
+    fn close(&self, py: Python<'_>) -> PyResult<()> {
+        let mut state = self.state();
+        let completed = self.complete(py, &mut state, |core, tls, ending, add| {
+            core.close(Closed::BySelf, |done| add(ending, done));
+            if let Some(tls) = tls {
+                tls.end();
+            }
+        });
+        drop(state);
+        settle(py, completed)
     }
 
     /// Reports that the connection is lost. `error` is `None` when the peer closed it normally.
     #[pyo3(signature = (error=None))]
-    fn lost<'py>(&self, py: Python<'py>, error: Option<String>) -> PyResult<Completed<'py>> {
-        let State { core, tls, ending } = &mut *self.state();
-        let mut completed = Completions::new(py);
-        if core.closed().is_none() {
-            let of_tls = tls.as_ref().and_then(|tls| tls.lost(error.is_some()));
-            *ending = match of_tls {
-                Some((failure, maybe_sent)) => Some(Ending::Tls(failure, maybe_sent)),
-                None => error.map(Ending::Io),
-            };
-        }
-        core.close(Closed::ByPeer, |done| completed.add(self, ending, done));
-        completed.all
+    fn lost(&self, py: Python<'_>, error: Option<String>) -> PyResult<()> {
+        let mut state = self.state();
+        let completed = self.complete(py, &mut state, |core, tls, ending, add| {
+            if core.closed().is_none() {
+                let of_tls = tls.as_ref().and_then(|tls| tls.lost(error.is_some()));
+                *ending = match of_tls {
+                    Some((failure, maybe_sent)) => Some(Ending::Tls(failure, maybe_sent)),
+                    None => error.map(Ending::Io),
+                };
+            }
+            core.close(Closed::ByPeer, |done| add(ending, done));
+        });
+        drop(state);
+        settle(py, completed)
     }
 
     /// Why the connection has ended, as an exception; `None` while it is open.
@@ -223,11 +319,113 @@ impl Connection {
     fn longest_late(&self) -> f64 {
         self.state().core.longest_late().as_secs_f64()
     }
+
+    fn __traverse__(&self, visit: PyVisit<'_>) -> Result<(), PyTraverseError> {
+        visit.call(&self.create_future)?;
+        visit.call(&self.time)?;
+        // What a locked state has is in use.
+        let Ok(state) = self.state.try_lock() else { return Ok(()) };
+        for (_, future) in &state.waiting {
+            visit.call(future)?;
+        }
+        if let Some(Owner { write, flush_soon, wake_at, changed }) = &state.owner {
+            for method in [write, flush_soon, wake_at, changed] {
+                visit.call(method)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn __clear__(&self) {
+        let mut state = self.state();
+        let left = (std::mem::take(&mut state.waiting), state.owner.take());
+        drop(state);
+        drop(left);
+    }
+}
+
+impl State {
+    fn is_handshaking(&self) -> bool {
+        self.tls.as_ref().is_some_and(Tls::is_handshaking)
+    }
+
+    /// Takes the bytes to send now, if there are any.
+    fn outgoing<'py>(&mut self, py: Python<'py>) -> Option<Bound<'py, PyBytes>> {
+        let plain = self.core.outgoing();
+        let bytes = match &mut self.tls {
+            None if plain.is_empty() => return None,
+            None => PyBytes::new(py, plain),
+            Some(tls) => {
+                tls.send(plain);
+                let bytes = PyBytes::new(py, &tls.out);
+                tls.out.clear();
+                bytes
+            }
+        };
+        let len = plain.len();
+        self.core.sent(len);
+        Some(bytes).filter(|bytes| !bytes.as_bytes().is_empty())
+    }
 }
 
 impl Connection {
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Processes received bytes.
+    fn process(&self, py: Python<'_>, data: &[u8]) -> PyResult<()> {
+        let now = clock(self.time.bind(py).call0()?.extract()?)?;
+        let mut state = self.state();
+        let was_handshaking = state.is_handshaking();
+        let completed = self.complete(py, &mut state, |core, tls, ending, add| {
+            let Some(tls) = tls else {
+                return core.receive(data, now, |done| add(ending, done));
+            };
+            let received = tls.receive(data);
+            core.receive(&tls.plain, now, |done| add(ending, done));
+            if received.is_err() || tls.has_ended() {
+                *ending =
+                    received.err().map(|(failure, maybe_sent)| Ending::Tls(failure, maybe_sent));
+                core.close(Closed::ByPeer, |done| add(ending, done));
+            }
+        });
+        let has_changed = was_handshaking || state.core.closed().is_some();
+        let owner = state.owner.as_ref().filter(|_| has_changed);
+        let changed = owner.map(|owner| owner.changed.clone_ref(py));
+        drop(state);
+        settle(py, completed)?;
+        changed.map_or(Ok(()), |changed| changed.call0(py).map(|_| ()))
+    }
+
+    /// Collects what `work` completes.
+    fn complete(
+        &self,
+        py: Python<'_>,
+        State { core, tls, ending, waiting, .. }: &mut State,
+        work: impl FnOnce(
+            &mut Core,
+            &mut Option<Tls>,
+            &mut Option<Ending>,
+            &mut dyn FnMut(&Option<Ending>, Done<'_>),
+        ),
+    ) -> Vec<Completed> {
+        let mut completed = Vec::new();
+        work(core, tls, ending, &mut |ending, done| {
+            let Ok(at) = waiting.binary_search_by_key(&done.ticket.0, |(ticket, _)| *ticket) else {
+                return;
+            };
+            let Some((_, future)) = waiting.remove(at) else { return };
+            let outcome = match done.outcome {
+                Ok(response) => value(py, response).map(Bound::unbind),
+                Err(failure) => match done.again {
+                    Some(core) => Py::new(py, Attempt { core }).map(Py::into_any),
+                    None => Err(raised(self.error(ending, failure, done.timeout))),
+                },
+            };
+            completed.push((future, outcome));
+        });
+        completed
     }
 
     fn error(&self, ending: &Option<Ending>, failure: Failure, timeout: Duration) -> ClientError {
@@ -244,31 +442,24 @@ impl Connection {
     }
 }
 
-/// Collects completed requests, or the first error.
-struct Completions<'py> {
-    py: Python<'py>,
-    all: PyResult<Completed<'py>>,
-}
+/// A future, and the result or the exception of its request.
+type Completed = (Py<PyAny>, PyResult<Py<PyAny>>);
 
-impl<'py> Completions<'py> {
-    fn new(py: Python<'py>) -> Completions<'py> {
-        Completions { py, all: Ok(Vec::new()) }
-    }
-
-    fn add(&mut self, connection: &Connection, ending: &Option<Ending>, done: Done<'_>) {
-        let value = match done.outcome {
-            Ok(response) => Reply::new(response).into_python(self.py),
-            Err(failure) => match done.again {
-                Some(core) => Bound::new(self.py, Attempt { core }).map(Bound::into_any),
-                None => Ok(exception(self.py, &connection.error(ending, failure, done.timeout))),
-            },
+/// Delivers results. Futures of calls that were cancelled are left alone.
+fn settle(py: Python<'_>, completed: Vec<Completed>) -> PyResult<()> {
+    for (future, outcome) in completed {
+        let future = future.bind(py);
+        let delivered = match outcome {
+            Ok(value) => future.call_method1(intern!(py, "set_result"), (value,)),
+            Err(error) => future.call_method1(intern!(py, "set_exception"), (error,)),
         };
-        match (&mut self.all, value) {
-            (Ok(all), Ok(value)) => all.push((done.ticket.0, value)),
-            (all, Err(error)) => *all = Err(error),
-            (Err(_), Ok(_)) => {}
+        if let Err(error) = delivered
+            && !future.call_method0(intern!(py, "cancelled"))?.is_truthy()?
+        {
+            return Err(error);
         }
     }
+    Ok(())
 }
 
 /// Converts the time of an event loop.

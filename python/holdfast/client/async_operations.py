@@ -276,7 +276,9 @@ class AsyncOperations(BaseClient):
     def _run(self, plan: Plan[Result], unit: int | None) -> Awaitable[Result]:
         """Runs a plan."""
         if isinstance(plan, Request):
-            result: Awaitable[Result] = self._call(plan, unit)
+            result: Awaitable[Result] = self._transport.call(
+                plan, self.unit_for(plan, unit), self.timeout
+            )
             return result
         return requests.carry_out_async(plan, lambda request: self._call(request, unit))
 

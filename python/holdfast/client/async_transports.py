@@ -2,9 +2,10 @@
 
 Over TCP and TLS: many requests in flight on one connection, without threads. The native connection
 frames requests, matches replies, tracks deadlines and handles TLS; `AsyncConnection` owns the
-socket, one timer and the futures. Requests from the same turn of the event loop are sent in one
+socket and one timer. Requests from the same turn of the event loop are sent in one
 write, and replies that arrive together are delivered together, so a busy connection causes few
-wake-ups. All other transports have one request at a time: `ThreadedConnection`.
+wake-ups. A request runs as little Python as possible: a reply goes from the native connection to
+the future of its request. All other transports have one request at a time: `ThreadedConnection`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ import os
 import socket
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from math import inf
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
@@ -112,12 +112,46 @@ class AsyncConnection:
         self._max_in_flight = 1 if target.tolerance.is_one_at_a_time else max_in_flight
         self._last: _LoopConnection | None = None
 
-    def call(self, request: Request, unit: int, timeout: float) -> Awaitable[Any]:
+    async def call(self, request: Request, unit: int, timeout: float) -> Any:
         """Sends a request as soon as a place is free, and waits for the result.
 
         Raises `RuntimeError` while the client is in use in another event loop.
         """
-        return self._here().call(request, unit, timeout)
+        here = self._last
+        if here is None or here.loop is not asyncio.get_running_loop():
+            here = self._here()
+        if here.free:
+            here.free -= 1
+        else:
+            await here.turn()
+        try:
+            now, left, attempt = here.time(), timeout, None
+            deadline = now + timeout
+            while True:
+                connection = here.open
+                if connection is None:
+                    connection = await here.connected(deadline, timeout)
+                # Without pauses the core needs no later time than that of the call.
+                if here.has_pauses or attempt is not None:
+                    now = here.time()
+                    left = max(deadline - now, 0.0)
+                future = connection.send(request, unit, left, now, attempt)
+                try:
+                    result = await future
+                except asyncio.CancelledError:
+                    connection.cancel(future)
+                    raise
+                if type(result) is not Attempt:
+                    return result
+                attempt = result
+                await asyncio.sleep(attempt.pause)
+                if attempt.has_own_timeout:
+                    deadline = here.time() + timeout
+        finally:
+            if here.queue:
+                here.next_turn()
+            else:
+                here.free += 1
 
     async def close(self) -> None:
         """Closes the connection; pending calls fail."""
@@ -148,108 +182,90 @@ class AsyncConnection:
         return here
 
 
-@dataclass(eq=False)
 class _LoopConnection:
     """A connection in one event loop. Connects on demand, and reconnects after a loss."""
 
-    target: NetworkTarget
-    endpoint: Endpoint
-    max_in_flight: int
-    loop: asyncio.AbstractEventLoop
-    late_before: int = 0
-    longest_late_before: float = 0.0
-    """The late replies of connections that have ended."""
-
-    def __post_init__(self) -> None:
-        self._free = self.max_in_flight
-        self._queue: deque[asyncio.Future[None]] = deque()
-        self._open: _Protocol | None = None
-        self._last: Connection | None = None
-        """The newest connection, open or ended: its late replies may come on the next one."""
+    def __init__(
+        self,
+        target: NetworkTarget,
+        endpoint: Endpoint,
+        max_in_flight: int,
+        loop: asyncio.AbstractEventLoop,
+        late: int,
+        longest_late: float,
+    ) -> None:
+        self.loop = loop
+        self.time = loop.time
+        self.has_pauses = target.tolerance.has_pauses
+        self.free = max_in_flight
+        """Requests that may be sent before one ends."""
+        self.queue: deque[asyncio.Future[None]] = deque()
+        """The calls that wait for one to end."""
+        self.open: Connection | None = None
+        self._max_in_flight = max_in_flight
+        self._target = target
+        self._endpoint = endpoint
+        self._late_before = late
+        self._longest_late_before = longest_late
+        """The late replies of connections that have ended."""
+        self._protocol: _Protocol | None = None
+        """The socket of the open connection."""
+        self._newest: Connection | None = None
+        """Open or ended: its late replies may come on the next one."""
         self._connecting: asyncio.Task[_Protocol] | None = None
         self._is_looking_up = False
         """Whether the attempt to connect waits, or has waited, for the addresses of the host."""
         self._connect_at = -inf
 
-    async def call(self, request: Request, unit: int, timeout: float) -> Any:
-        if self._free:
-            self._free -= 1
-        else:
-            await self._turn()
-        try:
-            deadline = self.loop.time() + timeout
-            attempt = None
-            while True:
-                connection = self._open
-                if connection is None:
-                    connection = await self._connected(deadline, timeout)
-                ticket, future = connection.send(request, unit, deadline, timeout, attempt)
-                try:
-                    result = await future
-                except asyncio.CancelledError:
-                    connection.cancel(ticket)
-                    raise
-                if type(result) is not Attempt:
-                    return result
-                attempt = result
-                await asyncio.sleep(attempt.pause)
-                if attempt.has_own_timeout:
-                    deadline = self.loop.time() + timeout
-        finally:
-            if self._queue:
-                self._next_turn()
-            else:
-                self._free += 1
-
     async def close(self) -> None:
-        for turn in self._queue:
+        for turn in self.queue:
             if not turn.done():
                 turn.set_exception(ConnectionLost(CLOSED))
-        self._queue.clear()
+        self.queue.clear()
         if self._connecting is not None:
             self._connecting.cancel()
             await asyncio.wait([self._connecting])
-        if self._open is not None:
-            ended = self._open.ended
-            self._open.close()
+        if self._protocol is not None:
+            ended = self._protocol.ended
+            self._protocol.close()
             await ended
 
     @property
     def in_use(self) -> bool:
         """Whether there is a connection, or a pending call."""
-        connected = self._open is not None or self._connecting is not None
-        return connected or self._free < self.max_in_flight
+        connected = self.open is not None or self._connecting is not None
+        return connected or self.free < self._max_in_flight
 
     @property
     def late(self) -> int:
-        return self.late_before + (0 if self._open is None else self._open.core.late)
+        return self._late_before + (0 if self.open is None else self.open.late)
 
     @property
     def longest_late(self) -> float:
-        here = 0.0 if self._open is None else self._open.core.longest_late
-        return max(self.longest_late_before, here)
+        here = 0.0 if self.open is None else self.open.longest_late
+        return max(self._longest_late_before, here)
 
-    async def _turn(self) -> None:
+    async def turn(self) -> None:
         """Waits for a free place in flight, in the order of the calls."""
         turn = self.loop.create_future()
-        self._queue.append(turn)
+        self.queue.append(turn)
         try:
             await turn
         except asyncio.CancelledError:
             if turn.done() and not turn.cancelled() and turn.exception() is None:
-                self._next_turn()
+                self.next_turn()
             raise
 
-    def _next_turn(self) -> None:
+    def next_turn(self) -> None:
         """Gives a free place to the next waiting call."""
-        while self._queue:
-            turn = self._queue.popleft()
+        while self.queue:
+            turn = self.queue.popleft()
             if not turn.done():
                 turn.set_result(None)
                 return
-        self._free += 1
+        self.free += 1
 
-    async def _connected(self, deadline: float, timeout: float) -> _Protocol:
+    async def connected(self, deadline: float, timeout: float) -> Connection:
         """The connection; connects if necessary. Several calls can wait for the same attempt."""
         if self._connecting is None:
             self._connecting = self.loop.create_task(self._connect(timeout))
@@ -263,15 +279,15 @@ class _LoopConnection:
         failure = connecting.exception()
         if isinstance(failure, ModbusError):
             raise copy.copy(failure) from failure.__cause__
-        return connecting.result()
+        return connecting.result().core
 
     async def _connect(self, timeout: float) -> _Protocol:
-        target = self.target
+        target = self._target
         self._is_looking_up = False
         if self._connect_at > self.loop.time():
             await asyncio.sleep(min(self._connect_at - self.loop.time(), timeout))
-        self._last = core = Connection(self.endpoint, self.loop.time(), self._last)
-        protocol = _Protocol(self, core, has_pauses=target.tolerance.has_pauses)
+        self._newest = core = Connection(self._endpoint, self.loop, self._newest)
+        protocol = _Protocol(self, core)
         deadline = self.loop.time() + timeout
         try:
             async with asyncio.timeout_at(deadline):
@@ -295,107 +311,65 @@ class _LoopConnection:
 
     def _not_in_time(self, timeout: float) -> RequestTimeout:
         why = ": its name was not resolved" if self._is_looking_up else ""
-        text = f"no connection to {self.target} within {timeout:g} s{why}"
+        text = f"no connection to {self._target} within {timeout:g} s{why}"
         return RequestTimeout(text, maybe_sent=False)
 
     def _connect_ended(self, task: asyncio.Task[_Protocol]) -> None:
         self._connecting = None
         # The connection may already be lost.
         if not task.cancelled() and task.exception() is None and task.result().is_ready:
-            self._open = task.result()
+            self._protocol = task.result()
+            self.open = self._protocol.core
 
     def lost(self, connection: _Protocol) -> None:
         """The connection has ended: the next call makes a new one."""
-        self._connect_at = self.loop.time() + self.target.tolerance.reconnect
-        self.late_before += connection.core.late
-        self.longest_late_before = max(self.longest_late_before, connection.core.longest_late)
-        if self._open is connection:
-            self._open = None
+        self._connect_at = self.loop.time() + self._target.tolerance.reconnect
+        core = connection.core
+        self._late_before += core.late
+        self._longest_late_before = max(self._longest_late_before, core.longest_late)
+        if self._protocol is connection:
+            self._protocol = self.open = None
 
 
-class _Protocol(asyncio.Protocol):
-    """One connection: sends requests and receives replies."""
+class _Protocol(asyncio.BufferedProtocol):
+    """The socket of one connection, and its timer."""
 
-    def __init__(self, here: _LoopConnection, core: Connection, *, has_pauses: bool) -> None:
+    def __init__(self, here: _LoopConnection, core: Connection) -> None:
         self.core = core
-        self._has_pauses = has_pauses
         self._here = here
         self._loop = here.loop
         self.ready: asyncio.Future[None] = self._loop.create_future()
         """Done when requests can be sent."""
         self.ended: asyncio.Future[None] = self._loop.create_future()
         """Done when the socket is closed."""
-        self._futures: dict[int, asyncio.Future[Any]] = {}
         self._alarm: asyncio.TimerHandle | None = None
-        self._alarm_at = inf
-        self._flushing = False
         self._transport: asyncio.Transport | None = None
+        # Without a function of Python in between.
+        self.get_buffer = core.get_buffer  # type: ignore[assignment, method-assign]
+        self.buffer_updated = core.buffer_updated  # type: ignore[assignment, method-assign]
 
     @property
     def is_ready(self) -> bool:
         """Whether requests can be sent."""
         return self._transport is not None and self.core.is_ready
 
-    def send(
-        self,
-        request: Request,
-        unit: int,
-        deadline: float,
-        timeout: float,
-        attempt: Attempt | None,
-    ) -> tuple[int, asyncio.Future[Any]]:
-        """Sends a request: at once if no other is pending, else with others of this loop turn.
-
-        Returns its ticket and the future of its result.
-        """
-        # When the call began. Without pauses the core needs no later time, and each look at the
-        # clock costs something.
-        now = deadline - timeout
-        if self._has_pauses or attempt is not None:
-            now = self._loop.time()
-        ticket = self.core.send(request, unit, max(deadline - now, 0.0), now, attempt)
-        if not self._futures:
-            self._flush()
-        elif not self._flushing:
-            self._flushing = True
-            self._loop.call_soon(self._flush)
-        future = self._futures[ticket] = self._loop.create_future()
-        if self._has_pauses:
-            deadline = self.core.deadline or deadline
-        if deadline < self._alarm_at:
-            self._set_alarm(deadline)
-        return ticket, future
-
-    def cancel(self, ticket: int) -> None:
-        """Drops a request whose caller no longer waits."""
-        if self._futures.pop(ticket, None) is not None:
-            self.core.cancel(ticket)
-
     def close(self) -> None:
         """Closes the connection; pending requests raise `ConnectionLost`."""
-        self._settle(self.core.close())
+        self.core.close()
+        self._changed()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)  # Those of uvloop have no such base.
-        self._settle([])
-
-    def data_received(self, data: bytes) -> None:
-        self._settle(self.core.receive(data, self._loop.time()))
+        self.core.opened(self._transport.write, self._flush_soon, self._wake_at, self._changed)
+        self._changed()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._settle(self.core.lost(None if exc is None else explained(exc)))
+        self.core.lost(None if exc is None else explained(exc))
+        self._changed()
         self.ended.set_result(None)
 
-    def _settle(self, completed: list[tuple[int, Any]]) -> None:
-        """Delivers results, continues the handshake, and handles the end of the connection."""
-        for ticket, result in completed:
-            future = self._futures.pop(ticket)
-            if future.done():
-                continue
-            if isinstance(result, ModbusError):
-                future.set_exception(result)
-            else:
-                future.set_result(result)
+    def _changed(self) -> None:
+        """Continues the handshake, and handles the end of the connection."""
         if not self.ready.done():
             self._greet()
         closed = self.core.closed
@@ -418,33 +392,33 @@ class _Protocol(asyncio.Protocol):
         transport, self._transport = self._transport, None
         if transport is not None:
             self._here.lost(self)
-            outgoing = self.core.outgoing()
-            if outgoing and not transport.is_closing():
-                transport.write(outgoing)
+            if not transport.is_closing():
+                self.core.flush()
+            self.core.detach()
             transport.abort()
 
-    def _flush(self) -> None:
-        self._flushing = False
-        if self._transport is not None:
-            outgoing = self.core.outgoing()
-            if outgoing:
-                self._transport.write(outgoing)
+    def _flush_soon(self) -> None:
+        """Sends what waits at the end of this turn of the loop."""
+        self._loop.call_soon(self._flush)
 
-    def _set_alarm(self, at: float) -> None:
+    def _flush(self) -> None:
+        if self._transport is not None:
+            self.core.flush()
+
+    def _wake_at(self, at: float) -> None:
         if self._alarm is not None:
             self._alarm.cancel()
-        self._alarm_at = at
         self._alarm = self._loop.call_at(at, self._look_at_deadlines)
 
     def _look_at_deadlines(self) -> None:
         """Ends calls after their deadline, and sets the timer for the next deadline."""
-        self._alarm, self._alarm_at = None, inf
-        self._settle(self.core.advance(self._loop.time()))
-        if self._has_pauses:
+        self._alarm = None
+        deadline = self.core.advance()
+        self._changed()
+        if self._here.has_pauses:
             self._flush()
-        deadline = self.core.deadline
         if deadline is not None and self._transport is not None:
-            self._set_alarm(deadline)
+            self._wake_at(deadline)
 
 
 def explained(error: Exception) -> str:

@@ -148,9 +148,11 @@ class EventLog:
 
 def read_range(area: Area, address: int, count: int) -> Plan[list[Any]]:
     """Reads `count` bits or registers, in several requests if necessary."""
-    address, count = index(address), index(count)
     limit = READ_LIMITS.get(area)
-    if limit is None or count <= limit:
+    if limit is None or (type(count) is int and count <= limit):
+        return Request.read(area, address, count)
+    address, count = index(address), index(count)
+    if count <= limit:
         return Request.read(area, address, count)
     return _in_turn(
         [

@@ -272,7 +272,7 @@ class SyncOperations(BaseClient):
     def _run(self, plan: Plan[Result], unit: int | None) -> Result:
         """Runs a plan."""
         if isinstance(plan, Request):
-            result: Result = self._call(plan, unit)
+            result: Result = self._transport.call(plan, self.unit_for(plan, unit), self.timeout)
             return result
         return requests.carry_out(plan, lambda request: self._call(request, unit))
 

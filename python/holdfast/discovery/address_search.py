@@ -47,7 +47,15 @@ FIRST_ADDRESSES = 16
 """All of the first addresses are samples."""
 
 NEAR, NEAR_STEP, FAR_STEP = 10_000, 10, 100
-"""Samples are `NEAR_STEP` apart below `NEAR`, and `FAR_STEP` apart above."""
+"""Samples are `NEAR_STEP` apart below `NEAR`, and `FAR_STEP` apart above.
+
+Each of them costs a request where nothing exists, and no other read can replace it: a block that
+contains an absent address is refused, whatever else it contains. `benches/address_search.py` shows
+what fewer samples miss.
+"""
+
+SPARSE_NEAR_STEP, SPARSE_FAR_STEP = 50, 1000
+"""The same for few samples."""
 
 NUMBERED = (range(30_000, 31_000), range(40_000, 41_000))
 """Where devices have maps at the numbers of their manuals; samples are `NEAR_STEP` apart."""
@@ -231,6 +239,9 @@ class Survey:
         """The first error message of each failure."""
         self.max_quantity = max_quantity
         self.max_requests = max_requests
+        steps = (NEAR_STEP, FAR_STEP) if dense else (SPARSE_NEAR_STEP, SPARSE_FAR_STEP)
+        self.distances = (min(steps[0], step), min(steps[1], step))
+        """How far samples are apart, below `NEAR` and above."""
         self.samples = [] if exact else sample_places(span, step, dense=dense)
         """The addresses that a fast search reads in each area."""
         everywhere = span if exact else set(self.samples)
@@ -345,8 +356,8 @@ def sample_places(span: range, step: int = STEP, *, dense: bool = True) -> list[
     Usual are the first 16, multiples of 10 and 100, the addresses after a multiple of 100 for maps
     that count from 1, and maps at the numbers of manuals (30001, 40001). Without `dense`, fewer.
     """
-    near, far = (NEAR_STEP, FAR_STEP) if dense else (50, 1000)
-    ones = range(1, NEAR, FAR_STEP if dense else 1000)
+    near, far = (NEAR_STEP, FAR_STEP) if dense else (SPARSE_NEAR_STEP, SPARSE_FAR_STEP)
+    ones = range(1, NEAR, far)
     usual = {*range(0, NEAR, near), *ones, *range(FIRST_ADDRESSES if dense else 2), 10, 20}
     usual.update(range(NEAR, ADDRESSES, far), range(NEAR + 1, ADDRESSES, 1000))
     if dense:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.cli import terminal_text
-from holdfast.discovery.address_search import FAR_STEP, NEAR, NEAR_STEP
+from holdfast.discovery.address_search import NEAR
 
 if TYPE_CHECKING:
     from holdfast.discovery.address_search import AreaMap, Survey
@@ -56,9 +56,11 @@ def incomplete(survey: Survey) -> list[str]:
     return [f"Incomplete. Not searched: {listed}."]
 
 
-UNKNOWN = (
-    "Nothing is known about addresses that were not asked: a range without a sample is missed.",
-    f"Samples are {NEAR_STEP} apart below {NEAR}, {FAR_STEP} above. --exact reads every address, "
-    "--range limits it.",
-)
-"""The limits of a search by samples."""
+def unknown(survey: Survey) -> list[str]:
+    """The limits of a search by samples."""
+    near, far = survey.distances
+    return [
+        "Nothing is known about addresses that were not asked: a range without a sample is missed.",
+        f"Samples are {near} apart below {NEAR}, {far} above. --exact reads every address, --range "
+        "limits it.",
+    ]

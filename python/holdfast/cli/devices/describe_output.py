@@ -67,7 +67,7 @@ def described_lines(found: Description, most: int | None) -> list[str]:
     for (area, extent), error in found.unread.items():
         tags.append(f"{area} {extent.start}-{extent.stop - 1} could not be read again: {error}")
     counts = [*coverage.counts(found.survey), *coverage.incomplete(found.survey)]
-    parts = (orders, tags, counts, () if found.survey.exact else coverage.UNKNOWN)
+    parts = (orders, tags, counts, () if found.survey.exact else coverage.unknown(found.survey))
     return [line for part in parts if part for line in ("", *part)]
 
 

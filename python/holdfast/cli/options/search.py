@@ -29,6 +29,7 @@ class Settings:
 
     areas: tuple[Area, ...] | None
     exact: bool
+    sparse: bool
     max_quantity: int | None
     step: int
     span: range
@@ -47,6 +48,7 @@ _LIMIT = f"Send at most N requests.  [default: {MAX_REQUESTS}, no limit with --e
 survey_options = option_group(
     option("--areas", "AREA,...", "Areas to search.  [default: all four]", areas_of),
     flag("--exact", "Read every address instead of samples."),
+    flag("--sparse", "Read a quarter of the samples."),
     number_option("--max-quantity", "Read at most N bits or registers per request."),
     number_option("--step", "Distance between samples.", default=address_search.STEP),
     option("--range span", "FIRST-LAST", "Addresses to search.", _span, f"0-{LAST_ADDRESS}"),
@@ -57,7 +59,9 @@ survey_options = option_group(
 
 
 def planned(settings: Settings) -> Survey:
-    """The survey of the options."""
+    """The survey of the options. Raises `click.UsageError`."""
+    if settings.exact and settings.sparse:
+        raise click.UsageError("--exact and --sparse: give one of them.")
     limit = settings.max_requests or (None if settings.exact else MAX_REQUESTS)
     return Survey(
         settings.areas or AREAS,
@@ -65,6 +69,7 @@ def planned(settings: Settings) -> Survey:
         max_quantity=settings.max_quantity,
         step=settings.step,
         span=settings.span,
+        dense=not settings.sparse,
         max_requests=limit,
     )
 
