@@ -12,6 +12,7 @@ from holdfast.simulation import HEATER
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     import holdfast
 
@@ -39,6 +40,16 @@ HEAVY = {
 """Modules that take several milliseconds to import, and those that bring such modules."""
 
 CONFIGURATION = {"holdfast.config", "pydantic", "ruamel"}
+OWN = {"holdfast.appliance", "holdfast.config", "holdfast.tags", "logging"}
+
+PLANT = """
+memories: {plant: {holding_registers: 8}}
+listeners:
+  modbus:
+    type: modbus-tcp
+    bind: "127.0.0.1:0"
+    rules: [{sources: [127.0.0.1], units: {1: plant}, access: read-only}]
+"""
 
 PROGRAM = """
 import sys
@@ -139,6 +150,23 @@ def test_a_search_imports_no_model_of_a_configuration() -> None:
     printed, heavy = heavy_after(PROGRAM, "find", "--help")
     assert printed
     assert not heavy & {"pydantic", "ruamel"}
+
+
+def test_an_appliance_with_a_memory_and_a_listener_imports_no_event_loop(tmp_path: Path) -> None:
+    file = tmp_path / "plant.yaml"
+    file.write_text(PLANT)
+    program = """
+import sys
+from holdfast.appliance import Appliance
+from holdfast.config import load
+from holdfast.config.allowed_words import cached
+with Appliance(load(sys.argv[1])) as appliance:
+    print(appliance.endpoints()[0].name, cached.cache_info().currsize)
+print(*sys.modules, sep="\\n", file=sys.stderr)
+"""
+    printed, heavy = heavy_after(program, str(file))
+    assert printed == "modbus 0\n", "the JSON Schema is made for messages only"
+    assert heavy <= {"concurrent.futures", "email", "msgspec", "pydantic", *OWN}
 
 
 def test_a_configuration_does_not_read_its_own_source() -> None:

@@ -7,7 +7,6 @@ models that are valid, so an error in one does not hide an error in the other.
 from __future__ import annotations
 
 import hashlib
-from difflib import get_close_matches
 from pathlib import Path
 
 from holdfast.config.allowed_words import allowed, known_keys
@@ -121,12 +120,16 @@ def _warn(scope: Scope) -> None:
 
 def _foreign(data: object) -> str | None:
     """What a file is that is no configuration. Its content is not shown: it could be a secret."""
+    from difflib import get_close_matches
+
     if data is None:
         return "an empty file"
     if not isinstance(data, dict):
         return shape(data) if data else show(data)
+    if not data or any(str(key) in Config.model_fields for key in data):
+        return None
     known = known_keys((), None)
-    if not data or any(get_close_matches(str(key), known, cutoff=0.8) for key in data):
+    if any(get_close_matches(str(key), known, cutoff=0.8) for key in data):
         return None
     return (
         f"a mapping with {len(data)} other keys" if len(data) > 1 else "a mapping with another key"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import itertools
 import time
 from dataclasses import replace
@@ -20,6 +19,7 @@ from holdfast.tags import Tag, TagList
 from holdfast.tags.base import DEFAULT_MAX_GAP
 
 if TYPE_CHECKING:
+    import asyncio
     from collections.abc import AsyncIterator, Iterator, Mapping
 
     from holdfast.polling.readings import DevicePoll
@@ -190,6 +190,8 @@ class Poller:
             yield batch
 
     async def __aiter__(self) -> AsyncIterator[Batch]:
+        import asyncio  # Who iterates over it without a loop does not need it.
+
         while True:
             if self._pending is None:
                 loop = asyncio.get_running_loop()

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import time
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
 
 PERIOD_S = 1.0
 """Seconds between two beats."""
@@ -28,17 +22,3 @@ class Heartbeat:
     def age(self) -> float:
         """Seconds since the last beat."""
         return time.monotonic() - self._last
-
-    @contextlib.asynccontextmanager
-    async def beating(self) -> AsyncIterator[None]:
-        """Beats in this event loop until the block ends."""
-        task = asyncio.create_task(self._keep())
-        try:
-            yield
-        finally:
-            task.cancel()
-
-    async def _keep(self) -> None:
-        while True:
-            self.beat()
-            await asyncio.sleep(PERIOD_S)

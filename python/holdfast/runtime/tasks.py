@@ -1,12 +1,17 @@
-"""Ends tasks of asyncio."""
+"""Tasks of asyncio: their end, and the heartbeat of their event loop."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from typing import TYPE_CHECKING, Any
 
+from holdfast.runtime.heartbeat import PERIOD_S
+
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import AsyncIterator, Iterable
+
+    from holdfast.runtime.heartbeat import Heartbeat
 
 CANCEL_INTERVAL_S = 2.0
 """Seconds after which a task that has not ended is cancelled again."""
@@ -36,3 +41,19 @@ async def end(tasks: Iterable[asyncio.Task[Any]]) -> None:
         for task in done:
             if not task.cancelled():
                 task.exception()  # Marks it retrieved.
+
+
+@contextlib.asynccontextmanager
+async def beating(heartbeat: Heartbeat) -> AsyncIterator[None]:
+    """Beats in this event loop until the block ends."""
+    task = asyncio.create_task(_keep(heartbeat))
+    try:
+        yield
+    finally:
+        task.cancel()
+
+
+async def _keep(heartbeat: Heartbeat) -> None:
+    while True:
+        heartbeat.beat()
+        await asyncio.sleep(PERIOD_S)

@@ -8,6 +8,7 @@ import threading
 from typing import TYPE_CHECKING
 
 from holdfast.net import event_loop
+from holdfast.runtime import tasks
 from holdfast.runtime.heartbeat import Heartbeat
 from holdfast.scanner.service import Scanner
 
@@ -51,7 +52,7 @@ class ScannerAdapter:
                 loop.call_soon_threadsafe(self._scanner.end)
 
         stop.then(end)
-        async with self.heartbeat.beating():
+        async with tasks.beating(self.heartbeat):
             await self._scanner.run()
 
     def status(self) -> dict[str, object]:

@@ -17,7 +17,7 @@ use super::inbox::Inbox;
 use crate::heartbeat::Heartbeat;
 use crate::own_threads::OwnThreads;
 use crate::server::Peer;
-use crate::server::connections::listener::{Admitted, ListenerContext, Service, accept};
+use crate::server::connections::listener::{Admitted, ListenerContext, Service, Serving, accept};
 use crate::server::connections::live::Live;
 use crate::server::reports::counters::ConnectionCounters;
 use crate::server::reports::event::{self, Events, Kind, Verbosity};
@@ -41,14 +41,14 @@ impl Service for Front {
         None
     }
 
-    async fn serve(
+    fn serve(
         self: Arc<Self>,
         _live: Arc<Live<Front>>,
         _context: Arc<ListenerContext>,
         connection: Admitted<()>,
         stop: watch::Receiver<bool>,
-    ) {
-        serve(self, connection, stop).await;
+    ) -> Serving {
+        Box::pin(serve(self, connection, stop))
     }
 }
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast import _core
 from holdfast.appliance.nats_servers import tls_files
-from holdfast.appliance.parts import log_servers
 from holdfast.appliance.parts.part import Part
 from holdfast.events import log_lines
 
@@ -72,6 +71,8 @@ class SharedLogs(Part):
 
     def _serve(self, name: str, settings: SharedLogConfig) -> None:
         """Starts the server of the log, if the log has one of its own."""
+        from holdfast.appliance.parts import log_servers  # Most appliances have no log.
+
         server = log_servers.embedded(name, settings)
         if server is None:
             return
@@ -85,6 +86,8 @@ class SharedLogs(Part):
     def _join(
         self, name: str, settings: SharedLogConfig, members: list[tuple[str, _core.Memory]]
     ) -> None:
+        from holdfast.appliance.parts import log_servers
+
         path, note = self._memories.of_log(name), self._memories.note(name)
         try:
             log = _core.Log(

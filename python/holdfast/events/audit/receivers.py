@@ -13,7 +13,6 @@ import socket
 import sys
 from abc import ABC, abstractmethod
 from array import array
-from logging.handlers import SysLogHandler
 from typing import Any, Literal
 
 import msgspec
@@ -21,7 +20,8 @@ import msgspec
 TIMEOUT_S = 5.0
 """Seconds for a connection, and for a message that the receiver does not take."""
 
-PRIORITY = SysLogHandler.LOG_LOCAL0 << 3 | SysLogHandler.LOG_NOTICE
+LOCAL0, NOTICE = 16, 5
+PRIORITY = LOCAL0 << 3 | NOTICE
 """Facility and severity of all messages. Receivers select them by their application."""
 
 JOURNAL_PATH = "/run/systemd/journal/socket"

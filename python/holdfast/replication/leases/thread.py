@@ -128,7 +128,7 @@ class LeaseThread:
 
     async def _hold(self) -> None:
         running = [asyncio.create_task(self._keep_connected()), asyncio.create_task(self._keep())]
-        async with self._heartbeat.beating():
+        async with tasks.beating(self._heartbeat):
             await self._stopping.wait()
             self._leases.want(())
             returned = (self._leases.give_back(key, self._ending) for key in self._leases.held)

@@ -128,7 +128,7 @@ class FleetMember(Placement):
         running: list[asyncio.Task[None]] = []
         self.fleet.start()
         try:
-            async with self._heartbeat.beating():
+            async with tasks.beating(self._heartbeat):
                 await self._open(ready)
                 works = (self.fleet.run(), self._follow_again(), self._adopt_changes())
                 running += [asyncio.create_task(work) for work in works]

@@ -9,7 +9,6 @@
 use std::cell::RefCell;
 use std::future::poll_fn;
 use std::io;
-use std::mem;
 use std::pin::{Pin, pin};
 use std::sync::Arc;
 use std::task::{Context, Poll};
@@ -22,7 +21,7 @@ use tokio::time::{Instant, Sleep, sleep_until};
 use crate::server::connections::admission::Ticket;
 use crate::server::connections::deadlines::{Deadlines, Exchange, Expired, NO_DEADLINE, Timeouts};
 use crate::server::connections::fair_share::{Share, WORK_OF_READ};
-use crate::server::connections::listener::ListenerContext;
+use crate::server::connections::listener::{ListenerContext, Serving};
 use crate::server::connections::peer::Peer;
 use crate::server::connections::reply_order::{Deferral, Deferred, MAX_WAITING};
 use crate::server::reports::event::Kind;
@@ -71,14 +70,17 @@ pub(crate) struct Terms {
     pub(crate) timeouts: Timeouts,
 }
 
-/// Looks up the terms of a connection again; `None` if it has no rights any more.
-pub(crate) type Renewal = Box<dyn Fn() -> Option<Terms> + Send + Sync>;
+/// Looks up the terms of a connection again.
+pub(crate) trait Renewal: Send + Sync {
+    /// `None` if it has no rights any more.
+    fn terms(&self, peer: &Peer) -> Option<Terms>;
+}
 
 pub(crate) struct Connection<F: Framing, S> {
     stream: S,
     answering: Answering<F>,
     deadlines: Deadlines,
-    renewal: Renewal,
+    renewal: Arc<dyn Renewal>,
     ticket: Ticket,
     /// Bytes queued for the peer.
     unsent: Vec<u8>,
@@ -93,9 +95,8 @@ struct Answering<F: Framing> {
     peer: Peer,
     unit_server: Arc<UnitServer>,
     rights: Arc<PeerRights>,
-    /// The beginning of an incomplete request.
-    partial: F::Partial,
-    partial_len: usize,
+    /// The beginning of an incomplete request. Most connections never have one.
+    partial: Vec<u8>,
     /// What is known of the bytes before it.
     before: F::Before,
     /// The last character of an ASCII frame, which the peer can change.
@@ -118,13 +119,13 @@ struct Answered {
     broken: bool,
 }
 
-impl<F: Framing, S: Stream> Connection<F, S> {
+impl<F: Framing, S: Stream + 'static> Connection<F, S> {
     pub(crate) fn new(
         context: Arc<ListenerContext>,
         unit_server: Arc<UnitServer>,
         (stream, peer): (S, Peer),
         Terms { rights, timeouts }: Terms,
-        renewal: Renewal,
+        renewal: Arc<dyn Renewal>,
         ticket: Ticket,
     ) -> Connection<F, S> {
         let share = Share::of(peer.ip());
@@ -149,36 +150,40 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
     }
 
-    /// Serves until the connection ends. The end is counted before the peer can see it.
-    pub(crate) async fn run(mut self, stop: watch::Receiver<bool>) {
-        let (context, peer) = (Arc::clone(&self.answering.context), self.answering.peer.clone());
-        // The engine waits until all receivers are dropped.
-        let running = stop.clone();
-        match self.serve(stop).await {
-            Some(end) => {
-                self.answering.give_up(running);
-                context.ended(end, peer);
-                // After replies that were cut off, a closing message would be misread.
-                if self.unsent.is_empty() {
-                    self.stream.end(&mut self.unsent);
-                    let _ = stream::write(self.stream.socket(), &mut self.unsent);
+    /// Serves until the connection ends. The end is counted before the peer can see it. As a block: an
+    /// `async fn` would have room for the connection twice.
+    pub(crate) fn run(mut self, mut stop: watch::Receiver<bool>) -> Serving {
+        Box::pin(async move {
+            match self.serve(&mut stop).await {
+                Some(end) => {
+                    // The engine waits until all receivers are dropped.
+                    self.answering.give_up(stop);
+                    self.answering.ended(end);
+                    // After replies that were cut off, a closing message would be misread.
+                    if self.unsent.is_empty() {
+                        self.stream.end(&mut self.unsent);
+                        let _ = stream::write(self.stream.socket(), &mut self.unsent);
+                    }
+                }
+                None => {
+                    self.finish().await;
+                    self.answering.ended(Kind::Closed);
                 }
             }
-            None => {
-                self.finish().await;
-                context.ended(Kind::Closed, peer);
-            }
-        }
+        })
     }
 
     /// Serves until the connection ends. Returns `None` when the engine stops.
-    async fn serve(&mut self, mut stop: watch::Receiver<bool>) -> Option<Kind> {
+    async fn serve(&mut self, stop: &mut watch::Receiver<bool>) -> Option<Kind> {
         // With a peer that never pauses, the branch for `stop` would never run.
         let flooded = stop.clone();
         let mut stopping = pin!(stop.wait_for(|stop| *stop));
         let mut alarm = pin!(sleep_until(Instant::now() + NO_DEADLINE));
         loop {
-            if let Err(end) = self.send_unsent().await {
+            // In a box: most peers read their replies.
+            if !self.unsent.is_empty()
+                && let Err(end) = Box::pin(self.send_unsent()).await
+            {
                 return Some(end);
             }
             if flooded.has_changed().unwrap_or(true) {
@@ -274,7 +279,8 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     #[inline]
     fn renew(&mut self) -> Result<(), Kind> {
         if self.ticket.take_outdated() {
-            let Terms { rights, timeouts } = (self.renewal)().ok_or(Kind::RightsRevoked)?;
+            let Terms { rights, timeouts } =
+                self.renewal.terms(&self.answering.peer).ok_or(Kind::RightsRevoked)?;
             (self.answering.rights, self.deadlines.timeouts) = (rights, timeouts);
             // Other rights refuse other requests: each first one is reported again.
             self.answering.reported = Reported::default();
@@ -291,7 +297,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
         self.share.charge((answered.requests + answered.discarded) as u32);
         let is_at_start = F::is_at_start(&self.answering.before);
-        if self.answering.partial_len == 0 && is_at_start && !self.stream.is_amid_record() {
+        if self.answering.partial.is_empty() && is_at_start && !self.stream.is_amid_record() {
             return self.deadlines.note_complete();
         }
         // Bytes that are discarded until a silence do not put off the end of the connection.
@@ -301,17 +307,15 @@ impl<F: Framing, S: Stream> Connection<F, S> {
 
     /// Waits for the peer to read its replies.
     async fn send_unsent(&mut self) -> Result<(), Kind> {
-        if !self.unsent.is_empty() {
-            let time_limit = self.deadlines.timeouts.request;
-            stream::send_all(self.stream.socket(), &self.unsent, time_limit).await?;
-            // Frees the buffer of a slow peer: most connections never need one.
-            self.unsent = Vec::new();
-        }
+        let time_limit = self.deadlines.timeouts.request;
+        stream::send_all(self.stream.socket(), &self.unsent, time_limit).await?;
+        // Frees the buffer of a slow peer.
+        self.unsent = Vec::new();
         Ok(())
     }
 
     fn exchange(&self) -> Exchange {
-        if self.answering.partial_len > 0 || self.stream.is_amid_record() {
+        if !self.answering.partial.is_empty() || self.stream.is_amid_record() {
             Exchange::Request
         } else if self.answering.is_waiting() {
             Exchange::Replies
@@ -377,8 +381,7 @@ impl<F: Framing> Answering<F> {
             peer,
             unit_server,
             rights,
-            partial: F::NO_PARTIAL,
-            partial_len: 0,
+            partial: Vec::new(),
             before: F::Before::default(),
             delimiter: ASCII_DELIMITER,
             reported: Reported::default(),
@@ -388,9 +391,8 @@ impl<F: Framing> Answering<F> {
 
     /// Copies the beginning of a request to the start of `input`. Returns its length.
     fn restore(&self, input: &mut [u8]) -> usize {
-        let partial = &self.partial.as_ref()[..self.partial_len];
-        input[..partial.len()].copy_from_slice(partial);
-        self.partial_len
+        input[..self.partial.len()].copy_from_slice(&self.partial);
+        self.partial.len()
     }
 
     /// Answers the complete requests of `input`, and keeps the incomplete one after them.
@@ -455,15 +457,14 @@ impl<F: Framing> Answering<F> {
 
     /// Keeps an incomplete frame, which is shorter than the longest one.
     fn keep(&mut self, rest: &[u8]) {
-        let partial = self.partial.as_mut();
-        let len = rest.len().min(partial.len());
-        partial[..len].copy_from_slice(&rest[..len]);
-        self.partial_len = len;
+        self.partial.clear();
+        self.partial.extend_from_slice(&rest[..rest.len().min(F::MAX_LEN)]);
     }
 
     /// Discards the beginning of a request: the next byte starts a frame.
     fn discard_partial(&mut self) {
-        if mem::take(&mut self.partial_len) > 0 {
+        if !self.partial.is_empty() {
+            self.partial.clear();
             self.unit_server.discard(|frames| &frames.damaged);
         }
         self.before = F::Before::default();
@@ -497,6 +498,10 @@ impl<F: Framing> Answering<F> {
             }
         }
         len
+    }
+
+    fn ended(&self, end: Kind) {
+        self.context.ended(end, self.peer.clone());
     }
 
     /// The peer has disconnected. Replies of devices that still come are recorded.
@@ -780,16 +785,22 @@ mod tests {
             let replies = rtu_frame(1, &[99]) == before;
             assert_eq!(first.len > 0, replies, "{before:02x?}");
             answering.discard_partial();
-            assert_eq!(answering.partial_len, 0);
+            assert!(answering.partial.is_empty());
             let len = answering.answer(&read, &mut output).len;
             assert_eq!(output[..len], answer, "{before:02x?}");
         }
     }
 
-    #[test]
-    fn a_peer_is_not_to_blame_for_silence_while_its_source_waits() {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-        let _guard = runtime.enter();
+    struct NoRights;
+
+    impl Renewal for NoRights {
+        fn terms(&self, _peer: &Peer) -> Option<Terms> {
+            None
+        }
+    }
+
+    /// A connection, and the listener that its peer is connected with.
+    fn connection<F: Framing>() -> (Connection<F, tokio::net::TcpStream>, std::net::TcpListener) {
         let bound = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
         let client = std::net::TcpStream::connect(bound.local_addr().unwrap()).unwrap();
         client.set_nonblocking(true).unwrap();
@@ -799,13 +810,18 @@ mod tests {
         );
         let limits = ConnectionLimits { max_connections: 1, ..ConnectionLimits::NONE };
         let (ticket, _) = Arc::new(Admission::new(limits)).admit(peer).unwrap();
-        let Answering { context, unit_server, rights, .. } = answering::<Mbap>();
+        let Answering { context, unit_server, rights, .. } = answering::<F>();
         let timeouts = Timeouts { idle: None, request: Duration::ZERO, frame: None };
-        let terms = Terms { rights, timeouts };
+        let (terms, renewal) = (Terms { rights, timeouts }, Arc::new(NoRights));
         let stream = (stream, peer.into());
-        let renewal = Box::new(|| None);
-        let mut connection =
-            Connection::<Mbap, _>::new(context, unit_server, stream, terms, renewal, ticket);
+        (Connection::new(context, unit_server, stream, terms, renewal, ticket), bound)
+    }
+
+    #[test]
+    fn a_peer_is_not_to_blame_for_silence_while_its_source_waits() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let _guard = runtime.enter();
+        let (mut connection, _bound) = connection::<Mbap>();
         connection.begin_with(&[0]);
         let other = Share::of([192, 0, 2, 2].into());
         connection.share.charge(1_000_000);
@@ -815,6 +831,20 @@ mod tests {
         drop(other);
         assert!(connection.poll(&mut context).is_pending(), "nothing has arrived");
         assert_eq!(connection.on_alarm(), Err(Kind::RequestTimeout));
+    }
+
+    #[test]
+    fn a_connection_takes_less_than_a_kilobyte() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let _guard = runtime.enter();
+        let stop = || watch::channel(false).1;
+        for connection in [
+            connection::<Mbap>().0.run(stop()),
+            connection::<Rtu>().0.run(stop()),
+            connection::<Ascii>().0.run(stop()),
+        ] {
+            assert!(size_of_val(&*connection) < 1024, "{}", size_of_val(&*connection));
+        }
     }
 
     #[test]
@@ -848,11 +878,11 @@ mod tests {
             |answering: &Answering<Ascii>| answering.unit_server.counters.frames.damaged.get();
         let line = [b":".to_vec(), vec![b'0'; INPUT_BYTES - 1]].concat();
         let answered = answering.answer(&line, &mut vec![0; OUTPUT_BYTES]);
-        assert_eq!((answered.consumed, answering.partial_len), (INPUT_BYTES, 0));
+        assert_eq!((answered.consumed, answering.partial.len()), (INPUT_BYTES, 0));
         assert_eq!(damaged(&answering), 1);
 
         answering.answer(&line[..ascii::MAX_LEN - 1], &mut vec![0; OUTPUT_BYTES]);
-        assert_eq!((answering.partial_len, damaged(&answering)), (ascii::MAX_LEN - 1, 1));
+        assert_eq!((answering.partial.len(), damaged(&answering)), (ascii::MAX_LEN - 1, 1));
     }
 
     #[test]

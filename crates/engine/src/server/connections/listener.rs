@@ -3,6 +3,7 @@
 
 use std::io;
 use std::net::{IpAddr, SocketAddr};
+use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -200,6 +201,10 @@ pub(crate) struct Admitted<G> {
     pub(crate) ticket: Ticket,
 }
 
+/// What serves a connection. In a box, so that each connection takes what its own kind requires, not what
+/// the largest does.
+pub(crate) type Serving = Pin<Box<dyn Future<Output = ()> + Send>>;
+
 /// The protocol of a listener.
 pub(crate) trait Service: Send + Sync + Sized + 'static {
     type PeerRights: Send + Sync + 'static;
@@ -219,14 +224,15 @@ pub(crate) trait Service: Send + Sync + Sized + 'static {
         connection
     }
 
-    /// Serves a connection to its end. `live` is this service, or what has taken its place.
+    /// Serves a connection to its end. `live` is this service, or what has taken its place. Called on the
+    /// thread of the worker.
     fn serve(
         self: Arc<Self>,
         live: Arc<Live<Self>>,
         context: Arc<ListenerContext>,
         connection: Admitted<Self::PeerRights>,
         stop: watch::Receiver<bool>,
-    ) -> impl Future<Output = ()> + Send;
+    ) -> Serving;
 }
 
 /// Accepts connections until `stop`, and distributes them to the workers in turn.

@@ -39,10 +39,6 @@ pub(crate) trait Framing: Send + Sync + 'static {
     /// The longest frame.
     const MAX_LEN: usize;
 
-    /// Room for an incomplete frame.
-    type Partial: AsRef<[u8]> + AsMut<[u8]> + Send;
-    const NO_PARTIAL: Self::Partial;
-
     /// What is known of the bytes before those that are looked at.
     type Before: Default + Clone + Send;
 
@@ -89,9 +85,6 @@ impl<const HAS_PACKETS: bool> Framing for MbapOnPort<HAS_PACKETS> {
     const HEADER_LEN: usize = mbap::HEADER_LEN;
     const SHORTEST: usize = mbap::HEADER_LEN + 1;
     const MAX_LEN: usize = mbap::MAX_LEN;
-
-    type Partial = [u8; mbap::MAX_LEN];
-    const NO_PARTIAL: Self::Partial = [0; mbap::MAX_LEN];
 
     type Before = ();
 
@@ -150,9 +143,6 @@ impl Framing for Rtu {
     const SHORTEST: usize = 4;
     const MAX_LEN: usize = rtu::MAX_LEN;
 
-    type Partial = [u8; Self::MAX_LEN];
-    const NO_PARTIAL: Self::Partial = [0; Self::MAX_LEN];
-
     type Before = rtu::Requests;
 
     type Decoded = ();
@@ -204,9 +194,6 @@ impl Framing for Ascii {
     /// A function code without data.
     const SHORTEST: usize = 1 + 2 * 3 + 2;
     const MAX_LEN: usize = ascii::MAX_LEN;
-
-    type Partial = [u8; Self::MAX_LEN];
-    const NO_PARTIAL: Self::Partial = [0; Self::MAX_LEN];
 
     type Before = ();
 

@@ -31,7 +31,7 @@ use crate::server::connections::admission::{ConnectionLimits, Ticket};
 use crate::server::connections::closing::drain;
 use crate::server::connections::fair_share::{self, Share, WORK_OF_READ};
 use crate::server::connections::listener::{
-    Admitted, KEEPALIVE, ListenerContext, Service, set_options,
+    Admitted, KEEPALIVE, ListenerContext, Service, Serving, set_options,
 };
 use crate::server::connections::live::Live;
 use crate::server::connections::partial_packet::Incoming;
@@ -273,6 +273,31 @@ impl RawIngest {
         bytes.extend(received);
         let share = Share::of(peer.ip());
         Sending { stream, peer, rights, bytes, unsent: Vec::new(), ticket, share }
+    }
+
+    /// Serves a connection to its end.
+    async fn receive_all(
+        self: Arc<Self>,
+        live: Arc<Live<RawIngest>>,
+        context: Arc<ListenerContext>,
+        connection: Admitted<RawGrant>,
+        stop: watch::Receiver<bool>,
+    ) {
+        if let Some(tls) = &self.tls {
+            set_options(&connection.stream, KEEPALIVE);
+            // In a box of its own, so that plain connections do not reserve memory for it.
+            return Box::pin(self.secure(tls, live, context, connection, stop)).await;
+        }
+        if connection.ticket.is_answered() {
+            let Admitted { mut stream, peer, received, ticket, .. } = connection;
+            let from = (&mut stream, &peer.into());
+            self.drain_surplus(&context, from, received.len(), stop).await;
+            context.ended(Kind::Closed, peer);
+            return drop(ticket);
+        }
+        let peer = connection.peer.ip();
+        let renewal = Box::new(move || live.get().rights(peer));
+        self.serve_packets(context, self.sending(connection), renewal, stop).await;
     }
 
     /// Performs the handshake, selects the rights by the role in the certificate, and serves the
@@ -739,28 +764,14 @@ impl Service for RawIngest {
         (had_rights && self.granted(peer).is_none()).then_some(Kind::RightsRevoked)
     }
 
-    async fn serve(
+    fn serve(
         self: Arc<Self>,
         live: Arc<Live<Self>>,
         context: Arc<ListenerContext>,
         connection: Admitted<RawGrant>,
         stop: watch::Receiver<bool>,
-    ) {
-        if let Some(tls) = &self.tls {
-            set_options(&connection.stream, KEEPALIVE);
-            // In a box of its own, so that plain connections do not reserve memory for it.
-            return Box::pin(self.secure(tls, live, context, connection, stop)).await;
-        }
-        if connection.ticket.is_answered() {
-            let Admitted { mut stream, peer, received, ticket, .. } = connection;
-            let from = (&mut stream, &peer.into());
-            self.drain_surplus(&context, from, received.len(), stop).await;
-            context.ended(Kind::Closed, peer);
-            return drop(ticket);
-        }
-        let peer = connection.peer.ip();
-        let renewal = Box::new(move || live.get().rights(peer));
-        self.serve_packets(context, self.sending(connection), renewal, stop).await;
+    ) -> Serving {
+        Box::pin(self.receive_all(live, context, connection, stop))
     }
 }
 

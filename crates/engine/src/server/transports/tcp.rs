@@ -11,7 +11,9 @@ use tokio::time::{Instant, timeout_at};
 use crate::server::connections::admission::{ConnectionLimits, Ticket};
 use crate::server::connections::connection::{Connection, Renewal, Terms};
 use crate::server::connections::deadlines::Timeouts;
-use crate::server::connections::listener::{Admitted, ListenerContext, Service, set_options};
+use crate::server::connections::listener::{
+    Admitted, ListenerContext, Service, Serving, set_options,
+};
 use crate::server::connections::live::Live;
 use crate::server::connections::peer::Peer;
 use crate::server::reports::counters::PacketCounters;
@@ -114,36 +116,26 @@ impl ModbusStream {
         Some(Terms { rights, timeouts: self.timeouts })
     }
 
-    async fn connection<F: Framing>(
-        &self,
+    fn connection<F: Framing>(
+        self: Arc<Self>,
         live: Arc<Live<ModbusStream>>,
         context: Arc<ListenerContext>,
         admitted: Admitted<PeerRights>,
         stop: watch::Receiver<bool>,
-    ) {
-        match &self.tls {
-            None => {
-                let Admitted { stream, peer, rights, ticket, received } = admitted;
-                self.modbus::<F, _>(
-                    live,
-                    context,
-                    (stream, peer.into()),
-                    (rights, received),
-                    ticket,
-                    stop,
-                )
-                .await;
-            }
-            // In a box of its own, so that plain connections do not reserve memory for it.
-            Some(tls) => Box::pin(self.secure::<F>(tls, live, context, admitted, stop)).await,
+    ) -> Serving {
+        if let Some(tls) = self.tls.clone() {
+            return Box::pin(self.secure::<F>(tls, live, context, admitted, stop));
         }
+        let Admitted { stream, peer, rights, ticket, received } = admitted;
+        let peer = (stream, peer.into());
+        self.modbus::<F, _>(live, context, peer, (rights, received), ticket, stop)
     }
 
     /// Performs the handshake, selects the rights by the role in the certificate, and serves the
     /// connection.
     async fn secure<F: Framing>(
-        &self,
-        tls: &ServerTls,
+        self: Arc<Self>,
+        tls: Arc<ServerTls>,
         live: Arc<Live<ModbusStream>>,
         context: Arc<ListenerContext>,
         admitted: Admitted<PeerRights>,
@@ -151,7 +143,7 @@ impl ModbusStream {
     ) {
         let Admitted { stream, peer, ticket, .. } = admitted;
         let (time_limit, stopping) = (self.timeouts.request, stop.clone());
-        let secured = secured(tls, &context, (stream, peer), &ticket, time_limit, stopping).await;
+        let secured = secured(&tls, &context, (stream, peer), &ticket, time_limit, stopping).await;
         let Some((stream, peer)) = secured else { return };
         // A reload reviews connections by their roles. This one looks up its rights only now.
         let rights = live.get().terms(&peer).map(|terms| terms.rights).unwrap_or_else(|| {
@@ -163,7 +155,7 @@ impl ModbusStream {
             .await;
     }
 
-    async fn modbus<F: Framing, S: Stream>(
+    fn modbus<F: Framing, S: Stream + 'static>(
         &self,
         live: Arc<Live<ModbusStream>>,
         context: Arc<ListenerContext>,
@@ -171,21 +163,19 @@ impl ModbusStream {
         (rights, received): (Arc<PeerRights>, Vec<u8>),
         ticket: Ticket,
         stop: watch::Receiver<bool>,
-    ) {
+    ) -> Serving {
         let unit_server = Arc::clone(&self.unit_server);
-        let (terms, renewal) =
-            (Terms { rights, timeouts: self.timeouts }, renewal(live, peer.clone()));
-        let stream = (stream, peer);
+        let terms = Terms { rights, timeouts: self.timeouts };
         let mut connection =
-            Connection::<F, S>::new(context, unit_server, stream, terms, renewal, ticket);
+            Connection::<F, S>::new(context, unit_server, (stream, peer), terms, live, ticket);
         connection.begin_with(&received);
-        connection.run(stop).await;
+        connection.run(stop)
     }
 
     /// Serves a connection that may begin with a packet: its first bytes decide.
     async fn shared(
-        &self,
-        raw: &Arc<RawIngest>,
+        self: Arc<Self>,
+        raw: Arc<RawIngest>,
         live: Arc<Live<ModbusStream>>,
         context: Arc<ListenerContext>,
         mut admitted: Admitted<PeerRights>,
@@ -211,7 +201,8 @@ impl ModbusStream {
                     let admitted = Admitted { stream, peer, rights, received, ticket };
                     let renewal =
                         Box::new(move || live.get().raw_ingest.as_ref()?.rights(peer.ip()));
-                    return raw.serve_packets(context, raw.sending(admitted), renewal, stop).await;
+                    let sending = raw.sending(admitted);
+                    return Box::pin(raw.serve_packets(context, sending, renewal, stop)).await;
                 }
             }
             let is_partial = !admitted.received.is_empty();
@@ -240,15 +231,15 @@ impl ModbusStream {
     }
 }
 
-/// Looks up the rights of a connection after a reload. One that had none by its role has none still.
-fn renewal(live: Arc<Live<ModbusStream>>, peer: Peer) -> Renewal {
-    Box::new(move || {
-        let service = live.get();
+impl Renewal for Live<ModbusStream> {
+    /// A connection that had no rights by its role has none still.
+    fn terms(&self, peer: &Peer) -> Option<Terms> {
+        let service = self.get();
         let no_rights =
             || Terms { rights: Arc::clone(&service.no_rights), timeouts: service.timeouts };
-        let terms = service.terms(&peer);
+        let terms = service.terms(peer);
         terms.or_else(|| peer.certificate.is_some().then(no_rights))
-    })
+    }
 }
 
 impl Service for ModbusStream {
@@ -275,21 +266,21 @@ impl Service for ModbusStream {
         (self.terms(peer).is_none() && before.terms(peer).is_some()).then_some(Kind::RightsRevoked)
     }
 
-    async fn serve(
+    fn serve(
         self: Arc<Self>,
         live: Arc<Live<Self>>,
         context: Arc<ListenerContext>,
         connection: Admitted<PeerRights>,
         stop: watch::Receiver<bool>,
-    ) {
+    ) -> Serving {
         set_options(&connection.stream, self.keepalive);
-        if let Some(raw) = &self.raw_ingest {
-            return self.shared(raw, live, context, connection, stop).await;
+        if let Some(raw) = self.raw_ingest.clone() {
+            return Box::pin(self.shared(raw, live, context, connection, stop));
         }
         match self.framing {
-            StreamFraming::Mbap => self.connection::<Mbap>(live, context, connection, stop).await,
-            StreamFraming::Rtu => self.connection::<Rtu>(live, context, connection, stop).await,
-            StreamFraming::Ascii => self.connection::<Ascii>(live, context, connection, stop).await,
+            StreamFraming::Mbap => self.connection::<Mbap>(live, context, connection, stop),
+            StreamFraming::Rtu => self.connection::<Rtu>(live, context, connection, stop),
+            StreamFraming::Ascii => self.connection::<Ascii>(live, context, connection, stop),
         }
     }
 }
