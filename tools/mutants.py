@@ -17,6 +17,7 @@ from __future__ import annotations
 import ast
 import builtins
 import copy
+import gc
 import multiprocessing
 import os
 import random
@@ -26,8 +27,10 @@ import time
 import tomllib
 import traceback
 from collections import defaultdict
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from importlib import import_module
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
@@ -42,7 +45,12 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("values", "tags")
 EQUIVALENT = Path(__file__).with_name("mutants.toml")
-OPTIONS = "--noconftest -p no:cacheprovider -p no:xdist --timeout=0 -W ignore::pytest.PytestAssertRewriteWarning"
+OPTIONS = (
+    "--noconftest --capture=no --timeout=0 -W ignore::pytest.PytestAssertRewriteWarning "
+    "-p no:cacheprovider -p no:logging -p no:threadexception -p no:unraisableexception -p no:xdist"
+)
+"""What the tests don't use takes most of their time."""
+
 LIMITS = {resource.RLIMIT_CPU: 120, resource.RLIMIT_AS: 8 << 30}
 """What the tests of one change may use: seconds and bytes."""
 
@@ -81,8 +89,10 @@ SKIPPED = {"TYPE_CHECKING", "TypeAlias", "TypeVar", "cast", "AssertionError"}
 """What is for type checkers, and what can't happen."""
 
 Result = TypeVar("Result")
-Trials: TypeAlias = tuple[dict[str, float], dict[int, bool], list[int]]
-"""The costs of all tests; which changes survived; those of them that must be imported anew."""
+Trials: TypeAlias = tuple[dict[str, float], dict[int, bool], list[int], list[str]]
+"""The costs of all tests; which changes survived; those of them that must be imported anew; the
+modules of others, which need not.
+"""
 
 
 @dataclass(frozen=True)
@@ -199,14 +209,14 @@ class Planter(ast.NodeTransformer):
 
 def plant(package: str, mutants: list[Mutant]) -> None:
     """From now on, this process imports a package with all its changes, which are appended."""
-    trees: dict[str, Any] = {}
+    changed: dict[str, CodeType] = {}
     for file in sorted((ROOT / "python" / "holdfast" / package).glob("*.py")):
-        trees[str(file)] = Planter(file, mutants).visit(ast.parse(file.read_text("utf-8")))
+        tree = Planter(file, mutants).visit(ast.parse(file.read_text("utf-8")))
+        changed[str(file)] = compile(tree, file, "exec")
     usual = SourceFileLoader.get_code
 
     def get_code(self: SourceFileLoader, name: str) -> CodeType | None:
-        tree = trees.get(self.path)
-        return usual(self, name) if tree is None else compile(tree, self.path, "exec")
+        return changed.get(self.path) or usual(self, name)
 
     SourceFileLoader.get_code = get_code  # type: ignore[method-assign, assignment]
 
@@ -312,6 +322,7 @@ def trials(package: str, numbers: list[int], until: float) -> Trials:
     def work(tests: Tests) -> None:
         if not tests.run(dict.fromkeys((item.nodeid for item in tests.items), 0)):
             raise SystemExit(f"ERROR: a test of {package} fails without a change")
+        gc.freeze()
         for number in numbers:
             if time.monotonic() > until:
                 break
@@ -320,7 +331,10 @@ def trials(package: str, numbers: list[int], until: float) -> Trials:
             if survived[number] and "" in tests.reached[number]:
                 anew.append(number)
 
-    return Tests(package, work).costs, survived, anew
+    costs = Tests(package, work).costs
+    ours = tuple(str(ROOT / folder) for folder in ("python", "tests", "tools"))
+    files = {name: str(getattr(module, "__file__", "")) for name, module in sys.modules.items()}
+    return costs, survived, anew, [name for name in files if not files[name].startswith(ours)]
 
 
 def passes(package: str, costs: dict[str, float]) -> bool:
@@ -333,7 +347,10 @@ def verdicts(package: str, numbers: list[int], until: float) -> dict[int, bool]:
     found = forked(partial(trials, package, numbers, until))
     if found is None:
         raise SystemExit(f"ERROR: the tests of {package} can't be run")
-    costs, survived, anew = found
+    costs, survived, anew, modules = found
+    for name in modules:
+        with suppress(ImportError):
+            import_module(name)
     for number in anew:
         if time.monotonic() > until:
             del survived[number]
@@ -352,6 +369,7 @@ def main(seconds: float, seed: int) -> int:
         report_multiple_bugs=False,
     )
     settings.load_profile("mutants")
+    sys.dont_write_bytecode = False
     listed = tomllib.loads(EQUIVALENT.read_text(encoding="utf-8"))["equivalent"]
     known = {Mutant(*(each[part] for part in ("file", "line", "old", "new"))) for each in listed}
     mutants: list[Mutant] = []
