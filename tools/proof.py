@@ -83,7 +83,7 @@ def parts() -> list[Part]:
             "mutants of Python",
             1,
             (*python, "tools/mutants.py", "{seconds}", str(int(time.time()))),
-            r"SURVIVED|tried",
+            r"SURVIVED|ERROR|tried",
         ),
     ]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import random
-import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -14,7 +13,6 @@ from hypothesis import strategies as st
 
 from holdfast import values
 from holdfast.discovery.type_guess import guess
-from holdfast.values.digits import shortest
 from support import plant_data
 from support.paths import ROOT
 
@@ -286,28 +284,3 @@ def test_zeros_say_nothing_about_a_type() -> None:
 def test_reads_without_registers_or_of_other_sizes_are_refused(found: list[list[int]]) -> None:
     with pytest.raises(ValueError, match="all reads require the same number of registers"):
         guess(found)
-
-
-@pytest.mark.parametrize(
-    ("value", "kind", "text"),
-    [
-        (0.1, "float64", "0.1"),
-        (struct.unpack("f", struct.pack("f", 0.1))[0], "float32", "0.1"),
-        (16777216.0, "float32", "16777216"),
-        (65504.0, "float16", "65504"),
-        (1 / 3, "float64", "0.3333333333333333"),
-        (100000.0, "float64", "100000"),
-        (1.5e-7, "float64", "1.5e-07"),
-        (1e30, "float64", "1e+30"),
-        (-0.0, "float32", "-0"),
-        (float("inf"), "float32", "inf"),
-        (float("nan"), "float32", "nan"),
-    ],
-)
-def test_floats_are_told_shortly(value: float, kind: str, text: str) -> None:
-    assert shortest(value, kind) == text
-
-
-@given(st.floats(width=32, allow_nan=False))
-def test_a_short_float_is_the_same_float(value: float) -> None:
-    assert struct.pack("f", float(shortest(value, "float32"))) == struct.pack("f", value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import pytest
@@ -17,9 +18,9 @@ HR: Final = "holding_registers"
 
 
 def by_name(form: Form = "exponent", **more: Any) -> TagList:
-    source: dict[str, Any] = {"type": "int16", **more.pop("source", {})}
+    source: dict[str, Any] = {"address": 12, "type": "int16", **more.pop("source", {})}
     made: dict[str, Any] = {"type": "int16", "scale": RegisterScale(form, "sf"), **more}
-    return TagList([Tag("power", HR, 10, **made), Tag("sf", HR, 12, **source)])
+    return TagList([Tag("power", HR, 10, **made), Tag("sf", HR, **source)])
 
 
 def value(tags: TagList, registers: list[int]) -> Any:
@@ -77,7 +78,10 @@ def test_a_point_without_a_value_needs_no_scale() -> None:
         ({"type": "float32"}, [215, 0, 0x7FC0, 0], "has no value"),
         ({"type": "float32"}, [215, 0, 0x7F80, 0], "is inf, allowed: a finite number other"),
         ({"type": "uint16", "null": frozenset([7])}, [1, 0, 7], "has no value"),
-        ({"type": "bcd16"}, [1, 0, 0xFFFF], "the scale: "),
+        ({"type": "uint16", "scale": 1e300}, [1, 0, 0xFFFF], 6.5535e304),
+        ({"type": "float32"}, [0, 0, *values.encode(-0.1, "float32")], 0),
+        ({"type": "uint64", "scale": 1e289}, [1, 0, *[0xFFFF] * 4], "is inf, allowed: a finite"),
+        ({"type": "bcd16"}, [1, 0, 0xFFFF], "the scale: digits 0xFFFF are not bcd16"),
     ],
 )
 def test_a_factor_is_the_value_of_its_tag(
@@ -93,6 +97,10 @@ def test_floats_and_arrays_have_scales_too() -> None:
     assert value(floating, registers) == 0.01
     assert plain(floating["power"], 0.01) == 0.01
     assert value(by_name(type="int16[2]", offset=5), [1, 2, 1]) == [15, 25]
+    assert value(floating, [0x7F80, 0, 1]) == math.inf
+    large = by_name(type="float64", source={"address": 14})
+    assert value(large, [*values.encode(1e308, "float64"), 10]) == math.inf
+    assert value(large, [*values.encode(-1e308, "float64"), 10]) == -math.inf
     assert text_of(floating["power"], 21.5) == "21.5"
     assert text_of(by_name()["power"], 432.0) == "432"
 
@@ -109,6 +117,24 @@ def test_a_value_without_the_content_of_its_scale_is_refused() -> None:
         fixed.raw(4321)
     with pytest.raises(ValueError, match="is 10\\^-32768"):
         power.with_scale(-32768)
+
+
+def test_values_of_an_array_may_have_none() -> None:
+    tags = by_name(type="float32[2]", null=frozenset([0.1]), source={"address": 14})
+    exponent = -1 & 0xFFFF
+    full = values.encode([0.1, 215.0], "float32[2]")
+    assert value(tags, [*full, exponent]) == [None, 21.5]
+    assert value(tags, [*values.encode([math.nan, math.inf], "float32[2]"), exponent]) == [
+        None,
+        math.inf,
+    ]
+    assert value(tags, [*values.encode([0.1, math.nan], "float32[2]"), 99]) == [None, None]
+
+
+def test_registers_that_hold_no_number_have_no_value_with_any_scale() -> None:
+    assert value(by_name(type="bcd16"), [0xFA, 0, 1]) == (
+        "digits 0x00FA are not bcd16, allowed: 0 to 9"
+    )
 
 
 def test_a_block_has_a_tag_only_with_its_scale() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from typing import Any
 
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.tags import Tag, TagError, TagList
-from holdfast.values import DoesNotFit
+from holdfast.values import DoesNotFit, decode, encode
 
 
 def tag(**more: Any) -> Tag:
@@ -26,8 +27,18 @@ def tag(**more: Any) -> Tag:
         (-7, 0.01, 20, 19.93),
         (12, 10, -5, 115),
         (1, 1 / 3, 0, 1 / 3),
+        (1, 4, 0.5, 4.5),
+        (1, 0.5, 4, 4.5),
         (0.5, 2, 0, 1.0),
         (math.inf, 2, 0, math.inf),
+        (1e308, 10, 0, math.inf),
+        (1e308, -10, 0, -math.inf),
+        (-1e308, -10, 0, math.inf),
+        (1e308, 1e300, 1e-300, math.inf),
+        (1, 9e288, 0, 9 * 10**288),
+        (1, 1.1e289, 0, 1.1e289),
+        (1000, 1e308, 0, math.inf),
+        (-1000, 1e308, 0.5, -math.inf),
     ],
 )
 def test_a_value_is_the_scaled_number_without_a_rounding_error(
@@ -67,6 +78,13 @@ def test_what_is_read_can_be_written_and_gives_the_same_registers(
         (True, {}, "True is not a number"),
         ("on", {}, "'on' is not a number"),
         ("on", {"states": {0: "off", 1: "running"}}, "'on' is no state, allowed: off, running"),
+        (31, {"max": 30}, "31 is outside to 30$"),
+        (4.5, {"min": 5}, r"4\.5 is outside 5 to$"),
+        (10**400, {}, "an integer of 1329 bits is too large"),
+        (-(10**400), {"type": "float64"}, "an integer of 1329 bits is too large"),
+        (1e308, {"type": "float32", "scale": 0.001}, r"1e\+308 does not fit float32$"),
+        (0.7, {"type": "bcd16"}, "0.7 is between two values of the registers"),
+        ([1, None], {"type": "uint16[2]"}, "None is not a number"),
     ],
 )
 def test_a_value_that_does_not_fit_is_refused(
@@ -85,6 +103,8 @@ def test_a_value_that_does_not_fit_is_refused(
         (2.5, {}, 2),
         (3.5, {}, 4),
         ([0.2, 0.8], {"type": "int16[2]"}, [0, 1]),
+        ((0.2, 0.8), {"type": "int16[2]"}, [0, 1]),
+        (array("d", [0.2, 0.8]), {"type": "int16[2]"}, [0, 1]),
         (21.5, {"type": "float32"}, 21.5),
     ],
 )
@@ -124,12 +144,20 @@ def test_markers_and_nan_are_no_values() -> None:
     assert tag(type="int16[3]", null=frozenset([7])).value([7, 8, 9]) == [None, 8, 9]
 
 
+def test_a_marker_is_what_the_registers_hold() -> None:
+    it = tag(type="float32", null=frozenset([0.1]))
+    held = decode(encode(0.1, "float32"), "float32")
+    assert it.null == {held}
+    assert (it.value(held), it.value(0.1)) == (None, 0.1)
+
+
 @pytest.mark.parametrize(
     ("settings", "key", "message"),
     [
         ({"area": "registers"}, "area", "area is 'registers', allowed: coils, "),
         ({"address": 65536}, "address", "address is 65536, allowed: 0 to 65535"),
         ({"address": True}, "address", "address is True"),
+        ({"address": -1}, "address", "address is -1, allowed: 0 to 65535"),
         ({"address": 65535, "type": "float32"}, "address", "ends at 65536, allowed: up to 65535"),
         ({"type": "flaot32"}, "type", "type 'flaot32' is unknown"),
         ({"order": "ABDC"}, "order", "order"),
@@ -137,6 +165,9 @@ def test_markers_and_nan_are_no_values() -> None:
         ({"type": "string:4", "encoding": "klingon"}, "encoding", "klingon"),
         ({"scale": 0}, "scale", "scale is 0, allowed: any other number"),
         ({"offset": math.inf}, "offset", "offset is inf, allowed: a finite number"),
+        ({"scale": 10**400}, "scale", "allowed: a finite number"),
+        ({"deadband": math.inf}, "deadband", "deadband is inf, allowed: a finite number from 0"),
+        ({"deadband": 10**400}, "deadband", "allowed: a finite number from 0"),
         ({"type": "string:4", "scale": 2}, "scale", "scale is 2, allowed: only with numbers"),
         ({"type": "bool", "deadband": 1}, "deadband", "only with numbers"),
         ({"deadband": -1}, "deadband", "allowed: a finite number from 0"),
@@ -149,7 +180,13 @@ def test_markers_and_nan_are_no_values() -> None:
         ({"area": "input_registers", "writable": True}, "writable", "input_registers can't be"),
         ({"type": "bit:3[2]", "writable": True}, "writable", "only one bit can"),
         ({"type": "uint16[124]", "writable": True}, "writable", "one request writes at most 123"),
+        (
+            {"area": "coils", "type": "bool[1969]", "writable": True},
+            "writable",
+            "bool[1969] has 1969 coils, one request writes at most 1968",
+        ),
         ({"null": frozenset(["x"])}, "null", "x"),
+        ({"null": frozenset(["nan"])}, "null", "'nan' is not an integer"),
         ({"type": "bytes:4", "null": frozenset([1])}, "null", "not supported for bytes:4"),
     ],
 )
@@ -163,6 +200,56 @@ def test_a_tag_without_a_type_is_a_bit_or_a_register() -> None:
     assert (Tag("a", "coils", 0).type, Tag("b", "input_registers", 0).type) == ("bool", "uint16")
 
 
+def test_a_tag_has_nothing_that_it_was_not_given() -> None:
+    made = Tag("t", "holding_registers", 0)
+    assert (made.unit, made.description, made.encoding, made.round) == ("", "", None, None)
+    assert (made.writable, made.states, made.null, made.deadband) == (False, {}, frozenset(), 0)
+    assert (made.min, made.max, made.value(7)) == (None, None, 7)
+
+
+def test_the_largest_tags_that_one_request_writes_are_writable() -> None:
+    assert tag(type="uint16[123]", writable=True).writable
+    assert tag(area="coils", type="bool[1968]", writable=True).writable
+    assert tag(type="bit:3", writable=True).writable
+
+
+def test_tags_are_equal_and_found_by_their_settings() -> None:
+    settings: dict[str, Any] = {"scale": 0.1, "states": {1: "on"}, "null": frozenset([7])}
+    assert tag(**settings) == tag(**settings) != tag(**{**settings, "scale": 0.2})
+    assert {tag(**settings): 5}[tag(**settings)] == 5
+    assert TagList([tag()]) == TagList([tag()]) != [tag()]
+
+
+def test_the_text_of_a_tag_makes_the_tag() -> None:
+    made = TagList([tag(scale=0.1, offset=5), tag_of("sf")])
+    text = repr(made)
+    assert eval(text, {"Tag": Tag, "TagList": TagList}) == made
+    assert text.count("address=0") == 2
+
+
+def tag_of(name: str) -> Tag:
+    return Tag(name, "input_registers", 0, "float32", null=frozenset([1.5]))
+
+
 def test_a_list_has_each_name_once() -> None:
     with pytest.raises(TagError, match="two tags have the name 't'"):
         TagList([tag(), tag(address=1)])
+
+
+def test_a_list_is_a_table_of_its_tags() -> None:
+    tags = TagList([tag(), tag_of("sf")])
+    assert ("sf" in tags, "x" in tags, len(tags)) == (True, False, 2)
+    assert [each.name for each in tags] == ["t", "sf"]
+    assert tags["sf"] == tag_of("sf")
+    assert len(TagList()) == 0
+
+
+def test_nan_as_marker_is_the_value_of_a_float() -> None:
+    [marker] = tag(type="float32", null=frozenset(["nan"])).null
+    assert isinstance(marker, float)
+    assert math.isnan(marker)
+
+
+def test_text_and_bits_are_written_as_they_are() -> None:
+    assert tag(type="string:4").raw("AB") == "AB"
+    assert tag(area="coils", type="bool").raw(True) is True

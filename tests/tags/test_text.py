@@ -49,7 +49,14 @@ def float32(number: float) -> float:
         (tag("uint64"), 2**64 - 1, str(2**64 - 1), 2**64 - 1),
         (tag(states={0: "off", 2: "fault"}), 2, "fault", 2),
         (tag(states={0: "off"}), 7, "7", 7),
+        (tag("int16", scale=0.000125), 8, "0.001000", 0.001),
+        (tag("int16", scale=0.0001251), 10, "0.001251", 0.001251),
+        (tag("float32", scale=100), float32(1e38), "1e+40", 1e40),
+        (tag("float32"), -math.inf, "-inf", None),
+        (tag("float64", scale=0.001), 230.1, "0.2301", 0.2301),
+        (tag("float16"), 0.0999755859375, "0.1", 0.1),
         (tag("bool"), True, "true", True),
+        (tag("bool"), False, "false", False),
         (tag("bool", states={0: "closed", 1: "open"}), True, "open", True),
         (tag("uint16", null=frozenset([65535])), 65535, "", None),
         (tag("string:8"), "P 1\n", "P 1\n", "P 1\n"),
@@ -100,6 +107,11 @@ def test_the_text_of_an_integer_is_read_back_as_the_same_registers(raw: int, sca
         (tag(states={1: "running"}), "running", "running"),
         (tag(states={1: "running"}), "1", 1),
         (tag("bool"), "ON", True),
+        (tag("bit:3"), " Off ", False),
+        (tag("bool[2]"), "[true, 0]", [True, 0]),
+        (tag("uint16"), "+7", 7),
+        (tag("int16"), "-7.5E1", -75.0),
+        (tag("float32"), ".5", 0.5),
         (tag("bit:3"), "0", False),
         (tag("bool", states={1: "open"}), "open", "open"),
         (tag("string:8"), " 1,5 ", " 1,5 "),
@@ -124,6 +136,9 @@ def test_text_is_parsed_by_the_type_of_the_tag(it: Tag, text: str, value: Any) -
         (tag(), "", "'' is not a number"),
         (tag("float32"), "nan", "'nan' is not a number"),
         (tag("float32"), "0x10", "'0x10' is not a number"),
+        (tag(scale=2), "0x10", "'0x10' is not a number"),
+        (tag(offset=2), "0x10", "'0x10' is not a number"),
+        (tag("float32"), "-,5e3", r"as in -\.5e3$"),
         (tag(), "1_000", "not a number"),
         (tag("bool"), "2", "'2' is not true, false, on, off, 1 or 0"),
         (tag("bool", states={1: "open"}), "shut", "'shut' is not open, true"),
@@ -135,6 +150,10 @@ def test_text_is_parsed_by_the_type_of_the_tag(it: Tag, text: str, value: Any) -
 def test_text_that_is_no_value_is_refused(it: Tag, text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         value_from(it, text)
+
+
+def test_a_value_beyond_its_registers_has_all_its_digits() -> None:
+    assert plain(tag("float32", scale=1e-300), 1.5e100) == 1.5e100
 
 
 def test_an_unknown_state_is_refused_with_those_that_exist() -> None:

@@ -114,6 +114,16 @@ def test_a_layout_has_fields_of_every_kind_in_any_place() -> None:
     }
 
 
+def test_the_offset_of_a_field_may_be_an_integer_of_any_library() -> None:
+    class Integer:
+        def __index__(self) -> int:
+            return 3
+
+    layout = Layout([("a", "uint16", Integer())], size=5)
+    assert (layout.fields[0].offset, type(layout.fields[0].offset)) == (3, int)
+    assert layout.encode({"a": 7}) == [0, 0, 0, 7, 0]
+
+
 def test_a_layout_of_bools_decodes_bits() -> None:
     layout = Layout([("open", "bool", 0), ("doors", "bool[2]", 1)])
 

@@ -20,7 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast import values
-from holdfast.values import ConversionError, decode, encode, register_count
+from holdfast.values import ConversionError, codec_for, decode, encode, register_count
+from holdfast.values.integers import as_boolean
+from holdfast.values.orders import SWAPPED_BYTES
 from support.cases import examples
 from support.paths import VECTORS
 
@@ -221,6 +223,26 @@ def test_a_numpy_array_of_uint16_is_registers_in_any_byte_order() -> None:
         decode(numpy.array([1, 2]), "uint32")
 
 
+def test_numpy_booleans_are_bits_beside_those_of_python() -> None:
+    numpy = pytest.importorskip("numpy")
+    yes, no = numpy.bool_(True), numpy.bool_(False)
+    assert decode([yes, 0, no, True, 1], "bool[5]") == [True, False, False, True, True]
+    assert (encode(yes, "bool"), encode(no, "bit:3")) == ([1], [0xFFFF ^ 8])
+    for wrong in ([yes, -1], [True, -1]):
+        with pytest.raises(values.InvalidRegister, match=r"^registers\[1\]: -1 is outside 0 to"):
+            decode(wrong, "bool[2]")
+    with pytest.raises(values.InvalidRegister, match=r"^registers\[0\]: a bool_? is not an int"):
+        decode([yes], "uint16")
+
+
+@pytest.mark.parametrize(("module", "name"), [("numpy", "bool"), ("numpy", "bool_")])
+def test_a_boolean_of_any_version_of_numpy_is_one(module: str, name: str) -> None:
+    kind = type(name, (), {"__module__": module, "__bool__": lambda _: False})
+    assert as_boolean(kind()) is False
+    assert as_boolean(type(name, (), {"__module__": "other"})()) is None
+    assert as_boolean(type("int64", (), {"__module__": module})()) is None
+
+
 def test_the_package_does_not_import_numpy() -> None:
     files = list(Path(values.__path__[0]).glob("*.py"))
 
@@ -257,6 +279,28 @@ def test_an_unknown_type_is_refused_with_all_that_are_allowed(name: Any) -> None
     for convert in (register_count, lambda name: decode([1], name), lambda name: encode(1, name)):
         with pytest.raises(values.UnknownType, match=rf"^type .* is unknown.*{allowed}"):
             convert(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        *(("BIT", "bit:0"), ("boolean", "bool"), ("Bytes", "bytes:8"), ("char", "string:8")),
+        *(("DOUBLE", "float64"), ("dint", "int32"), ("dword", "uint32"), ("float", "float32")),
+        *(("INT", "int16"), ("long", "int32"), ("real", "float32"), ("short", "int16")),
+        *(("string", "string:8"), ("udint", "uint32"), ("uint", "uint16"), ("WORD", "uint16")),
+        *(("u16", "uint16"), ("I32", "int32"), ("f64", "float64"), ("f16", "float16")),
+        *(("flaot32", "float32"), ("unit64", "uint64")),
+        *(("flaot32[5]", "float32[5]"), ("real[5]", "float32[5]"), ("real[x", "float32")),
+    ],
+)
+def test_a_type_of_another_program_is_suggested_as_it_is_called_here(name: str, meant: str) -> None:
+    with pytest.raises(values.UnknownType, match=rf"; did you mean {re.escape(repr(meant))}\?$"):
+        register_count(name)
+
+
+def test_no_type_is_suggested_for_what_is_like_none() -> None:
+    with pytest.raises(values.UnknownType, match=r"arrays: float32\[10\]$"):
+        register_count("qqqqqq")
 
 
 @pytest.mark.parametrize(
@@ -351,6 +395,38 @@ def test_eight_letters_that_are_no_order_of_the_field_are_refused(
 ) -> None:
     with pytest.raises(values.UnknownOrder, match=f"^{text}$"):
         decode([], name, order)
+
+
+@pytest.mark.parametrize("name", [name for name, size in SIZES.items() if size != 8])
+def test_eight_letters_are_only_for_eight_bytes(name: str) -> None:
+    text = f"order GHEFCDAB is for 8 bytes, {name} has {SIZES[name]}"
+    with pytest.raises(values.UnknownOrder, match=f"^{text}$"):
+        decode([], name, "GHEFCDAB")
+
+
+def test_the_orders_that_swap_the_bytes_of_a_register_are_known() -> None:
+    assert {each for each in FOUR if encode(1, "uint16", each) == [256]} == set(SWAPPED_BYTES)
+
+
+# Areas
+
+
+def test_in_an_area_of_bits_there_are_only_bools() -> None:
+    assert codec_for("coils", "bool[2]").encode([True, False]) == [1, 0]
+    assert codec_for("discrete_inputs", "bool").encode(1) == [1]
+    with pytest.raises(values.WrongArea, match=r"^type is 'uint16', allowed in coils: bool$"):
+        codec_for("coils", "uint16")
+    with pytest.raises(values.WrongArea, match=r"allowed in discrete_inputs: bool$"):
+        codec_for("discrete_inputs", "bit:0")
+
+
+def test_in_registers_there_are_all_types() -> None:
+    assert codec_for("holding_registers", "uint16", "BADC").encode(1) == [256]
+    assert codec_for("input_registers", "bool").encode(True) == [1]
+    latin = codec_for("holding_registers", "string:2", encoding="latin-1")
+    assert latin.encode("°") == [0xB000]
+    with pytest.raises(values.UnknownOrder):
+        codec_for("holding_registers", "uint16", "ABDC")
 
 
 # Registers
@@ -461,6 +537,14 @@ def test_an_integer_outside_its_type_is_refused(name: str, bounds: tuple[int, in
     for value in (least - 1, most + 1, 10**5000, -(10**5000)):
         with pytest.raises(values.DoesNotFit, match=rf" is outside {least} to {most} of {name}$"):
             encode(value, name)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_message_has_integers_of_up_to_128_bits(sign: int) -> None:
+    with pytest.raises(values.DoesNotFit, match=rf"^{sign * (2**128 - 1)} is outside"):
+        encode(sign * (2**128 - 1), "uint64")
+    with pytest.raises(values.DoesNotFit, match=r"^an integer of 129 bits is outside"):
+        encode(sign * 2**128, "uint64")
 
 
 @pytest.mark.parametrize("name", [*INTEGERS, "bcd16", "bcd32"])

@@ -13,4 +13,4 @@ def differs(value: Any, last: Any, deadband: float) -> bool:
     if type(value) in (int, float) and type(last) in (int, float):
         # The difference of two equal infinities is NaN, which is not greater than the deadband.
         return bool(abs(value - last) > deadband)
-    return bool(value is not last and value != last)
+    return bool(value != last)

@@ -56,7 +56,7 @@ class RegisterScale:
                 allowed = f"exponents from {EXPONENTS[0]} to {EXPONENTS[-1]}"
                 raise ValueError(f"the scale in {self.where} is 10^{value}, allowed: {allowed}")
             return 10 ** int(value) if value >= 0 else float(f"1e{int(value)}")
-        if value == 0 or not math.isfinite(value):
+        if value == 0 or not is_finite(value):
             allowed = "a finite number other than 0"
             raise ValueError(f"the scale in {self.where} is {value}, allowed: {allowed}")
         if value == content and isinstance(value, float):
@@ -79,32 +79,42 @@ class Linear:
 
     def __init__(self, scale: float, offset: float) -> None:
         for name, number in (("scale", scale), ("offset", offset)):
-            if not math.isfinite(number):
+            if not is_finite(number):
                 raise TagError(name, f"{name} is {number}, allowed: a finite number")
         if scale == 0:
             raise TagError("scale", "scale is 0, allowed: any other number")
         self._scale, self._offset = _exact(scale), _exact(offset)
-        self._whole = self._scale.denominator == self._offset.denominator == 1
         self._over = math.lcm(self._scale.denominator, self._offset.denominator)
         self._times = self._scale.numerator * (self._over // self._scale.denominator)
         self._plus = self._offset.numerator * (self._over // self._offset.denominator)
+        # Integers beyond all floats could not be compared with floats.
+        most = (abs(self._times) << 64) + abs(self._plus)
+        self._whole = self._over == 1 and is_finite(most)
         self.is_identity = scale == 1 and offset == 0
 
     def value(self, number: float | Fraction) -> int | float:
         """The value of a number in the registers; an integer if everything is one."""
-        if isinstance(number, int):
-            scaled = number * self._times + self._plus
-            return scaled if self._whole else scaled / self._over
         if isinstance(number, float) and not math.isfinite(number):
             return number
         try:
+            if isinstance(number, int):
+                scaled = number * self._times + self._plus
+                return scaled if self._whole else scaled / self._over
             return float(Fraction(number) * self._scale + self._offset)
         except OverflowError:
-            return math.copysign(math.inf, number * self._times)
+            return math.copysign(math.inf, number) * float(self._scale)
 
     def number(self, value: float) -> Fraction:
         """The number in the registers for a finite value."""
         return (_exact(value) - self._offset) / self._scale
+
+
+def is_finite(number: float) -> bool:
+    """Whether a number is finite, and no integer beyond all floats."""
+    try:
+        return math.isfinite(number)
+    except OverflowError:
+        return False
 
 
 def _exact(number: float) -> Fraction:

@@ -10,7 +10,7 @@ from typing import Any
 
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_LIMITS, WRITE_LIMITS
 from holdfast.tags.base import Marker, Scaled, TagError
-from holdfast.tags.scale import Linear, RegisterScale
+from holdfast.tags.scale import Linear, RegisterScale, is_finite
 from holdfast.tags.writing import Rounding, WritableTag, unwritable
 from holdfast.types import AREAS, BIT_AREAS, Area
 from holdfast.values import (
@@ -100,7 +100,7 @@ class Tag(WritableTag):
     def _put(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
 
-    of_type: Type = field(init=False, repr=False, compare=False)
+    of_type: Type = field(init=False, repr=False)
     """The type, split into its parts."""
     _linear: Linear = field(init=False, repr=False, compare=False)
     """Of a scale in a register, only the offset."""
@@ -113,7 +113,7 @@ class Tag(WritableTag):
                 if (given := getattr(self, key)) != getattr(Tag, key):
                     raise TagError(key, f"{key} is {given}, allowed: only with numbers")
         self._check_source()
-        if not (math.isfinite(self.deadband) and self.deadband >= 0):
+        if not (is_finite(self.deadband) and self.deadband >= 0):
             found = f"deadband is {self.deadband}"
             raise TagError("deadband", f"{found}, allowed: a finite number from 0")
         if self.min is not None and self.max is not None and self.min > self.max:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.tags.base import BaseTag
-from holdfast.tags.scale import RegisterScale
+from holdfast.tags.scale import RegisterScale, is_finite
 from holdfast.types import BIT_AREAS
 from holdfast.values import DoesNotFit
 from holdfast.values.digits import FLOATS
+from holdfast.values.errors import shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -75,14 +75,20 @@ class WritableTag(BaseTag):
             return value
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise DoesNotFit(f"{value!r} is not a number")
-        if not math.isfinite(value):
-            raise DoesNotFit(f"{value} is not a finite number")
+        if not is_finite(value):
+            flaw = "too large" if isinstance(value, int) else "not a finite number"
+            raise DoesNotFit(f"{shown(value)} is {flaw}")
         if isinstance(self.scale, RegisterScale):
             raise DoesNotFit(self.unscaled)
         self._check_limits(value, f"{value} is")
-        if self.is_float:
-            return value if self._linear.is_identity else float(self._linear.number(value))
+        if self.is_float and self._linear.is_identity:
+            return value
         exact = self._linear.number(value)
+        if self.is_float:
+            try:
+                return float(exact)
+            except OverflowError:
+                raise DoesNotFit(f"{value} does not fit {self.type}") from None
         if exact.denominator == 1:
             return exact.numerator
         steps = f"steps of {abs(self.scale)}"

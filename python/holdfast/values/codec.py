@@ -116,22 +116,23 @@ class Codec:
 
     def encode(self, value: Any) -> list[int]:
         """The registers of a value."""
-        if self.type.count is None:
-            return self._to_registers(self.kind.pack_one(value))
-        return self._to_registers(self._pack_array(value))
+        return self._to_registers(self._packed(value))
 
     def pack(self, value: Any) -> bytes:
         """The bytes of a value as on the wire."""
-        data = self.kind.pack_one(value) if self.type.count is None else self._pack_array(value)
+        data = self._packed(value)
         return swap_registers(data) if self.swapped else data
 
-    def _pack_array(self, values: Any) -> bytes:
+    def _packed(self, values: Any) -> bytes:
+        count = self.type.count
+        if count is None:
+            return self.kind.pack_one(values)
         if hasattr(values, "tolist"):
             values = values.tolist()
         if not isinstance(values, Sequence) or isinstance(values, str | bytes | bytearray):
             raise DoesNotFit(f"{shown(values)} is not a sequence, which {self.type.name} requires")
-        if len(values) != self.type.count:
-            takes = counted(self.type.count or 0, "value")
+        if len(values) != count:
+            takes = counted(count, "value")
             raise WrongLength(f"{self.type.name} takes {takes}, found {len(values)}")
         return self.kind.pack_many(values)
 

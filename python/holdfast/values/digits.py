@@ -13,12 +13,14 @@ def shortest(value: float, kind: str) -> str:
     """The shortest decimal that rounds to this float in its type: `0.1` for every float type."""
     if abs(value) < LARGE and value == int(value):
         return f"{value:.0f}"
-    form = FLOATS.get(kind, "d")
-    for digits in range(1, MAX_DIGITS):
-        text = f"{value:.{digits}g}"
-        try:
-            if struct.pack(form, float(text)) == struct.pack(form, value):
+    if kind in ("float16", "float32"):
+        form = FLOATS[kind]
+        for digits in range(1, MAX_DIGITS):
+            text = f"{value:.{digits}g}"
+            try:
+                is_same = struct.pack(form, float(text)) == struct.pack(form, value)
+            except OverflowError:  # Rounded up, the largest values are outside the type.
+                is_same = False
+            if is_same:
                 return text
-        except OverflowError:
-            continue
-    return repr(value)
+    return repr(float(value))
