@@ -39,6 +39,7 @@ BENCHMARKS = {
     "just_the_memory": "Just the memory",
     "mqtt_output": "MQTT output",
     "calibration": "Confidence of guesses",
+    "address_search": "Search for addresses",
 }
 """The benchmarks and the headings of their parts."""
 
