@@ -62,10 +62,9 @@ def main() -> None:
             results.append(measure("blocking, one call at a time", blocking, options))
             for connections, at_once in SHAPES:
                 title = f"{connections} connections, {at_once} concurrent calls on each, asyncio"
-                shape = (server.address, connections, at_once)
+                shape = (server.address, options.loop, connections, at_once)
                 commands = {
-                    name: common.python("client.py", "turn", name, options.loop, *shape)
-                    for name in ASYNCIO
+                    name: common.python("client.py", "turn", name, *shape) for name in ASYNCIO
                 }
                 if options.against:
                     interpreter = options.against / ".venv" / "bin" / "python"
@@ -133,7 +132,7 @@ def turn(name: str, address: str, *numbers: str) -> Result:
         return blocking_turn(BLOCKING[name](host, int(port)), float(seconds))
     loop, *counts = shape
     connections, at_once = map(int, counts)
-    made = ASYNCIO[name](host, int(port), connections)
+    made = ASYNCIO[name](host, int(port), connections, at_once)
     with asyncio.Runner(loop_factory=LOOPS[loop]) as runner:
         return runner.run(asyncio_turn(made, at_once, float(seconds)))
 
@@ -181,8 +180,9 @@ async def asyncio_turn(made: Awaitable[Calls], at_once: int, seconds: float) -> 
     return result
 
 
-async def holdfast_calls(host: str, port: int, connections: int) -> Calls:
-    clients = [holdfast.Client(f"tcp://{host}:{port}", **PATIENT) for _ in range(connections)]
+async def holdfast_calls(host: str, port: int, connections: int, at_once: int) -> Calls:
+    url = f"tcp://{host}:{port}"
+    clients = [holdfast.Client(url, max_in_flight=at_once, **PATIENT) for _ in range(connections)]
 
     def reading(client: holdfast.Client) -> Read:
         async def read() -> None:
@@ -197,7 +197,7 @@ async def holdfast_calls(host: str, port: int, connections: int) -> Calls:
     return [reading(client) for client in clients], close
 
 
-async def pymodbus_calls(host: str, port: int, connections: int) -> Calls:
+async def pymodbus_calls(host: str, port: int, connections: int, _: int) -> Calls:
     from pymodbus.client import AsyncModbusTcpClient
 
     clients = [AsyncModbusTcpClient(host, port=port, **PATIENT) for _ in range(connections)]
@@ -233,7 +233,7 @@ class Bare(asyncio.Protocol):
         await self.reply
 
 
-async def bare_calls(host: str, port: int, connections: int) -> Calls:
+async def bare_calls(host: str, port: int, connections: int, _: int) -> Calls:
     loop = asyncio.get_running_loop()
     made = [(await loop.create_connection(Bare, host, port))[1] for _ in range(connections)]
 
@@ -244,7 +244,7 @@ async def bare_calls(host: str, port: int, connections: int) -> Calls:
     return [protocol.read for protocol in made], close
 
 
-ASYNCIO: dict[str, Callable[[str, int, int], Awaitable[Calls]]] = {
+ASYNCIO: dict[str, Callable[[str, int, int, int], Awaitable[Calls]]] = {
     "Client": holdfast_calls,
     "pymodbus": pymodbus_calls,
     "asyncio itself": bare_calls,

@@ -24,6 +24,7 @@ import pytest
 
 import holdfast
 from holdfast.client.url import NetworkTarget, SerialTarget, Tls, Tolerance, parse
+from holdfast.net import event_loop
 from holdfast.server import Identity
 from holdfast.types import AREAS
 from support import lines, transports, wire
@@ -33,7 +34,7 @@ from support.paths import DOCS
 from support.running import endpoint
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Iterator, Sequence
+    from collections.abc import Awaitable, Callable, Iterator, Sequence
 
     from holdfast.types import Area
     from support.fake_device import Behaviour
@@ -816,6 +817,45 @@ def test_a_call_that_is_cancelled_in_the_queue_sends_nothing_and_keeps_no_place(
                 assert [asked.pdu[2] for asked in device.requests] == [0, 3, 9]
 
     run(main)
+
+
+@pytest.mark.parametrize("loop_factory", [asyncio.new_event_loop, event_loop.fastest])
+def test_every_event_loop_carries_replies_that_are_longer_than_its_buffer(
+    serve: Serve, loop_factory: Callable[[], asyncio.AbstractEventLoop]
+) -> None:
+    memory = holdfast.Memory(holding_registers=2000)
+    memory.write("holding_registers", 0, range(2000))
+
+    async def main() -> None:
+        url = url_of(serve({1: memory}))
+        async with holdfast.Client(url, timeout=wire.DEADLINE, max_in_flight=16) as plc:
+            reads = [plc.read_holding_registers(at, 125) for at in range(0, 1600, 25)]
+            assert await asyncio.gather(*reads) == [
+                [*range(at, at + 125)] for at in range(0, 1600, 25)
+            ]
+            with pytest.raises(holdfast.ModbusException):
+                await plc.read_holding_registers(2000, 1)
+
+    with asyncio.Runner(loop_factory=loop_factory) as runner:
+        runner.run(main())
+
+
+@pytest.mark.parametrize("loop_factory", [asyncio.new_event_loop, event_loop.fastest])
+def test_every_event_loop_ends_calls_in_time_and_drops_late_replies(
+    loop_factory: Callable[[], asyncio.AbstractEventLoop],
+) -> None:
+    async def main() -> None:
+        with Stream("tcp", silent) as device:
+            async with holdfast.Client(device.url, timeout=0.05, max_in_flight=2) as plc:
+                with pytest.raises(holdfast.RequestTimeout):
+                    await plc.read_holding_registers(1, 1)
+                plc.timeout = wire.DEADLINE
+                device.requests[0].answer()
+                assert await plc.read_holding_registers(2, 1) == [2]
+                assert plc.late == 1
+
+    with asyncio.Runner(loop_factory=loop_factory) as runner:
+        runner.run(main())
 
 
 def test_the_reply_to_a_cancelled_call_is_dropped_and_counted() -> None:

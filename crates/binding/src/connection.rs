@@ -12,10 +12,9 @@ use holdfast_engine::tls::TlsFailure;
 use holdfast_protocol::client::{
     Attempt as CoreAttempt, Closed, Connection as Core, Done, Failure, Ticket, Transport,
 };
-use pyo3::buffer::PyBuffer;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyByteArray, PyBytes};
+use pyo3::types::{PyByteArray, PyBytes, PySlice};
 use pyo3::{PyTraverseError, PyVisit, intern};
 
 use crate::arguments::{byte, seconds};
@@ -35,7 +34,6 @@ pub struct Connection {
     time: Py<PyAny>,
     /// Received bytes, until they are processed.
     buffer: Py<PyByteArray>,
-    filled: PyBuffer<u8>,
 }
 
 /// The bytes that are received at once: seven of the longest replies.
@@ -53,8 +51,6 @@ struct State {
     flushes: bool,
     /// When the owner calls `advance`.
     wakes_at: f64,
-    /// The bytes of the buffer.
-    copy: Box<[u8]>,
 }
 
 /// What the owner of the socket gave: methods.
@@ -127,13 +123,11 @@ impl Connection {
             owner: None,
             flushes: false,
             wakes_at: f64::INFINITY,
-            copy: Box::new([0; BUFFER_LEN]),
         };
         let create_future = event_loop.getattr("create_future")?.unbind();
         let (time, state) = (time.unbind(), Mutex::new(state));
         let buffer = PyByteArray::new(event_loop.py(), &[0; BUFFER_LEN]);
-        let filled = PyBuffer::get(&buffer)?;
-        Ok(Connection { state, to, create_future, time, buffer: buffer.unbind(), filled })
+        Ok(Connection { state, to, create_future, time, buffer: buffer.unbind() })
     }
 
     /// Takes the methods of the owner of the socket.
@@ -233,14 +227,37 @@ impl Connection {
         self.buffer.clone_ref(py)
     }
 
-    /// Processes so many bytes of the buffer, and completes the requests that they answer.
+    /// Processes so many bytes of the buffer.
     #[pyo3(signature = (len, /))]
-    fn buffer_updated(&self, py: Python<'_>, len: usize) -> PyResult<()> {
-        let mut copy = std::mem::take(&mut self.state().copy);
-        let copied = self.filled.copy_to_slice(py, &mut copy);
-        let done = copied.and_then(|()| self.process(py, copy.get(..len).unwrap_or_default()));
-        self.state().copy = copy;
-        done
+    fn buffer_updated(&self, py: Python<'_>, len: i16) -> PyResult<()> {
+        let filled = self.buffer.bind(py).get_item(PySlice::new(py, 0, len.into(), 1))?;
+        self.data_received(py, &filled.cast_into::<PyByteArray>()?.to_vec())
+    }
+
+    /// Processes received bytes, and completes the requests that they answer.
+    #[pyo3(signature = (data, /))]
+    fn data_received(&self, py: Python<'_>, data: &[u8]) -> PyResult<()> {
+        let now = clock(self.time.bind(py).call0()?.extract()?)?;
+        let mut state = self.state();
+        let was_handshaking = state.is_handshaking();
+        let completed = self.complete(py, &mut state, |core, tls, ending, add| {
+            let Some(tls) = tls else {
+                return core.receive(data, now, |done| add(ending, done));
+            };
+            let received = tls.receive(data);
+            core.receive(&tls.plain, now, |done| add(ending, done));
+            if received.is_err() || tls.has_ended() {
+                *ending =
+                    received.err().map(|(failure, maybe_sent)| Ending::Tls(failure, maybe_sent));
+                core.close(Closed::ByPeer, |done| add(ending, done));
+            }
+        });
+        let has_changed = was_handshaking || state.core.closed().is_some();
+        let owner = state.owner.as_ref().filter(|_| has_changed);
+        let changed = owner.map(|owner| owner.changed.clone_ref(py));
+        drop(state);
+        settle(py, completed)?;
+        changed.map_or(Ok(()), |changed| changed.call0(py).map(|_| ()))
     }
 
     /// Ends the requests whose timeout has expired. When to call it again; `None` for no request.
@@ -371,31 +388,6 @@ impl State {
 impl Connection {
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Processes received bytes.
-    fn process(&self, py: Python<'_>, data: &[u8]) -> PyResult<()> {
-        let now = clock(self.time.bind(py).call0()?.extract()?)?;
-        let mut state = self.state();
-        let was_handshaking = state.is_handshaking();
-        let completed = self.complete(py, &mut state, |core, tls, ending, add| {
-            let Some(tls) = tls else {
-                return core.receive(data, now, |done| add(ending, done));
-            };
-            let received = tls.receive(data);
-            core.receive(&tls.plain, now, |done| add(ending, done));
-            if received.is_err() || tls.has_ended() {
-                *ending =
-                    received.err().map(|(failure, maybe_sent)| Ending::Tls(failure, maybe_sent));
-                core.close(Closed::ByPeer, |done| add(ending, done));
-            }
-        });
-        let has_changed = was_handshaking || state.core.closed().is_some();
-        let owner = state.owner.as_ref().filter(|_| has_changed);
-        let changed = owner.map(|owner| owner.changed.clone_ref(py));
-        drop(state);
-        settle(py, completed)?;
-        changed.map_or(Ok(()), |changed| changed.call0(py).map(|_| ()))
     }
 
     /// Collects what `work` completes.
