@@ -93,6 +93,8 @@ def wheel(system: System, folder: Path) -> Path:
     needs_target(system.target)
     options = ["--release", "--strip", "--locked", "--target", system.target]
     variables = {"CARGO_NET_OFFLINE": "true", "CARGO_TARGET_DIR": str(ROOT / "target" / "dist")}
+    # Smaller by 0.9 MB, but a minute more to build.
+    variables["CARGO_PROFILE_RELEASE_LTO"] = "fat"
     if system.policy:
         options += ["--zig", "--compatibility", system.policy]
         variables["CARGO_ZIGBUILD_ZIG_PATH"] = str(zig())
