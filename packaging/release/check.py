@@ -24,6 +24,9 @@ IN_WHEELS = (
     ".dist-info/licenses/LICENSE",
     ".dist-info/sboms/",
 )
+MAX_CORE_BYTES = 13_000_000
+"""The most bytes of the native core. One with symbols, or with a dependency more, has more."""
+
 IN_PACKAGES = (
     "./etc/holdfast/holdfast.yaml",
     "./usr/bin/holdfast",
@@ -84,14 +87,19 @@ def changes(version: str, tag: str | None) -> list[str]:
 
 
 def wheels(folder: Path, version: str) -> list[str]:
-    """What the wheels lack."""
+    """What the wheels lack, and what they have too much of."""
     found = []
     made = sorted(folder.glob(f"holdfast_modbus-{version}-*.whl"))
     for wheel in made:
         with zipfile.ZipFile(wheel) as archive:
-            names = archive.namelist()
-        missing = [part for part in IN_WHEELS if not any(part in name for name in names)]
+            sizes = {each.filename: each.file_size for each in archive.infolist()}
+        missing = [part for part in IN_WHEELS if not any(part in name for name in sizes)]
         found += [f"{wheel.name}: no {part}" for part in missing]
+        for name, size in sizes.items():
+            if IN_WHEELS[0] in name and size > MAX_CORE_BYTES:
+                found.append(
+                    f"{wheel.name}: {name} has {size:,} bytes, allowed: {MAX_CORE_BYTES:,}"
+                )
     return found or ([] if made else [f"{folder}: no wheel of {version}: make dist"])
 
 

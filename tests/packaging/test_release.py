@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zipfile
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -92,6 +93,23 @@ def test_a_tag_needs_its_version_and_its_section(
 def test_missing_packages_are_named(check: Any, tmp_path: Path) -> None:
     assert check.wheels(tmp_path, "0.2.0") == [f"{tmp_path}: no wheel of 0.2.0: make dist"]
     assert check.debian(tmp_path, "0.2.0") == [f"{tmp_path}: no Debian package of 0.2.0: make deb"]
+
+
+def test_a_core_that_is_too_large_is_named(check: Any, tmp_path: Path) -> None:
+    wheel = tmp_path / "holdfast_modbus-0.2.0-cp311-abi3-linux_x86_64.whl"
+
+    def problems(size: int) -> list[str]:
+        with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("holdfast/_core.abi3.so", bytes(size))
+            for part in check.IN_WHEELS[1:]:
+                archive.writestr(part, b"")
+        found: list[str] = check.wheels(tmp_path, "0.2.0")
+        return found
+
+    assert problems(13_000_000) == []
+    assert problems(13_000_001) == [
+        f"{wheel.name}: holdfast/_core.abi3.so has 13,000,001 bytes, allowed: 13,000,000"
+    ]
 
 
 @pytest.mark.parametrize("file", WORKFLOWS, ids=lambda file: file.name)

@@ -1,7 +1,6 @@
 //! The handshake of an admitted connection.
 
 use std::net::SocketAddr;
-use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -20,15 +19,15 @@ use crate::tls::server::ServerTls;
 
 /// Performs the handshake, and gives the connection its place among the sessions. `None`: the connection
 /// has ended, which was counted and reported. In a box, whose memory is free again when this ends.
-pub(crate) fn secured<'a>(
-    tls: &'a ServerTls,
-    context: &'a ListenerContext,
+pub(crate) async fn secured(
+    tls: &ServerTls,
+    context: &ListenerContext,
     connection: (TcpStream, SocketAddr),
-    ticket: &'a Ticket,
+    ticket: &Ticket,
     time_limit: Duration,
     stop: watch::Receiver<bool>,
-) -> Pin<Box<dyn Future<Output = Option<(ServerTlsStream, Peer)>> + Send + 'a>> {
-    Box::pin(handshake(tls, context, connection, ticket, time_limit, stop))
+) -> Option<(ServerTlsStream, Peer)> {
+    Box::pin(handshake(tls, context, connection, ticket, time_limit, stop)).await
 }
 
 async fn handshake(
