@@ -51,8 +51,8 @@ OPTIONS = (
 )
 """What the tests don't use takes most of their time."""
 
-LIMITS = {resource.RLIMIT_CPU: 120, resource.RLIMIT_AS: 8 << 30}
-"""What the tests of one change may use: seconds and bytes."""
+MEMORY = 8 << 30
+"""What the tests of one change may use, in bytes."""
 
 SWITCH = "_is_mutant"
 CACHE = type(lru_cache(int))
@@ -138,7 +138,7 @@ def others(node: Any, is_condition: bool) -> Iterator[Any]:
             for at, keyword in enumerate(keywords):
                 if keyword.arg not in (None, "strict"):
                     yield ast.Call(node.func, node.args, keywords[:at] + keywords[at + 1 :])
-        case ast.Return(ast.expr() as value) if ast.unparse(value) != "None":
+        case ast.Return(ast.expr() as value) if ast.unparse(value) not in ("None", "False"):
             yield ast.Return(ast.Constant(None))
         case ast.Raise() | ast.AugAssign() | ast.Continue() | ast.Break() | ast.Expr(ast.Call()):
             yield ast.Pass()
@@ -241,13 +241,6 @@ def forked(work: Callable[[], Result]) -> Result | None:
         os.waitpid(child, 0)
 
 
-def turn_on(number: int) -> None:
-    """Turns one change on."""
-    setattr(builtins, SWITCH, number.__eq__)
-    for limit, most in LIMITS.items():
-        resource.setrlimit(limit, (most, most))
-
-
 def caches() -> list[Any]:
     """All caches of the program. What is cached reaches nothing."""
     modules = [module for name, module in sys.modules.items() if name.startswith("holdfast.")]
@@ -264,7 +257,7 @@ class Tests:
         self.items: list[pytest.Item] = []
         self.have_passed = False
         self.costs: dict[str, float] = {}
-        """The seconds of each test."""
+        """The processor time of each test, in seconds."""
         self.reached: defaultdict[int, set[str]] = defaultdict(set)
         """The tests that reach a change; the empty name is that of the imports."""
         if not hasattr(builtins, SWITCH):
@@ -296,19 +289,22 @@ class Tests:
         for item in sorted(chosen, key=lambda each: costs[each.nodeid]):
             for cache in cached:
                 cache.cache_clear()
-            self._now, started = item.nodeid, time.monotonic()
+            self._now, started = item.nodeid, time.process_time()
             item.config.hook.pytest_runtest_protocol(item=item, nextitem=None)
-            self.costs[item.nodeid] = time.monotonic() - started
+            self.costs[item.nodeid] = time.process_time() - started
             if not self.have_passed:
                 break
         return self.have_passed
 
 
-def survives(number: int, work: Callable[[], bool]) -> bool:
-    """Whether tests pass with a change."""
+def survives(number: int, costs: dict[str, float], work: Callable[[], bool]) -> bool:
+    """Whether tests pass with a change, in about the time that they need without."""
 
     def changed() -> bool:
-        turn_on(number)
+        setattr(builtins, SWITCH, number.__eq__)
+        seconds = 5 + int(2 * sum(costs.values()))
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         return work()
 
     return bool(forked(changed))
@@ -327,7 +323,7 @@ def trials(package: str, numbers: list[int], until: float) -> Trials:
             if time.monotonic() > until:
                 break
             near = {each: tests.costs[each] for each in tests.reached[number] if each}
-            survived[number] = survives(number, partial(tests.run, near))
+            survived[number] = survives(number, near, partial(tests.run, near))
             if survived[number] and "" in tests.reached[number]:
                 anew.append(number)
 
@@ -355,7 +351,7 @@ def verdicts(package: str, numbers: list[int], until: float) -> dict[int, bool]:
         if time.monotonic() > until:
             del survived[number]
         else:
-            survived[number] = survives(number, partial(passes, package, costs))
+            survived[number] = survives(number, costs, partial(passes, package, costs))
     return survived
 
 

@@ -31,12 +31,15 @@ def tag(**more: Any) -> Tag:
         (1, 0.5, 4, 4.5),
         (0.5, 2, 0, 1.0),
         (math.inf, 2, 0, math.inf),
+        (math.inf, -2, 5, -math.inf),
         (1e308, 10, 0, math.inf),
         (1e308, -10, 0, -math.inf),
         (-1e308, -10, 0, math.inf),
         (1e308, 1e300, 1e-300, math.inf),
         (1, 9e288, 0, 9 * 10**288),
         (1, 1.1e289, 0, 1.1e289),
+        (1, 9e288, 1.7e308, 1.7e308),
+        (-0.0, 1, 0, -0.0),
         (1000, 1e308, 0, math.inf),
         (-1000, 1e308, 0.5, -math.inf),
     ],
@@ -46,7 +49,7 @@ def test_a_value_is_the_scaled_number_without_a_rounding_error(
 ) -> None:
     kind = "float64" if isinstance(raw, float) else "int16"
     made = tag(type=kind, scale=scale, offset=offset).value(raw)
-    assert (made, type(made)) == (value, type(value))
+    assert (repr(made), type(made)) == (repr(value), type(value))
 
 
 @given(
@@ -173,13 +176,15 @@ def test_a_marker_is_what_the_registers_hold() -> None:
         ({"deadband": -1}, "deadband", "allowed: a finite number from 0"),
         ({"min": 2, "max": 1}, "max", "max is 1, allowed: at least min, 2"),
         ({"type": "float32", "states": {0: "off"}}, "states", "states of float32"),
+        ({"type": "string:4", "states": {0: "off"}}, "states", "states of string:4"),
+        ({"type": "bytes:4", "states": {0: "off"}}, "states", "states of bytes:4"),
         ({"type": "float32", "round": "nearest"}, "round", "only with integers without states"),
         ({"states": {0: "off"}, "round": "nearest"}, "round", "round is nearest, allowed: only"),
         ({"type": "string:4", "round": "exact"}, "round", "only with integers without states"),
-        ({"states": {0: "off", 1: "off"}}, "states", "two states have the name 'off'"),
+        ({"states": {0: "on", 1: "off", 2: "off"}}, "states", "two states have the name 'off'"),
         ({"area": "input_registers", "writable": True}, "writable", "input_registers can't be"),
         ({"type": "bit:3[2]", "writable": True}, "writable", "only one bit can"),
-        ({"type": "uint16[124]", "writable": True}, "writable", "one request writes at most 123"),
+        ({"type": "uint16[124]", "writable": True}, "writable", "124 registers, one request"),
         (
             {"area": "coils", "type": "bool[1969]", "writable": True},
             "writable",
@@ -205,6 +210,20 @@ def test_a_tag_has_nothing_that_it_was_not_given() -> None:
     assert (made.unit, made.description, made.encoding, made.round) == ("", "", None, None)
     assert (made.writable, made.states, made.null, made.deadband) == (False, {}, frozenset(), 0)
     assert (made.min, made.max, made.value(7)) == (None, None, 7)
+
+
+def test_a_bit_has_no_order_of_bytes() -> None:
+    made = tag(area="coils", type="bool[3]", order="DCBA")
+    assert made == tag(area="coils", type="bool[3]")
+
+
+def test_the_address_may_be_an_integer_of_any_library() -> None:
+    class Integer:
+        def __index__(self) -> int:
+            return 7
+
+    made = tag(address=Integer())
+    assert (made.address, type(made.address)) == (7, int)
 
 
 def test_the_largest_tags_that_one_request_writes_are_writable() -> None:

@@ -234,8 +234,13 @@ def test_every_field_has_a_value_and_every_value_a_field() -> None:
     ("fields", "error", "text"),
     [
         ([], values.InvalidLayout, "a layout requires at least one field"),
-        ([("a", "bool", 0)] * 2, values.InvalidLayout, "two fields have the name 'a'"),
+        (
+            [("b", "bool", 0), ("a", "bool", 0), ("a", "bool", 0)],
+            values.InvalidLayout,
+            "two fields have the name 'a'",
+        ),
         ([("a", "bool")], values.InvalidLayout, "a field is a tuple, allowed: a Field, or"),
+        ([("a", "bool", 0, "ABCD", None, 0)], values.InvalidLayout, "a field is a tuple, allowed"),
         ([{"name": "a"}], values.InvalidLayout, "a field is a dict, allowed: a Field, or"),
         (
             [("", "bool", 0)],

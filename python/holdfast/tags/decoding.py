@@ -145,11 +145,11 @@ def assembled(tag: BaseTag, pieces: Sequence[tuple[int, bytes]]) -> bytes | None
             _unpacked(data) if tag.of_bits else [data[at : at + 2] for at in range(0, len(data), 2)]
         )
         units.update(enumerate(of_piece, address))
-    content = [units.get(address) for address in range(tag.address, tag.end)]
+    content: list[Any] = [units.get(address) for address in range(tag.address, tag.end)]
     if None in content:
         return None
     if not tag.of_bits:
-        return b"".join(unit for unit in content if isinstance(unit, bytes))
+        return b"".join(content)
     packed = sum(1 << at for at, bit in enumerate(content) if bit)
     return packed.to_bytes((len(content) + 7) // 8, "little")
 
