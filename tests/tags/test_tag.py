@@ -129,6 +129,12 @@ def test_limits_hold_for_the_rounded_value() -> None:
         it.raw(20.3)
 
 
+def test_the_limits_themselves_may_be_written() -> None:
+    it = tag(min=5, max=30)
+    assert (it.raw(5), it.raw(30)) == (5, 30)
+    assert tag(min=5, max=5).raw(5) == 5
+
+
 def test_a_state_is_never_rounded() -> None:
     with pytest.raises(DoesNotFit, match="between two values"):
         tag(states={0: "off", 1: "on"}).raw(0.7, default_round="nearest")

@@ -166,6 +166,10 @@ def test_text_that_is_no_value_is_refused(it: Tag, text: str, message: str) -> N
         value_from(it, text)
 
 
+def test_no_value_is_no_text() -> None:
+    assert [text_of(tag("float32"), none) for none in (None, math.nan)] == ["", ""]
+
+
 def test_the_sign_of_zero_is_kept() -> None:
     assert text_of(tag("float32"), -0.0) == "-0"
     assert repr(plain(tag("float32"), -0.0)) == "-0.0"
