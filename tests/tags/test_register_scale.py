@@ -101,6 +101,7 @@ def test_floats_and_arrays_have_scales_too() -> None:
     floating = by_name(type="float32")
     registers = [*values.encode(0.1, "float32"), -1 & 0xFFFF]
     assert value(floating, registers) == 0.01
+    assert repr(value(floating, [*registers[:2], 0])) == "0.1"
     assert plain(floating["power"], 0.01) == 0.01
     assert value(by_name(type="int16[2]", offset=5), [1, 2, 1]) == [15, 25]
     assert value(floating, [0x7F80, 0, 1]) == math.inf
@@ -153,6 +154,7 @@ def test_values_of_an_array_may_have_none() -> None:
     exponent = -1 & 0xFFFF
     full = values.encode([0.1, 215.0], "float32[2]")
     assert value(tags, [*full, exponent]) == [None, 21.5]
+    assert value(tags, [*values.encode([0.2, 0.3], "float32[2]"), exponent]) == [0.02, 0.03]
     assert value(tags, [*values.encode([math.nan, math.inf], "float32[2]"), exponent]) == [
         None,
         math.inf,

@@ -257,8 +257,9 @@ def tag_of(name: str) -> Tag:
 
 
 def test_a_list_has_each_name_once() -> None:
-    with pytest.raises(TagError, match="two tags have the name 't'"):
+    with pytest.raises(TagError, match="two tags have the name 't'") as caught:
         TagList([tag(), tag(address=1)])
+    assert caught.value.key == "name"
 
 
 def test_a_list_is_a_table_of_its_tags() -> None:

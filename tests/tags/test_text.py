@@ -166,6 +166,10 @@ def test_text_that_is_no_value_is_refused(it: Tag, text: str, message: str) -> N
         value_from(it, text)
 
 
+def test_a_scale_without_decimal_places_gives_none() -> None:
+    assert text_of(tag("int16", scale=10, offset=5), 20.0) == "20"
+
+
 def test_no_value_is_no_text() -> None:
     assert [text_of(tag("float32"), none) for none in (None, math.nan)] == ["", ""]
 

@@ -124,6 +124,11 @@ def test_the_offset_of_a_field_may_be_an_integer_of_any_library() -> None:
     assert layout.encode({"a": 7}) == [0, 0, 0, 7, 0]
 
 
+def test_a_layout_may_be_a_whole_area() -> None:
+    assert Layout([("a", "uint16", 65535)]).size == 65536
+    assert [Layout([("a", "uint32", 1)], size=size).size for size in (3, 4, 65536)] == [3, 4, 65536]
+
+
 def test_a_layout_of_bools_decodes_bits() -> None:
     layout = Layout([("open", "bool", 0), ("doors", "bool[2]", 1)])
 
@@ -253,6 +258,7 @@ def test_every_field_has_a_value_and_every_value_a_field() -> None:
             "the name of a field is 5, allowed: non-empty text",
         ),
         ([("a", "bool", -1)], values.InvalidLayout, "a: offset -1, allowed: 0 to 65535"),
+        ([("a", "bool", 65536)], values.InvalidLayout, "a: offset 65536, allowed: 0 to 65535"),
         ([("a", "bool", True)], values.InvalidLayout, "a: offset True, allowed: 0 to 65535"),
         (
             [("a", "uint32", 65535)],

@@ -238,7 +238,7 @@ class _Pass:
         if codec.swapped is not self.swapped or codec.kind.mark != self._mark:
             return None
         key = start, codec.item
-        if key not in self._places and start >= self._end:
+        if start >= self._end:
             self._form += f"{start - self._end}x{codec.item}"
             self._end = start + 2 * codec.type.registers
             self._places[key] = len(self._places)
