@@ -144,6 +144,7 @@ def test_states_have_names_both_ways() -> None:
     it = tag(states={0: "off", 1: "running"})
     assert [it.state(it.value(raw)) for raw in (0, 1, 2)] == ["off", "running", None]
     assert (it.raw("running"), it.raw(1)) == (1, 1)
+    assert (it.state(1.0), it.state([1])) == (None, None)
 
 
 def test_markers_and_nan_are_no_values() -> None:
@@ -157,6 +158,8 @@ def test_a_marker_is_what_the_registers_hold() -> None:
     it = tag(type="float32", null=frozenset([0.1]))
     held = decode(encode(0.1, "float32"), "float32")
     assert it.null == {held}
+    text = tag(type="string:4", encoding="latin-1", null=frozenset(["°"]))
+    assert (text.value("°"), text.value("A")) == (None, "A")
     assert (it.value(held), it.value(0.1)) == (None, 0.1)
 
 
