@@ -279,6 +279,7 @@ def test_nan_as_marker_is_the_value_of_a_float() -> None:
     assert math.isnan(marker)
 
 
-def test_text_and_bits_are_written_as_they_are() -> None:
+def test_text_bits_and_floats_are_written_as_they_are() -> None:
     assert tag(type="string:4").raw("AB") == "AB"
+    assert repr(tag(type="float32").raw(-0.0)) == "-0.0"
     assert tag(area="coils", type="bool").raw(True) is True
