@@ -259,6 +259,10 @@ def tag_of(name: str) -> Tag:
     return Tag(name, "input_registers", 0, "float32", null=frozenset([1.5]))
 
 
+def test_a_tag_may_end_with_its_area() -> None:
+    assert tag(address=65535).end == tag(address=65534, type="float32").end == 65536
+
+
 def test_a_list_has_each_name_once() -> None:
     with pytest.raises(TagError, match="two tags have the name 't'") as caught:
         TagList([tag(), tag(address=1)])

@@ -126,7 +126,8 @@ def _layout(count: int, *fields: tuple[str, int, str, str | None]) -> Layout:
 def value_of(tag: BaseTag, data: bytes, address: int) -> Any:
     """Decodes one tag of a block that begins at `address`."""
     if tag.of_bits:
-        return _bits([tag], address)(data)[0]
+        [value] = _bits([tag], address)(data)
+        return value
     raw = _alone(tag, data, address)
     source = tag.source
     return raw if source is None else _scaled(tag, raw, _alone(source, data, address))
