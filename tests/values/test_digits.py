@@ -37,6 +37,8 @@ def float32(number: float) -> float:
         (1e30, "float64", "1e+30"),
         (float32(3.4028234663852886e38), "float32", "3.4028235e+38"),
         (1e300, "float32", "1e+300"),
+        (1.5e300, "float32", "1.5e+300"),
+        (1.5e300, "float16", "1.5e+300"),
         (-0.0, "float32", "-0"),
         (math.inf, "float32", "inf"),
         (math.nan, "float32", "nan"),

@@ -170,6 +170,7 @@ def test_gaps_are_zero_or_as_in_the_base() -> None:
         [("a", "bit:1", 0), ("b", "bit:1", 0, "CDAB")],
         [("a", "bit:1", 0), ("b", "bit:9", 0, "DCBA")],
         [("a", "uint16", 0), ("b", "bool", 0)],
+        [("a", "uint16", 0), ("b", "bit:15", 0)],
         [("a", "bit:1[3]", 0), ("b", "bit:1", 2)],
     ],
     ids=repr,
