@@ -5,7 +5,7 @@ makes no difference is in `mutants.toml`, with the reason.
 
 No file is changed: a package is imported with all its changes, each behind a switch. The tests run
 once, which tells what they reach, and how long they take. For each change, a copy of this process
-turns it on and runs the tests that reach it, the fastest first. What runs on import is imported
+turns it on and runs the tests that reach it, the cheap ones first. What runs on import is imported
 again in another copy.
 
 mutmut and cosmic-ray don't replace it: mutmut 3 refuses sources in `python/` and leaves out tables
@@ -51,8 +51,8 @@ OPTIONS = (
 )
 """What the tests don't use takes most of their time."""
 
-LIMITS = {resource.RLIMIT_CPU: 120, resource.RLIMIT_AS: 8 << 30}
-"""What the tests of one change may use: seconds and bytes."""
+MEMORY = 8 << 30
+"""What the tests of one change may use, in bytes."""
 
 SWITCH = "_is_mutant"
 CACHE = type(lru_cache(int))
@@ -108,7 +108,7 @@ class Mutant:
         return f"{self.file}: {self.line}  |  {self.old}  ->  {self.new}"
 
 
-def others(node: Any, is_condition: bool) -> Iterator[Any]:
+def alternatives(node: Any, is_condition: bool) -> Iterator[Any]:
     """What an expression or a statement is changed to."""
     if is_condition:
         yield from (ast.Constant(True), ast.Constant(False))
@@ -138,7 +138,7 @@ def others(node: Any, is_condition: bool) -> Iterator[Any]:
             for at, keyword in enumerate(keywords):
                 if keyword.arg not in (None, "strict"):
                     yield ast.Call(node.func, node.args, keywords[:at] + keywords[at + 1 :])
-        case ast.Return(ast.expr() as value) if ast.unparse(value) != "None":
+        case ast.Return(ast.expr() as value) if ast.unparse(value) not in ("None", "False"):
             yield ast.Return(ast.Constant(None))
         case ast.Raise() | ast.AugAssign() | ast.Continue() | ast.Break() | ast.Expr(ast.Call()):
             yield ast.Pass()
@@ -192,7 +192,7 @@ class Planter(ast.NodeTransformer):
         before = copy.deepcopy(node)
         changed: Any = self.generic_visit(node)
         old = ast.unparse(before)
-        for other in others(before, node in self._conditions):
+        for other in alternatives(before, node in self._conditions):
             new = ast.unparse(other)
             if new != old:
                 number = ast.Constant(len(self._mutants))
@@ -241,13 +241,6 @@ def forked(work: Callable[[], Result]) -> Result | None:
         os.waitpid(child, 0)
 
 
-def turn_on(number: int) -> None:
-    """Turns one change on."""
-    setattr(builtins, SWITCH, number.__eq__)
-    for limit, most in LIMITS.items():
-        resource.setrlimit(limit, (most, most))
-
-
 def caches() -> list[Any]:
     """All caches of the program. What is cached reaches nothing."""
     modules = [module for name, module in sys.modules.items() if name.startswith("holdfast.")]
@@ -264,7 +257,7 @@ class Tests:
         self.items: list[pytest.Item] = []
         self.have_passed = False
         self.costs: dict[str, float] = {}
-        """The seconds of each test."""
+        """The processor time of each test, in seconds."""
         self.reached: defaultdict[int, set[str]] = defaultdict(set)
         """The tests that reach a change; the empty name is that of the imports."""
         if not hasattr(builtins, SWITCH):
@@ -289,26 +282,35 @@ class Tests:
         self.have_passed &= not report.failed
 
     def run(self, costs: dict[str, float]) -> bool:
-        """Runs the tests that have costs, the cheapest first, until one fails."""
+        """Runs the tests that have costs until one fails: first all functions with a cheap case."""
         chosen = [item for item in self.items if item.nodeid in costs]
+        spent: defaultdict[str, float] = defaultdict(float)
+        ranks: dict[str, float] = {}
+        for item in sorted(chosen, key=lambda each: costs[each.nodeid]):
+            function = item.nodeid.partition("[")[0]
+            spent[function] += costs[item.nodeid]
+            ranks[item.nodeid] = spent[function]
         self.have_passed = True
         cached = caches()
-        for item in sorted(chosen, key=lambda each: costs[each.nodeid]):
+        for item in sorted(chosen, key=lambda each: ranks[each.nodeid]):
             for cache in cached:
                 cache.cache_clear()
-            self._now, started = item.nodeid, time.monotonic()
+            self._now, started = item.nodeid, time.process_time()
             item.config.hook.pytest_runtest_protocol(item=item, nextitem=None)
-            self.costs[item.nodeid] = time.monotonic() - started
+            self.costs[item.nodeid] = time.process_time() - started
             if not self.have_passed:
                 break
         return self.have_passed
 
 
-def survives(number: int, work: Callable[[], bool]) -> bool:
-    """Whether tests pass with a change."""
+def survives(number: int, costs: dict[str, float], work: Callable[[], bool]) -> bool:
+    """Whether tests pass with a change, in about the time that they need without."""
 
     def changed() -> bool:
-        turn_on(number)
+        setattr(builtins, SWITCH, number.__eq__)
+        seconds = 5 + int(2 * sum(costs.values()))
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         return work()
 
     return bool(forked(changed))
@@ -321,20 +323,22 @@ def trials(package: str, numbers: list[int], until: float) -> Trials:
 
     def work(tests: Tests) -> None:
         if not tests.run(dict.fromkeys((item.nodeid for item in tests.items), 0)):
-            raise SystemExit(f"ERROR: a test of {package} fails without a change")
+            return
         gc.freeze()
         for number in numbers:
             if time.monotonic() > until:
                 break
             near = {each: tests.costs[each] for each in tests.reached[number] if each}
-            survived[number] = survives(number, partial(tests.run, near))
+            survived[number] = survives(number, near, partial(tests.run, near))
             if survived[number] and "" in tests.reached[number]:
                 anew.append(number)
 
-    costs = Tests(package, work).costs
+    tests = Tests(package, work)
+    assert tests.have_passed
     ours = tuple(str(ROOT / folder) for folder in ("python", "tests", "tools"))
     files = {name: str(getattr(module, "__file__", "")) for name, module in sys.modules.items()}
-    return costs, survived, anew, [name for name in files if not files[name].startswith(ours)]
+    others = [name for name in files if not files[name].startswith(ours)]
+    return tests.costs, survived, anew, others
 
 
 def passes(package: str, costs: dict[str, float]) -> bool:
@@ -346,7 +350,7 @@ def verdicts(package: str, numbers: list[int], until: float) -> dict[int, bool]:
     """Which changes survive, of those for which there is time."""
     found = forked(partial(trials, package, numbers, until))
     if found is None:
-        raise SystemExit(f"ERROR: the tests of {package} can't be run")
+        raise SystemExit(f"ERROR: the tests of {package} fail without a change")
     costs, survived, anew, modules = found
     for name in modules:
         with suppress(ImportError):
@@ -355,7 +359,7 @@ def verdicts(package: str, numbers: list[int], until: float) -> dict[int, bool]:
         if time.monotonic() > until:
             del survived[number]
         else:
-            survived[number] = survives(number, partial(passes, package, costs))
+            survived[number] = survives(number, costs, partial(passes, package, costs))
     return survived
 
 

@@ -75,9 +75,15 @@ def test_a_point_without_a_value_needs_no_scale() -> None:
         ({"type": "uint16", "scale": 0.01}, [43, 0, 50], 21.5),
         ({"type": "float32"}, [215, 0, *values.encode(0.1, "float32")], 21.5),
         ({"type": "uint16"}, [43, 0, 0], "is 0, allowed: a finite number other than 0"),
+        (
+            {"type": "float32", "scale": 1 / 3},
+            [3, 0, *values.encode(1.0, "float32")],
+            0.9999999999999999,
+        ),
         ({"type": "float32"}, [215, 0, 0x7FC0, 0], "has no value"),
         ({"type": "float32"}, [215, 0, 0x7F80, 0], "is inf, allowed: a finite number other"),
         ({"type": "uint16", "null": frozenset([7])}, [1, 0, 7], "has no value"),
+        ({"type": "uint64"}, [1, 0, 32, 0, 0, 1], 2**53 + 1),
         ({"type": "uint16", "scale": 1e300}, [1, 0, 0xFFFF], 6.5535e304),
         ({"type": "float32"}, [0, 0, *values.encode(-0.1, "float32")], 0),
         ({"type": "uint64", "scale": 1e289}, [1, 0, *[0xFFFF] * 4], "is inf, allowed: a finite"),
@@ -95,6 +101,7 @@ def test_floats_and_arrays_have_scales_too() -> None:
     floating = by_name(type="float32")
     registers = [*values.encode(0.1, "float32"), -1 & 0xFFFF]
     assert value(floating, registers) == 0.01
+    assert repr(value(floating, [*registers[:2], 0])) == "0.1"
     assert plain(floating["power"], 0.01) == 0.01
     assert value(by_name(type="int16[2]", offset=5), [1, 2, 1]) == [15, 25]
     assert value(floating, [0x7F80, 0, 1]) == math.inf
@@ -113,10 +120,33 @@ def test_a_value_without_the_content_of_its_scale_is_refused() -> None:
         power.raw(4320)
     fixed = power.with_scale(1)
     assert (fixed.raw(4320), fixed.value(432), fixed.min) == (432, 4320, 0)
-    with pytest.raises(DoesNotFit, match="steps of 10"):
+    with pytest.raises(DoesNotFit, match=r"steps of 10$"):
         fixed.raw(4321)
     with pytest.raises(ValueError, match="is 10\\^-32768"):
         power.with_scale(-32768)
+
+
+def test_a_block_has_tags_with_and_without_scales() -> None:
+    tags = [by_name()["power"], Tag("other", HR, 11, "uint16")]
+    scaled, other = decoder(tags, 10, 3)(b"\0\5\0\6\0\1")
+    assert (tags[0].value(scaled), other) == (50, 6)
+
+
+def test_each_tag_of_a_block_has_its_own_scale() -> None:
+    places: list[tuple[Any, ...]] = [(12, "int16"), (11, "int16")]
+    places += [(12, "int16", "BADC"), (12, "uint16")]
+    tags = [
+        Tag(f"t{at}", HR, 10, scale=RegisterScale("factor", source=Tag("", HR, *place)))
+        for at, place in enumerate(places)
+    ]
+    found = decoder(tags, 10, 3)(b"\0\7\0\3\xff\xfe")
+    assert [tag.value(raw) for tag, raw in zip(tags, found, strict=True)] == [
+        *(-14, 21, -7 * 257, 7 * 0xFFFE)
+    ]
+
+
+def test_a_scale_is_at_most_as_far_away_as_one_request_reads() -> None:
+    assert len(by_name(source={"address": 134})["power"].span) == 125
 
 
 def test_values_of_an_array_may_have_none() -> None:
@@ -124,6 +154,7 @@ def test_values_of_an_array_may_have_none() -> None:
     exponent = -1 & 0xFFFF
     full = values.encode([0.1, 215.0], "float32[2]")
     assert value(tags, [*full, exponent]) == [None, 21.5]
+    assert value(tags, [*values.encode([0.2, 0.3], "float32[2]"), exponent]) == [0.02, 0.03]
     assert value(tags, [*values.encode([math.nan, math.inf], "float32[2]"), exponent]) == [
         None,
         math.inf,
@@ -172,6 +203,12 @@ def test_scales_that_one_request_cannot_read_are_refused(
         TagList([Tag("power", HR, 10, **made), Tag("sf", **place)])
     assert caught.value.key == "scale"
     assert message in str(caught.value)
+
+
+def test_a_scale_without_a_name_is_called_by_its_register() -> None:
+    scale = RegisterScale("factor", source=Tag("", HR, 2))
+    with pytest.raises(TagError, match=rf"^scale is factor from {HR} 2, allowed: only with num"):
+        Tag("t", HR, 0, "string:2", scale=scale)
 
 
 def test_a_list_takes_the_register_of_its_own_tag() -> None:

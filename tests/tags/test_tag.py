@@ -31,12 +31,15 @@ def tag(**more: Any) -> Tag:
         (1, 0.5, 4, 4.5),
         (0.5, 2, 0, 1.0),
         (math.inf, 2, 0, math.inf),
+        (math.inf, -2, 5, -math.inf),
         (1e308, 10, 0, math.inf),
         (1e308, -10, 0, -math.inf),
         (-1e308, -10, 0, math.inf),
         (1e308, 1e300, 1e-300, math.inf),
         (1, 9e288, 0, 9 * 10**288),
         (1, 1.1e289, 0, 1.1e289),
+        (1, 9e288, 1.7e308, 1.7e308),
+        (-0.0, 1, 0, -0.0),
         (1000, 1e308, 0, math.inf),
         (-1000, 1e308, 0.5, -math.inf),
     ],
@@ -46,7 +49,7 @@ def test_a_value_is_the_scaled_number_without_a_rounding_error(
 ) -> None:
     kind = "float64" if isinstance(raw, float) else "int16"
     made = tag(type=kind, scale=scale, offset=offset).value(raw)
-    assert (made, type(made)) == (value, type(value))
+    assert (repr(made), type(made)) == (repr(value), type(value))
 
 
 @given(
@@ -126,6 +129,12 @@ def test_limits_hold_for_the_rounded_value() -> None:
         it.raw(20.3)
 
 
+def test_the_limits_themselves_may_be_written() -> None:
+    it = tag(min=5, max=30)
+    assert (it.raw(5), it.raw(30)) == (5, 30)
+    assert tag(min=5, max=5).raw(5) == 5
+
+
 def test_a_state_is_never_rounded() -> None:
     with pytest.raises(DoesNotFit, match="between two values"):
         tag(states={0: "off", 1: "on"}).raw(0.7, default_round="nearest")
@@ -135,6 +144,7 @@ def test_states_have_names_both_ways() -> None:
     it = tag(states={0: "off", 1: "running"})
     assert [it.state(it.value(raw)) for raw in (0, 1, 2)] == ["off", "running", None]
     assert (it.raw("running"), it.raw(1)) == (1, 1)
+    assert (it.state(1.0), it.state([1])) == (None, None)
 
 
 def test_markers_and_nan_are_no_values() -> None:
@@ -148,6 +158,8 @@ def test_a_marker_is_what_the_registers_hold() -> None:
     it = tag(type="float32", null=frozenset([0.1]))
     held = decode(encode(0.1, "float32"), "float32")
     assert it.null == {held}
+    text = tag(type="string:4", encoding="latin-1", null=frozenset(["°"]))
+    assert (text.value("°"), text.value("A")) == (None, "A")
     assert (it.value(held), it.value(0.1)) == (None, 0.1)
 
 
@@ -173,13 +185,15 @@ def test_a_marker_is_what_the_registers_hold() -> None:
         ({"deadband": -1}, "deadband", "allowed: a finite number from 0"),
         ({"min": 2, "max": 1}, "max", "max is 1, allowed: at least min, 2"),
         ({"type": "float32", "states": {0: "off"}}, "states", "states of float32"),
+        ({"type": "string:4", "states": {0: "off"}}, "states", "states of string:4"),
+        ({"type": "bytes:4", "states": {0: "off"}}, "states", "states of bytes:4"),
         ({"type": "float32", "round": "nearest"}, "round", "only with integers without states"),
         ({"states": {0: "off"}, "round": "nearest"}, "round", "round is nearest, allowed: only"),
         ({"type": "string:4", "round": "exact"}, "round", "only with integers without states"),
-        ({"states": {0: "off", 1: "off"}}, "states", "two states have the name 'off'"),
+        ({"states": {0: "on", 1: "off", 2: "off"}}, "states", "two states have the name 'off'"),
         ({"area": "input_registers", "writable": True}, "writable", "input_registers can't be"),
         ({"type": "bit:3[2]", "writable": True}, "writable", "only one bit can"),
-        ({"type": "uint16[124]", "writable": True}, "writable", "one request writes at most 123"),
+        ({"type": "uint16[124]", "writable": True}, "writable", "124 registers, one request"),
         (
             {"area": "coils", "type": "bool[1969]", "writable": True},
             "writable",
@@ -207,6 +221,20 @@ def test_a_tag_has_nothing_that_it_was_not_given() -> None:
     assert (made.min, made.max, made.value(7)) == (None, None, 7)
 
 
+def test_a_bit_has_no_order_of_bytes() -> None:
+    made = tag(area="coils", type="bool[3]", order="DCBA")
+    assert made == tag(area="coils", type="bool[3]")
+
+
+def test_the_address_may_be_an_integer_of_any_library() -> None:
+    class Integer:
+        def __index__(self) -> int:
+            return 7
+
+    made = tag(address=Integer())
+    assert (made.address, type(made.address)) == (7, int)
+
+
 def test_the_largest_tags_that_one_request_writes_are_writable() -> None:
     assert tag(type="uint16[123]", writable=True).writable
     assert tag(area="coils", type="bool[1968]", writable=True).writable
@@ -231,9 +259,14 @@ def tag_of(name: str) -> Tag:
     return Tag(name, "input_registers", 0, "float32", null=frozenset([1.5]))
 
 
+def test_a_tag_may_end_with_its_area() -> None:
+    assert tag(address=65535).end == tag(address=65534, type="float32").end == 65536
+
+
 def test_a_list_has_each_name_once() -> None:
-    with pytest.raises(TagError, match="two tags have the name 't'"):
+    with pytest.raises(TagError, match="two tags have the name 't'") as caught:
         TagList([tag(), tag(address=1)])
+    assert caught.value.key == "name"
 
 
 def test_a_list_is_a_table_of_its_tags() -> None:
@@ -250,6 +283,7 @@ def test_nan_as_marker_is_the_value_of_a_float() -> None:
     assert math.isnan(marker)
 
 
-def test_text_and_bits_are_written_as_they_are() -> None:
+def test_text_bits_and_floats_are_written_as_they_are() -> None:
     assert tag(type="string:4").raw("AB") == "AB"
+    assert repr(tag(type="float32").raw(-0.0)) == "-0.0"
     assert tag(area="coils", type="bool").raw(True) is True

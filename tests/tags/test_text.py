@@ -51,9 +51,19 @@ def float32(number: float) -> float:
         (tag(states={0: "off"}), 7, "7", 7),
         (tag("int16", scale=0.000125), 8, "0.001000", 0.001),
         (tag("int16", scale=0.0001251), 10, "0.001251", 0.001251),
+        (tag("float32", offset=-1), float32(1.1), "0.1", 0.1),
+        (tag("float32", offset=1), float32(-0.9), "0.1", 0.1),
+        (tag("float32", scale=2), float32(0.76377463), "1.52754926", 1.52754926),
         (tag("float32", scale=100), float32(1e38), "1e+40", 1e40),
         (tag("float32"), -math.inf, "-inf", None),
+        (tag("float32", scale=0.1), math.inf, "inf", None),
         (tag("float64", scale=0.001), 230.1, "0.2301", 0.2301),
+        (
+            tag("float64", scale=0.1),
+            0.5442292252959519,
+            "0.054422922529595186",
+            0.0544229225295951858,
+        ),
         (tag("float16"), 0.0999755859375, "0.1", 0.1),
         (tag("bool"), True, "true", True),
         (tag("bool"), False, "false", False),
@@ -141,7 +151,11 @@ def test_text_is_parsed_by_the_type_of_the_tag(it: Tag, text: str, value: Any) -
         (tag("float32"), "-,5e3", r"as in -\.5e3$"),
         (tag(), "1_000", "not a number"),
         (tag("bool"), "2", "'2' is not true, false, on, off, 1 or 0"),
-        (tag("bool", states={1: "open"}), "shut", "'shut' is not open, true"),
+        (
+            tag("bool", states={0: "closed", 1: "open"}),
+            "shut",
+            "'shut' is not closed, open, true, false, on, off, 1 or 0",
+        ),
         (tag("uint16[2]"), "1 2", "JSON array"),
         (tag("bytes:3"), "zz!", "base64"),
     ],
@@ -150,6 +164,19 @@ def test_text_is_parsed_by_the_type_of_the_tag(it: Tag, text: str, value: Any) -
 def test_text_that_is_no_value_is_refused(it: Tag, text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         value_from(it, text)
+
+
+def test_a_scale_without_decimal_places_gives_none() -> None:
+    assert text_of(tag("int16", scale=10, offset=5), 20.0) == "20"
+
+
+def test_no_value_is_no_text() -> None:
+    assert [text_of(tag("float32"), none) for none in (None, math.nan)] == ["", ""]
+
+
+def test_the_sign_of_zero_is_kept() -> None:
+    assert text_of(tag("float32"), -0.0) == "-0"
+    assert repr(plain(tag("float32"), -0.0)) == "-0.0"
 
 
 def test_a_value_beyond_its_registers_has_all_its_digits() -> None:

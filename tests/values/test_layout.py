@@ -124,6 +124,11 @@ def test_the_offset_of_a_field_may_be_an_integer_of_any_library() -> None:
     assert layout.encode({"a": 7}) == [0, 0, 0, 7, 0]
 
 
+def test_a_layout_may_be_a_whole_area() -> None:
+    assert Layout([("a", "uint16", 65535)]).size == 65536
+    assert [Layout([("a", "uint32", 1)], size=size).size for size in (3, 4, 65536)] == [3, 4, 65536]
+
+
 def test_a_layout_of_bools_decodes_bits() -> None:
     layout = Layout([("open", "bool", 0), ("doors", "bool[2]", 1)])
 
@@ -165,6 +170,7 @@ def test_gaps_are_zero_or_as_in_the_base() -> None:
         [("a", "bit:1", 0), ("b", "bit:1", 0, "CDAB")],
         [("a", "bit:1", 0), ("b", "bit:9", 0, "DCBA")],
         [("a", "uint16", 0), ("b", "bool", 0)],
+        [("a", "uint16", 0), ("b", "bit:15", 0)],
         [("a", "bit:1[3]", 0), ("b", "bit:1", 2)],
     ],
     ids=repr,
@@ -234,8 +240,13 @@ def test_every_field_has_a_value_and_every_value_a_field() -> None:
     ("fields", "error", "text"),
     [
         ([], values.InvalidLayout, "a layout requires at least one field"),
-        ([("a", "bool", 0)] * 2, values.InvalidLayout, "two fields have the name 'a'"),
+        (
+            [("b", "bool", 0), ("a", "bool", 0), ("a", "bool", 0)],
+            values.InvalidLayout,
+            "two fields have the name 'a'",
+        ),
         ([("a", "bool")], values.InvalidLayout, "a field is a tuple, allowed: a Field, or"),
+        ([("a", "bool", 0, "ABCD", None, 0)], values.InvalidLayout, "a field is a tuple, allowed"),
         ([{"name": "a"}], values.InvalidLayout, "a field is a dict, allowed: a Field, or"),
         (
             [("", "bool", 0)],
@@ -248,6 +259,7 @@ def test_every_field_has_a_value_and_every_value_a_field() -> None:
             "the name of a field is 5, allowed: non-empty text",
         ),
         ([("a", "bool", -1)], values.InvalidLayout, "a: offset -1, allowed: 0 to 65535"),
+        ([("a", "bool", 65536)], values.InvalidLayout, "a: offset 65536, allowed: 0 to 65535"),
         ([("a", "bool", True)], values.InvalidLayout, "a: offset True, allowed: 0 to 65535"),
         (
             [("a", "uint32", 65535)],

@@ -23,6 +23,7 @@ from holdfast import values
 from holdfast.values import ConversionError, codec_for, decode, encode, register_count
 from holdfast.values.integers import as_boolean
 from holdfast.values.orders import SWAPPED_BYTES
+from holdfast.values.types import parsed
 from support.cases import examples
 from support.paths import VECTORS
 
@@ -250,7 +251,31 @@ def test_the_package_does_not_import_numpy() -> None:
     assert [file for file in files if re.search(r"(import|from) numpy", file.read_text())] == []
 
 
+@pytest.mark.parametrize(("machine", "number"), [("little", 0x0100), ("big", 0x0001)])
+def test_integers_without_a_byte_order_have_that_of_the_machine(
+    monkeypatch: pytest.MonkeyPatch, machine: str, number: int
+) -> None:
+    numpy = pytest.importorskip("numpy")
+    data = b"\x00\x01"
+    native = memoryview(data)
+    big, little = ctypes.c_uint16.__ctype_be__ * 1, ctypes.c_uint16.__ctype_le__ * 1
+    unaligned = memoryview(numpy.frombuffer(b"?" + data, "u2", offset=1))
+    forms = (native.cast("H"), native.cast("@H"), unaligned)
+    monkeypatch.setattr(sys, "byteorder", machine)
+    assert [form.format for form in forms] == ["H", "@H", "=H"]
+    assert [decode(form, "uint16") for form in forms] == [number] * 3
+    assert [decode(form, "uint16") for form in (big(7), little(7))] == [7, 7]
+
+
 # Types
+
+
+def test_the_name_of_a_type_has_up_to_four_parts() -> None:
+    whole, single = parsed("string:5[3]"), parsed("uint16")
+    assert (whole.element, whole.base, whole.parameter) == ("string:5", "string", 5)
+    assert (whole.width, whole.count, whole.registers) == (6, 3, 9)
+    assert (single.element, single.base, single.parameter) == ("uint16", "uint16", 0)
+    assert (single.width, single.count, single.registers) == (2, None, 1)
 
 
 @pytest.mark.parametrize(("name", "size"), SIZES.items())
@@ -470,6 +495,13 @@ def test_a_register_is_an_integer_of_16_bits(register: Any, text: str, form: Any
         decode(form([0, register]), "uint32")
 
 
+class Endless:
+    """Items without an end."""
+
+    def __getitem__(self, at: int) -> int:
+        return at
+
+
 @pytest.mark.parametrize(
     ("registers", "found"),
     [
@@ -482,6 +514,9 @@ def test_a_register_is_an_integer_of_16_bits(register: Any, text: str, form: Any
         (array("h", [1, 2]), "a buffer of format 'h', dimensions 1"),
         (array("d", [1, 2]), "a buffer of format 'd', dimensions 1"),
         (memoryview(bytes(4)).cast("B", (2, 2)), "a buffer of format 'B', dimensions 2"),
+        (memoryview(bytes(8)).cast("H", (2, 2)), "a buffer of format 'H', dimensions 2"),
+        (memoryview(bytes(4)).cast("?", (2, 2)), "a buffer of format '?', dimensions 2"),
+        (Endless(), "a Endless"),
     ],
     ids=lambda each: each if isinstance(each, str) else type(each).__name__,
 )
@@ -565,7 +600,11 @@ def test_what_is_no_number_is_refused(name: str, value: Any) -> None:
 
 @pytest.mark.parametrize(("name", "most"), MAX_VALUE.items())
 def test_a_float_too_large_is_refused_and_no_infinity(name: str, most: float) -> None:
-    beyond: list[float] = [10**400] if name == "float64" else [most * 1.01, 1e300, 10**400]
+    beyond: list[Any] = (
+        [10**400, Fraction(10**400)]
+        if name == "float64"
+        else [most * 1.01, 1e300, Fraction(10**400)]
+    )
     for value in (most, -most):
         assert decode(encode(value, name), name) == value
     for value in (*beyond, *(-value for value in beyond)):

@@ -126,7 +126,8 @@ def _layout(count: int, *fields: tuple[str, int, str, str | None]) -> Layout:
 def value_of(tag: BaseTag, data: bytes, address: int) -> Any:
     """Decodes one tag of a block that begins at `address`."""
     if tag.of_bits:
-        return _bits([tag], address)(data)[0]
+        [value] = _bits([tag], address)(data)
+        return value
     raw = _alone(tag, data, address)
     source = tag.source
     return raw if source is None else _scaled(tag, raw, _alone(source, data, address))
@@ -145,11 +146,11 @@ def assembled(tag: BaseTag, pieces: Sequence[tuple[int, bytes]]) -> bytes | None
             _unpacked(data) if tag.of_bits else [data[at : at + 2] for at in range(0, len(data), 2)]
         )
         units.update(enumerate(of_piece, address))
-    content = [units.get(address) for address in range(tag.address, tag.end)]
+    content: list[Any] = [units.get(address) for address in range(tag.address, tag.end)]
     if None in content:
         return None
     if not tag.of_bits:
-        return b"".join(unit for unit in content if isinstance(unit, bytes))
+        return b"".join(content)
     packed = sum(1 << at for at, bit in enumerate(content) if bit)
     return packed.to_bytes((len(content) + 7) // 8, "little")
 

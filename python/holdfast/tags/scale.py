@@ -48,7 +48,7 @@ class RegisterScale:
     def factor(self, content: Any) -> float:
         """The scale for the decoded content of the register. Raises `ValueError` without one."""
         assert self.source is not None, "a tag list finds the registers of all scales"
-        value = self.source.value(content)
+        value: float | None = self.source.value(content)
         if value is None:
             raise ValueError(f"the scale in {self.where} has no value")
         if self.form == "exponent":
@@ -59,9 +59,9 @@ class RegisterScale:
         if value == 0 or not is_finite(value):
             allowed = "a finite number other than 0"
             raise ValueError(f"the scale in {self.where} is {value}, allowed: {allowed}")
-        if value == content and isinstance(value, float):
+        if isinstance(value, float) and value == content:
             return float(shortest(value, parsed(self.source.type).base))
-        return float(value) if isinstance(value, float) else int(value)
+        return value
 
     def linear(self, content: Any, offset: float) -> Linear:
         """Scale and offset for the decoded content of the register. Raises `ValueError`."""
@@ -94,8 +94,6 @@ class Linear:
 
     def value(self, number: float | Fraction) -> int | float:
         """The value of a number in the registers; an integer if everything is one."""
-        if isinstance(number, float) and not math.isfinite(number):
-            return number
         try:
             if isinstance(number, int):
                 scaled = number * self._times + self._plus

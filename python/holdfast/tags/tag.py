@@ -131,8 +131,9 @@ class Tag(WritableTag):
     def _check_source(self) -> None:
         """A scale must be readable in the request that reads the value."""
         source = self.source
-        if source is None or not isinstance(self.scale, RegisterScale):
+        if source is None:
             return
+        assert isinstance(self.scale, RegisterScale), "only such tags have a register for it"
         found = f"the scale is from {self.scale.where}"
         if source.area != self.area:
             raise TagError("scale", f"{found}, allowed: a register in {self.area}, as the value")
@@ -220,7 +221,7 @@ class Tag(WritableTag):
             return [self._value(item, linear) for item in raw]
         if self.is_null(raw):
             return None
-        if linear.is_identity or not self.is_number:
+        if linear.is_identity:
             return float(raw) if isinstance(raw, Fraction) else raw
         return linear.value(raw)
 

@@ -126,11 +126,8 @@ def _places(scale: float | RegisterScale, offset: float) -> int | None:
     """The decimal places of all scaled integers; `None` for too many, and if they may change."""
     if isinstance(scale, RegisterScale):
         return None
-    found = 0
-    for number in (scale, offset):
-        text = repr(float(number))
-        if "e" in text:
-            return None
-        places = 0 if text.endswith(".0") else len(text.partition(".")[2])
-        found = max(found, places)
+    texts = [repr(float(number)).removesuffix(".0") for number in (scale, offset)]
+    if any("e" in text for text in texts):
+        return None
+    found = max(len(text.partition(".")[2]) for text in texts)
     return found if found <= MAX_PLACES else None

@@ -102,8 +102,10 @@ class WritableTag(BaseTag):
     def _check_limits(self, value: float, found: str) -> None:
         least, most = self.min, self.max
         if (least is not None and value < least) or (most is not None and value > most):
-            allowed = f"{'' if least is None else least} to {'' if most is None else most}"
-            raise DoesNotFit(f"{found} outside {allowed.strip()}")
+            allowed = (
+                f"{'' if least is None else f'{least} '}to{'' if most is None else f' {most}'}"
+            )
+            raise DoesNotFit(f"{found} outside {allowed}")
 
     def _named(self, name: str) -> int:
         for value, known in self.states.items():

@@ -14,7 +14,7 @@ def shortest(value: float, kind: str) -> str:
     if abs(value) < LARGE and value == int(value):
         return f"{value:.0f}"
     if kind in ("float16", "float32"):
-        form = FLOATS[kind]
+        form = f">{FLOATS[kind]}"  # Without a mark, what is too large would be infinite.
         for digits in range(1, MAX_DIGITS):
             text = f"{value:.{digits}g}"
             try:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -161,11 +162,9 @@ def _overlap(fields: tuple[Field, ...], codecs: list[Codec]) -> tuple[str, str] 
         for entry, codec in zip(fields, codecs, strict=True)
         for start, end in _extents(entry.offset, codec)
     )
-    furthest, holder = 0, ""
-    for start, end, name in extents:
-        if start < furthest:
+    for (_, end, holder), (start, _, name) in pairwise(extents):
+        if start < end:
             return holder, name
-        furthest, holder = end, name
     return None
 
 
@@ -239,7 +238,7 @@ class _Pass:
         if codec.swapped is not self.swapped or codec.kind.mark != self._mark:
             return None
         key = start, codec.item
-        if key not in self._places and start >= self._end:
+        if start >= self._end:
             self._form += f"{start - self._end}x{codec.item}"
             self._end = start + 2 * codec.type.registers
             self._places[key] = len(self._places)
@@ -257,7 +256,7 @@ def _placed(passes: list[_Pass], codec: Codec, start: int) -> tuple[_Pass, int]:
         if place is not None:
             return one, place
     passes.append(_Pass(codec))
-    return _placed(passes[-1:], codec, start)
+    return _placed(passes, codec, start)
 
 
 def _sources(passes: list[_Pass], places: list[tuple[_Pass, int]]) -> list[int]:

@@ -40,7 +40,8 @@ class Number(Kind):
             self.item = f"{self.width}s"
             self.finish = self.unpack_one
         self._one = struct.Struct(f"{self.mark}{code}")
-        self._many = struct.Struct(f"{self.mark}{type.count or 1}{code}")
+        many = self.mark + code if type.count is None else f"{self.mark}{type.count}{code}"
+        self._many = struct.Struct(many)
 
     def unpack_one(self, data: bytes) -> Any:
         """The number."""
@@ -52,9 +53,9 @@ class Number(Kind):
 
     def pack_one(self, value: Any) -> bytes:
         """The bytes of a number. Raises `DoesNotFit`."""
-        if type(value) not in self.plain:
-            value = self._number(value)
         try:
+            if type(value) not in self.plain:
+                value = self._number(value)
             data = self._one.pack(value)
         except (struct.error, OverflowError):
             raise self._too_large(value) from None
@@ -111,10 +112,10 @@ class Float(Number):
         super().__init__(type, order, FLOATS[type.base])
         self._most = MAX[type.base]
 
-    def _number(self, value: Any) -> float | int:
+    def _number(self, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, Real):
             raise DoesNotFit(f"{shown(value)} is not a number, which {self.name} requires")
-        return value if isinstance(value, int) else float(value)
+        return float(value)
 
     def _too_large(self, value: Any) -> DoesNotFit:
         allowed = f"{-self._most} to {self._most} of {self.name}"

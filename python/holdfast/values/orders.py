@@ -91,7 +91,7 @@ def _flaw(name: str) -> str | None:
     if sorted(name) != list(LETTERS):
         return "is unknown, allowed with eight letters: A to H once each"
     places = _places(name)
-    if any(places[at] // 2 != places[at + 1] // 2 for at in range(0, 8, 2)):
+    if any(one // 2 != other // 2 for one, other in zip(places[::2], places[1::2], strict=True)):
         return "splits a register, allowed: AB, CD, EF and GH together"
     if any(places[source] != place for place, source in enumerate(places)):
         return "is not its own inverse"
