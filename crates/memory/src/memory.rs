@@ -1127,6 +1127,20 @@ mod tests {
     }
 
     #[test]
+    fn a_journal_that_does_not_guard_is_not_asked_for_a_sealed_memory_either() {
+        let layout = Layout::default().with(Area::Coils, Span::new(0, 20).unwrap());
+        let gate = Gate { area: Area::Coils, address: 3, mode: GateMode::Level };
+        let memory = Arc::new(Memory::new(layout, Some(gate)).unwrap());
+        let refusal = std::sync::Mutex::new(Some(Refusal::Behind));
+        let guard = Guard { guards: false, refusal, members: Arc::downgrade(&memory) };
+        memory.keep_in(Arc::new(guard) as Arc<dyn Journal>, 0);
+        let mut out = [0];
+        let read = Read { area: Area::Coils, address: 0, count: 1, out: &mut out };
+        assert_eq!(memory.read(Access::Ingest, read), Ok(()));
+        assert_eq!(memory.write(Access::Restore, writing(Area::Coils, 4, &[1])), Ok(()));
+    }
+
+    #[test]
     fn the_seal_of_a_guarded_memory_still_opens_and_closes() {
         let span = Span::new(0, 20).unwrap();
         let layout = Layout::default().with(Area::Coils, span);

@@ -135,6 +135,17 @@ fn what_an_incomplete_write_swallows_is_never_found() {
     assert_eq!((seen.frames, seen.damaged, seen.is_at_start), (vec![], 1, false));
 }
 
+#[test]
+fn behind_a_request_of_known_length_the_next_one_begins() {
+    for (pdu, is_at_start) in [(&[43, 14, 1, 0][..], true), (&[17], true), (&[0x41, 1], false)] {
+        let mut requests = Requests::default();
+        let frame = frame(7, pdu);
+        let next = Next::Frame { unit_id: 7, pdu, len: frame.len() };
+        assert_eq!(requests.next(&frame), next);
+        assert_eq!(requests.is_at_start(), is_at_start, "{pdu:?}");
+    }
+}
+
 fn stream() -> impl Strategy<Value = Vec<u8>> {
     let code = prop_oneof![prop::sample::select(vec![3, 7, 16, 17, 23, 24, 43]), any::<u8>()];
     let unit = prop_oneof![0..3_u8, any::<u8>()];

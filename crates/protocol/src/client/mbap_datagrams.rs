@@ -182,3 +182,16 @@ fn write(flights: &mut Flights) {
         flights.out = [&header[..], pdu].concat();
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn transaction_ids_are_the_high_bits_of_splitmix64() {
+        // The first numbers of the generator after 0 are E220A8397B1DCDAF, 6E789E6AA1B965F4 and
+        // 06C45D188009454F.
+        let mut state = 0;
+        assert_eq!([(); 3].map(|()| split_mix(&mut state)), [0xE220, 0x6E78, 0x06C4]);
+    }
+}
