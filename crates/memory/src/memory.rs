@@ -978,6 +978,8 @@ mod tests {
             }
             assert_eq!(accesses(&memory, access, 0, 5), [Ok(()); 6]);
             assert_eq!(accesses(&memory, access, 8, 4), [Ok(()); 6]);
+            let own = Read { area: REGISTERS, address: 5, count: 3, out: &mut [0; 6] };
+            assert_eq!(memory.read(Access::Mirror, own), Ok(()));
             let outside = Read { area: REGISTERS, address: 7, count: 20, out: &mut [0; 40] };
             assert_eq!(memory.read(access, outside), Err(Refusal::OutOfRange));
             memory.write(Access::Mirror, writing(REGISTERS, 6, &[1; 4])).unwrap();

@@ -77,6 +77,12 @@ fn a_file_of_a_layout_can_be_replaced_and_removed() {
     assert_eq!(layout.byte_lens(), [0; 4]);
 }
 
+#[test]
+fn a_span_has_its_bounds() {
+    let span = span(100, 50);
+    assert_eq!((span.start(), span.size(), span.end()), (100, 50, 150));
+}
+
 fn gated(mode: GateMode) -> Memory {
     let layout = Layout::default().with(Area::Coils, span(100, 50));
     Memory::new(layout, Some(Gate { area: Area::Coils, address: 111, mode })).unwrap()

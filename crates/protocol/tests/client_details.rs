@@ -109,6 +109,7 @@ fn random_transaction_ids_depend_on_the_whole_seed() {
         assert_eq!(first(Transport::Tcp, 0xABCD << shift), 0xABCD);
     }
     assert_eq!(first(Transport::Tcp, 0x0001_0003_0010_0030), 0x22);
+    assert_eq!(first(Transport::Tcp, 0x0000_0003_0001_0003), 1);
     assert_eq!(first(Transport::Udp, 0), 0xE220, "SplitMix64");
 }
 
@@ -294,6 +295,110 @@ fn a_reply_whose_count_is_that_of_an_exception_of_a_gateway_is_no_exception() {
     assert!(!client.outgoing().is_empty());
 }
 
+#[test]
+fn only_behind_the_exception_of_a_gateway_without_a_reply_one_may_follow() {
+    for (code, may_follow) in [(2, false), (11, true)] {
+        let mut client = Client::new(RTU, Tolerance::default());
+        (0..10).for_each(|number| client.read_in_time(number, false));
+        client.send(&read(1));
+        client.after(SILENCE);
+        client.outgoing();
+        client.after(30 * MS);
+        client.receive(&rtu_frame(&[0x83, code]));
+        assert_eq!(client.got(), [Err(Failure::Exception(code))]);
+        client.send(&read(1));
+        client.after(SILENCE);
+        assert_eq!(client.outgoing().is_empty(), may_follow, "{code}");
+    }
+}
+
+#[test]
+fn another_frame_right_behind_a_reply_contradicts_it_unless_replies_are_padded() {
+    let frames = [rtu_frame(&[3, 2, 0, 1]), rtu_frame(&[3, 2, 0, 2])].concat();
+    let unrequested = Failure::Invalid(InvalidResponse::Unrequested);
+    for (pad, expected) in [(false, Err(unrequested)), (true, Ok(vec![3, 2, 0, 1]))] {
+        let mut client = Client::new(RTU, Tolerance { pad, ..Tolerance::default() });
+        client.send(&read(1));
+        client.receive(&frames);
+        assert_eq!(client.got(), [expected]);
+    }
+}
+
+#[test]
+fn stray_bytes_that_look_like_a_longer_reply_of_another_unit_do_not_hide_one() {
+    let mut client = Client::new(RTU, Tolerance::default());
+    client.send(&read(1));
+    client.receive(&[&[9, 3, 200][..], &rtu_frame(&[3, 2, 0, 1])].concat());
+    assert_eq!(client.got(), [Ok(vec![3, 2, 0, 1])]);
+
+    let mut client = Client::new(RTU, Tolerance::default());
+    client.send(&read(1));
+    let mut frame = [0; rtu::MAX_LEN];
+    let len = rtu::encode(8, &[3, 2, 0, 1], &mut frame).unwrap();
+    client.receive(&[&[0][..], &frame[..len]].concat());
+    assert_eq!(client.got(), [], "behind a stray byte, the reply of another unit is stray too");
+}
+
+#[test]
+fn more_characters_than_an_echo_and_a_reply_have_are_too_long() {
+    let most = 2 * ascii::MAX_LEN;
+    for (lens, bytes) in [([most - 1, 1], most), ([most - 1, 9], most + 8), ([most, 0], most)] {
+        let mut client = Client::new(Transport::AsciiOverTcp, Tolerance::default());
+        client.send(&read(1));
+        client.receive(&vec![b'0'; lens[0]]);
+        let is_closed = client.connection.closed().is_some();
+        assert_eq!(is_closed, lens[0] == most);
+        client.receive(&vec![b'0'; lens[1]]);
+        let too_long = InvalidResponse::TooLong;
+        assert_eq!(client.got(), [Err(Failure::Invalid(too_long))]);
+        let strays = Strays { replies: 0, bytes: bytes as u64 };
+        assert_eq!(client.connection.take_strays(), strays);
+    }
+}
+
+#[test]
+fn only_a_datagram_may_be_empty_and_it_is_malformed() {
+    for (transport, closed) in [
+        (Transport::Tcp, None),
+        (RTU, None),
+        (Transport::Udp, Some(Closed::Invalid(InvalidResponse::Datagram))),
+    ] {
+        let mut client = Client::new(transport, Tolerance::default());
+        client.send(&read(1));
+        assert_eq!(client.connection.in_flight(), 1);
+        client.receive(&[]);
+        assert_eq!(client.connection.closed(), closed);
+        assert_eq!(client.connection.in_flight(), usize::from(closed.is_none()));
+        client.close();
+        client.got();
+        client.receive(&mbap_frame(0, &[3, 2, 0, 1]));
+        assert_eq!((client.got(), client.connection.take_strays()), (vec![], Strays::default()));
+    }
+}
+
+#[test]
+fn each_invalid_response_has_a_word_for_programs() {
+    use holdfast_protocol::frame::FrameError;
+    use holdfast_protocol::pdu::ResponseError;
+
+    for (invalid, word) in [
+        (InvalidResponse::ProtocolId(1), "protocol_id"),
+        (InvalidResponse::Length(1), "length"),
+        (InvalidResponse::TransactionId(1), "transaction_id"),
+        (InvalidResponse::UnitId { expected: 1, found: 2 }, "unit_id"),
+        (InvalidResponse::Pdu(ResponseError::Function { expected: 1, found: 2 }), "function"),
+        (InvalidResponse::Pdu(ResponseError::Echo), "echo"),
+        (InvalidResponse::Pdu(ResponseError::Length), "length"),
+        (InvalidResponse::Frame(FrameError::CheckSum), "checksum"),
+        (InvalidResponse::Frame(FrameError::Length), "frame"),
+        (InvalidResponse::Datagram, "datagram"),
+        (InvalidResponse::TooLong, "too_long"),
+        (InvalidResponse::Unrequested, "unrequested"),
+    ] {
+        assert_eq!(invalid.reason(), word);
+    }
+}
+
 /// A connection that has had one echo, and now the bytes of one that may also be the reply.
 fn with_what_may_be_an_echo(transport: Transport) -> Client {
     let mut client = Client::new(transport, Tolerance::default());
@@ -331,8 +436,10 @@ fn what_a_stream_has_brought_before_it_ends_is_a_reply_unless_it_may_be_an_echo(
     client.after(SECOND / 10);
     let other = Request::ReadHoldingRegisters(Range::new(4, 1).unwrap());
     client.send(&EncodedRequest::new(&other));
+    client.after(50 * MS);
     client.receive(&rtu_frame(&[3, 2, 0, 1]));
     assert_eq!(client.got(), [], "it may be a copy of the reply before");
+    assert_eq!(client.connection.deadline(), Some(client.now + GUARD));
     client.close();
     assert_eq!(client.got(), [Ok(vec![3, 2, 0, 1])]);
 }
@@ -376,6 +483,35 @@ fn the_reply_to_an_opaque_request_ends_where_its_crc_fits() {
     }
     let request = EncodedRequest::opaque(&[3, 0, 3, 0, 1]).unwrap();
     assert_eq!(request.response(&[3, 2, 0, 7]), Ok(Response::Opaque(&[2, 0, 7])));
+}
+
+#[test]
+fn a_reply_may_come_as_soon_as_the_line_can_have_carried_it_and_no_sooner() {
+    // The characters of the request and the reply, 1 ms each.
+    for (transport, least) in [(RTU, 8 + 7), (Transport::SerialAscii { silence: SILENCE }, 17 + 15)]
+    {
+        for (early, expected) in [(Duration::ZERO, vec![Ok(vec![3, 2, 0, 7])]), (MS, vec![])] {
+            let frame = |value| {
+                let mut frame = [0; ascii::MAX_LEN];
+                let len = ascii::encode(7, &[3, 2, 0, value], &mut frame).unwrap();
+                if transport == RTU { rtu_frame(&[3, 2, 0, value]) } else { frame[..len].to_vec() }
+            };
+            let mut client = Client::new(transport, Tolerance::default());
+            client.connection = Connection::new(transport).on_line(MS);
+            client.send(&read(1));
+            client.after(50 * MS);
+            client.receive(&frame(1));
+            assert_eq!(client.got(), [Ok(vec![3, 2, 0, 1])]);
+            // From now on, a fast reply does not show that the line is faster than its settings.
+            client.after(SECOND);
+            client.receive(&frame(2));
+            client.after(SECOND);
+            client.send(&read(1));
+            client.after(MS * least - early);
+            client.receive(&frame(7));
+            assert_eq!(client.got(), expected, "{transport:?} {early:?}");
+        }
+    }
 }
 
 #[test]

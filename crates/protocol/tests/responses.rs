@@ -382,4 +382,21 @@ fn a_range_of_a_file_has_its_parts_and_a_pdu_its_function() {
     assert_eq!(Function::from_pdu(&[3, 0]), Some(Function::ReadHoldingRegisters));
     assert_eq!(Function::from_pdu(&[0x83, 1]), None);
     assert_eq!(Function::from_pdu(&[]), None);
+    let echo = Some(SubFunction::ReturnQueryData);
+    assert_eq!(SubFunction::from_pdu(&[8, 0, 0]), echo);
+    assert_eq!(SubFunction::from_pdu(&[8, 0]), None);
+}
+
+#[test]
+fn a_write_whose_byte_count_or_quantity_does_not_fit_is_an_illegal_value() {
+    assert!(Request::parse(&[16, 0, 0, 0, 1, 2, 0, 7]).is_ok());
+    for pdu in [
+        &[16, 0, 0, 0, 1, 2, 0, 7, 0][..],
+        &[16, 0, 0, 0, 1, 2, 0],
+        &[16, 0, 0, 0, 1, 4, 0, 7],
+        &[16, 0, 0, 0, 2, 2, 0, 7],
+        &[16, 0, 0, 0, 0, 0],
+    ] {
+        assert_eq!(Request::parse(pdu), Err(ExceptionCode::IllegalDataValue), "{pdu:?}");
+    }
 }

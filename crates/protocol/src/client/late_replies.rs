@@ -502,6 +502,10 @@ mod tests {
         let unchanged = (ms(600), Time::ZERO);
         let changed = (ms(810), START + ms(245));
         assert!(times.eq([changed, unchanged, unchanged]));
+        assert_eq!(replies.late(0, START + ms(244)), Duration::ZERO, "a copy of the other reply");
+        assert_eq!(replies.late(0, START + ms(245)), ms(245));
+        assert_eq!(replies.late(0, START + ms(9_000)), ms(600), "at most as late as expected");
+        assert_eq!(replies.unanswered().count(), 1);
     }
 
     #[test]

@@ -171,7 +171,8 @@ fn split_mix(state: &mut u64) -> u16 {
     *state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
     let mixed = (*state ^ (*state >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
     let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    ((mixed ^ (mixed >> 31)) >> 48) as u16
+    // The last step of the generator changes only lower bits.
+    (mixed >> 48) as u16
 }
 
 /// Writes the datagram of the request in flight.
