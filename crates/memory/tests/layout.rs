@@ -16,9 +16,9 @@ fn bit(bytes: &[u8], at: usize) -> bool {
 
 #[test]
 fn items_are_copied_from_any_place_to_any_other_and_those_around_them_stay() {
-    let mut registers = [0xEE; 10];
-    REGISTERS.copy(&[1, 2, 3, 4, 5, 6, 7, 8], 1, &mut registers, 2, 2);
-    assert_eq!(registers, [0xEE, 0xEE, 0xEE, 0xEE, 3, 4, 5, 6, 0xEE, 0xEE]);
+    let mut registers = [0xEE; 12];
+    REGISTERS.copy(&[1, 2, 3, 4, 5, 6, 7, 8], 1, &mut registers, 3, 2);
+    assert_eq!(registers, [0xEE, 0xEE, 0xEE, 0xEE, 0xEE, 0xEE, 3, 4, 5, 6, 0xEE, 0xEE]);
     let from = [0b1011_0010, 0b0110_1101, 0b1100_0101];
     for (at, to) in (0..14).flat_map(|at| (0..14).map(move |to| (at, to))) {
         for before in [0x00, 0xFF] {
@@ -136,6 +136,17 @@ fn a_queue_of_writes_has_room_for_4096_and_one_mebibyte_of_values() {
         }
         assert_eq!(queue.next(Duration::ZERO), None);
     }
+    (0..8).for_each(|number| write(&[number; 128 * 1024]));
+    queue.next(Duration::ZERO).unwrap();
+    (8..10).for_each(|number| write(&[number; 128 * 1024]));
+    assert_eq!(queue.dropped(), 3);
+}
+
+#[test]
+fn ranges_that_mirror_a_device_do_not_change_the_seal() {
+    let memory = gated(GateMode::Level);
+    memory.mirror(vec![holdfast_memory::Mirrored::reserved(Area::Coils, 120, 3)]).unwrap();
+    assert!(memory.sealed());
 }
 
 #[test]

@@ -426,6 +426,33 @@ fn a_reply_that_follows_an_equal_echo_is_believed_when_it_is_complete() {
 }
 
 #[test]
+fn what_may_have_been_an_echo_is_no_reply_which_may_still_come() {
+    let mut client = with_what_may_be_an_echo(RTU);
+    client.after(SECOND);
+    assert_eq!(client.got(), [Err(Failure::Timeout)]);
+    client.send(&EncodedRequest::parse(&COILS).unwrap());
+    client.after(GUARD);
+    assert_eq!(client.outgoing(), []);
+}
+
+#[test]
+fn noise_behind_a_reply_that_is_doubted_is_counted() {
+    let mut client = Client::new(RTU, Tolerance::default());
+    client.read_in_time(1, false);
+    client.after(SECOND / 10);
+    let other = Request::ReadHoldingRegisters(Range::new(4, 1).unwrap());
+    client.send(&EncodedRequest::new(&other));
+    client.after(30 * MS);
+    client.receive(&rtu_frame(&[3, 2, 0, 1]));
+    assert_eq!(client.got(), []);
+    client.receive(&[7]);
+    client.receive(&[0]);
+    client.after(SECOND / 10);
+    assert_eq!(client.got(), [Ok(vec![3, 2, 0, 1])]);
+    assert_eq!(client.connection.take_strays(), Strays { replies: 0, bytes: 2 });
+}
+
+#[test]
 fn what_a_stream_has_brought_before_it_ends_is_a_reply_unless_it_may_be_an_echo() {
     let mut client = with_what_may_be_an_echo(Transport::RtuOverTcp);
     client.close();

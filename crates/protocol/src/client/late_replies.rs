@@ -528,6 +528,19 @@ mod tests {
     }
 
     #[test]
+    fn a_reply_is_doubtful_after_one_of_its_function_that_never_came() {
+        let mut replies = LateReplies::default();
+        until(&mut replies, 200, Ended::TimedOut, 200);
+        for (at, is_doubtful) in [(599, false), (600, true)] {
+            replies.expire(START + ms(at));
+            assert_eq!(replies.is_doubtful((1, &[3, 1]), &[1], START), is_doubtful, "{at}");
+        }
+        assert!(!replies.is_doubtful((1, &[4, 1]), &[1], START));
+        replies.believed((1, &[3, 1]), &[1], true, START);
+        assert!(!replies.is_doubtful((1, &[3, 1]), &[1], START));
+    }
+
+    #[test]
     fn sixteen_replies_are_compared_and_after_eight_wrong_doubts_none() {
         let mut replies = LateReplies::default();
         (0..16).for_each(|number| replies.believed((1, &[3, number]), &[number], false, START));
