@@ -5,7 +5,7 @@ mod support;
 use holdfast_protocol::frame::rtu;
 use holdfast_protocol::pdu::{
     self, EncodedRequest, ExceptionCode, FileRange, FileRanges, FileRecords, Function,
-    RegisterRange, Request, Response, ResponseError, SubFunction, reply,
+    RegisterRange, Registers, Request, RequestError, Response, ResponseError, SubFunction, reply,
 };
 use proptest::prelude::*;
 use support::a_request;
@@ -399,4 +399,22 @@ fn a_write_whose_byte_count_or_quantity_does_not_fit_is_an_illegal_value() {
     ] {
         assert_eq!(Request::parse(pdu), Err(ExceptionCode::IllegalDataValue), "{pdu:?}");
     }
+}
+
+#[test]
+fn more_values_than_a_request_holds_are_not_packed() {
+    let mut room = [0; pdu::MAX_LEN];
+    let refused = |found| RequestError::Quantity { found, max: 123 };
+    for found in [0, 124, 1000] {
+        let packed = Registers::<123>::pack(&vec![7; found], &mut room);
+        assert_eq!(packed.unwrap_err(), refused(found));
+    }
+}
+
+#[test]
+fn an_encoded_request_is_shown_as_its_parts_or_its_bytes() {
+    let opaque = EncodedRequest::opaque(&[66, 1]).unwrap();
+    assert_eq!(format!("{opaque:?}"), "EncodedRequest([66, 1])");
+    let known = EncodedRequest::new(&Request::ReadExceptionStatus);
+    assert_eq!(format!("{known:?}"), "EncodedRequest(ReadExceptionStatus)");
 }

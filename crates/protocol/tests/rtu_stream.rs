@@ -173,6 +173,13 @@ fn of_two_frames_after_an_unknown_function_the_one_that_ends_first_is_found() {
     both.extend(rtu::crc(&both).to_le_bytes());
     let seen = seen_however_cut(&[frame(7, &[0x41, 1]), both].concat());
     assert_eq!(units(&seen), [7, 16]);
+
+    // A write to unit 0, in which a write to unit 16 begins that ends later.
+    let zero = frame(0, &[16, 16, 0, 0, 1, 1, 4]);
+    let mut later = [&zero[1..], &[1, 7]].concat();
+    later.extend(rtu::crc(&later).to_le_bytes());
+    let seen = seen_however_cut(&[frame(7, &[0x41, 1]), vec![0], later].concat());
+    assert_eq!(units(&seen), [7, 0]);
 }
 
 #[test]
