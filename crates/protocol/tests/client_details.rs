@@ -545,7 +545,8 @@ fn a_reply_may_come_as_soon_as_the_line_can_have_carried_it_and_no_sooner() {
 fn a_line_of_characters_may_have_small_letters() {
     let mut body = [0; ascii::MAX_BODY_LEN];
     for line in [&b":0A03024AFAAD\r\n"[..], b":0a03024afaad\r\n"] {
-        let line: Vec<u8> = line.to_vec();
-        assert_eq!(ascii::decode(&line, &mut body), Ok((10, &[3, 2, 0x4A, 0xFA][..])));
+        assert_eq!(ascii::decode(line, &mut body), Ok((10, &[3, 2, 0x4A, 0xFA][..])));
     }
+    let length = Err(holdfast_protocol::frame::FrameError::Length);
+    assert_eq!(ascii::decode(b":07F9\r\n", &mut body), length, "it has no PDU");
 }
