@@ -70,3 +70,40 @@ pub(crate) fn flatten<'w>(writes: impl Iterator<Item = &'w Write<'w>> + Clone) -
     );
     runs
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn flattened(area: Area, writes: &[(u16, usize, &[u8])]) -> Vec<(u16, usize, Vec<u8>)> {
+        let write = |&(address, count, bytes)| Write { area, address, count, bytes };
+        let writes: Vec<Write> = writes.iter().map(write).collect();
+        let runs = flatten(writes.iter()).into_iter();
+        runs.map(|run| (run.address, run.count, run.bytes)).collect()
+    }
+
+    #[test]
+    fn runs_have_the_last_value_of_each_item_and_end_at_gaps() {
+        assert_eq!(
+            flattened(
+                Area::HoldingRegisters,
+                &[
+                    (30, 1, &[7, 7]),
+                    (10, 2, &[1, 1, 2, 2]),
+                    (20, 1, &[3, 3]),
+                    (11, 1, &[9, 9]),
+                    (21, 1, &[4, 4]),
+                ]
+            ),
+            [(10, 2, vec![1, 1, 9, 9]), (20, 2, vec![3, 3, 4, 4]), (30, 1, vec![7, 7])]
+        );
+        assert_eq!(
+            flattened(
+                Area::Coils,
+                &[(3, 9, &[0xFF, 0xFF]), (20, 3, &[0b101]), (5, 2, &[0b10]), (40, 1, &[1])]
+            ),
+            [(3, 9, vec![0b1111_1011, 1]), (20, 3, vec![0b101]), (40, 1, vec![1])]
+        );
+        assert!(flattened(Area::Coils, &[]).is_empty());
+    }
+}

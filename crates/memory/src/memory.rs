@@ -978,6 +978,8 @@ mod tests {
             }
             assert_eq!(accesses(&memory, access, 0, 5), [Ok(()); 6]);
             assert_eq!(accesses(&memory, access, 8, 4), [Ok(()); 6]);
+            let own = Read { area: REGISTERS, address: 5, count: 3, out: &mut [0; 6] };
+            assert_eq!(memory.read(Access::Mirror, own), Ok(()));
             let outside = Read { area: REGISTERS, address: 7, count: 20, out: &mut [0; 40] };
             assert_eq!(memory.read(access, outside), Err(Refusal::OutOfRange));
             memory.write(Access::Mirror, writing(REGISTERS, 6, &[1; 4])).unwrap();
@@ -1124,6 +1126,20 @@ mod tests {
             memory.read(Access::Client, read).unwrap();
             assert_eq!(out, [3, 4]);
         }
+    }
+
+    #[test]
+    fn a_journal_that_does_not_guard_is_not_asked_for_a_sealed_memory_either() {
+        let layout = Layout::default().with(Area::Coils, Span::new(0, 20).unwrap());
+        let gate = Gate { area: Area::Coils, address: 3, mode: GateMode::Level };
+        let memory = Arc::new(Memory::new(layout, Some(gate)).unwrap());
+        let refusal = std::sync::Mutex::new(Some(Refusal::Behind));
+        let guard = Guard { guards: false, refusal, members: Arc::downgrade(&memory) };
+        memory.keep_in(Arc::new(guard) as Arc<dyn Journal>, 0);
+        let mut out = [0];
+        let read = Read { area: Area::Coils, address: 0, count: 1, out: &mut out };
+        assert_eq!(memory.read(Access::Ingest, read), Ok(()));
+        assert_eq!(memory.write(Access::Restore, writing(Area::Coils, 4, &[1])), Ok(()));
     }
 
     #[test]

@@ -95,6 +95,26 @@ mod tests {
     use super::*;
 
     #[test]
+    fn a_range_is_in_a_write_of_all_its_items() {
+        let range = Mirrored::reserved(Area::HoldingRegisters, 10, 3);
+        for (address, count, is_in) in [
+            (10, 3, true),
+            (9, 4, true),
+            (10, 9, true),
+            (0, 13, true),
+            (0, 12, false),
+            (10, 2, false),
+            (11, 3, false),
+            (9, 3, false),
+            (13, 3, false),
+        ] {
+            let write = Write { area: Area::HoldingRegisters, address, count, bytes: &[] };
+            assert_eq!(range.is_in(&write), is_in, "{address} {count}");
+            assert!(!range.is_in(&Write { area: Area::InputRegisters, ..write }));
+        }
+    }
+
+    #[test]
     fn the_touched_ranges_are_those_with_an_item_in_common() {
         let areas = [Area::Coils, Area::HoldingRegisters];
         let places = [(0, 1), (3, 4), (3, 1), (9, 1), (8, 2), (65_530, 6), (20, 30), (60, 1)];

@@ -82,9 +82,8 @@ impl WriteQueue {
         }
         state.bytes += bytes.len();
         state.waiting.push_back(Written { access, area, address, count, bytes: bytes.to_vec() });
-        while state.waiting.len() > MAX_QUEUED_WRITES
-            || (state.bytes > MAX_QUEUED_BYTES && state.waiting.len() > 1)
-        {
+        // One write alone is never too large: an area has 128 KiB at most.
+        while state.waiting.len() > MAX_QUEUED_WRITES || state.bytes > MAX_QUEUED_BYTES {
             let oldest = state.waiting.pop_front().map_or(0, |oldest| oldest.bytes.len());
             state.bytes -= oldest;
             state.dropped += 1;

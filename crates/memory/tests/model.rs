@@ -496,6 +496,7 @@ fn a_step_without_an_outcome_is_not_confirmed() {
             drop(done);
         }
     }
+    assert!(!Forgetful.guards(), "it has no contents of its own");
     let memory = Memory::new(layout(), None).unwrap();
     memory.keep_in(Arc::new(Forgetful), 0);
     let write = Write { area: Area::Coils, address: 3, count: 1, bytes: &[1] };

@@ -165,3 +165,23 @@ fn a_write_then_read_returns_what_it_wrote() {
         }
     });
 }
+
+#[test]
+fn a_queue_of_writes_waits_for_the_next_one() {
+    let memory = memory();
+    let queue = memory.observe(false);
+    let (ask, asked) = std::sync::mpsc::sync_channel(0);
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            for () in asked {
+                let write = Write { area: Area::Coils, address: 7, count: 1, bytes: &[1] };
+                memory.write(Access::Ingest, write).unwrap();
+            }
+        });
+        for _ in 0..200 {
+            ask.send(()).unwrap();
+            assert!(queue.next(std::time::Duration::from_secs(20)).is_some());
+        }
+        drop(ask);
+    });
+}

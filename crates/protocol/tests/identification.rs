@@ -57,3 +57,13 @@ fn an_individual_object_that_is_unknown_is_an_illegal_address() {
     let reply = objects(&[0, 1, 2]).unwrap().reply(ReadCode::Individual, 3, &mut pdu);
     assert_eq!(reply, Err(ExceptionCode::IllegalDataAddress));
 }
+
+#[test]
+fn an_object_has_its_value() {
+    let values = [(0, &b"vendor"[..]), (1, b"code"), (2, b"1.2"), (0x80, b"")];
+    let objects = Objects::new(values.map(|(id, value)| (id, Box::from(value)))).unwrap();
+    for (id, value) in values {
+        assert_eq!(objects.get(id), Some(value));
+    }
+    assert_eq!(objects.get(3), None);
+}

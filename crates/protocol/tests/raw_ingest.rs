@@ -143,3 +143,16 @@ fn a_packet_that_its_header_does_not_describe_is_not_encoded() {
     let refused = EncodeError::Room { found: 13, expected: 14 };
     assert_eq!(Format::V1.encode_to_slice(&header, &[0; 4], &mut packet[..13]), Err(refused));
 }
+
+#[cfg(feature = "alloc")]
+#[test]
+fn both_bytes_of_the_magic_number_are_checked() {
+    let header = Header { area: Area::ALL[0], target: 0, address: 0, count: NonZeroU16::MIN };
+    let mut packet = Vec::new();
+    Format::V1.encode(&header, &vec![0; header.payload_len()], &mut packet).unwrap();
+    for at in [0, 1] {
+        let mut wrong = packet.clone();
+        wrong[at] ^= 1;
+        assert_eq!(Format::V1.header(&wrong), Err(Refusal::Magic));
+    }
+}

@@ -2,9 +2,10 @@
 
 mod support;
 
+use holdfast_protocol::frame::rtu;
 use holdfast_protocol::pdu::{
-    self, ExceptionCode, FileRange, FileRanges, FileRecords, Function, RegisterRange, Request,
-    Response, ResponseError, SubFunction, reply,
+    self, EncodedRequest, ExceptionCode, FileRange, FileRanges, FileRecords, Function,
+    RegisterRange, Registers, Request, RequestError, Response, ResponseError, SubFunction, reply,
 };
 use proptest::prelude::*;
 use support::a_request;
@@ -77,7 +78,25 @@ fn a_reply(request: &Request<'_>, byte: u8) -> Option<Vec<u8>> {
     Some(pdu[..len].to_vec())
 }
 
+/// The PDU, and the length of its frame as it is known from each beginning of it.
+fn lengths(pdu: &[u8], request: &Request<'_>) -> (Vec<u8>, Vec<Option<usize>>) {
+    let (mut frame, mut encoded) = ([0; rtu::MAX_LEN], [0; pdu::MAX_LEN]);
+    let len = rtu::encode(1, pdu, &mut frame).unwrap();
+    let request_len = request.encode(&mut encoded);
+    let known = (0..=len).map(|end| rtu::response_len(&frame[..end], request_len).unwrap());
+    (frame[..len].to_vec(), known.collect())
+}
+
 proptest! {
+    #[test]
+    fn the_length_of_an_rtu_reply_is_known_before_its_end(parts in a_request(), byte: u8) {
+        let request = parts.request();
+        let Some(reply) = a_reply(&request, byte) else { return Ok(()) };
+        let (frame, known) = lengths(&reply, &request);
+        prop_assert!(known.iter().flatten().all(|len| *len == frame.len()), "{:?}", known);
+        prop_assert!(known[frame.len() - 2].is_some());
+    }
+
     #[test]
     fn a_reply_is_the_response_to_its_request(parts in a_request(), byte: u8) {
         let request = parts.request();
@@ -276,4 +295,126 @@ fn a_log_of_more_than_64_events_is_refused() {
     let reply = |events: usize| [&[12, 6 + events as u8][..], &vec![0; 6 + events]].concat();
     assert!(Request::GetCommEventLog.response(&reply(64)).is_ok());
     assert_eq!(Request::GetCommEventLog.response(&reply(65)), Err(ResponseError::Length));
+}
+
+#[test]
+fn the_length_of_an_identification_in_rtu_is_known_with_the_length_of_its_last_object() {
+    let code = pdu::identification::ReadCode::Basic;
+    let request = Request::ReadDeviceIdentification { code, object_id: 0 };
+    let objects = [&[0, 2, b'a', b'b'][..], &[1, 0], &[2, 3, b'c', b'd', b'e']].concat();
+    let reply = [&[43, 14, 1, 0x81, 0, 0, 3][..], &objects].concat();
+    let (frame, known) = lengths(&reply, &request);
+    // What remains are the three bytes of the last object, and the CRC.
+    let (unknown, whole) = known.split_at(frame.len() - 5);
+    assert!(unknown.iter().all(Option::is_none), "{known:?}");
+    assert_eq!(whole, [Some(frame.len()); 6]);
+}
+
+#[test]
+fn a_reply_of_another_function_or_length_is_told_apart_from_an_exception() {
+    let range = RegisterRange::new(3, 1).unwrap();
+    let request = Request::ReadHoldingRegisters(range);
+    let function = |found| Err(ResponseError::Function { expected: 3, found });
+    for (pdu, expected) in [
+        (&[][..], Err(ResponseError::Length)),
+        (&[0x83], Err(ResponseError::Length)),
+        (&[0x83, 2, 0], Err(ResponseError::Length)),
+        (&[0x83, 2], Err(ResponseError::Exception(ExceptionCode::IllegalDataAddress))),
+        (&[0x83, 99], Err(ResponseError::UnknownException(99))),
+        (&[4, 2, 0, 7], function(4)),
+        (&[0x84, 2], function(0x84)),
+    ] {
+        assert_eq!(request.response(pdu), expected, "{pdu:?}");
+        // The same holds for one that a server would refuse.
+        let opaque = EncodedRequest::opaque(&[3, 0]).unwrap();
+        assert_eq!(opaque.request(), None);
+        assert_eq!(opaque.response(pdu), expected, "{pdu:?}");
+    }
+    let opaque = EncodedRequest::opaque(&[3, 0]).unwrap();
+    assert_eq!(opaque.response(&[3, 1, 2]), Ok(Response::Opaque(&[1, 2])));
+    assert_eq!(opaque.response(&[3]), Ok(Response::Opaque(&[])));
+}
+
+#[test]
+fn an_opaque_request_has_a_function_below_128_and_at_most_253_bytes() {
+    for pdu in [&[][..], &[0x80], &[0xFF, 1], &[1; 254]] {
+        assert!(EncodedRequest::opaque(pdu).is_none(), "{pdu:?}");
+    }
+    for pdu in [&[0x7F][..], &[0], &[1; 253]] {
+        assert_eq!(EncodedRequest::opaque(pdu).unwrap().pdu(), pdu);
+    }
+}
+
+#[test]
+fn an_identification_whose_count_or_length_does_not_fit_is_refused() {
+    let code = pdu::identification::ReadCode::Basic;
+    let request = Request::ReadDeviceIdentification { code, object_id: 0 };
+    let reply = |count, objects: &[u8]| [&[43, 14, 1, 0x81, 0, 0, count][..], objects].concat();
+    assert!(request.response(&reply(1, &[0, 1, b'a'])).is_ok());
+    for (count, objects) in [
+        (2, &[0, 1, b'a'][..]),
+        (0, &[0, 1, b'a']),
+        (1, &[0, 1, b'a', 1]),
+        (1, &[0, 2, b'a']),
+        (2, &[0, 1, b'a', 1, 1]),
+    ] {
+        assert_eq!(request.response(&reply(count, objects)), Err(ResponseError::Length));
+    }
+    let other = [43, 14, 2, 0x81, 0, 0, 1, 0, 1, b'a'];
+    assert_eq!(request.response(&other), Err(ResponseError::Length), "another read code");
+}
+
+#[test]
+fn diagnostics_that_change_a_device_are_no_reads() {
+    for code in SubFunction::ALL {
+        let pdu = [8, 0, code.code() as u8, 0, 0];
+        let request = Request::parse(&pdu).unwrap();
+        assert_eq!(request.is_read(), !code.changes_state(), "{code:?}");
+    }
+    assert!(SubFunction::ClearCounters.changes_state());
+    assert!(!SubFunction::ReturnQueryData.changes_state());
+}
+
+#[test]
+fn a_range_of_a_file_has_its_parts_and_a_pdu_its_function() {
+    let range = FileRange::new(4, 700, 9).unwrap();
+    assert_eq!((range.file(), range.record(), range.quantity()), (4, 700, 9));
+    assert_eq!(Function::from_pdu(&[3, 0]), Some(Function::ReadHoldingRegisters));
+    assert_eq!(Function::from_pdu(&[0x83, 1]), None);
+    assert_eq!(Function::from_pdu(&[]), None);
+    let echo = Some(SubFunction::ReturnQueryData);
+    assert_eq!(SubFunction::from_pdu(&[8, 0, 0]), echo);
+    assert_eq!(SubFunction::from_pdu(&[8, 0]), None);
+}
+
+#[test]
+fn a_write_whose_byte_count_or_quantity_does_not_fit_is_an_illegal_value() {
+    assert!(Request::parse(&[16, 0, 0, 0, 1, 2, 0, 7]).is_ok());
+    for pdu in [
+        &[16, 0, 0, 0, 1, 2, 0, 7, 0][..],
+        &[16, 0, 0, 0, 1, 2, 0],
+        &[16, 0, 0, 0, 1, 4, 0, 7],
+        &[16, 0, 0, 0, 2, 2, 0, 7],
+        &[16, 0, 0, 0, 0, 0],
+    ] {
+        assert_eq!(Request::parse(pdu), Err(ExceptionCode::IllegalDataValue), "{pdu:?}");
+    }
+}
+
+#[test]
+fn more_values_than_a_request_holds_are_not_packed() {
+    let mut room = [0; pdu::MAX_LEN];
+    let refused = |found| RequestError::Quantity { found, max: 123 };
+    for found in [0, 124, 1000] {
+        let packed = Registers::<123>::pack(&vec![7; found], &mut room);
+        assert_eq!(packed.unwrap_err(), refused(found));
+    }
+}
+
+#[test]
+fn an_encoded_request_is_shown_as_its_parts_or_its_bytes() {
+    let opaque = EncodedRequest::opaque(&[66, 1]).unwrap();
+    assert_eq!(format!("{opaque:?}"), "EncodedRequest([66, 1])");
+    let known = EncodedRequest::new(&Request::ReadExceptionStatus);
+    assert_eq!(format!("{known:?}"), "EncodedRequest(ReadExceptionStatus)");
 }

@@ -1,5 +1,6 @@
 //! Tests RTU requests in a stream, as in RTU over TCP.
 
+use holdfast_protocol::frame::FrameError;
 use holdfast_protocol::frame::rtu::{self, Next, Requests};
 use proptest::prelude::*;
 
@@ -133,6 +134,64 @@ fn what_an_incomplete_write_swallows_is_never_found() {
     // Here it ends within one.
     let seen = seen_however_cut(&[&begun[..], &[0], &read.repeat(40)].concat());
     assert_eq!((seen.frames, seen.damaged, seen.is_at_start), (vec![], 1, false));
+}
+
+#[test]
+fn behind_a_request_of_known_length_the_next_one_begins() {
+    for (pdu, is_at_start) in [
+        (&[3, 0, 0, 0, 1][..], true),
+        (&[8, 0, 0, 1, 2], true),
+        (&[17], true),
+        (&[16, 0, 0, 0, 1, 2, 0, 7], true),
+        (&[20, 7, 6, 0, 1, 0, 0, 0, 1], true),
+        (&[21, 9, 6, 0, 1, 0, 0, 0, 1, 0, 7], true),
+        (&[22, 0, 0, 0, 1, 0, 2], true),
+        (&[23, 0, 0, 0, 1, 0, 0, 0, 1, 2, 0, 7], true),
+        (&[24, 0, 0], true),
+        (&[43, 14, 1, 0], true),
+        (&[43, 13, 1, 0], false),
+        (&[0x41, 1], false),
+    ] {
+        let mut requests = Requests::default();
+        let frame = frame(7, pdu);
+        let next = Next::Frame { unit_id: 7, pdu, len: frame.len() };
+        assert_eq!(requests.next(&frame), next);
+        assert_eq!(requests.is_at_start(), is_at_start, "{pdu:?}");
+    }
+}
+
+#[test]
+fn a_byte_other_than_0_after_an_unknown_function_begins_a_frame() {
+    let stream = [&frame(7, &[0x41, 1])[..], &[9], &frame(7, &[3, 0, 0, 0, 1])].concat();
+    assert_eq!(units(&seen_however_cut(&stream)), [7]);
+}
+
+#[test]
+fn of_two_frames_after_an_unknown_function_the_one_that_ends_first_is_found() {
+    // The zero begins a write to unit 0, and is followed by a read of unit 16.
+    let mut both = [&[0][..], &frame(16, &[3, 0, 0, 0, 4]), &[1, 2]].concat();
+    both.extend(rtu::crc(&both).to_le_bytes());
+    let seen = seen_however_cut(&[frame(7, &[0x41, 1]), both].concat());
+    assert_eq!(units(&seen), [7, 16]);
+
+    // A write to unit 0, in which a write to unit 16 begins that ends later.
+    let zero = frame(0, &[16, 16, 0, 0, 1, 1, 4]);
+    let mut later = [&zero[1..], &[1, 7]].concat();
+    later.extend(rtu::crc(&later).to_le_bytes());
+    let seen = seen_however_cut(&[frame(7, &[0x41, 1]), vec![0], later].concat());
+    assert_eq!(units(&seen), [7, 0]);
+}
+
+#[test]
+fn a_request_of_more_than_256_bytes_is_not_waited_for() {
+    let next = |count| Requests::default().next(&[1, 16, 0, 0, 0, 1, count]) == Next::Incomplete;
+    assert_eq!([247, 248, 255].map(next), [true, false, false]);
+}
+
+#[test]
+fn a_reply_has_at_most_256_bytes() {
+    assert_eq!(rtu::response_len(&[1, 20, 251], 9), Ok(Some(256)));
+    assert_eq!(rtu::response_len(&[1, 20, 252], 9), Err(FrameError::Length));
 }
 
 fn stream() -> impl Strategy<Value = Vec<u8>> {

@@ -383,3 +383,191 @@ fn checksum((unit_id, pdu): (u8, &[u8])) -> u32 {
     hasher.update(pdu);
     hasher.finalize()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pdu::Range;
+
+    const MS: Duration = Duration::from_millis(1);
+    const START: Time = Duration::from_secs(100);
+
+    fn registers(quantity: u16) -> EncodedRequest {
+        EncodedRequest::new(&Request::ReadHoldingRegisters(Range::new(0, quantity).unwrap()))
+    }
+
+    fn coils(quantity: u16) -> EncodedRequest {
+        EncodedRequest::new(&Request::ReadCoils(Range::new(0, quantity).unwrap()))
+    }
+
+    fn ms(times: u32) -> Duration {
+        MS * times
+    }
+
+    /// Until when the reply may come to a request of unit 1 that ended like this, since it was sent.
+    fn until(replies: &mut LateReplies, timeout: u32, how: Ended, took: u32) -> Duration {
+        replies.ended((1, &registers(1)), (START, ms(timeout)), how, START + ms(took));
+        replies.unanswered().last().unwrap().until - START
+    }
+
+    fn answered(took: u32, timeout: u32) -> LateReplies {
+        let mut replies = LateReplies::default();
+        replies.answered(1, ms(took), ms(timeout));
+        replies
+    }
+
+    #[test]
+    fn after_a_timeout_a_reply_may_come_as_late_as_this_and_other_timeouts_and_replies_say() {
+        let timed_out = |mut replies: LateReplies, timeout| {
+            until(&mut replies, timeout, Ended::TimedOut, timeout)
+        };
+        assert_eq!(timed_out(LateReplies::default(), 50), ms(250), "however short");
+        assert_eq!(timed_out(LateReplies::default(), 200), ms(600));
+        assert_eq!(timed_out(LateReplies::default(), 6_000), ms(16_000), "10 s later at most");
+        assert_eq!(timed_out(answered(1, 300), 10), ms(900), "by an earlier timeout");
+        assert_eq!(timed_out(answered(1, 500), 10), ms(1_000), "by it, at most");
+        assert_eq!(timed_out(answered(400, 500), 10), ms(1_600), "by the usual time");
+        let mut late = LateReplies::default();
+        late.lateness.late(1, ms(2_000));
+        assert_eq!(timed_out(late, 10), ms(4_000), "by the latest reply");
+    }
+
+    #[test]
+    fn after_another_reply_or_the_end_of_the_connection_it_may_come_within_its_time() {
+        let other = |mut replies: LateReplies, timeout, took| {
+            until(&mut replies, timeout, Ended::Other, took) - ms(took)
+        };
+        assert_eq!(other(LateReplies::default(), 300, 100), ms(200), "the rest of its timeout");
+        assert_eq!(other(LateReplies::default(), 2_000, 100), ms(500), "or of half a second");
+        assert_eq!(other(LateReplies::default(), 300, 290), GUARD);
+        assert_eq!(other(answered(100, 300), 10, 10), ms(400), "by the usual time");
+        let cut_off = |timeout, took| {
+            let mut replies = LateReplies::default();
+            until(&mut replies, timeout, Ended::WithConnection, took) - ms(took)
+        };
+        assert_eq!(cut_off(300, 1_000), ms(2_000), "twice as long again");
+        assert_eq!(cut_off(300, 6_000), ms(10_000), "10 s at most");
+    }
+
+    #[test]
+    fn after_a_damaged_reply_it_may_come_for_a_while_but_not_after_its_timeout() {
+        let damaged =
+            |mut replies: LateReplies, timeout| until(&mut replies, timeout, Ended::Damaged, 100);
+        assert_eq!(damaged(LateReplies::default(), 1_000), ms(350));
+        assert_eq!(damaged(LateReplies::default(), 300), ms(300));
+        assert_eq!(damaged(answered(20, 300), 1_000), ms(180), "by the usual time");
+    }
+
+    #[test]
+    fn the_guard_time_is_twice_that_after_which_a_reply_was_repeated() {
+        for (after, guard) in [(0, 25), (10, 25), (100, 200), (125, 250), (250, 250), (251, 25)] {
+            let mut replies = answered(1, 300);
+            replies.stray(ms(after));
+            assert_eq!(replies.guard(), ms(guard), "{after}");
+            replies.stray(ms(10));
+            assert_eq!(replies.guard(), ms(guard), "it is never shorter than before");
+            (1..1000).for_each(|_| replies.answered(1, MS, ms(300)));
+            assert_eq!(replies.guard(), ms(guard));
+            replies.answered(1, MS, ms(300));
+            assert_eq!(replies.guard(), Duration::ZERO, "after 1,000 replies");
+        }
+    }
+
+    #[test]
+    fn only_the_first_replies_have_a_guard_time_or_show_a_fast_line() {
+        let mut replies = LateReplies::default();
+        assert_eq!(replies.guard(), Duration::ZERO, "nothing can come twice");
+        for _ in 1..8 {
+            replies.answered(1, MS, ms(300));
+            assert_eq!(replies.guard(), GUARD);
+        }
+        let mut fast = LateReplies::default();
+        (1..8).for_each(|_| fast.answered(1, MS, ms(300)));
+        assert!(fast.is_fast_line());
+        replies.answered(1, MS, ms(300));
+        assert_eq!(replies.guard(), Duration::ZERO);
+        assert!(!replies.is_fast_line());
+    }
+
+    #[test]
+    fn the_reply_to_an_earlier_attempt_is_expected_as_much_later_as_the_next_one_was_sent() {
+        let mut replies = LateReplies::default();
+        let (read, other) = (registers(1), registers(2));
+        for (unit_id, request) in [(1, &read), (2, &read), (1, &other)] {
+            let now = START + ms(200);
+            replies.ended((unit_id, request), (START, ms(200)), Ended::TimedOut, now);
+        }
+        replies.repeated((1, &read), START + ms(210), START + ms(220));
+        let times = replies.unanswered().map(|earlier| (earlier.until - START, earlier.from));
+        let unchanged = (ms(600), Time::ZERO);
+        let changed = (ms(810), START + ms(245));
+        assert!(times.eq([changed, unchanged, unchanged]));
+        assert_eq!(replies.late(0, START + ms(244)), Duration::ZERO, "a copy of the other reply");
+        assert_eq!(replies.late(0, START + ms(245)), ms(245));
+        assert_eq!(replies.late(0, START + ms(9_000)), ms(600), "at most as late as expected");
+        assert_eq!(replies.unanswered().count(), 1);
+    }
+
+    #[test]
+    fn a_reply_is_doubtful_that_equals_the_last_one_to_another_recent_request() {
+        let mut replies = LateReplies::default();
+        let request = |number: &'static [u8]| (1, number);
+        let is_doubtful = |replies: &LateReplies, asked: &'static [u8], reply: &[u8], now| {
+            replies.is_doubtful(request(asked), reply, START + now)
+        };
+        replies.believed(request(&[3, 1]), &[1], false, START);
+        replies.believed(request(&[3, 2]), &[2], false, START);
+        assert!(!is_doubtful(&replies, &[3, 1], &[1], MS), "it is usual");
+        assert!(is_doubtful(&replies, &[3, 1], &[2], MS));
+        assert!(is_doubtful(&replies, &[3, 3], &[1], ms(250)));
+        assert!(!is_doubtful(&replies, &[3, 3], &[1], ms(251)), "that is long ago");
+        assert!(!is_doubtful(&replies, &[3, 3], &[3], MS));
+        replies.believed(request(&[3, 1]), &[9], false, START);
+        assert!(!is_doubtful(&replies, &[3, 3], &[1], MS), "it is no longer the last one");
+        assert!(is_doubtful(&replies, &[3, 3], &[2], MS));
+    }
+
+    #[test]
+    fn a_reply_is_doubtful_after_one_of_its_function_that_never_came() {
+        let mut replies = LateReplies::default();
+        until(&mut replies, 200, Ended::TimedOut, 200);
+        for (at, is_doubtful) in [(599, false), (600, true)] {
+            replies.expire(START + ms(at));
+            assert_eq!(replies.is_doubtful((1, &[3, 1]), &[1], START), is_doubtful, "{at}");
+        }
+        assert!(!replies.is_doubtful((1, &[4, 1]), &[1], START));
+        replies.believed((1, &[3, 1]), &[1], true, START);
+        assert!(!replies.is_doubtful((1, &[3, 1]), &[1], START));
+    }
+
+    #[test]
+    fn sixteen_replies_are_compared_and_after_eight_wrong_doubts_none() {
+        let mut replies = LateReplies::default();
+        (0..16).for_each(|number| replies.believed((1, &[3, number]), &[number], false, START));
+        assert!(replies.is_doubtful((1, &[3, 99]), &[0], START));
+        replies.believed((1, &[3, 16]), &[16], false, START);
+        assert!(!replies.is_doubtful((1, &[3, 99]), &[0], START));
+        for _ in 0..8 {
+            assert!(replies.is_doubtful((1, &[3, 99]), &[1], START));
+            replies.believed((1, &[3, 16]), &[16], true, START);
+        }
+        assert!(!replies.is_doubtful((1, &[3, 99]), &[1], START));
+    }
+
+    #[test]
+    fn reads_of_another_number_of_bytes_or_another_function_can_not_be_confused() {
+        let mut replies = LateReplies::default();
+        let now = START + ms(200);
+        replies.ended((1, &coils(8)), (START, ms(200)), Ended::TimedOut, now);
+        let waits = |replies: &mut LateReplies, unit_id, request, pad| {
+            let tolerance = Tolerance { pad, ..Tolerance::default() };
+            replies.until(unit_id, &request, &tolerance, now).is_some()
+        };
+        assert!(waits(&mut replies, 1, coils(8), false));
+        assert!(waits(&mut replies, 1, coils(7), false));
+        assert!(!waits(&mut replies, 1, coils(9), false));
+        assert!(waits(&mut replies, 1, coils(9), true));
+        assert!(!waits(&mut replies, 1, registers(8), true));
+        assert!(!waits(&mut replies, 2, coils(8), false));
+    }
+}

@@ -171,7 +171,8 @@ fn split_mix(state: &mut u64) -> u16 {
     *state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
     let mixed = (*state ^ (*state >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
     let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    ((mixed ^ (mixed >> 31)) >> 48) as u16
+    // The last step of the generator changes only lower bits.
+    (mixed >> 48) as u16
 }
 
 /// Writes the datagram of the request in flight.
@@ -180,5 +181,18 @@ fn write(flights: &mut Flights) {
         let pdu = flight.request.pdu();
         let header = mbap::header(flight.transaction_id, flight.unit_id, pdu.len());
         flights.out = [&header[..], pdu].concat();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn transaction_ids_are_the_high_bits_of_splitmix64() {
+        // The first numbers of the generator after 0 are E220A8397B1DCDAF, 6E789E6AA1B965F4 and
+        // 06C45D188009454F.
+        let mut state = 0;
+        assert_eq!([(); 3].map(|()| split_mix(&mut state)), [0xE220, 0x6E78, 0x06C4]);
     }
 }

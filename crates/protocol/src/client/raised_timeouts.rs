@@ -93,3 +93,54 @@ impl Lateness {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ms(times: u64) -> Duration {
+        Duration::from_millis(times)
+    }
+
+    #[test]
+    fn a_timeout_is_half_as_long_again_as_the_latest_of_two_late_replies() {
+        let mut lateness = Lateness::default();
+        lateness.late(1, ms(200));
+        assert_eq!(lateness.timeout(1, ms(180)), ms(180), "one is no habit");
+        lateness.late(1, ms(190));
+        assert_eq!(lateness.timeout(1, ms(180)), ms(300));
+        assert_eq!(lateness.timeout(1, ms(400)), ms(400), "it is never shorter");
+        assert_eq!(lateness.timeout(1, ms(50)), ms(200), "four times as long at most");
+        assert_eq!(lateness.timeout(2, ms(180)), ms(180));
+    }
+
+    #[test]
+    fn thirty_two_replies_in_a_row_within_the_timeout_end_it() {
+        let mut lateness = Lateness::default();
+        (0..2).for_each(|_| lateness.late(1, ms(200)));
+        (0..31).for_each(|_| lateness.answered(1, ms(100), ms(100)));
+        lateness.answered(1, ms(220), ms(100));
+        assert_eq!(lateness.timeout(1, ms(180)), ms(330), "they begin again");
+        (0..31).for_each(|_| lateness.answered(1, ms(100), ms(100)));
+        assert_eq!(lateness.timeout(1, ms(180)), ms(330));
+        lateness.answered(1, ms(100), ms(100));
+        assert_eq!(lateness.timeout(1, ms(180)), ms(180));
+        assert_eq!((lateness.longest(1), lateness.latest(1)), (Some(ms(100)), ms(0)));
+    }
+
+    #[test]
+    fn the_longest_reply_and_timeout_of_a_unit_are_known() {
+        let mut lateness = Lateness::default();
+        assert_eq!((lateness.longest(1), lateness.latest(1)), (None, ms(0)));
+        lateness.answered(1, ms(30), ms(100));
+        lateness.answered(1, ms(20), ms(50));
+        assert_eq!((lateness.longest(1), lateness.latest(1)), (Some(ms(30)), ms(0)));
+        lateness.answered(1, ms(150), ms(100));
+        assert_eq!((lateness.longest(1), lateness.latest(1)), (Some(ms(100)), ms(150)));
+        assert_eq!(lateness.note_timeout(1, ms(10)), ms(100));
+        (0..32).for_each(|_| lateness.answered(1, ms(1), ms(10)));
+        assert_eq!(lateness.note_timeout(1, ms(10)), ms(100), "that of before counts");
+        (0..32).for_each(|_| lateness.answered(1, ms(1), ms(10)));
+        assert_eq!(lateness.note_timeout(1, ms(10)), ms(10));
+    }
+}

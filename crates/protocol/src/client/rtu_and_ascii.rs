@@ -346,7 +346,7 @@ impl OneAtATime {
     ) {
         if self.is_too_fast(flights, pdu.len(), now) && !self.late_replies.shows_fast_line(&pdu) {
             flights.strays.replies += 1;
-            flights.strays.bytes += self.received.len() as u64;
+            flights.strays.bytes += self.reply_len(pdu.len()) as u64;
             self.received.clear();
             return self.late_replies.came_too_fast();
         }
@@ -389,12 +389,16 @@ impl OneAtATime {
     /// Whether the line can't have carried the request and its reply by now.
     fn is_too_fast(&mut self, flights: &Flights, pdu_len: usize, now: Time) -> bool {
         let Some(flight) = flights.first() else { return false };
-        let reply_len = match self.framing {
+        let least = self.character * (self.frame.len() + self.reply_len(pdu_len)) as u32;
+        now.saturating_sub(flight.sent) < least && !self.late_replies.is_fast_line()
+    }
+
+    /// The length of the frame of a reply.
+    fn reply_len(&self, pdu_len: usize) -> usize {
+        match self.framing {
             Framing::Rtu => pdu_len + 3,
             Framing::Ascii => 2 * pdu_len + 7,
-        };
-        let least = self.character * (self.frame.len() + reply_len) as u32;
-        now.saturating_sub(flight.sent) < least && !self.late_replies.is_fast_line()
+        }
     }
 
     /// Whether this reply may be an echo: it equals the request, and the last reads had one, but too few to

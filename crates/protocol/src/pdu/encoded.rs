@@ -86,8 +86,8 @@ impl EncodedRequest {
         let expected = self.pdu()[0];
         match pdu {
             [found, body @ ..] if *found == expected => Ok(Response::Opaque(body)),
-            [found, code] if *found == expected | 0x80 => Err(ResponseError::exception(*code)),
-            [found, ..] if *found | 0x80 != expected | 0x80 => {
+            [found, code] if *found & 0x7F == expected => Err(ResponseError::exception(*code)),
+            [found, ..] if *found & 0x7F != expected => {
                 Err(ResponseError::Function { expected, found: *found })
             }
             _ => Err(ResponseError::Length),

@@ -108,10 +108,10 @@ impl Request<'_> {
         let expected = self.function().code();
         let body = match pdu {
             [found, body @ ..] if *found == expected => body,
-            [found, code] if *found == expected | 0x80 => {
+            [found, code] if *found & 0x7F == expected => {
                 return Err(ResponseError::exception(*code));
             }
-            [found, ..] if *found | 0x80 != expected | 0x80 => {
+            [found, ..] if *found & 0x7F != expected => {
                 return Err(ResponseError::Function { expected, found: *found });
             }
             _ => return Err(ResponseError::Length),
