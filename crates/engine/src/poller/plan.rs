@@ -7,6 +7,7 @@
 //! a high cost of a request it reads all allowed gaps, with cost 0 none.
 
 use holdfast_memory::Area;
+use holdfast_protocol::pdu::limit;
 use thiserror::Error;
 
 /// Bits that count as one register.
@@ -114,8 +115,8 @@ impl Block {
 impl Default for PlanLimits {
     fn default() -> PlanLimits {
         PlanLimits {
-            max_registers: 125,
-            max_bits: 2000,
+            max_registers: limit::READ_REGISTERS,
+            max_bits: limit::READ_BITS,
             readable: Vec::new(),
             forbidden: Vec::new(),
             cuts: Vec::new(),

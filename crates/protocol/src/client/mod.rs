@@ -25,6 +25,7 @@
 //!
 //! An ended connection cannot be used again: the driver creates a new one.
 
+mod attempts;
 mod connection;
 mod flights;
 mod late_replies;
@@ -34,10 +35,11 @@ mod raised_timeouts;
 mod rtu_and_ascii;
 mod tolerance;
 
+pub use attempts::{Attempt, BUSY_PAUSE};
 pub use connection::{Connection, Past};
 pub use flights::{Done, Strays, Ticket};
 pub use late_replies::MAX_LATENESS;
-pub use tolerance::{AcceptUnit, Attempt, BUSY_PAUSE, Echo, Tolerance};
+pub use tolerance::{AcceptUnit, Echo, Tolerance};
 
 use core::time::Duration;
 

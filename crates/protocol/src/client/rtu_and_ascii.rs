@@ -7,9 +7,10 @@
 use alloc::vec::Vec;
 use core::time::Duration;
 
+use super::attempts::Attempt;
 use super::flights::{Call, Done, Flight, Flights, Ticket};
 use super::late_replies::{Ended, LateReplies};
-use super::tolerance::{Attempt, Echo};
+use super::tolerance::Echo;
 use super::{Closed, Failure, GUARD, InvalidResponse, TURNAROUND, Time};
 use crate::frame::{FrameError, ascii, rtu};
 use crate::pdu::{self, EncodedRequest, ExceptionCode, Response, ResponseError};
