@@ -126,5 +126,8 @@ BUSY = _EXCEPTION["Server Device Busy"]
 PATH_UNAVAILABLE = _EXCEPTION["Gateway Path Unavailable"]
 TARGET_SILENT = _EXCEPTION["Gateway Target Device Failed To Respond"]
 
+GATEWAY_FAILURES = (PATH_UNAVAILABLE, TARGET_SILENT)
+"""Exceptions of a gateway that does not reach the device."""
+
 HARMLESS_DIAGNOSTICS = tuple(code for code, _, changes in _core.SUB_FUNCTIONS if not changes)
 """Sub-functions of function 8 that change nothing: echo, diagnostic register, counters."""

@@ -17,7 +17,7 @@ from holdfast.errors import (
     RequestTimeout,
     TlsFailed,
 )
-from holdfast.protocol import ILLEGAL_ADDRESS, ILLEGAL_VALUE, READ_LIMITS
+from holdfast.protocol import GATEWAY_FAILURES, ILLEGAL_ADDRESS, ILLEGAL_VALUE, READ_LIMITS
 from holdfast.tags.decoding import Decoder, Undecoded, decoder
 from holdfast.types import BIT_AREAS
 from holdfast.values import ConversionError
@@ -37,9 +37,6 @@ REFUSAL_RETRY_S = 60.0
 
 ILLEGAL = (ILLEGAL_ADDRESS, ILLEGAL_VALUE)
 """Exceptions that depend on the request, not on the state of the device."""
-
-GATEWAY = (0x0A, 0x0B)
-"""Exceptions of a gateway whose device does not answer."""
 
 Error: TypeAlias = ModbusError | ConversionError
 Result = TypeVar("Result")
@@ -259,5 +256,5 @@ def packed(bits: Sequence[bool]) -> bytes:
 def _is_silence(error: ModbusError) -> bool:
     """Whether the device did not answer, so that more requests would likely wait in vain."""
     if isinstance(error, ModbusException):
-        return error.code in GATEWAY
+        return error.code in GATEWAY_FAILURES
     return isinstance(error, ConnectionLost | RequestTimeout | InvalidResponse)

@@ -24,7 +24,7 @@ from holdfast.errors import (
     RequestTimeout,
 )
 from holdfast.net.addresses import joined
-from holdfast.protocol import MAX_SERIAL_UNIT
+from holdfast.protocol import GATEWAY_FAILURES, MAX_SERIAL_UNIT
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
@@ -32,9 +32,6 @@ if TYPE_CHECKING:
     from holdfast.client.requests import Identification, ServerId
     from holdfast.client.url import Parity
     from holdfast.net.addresses import Address, Network
-
-BEHIND_GATEWAY = (0x0A, 0x0B)
-"""Exceptions of a gateway whose device is not there."""
 
 UNUSUAL_UNIT = 231
 """A unit id that is rare: a device that answers it too probably ignores unit ids."""
@@ -199,7 +196,7 @@ async def _ask(host: Host, client: Client, units: Sequence[int]) -> None:
             host.detail = "answers"
         except ModbusException as error:
             host.detail = str(error)
-            if error.code in BEHIND_GATEWAY:
+            if error.code in GATEWAY_FAILURES:
                 host.state = "modbus"
                 continue
         except ConnectFailed as error:
@@ -237,7 +234,7 @@ def probe(client: SyncClient, unit: int) -> Unit:
         client.read("holding_registers", 0, "uint16", unit=unit)
         detail = "answers"
     except ModbusException as error:
-        if error.code in BEHIND_GATEWAY:
+        if error.code in GATEWAY_FAILURES:
             return Unit(unit, answers=False, detail=str(error))
         detail = str(error)
     except ConnectFailed:

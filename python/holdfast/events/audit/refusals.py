@@ -83,7 +83,8 @@ class Refusals:
 def _is_audited(event: str, fields: Mapping[str, object]) -> bool:
     if event in REQUESTS:
         function = OF_CODE.get(cast("int", fields.get("function")))
-        return function is None or not function.writes  # A write has a line of its own.
+        # A write has a line of its own: crates/engine/src/server/reports/audit.rs.
+        return function is None or not function.writes
     return event in CONNECTIONS or (event, fields.get("reason")) in DENIALS
 
 

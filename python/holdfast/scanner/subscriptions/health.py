@@ -17,11 +17,11 @@ from holdfast.polling.faults import (
 )
 from holdfast.protocol import (
     BUSY,
+    GATEWAY_FAILURES,
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     ILLEGAL_VALUE,
     PATH_UNAVAILABLE,
-    TARGET_SILENT,
 )
 
 if TYPE_CHECKING:
@@ -32,9 +32,6 @@ if TYPE_CHECKING:
 
 Block = TypeVar("Block", bound=tuple[Any, ...])
 """A tuple that begins with area, address and count."""
-
-GATEWAY_FAILURES = (PATH_UNAVAILABLE, TARGET_SILENT)
-"""Exceptions of a gateway that does not reach the device."""
 
 TOLERATED_FAILURES = 1
 """Consecutive scans without a response before a device is offline."""
