@@ -13,7 +13,7 @@ from holdfast.net.mqtt.packets import parse_publish
 from holdfast.net.mqtt.selector import Waiter
 from holdfast.net.mqtt.stream import BrokerSocket, Packets
 from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES
-from holdfast.outputs.mqtt.messages import Delivery, Message, packed, packed_topic
+from holdfast.outputs.mqtt.delivery import Delivery, Message, packed, packed_topic
 from holdfast.runtime.stop import Stop
 from support.config_folder import Folder
 

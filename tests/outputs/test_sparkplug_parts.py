@@ -24,7 +24,7 @@ from holdfast.tags.scale import RegisterScale
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.outputs.mqtt.messages import Message
+    from holdfast.outputs.mqtt.delivery import Message
 
 SPEED = Tag("speed", "input_registers", 0)
 LEVEL = Tag("level", "input_registers", 1)

@@ -19,7 +19,7 @@ from holdfast.events import log_lines
 from holdfast.gateway import assets, port_of_call
 from holdfast.gateway.broadcast import NOTE
 from holdfast.gateway.device import Failed, RequestedDevice
-from holdfast.gateway.device_route import Egress
+from holdfast.gateway.egress import Egress
 from holdfast.gateway.endpoints import address_map
 from holdfast.gateway.pool import Pool
 from holdfast.gateway.refusals import EXCEPTION_STATUS, FAILURE, REFUSALS

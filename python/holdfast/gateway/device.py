@@ -30,7 +30,7 @@ from holdfast.types import SERIAL_FRAMES
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from holdfast.gateway.device_route import Egress
+    from holdfast.gateway.egress import Egress
     from holdfast.gateway.pool import Pool
     from holdfast.gateway.sharing import Turns
     from holdfast.types import Transport

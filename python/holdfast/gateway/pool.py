@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from holdfast._core import Request
     from holdfast.client.async_transports import AsyncTransport
-    from holdfast.gateway.device_route import Route
+    from holdfast.gateway.egress import Route
     from holdfast.gateway.sharing import Shared
     from holdfast.net.tls import Tls
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.outputs.mqtt.messages import Message, packed_topic
+from holdfast.outputs.mqtt.delivery import Message, packed_topic
 
 if TYPE_CHECKING:
     from collections.abc import Set

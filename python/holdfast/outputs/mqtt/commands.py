@@ -10,7 +10,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from holdfast.config.values.topic_names import REPLY
-from holdfast.outputs.mqtt.messages import NO_PROPERTIES, Message, packed_topic
+from holdfast.outputs.mqtt.delivery import NO_PROPERTIES, Message, packed_topic
 from holdfast.outputs.site import CommandOutcomes, NotWritten
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from holdfast.config.values.topic_names import TopicNames
     from holdfast.net.mqtt.packets import Publish
-    from holdfast.outputs.mqtt.messages import Delivery
+    from holdfast.outputs.mqtt.delivery import Delivery
     from holdfast.outputs.mqtt.session import Session
     from holdfast.outputs.site import Site
     from holdfast.tags import Tag

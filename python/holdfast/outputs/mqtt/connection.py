@@ -25,7 +25,7 @@ from holdfast.net.addresses import joined
 from holdfast.net.mqtt.client import BrokerClient
 from holdfast.net.mqtt.packets import acknowledgement, parse_publish
 from holdfast.net.mqtt.stream import Packets
-from holdfast.outputs.mqtt.messages import Message, packed, size_of
+from holdfast.outputs.mqtt.delivery import Message, packed, size_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.services import BrokerConfig
     from holdfast.net.mqtt.packets import Publish
     from holdfast.net.mqtt.stream import BrokerSocket
-    from holdfast.outputs.mqtt.messages import Delivery
+    from holdfast.outputs.mqtt.delivery import Delivery
 
 WINDOW = {"5": 1000, "3.1.1": 100}
 """Messages that are sent and not confirmed, unless the broker allows fewer. MQTT 3.1.1 has no way

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast.outputs.mqtt.messages import Message, packed_topic
+from holdfast.outputs.mqtt.delivery import Message, packed_topic
 from holdfast.tags.text import plain, text_of
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from holdfast.outputs.sending import Receiver
 
 if TYPE_CHECKING:
     from holdfast.config.models.outputs import MqttOutputConfig, SparkplugConfig
-    from holdfast.outputs.mqtt.messages import Delivery
+    from holdfast.outputs.mqtt.delivery import Delivery
     from holdfast.outputs.mqtt.session import Session
     from holdfast.runtime.stop import Stop
 

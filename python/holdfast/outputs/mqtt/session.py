@@ -17,7 +17,7 @@ from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secret_file import read_password
 from holdfast.net.secure_channel import failure_text
 from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES, Connection
-from holdfast.outputs.mqtt.messages import Delivery, Message
+from holdfast.outputs.mqtt.delivery import Delivery, Message
 from holdfast.runtime.standstill import MAX_LOOK_INTERVAL_S, Standstill
 from holdfast.runtime.stop import Stop
 

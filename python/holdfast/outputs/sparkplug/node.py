@@ -7,7 +7,7 @@ import random
 import time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from holdfast.outputs.mqtt.messages import Message, packed_topic
+from holdfast.outputs.mqtt.delivery import Message, packed_topic
 from holdfast.outputs.sparkplug.datatypes import BOOLEAN, INT64
 from holdfast.outputs.sparkplug.definition import Payload
 from holdfast.outputs.sparkplug.metrics import DeviceMetrics

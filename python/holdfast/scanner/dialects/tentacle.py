@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.messages.subjects import second_id, subject_id
+from holdfast.scanner.messages.subject_parts import second_id, subject_id
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.messages.subjects import next_name
+from holdfast.scanner.messages.subject_parts import next_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -11,7 +11,7 @@ import msgspec
 
 from holdfast.client.url import NetworkTarget
 from holdfast.scanner.messages.decoding import decode
-from holdfast.scanner.messages.subjects import subject_id
+from holdfast.scanner.messages.subject_parts import subject_id
 from holdfast.scanner.messages.types import SubscribeRequest, TagRequest
 from holdfast.scanner.subscriptions.tag import CODE_OF_AREA
 

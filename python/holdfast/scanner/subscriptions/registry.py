@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from holdfast.client.url import STRICT, SerialTarget
 from holdfast.scanner.dialects import TENTACLE, Dialect
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.messages.subjects import subject_id
+from holdfast.scanner.messages.subject_parts import subject_id
 from holdfast.scanner.subscriptions.device import ScannedDevice, Source, Subscriber
 from holdfast.scanner.subscriptions.health import Health
 from holdfast.scanner.subscriptions.subscription import SETTINGS
