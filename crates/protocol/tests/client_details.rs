@@ -550,3 +550,23 @@ fn a_line_of_characters_may_have_small_letters() {
     let length = Err(holdfast_protocol::frame::FrameError::Length);
     assert_eq!(ascii::decode(b":07F9\r\n", &mut body), length, "it has no PDU");
 }
+
+#[test]
+fn an_exception_code_that_the_standard_does_not_have_reaches_the_caller() {
+    for transport in [Transport::Tcp, Transport::Udp] {
+        let mut client = Client::new(transport, Tolerance::default());
+        client.send(&read(1));
+        let id = u16::from_be_bytes(client.outgoing()[..2].try_into().unwrap());
+        client.receive(&mbap_frame(id, &[0x83, 0x99]));
+        assert_eq!(client.got(), [Err(Failure::Exception(0x99))]);
+    }
+}
+
+#[test]
+fn a_pdu_that_is_empty_or_too_long_has_no_frame() {
+    for pdu in [&[][..], &[0; 254]] {
+        assert_eq!(mbap::encode(1, 7, pdu, &mut [0; mbap::MAX_LEN]), None);
+        assert_eq!(rtu::encode(7, pdu, &mut [0; rtu::MAX_LEN]), None);
+        assert_eq!(ascii::encode(7, pdu, &mut [0; ascii::MAX_LEN]), None);
+    }
+}

@@ -67,3 +67,35 @@ fn an_object_has_its_value() {
     }
     assert_eq!(objects.get(3), None);
 }
+
+/// The ids of the objects in the first reply.
+fn first_ids(objects: &Objects, code: ReadCode, object_id: u8) -> Result<Vec<u8>, ExceptionCode> {
+    let mut buffer = [0; pdu::MAX_LEN];
+    let len = objects.reply(code, object_id, &mut buffer)?;
+    let request = Request::ReadDeviceIdentification { code, object_id };
+    let Ok(Response::Identification(answer)) = request.response(&buffer[..len]) else {
+        panic!("not an identification");
+    };
+    Ok(answer.iter().map(|(id, _)| id).collect())
+}
+
+#[test]
+fn each_read_code_ends_at_its_last_object() {
+    let ids = [0x00, 0x01, 0x02, 0x05, 0x06, 0x80, 0xFF];
+    let objects = Objects::new(ids.map(|id| (id, vec![id].into_boxed_slice()))).unwrap();
+    assert_eq!(first_ids(&objects, ReadCode::Basic, 0), Ok(ids[..3].to_vec()));
+    assert_eq!(first_ids(&objects, ReadCode::Regular, 0), Ok(ids[..5].to_vec()));
+    assert_eq!(first_ids(&objects, ReadCode::Extended, 0), Ok(ids.to_vec()));
+    assert_eq!(first_ids(&objects, ReadCode::Individual, 0x80), Ok(vec![0x80]));
+    let unknown = first_ids(&objects, ReadCode::Individual, 0x81);
+    assert_eq!(unknown, Err(ExceptionCode::IllegalDataAddress));
+    assert_eq!(first_ids(&objects, ReadCode::Basic, 0x05), Ok(ids[..3].to_vec()), "from the first");
+}
+
+#[test]
+fn an_identification_that_neither_ends_nor_goes_on_is_malformed() {
+    let request = Request::ReadDeviceIdentification { code: ReadCode::Basic, object_id: 0 };
+    let reply = |more| [0x2B, 0x0E, 0x01, 0x81, more, 0, 1, 0, 1, b'a'];
+    assert!(request.response(&reply(0x00)).is_ok());
+    assert!(request.response(&reply(0x01)).is_err());
+}
