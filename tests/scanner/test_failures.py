@@ -466,12 +466,12 @@ def test_it_ends_while_everything_hangs(
         }
         own_caller.request("modbus.subscribe", request)
     data.next()
-    os.kill(plc.pid, signal.SIGSTOP)
-    os.waitid(os.P_PID, plc.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
-    own_caller.publish("modbus.command.tcp-1", "1")
-    own_caller.publish("modbus.command.rtu-1", "1")
-    own_nats.freeze()
     try:
+        os.kill(plc.pid, signal.SIGSTOP)
+        os.waitid(os.P_PID, plc.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
+        own_caller.publish("modbus.command.tcp-1", "1")
+        own_caller.publish("modbus.command.rtu-1", "1")
+        own_nats.freeze()
         began = time.monotonic()
         scanner.stop()
         assert time.monotonic() - began < wire.DEADLINE
