@@ -27,7 +27,7 @@ BUILD = ROOT / "build" / "dist"
 DIST = ROOT / "dist"
 MINGW = "x86_64-w64-mingw32-gcc"
 STAMP = 1_000_000_000
-"""The time of all files in what is made: the same source makes the same file."""
+"""The time of all files in what is made, so that the same source makes the same file."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def wheel(system: System, folder: Path) -> Path:
         "CARGO_TARGET_DIR": str(target),
         # Smaller by 0.9 MB, but a minute more to build.
         "CARGO_PROFILE_RELEASE_LTO": "fat",
-        # The same source makes the same file, wherever it lies.
+        # So that the same source makes the same file, wherever it lies.
         "SOURCE_DATE_EPOCH": str(STAMP),
         "RUSTFLAGS": f"--remap-path-prefix={folder}=. --remap-path-prefix={target}=target",
         "CFLAGS": f"-ffile-prefix-map={folder}=. -ffile-prefix-map={target}=target",
