@@ -34,7 +34,7 @@ listeners:
     max_connections_per_source: null
     rules: [{{sources: [127.0.0.0/8], units: {{{units}}}, access: read-only}}]
 """
-SHAPE = (64, 1, 10)
+SHAPE = [64, 1, 10]
 """Connections, requests in flight on each, and registers in each."""
 
 
@@ -111,7 +111,9 @@ def server_turn(options: argparse.Namespace, at: int) -> Callable[[int], common.
     """Measures a server; the number stands at this place of the shape, or for memories, workers."""
 
     def turn(number: int) -> common.Result:
-        shape = [16 if at == 1 else 64, 1, 10]
+        shape = SHAPE.copy()
+        if at == 1:
+            shape[0] = 16
         if at < len(shape):
             shape[at] = number
         memories = number if at == 3 else 1

@@ -83,6 +83,9 @@ def test_after_an_error_of_a_file_no_search_of_addresses_is_suggested() -> None:
         assert failure("read", device.url, "file:4:0") == [told]
         assert failure("read", device.url, "fifo:7") == [told]
         assert failure("write", device.url, "file:4:0", "1") == [told]
+    with FakeDevice(lambda pdu: exception(pdu, 11)) as device:
+        _, hint = failure("read", device.url, "file:4:0")
+        assert hint == f"hint: 'holdfast find {device.url}' finds the unit ids that answer"
 
 
 def test_a_file_that_does_not_exist_is_told() -> None:

@@ -120,7 +120,7 @@ def _warn(scope: Scope) -> None:
 
 def _foreign(data: object) -> str | None:
     """What a file is that is no configuration. Its content is not shown: it could be a secret."""
-    from difflib import get_close_matches
+    from difflib import get_close_matches  # Only a file of unknown keys is compared.
 
     if data is None:
         return "an empty file"

@@ -93,7 +93,7 @@ class Linear:
         self.is_identity = scale == 1 and offset == 0
 
     def value(self, number: float | Fraction) -> int | float:
-        """The value of a number in the registers; an integer if everything is one."""
+        """The value of a number, not NaN, in the registers; an integer if everything is one."""
         try:
             if isinstance(number, int):
                 scaled = number * self._times + self._plus

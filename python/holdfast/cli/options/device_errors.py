@@ -90,5 +90,6 @@ def print_error(
     click.echo(f"holdfast: {url}: {error}", err=True)
     if first is not None:
         click.echo(f"hint: {first}", err=True)
-    if is_in_area:
+    is_absent = isinstance(error, ModbusException) and error.code == ILLEGAL_ADDRESS
+    if is_in_area or not is_absent:  # A search of addresses finds no files and queues.
         hint(error, url)
