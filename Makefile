@@ -56,13 +56,14 @@ test-slow: .venv/core.stamp .venv/dev.stamp
 	$(PYTEST) --slow only
 
 # New cases for all property tests, and more of them. A case that fails is printed and kept: as a patch of the
-# Python test (`git apply`), and for Rust as a line of a proptest-regressions file. Commit it with the mend.
+# Python test (`git apply`), and for Rust as a line of a proptest-regressions file. Commit it with the mend. Each check
+# of fuzz/src gets random inputs for SECONDS.
 explore: export PROPTEST_RNG_SEED := $(shell date +%s)
 explore: .venv/core.stamp .venv/dev.stamp
 	@echo PROPTEST_RNG_SEED=$$PROPTEST_RNG_SEED
 	PROPTEST_CASES=5000 cargo test --locked --quiet $(CRATES) --lib --tests; rust=$$?; \
 	cargo run --locked --quiet --release --manifest-path $(FUZZ) --target-dir target/fuzz --bin random -- \
-	  $$PROPTEST_RNG_SEED 60; random=$$?; \
+	  $$PROPTEST_RNG_SEED $(SECONDS); random=$$?; \
 	HOLDFAST_EXPLORE=1 $(BIN)/pytest -m hypothesis && exit $$(( rust || random ))
 
 # Looks for faults of the program and of its tests for HOURS: planted faults, fuzzing, new cases, hostile devices,

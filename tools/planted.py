@@ -1,12 +1,14 @@
 """Puts faults into the program, one after the other, and tells which their tests find.
 
-`make proof` runs it with all faults of `mutations.toml`. Words on the command line choose those
-whose row has all of them. It changes files of this checkout and restores them.
+`make proof` runs it with all faults of `mutations.toml`, in an order that is another one each time.
+Words on the command line choose those whose row has all of them. It changes files of this checkout
+and restores them.
 """
 
 from __future__ import annotations
 
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -99,6 +101,7 @@ def main(words: list[str]) -> int:
     """Returns 1 if a fault was not found, or could not be put in."""
     every = tomllib.loads(LIST.read_text())["mutation"]
     chosen = [each for each in every if all(word in each["row"] for word in words)]
+    random.shuffle(chosen)
     verdicts = Counter[str]()
     saved = CORE.read_bytes()
     try:
@@ -110,8 +113,8 @@ def main(words: list[str]) -> int:
     finally:
         CORE.unlink()
         CORE.write_bytes(saved)
-    found = ", ".join(f"{count} {each}" for each, count in verdicts.items())
-    print(f"{len(every)} faults: {found}")
+        found = ", ".join(f"{count} {each}" for each, count in verdicts.items())
+        print(f"of {len(chosen)} faults: {found}", flush=True)
     return int(verdicts.total() != verdicts["killed"])
 
 

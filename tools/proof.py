@@ -51,7 +51,7 @@ def parts() -> list[Part]:
     targets = sorted(each.name for each in (ROOT / "fuzz" / "corpus").iterdir())
     python = (sys.executable,)
     torture = {"HOLDFAST_TORTURE": "1", "HOLDFAST_TORTURE_SECONDS": "{seconds}"}
-    failed = r"^FAILED|^ERROR|\b(passed|failed)\b|^test result: FAILED|panicked at|SEED="
+    failed = r"^FAILED|^ERROR|\b(passed|failed)\b|^test result: FAILED|panicked at|SEED=|inputs in"
     return [
         Part("planted faults", 4, (*python, "tools/planted.py"), r"^(?!killed)", ends=False),
         *(
@@ -63,7 +63,7 @@ def parts() -> list[Part]:
             )
             for target in targets
         ),
-        Part("new cases", 2, ("make", "explore"), failed, ends=False),
+        Part("new cases", 2, ("make", "explore", "SECONDS=30"), failed, ends=False),
         Part("hostile devices", 1, (*PYTEST, "tests/hostile"), failed, torture),
         Part(
             "model of the memory",

@@ -17,6 +17,7 @@ pub mod raw_ingest;
 pub mod request;
 pub mod response;
 pub mod rtu;
+pub mod server;
 pub mod step;
 #[path = "../../crates/engine/src/tls/hello.rs"]
 mod tls_hello;
@@ -25,7 +26,7 @@ mod tls_hello;
 pub type Check = fn(&[u8]);
 
 /// All checks, with the names of their targets.
-pub const TARGETS: [(&str, Check); 13] = [
+pub const TARGETS: [(&str, Check); 14] = [
     ("ascii", ascii::check),
     ("client", client::check),
     ("file", file::check),
@@ -38,6 +39,7 @@ pub const TARGETS: [(&str, Check); 13] = [
     ("request", request::check),
     ("response", response::check),
     ("rtu", rtu::check),
+    ("server", server::check),
     ("step", step::check),
 ];
 
