@@ -13,12 +13,18 @@ import json
 import sys
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from math import exp, log, sqrt
+from statistics import fmean, stdev
 
 import common
 from common import Result, Server, TurnFailed
 
 FLOOD = (2, 3000)
-SCENARIOS = [(connections, in_flight) for connections in (1, 64) for in_flight in (1, 16)]
+ENOUGH = 10
+STUDENT_T = 1.833
+"""The 95 % quantile for 9 degrees of freedom; it is smaller for more."""
+
+SHAPES = ("1x1", "1x16", "64x1", "64x16")
 
 
 @dataclass
@@ -37,10 +43,12 @@ def main() -> None:
     with ExitStack() as stack:
         servers = start_servers(options, stack)
         scenarios = []
-        for connections, in_flight in SCENARIOS:
+        for shape in options.shape or SHAPES:
+            connections, in_flight = map(int, shape.split("x"))
             scenarios.append(measure(servers, connections, in_flight, options))
             show(scenarios[-1], list(servers))
-        beside = {} if options.null else beside_a_flood(servers["holdfast"], options)
+        is_all = not (options.null or options.shape)
+        beside = beside_a_flood(servers["holdfast"], options) if is_all else {}
     show_flood(beside)
     if options.json:
         results = {
@@ -56,6 +64,12 @@ def arguments() -> argparse.Namespace:
     parser = common.parser(__doc__, seconds=2, rounds=7)
     parser.add_argument("--null", action="store_true", help="compare the bare loop with itself")
     parser.add_argument("--quantity", type=int, default=10, help="registers per read, 1 to 125")
+    parser.add_argument(
+        "--shape",
+        action="append",
+        metavar="CONNECTIONSxIN_FLIGHT",
+        help=f"only this, without pymodbus; can be repeated; default {', '.join(SHAPES)}",
+    )
     options = common.parsed(parser)
     if not 1 <= options.quantity <= 125:
         parser.error("--quantity must be 1 to 125")
@@ -80,6 +94,8 @@ def start_servers(options: argparse.Namespace, stack: ExitStack) -> dict[str, Se
     if options.null:
         start("bare again", limit)
         del servers["holdfast"]
+        return servers
+    if options.shape:
         return servers
     address = start("pymodbus", common.python("pymodbus_server.py"))
     if common.ask(address, options.quantity) != reply:
@@ -142,12 +158,25 @@ def show(scenario: Scenario, names: list[str]) -> None:
         rate, p50, p99, cpu, busy = common.medians(
             scenario.rounds, name, "rate", "p50", "p99", "server_us", "busy"
         )
-        against = "" if name == names[0] else common.ratio(scenario.rounds, names[0], name)
+        against = "" if name == names[0] else compared(scenario.rounds, names[0], name)
         print(
             f"  {name:10}  {rate:10,.0f}  {p50:7.1f}  {p99:7.1f}  {cpu:14.2f}  {busy:10.0%}"
             f"   {against}".rstrip()
         )
     sys.stdout.flush()
+
+
+def compared(rounds: list[dict[str, Result]], first: str, second: str) -> str:
+    """Formats the ratio of two servers; from 10 rounds on with the lower bound of its mean (95 %).
+
+    The bound is Student's, one-sided, for the logarithms of the rounds' ratios.
+    """
+    shown = common.ratio(rounds, first, second)
+    ratios = [log(one[first]["rate"] / one[second]["rate"]) for one in rounds]
+    if len(ratios) < ENOUGH:
+        return shown
+    bound = fmean(ratios) - STUDENT_T * stdev(ratios) / sqrt(len(ratios))
+    return f"{shown}, mean {exp(fmean(ratios)):.3f}, at least {exp(bound):.3f}"
 
 
 def show_flood(beside: dict[str, Result]) -> None:
