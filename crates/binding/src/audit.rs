@@ -10,8 +10,8 @@ use holdfast_protocol::raw_ingest::{Format, Header};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 
-use crate::listed::{items, listed};
 use crate::peer;
+use crate::python_values::{items, listed};
 
 /// The line of one write of a command, in JSON. `origin` is its beginning, `name` that of the memory.
 pub fn line(

@@ -18,13 +18,13 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyList, PyTuple};
 
 use crate::arguments::{address, network, os_error, os_text, time_to_wait};
-use crate::command::{Commands, ParsedWrite, ParsedWrites};
 use crate::engine::{dict, event_fields};
 use crate::exchange::{Answers, Headers, HttpExchange, request, response_head};
-use crate::heads::Heads;
 use crate::heartbeat;
+use crate::json_commands::{Commands, ParsedWrite, ParsedWrites};
 use crate::link::handle;
 use crate::listener::limits;
+use crate::request_heads::Heads;
 use crate::server_tls::ServerTls;
 
 /// The key under which a handler keeps, with a head, what parses the body and who takes the result.

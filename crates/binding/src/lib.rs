@@ -8,18 +8,16 @@ mod audit;
 mod batch;
 mod channel;
 mod client;
-mod command;
 mod connection;
 mod engine;
 mod exchange;
-mod fence;
-mod following;
-mod heads;
+mod follower;
 mod heartbeat;
 mod http;
+mod json_commands;
+mod lease_fence;
 mod limits;
 mod link;
-mod listed;
 mod listener;
 mod log;
 mod memory;
@@ -27,7 +25,9 @@ mod memory_file;
 mod mirror_age;
 mod peer;
 mod poller;
+mod python_values;
 mod raw_ingest;
+mod request_heads;
 mod server_tls;
 mod write_queue;
 mod yaml;
@@ -45,19 +45,19 @@ mod _core {
     #[pymodule_export]
     use super::client::{BlockingClient, Endpoint, Request};
     #[pymodule_export]
-    use super::command::{Commands, ParsedWrites};
-    #[pymodule_export]
     use super::connection::{Attempt, Connection};
     #[pymodule_export]
     use super::engine::Engine;
     #[pymodule_export]
     use super::exchange::HttpExchange;
     #[pymodule_export]
-    use super::fence::Fence;
-    #[pymodule_export]
-    use super::following::Follower;
+    use super::follower::Follower;
     #[pymodule_export]
     use super::http::{HttpServer, ListeningSocket};
+    #[pymodule_export]
+    use super::json_commands::{Commands, ParsedWrites};
+    #[pymodule_export]
+    use super::lease_fence::Fence;
     #[pymodule_export]
     use super::link::{Caller, Link, Passage, Route};
     #[pymodule_export]

@@ -14,8 +14,8 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 
 use crate::arguments::{seconds, within, word};
-use crate::listed::listed;
 use crate::memory::Memory;
+use crate::python_values::listed;
 
 pyo3::create_exception!(
     holdfast._core,

@@ -13,8 +13,8 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyByteArray, PyBytes, PyDict, PyInt, PyList, PyString};
 
 use crate::arguments::within;
-use crate::listed::listed;
 use crate::mirror_age::MirrorAge;
+use crate::python_values::listed;
 use crate::write_queue::WriteQueue;
 
 pyo3::create_exception!(

@@ -19,8 +19,8 @@ use pyo3::types::{PyBytes, PyDict};
 
 use crate::arguments::{byte, packet_format, seconds, within};
 use crate::client::{Endpoint, Request};
-use crate::fence::Fence;
 use crate::heartbeat;
+use crate::lease_fence::Fence;
 use crate::link::{self, Link, Passage};
 use crate::memory::{Memory, named};
 

@@ -8,7 +8,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyList;
 
 use crate::arguments::seconds;
-use crate::listed::listed;
+use crate::python_values::listed;
 
 /// Area, address, values, and whether a Modbus client wrote them.
 type Written<'py> = (Cow<'static, str>, u16, Bound<'py, PyList>, bool);

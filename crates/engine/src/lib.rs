@@ -21,7 +21,7 @@ mod heartbeat;
 pub mod http;
 pub mod items;
 pub mod link;
-mod lookup;
+mod name_lookup;
 mod own_threads;
 pub mod packet_area;
 pub mod poller;

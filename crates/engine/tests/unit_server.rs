@@ -8,7 +8,8 @@ use holdfast_engine::server::reports::counters::Bus;
 use holdfast_engine::server::requests::identity::Identity;
 use holdfast_engine::server::requests::unit_server::{UnitServer, UnitSettings};
 use holdfast_engine::server::rights::functions::{AccessMode, Functions};
-use holdfast_engine::server::rights::policy::{Narrowed, PeerRights, Rule};
+use holdfast_engine::server::rights::peer_rights::PeerRights;
+use holdfast_engine::server::rights::policy::{Narrowed, Rule};
 use holdfast_engine::server::rights::ranges::Ranges;
 use holdfast_memory::{
     Access, Area, CarriedOut, Done, Gate, GateMode, Journal, Layout, Memory, Refusal, Refused,

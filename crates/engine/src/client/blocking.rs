@@ -16,8 +16,8 @@ use holdfast_protocol::pdu::{EncodedRequest, Response};
 
 use super::byte_stream::{ByteStream, StreamError};
 use super::connect::connect;
+use super::fair_lock::Turns;
 use super::interrupt::{Interrupt, SIGNAL_CHECK_INTERVAL};
-use super::turns::Turns;
 use super::{ClientError, Endpoint, Lost, Place, StrayCounters};
 
 /// Bytes per read of a socket. No Modbus datagram is longer.

@@ -4,7 +4,7 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream, UdpSocket};
 use std::time::{Duration, Instant};
 
-use crate::lookup::{self, Unresolved};
+use crate::name_lookup::{self, Unresolved};
 use crate::tls::TlsFailure;
 
 /// The shortest timeout that all systems accept.
@@ -111,9 +111,9 @@ impl TcpByteStream {
         port: u16,
         deadline: Instant,
     ) -> Result<TcpByteStream, StreamError> {
-        let found = lookup::addresses(host, port, deadline)?;
+        let found = name_lookup::addresses(host, port, deadline)?;
         let socket = first(found, |address, others| {
-            let timeout = left(deadline)?.min(lookup::share(deadline, others));
+            let timeout = left(deadline)?.min(name_lookup::share(deadline, others));
             TcpStream::connect_timeout(&address, timeout.max(MIN_TIMEOUT))
         })?;
         socket.set_nodelay(true)?;
@@ -179,7 +179,7 @@ pub(super) fn connect_udp(
     port: u16,
     deadline: Instant,
 ) -> Result<UdpSocket, StreamError> {
-    let found = lookup::addresses(host, port, deadline)?;
+    let found = name_lookup::addresses(host, port, deadline)?;
     Ok(first(found, |address, _| {
         let any = if address.is_ipv6() { "[::]:0" } else { "0.0.0.0:0" };
         let socket = UdpSocket::bind(any)?;

@@ -7,14 +7,14 @@ mod blocking;
 mod byte_stream;
 mod connect;
 mod endpoint;
+mod fair_lock;
 mod interrupt;
-mod strays;
+mod stray_counts;
 mod tls_stream;
-mod turns;
 
 pub use blocking::{BlockingClient, Conditions};
 pub use endpoint::{Endpoint, Place};
-pub use strays::StrayCounters;
+pub use stray_counts::StrayCounters;
 
 use std::io;
 use std::time::Duration;

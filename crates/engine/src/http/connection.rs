@@ -23,8 +23,8 @@ use super::exchange::{Abandoned, Event, Exchange, Order, RequestHead, ResponseHe
 use super::front::Front;
 use super::line::{SharedLine, Verdict, Wire};
 use super::output::Output;
-use super::portion::MAX_HEADER_BYTES;
 use super::refusal::{Refusal, RefusalBody};
+use super::request_bytes::MAX_HEADER_BYTES;
 use crate::server::Peer;
 use crate::server::connections::admission::Ticket;
 use crate::server::connections::closing::drain_for;

@@ -14,7 +14,7 @@ use super::refusal::{Refusal, RefusalBody};
 use crate::server::Peer;
 use crate::server::connections::admission::ConnectionLimits;
 use crate::server::connections::listener::ListenerContext;
-use crate::server::connections::live::Live;
+use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::event::{Kind, Reporter};
 use crate::tls::server::ServerTls;
 
@@ -45,7 +45,7 @@ pub(super) struct Front {
     pub(super) request_timeout: Duration,
     pub(super) idle_timeout: Duration,
     pub(super) leaving: bool,
-    tls: Option<Live<ServerTls>>,
+    tls: Option<Reloadable<ServerTls>>,
     refusals: [RefusalBody; Refusal::ALL.len()],
     next: AtomicU64,
 }
@@ -65,7 +65,7 @@ impl Front {
             request_timeout: settings.request_timeout,
             idle_timeout: settings.idle_timeout,
             leaving: settings.leaving,
-            tls: settings.tls.map(Live::from),
+            tls: settings.tls.map(Reloadable::from),
             refusals: settings.refusals,
             next: AtomicU64::new(0),
         };
@@ -84,7 +84,7 @@ impl Front {
     }
 
     pub(super) fn tls(&self) -> Option<Arc<ServerTls>> {
-        self.tls.as_ref().map(Live::get)
+        self.tls.as_ref().map(Reloadable::get)
     }
 
     pub(super) fn refusal(&self, refusal: Refusal) -> &RefusalBody {

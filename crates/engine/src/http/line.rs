@@ -11,8 +11,8 @@ use socket2::SockRef;
 
 use super::exchange::{Exchange, Order};
 use super::front::Front;
-use super::portion::{ChunksEnd, HeadEnd, Portion};
 use super::refusal::{self, Refusal};
+use super::request_bytes::{ChunksEnd, HeadEnd, Portion};
 use crate::server::Peer;
 use crate::server::connections::admission::{Ticket, WaitingFor};
 use crate::server::reports::event::Kind;

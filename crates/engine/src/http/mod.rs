@@ -10,7 +10,7 @@
 
 mod connection;
 #[cfg(test)]
-mod cuts;
+mod cut_tests;
 mod exchange;
 mod front;
 #[cfg(any(test, feature = "fuzz"))]
@@ -18,8 +18,8 @@ pub mod in_memory;
 mod inbox;
 mod line;
 mod output;
-mod portion;
 mod refusal;
+mod request_bytes;
 mod server;
 
 pub use hyper::http::request::Parts;

@@ -18,7 +18,7 @@ use crate::heartbeat::Heartbeat;
 use crate::own_threads::OwnThreads;
 use crate::server::Peer;
 use crate::server::connections::listener::{Admitted, ListenerContext, Service, Serving, accept};
-use crate::server::connections::live::Live;
+use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::counters::ConnectionCounters;
 use crate::server::reports::event::{self, Events, Kind, Verbosity};
 use crate::tls::TlsFailure;
@@ -43,7 +43,7 @@ impl Service for Front {
 
     fn serve(
         self: Arc<Self>,
-        _live: Arc<Live<Front>>,
+        _live: Arc<Reloadable<Front>>,
         _context: Arc<ListenerContext>,
         connection: Admitted<()>,
         stop: watch::Receiver<bool>,
@@ -107,7 +107,7 @@ impl HttpServer {
         runtime.spawn(async move { inbox.deliver().await });
         let work = async move {
             let context = Arc::clone(&front.context);
-            let live = Arc::new(Live::from(front));
+            let live = Arc::new(Reloadable::from(front));
             accept(Arc::clone(&context), live, socket, vec![worker], stop).await;
             while context.admission.open() > 0 {
                 tokio::select! {

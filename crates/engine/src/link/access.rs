@@ -157,13 +157,13 @@ mod tests {
     use tokio::task::LocalSet;
 
     use super::*;
-    use crate::lookup;
+    use crate::name_lookup;
 
     #[test]
     fn a_name_that_is_not_resolved_in_time_is_a_failed_connect_on_every_transport() {
         let read = EncodedRequest::new(&Request::ReadHoldingRegisters(Range::new(0, 1).unwrap()));
         let (host, port) = (String::from("unanswered.test"), 502);
-        let _unanswered = lookup::hold(&host);
+        let _unanswered = name_lookup::hold(&host);
         let places = [
             Place::Tcp { host: host.clone(), port, tls: None },
             Place::Udp { host: host.clone(), port },

@@ -23,16 +23,16 @@ use holdfast_runtime::Retry;
 use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
+use super::bisection;
 use super::cost::Samples;
 use super::destination::Destination;
 use super::forwarding::{Forward, ForwardSettings};
-use super::learned::{Learned, Unreadable};
+use super::learned_limits::{Learned, Unreadable};
 use super::panic_guard::{Panicked, catch};
 use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
 use super::poll_pause::PollPause;
 use super::results::{BlockResult, Poll, Results};
 use super::schedule::Schedule;
-use super::search;
 use super::state::DeviceState;
 use super::status::StatusSettings;
 use super::turn::Turn;
@@ -520,8 +520,8 @@ impl Device {
                 self.take(block, bytes, gathered);
                 Ok(())
             }
-            Err(fault) if search::is_illegal(fault) => {
-                search::search(&mut Search { device: self, gathered }, block, fault).await
+            Err(fault) if bisection::is_illegal(fault) => {
+                bisection::search(&mut Search { device: self, gathered }, block, fault).await
             }
             Err(other) => {
                 gathered.note(block, Err(other));
@@ -724,7 +724,7 @@ struct Search<'a> {
     gathered: &'a mut Gathered,
 }
 
-impl search::Searched for Search<'_> {
+impl bisection::Searched for Search<'_> {
     fn fields(&self) -> &[Field] {
         &self.device.fields
     }

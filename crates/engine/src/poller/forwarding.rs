@@ -20,7 +20,7 @@ use tokio::time::{Instant, sleep, timeout_at};
 use super::status::{BlockSettings, STATUS_BLOCK_LEN, Status};
 use crate::counter::Counter;
 use crate::link::{agree, dial};
-use crate::lookup;
+use crate::name_lookup;
 use crate::packet_area::in_packet;
 use crate::tls::TlsFailure;
 use crate::tls::client::ClientTls;
@@ -241,7 +241,7 @@ impl Forward {
     }
 
     async fn send(&self, packet: &[u8], deadline: Instant) -> io::Result<u8> {
-        let found = lookup::addresses_of(&self.settings.host, self.settings.port).await?;
+        let found = name_lookup::addresses_of(&self.settings.host, self.settings.port).await?;
         let mut stream = dial(found, deadline).await?;
         if let Some(tls) = &self.settings.tls {
             return send_over_tls(stream, tls, packet).await;

@@ -6,12 +6,13 @@
 //!
 //! All tasks of a poller run on one thread, so that they share state without locks.
 
+mod bisection;
 mod cost;
 mod destination;
 mod device;
 mod forwarding;
 mod health;
-mod learned;
+mod learned_limits;
 mod mirror_age;
 mod panic_guard;
 pub mod plan;
@@ -19,7 +20,6 @@ mod poll_pause;
 mod results;
 mod roster;
 mod schedule;
-mod search;
 mod standby;
 mod state;
 mod status;

@@ -19,7 +19,7 @@ use crate::own_threads::OwnThreads;
 use crate::serial_line::SerialLine;
 use crate::server::connections::admission::{ConnectionLimits, OpenConnection};
 use crate::server::connections::listener::{ListenerContext, Service, accept, bind_tcp, bind_udp};
-use crate::server::connections::live::Live;
+use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::audit::{Auditor, Record, Records, Unrecordable, auditing};
 use crate::server::reports::counters::{ConnectionCounters, PacketCounters};
 use crate::server::reports::event::{
@@ -27,7 +27,8 @@ use crate::server::reports::event::{
 };
 use crate::server::requests::identity::Identity;
 use crate::server::requests::unit_server::UnitServer;
-use crate::server::rights::policy::{PeerRights, Policy};
+use crate::server::rights::peer_rights::PeerRights;
+use crate::server::rights::policy::Policy;
 use crate::server::transports::raw_ingest::{RawIngest, RawSettings};
 use crate::server::transports::serial::{ModbusSerial, SerialSettings};
 use crate::server::transports::tcp::{ModbusStream, StreamSettings};
@@ -126,10 +127,10 @@ struct Listener {
 }
 
 enum Served {
-    Stream(Arc<Live<ModbusStream>>, Arc<UnitServer>),
-    Datagrams(DatagramFraming, Arc<Live<Policy>>, Arc<UnitServer>),
-    Serial(SerialLine, Arc<Live<PeerRights>>, Arc<UnitServer>),
-    Packets(Arc<Live<RawIngest>>),
+    Stream(Arc<Reloadable<ModbusStream>>, Arc<UnitServer>),
+    Datagrams(DatagramFraming, Arc<Reloadable<Policy>>, Arc<UnitServer>),
+    Serial(SerialLine, Arc<Reloadable<PeerRights>>, Arc<UnitServer>),
+    Packets(Arc<Reloadable<RawIngest>>),
 }
 
 /// The counters of a listener.
@@ -264,7 +265,7 @@ impl Engine {
                 let context = context(Some(stream.limits));
                 let unit_server = unit_server(stream.units);
                 let service = ModbusStream::new(&stream, Arc::clone(&unit_server), None);
-                let live = Arc::new(Live::new(service));
+                let live = Arc::new(Reloadable::new(service));
                 let served = Served::Stream(Arc::clone(&live), unit_server);
                 let task = accept(Arc::clone(&context), live, socket, workers, stopping);
                 (context, Some(stream.bind), Some(address), served, Box::pin(task))
@@ -272,7 +273,7 @@ impl Engine {
             ListenerKind::RawIngest(raw) => {
                 let (socket, address) = bound(name, raw.bind, bind_tcp, TcpListener::local_addr)?;
                 let context = context(Some(raw.limits));
-                let live = Arc::new(Live::new(RawIngest::new(&raw, Arc::default())));
+                let live = Arc::new(Reloadable::new(RawIngest::new(&raw, Arc::default())));
                 let served = Served::Packets(Arc::clone(&live));
                 let task = accept(Arc::clone(&context), live, socket, workers, stopping);
                 (context, Some(raw.bind), Some(address), served, Box::pin(task))
@@ -280,7 +281,7 @@ impl Engine {
             ListenerKind::ModbusUdp(udp) => {
                 let (socket, address) = bound(name, udp.bind, bind_udp, UdpSocket::local_addr)?;
                 let (context, unit_server) = (context(None), unit_server(udp.units));
-                let policy = Arc::new(Live::new(Policy::of(&udp.rules)));
+                let policy = Arc::new(Reloadable::new(Policy::of(&udp.rules)));
                 let (rules, units) = (Arc::clone(&policy), Arc::clone(&unit_server));
                 let service = ModbusUdp::new(udp.framing, rules, units);
                 let served = Served::Datagrams(udp.framing, policy, unit_server);
@@ -295,7 +296,7 @@ impl Engine {
                     error,
                 })?;
                 let (context, unit_server) = (context(None), unit_server(units));
-                let rights = Arc::new(Live::new(PeerRights::new(&rule)));
+                let rights = Arc::new(Reloadable::new(PeerRights::new(&rule)));
                 let (own, units) = (Arc::clone(&rights), Arc::clone(&unit_server));
                 let service = ModbusSerial::new(line.clone(), own, units);
                 let served = Served::Serial(line, rights, unit_server);
@@ -510,14 +511,14 @@ impl Listener {
         }
     }
 
-    fn take_over<S: Service>(&self, live: &Live<S>, service: S, limits: ConnectionLimits) {
+    fn take_over<S: Service>(&self, live: &Reloadable<S>, service: S, limits: ConnectionLimits) {
         self.context.admission.set_limits(limits);
         let service = Arc::new(service);
         let before = live.replace(Arc::clone(&service));
         self.context.review(&*before, &*service);
     }
 
-    fn review<S: Service>(&self, live: &Live<S>) {
+    fn review<S: Service>(&self, live: &Reloadable<S>) {
         let service = live.get();
         self.context.review(&*service, &*service);
     }

@@ -18,7 +18,7 @@ use thiserror::Error as ThisError;
 
 use super::certificate::Purpose;
 use super::files::FileError;
-use super::own::own;
+use super::own_certificate::own;
 use super::provider::{handshake_signatures, provider};
 use super::revocation::Lists;
 use super::verification::{Listed, Trust};

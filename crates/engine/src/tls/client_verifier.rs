@@ -9,9 +9,9 @@ use rustls::{CertificateError, DistinguishedName, Error, OtherError};
 
 use super::TlsFailure;
 use super::certificate::{Parsed, Purpose};
-use super::doubts::Doubts;
+use super::file_warnings::Doubts;
 use super::files::FileError;
-use super::notes::{Chain, noted};
+use super::handshake_notes::{Chain, noted};
 use super::provider::handshake_signatures;
 use super::revocation::{List, Lists};
 use super::server_files::{Protocol, ServerFiles};

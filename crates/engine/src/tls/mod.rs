@@ -6,12 +6,12 @@
 mod certificate;
 pub mod client;
 mod client_verifier;
-mod doubts;
 mod failure;
+mod file_warnings;
 mod files;
+mod handshake_notes;
 mod hello;
-mod notes;
-mod own;
+mod own_certificate;
 mod p521;
 mod provider;
 mod revocation;

@@ -14,11 +14,11 @@ use rustls::{AlertDescription, Error, ProtocolVersion, ServerConfig, ServerConne
 
 use super::certificate::Parsed;
 use super::client_verifier::Clients;
-use super::doubts::Doubts;
+use super::file_warnings::Doubts;
 use super::files::FileError;
+use super::handshake_notes::Notes;
 use super::hello::{Hello, LENGTHS, RECORD_HEADER_LEN};
-use super::notes::Notes;
-use super::own::own;
+use super::own_certificate::own;
 use super::provider::provider;
 pub use super::server_files::{ExpiredLists, Protocol, ServerFiles};
 use super::sessions::Sessions;

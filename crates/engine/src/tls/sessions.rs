@@ -16,7 +16,7 @@ use rustls::server::StoresServerSessions;
 use rustls::time_provider::TimeProvider;
 
 use super::client_verifier::Clients;
-use super::notes::{Chain, noted};
+use super::handshake_notes::{Chain, noted};
 
 /// The most sessions. The oldest gives way.
 const MAX_SESSIONS: usize = 1024;

@@ -46,8 +46,8 @@ pub use shared::Checkpoint;
 pub use status::{Digest, Event, Node, Phase, Status};
 pub use stream::message::Origin;
 
+use parts::applied_file::Note;
 use parts::node::Node as Running;
-use parts::note::Note;
 use shared::Shared;
 
 /// The journal of memories that several nodes share.

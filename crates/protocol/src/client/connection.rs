@@ -6,7 +6,7 @@ use core::mem::take;
 use core::time::Duration;
 
 use super::flights::{Call, Done, Flights, Strays, Ticket};
-use super::late_replies::LateReplies;
+use super::late_replies_without_ids::LateReplies;
 use super::mbap_datagrams::Datagrams;
 use super::mbap_stream::Stream;
 use super::raised_timeouts::Lateness;

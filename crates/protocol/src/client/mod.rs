@@ -28,7 +28,7 @@
 mod attempts;
 mod connection;
 mod flights;
-mod late_replies;
+mod late_replies_without_ids;
 mod mbap_datagrams;
 mod mbap_stream;
 mod raised_timeouts;
@@ -38,7 +38,7 @@ mod tolerance;
 pub use attempts::{Attempt, BUSY_PAUSE};
 pub use connection::{Connection, Past};
 pub use flights::{Done, Strays, Ticket};
-pub use late_replies::MAX_LATENESS;
+pub use late_replies_without_ids::MAX_LATENESS;
 pub use tolerance::{AcceptUnit, Echo, Tolerance};
 
 use core::time::Duration;

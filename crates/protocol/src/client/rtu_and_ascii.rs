@@ -9,7 +9,7 @@ use core::time::Duration;
 
 use super::attempts::Attempt;
 use super::flights::{Call, Done, Flight, Flights, Ticket};
-use super::late_replies::{Ended, LateReplies};
+use super::late_replies_without_ids::{Ended, LateReplies};
 use super::tolerance::Echo;
 use super::{Closed, Failure, GUARD, InvalidResponse, TURNAROUND, Time};
 use crate::frame::{FrameError, ascii, rtu};

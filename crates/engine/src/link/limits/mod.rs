@@ -2,6 +2,6 @@
 
 pub(crate) mod circuit_breaker;
 pub(crate) mod connect_pause;
-pub(crate) mod fence;
 pub(crate) mod flood;
+pub(crate) mod lease_fence;
 pub(crate) mod permit;

@@ -6,7 +6,7 @@ use std::time::Instant;
 use tokio::time::timeout_at;
 
 use crate::client::ClientError;
-use crate::link::limits::fence::Fence;
+use crate::link::limits::lease_fence::Fence;
 
 /// Until when a request may be sent. The default is without a limit.
 #[derive(Debug, Clone, Default)]

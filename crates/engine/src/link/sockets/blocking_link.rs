@@ -15,8 +15,8 @@ use crate::client::{
 };
 use crate::link::fault::Exchanged;
 use crate::link::limits::connect_pause::ConnectPause;
-use crate::link::limits::fence::Pass;
 use crate::link::limits::flood::Flood;
+use crate::link::limits::lease_fence::Pass;
 use crate::link::limits::permit::Permit;
 
 pub(in crate::link) struct BlockingLink {

@@ -6,7 +6,7 @@ use std::net::SocketAddr;
 use tokio::net::TcpStream;
 use tokio::time::{Instant, timeout};
 
-use crate::lookup;
+use crate::name_lookup;
 
 /// Tries the addresses in order. Each but the last gets its share of the time until the deadline. The caller
 /// limits the last one.
@@ -20,7 +20,7 @@ pub(crate) async fn dial(addresses: Vec<SocketAddr>, deadline: Instant) -> io::R
         if others == 0 {
             return TcpStream::connect(address).await;
         }
-        let share = lookup::share(deadline.into_std(), others);
+        let share = name_lookup::share(deadline.into_std(), others);
         if let Ok(Ok(stream)) = timeout(share, TcpStream::connect(address)).await {
             return Ok(stream);
         }

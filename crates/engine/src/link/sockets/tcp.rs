@@ -22,13 +22,13 @@ use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 use crate::client::{ClientError, StrayCounters};
 use crate::link::fault::Exchanged;
 use crate::link::limits::connect_pause::ConnectPause;
-use crate::link::limits::fence::Pass;
 use crate::link::limits::flood::Flood;
+use crate::link::limits::lease_fence::Pass;
 use crate::link::limits::permit::Permit;
 use crate::link::scheduling::pace::Pace;
 use crate::link::sockets::connect::dial;
 use crate::link::sockets::handshake;
-use crate::lookup;
+use crate::name_lookup;
 use crate::tls::client::ClientTls;
 use crate::tls::{Channel, TlsFailure};
 
@@ -199,13 +199,14 @@ impl TcpLink {
             sleep_until((ended + self.tolerance.reconnect).min(deadline)).await;
         }
         permit.check()?;
-        let found = match timeout_at(deadline, lookup::addresses_of(&self.host, self.port)).await {
-            Ok(found) => found,
-            Err(_) => {
-                let error = ClientError::LookupTimeout { to: self.url.clone(), after: timeout };
-                return Err(self.pause.failed(error));
-            }
-        };
+        let found =
+            match timeout_at(deadline, name_lookup::addresses_of(&self.host, self.port)).await {
+                Ok(found) => found,
+                Err(_) => {
+                    let error = ClientError::LookupTimeout { to: self.url.clone(), after: timeout };
+                    return Err(self.pause.failed(error));
+                }
+            };
         let connected = timeout_at(deadline, async {
             let mut stream = dial(found?, deadline).await?;
             let tls = match &self.tls {

@@ -27,7 +27,7 @@ use crate::server::connections::reply_order::{Deferral, Deferred, MAX_WAITING};
 use crate::server::reports::event::Kind;
 use crate::server::reports::refused_request::{RefusedRequest, Reported};
 use crate::server::requests::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};
-use crate::server::rights::policy::PeerRights;
+use crate::server::rights::peer_rights::PeerRights;
 use crate::server::transports::framing::{Ascii, Framing, Mbap, Next, Rtu};
 use crate::server::transports::stream::{self, Stream};
 
@@ -592,7 +592,7 @@ mod tests {
     use crate::server::requests::unit_server::UnitSettings;
     use crate::server::rights::functions::{AccessMode, Functions};
     use crate::server::rights::policy::Rule;
-    use crate::server::transports::cuts::assert_same_outcome;
+    use crate::server::transports::cut_tests::assert_same_outcome;
     use crate::server::transports::framing::MbapBesidePackets;
 
     fn memory() -> Arc<Memory> {

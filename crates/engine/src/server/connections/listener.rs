@@ -16,14 +16,14 @@ use tokio::sync::watch;
 use crate::server::connections::admission::{
     Admission, ConnectionLimits, Evicted, Full, Ticket, attach,
 };
-use crate::server::connections::live::Live;
 use crate::server::connections::peer::Peer;
+use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::audit::{Auditor, Permit};
 use crate::server::reports::counters::ConnectionCounters;
 use crate::server::reports::event::{Kind, Reporter};
 use crate::server::reports::refused_request::RefusedRequest;
 use crate::server::requests::unit_server::UnitServer;
-use crate::server::rights::policy::PeerRights;
+use crate::server::rights::peer_rights::PeerRights;
 
 /// The most connections that wait in the system to be accepted.
 const MAX_BACKLOG: i32 = 1024;
@@ -228,7 +228,7 @@ pub(crate) trait Service: Send + Sync + Sized + 'static {
     /// thread of the worker.
     fn serve(
         self: Arc<Self>,
-        live: Arc<Live<Self>>,
+        live: Arc<Reloadable<Self>>,
         context: Arc<ListenerContext>,
         connection: Admitted<Self::PeerRights>,
         stop: watch::Receiver<bool>,
@@ -238,7 +238,7 @@ pub(crate) trait Service: Send + Sync + Sized + 'static {
 /// Accepts connections until `stop`, and distributes them to the workers in turn.
 pub(crate) async fn accept<S: Service>(
     context: Arc<ListenerContext>,
-    service: Arc<Live<S>>,
+    service: Arc<Reloadable<S>>,
     socket: std::net::TcpListener,
     workers: Vec<Handle>,
     mut stop: watch::Receiver<bool>,
@@ -267,7 +267,7 @@ pub(crate) async fn accept<S: Service>(
 /// Checks the rights and limits of a new connection, and starts to serve it.
 fn admit<S: Service>(
     context: &Arc<ListenerContext>,
-    live: &Arc<Live<S>>,
+    live: &Arc<Reloadable<S>>,
     stream: TcpStream,
     peer: SocketAddr,
     workers: &[Handle],

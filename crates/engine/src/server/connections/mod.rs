@@ -6,7 +6,7 @@ pub(crate) mod connection;
 pub(crate) mod deadlines;
 pub(crate) mod fair_share;
 pub(crate) mod listener;
-pub(crate) mod live;
 pub(crate) mod partial_packet;
 pub(crate) mod peer;
+pub(crate) mod reloadable;
 pub(crate) mod reply_order;

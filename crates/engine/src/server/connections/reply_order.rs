@@ -18,7 +18,8 @@ use crate::server::connections::peer::Peer;
 use crate::server::reports::audit::{Forwarded, Permit};
 use crate::server::reports::refused_request::RefusedRequest;
 use crate::server::requests::unit_server::UnitServer;
-use crate::server::rights::policy::{Elsewhere, PeerRights};
+use crate::server::rights::peer_rights::PeerRights;
+use crate::server::rights::policy::Elsewhere;
 
 /// The most requests of a connection that wait for replies.
 pub(in crate::server) const MAX_WAITING: usize = 16;

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 use holdfast_protocol::pdu::ExceptionCode;
 
 use crate::server::rights::functions::is_write;
-use crate::server::rights::policy::PeerRights;
+use crate::server::rights::peer_rights::PeerRights;
 
 /// A refused request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

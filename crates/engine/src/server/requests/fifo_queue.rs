@@ -6,7 +6,7 @@ use holdfast_protocol::pdu::{Buffer, ExceptionCode, limit, reply};
 
 use crate::items::Items;
 use crate::server::requests::memory_operations::{exception_of, out_of_ranges};
-use crate::server::rights::policy::PeerRights;
+use crate::server::rights::peer_rights::PeerRights;
 
 /// The most registers of a queue, with that of the count.
 const MAX_REGISTERS: usize = 1 + limit::QUEUE_REGISTERS as usize;

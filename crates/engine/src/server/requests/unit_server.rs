@@ -18,7 +18,7 @@ use holdfast_protocol::pdu::{
 use crate::counter::Counter;
 use crate::items::Items;
 use crate::link::{Asker, PendingReply};
-use crate::server::connections::live::Live;
+use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::comm_events::{CommEvents, Received};
 use crate::server::reports::counters::{Bus, Counters, FrameCounters};
 use crate::server::requests::identity::Identity;
@@ -26,7 +26,8 @@ use crate::server::requests::listen_only::ListenOnly;
 use crate::server::requests::memory_operations::{exception_of, out_of_ranges, reading, writing};
 use crate::server::requests::{fifo_queue, file_records, journaled_write};
 use crate::server::rights::functions::is_write;
-use crate::server::rights::policy::{Elsewhere, NOT_ALLOWED, PeerRights};
+use crate::server::rights::peer_rights::{NOT_ALLOWED, PeerRights};
+use crate::server::rights::policy::Elsewhere;
 
 /// What all units of a listener do.
 #[derive(Debug, Clone, Copy, Default)]
@@ -41,7 +42,7 @@ pub struct UnitSettings {
 #[derive(Debug)]
 pub struct UnitServer {
     pub counters: Counters,
-    identity: Live<Identity>,
+    identity: Reloadable<Identity>,
     pub(crate) listen_only: ListenOnly,
     comm_events: CommEvents,
 }
@@ -59,7 +60,7 @@ pub(crate) fn changed_delimiter(request: &[u8], reply: &[u8]) -> Option<u8> {
 
 impl UnitServer {
     pub fn new(identity: Identity, settings: UnitSettings) -> UnitServer {
-        let (counters, identity) = (Counters::default(), Live::new(identity));
+        let (counters, identity) = (Counters::default(), Reloadable::new(identity));
         let listen_only = ListenOnly::new(settings.listen_only);
         let comm_events = CommEvents::new(settings.event_log);
         UnitServer { counters, identity, listen_only, comm_events }

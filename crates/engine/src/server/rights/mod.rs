@@ -1,5 +1,6 @@
 //! What peers may do: rules, functions and ranges.
 
 pub mod functions;
+pub mod peer_rights;
 pub mod policy;
 pub mod ranges;

@@ -1,7 +1,7 @@
 //! Listeners, by transport: where a frame ends, and what carries it.
 
 #[cfg(test)]
-pub(crate) mod cuts;
+pub(crate) mod cut_tests;
 pub(crate) mod framing;
 pub(crate) mod raw_ingest;
 pub(crate) mod secure;

@@ -33,9 +33,9 @@ use crate::server::connections::fair_share::{self, Share, WORK_OF_READ};
 use crate::server::connections::listener::{
     Admitted, KEEPALIVE, ListenerContext, Service, Serving, set_options,
 };
-use crate::server::connections::live::Live;
 use crate::server::connections::partial_packet::Incoming;
 use crate::server::connections::peer::Peer;
+use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::audit::{Permit, Record, Written};
 use crate::server::reports::counters::PacketCounters;
 use crate::server::reports::event::Kind;
@@ -278,7 +278,7 @@ impl RawIngest {
     /// Serves a connection to its end.
     async fn receive_all(
         self: Arc<Self>,
-        live: Arc<Live<RawIngest>>,
+        live: Arc<Reloadable<RawIngest>>,
         context: Arc<ListenerContext>,
         connection: Admitted<RawGrant>,
         stop: watch::Receiver<bool>,
@@ -305,7 +305,7 @@ impl RawIngest {
     async fn secure(
         &self,
         tls: &ServerTls,
-        live: Arc<Live<RawIngest>>,
+        live: Arc<Reloadable<RawIngest>>,
         context: Arc<ListenerContext>,
         admitted: Admitted<RawGrant>,
         stop: watch::Receiver<bool>,
@@ -766,7 +766,7 @@ impl Service for RawIngest {
 
     fn serve(
         self: Arc<Self>,
-        live: Arc<Live<Self>>,
+        live: Arc<Reloadable<Self>>,
         context: Arc<ListenerContext>,
         connection: Admitted<RawGrant>,
         stop: watch::Receiver<bool>,
@@ -820,7 +820,7 @@ mod tests {
     use crate::counter::Counter;
     use crate::server::connections::admission::Admission;
     use crate::server::reports::event::{self, Verbosity};
-    use crate::server::transports::cuts::assert_same_outcome;
+    use crate::server::transports::cut_tests::assert_same_outcome;
 
     fn listener(format: Format, flags: Flags) -> RawIngest {
         let settings = RawSettings {
@@ -1132,7 +1132,7 @@ mod tests {
         while accepted.peek(&mut vec![0; sent.len()]).unwrap() < sent.len() {}
         let connection = admitted(accepted, peer, Vec::new());
         let memory = Arc::clone(&connection.rights.targets[&1]);
-        let live = Arc::new(Live::new(raw));
+        let live = Arc::new(Reloadable::new(raw));
         let (raw, context) = (live.get(), Arc::new(ListenerContext::for_tests()));
         let (_engine, stop) = watch::channel(false);
         let connection = raw.serve_at_once(&context, connection);

@@ -18,7 +18,7 @@ use tokio::time::{Instant, sleep, sleep_until, timeout};
 use crate::link::{Asker, source};
 use crate::serial_line::{LineMode, SerialLine};
 use crate::server::connections::listener::ListenerContext;
-use crate::server::connections::live::Live;
+use crate::server::connections::reloadable::Reloadable;
 use crate::server::connections::reply_order::{Asked, Expected};
 use crate::server::reports::audit::Forwarded;
 use crate::server::reports::event::Kind;
@@ -26,7 +26,8 @@ use crate::server::reports::refused_request::{RefusedRequest, Reported};
 use crate::server::requests::unit_server::{
     ASCII_DELIMITER, UnitServer, UnitSettings, changed_delimiter,
 };
-use crate::server::rights::policy::{PeerRights, Rule};
+use crate::server::rights::peer_rights::PeerRights;
+use crate::server::rights::policy::Rule;
 use crate::server::transports::framing::{Framing, Rtu};
 
 /// The unit id that addresses all units (Modbus over Serial Line V1.02, 2.2).
@@ -52,7 +53,7 @@ pub struct SerialSettings {
 
 pub(crate) struct ModbusSerial {
     unit_server: Arc<UnitServer>,
-    rights: Arc<Live<PeerRights>>,
+    rights: Arc<Reloadable<PeerRights>>,
     line: SerialLine,
     /// The number of the line as a source of requests to devices.
     source: u64,
@@ -64,7 +65,7 @@ pub(crate) struct ModbusSerial {
 impl ModbusSerial {
     pub(crate) fn new(
         line: SerialLine,
-        rights: Arc<Live<PeerRights>>,
+        rights: Arc<Reloadable<PeerRights>>,
         unit_server: Arc<UnitServer>,
     ) -> ModbusSerial {
         ModbusSerial {

@@ -14,12 +14,13 @@ use crate::server::connections::deadlines::Timeouts;
 use crate::server::connections::listener::{
     Admitted, ListenerContext, Service, Serving, set_options,
 };
-use crate::server::connections::live::Live;
 use crate::server::connections::peer::Peer;
+use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::counters::PacketCounters;
 use crate::server::reports::event::Kind;
 use crate::server::requests::unit_server::{UnitServer, UnitSettings};
-use crate::server::rights::policy::{PeerRights, Policy, Rule};
+use crate::server::rights::peer_rights::PeerRights;
+use crate::server::rights::policy::{Policy, Rule};
 use crate::server::transports::framing::{Ascii, Framing, Mbap, MbapBesidePackets, Rtu};
 use crate::server::transports::raw_ingest::{RawIngest, RawSettings};
 use crate::server::transports::secure::secured;
@@ -118,7 +119,7 @@ impl ModbusStream {
 
     fn connection<F: Framing>(
         self: Arc<Self>,
-        live: Arc<Live<ModbusStream>>,
+        live: Arc<Reloadable<ModbusStream>>,
         context: Arc<ListenerContext>,
         admitted: Admitted<PeerRights>,
         stop: watch::Receiver<bool>,
@@ -136,7 +137,7 @@ impl ModbusStream {
     async fn secure<F: Framing>(
         self: Arc<Self>,
         tls: Arc<ServerTls>,
-        live: Arc<Live<ModbusStream>>,
+        live: Arc<Reloadable<ModbusStream>>,
         context: Arc<ListenerContext>,
         admitted: Admitted<PeerRights>,
         stop: watch::Receiver<bool>,
@@ -157,7 +158,7 @@ impl ModbusStream {
 
     fn modbus<F: Framing, S: Stream + 'static>(
         &self,
-        live: Arc<Live<ModbusStream>>,
+        live: Arc<Reloadable<ModbusStream>>,
         context: Arc<ListenerContext>,
         (stream, peer): (S, Peer),
         (rights, received): (Arc<PeerRights>, Vec<u8>),
@@ -176,7 +177,7 @@ impl ModbusStream {
     async fn shared(
         self: Arc<Self>,
         raw: Arc<RawIngest>,
-        live: Arc<Live<ModbusStream>>,
+        live: Arc<Reloadable<ModbusStream>>,
         context: Arc<ListenerContext>,
         mut admitted: Admitted<PeerRights>,
         mut stop: watch::Receiver<bool>,
@@ -231,7 +232,7 @@ impl ModbusStream {
     }
 }
 
-impl Renewal for Live<ModbusStream> {
+impl Renewal for Reloadable<ModbusStream> {
     /// A connection that had no rights by its role has none still.
     fn terms(&self, peer: &Peer) -> Option<Terms> {
         let service = self.get();
@@ -268,7 +269,7 @@ impl Service for ModbusStream {
 
     fn serve(
         self: Arc<Self>,
-        live: Arc<Live<Self>>,
+        live: Arc<Reloadable<Self>>,
         context: Arc<ListenerContext>,
         connection: Admitted<PeerRights>,
         stop: watch::Receiver<bool>,

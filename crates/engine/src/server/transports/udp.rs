@@ -16,7 +16,7 @@ use tokio::task::{JoinSet, yield_now};
 
 use crate::link::{Asker, Reply, source};
 use crate::server::connections::listener::ListenerContext;
-use crate::server::connections::live::Live;
+use crate::server::connections::reloadable::Reloadable;
 use crate::server::connections::reply_order::{Asked, Expected};
 use crate::server::reports::refused_request::RefusedRequest;
 use crate::server::requests::unit_server::{UnitServer, UnitSettings};
@@ -61,14 +61,14 @@ pub struct UdpSettings {
 
 pub(crate) struct ModbusUdp {
     unit_server: Arc<UnitServer>,
-    policy: Arc<Live<Policy>>,
+    policy: Arc<Reloadable<Policy>>,
     framing: DatagramFraming,
 }
 
 impl ModbusUdp {
     pub(crate) fn new(
         framing: DatagramFraming,
-        policy: Arc<Live<Policy>>,
+        policy: Arc<Reloadable<Policy>>,
         unit_server: Arc<UnitServer>,
     ) -> ModbusUdp {
         ModbusUdp { unit_server, policy, framing }
@@ -320,7 +320,7 @@ mod tests {
         let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
         let identity = Identity::new(&objects, &[]).unwrap();
         let unit_server = Arc::new(UnitServer::new(identity, UnitSettings::default()));
-        let policy = Arc::new(Live::new(Policy::of(&[rule])));
+        let policy = Arc::new(Reloadable::new(Policy::of(&[rule])));
         let service = ModbusUdp::new(DatagramFraming::Mbap, policy, Arc::clone(&unit_server));
         let socket = bind_udp("127.0.0.1:0".parse().unwrap()).unwrap();
         let client = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();

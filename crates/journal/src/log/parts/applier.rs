@@ -6,7 +6,7 @@ use holdfast_memory::Memory;
 
 use crate::log::clock::Moment;
 use crate::log::error::{End, LogError};
-use crate::log::parts::note::Note;
+use crate::log::parts::applied_file::Note;
 use crate::log::settings::Settings;
 use crate::log::shared::{Checkpoint, Shared};
 use crate::log::state::{Applied, Place, State};

@@ -17,9 +17,9 @@ use std::time::{Duration, Instant};
 use holdfast_memory::Memory;
 
 use crate::log::error::{End, LogError};
+use crate::log::parts::applied_file::Note;
 use crate::log::parts::applier::Applier;
 use crate::log::parts::comparer::Comparer;
-use crate::log::parts::note::Note;
 use crate::log::parts::rejoin::Rejoin;
 use crate::log::parts::sender::Sender;
 use crate::log::parts::snapshotter::Snapshotter;

@@ -3,7 +3,7 @@
 
 use std::cell::RefMut;
 
-use super::learned::Learned;
+use super::learned_limits::Learned;
 use super::plan::{self, Block, Field};
 use crate::link::Fault;
 

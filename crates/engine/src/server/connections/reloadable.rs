@@ -4,11 +4,11 @@ use std::sync::{Arc, PoisonError, RwLock};
 
 /// A value that is replaced as a whole. Callers that took the value before keep it.
 #[derive(Debug)]
-pub(crate) struct Live<T>(RwLock<Arc<T>>);
+pub(crate) struct Reloadable<T>(RwLock<Arc<T>>);
 
-impl<T> Live<T> {
-    pub(crate) fn new(value: T) -> Live<T> {
-        Live(RwLock::new(Arc::new(value)))
+impl<T> Reloadable<T> {
+    pub(crate) fn new(value: T) -> Reloadable<T> {
+        Reloadable(RwLock::new(Arc::new(value)))
     }
 
     pub(crate) fn get(&self) -> Arc<T> {
@@ -21,8 +21,8 @@ impl<T> Live<T> {
     }
 }
 
-impl<T> From<Arc<T>> for Live<T> {
-    fn from(value: Arc<T>) -> Live<T> {
-        Live(RwLock::new(value))
+impl<T> From<Arc<T>> for Reloadable<T> {
+    fn from(value: Arc<T>) -> Reloadable<T> {
+        Reloadable(RwLock::new(value))
     }
 }

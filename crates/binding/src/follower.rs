@@ -7,8 +7,8 @@ use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
 
-use crate::listed::listed;
 use crate::memory::{Memory, Range, Stale, integer};
+use crate::python_values::listed;
 
 #[pyclass(frozen, module = "holdfast")]
 pub struct Follower {

@@ -1,0 +1,219 @@
+//! The rights of a peer, compiled to a table by unit id: what answers each unit, and what the peer may do with it.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use holdfast_memory::{Area, Memory};
+use holdfast_protocol::pdu::{ExceptionCode, Function, Request, SubFunction};
+
+use crate::server::rights::functions::{AccessMode, Answerer, Codes, only_reads};
+use crate::server::rights::policy::{Elsewhere, Rule};
+use crate::server::rights::ranges::Ranges;
+
+/// The exception for what a peer may not do: for a peer that may only read, a write is no function.
+pub(crate) const NOT_ALLOWED: ExceptionCode = ExceptionCode::IllegalFunction;
+
+/// The rights of a peer, compiled to a table by unit id.
+#[derive(Debug)]
+pub struct PeerRights {
+    units: Box<[Option<UnitRights>; 256]>,
+    /// The functions of all units together: what a peer learns of units that it does not have.
+    functions: Codes,
+}
+
+#[derive(Debug)]
+struct UnitRights {
+    /// `None` if all requests go elsewhere.
+    memory: Option<Arc<Memory>>,
+    /// Where requests may go; the first place that takes one gets it. `None` if the memory answers
+    /// everything.
+    places: Option<Box<[Elsewhere]>>,
+    functions: Codes,
+    access: AccessMode,
+    /// `None` if there is no limit.
+    ranges: Option<Box<Ranges>>,
+    exception_status: Option<(Area, u16)>,
+    queues: Box<[u16]>,
+}
+
+impl UnitRights {
+    /// The rights by a rule that names the unit, and the functions that a peer may learn of by it.
+    fn new(
+        rule: &Rule,
+        unit_id: u8,
+        memory: Option<Arc<Memory>>,
+        elsewhere: Option<Elsewhere>,
+    ) -> (UnitRights, Codes) {
+        let narrowed = rule.narrowed.iter().find(|(narrowed, _)| *narrowed == unit_id);
+        let (access, allowed, ranges, exception_status, queues) = match narrowed {
+            None => (rule.access, &rule.functions, None, None, Box::default()),
+            Some((_, own)) => {
+                let limited = !own.ranges.is_everything();
+                let ranges = limited.then(|| Box::new(own.ranges.clone()));
+                let queues = own.queues.clone();
+                (own.access, &own.functions, ranges, own.exception_status, queues)
+            }
+        };
+        let answerer = match elsewhere {
+            Some(Elsewhere::Device(_)) => Answerer::Device,
+            _ => Answerer::Memory {
+                exception_status: exception_status.is_some(),
+                files: memory.as_ref().is_some_and(|memory| memory.layout().has_files()),
+                queues: !queues.is_empty(),
+            },
+        };
+        let functions = Codes::of(allowed, access, answerer);
+        let known = match answerer {
+            Answerer::Memory { .. } => functions,
+            // A peer must not learn which units are of devices.
+            Answerer::Device => Codes::of(allowed, access, Answerer::PLAIN_MEMORY),
+        };
+        let journal = memory.as_ref().filter(|memory| memory.has_journal()).cloned();
+        let places: Box<[_]> =
+            elsewhere.into_iter().chain(journal.map(Elsewhere::Journal)).collect();
+        let places = (!places.is_empty()).then_some(places);
+        let unit =
+            UnitRights { memory, places, functions, access, ranges, exception_status, queues };
+        (unit, known)
+    }
+}
+
+impl PeerRights {
+    pub fn new(rule: &Rule) -> PeerRights {
+        PeerRights::of([rule])
+    }
+
+    /// The rights of a peer that may do nothing: every request is answered with exception 01.
+    pub fn none() -> PeerRights {
+        PeerRights::of([])
+    }
+
+    /// The rights by some rules; for each unit id, the first one that names it decides.
+    pub(super) fn of<'r>(rules: impl IntoIterator<Item = &'r Rule>) -> PeerRights {
+        let mut units = Box::new([const { None }; 256]);
+        let mut functions = Codes::default();
+        for rule in rules {
+            let mut own: BTreeMap<u8, (Option<Arc<Memory>>, Option<Elsewhere>)> = BTreeMap::new();
+            for (unit, memory) in &rule.units {
+                own.entry(*unit).or_default().0 = Some(Arc::clone(memory));
+            }
+            for (unit, place) in &rule.elsewhere {
+                own.entry(*unit).or_default().1 = Some(place.clone());
+            }
+            for (unit_id, (memory, elsewhere)) in own {
+                let place = &mut units[usize::from(unit_id)];
+                if place.is_some() {
+                    continue;
+                }
+                let (unit, known) = UnitRights::new(rule, unit_id, memory, elsewhere);
+                functions = functions.with(known);
+                *place = Some(unit);
+            }
+            if rule.units.is_empty() && rule.elsewhere.is_empty() {
+                functions =
+                    functions.with(Codes::of(&rule.functions, rule.access, Answerer::PLAIN_MEMORY));
+            }
+        }
+        PeerRights { units, functions }
+    }
+
+    #[inline]
+    fn unit(&self, unit_id: u8) -> Option<&UnitRights> {
+        self.units[usize::from(unit_id)].as_ref()
+    }
+
+    /// The memory of a unit id.
+    #[inline]
+    pub fn memory(&self, unit_id: u8) -> Option<&Memory> {
+        self.unit(unit_id)?.memory.as_deref()
+    }
+
+    /// Where requests to a unit id go, or some of them.
+    #[inline]
+    pub(crate) fn elsewhere(&self, unit_id: u8) -> Option<&[Elsewhere]> {
+        self.unit(unit_id)?.places.as_deref()
+    }
+
+    /// The ranges that requests to a unit id must be inside, if they are limited.
+    #[inline]
+    pub(crate) fn ranges(&self, unit_id: u8) -> Option<&Ranges> {
+        self.unit(unit_id)?.ranges.as_deref()
+    }
+
+    /// Where the eight bits are that function 7 reads from the memory of a unit id.
+    pub(crate) fn exception_status(&self, unit_id: u8) -> Option<(Area, u16)> {
+        self.unit(unit_id)?.exception_status
+    }
+
+    /// Whether function 24 finds a queue at a holding register of the memory of a unit id.
+    pub(crate) fn has_queue(&self, unit_id: u8, address: u16) -> bool {
+        self.unit(unit_id).is_some_and(|unit| unit.queues.contains(&address))
+    }
+
+    /// The exception for a request that the peer may not send to this unit: its function is not allowed (writes
+    /// are not, for a peer that may only read), or its sub-function is unknown, or changes what it may only read.
+    #[inline]
+    pub(crate) fn refusal(
+        &self,
+        unit_id: u8,
+        (function_code, pdu): (u8, &[u8]),
+        request: &Result<Request<'_>, ExceptionCode>,
+    ) -> Option<ExceptionCode> {
+        let changes_state = || {
+            function_code == Function::Diagnostics.code()
+                && self.is_read_only(unit_id)
+                && SubFunction::from_pdu(pdu).is_some_and(SubFunction::changes_state)
+        };
+        let refused = !self.allows(unit_id, function_code)
+            || *request == Err(ExceptionCode::IllegalFunction)
+            || changes_state();
+        refused.then_some(NOT_ALLOWED)
+    }
+
+    /// Whether a request to a device is denied although its function is allowed: a read-only peer may send
+    /// only what is known to change nothing, which a sub-function decides too.
+    pub(crate) fn denies(&self, unit_id: u8, request: &[u8]) -> bool {
+        self.is_read_only(unit_id) && !only_reads(request)
+    }
+
+    /// One unit id per memory, chosen among the `wanted` unit ids: the first one that may do what is
+    /// asked, or else the first one.
+    pub fn one_unit_of_each_memory(
+        &self,
+        wanted: impl Fn(u8) -> bool,
+        may: impl Fn(u8) -> bool,
+    ) -> Vec<u8> {
+        let mut found: Vec<(u8, &Arc<Memory>)> = Vec::new();
+        for (unit_id, unit) in (0..=u8::MAX).zip(self.units.iter()) {
+            let Some(memory) = unit.as_ref().and_then(|unit| unit.memory.as_ref()) else {
+                continue;
+            };
+            if !wanted(unit_id) {
+                continue;
+            }
+            match found.iter_mut().find(|(_, known)| Arc::ptr_eq(known, memory)) {
+                None => found.push((unit_id, memory)),
+                Some((chosen, _)) if !may(*chosen) && may(unit_id) => *chosen = unit_id,
+                Some(_) => {}
+            }
+        }
+        found.into_iter().map(|(unit_id, _)| unit_id).collect()
+    }
+
+    /// Whether a function code is known and allowed for a unit; for a unit that the peer does not have,
+    /// whether it is for any.
+    #[inline]
+    pub fn allows(&self, unit_id: u8, function_code: u8) -> bool {
+        let functions = self.unit(unit_id).map_or(&self.functions, |unit| &unit.functions);
+        functions.has(function_code)
+    }
+
+    /// Whether a peer may not write to a unit; for a unit that it does not have, whether to none.
+    pub fn is_read_only(&self, unit_id: u8) -> bool {
+        let is_read_only = |unit: &UnitRights| unit.access == AccessMode::ReadOnly;
+        match self.unit(unit_id) {
+            Some(unit) => is_read_only(unit),
+            None => self.units.iter().flatten().all(is_read_only),
+        }
+    }
+}
