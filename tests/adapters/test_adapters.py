@@ -13,7 +13,7 @@ import pytest
 
 from holdfast import Memory
 from holdfast.adapters import Grant, MemoryAccess, Refused, Stop
-from holdfast.adapters.foreign import UnknownAdapter
+from holdfast.adapters.plugins import UnknownAdapter
 from holdfast.appliance.services import supervision as supervisor
 from holdfast.appliance.services.supervision import Supervisor
 from support import wire

@@ -11,7 +11,7 @@ import pytest
 import holdfast
 from holdfast.appliance import Appliance
 from holdfast.config import load
-from holdfast.outputs.stored import Stored
+from holdfast.outputs.buffer_file import Stored
 from support import wire
 from support.polled import Fake, data, exception
 from support.readings import tag

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 
 from holdfast._core import UNMEASURED_COST_MS
 from holdfast.client.url import Receiver, parse
-from holdfast.config import Config, json_schema, load, planning
+from holdfast.config import Config, json_schema, load, read_plans
 from holdfast.config.dump import effective
 from holdfast.config.initial_values import InitialRun
 from holdfast.config.models.devices import DestinationConfig, DeviceConfig, ReadConfig
@@ -422,7 +422,7 @@ def test_a_device_has_the_documented_defaults(loaded: Callable[..., Config]) -> 
 
 
 def test_a_device_with_an_automatic_gap_is_planned_by_costs(loaded: Callable[..., Config]) -> None:
-    rules = planning.rules(device_of(loaded, ", max_gap: auto"))
+    rules = read_plans.rules(device_of(loaded, ", max_gap: auto"))
     assert (rules["max_gap"], rules["cost"]) == (None, UNMEASURED_COST_MS)
 
 

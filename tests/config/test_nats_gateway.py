@@ -9,10 +9,10 @@ import pytest
 from holdfast.appliance.services.gateway import gateway_settings
 from holdfast.appliance.services.scanner import scanner_settings
 from holdfast.client.url import Tls
-from holdfast.config.values.scanning import written_pollable
+from holdfast.config.values.scanner_settings import written_pollable
 from holdfast.gateway import GatewayLimits
 from holdfast.net.nats.connection import Ping, Servers
-from holdfast.scanner.subscriptions.rules import Defaults, ScannerLimits
+from holdfast.scanner.subscriptions.request_rules import Defaults, ScannerLimits
 from support.config_folder import Folder
 
 if TYPE_CHECKING:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from holdfast.config.values.scanning import Writes
+    from holdfast.config.values.scanner_settings import Writes
     from support.brokers import NatsServer
     from support.judges import Judge
     from support.nats_bus import Run

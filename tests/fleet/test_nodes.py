@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import TimeoutError as NoAnswer
 
-from holdfast.config.values.scanning import parse_pollable
+from holdfast.config.values.scanner_settings import parse_pollable
 from holdfast.net.nats.connection import Servers
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.scanner.fleet import reports

@@ -13,7 +13,7 @@ from holdfast.errors import ConnectFailed, ConnectionLost, RequestTimeout
 from holdfast.gateway import pool
 from holdfast.gateway.egress import Route
 from holdfast.gateway.pool import Pool
-from holdfast.gateway.sharing import Turns
+from holdfast.gateway.shared_devices import Turns
 from support import wire
 
 READ = Request.read("coils", 0, 1)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.config.values.allow_entries import parse_allowed
-from holdfast.config.values.scanning import parse_pollable
+from holdfast.config.values.scanner_settings import parse_pollable
 from holdfast.net.allow_list import AllowList, NotAllowed
 from holdfast.net.resolver import NoSuchName
 from holdfast.types import TRANSPORTS

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast.outputs import Buffer
-from holdfast.outputs.stored import Stored
+from holdfast.outputs.buffer_file import Stored
 from support import wire
 from support.cases import examples
 from support.readings import numbered, numbers, reading, tag

@@ -9,9 +9,9 @@ import pytest
 from holdfast.config.models.devices import DeviceIdentityConfig
 from holdfast.config.models.outputs import MqttOutputConfig
 from holdfast.outputs import sending
+from holdfast.outputs.device_access import DeviceInfo
 from holdfast.outputs.mqtt.home_assistant import Discovery
 from holdfast.outputs.mqtt.payloads import Payloads
-from holdfast.outputs.site import DeviceInfo
 from holdfast.tags import Tag
 from holdfast.tags.scale import RegisterScale
 from support import wire

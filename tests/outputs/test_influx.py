@@ -13,8 +13,8 @@ import pytest
 from holdfast.config.models.outputs import InfluxConfig
 from holdfast.outputs import Buffer, Refused, Sending
 from holdfast.outputs import sending as module
+from holdfast.outputs.buffer_file import Stored
 from holdfast.outputs.influx import Influx
-from holdfast.outputs.stored import Stored
 from holdfast.runtime.stop import Stop
 from support import wire
 from support.brokers import free_port

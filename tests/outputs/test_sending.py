@@ -9,7 +9,7 @@ import pytest
 
 from holdfast.outputs import Buffer, Receiver, Refused, Sending
 from holdfast.outputs import sending as module
-from holdfast.outputs.stored import Stored
+from holdfast.outputs.buffer_file import Stored
 from holdfast.runtime.stop import Stop
 from support import wire
 from support.readings import numbered, numbers, tag

@@ -10,7 +10,7 @@ import pytest
 
 from holdfast.scanner.commands import value
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.subscriptions.rules import ScannerLimits
+from holdfast.scanner.subscriptions.request_rules import ScannerLimits
 from holdfast.scanner.subscriptions.tag import Tag
 from support import wire
 from support.fake_device import FakeDevice, exception, registers

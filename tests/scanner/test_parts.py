@@ -32,7 +32,7 @@ from holdfast.scanner.subscriptions.groups import Group, grouped
 from holdfast.scanner.subscriptions.health import Health
 from holdfast.scanner.subscriptions.plan import Plan
 from holdfast.scanner.subscriptions.registry import Registry
-from holdfast.scanner.subscriptions.rules import ScannerLimits
+from holdfast.scanner.subscriptions.request_rules import ScannerLimits
 from holdfast.scanner.subscriptions.tag import Tag
 from holdfast.tags.decoding import Places, decoder
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from nats.aio.client import Client
 
-    from holdfast.config.values.scanning import Publish
+    from holdfast.config.values.scanner_settings import Publish
     from holdfast.net.nats.tolerant_client import SafeClient
     from holdfast.types import PolledBlock
 

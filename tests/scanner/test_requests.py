@@ -10,11 +10,11 @@ import jsonschema_rs
 import pytest
 
 from holdfast.client.url import NetworkTarget, SerialTarget
-from holdfast.config.values.scanning import parse_pollable
+from holdfast.config.values.scanner_settings import parse_pollable
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.schema import json_schema
 from holdfast.scanner.polling.allowed_devices import AllowedDevices
-from holdfast.scanner.subscriptions.rules import ScannerLimits
+from holdfast.scanner.subscriptions.request_rules import ScannerLimits
 from support.brokers import free_port
 from support.nats_bus import leaving, subscription, tag
 from support.paths import ROOT

@@ -11,7 +11,7 @@ import holdfast
 from holdfast import _core
 from holdfast.scanner.dialects import DIALECTS
 from holdfast.scanner.settings import Settings
-from holdfast.scanner.subscriptions.rules import Defaults
+from holdfast.scanner.subscriptions.request_rules import Defaults
 from support import wire
 from support.nats_bus import leaving, logged, subscription, tag
 from support.tentacle import (

@@ -15,7 +15,7 @@ from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
 from holdfast.scanner.jetstream.store import BUCKET as KEPT
 from holdfast.scanner.messages.decoding import Adjustments, decode_lenient
 from holdfast.scanner.messages.types import SubscribeRequest
-from holdfast.scanner.subscriptions.rules import Defaults
+from holdfast.scanner.subscriptions.request_rules import Defaults
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag

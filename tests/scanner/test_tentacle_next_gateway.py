@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.scanner.subscriptions.rules import Defaults
+from holdfast.scanner.subscriptions.request_rules import Defaults
 from support import wire
 from support.nats_bus import Caller
 from support.tentacle_next import (

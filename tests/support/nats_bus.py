@@ -19,7 +19,7 @@ import pytest
 from nats.aio.client import Client
 from nats.js.errors import NotFoundError
 
-from holdfast.config.values.scanning import parse_pollable
+from holdfast.config.values.scanner_settings import parse_pollable
 from holdfast.net.nats.connection import Servers
 from holdfast.scanner.jetstream.store import BUCKET
 from holdfast.scanner.service import Scanner

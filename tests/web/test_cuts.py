@@ -1,6 +1,7 @@
 """HTTP requests cut and joined over a socket: the responses and what they do are the same.
 
-The core has the same test without a socket, cut at every byte: `crates/engine/src/http/cuts.rs`.
+The core has the same test without a socket, cut at every byte:
+`crates/engine/src/http/cut_tests.rs`.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from holdfast.gateway.egress import Egress
 from holdfast.gateway.endpoints import address_map
 from holdfast.gateway.pool import Pool
 from holdfast.gateway.refusals import EXCEPTION_STATUS, FAILURE, REFUSALS
-from holdfast.gateway.sharing import Shared
+from holdfast.gateway.shared_devices import Shared
 from holdfast.gateway.streams import views, watch
 from holdfast.net.allow_list import AllowList
 from holdfast.net.http import health as probes

@@ -19,7 +19,7 @@ from holdfast.errors import (
 from holdfast.events import log_lines
 from holdfast.gateway.broadcast import is_broadcast
 from holdfast.gateway.pool import Unusable
-from holdfast.gateway.sharing import QueueFull
+from holdfast.gateway.shared_devices import QueueFull
 from holdfast.net.http.fields import malformed
 from holdfast.net.http.requests import BadRequest
 from holdfast.net.resolver import NoSuchName
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from holdfast.gateway.egress import Egress
     from holdfast.gateway.pool import Pool
-    from holdfast.gateway.sharing import Turns
+    from holdfast.gateway.shared_devices import Turns
     from holdfast.types import Transport
 
 Result = TypeVar("Result")

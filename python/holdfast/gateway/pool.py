@@ -28,7 +28,7 @@ from holdfast.client.endpoint import check_files
 from holdfast.client.url import IN_FLIGHT, NetworkTarget
 from holdfast.errors import ConnectionLost, ModbusException
 from holdfast.gateway.broadcast import is_broadcast, send
-from holdfast.gateway.sharing import Turns
+from holdfast.gateway.shared_devices import Turns
 from holdfast.net.http.requests import BadRequest
 from holdfast.net.tls import NO_FILES
 from holdfast.protocol import READ_FUNCTIONS
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from holdfast._core import Request
     from holdfast.client.async_transports import AsyncTransport
     from holdfast.gateway.egress import Route
-    from holdfast.gateway.sharing import Shared
+    from holdfast.gateway.shared_devices import Shared
     from holdfast.net.tls import Tls
 
 Result = TypeVar("Result")

@@ -10,9 +10,9 @@ from holdfast.types import AREAS
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from holdfast.importing.binds import Binds
+    from holdfast.importing.address_filters import Peers
+    from holdfast.importing.listen_addresses import Binds
     from holdfast.importing.notes import Choices, Desk
-    from holdfast.importing.peers import Peers
     from holdfast.types import Area
 
 INGESTED = {"discrete_inputs", "input_registers"}

@@ -15,7 +15,7 @@ from holdfast.runtime.text import listing
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.importing.sections import Section
+    from holdfast.importing.key_reader import Section
 
 SOURCE = frozenset({1, 2, 3, 4, 5, 6, 15, 16})
 """Functions that the source supports; it refuses all others."""

@@ -11,8 +11,8 @@ from holdfast.types import AREAS
 
 if TYPE_CHECKING:
     from holdfast.config.text.yaml_document import KeyPath
+    from holdfast.importing.key_reader import Section
     from holdfast.importing.notes import Desk
-    from holdfast.importing.sections import Section
 
 
 def read_id(name: str) -> dict[str, int]:

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.importing.binds import Binds
+from holdfast.importing.address_filters import read_filter
 from holdfast.importing.draft import Draft
 from holdfast.importing.imported import Generation, Imported, Source
+from holdfast.importing.key_reader import Section
+from holdfast.importing.listen_addresses import Binds
 from holdfast.importing.mma_adapters import Adapters
 from holdfast.importing.mma_first import FirstGeneration
 from holdfast.importing.mma_second import TOP_REASONS, SecondGeneration
 from holdfast.importing.notes import Choices
-from holdfast.importing.peers import read_filter
-from holdfast.importing.sections import Section
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.text.messages import show
 from holdfast.config.values.topics import parse_topic_filter
 from holdfast.config.values.urls import parse_broker
+from holdfast.importing.address_filters import ALL, written
 from holdfast.importing.draft import ADMISSION, INGESTED, Reader
+from holdfast.importing.key_reader import seconds, section
 from holdfast.importing.names import free_name, unique_names
-from holdfast.importing.peers import ALL, written
-from holdfast.importing.sections import seconds, section
 from holdfast.net.addresses import LOOPBACK
 from holdfast.protocol import MAX_WORD
 from holdfast.runtime.text import all_of, listing
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from holdfast.config.text.yaml_document import KeyPath
     from holdfast.config.values.ip_addresses import Bind
-    from holdfast.importing.sections import Section
+    from holdfast.importing.key_reader import Section
     from holdfast.types import Area
 
 SHORT = 16

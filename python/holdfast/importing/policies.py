@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from holdfast.importing import function_rights as functions
-from holdfast.importing.peers import Peers
+from holdfast.importing.address_filters import Peers
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

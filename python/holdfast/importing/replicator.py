@@ -9,8 +9,8 @@ from urllib.parse import urlsplit
 from holdfast.config.models.devices import LAST_SLOT, MIN_INTERVAL
 from holdfast.config.text.messages import show
 from holdfast.importing.imported import Imported, Source
+from holdfast.importing.key_reader import Section, seconds, section
 from holdfast.importing.names import unique_names
-from holdfast.importing.sections import Section, seconds, section
 from holdfast.net.addresses import joined
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT
 from holdfast.types import AREAS, Area

@@ -11,7 +11,7 @@ from holdfast.config.models.outputs import MAX_VALUES
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.outputs.stored import Stored
+    from holdfast.outputs.buffer_file import Stored
     from holdfast.polling import Reading
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from holdfast.outputs.buffer import Buffer
-    from holdfast.outputs.stored import Stored
+    from holdfast.outputs.buffer_file import Stored
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
 

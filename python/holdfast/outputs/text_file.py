@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.config.models.outputs import MEASUREMENT
+from holdfast.outputs.buffer_file import file_errors
 from holdfast.outputs.line_protocol import lines
 from holdfast.outputs.sending import Receiver
-from holdfast.outputs.stored import file_errors
 from holdfast.tags.text import plain, text_of
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.responder import Responder
     from holdfast.scanner.subscriptions.key import SubscriptionKey
     from holdfast.scanner.subscriptions.registry import Registry
-    from holdfast.scanner.subscriptions.rules import Rules
+    from holdfast.scanner.subscriptions.request_rules import Rules
     from holdfast.scanner.subscriptions.subscription import Subscription
 
 RETRY_EXPIRY_S = 1

@@ -28,7 +28,7 @@ from holdfast.scanner.reports.reports import Reports
 from holdfast.scanner.requests import Requests
 from holdfast.scanner.responder import Responder
 from holdfast.scanner.subscriptions.registry import Registry
-from holdfast.scanner.subscriptions.rules import Rules
+from holdfast.scanner.subscriptions.request_rules import Rules
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Sequence

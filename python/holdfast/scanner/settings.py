@@ -5,20 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from holdfast.config.values.scanning import PARTITIONS, written_pollable
+from holdfast.config.values.scanner_settings import PARTITIONS, written_pollable
 from holdfast.net.nats.connection import MAX_PAUSE, Ping, Servers
 from holdfast.net.tls import NO_FILES, Tls
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.runtime.standstill import STANDSTILL_S
 from holdfast.scanner.dialects import DIALECTS
 from holdfast.scanner.jetstream.key_watch import WATCH_TIMES, WatchTimes
-from holdfast.scanner.subscriptions.rules import Defaults, ScannerLimits
+from holdfast.scanner.subscriptions.request_rules import Defaults, ScannerLimits
 from holdfast.scanner.subscriptions.write_access import described
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from holdfast.config.values import scanning
+    from holdfast.config.values import scanner_settings
     from holdfast.net.allow_list import AllowEntry
     from holdfast.tags import TagList
 
@@ -56,7 +56,7 @@ class Settings:
     """The TLS files for connections to devices."""
     defaults: Defaults = field(default_factory=Defaults)
     """What subscribe requests leave out."""
-    writes: scanning.Writes = "tags"
+    writes: scanner_settings.Writes = "tags"
     """Which tags callers may write."""
     strict: bool = False
     """Whether requests are refused that would otherwise be adjusted."""
@@ -68,7 +68,7 @@ class Settings:
     """Whether the log is also published."""
     keep_subscriptions: bool = True
     """Whether subscriptions and states are kept in JetStream."""
-    dialect: scanning.Dialect = "tentacle"
+    dialect: scanner_settings.Dialect = "tentacle"
     """The programs that it serves."""
     profiles: Mapping[str, TagList] = field(default_factory=dict)
     """The tags that requests can name by their profile."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from holdfast import _core
 from holdfast.client.endpoint import endpoint, receiver_endpoint
 from holdfast.client.url import Receiver
-from holdfast.config import planning
+from holdfast.config import read_plans
 from holdfast.config.checks.units import routed
 from holdfast.polling.readings import Reader
 from holdfast.types import AREAS
@@ -128,7 +128,7 @@ def device(
         report=report if fields else None,
         fields=fields,
         fence=fence,
-        **planning.rules(settings),
+        **read_plans.rules(settings),
     )
 
 

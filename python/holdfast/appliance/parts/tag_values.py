@@ -10,7 +10,7 @@ from holdfast.client.url import NetworkTarget
 from holdfast.config.models.devices import DeviceIdentityConfig
 from holdfast.events import log_lines
 from holdfast.outputs import Buffer, Changes, Sending
-from holdfast.outputs.site import DeviceInfo
+from holdfast.outputs.device_access import DeviceInfo
 from holdfast.polling import Reading
 from holdfast.polling.readings import Reader
 from holdfast.runtime.heartbeat import Heartbeat
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.devices import DeviceConfig
     from holdfast.config.models.outputs import Output
     from holdfast.outputs import Receiver
-    from holdfast.outputs.stored import Stored
+    from holdfast.outputs.buffer_file import Stored
     from holdfast.polling import DevicePoll
     from holdfast.tags import Tag
     from holdfast.types import ThreadHeartbeat
@@ -130,7 +130,7 @@ class TagValues:
         file = settings.file
 
         def opened() -> Stored:
-            from holdfast.outputs.stored import Stored
+            from holdfast.outputs.buffer_file import Stored
 
             assert file is not None, "called only with a file"
             return Stored(file, settings.max_bytes, self.find)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from holdfast.client.requests import write_typed
 from holdfast.events import log_lines
 from holdfast.events.audit import Unrecorded
-from holdfast.outputs.site import NotWritten
+from holdfast.outputs.device_access import NotWritten
 from holdfast.polling.faults import fault_text, fault_word
 from holdfast.polling.write_ttl import WRITE_TTL_S
 from holdfast.tags.text import value_from

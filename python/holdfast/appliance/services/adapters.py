@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from holdfast.adapters import foreign
+from holdfast.adapters import plugins
 from holdfast.appliance.services.services import Service
 from holdfast.appliance.services.supervision import Supervisor
 
@@ -80,10 +80,10 @@ class ForeignAdapters(Service):
     def check(self, config: Config) -> None:
         """Raises `UnknownAdapter` if one is not installed."""
         for name, settings in config.adapters.items():
-            foreign.entry_point(name, settings)
+            plugins.entry_point(name, settings)
 
     def adapters(self, config: Config, running: Services) -> Iterator[Supervisor]:
         """Yields all adapters."""
         for name, settings in config.adapters.items():
             access = running.memory_access(name)
-            yield Supervisor(name, foreign.factory(name, settings, access), settings, access=access)
+            yield Supervisor(name, plugins.factory(name, settings, access), settings, access=access)

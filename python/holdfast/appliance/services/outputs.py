@@ -15,7 +15,7 @@ from holdfast.config.models.outputs import (
     NatsOutputConfig,
     SparkplugConfig,
 )
-from holdfast.outputs.site import NotWritten
+from holdfast.outputs.device_access import NotWritten
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from holdfast.config import Config
     from holdfast.config.models.outputs import Output
     from holdfast.outputs import Receiver
-    from holdfast.outputs.site import DeviceInfo, Site
+    from holdfast.outputs.device_access import DeviceInfo, Site
     from holdfast.polling import Reading
     from holdfast.tags import Tag
 
@@ -49,7 +49,7 @@ class Outputs(Service):
 
 
 class OutputSite:
-    """The devices of the appliance, as one output may see them: a `holdfast.outputs.site.Site`."""
+    """The devices of the appliance, as one output may see them: a `Site`."""
 
     def __init__(
         self, output: str, only: Collection[str] | None, values: TagValues, writes: TagWrites

@@ -45,7 +45,7 @@ def scanner_settings(
     """Returns the settings of the scanner."""
     from holdfast.net.nats.connection import Ping
     from holdfast.scanner.settings import FleetSettings, Settings
-    from holdfast.scanner.subscriptions.rules import Defaults, ScannerLimits
+    from holdfast.scanner.subscriptions.request_rules import Defaults, ScannerLimits
 
     fleet, given = settings.fleet, settings.defaults
     return Settings(

@@ -14,7 +14,7 @@ from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.nats import nats_options
 from holdfast.cli.options.option import flag, json_option, option, parsed_by
 from holdfast.cli.terminal_text import counted, print_json, table
-from holdfast.config.values.scanning import PREFIX, parse_member
+from holdfast.config.values.scanner_settings import PREFIX, parse_member
 from holdfast.net import event_loop
 from holdfast.net.nats.connection import Servers
 from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable

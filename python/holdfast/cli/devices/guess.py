@@ -12,8 +12,9 @@ from holdfast.cli import terminal_text
 from holdfast.cli.live import schedule
 from holdfast.cli.options import device, device_errors, item
 from holdfast.cli.options.duration import every_option
-from holdfast.cli.options.item import modicon_option, words_argument
+from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import flag, json_option, number_option, option
+from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.url import url_argument
 from holdfast.cli.terminal_text import print_json
 from holdfast.discovery import type_guess
@@ -24,7 +25,7 @@ from holdfast.types import BIT_AREAS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from holdfast.cli.options.item import Place
+    from holdfast.cli.options.plc_addresses import Place
     from holdfast.discovery.type_guess import Guess
 
 REGISTERS = 4

@@ -13,20 +13,21 @@ from holdfast.cli.configuration import load_or_exit
 from holdfast.cli.old_spellings import hint
 from holdfast.cli.options import item
 from holdfast.cli.options.duration import Duration
-from holdfast.cli.options.item import modicon_option, range_of, words_argument
+from holdfast.cli.options.item import range_of, words_argument
 from holdfast.cli.options.option import choice, json_option, number_option, option, require_known
+from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.url import checked_url, is_url
 from holdfast.cli.options.value import typed
 from holdfast.cli.terminal_text import print_json
-from holdfast.config import planning
-from holdfast.config.planning import Preset
+from holdfast.config import read_plans
+from holdfast.config.read_plans import Preset
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_BITS, READ_REGISTERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from holdfast.config.models.devices import DeviceConfig
-    from holdfast.config.planning import Block, Field, Plan, Rules
+    from holdfast.config.read_plans import Block, Field, Plan, Rules
     from holdfast.types import Area
 
 FILL = 50
@@ -158,7 +159,7 @@ def _of_url(
     if not reads:
         raise click.UsageError("URL requires at least one ITEM, as in hr:100 20.")
     rules: Rules = {**given}  # type: ignore[typeddict-item]
-    return _Shown(planning.plan(reads, rules), rules, url, None, None)
+    return _Shown(read_plans.plan(reads, rules), rules, url, None, None)
 
 
 def _of_file(
@@ -174,12 +175,12 @@ def _of_file(
     for name in names or devices:
         require_known(name, devices, f"{file} has no device", "devices")
         settings = devices[name]
-        rules = planning.rules(settings)
+        rules = read_plans.rules(settings)
         if given.keys() & {"max_gap", "cost"}:
             rules["max_gap"] = rules["cost"] = None
         rules |= given  # type: ignore[typeddict-item]
         asked = [(read.area, read.address, read.count) for read in settings.reads]
-        yield _Shown(planning.plan(asked, rules), rules, settings.url, name, settings)
+        yield _Shown(read_plans.plan(asked, rules), rules, settings.url, name, settings)
 
 
 def _compared(preset: Preset | None, fill: int | None, shown: _Shown) -> dict[str, Any] | None:
@@ -187,7 +188,7 @@ def _compared(preset: Preset | None, fill: int | None, shown: _Shown) -> dict[st
     if preset is None:
         return None
     holes = {"fill": FILL if fill is None else fill} if preset == "max_insert" else {}
-    requests = planning.preset(shown.plan.reads, shown.rules, preset, holes.get("fill", 0))
+    requests = read_plans.preset(shown.plan.reads, shown.rules, preset, holes.get("fill", 0))
     return {"preset": preset, **holes, "requests": requests}
 
 

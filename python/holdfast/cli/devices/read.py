@@ -15,8 +15,9 @@ from holdfast.cli.live import schedule
 from holdfast.cli.old_spellings import hint
 from holdfast.cli.options import device, device_errors, item
 from holdfast.cli.options.duration import every_option
-from holdfast.cli.options.item import modicon_option, words_argument
+from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import json_option, number_option
+from holdfast.cli.options.plc_addresses import modicon_hint, modicon_option
 from holdfast.cli.options.value import typed, typed_options
 from holdfast.cli.tags import options as tag_options
 from holdfast.cli.tags.options import TagFiles
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from holdfast.cli.devices.device_items import Records
-    from holdfast.cli.options.item import Place
+    from holdfast.cli.options.plc_addresses import Place
     from holdfast.cli.options.value import Typed
     from holdfast.cli.tags.options import Selection, TagFiles
     from holdfast.client import SyncClient
@@ -131,7 +132,7 @@ def read(
             raw = query.read(client)
         except ModbusError as error:
             place = query.place if isinstance(query, _Query) else None
-            of_modicon = item.modicon_hint(place) if place and _is_absent(error) else None
+            of_modicon = modicon_hint(place) if place and _is_absent(error) else None
             shown = fields if as_json else None
             is_in_area = place is not None
             device_errors.print_error(error, url, shown, of_modicon, is_in_area=is_in_area)

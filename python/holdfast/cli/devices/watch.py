@@ -18,8 +18,9 @@ from holdfast.cli.live.changes import Tracker
 from holdfast.cli.live.sources import Unreadable, Unwatchable, WatchedRange
 from holdfast.cli.options import device, device_errors, item
 from holdfast.cli.options.duration import every_option
-from holdfast.cli.options.item import modicon_option, words_argument
+from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import json_option, number_option, option, require_known
+from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.url import checked_url, is_url
 from holdfast.cli.progress import bar
 from holdfast.cli.tags import options as tag_options
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
     from holdfast.cli.live.changes import Change
     from holdfast.cli.live.sources import Source
-    from holdfast.cli.options.item import Place
+    from holdfast.cli.options.plc_addresses import Place
     from holdfast.cli.tags.options import Selection, TagFiles
 
 TOKEN = "HOLDFAST_TOKEN"

@@ -15,8 +15,9 @@ from holdfast.cli import terminal_text
 from holdfast.cli.devices import device_items
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options import device, device_errors, item
-from holdfast.cli.options.item import modicon_option, words_argument
+from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import flag, json_option
+from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.value import typed, typed_options
 from holdfast.cli.tags import options as tag_options
 from holdfast.cli.tags.options import TagFiles
@@ -29,7 +30,7 @@ from holdfast.types import BIT_AREAS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from holdfast.cli.options.item import Place
+    from holdfast.cli.options.plc_addresses import Place
     from holdfast.cli.options.value import Typed
     from holdfast.cli.tags.options import TagFiles
     from holdfast.client import SyncClient

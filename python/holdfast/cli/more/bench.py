@@ -14,8 +14,9 @@ from holdfast.cli import terminal_text
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options import device, device_errors, item
 from holdfast.cli.options.duration import time_option
-from holdfast.cli.options.item import modicon_option, words_argument
+from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import json_option, number_option
+from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.url import url_argument
 from holdfast.cli.progress import bar
 from holdfast.cli.terminal_text import print_json

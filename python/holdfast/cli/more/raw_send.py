@@ -11,9 +11,10 @@ import click
 from holdfast import raw_ingest
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.duration import timeout_option
-from holdfast.cli.options.item import modicon_option, take, words_argument
 from holdfast.cli.options.item import number as number_of
+from holdfast.cli.options.item import take, words_argument
 from holdfast.cli.options.option import flag, json_option, option
+from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.url import Receiver, parse_receiver
 from holdfast.protocol import MAX_WORD

@@ -21,7 +21,7 @@ from holdfast.types import BIT_AREAS
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from holdfast.cli.options.item import Place
+    from holdfast.cli.options.plc_addresses import Place
     from holdfast.types import Area
 
 UNIT = f"Unit id, 0 to {MAX_UNIT}."

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import click
 from click.shell_completion import CompletionItem
 
-from holdfast.cli.options.option import Command, flag
+from holdfast.cli.options.option import Command
+from holdfast.cli.options.plc_addresses import MODICON_NUMBER, Place, of_iec, of_modicon
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.runtime.text import listing, suggestion
 from holdfast.types import AREAS, SHORT_AREAS, SHORT_OF
@@ -23,36 +24,12 @@ if TYPE_CHECKING:
 
     from holdfast.types import Area
 
-MODICON: dict[str, Area] = dict(zip("0143", AREAS, strict=True))
-"""The first digits of Modicon numbers."""
-
 SIZED = ("bit", "string", "bytes")
 """Types whose name has a colon."""
 
 FORM = "AREA:ADDRESS[:TYPE[:ORDER]], as in hr:100:float32:CDAB"
-MODICON_FORMS = "40001, 400001 or 4x0001, and 0, 1, 3 for coils, discrete inputs, input registers"
 RANGE = "[ITEM [COUNT]]"
 ITEMS = "[ITEM [COUNT] | ITEM...]"
-
-_MODICON = re.compile(r"([0134])(?:([xX])([0-9]{1,5})|([0-9]{4,5}))")
-_IEC = re.compile(r"%([A-Z]+)([0-9]{1,5})(.*)", re.I)
-IEC_AREAS: dict[str, Area] = {"M": "coils", "MW": "holding_registers"}
-IEC_READINGS = {
-    "MD": "hr:{0}:uint32 or hr:{1}:uint32, as controllers count words or pairs of words",
-    "MF": "hr:{0}:float32 or hr:{1}:float32, as controllers count words or pairs of words",
-    "IW": "ir:{0} or, with CODESYS, hr:{0}",
-    "QW": "hr:{0} or, with CODESYS, ir:{0}",
-    "MX": "co:{0}, or a bit of a register, as in hr:0:bit:3",
-}
-"""What addresses of IEC 61131-3 may mean that controllers use in several ways."""
-
-
-@dataclass(frozen=True)
-class Place:
-    """An area, and an address in that area."""
-
-    area: Area
-    address: int
 
 
 @dataclass(frozen=True)
@@ -188,25 +165,14 @@ def are_several(words: Sequence[str], *, modicon: bool) -> bool:
             or (len(left) > 1 and left[0].isalpha())
         )
     has_own_area = ":" in words[0] or not words[0][:1].isalpha()
-    match = _MODICON.fullmatch(left[0])
+    match = MODICON_NUMBER.fullmatch(left[0])
     if has_own_area and match is not None:
-        meant = _modicon(left[0])
+        meant = of_modicon(left[0])
         raise click.UsageError(
             f"{left[0]!r} is not clear: type --count {left[0]} for that many, or "
             f"{SHORT_OF[meant.area]}:{meant.address} for the Modicon number."
         )
     return False
-
-
-def modicon_hint(place: Place) -> str | None:
-    """A hint for an address that does not exist but looks like a Modicon number."""
-    match = _MODICON.fullmatch(str(place.address))
-    if match is None or MODICON[match[1]] != place.area:
-        return None
-    meant = int(match[4]) - 1
-    if meant < 0:
-        return None
-    return f"addresses count from 0; as a Modicon number (--modicon) {place.address} is {meant}"
 
 
 def complete(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
@@ -221,22 +187,19 @@ def words_argument(metavar: str, *, required: bool = False) -> Callable[[Command
     )
 
 
-modicon_option = flag("--modicon", "Addresses are Modicon numbers, also beside an area: hr 40001.")
-
-
 def _numbered(text: str, *, modicon: bool) -> Place | None:
     """The place of a number that names its area: Modicon's, or IEC's. `None` for other text."""
     if text.startswith("%"):
-        return _iec(text)
-    match = _MODICON.fullmatch(text)
+        return of_iec(text)
+    match = MODICON_NUMBER.fullmatch(text)
     if match is not None and text[:2] in ("0x", "0X") and not modicon:
-        meant = _modicon(text).address
+        meant = of_modicon(text).address
         raise click.UsageError(
             f"{text!r} is not clear: type co:{meant} for the Modicon number, or name the area of "
             f"the address {int(text, 16)}, as in hr:{text}."
         )
     if match is not None or (modicon and not text[:1].isalpha()):
-        return _modicon(text)
+        return of_modicon(text)
     if number(text) is not None:
         raise click.UsageError(
             f"{text!r} has no area: type hr:{text} for a holding register, counted from 0, or "
@@ -248,37 +211,16 @@ def _numbered(text: str, *, modicon: bool) -> Place | None:
 def _addressed(text: str, area: Area, *, modicon: bool) -> tuple[Place, int | None]:
     """The place of an address beside its area, and the number of addresses of FIRST-LAST."""
     if modicon or re.fullmatch("[134][xX][0-9]+", text):
-        place = _modicon(text)
+        place = of_modicon(text)
         if place.area != area:
             raise click.UsageError(f"{text} is in {place.area}, not in {area}.")
         return place, None
     found = span(text)
     if found is None:
         near = ""
-        if _MODICON.fullmatch(text):
-            meant = _modicon(text)
+        if MODICON_NUMBER.fullmatch(text):
+            meant = of_modicon(text)
             near = f"; did you mean {SHORT_OF[meant.area]}:{meant.address}, Modicon's {text}?"
         allowed = f"allowed: 0 to {LAST_ADDRESS}, decimal or 0x{near}"
         raise click.UsageError(f"ADDRESS is {text!r}, {allowed}")
     return Place(area, found.start), len(found) if "-" in text else None
-
-
-def _modicon(text: str) -> Place:
-    match = _MODICON.fullmatch(text)
-    count = int(match[3] or match[4]) if match else 0
-    if match is None or not 1 <= count <= ADDRESSES:
-        raise click.UsageError(f"{text!r} is not a Modicon number, as in {MODICON_FORMS}.")
-    return Place(MODICON[match[1]], count - 1)
-
-
-def _iec(text: str) -> Place:
-    match = _IEC.fullmatch(text)
-    kind, address = (match[1].upper(), int(match[2])) if match else ("", 0)
-    if kind in IEC_READINGS:
-        readings = IEC_READINGS[kind].format(address, 2 * address)
-        raise click.UsageError(f"{text!r} is not clear: type {readings}.")
-    if match is None or match[3] or kind not in IEC_AREAS or address > LAST_ADDRESS:
-        raise click.UsageError(
-            f"{text!r} is not an item, allowed: %MW0 for hr:0, %M0 for co:0, up to {LAST_ADDRESS}."
-        )
-    return Place(IEC_AREAS[kind], address)

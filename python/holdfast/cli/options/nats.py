@@ -9,7 +9,7 @@ import click
 
 from holdfast.cli.options.option import EXISTING_FILE, file_option, option, option_group
 from holdfast.cli.options.tls import tls_files, tls_of
-from holdfast.config.values.scanning import SERVER_PORT, parse_server
+from holdfast.config.values.scanner_settings import SERVER_PORT, parse_server
 from holdfast.net.nats.connection import Servers
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast.adapters.foreign import UnknownAdapter
+from holdfast.adapters.plugins import UnknownAdapter
 from holdfast.appliance.reload import ReloadIncomplete, ReloadRefused
 from holdfast.cli.services.file_snapshot import FileSnapshot
 from holdfast.config import ConfigError

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast.adapters.foreign import UnknownAdapter
+from holdfast.adapters.plugins import UnknownAdapter
 from holdfast.appliance import Appliance
 from holdfast.appliance.control import Control
 from holdfast.appliance.parts.memories import UnusableFile
@@ -23,8 +23,8 @@ from holdfast.appliance.services.gateway import gateway_settings
 from holdfast.appliance.services.scanner import scanner_settings
 from holdfast.cli.configuration import load_or_exit, load_whole
 from holdfast.cli.exit_codes import ExitCode, fail
-from holdfast.cli.options.item import MODICON
 from holdfast.cli.options.option import config_argument
+from holdfast.cli.options.plc_addresses import MODICON_AREAS
 from holdfast.cli.services.reloader import Reloader
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Interrupted, Signals
 from holdfast.cli.terminal_text import ranges_shown
@@ -32,7 +32,7 @@ from holdfast.config.checks.rights import unit_rights
 from holdfast.config.fingerprint import files_of
 from holdfast.config.models.listeners import ModbusTcpListener, RouteConfig, UnitMemoryConfig
 from holdfast.config.models.services import GatewayConfig
-from holdfast.config.values.scanning import written_pollable
+from holdfast.config.values.scanner_settings import written_pollable
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined, reachable
 from holdfast.net.http.port import explained
@@ -68,7 +68,7 @@ MAX_DEVICES = 10
 MBPOLL_TYPES = {
     area: number
     for preferred in (REGISTER_AREAS, BIT_AREAS)
-    for number, area in MODICON.items()
+    for number, area in MODICON_AREAS.items()
     if area in preferred
 }
 

@@ -30,7 +30,7 @@ from holdfast.cli.options.tls import DEVICES, tls_options
 from holdfast.cli.services.run import raise_open_file_limit
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.config.fingerprint import fingerprint
-from holdfast.config.values.scanning import (
+from holdfast.config.values.scanner_settings import (
     MAX_DEADBAND,
     MAX_PARTITIONS,
     MAX_PING_INTERVAL,
@@ -69,7 +69,7 @@ from holdfast.scanner.polling import device_tls as tls_check
 from holdfast.scanner.polling.allowed_devices import PRIVATE
 from holdfast.scanner.service import Scanner
 from holdfast.scanner.settings import FleetSettings, Settings, places
-from holdfast.scanner.subscriptions.rules import Defaults, ScannerLimits
+from holdfast.scanner.subscriptions.request_rules import Defaults, ScannerLimits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

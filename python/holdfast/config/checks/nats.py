@@ -10,7 +10,7 @@ from holdfast.config.checks.tls import check_client_tls, check_files
 from holdfast.config.models.base import INVALID
 from holdfast.config.models.services import NatsConfig
 from holdfast.config.text.messages import show
-from holdfast.config.values.scanning import check_dialect, parse_server
+from holdfast.config.values.scanner_settings import check_dialect, parse_server
 from holdfast.net.addresses import parse_address
 from holdfast.runtime.text import all_of, listing
 

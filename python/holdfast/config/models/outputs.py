@@ -22,7 +22,7 @@ from holdfast.config.values.scalars import (
     TopicTemplate,
     integral,
 )
-from holdfast.config.values.scanning import DIALECT, PREFIX, Dialect
+from holdfast.config.values.scanner_settings import DIALECT, PREFIX, Dialect
 from holdfast.config.values.topic_names import TopicNames
 from holdfast.config.values.urls import HttpTarget, parse_http
 

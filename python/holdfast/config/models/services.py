@@ -36,7 +36,7 @@ from holdfast.config.values.scalars import (
     TopicName,
     whole_number,
 )
-from holdfast.config.values.scanning import (
+from holdfast.config.values.scanner_settings import (
     DIALECT,
     MAX_DEADBAND,
     MAX_DEVICES,

@@ -41,7 +41,7 @@ from holdfast.config.text.messages import shape, show
 from holdfast.config.values.allow_entries import parse_allowed
 from holdfast.config.values.host_names import parse_host_name
 from holdfast.config.values.ip_addresses import Bind, parse_bind, parse_peer, parse_source
-from holdfast.config.values.scanning import (
+from holdfast.config.values.scanner_settings import (
     PREFIX,
     parse_member,
     parse_pollable,

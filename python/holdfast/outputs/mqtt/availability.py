@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Set
 
     from holdfast.config.values.topic_names import TopicNames
-    from holdfast.outputs.site import Site
+    from holdfast.outputs.device_access import Site
 
 ONLINE, OFFLINE = b"online", b"offline"
 

@@ -10,17 +10,17 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from holdfast.config.values.topic_names import REPLY
+from holdfast.outputs.device_access import CommandOutcomes, NotWritten
 from holdfast.outputs.mqtt.delivery import NO_PROPERTIES, Message, packed_topic
-from holdfast.outputs.site import CommandOutcomes, NotWritten
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from holdfast.config.values.topic_names import TopicNames
     from holdfast.net.mqtt.packets import Publish
+    from holdfast.outputs.device_access import Site
     from holdfast.outputs.mqtt.delivery import Delivery
     from holdfast.outputs.mqtt.session import Session
-    from holdfast.outputs.site import Site
     from holdfast.tags import Tag
 
 MAX_REPLIES = 1000

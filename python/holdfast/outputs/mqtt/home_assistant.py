@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from holdfast.config.models.outputs import MqttOutputConfig
-    from holdfast.outputs.site import DeviceInfo
+    from holdfast.outputs.device_access import DeviceInfo
     from holdfast.tags import Tag
 
 MEASUREMENT, TOTAL = "measurement", "total_increasing"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from holdfast.config.models.outputs import MqttOutputConfig
     from holdfast.net.mqtt.packets import Publish
-    from holdfast.outputs.site import Site
+    from holdfast.outputs.device_access import Site
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
     from holdfast.tags import Tag

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast.outputs.site import CommandOutcomes, NotWritten
+from holdfast.outputs.device_access import CommandOutcomes, NotWritten
 from holdfast.outputs.sparkplug.datatypes import value_of
 from holdfast.outputs.sparkplug.definition import parsed
 from holdfast.outputs.sparkplug.node import REBIRTH
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from holdfast.net.mqtt.packets import Publish
-    from holdfast.outputs.site import Site
+    from holdfast.outputs.device_access import Site
     from holdfast.outputs.sparkplug.metrics import Entry
 
     Find = Callable[[str, str, int | None], Entry | None]

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from holdfast.config.models.outputs import SparkplugConfig
     from holdfast.net.mqtt.packets import Publish
+    from holdfast.outputs.device_access import Site
     from holdfast.outputs.mqtt.delivery import Message
-    from holdfast.outputs.site import Site
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
 

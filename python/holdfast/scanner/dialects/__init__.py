@@ -8,11 +8,14 @@ from holdfast.scanner.dialects.tentacle import Tentacle
 from holdfast.scanner.dialects.tentacle_next import TentacleNext
 
 if TYPE_CHECKING:
-    from holdfast.config.values import scanning
+    from holdfast.config.values import scanner_settings
 
 Dialect: TypeAlias = Tentacle | TentacleNext
 """The rules of one generation of programs. They do no I/O, and have no state."""
 
 TENTACLE = Tentacle()
 
-DIALECTS: dict[scanning.Dialect, Dialect] = {"tentacle": TENTACLE, "tentacle-next": TentacleNext()}
+DIALECTS: dict[scanner_settings.Dialect, Dialect] = {
+    "tentacle": TENTACLE,
+    "tentacle-next": TentacleNext(),
+}

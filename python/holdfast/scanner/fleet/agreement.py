@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Self
 
 import msgspec
 
-from holdfast.config.values.scanning import written_pollable
+from holdfast.config.values.scanner_settings import written_pollable
 
 if TYPE_CHECKING:
     from holdfast.scanner.settings import FleetSettings, Settings

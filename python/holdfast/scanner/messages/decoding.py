@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, get_args
 
 import msgspec
 
-from holdfast.config.values.scanning import Publish
+from holdfast.config.values.scanner_settings import Publish
 from holdfast.runtime.text import clip, quote
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.types import (

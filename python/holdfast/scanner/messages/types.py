@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from holdfast.config.values.scanning import Publish
+from holdfast.config.values.scanner_settings import Publish
 from holdfast.net.addresses import LAST_PORT
 from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
 from holdfast.types import Area, Transport

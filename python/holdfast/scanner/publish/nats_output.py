@@ -25,7 +25,7 @@ from holdfast.tags.text import plain
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from holdfast.config.values.scanning import Dialect
+    from holdfast.config.values.scanner_settings import Dialect
     from holdfast.net.nats.connection import Servers
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop

@@ -7,14 +7,14 @@ from dataclasses import InitVar, dataclass, field
 from typing import TYPE_CHECKING
 
 from holdfast.scanner.dialects import TENTACLE, Dialect
-from holdfast.scanner.subscriptions.latest import LatestBlocks
+from holdfast.scanner.subscriptions.latest_values import LatestBlocks
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
     from holdfast._core import Endpoint
     from holdfast.client.url import Target
-    from holdfast.config.values.scanning import Publish, Writes
+    from holdfast.config.values.scanner_settings import Publish, Writes
     from holdfast.scanner.subscriptions.health import Health
     from holdfast.scanner.subscriptions.plan import Plan
     from holdfast.scanner.subscriptions.tag import Tag

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from holdfast.client.url import Target
-    from holdfast.config.values.scanning import Writes
+    from holdfast.config.values.scanner_settings import Writes
     from holdfast.scanner.messages.types import UnsubscribeRequest
-    from holdfast.scanner.subscriptions.rules import ScannerLimits
+    from holdfast.scanner.subscriptions.request_rules import ScannerLimits
     from holdfast.scanner.subscriptions.subscription import Subscription
     from holdfast.scanner.subscriptions.tag import Tag
 

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast.client.url import Target
-    from holdfast.config.values.scanning import Publish
+    from holdfast.config.values.scanner_settings import Publish
     from holdfast.scanner.messages.types import SubscribeRequest
-    from holdfast.scanner.subscriptions.rules import Rules
+    from holdfast.scanner.subscriptions.request_rules import Rules
     from holdfast.tags.base import Marker
     from holdfast.values.types import Type
 

@@ -12,7 +12,7 @@ from holdfast.values.types import parsed
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.config.values.scanning import Writes
+    from holdfast.config.values.scanner_settings import Writes
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.tag import Tag
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from holdfast.config.values.scanning import (
+from holdfast.config.values.scanner_settings import (
     MAX_DEVICES,
     MAX_SCAN_RATE,
     MAX_TAGS,
@@ -21,7 +21,7 @@ from holdfast.scanner.errors import Refused
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from holdfast.config.values.scanning import Publish
+    from holdfast.config.values.scanner_settings import Publish
     from holdfast.scanner.messages.decoding import Adjustments
     from holdfast.tags import TagList
 

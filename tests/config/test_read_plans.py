@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast._core import plan_blocks
-from holdfast.config import planning
+from holdfast.config import read_plans
 from holdfast.types import AREAS, BIT_AREAS
 from support.cases import examples
 from support.cli import answer, done, usage_error
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from holdfast.config.planning import Field, Preset
+    from holdfast.config.read_plans import Field, Preset
     from holdfast.types import Area
 
     Block = tuple[Area, int, int, list[int], int]
@@ -282,12 +282,12 @@ HOLDING: tuple[Field, ...] = (
 )
 
 
-def ends(rules: planning.Rules, reads: Sequence[Field] = HOLDING) -> list[str]:
-    return [block.ends for block in planning.plan(reads, rules).blocks]
+def ends(rules: read_plans.Rules, reads: Sequence[Field] = HOLDING) -> list[str]:
+    return [block.ends for block in read_plans.plan(reads, rules).blocks]
 
 
 def test_every_block_says_why_it_ends() -> None:
-    gaps: planning.Rules = {"max_gap": 5, "forbidden": [("holding_registers", 45, 46)]}
+    gaps: read_plans.Rules = {"max_gap": 5, "forbidden": [("holding_registers", 45, 46)]}
     assert ends(gaps) == [
         "another area",
         "gap: 24, max_gap is 5",
@@ -296,24 +296,24 @@ def test_every_block_says_why_it_ends() -> None:
         "limit: 200 with the next read, allowed: 125",
         "nothing more to read",
     ]
-    readable: planning.Rules = {"max_gap": 65535, "readable": [("holding_registers", 0, 20)]}
+    readable: read_plans.Rules = {"max_gap": 65535, "readable": [("holding_registers", 0, 20)]}
     assert ends(readable)[1:3] == ["not readable: 16 to 39", "not readable: 41 to 49"]
     assert ends({"cost": (1.0, 0.1)})[1] == "gap: 24, which costs more than a request"
 
 
 def test_a_block_tells_its_reads_holes_and_cost() -> None:
-    plan = planning.plan(HOLDING, {"cost": (3.0, 0.1)})
+    plan = read_plans.plan(HOLDING, {"cost": (3.0, 0.1)})
     block = plan.blocks[1]
     assert (block.address, block.count, block.reads) == (0, 52, (0, 1, 2, 3))
     assert block.holes == ((10, 2), (16, 24), (41, 9))
     assert block.cost == pytest.approx(8.2)
     assert plan.cost == pytest.approx(3 + 0.1 / 16 + 8.2 + 2 * 3 + 20)
     assert plan.unwanted == 35
-    assert planning.plan(HOLDING, {"max_gap": 0}).cost is None
+    assert read_plans.plan(HOLDING, {"max_gap": 0}).cost is None
 
 
 def test_a_long_read_is_in_several_blocks() -> None:
-    plan = planning.plan([("input_registers", 5, 300)], {"max_registers": 100})
+    plan = read_plans.plan([("input_registers", 5, 300)], {"max_registers": 100})
     assert [(b.address, b.count, b.reads) for b in plan.blocks] == [
         (5, 100, (0,)), (105, 100, (0,)), (205, 100, (0,)),
     ]  # fmt: skip
@@ -321,7 +321,7 @@ def test_a_long_read_is_in_several_blocks() -> None:
 
 def test_a_forbidden_read_is_named() -> None:
     with pytest.raises(ValueError, match="coils 3 overlaps the forbidden range 1 to 8"):
-        planning.plan(HOLDING, {"forbidden": [("coils", 1, 9)]})
+        read_plans.plan(HOLDING, {"forbidden": [("coils", 1, 9)]})
 
 
 @settings(max_examples=examples(60))
@@ -329,7 +329,7 @@ def test_a_forbidden_read_is_named() -> None:
 def test_the_preset_max_insert_is_telegrafs(problem: tuple[list[Field], Rules], fill: int) -> None:
     fields, rules = problem
     limits: Any = rules
-    assert planning.preset(fields, limits, "max_insert", fill) == max_insert(fields, rules, fill)
+    assert read_plans.preset(fields, limits, "max_insert", fill) == max_insert(fields, rules, fill)
 
 
 @pytest.mark.parametrize(
@@ -348,7 +348,7 @@ def test_the_preset_max_insert_is_telegrafs(problem: tuple[list[Field], Rules], 
 def test_presets_count_the_requests_of_other_rules(
     reads: Sequence[Field], preset: Preset, fill: int, requests: int
 ) -> None:
-    assert planning.preset(reads, {}, preset, fill) == requests
+    assert read_plans.preset(reads, {}, preset, fill) == requests
 
 
 # The command.

@@ -19,7 +19,7 @@ from holdfast.net.addresses import MAPPED, Network, unmapped
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.importing.sections import Section
+    from holdfast.importing.key_reader import Section
     from holdfast.net.addresses import Network
 
 
