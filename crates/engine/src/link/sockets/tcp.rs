@@ -1,11 +1,13 @@
 //! A TCP connection to a device: several requests in flight, if the settings allow it.
 
 use std::cell::{Cell, RefCell};
-use std::collections::HashMap;
+use std::future::poll_fn;
 use std::hash::{BuildHasher, RandomState};
 use std::io::{self, ErrorKind};
+use std::pin::Pin;
 use std::rc::Rc;
 use std::sync::Arc;
+use std::task::{Poll, ready};
 use std::time::Duration;
 
 use holdfast_protocol::client::{
@@ -13,6 +15,7 @@ use holdfast_protocol::client::{
 };
 use holdfast_protocol::pdu::EncodedRequest;
 use holdfast_runtime::Retry;
+use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::net::tcp::OwnedReadHalf;
 use tokio::sync::{Mutex, oneshot};
@@ -66,11 +69,34 @@ pub(in crate::link) struct TcpLink {
 /// The result of a request, and its next attempt, if there is one; `None` if it was not sent in time.
 type Outcome = Option<(Result<Vec<u8>, Failure>, Option<Attempt>)>;
 
+/// The callers that wait for the requests in flight, which are few.
+#[derive(Default)]
+struct Waiting(Vec<(Ticket, oneshot::Sender<Outcome>)>);
+
+impl Waiting {
+    fn insert(&mut self, ticket: Ticket, sender: oneshot::Sender<Outcome>) {
+        self.0.push((ticket, sender));
+    }
+
+    fn get(&self, ticket: Ticket) -> Option<&oneshot::Sender<Outcome>> {
+        self.0.iter().find(|(other, _)| *other == ticket).map(|(_, sender)| sender)
+    }
+
+    fn remove(&mut self, ticket: Ticket) -> Option<oneshot::Sender<Outcome>> {
+        let place = self.0.iter().position(|(other, _)| *other == ticket)?;
+        Some(self.0.swap_remove(place).1)
+    }
+
+    fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+}
+
 /// An open connection.
 struct Open {
     connection: Connection,
     epoch: Instant,
-    waiting: HashMap<Ticket, oneshot::Sender<Outcome>>,
+    waiting: Waiting,
     /// Requests that wait for a pause, and until when they may be sent.
     held: Vec<(Ticket, Instant)>,
     ended: Rc<Cell<Option<Instant>>>,
@@ -247,7 +273,7 @@ impl TcpLink {
         let open = Open {
             connection,
             epoch: self.epoch,
-            waiting: HashMap::new(),
+            waiting: Waiting::default(),
             held: Vec::new(),
             ended: Rc::clone(&self.ended),
             past: Rc::clone(&self.past),
@@ -347,17 +373,17 @@ impl Drop for Sent<'_> {
         self.outcome.close();
         if let Some(open) = self.link.open.borrow_mut().as_mut()
             // A new connection counts its tickets anew: this one may be of another request.
-            && open.waiting.get(&self.ticket).is_some_and(oneshot::Sender::is_closed)
+            && open.waiting.get(self.ticket).is_some_and(oneshot::Sender::is_closed)
         {
-            open.waiting.remove(&self.ticket);
+            open.waiting.remove(self.ticket);
             open.connection.cancel(self.ticket);
         }
     }
 }
 
 /// Hands a result to the caller that waits for it.
-fn hand_on(waiting: &mut HashMap<Ticket, oneshot::Sender<Outcome>>, done: &Done<'_>) {
-    if let Some(sender) = waiting.remove(&done.ticket) {
+fn hand_on(waiting: &mut Waiting, done: &Done<'_>) {
+    if let Some(sender) = waiting.remove(done.ticket) {
         // A device that was stopped does not wait.
         let answer = done.outcome.map(|_| done.pdu.to_vec());
         let _ = sender.send(Some((answer, done.again)));
@@ -388,7 +414,7 @@ impl Open {
                 return true;
             }
             connection.cancel(*ticket);
-            if let Some(sender) = waiting.remove(ticket) {
+            if let Some(sender) = waiting.remove(*ticket) {
                 // A device that was stopped does not wait.
                 let _ = sender.send(None);
             }
@@ -459,18 +485,25 @@ impl Drop for Open {
 }
 
 /// Reads replies until the connection ends.
-async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
+async fn receive(link: Rc<RefCell<Option<Open>>>, mut reader: OwnedReadHalf) {
     let mut plain = Vec::new();
     loop {
-        let ready = reader.readable().await;
+        // `readable` and `try_read` would ask the system twice for each reply.
+        let received = poll_fn(|context| {
+            CHUNK.with_borrow_mut(|chunk| {
+                let mut chunk = ReadBuf::new(chunk);
+                let read = ready!(Pin::new(&mut reader).poll_read(context, &mut chunk));
+                let received =
+                    Some(chunk.filled()).filter(|bytes| read.is_ok() && !bytes.is_empty());
+                let mut open = link.borrow_mut();
+                Poll::Ready(open.as_mut().map(|open| {
+                    received.is_some_and(|received| open.receive(received, &mut plain))
+                }))
+            })
+        });
+        let Some(intact) = received.await else { return };
         let mut open = link.borrow_mut();
         let Some(found) = open.as_mut() else { return };
-        let intact =
-            CHUNK.with_borrow_mut(|chunk| match ready.and_then(|()| reader.try_read(chunk)) {
-                Ok(0) => false,
-                Ok(len) => found.receive(&chunk[..len], &mut plain),
-                Err(error) => error.kind() == ErrorKind::WouldBlock,
-            });
         // The socket may now accept bytes that it did not accept before.
         if intact && (found.unsent.is_empty() || found.write()) {
             continue;
