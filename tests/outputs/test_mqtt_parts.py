@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.config.values.topic_names import TopicNames
+from holdfast.config.values.mqtt_output_topics import TopicNames
 from holdfast.net.mqtt.packets import parse_publish
 from holdfast.net.mqtt.selector import Waiter
 from holdfast.net.mqtt.stream import BrokerSocket, Packets

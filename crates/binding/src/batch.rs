@@ -9,7 +9,7 @@ use pyo3::prelude::*;
 use pyo3::pybacked::PyBackedBytes;
 use pyo3::types::{PyBytes, PyList, PyString, PyTuple};
 
-use crate::audit;
+use crate::audit_fields;
 use crate::memory::{Memory, Unfit, integer, is_text, item, put};
 
 pyo3::create_exception!(
@@ -132,7 +132,7 @@ impl Batch {
     ) -> Vec<Vec<u8>> {
         let writes = self.packed().into_iter().zip(names);
         writes
-            .map(|((_, write), name)| audit::line(origin, name, &write, outcome, sequence))
+            .map(|((_, write), name)| audit_fields::line(origin, name, &write, outcome, sequence))
             .collect()
     }
 

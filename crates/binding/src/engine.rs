@@ -14,7 +14,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::arguments::{os_error, seconds, within, word};
-use crate::audit;
+use crate::audit_fields;
 use crate::heartbeat;
 use crate::listener::Listener;
 use crate::peer;
@@ -121,7 +121,7 @@ impl Engine {
     ) -> PyResult<Vec<Bound<'py, PyDict>>> {
         let timeout = seconds("timeout", timeout)?;
         let records = py.detach(|| self.core.next_writes(timeout, most));
-        records.iter().map(|record| audit::to_python(py, record)).collect()
+        records.iter().map(|record| audit_fields::to_python(py, record)).collect()
     }
 
     fn set_audit_failing(&self, failing: bool) {

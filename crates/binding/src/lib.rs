@@ -4,7 +4,7 @@
 //! call that can block.
 
 mod arguments;
-mod audit;
+mod audit_fields;
 mod batch;
 mod channel;
 mod client;

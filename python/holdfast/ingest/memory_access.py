@@ -19,8 +19,8 @@ from holdfast import _core
 from holdfast.events import log_lines
 from holdfast.events.audit import Unrecorded
 from holdfast.events.audit.chain import encoded
+from holdfast.ingest.audit_lines import Recording, origin_around, values_of
 from holdfast.ingest.counts import Counts
-from holdfast.ingest.recording import Recording, origin_around, values_of
 from holdfast.ingest.refusals import (
     KEEPING,
     Refused,

@@ -17,7 +17,7 @@ use super::error::FileError;
 use super::image::{Changes, Image, StoredMemory};
 use super::periodic::{Periodic, Source, writes};
 use super::queue::{Queue, QueueLimits};
-use super::set_aside::SET_ASIDE;
+use super::shrunk_memory::SET_ASIDE;
 use super::status::Status;
 use super::store::Store;
 

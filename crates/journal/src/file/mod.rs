@@ -23,7 +23,7 @@ mod memory_file;
 mod overlay;
 mod periodic;
 mod queue;
-mod set_aside;
+mod shrunk_memory;
 mod status;
 mod store;
 
@@ -35,7 +35,7 @@ pub use image::StoredMemory;
 pub use memory_file::{Member, MemoryFile, Options};
 pub use overlay::Overlay;
 pub use periodic::Source;
-pub use set_aside::release;
+pub use shrunk_memory::release;
 pub use status::Status;
 pub use store::VERSION;
 

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use super::parts::comparer::DIGEST_EVERY;
-use super::parts::rejoin::REJOIN_AFTER;
 use super::parts::snapshotter::{SNAPSHOT_AFTER, SNAPSHOT_STEPS};
+use super::parts::wrong_contents::REJOIN_AFTER;
 use super::settings::{Login, Servers, Settings, WhenBehind};
 use super::shared::MAX_QUEUE_STEPS;
 use super::stream::connection::CONNECT_TIMEOUT;

@@ -1,4 +1,6 @@
-"""The application of REST: who may do what, and what each operation does.
+"""The application of REST: what a token grants, and what each operation does.
+
+`operations` says which operations need no token.
 
 The memory access checks everything about memories. A request that is refused here never reaches it.
 """

@@ -8,6 +8,7 @@ from pydantic import BeforeValidator, Field, Strict
 
 from holdfast.config.models.base import Model
 from holdfast.config.models.services import BrokerConfig, ClientTlsConfig, NatsServersConfig
+from holdfast.config.values.mqtt_output_topics import TopicNames
 from holdfast.config.values.scalars import (
     Duration,
     FilePath,
@@ -23,7 +24,6 @@ from holdfast.config.values.scalars import (
     integral,
 )
 from holdfast.config.values.scanner_settings import DIALECT, PREFIX, Dialect
-from holdfast.config.values.topic_names import TopicNames
 from holdfast.config.values.urls import HttpTarget, parse_http
 
 MAX_VALUES = 1_000_000

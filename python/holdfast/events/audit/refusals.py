@@ -1,4 +1,7 @@
-"""Which refusals the audit log has, and how many lines they get."""
+"""Which refusals besides those of writes the audit log has, and how many lines they get.
+
+A refused write has a line of its own.
+"""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from holdfast.outputs.mqtt.delivery import Message, packed_topic
 if TYPE_CHECKING:
     from collections.abc import Set
 
-    from holdfast.config.values.topic_names import TopicNames
+    from holdfast.config.values.mqtt_output_topics import TopicNames
     from holdfast.outputs.device_access import Site
 
 ONLINE, OFFLINE = b"online", b"offline"

@@ -9,14 +9,14 @@ import msgspec
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from holdfast.config.values.topic_names import REPLY
+from holdfast.config.values.mqtt_output_topics import REPLY
 from holdfast.outputs.device_access import CommandOutcomes, NotWritten
 from holdfast.outputs.mqtt.delivery import NO_PROPERTIES, Message, packed_topic
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from holdfast.config.values.topic_names import TopicNames
+    from holdfast.config.values.mqtt_output_topics import TopicNames
     from holdfast.net.mqtt.packets import Publish
     from holdfast.outputs.device_access import Site
     from holdfast.outputs.mqtt.delivery import Delivery
