@@ -172,7 +172,8 @@ def compared(rounds: list[dict[str, Result]], first: str, second: str) -> str:
     The bound is Student's, one-sided, for the logarithms of the rounds' ratios.
     """
     shown = common.ratio(rounds, first, second)
-    ratios = [log(one[first]["rate"] / one[second]["rate"]) for one in rounds]
+    both = [one for one in rounds if first in one and second in one]
+    ratios = [log(one[first]["rate"] / one[second]["rate"]) for one in both]
     if len(ratios) < ENOUGH:
         return shown
     bound = fmean(ratios) - STUDENT_T * stdev(ratios) / sqrt(len(ratios))
