@@ -30,7 +30,7 @@ from holdfast.config.models.outputs import MqttOutputConfig
 from holdfast.outputs import Buffer, Sending
 from holdfast.outputs.device_access import DeviceInfo
 from holdfast.outputs.mqtt import MqttOutput
-from holdfast.outputs.mqtt.payloads import Payloads
+from holdfast.outputs.mqtt.messages import Payloads
 from holdfast.polling import Reading
 from holdfast.runtime.stop import Stop
 from holdfast.tags import Tag

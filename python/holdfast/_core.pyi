@@ -74,7 +74,7 @@ __all__ = [
     "ListeningSocket",
     "Log",
     "LogError",
-    "LogFollower",
+    "LogReader",
     "Memory",
     "MemoryFile",
     "MirrorAge",
@@ -1222,7 +1222,7 @@ class Log:
         """Takes what has happened, as names and fields. Waits if there is nothing."""
 
 @final
-class LogFollower:
+class LogReader:
     """Rebuilds what a log leads to, in these memories, without writing to the log.
 
     It begins with a snapshot, and ends at a sequence, at a time (nanoseconds since 1970), at the
@@ -1246,7 +1246,7 @@ class LogFollower:
         token_file: str | PathLike[str] | None = None,
         credentials_file: str | PathLike[str] | None = None,
         tls: TlsFiles | None = None,
-    ) -> LogFollower: ...
+    ) -> LogReader: ...
     def next(self, timeout: float) -> LogRecord | None:
         """Applies the next message. Returns `None` if none comes in time, and at the end."""
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.events import log_lines
-from holdfast.events.audit.refusals import MAX_ORIGINS, Refusals
+from holdfast.events.audit.refusal_summaries import MAX_ORIGINS, Refusals
 from holdfast.events.throttle import NOBODY, Throttle, origin
 from support import web, wire
 from support.audits import lines, writes

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast import values
-from holdfast.discovery import clock_fields, segments
+from holdfast.discovery import byte_order_habits, clock_fields
 from holdfast.discovery.segments import confidence, divide
 from support.cases import examples
 
@@ -45,7 +45,7 @@ def test_values_of_several_types_are_told_from_each_other(order: str) -> None:
     assert [value.type for value, _ in division.best] == kinds
     assert {value.order for value, _ in division.best if value.registers == 2} == {order}
     assert all(chance > 0.5 for _, chance in division.best)
-    assert segments.order_shares(division.habits)[order] > 0.9
+    assert byte_order_habits.order_shares(division.habits)[order] > 0.9
 
 
 def test_a_value_of_the_other_common_order_is_recognised() -> None:

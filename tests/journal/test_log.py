@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast._core import Log, LogError, LogFollower
+from holdfast._core import Log, LogError, LogReader
 from support import wire
 from support.brokers import free_port
 
@@ -212,17 +212,17 @@ def test_a_log_is_replayed_to_a_sequence_or_a_time(node: Start, nats: NatsServer
     a.client.read_write(0, 2, 5, [6])
     a.memory.write("coils", 1, [1, 0, 1])
 
-    def replay(**until: Any) -> tuple[LogFollower, holdfast.Memory, list[Any]]:
+    def replay(**until: Any) -> tuple[LogReader, holdfast.Memory, list[Any]]:
         memory = plant()
-        follower = LogFollower("site", [nats.url], [("plant", memory)], **until)
+        reader = LogReader("site", [nats.url], [("plant", memory)], **until)
         records = []
-        while not follower.ended:
-            record = follower.next(wire.DEADLINE)
+        while not reader.ended:
+            record = reader.next(wire.DEADLINE)
             if record is not None and record["steps"]:
                 records.append(record)
-        return follower, memory, records
+        return reader, memory, records
 
-    follower, memory, records = replay()
+    reader, memory, records = replay()
     steps = [step for record in records for step in record["steps"]]
     register: Area = "holding_registers"
     assert steps == [
@@ -248,11 +248,11 @@ def test_a_log_is_replayed_to_a_sequence_or_a_time(node: Start, nats: NatsServer
     assert memory.read(register, 0, 6) == a.memory.read(register, 0, 6)
 
     second = records[1]
-    follower, memory, _ = replay(sequence=second["sequence"])
-    assert follower.sequence == second["sequence"]
+    reader, memory, _ = replay(sequence=second["sequence"])
+    assert reader.sequence == second["sequence"]
     assert memory.read(register, 0, 1) == [2]
     same = replay(sequence=second["sequence"])[0]
-    assert same.digest() == follower.digest() != replay()[0].digest()
+    assert same.digest() == reader.digest() != replay()[0].digest()
     _, memory, _ = replay(time_ns=second["time_ns"])
     assert memory.read(register, 0, 1) == [2]
 
@@ -260,16 +260,16 @@ def test_a_log_is_replayed_to_a_sequence_or_a_time(node: Start, nats: NatsServer
 def test_a_log_is_followed(node: Start, nats: NatsServer) -> None:
     a = node("a")
     memory = plant()
-    follower = LogFollower("site", [nats.url], [("plant", memory)], follow=True)
+    reader = LogReader("site", [nats.url], [("plant", memory)], follow=True)
     for number in (5, 6, 7):
         a.client.write_register(0, number)
-        while not (record := follower.next(wire.DEADLINE)) or not record["steps"]:
+        while not (record := reader.next(wire.DEADLINE)) or not record["steps"]:
             pass
         assert memory.read("holding_registers", 0, 1) == [number]
-    assert not follower.ended
+    assert not reader.ended
 
 
 def test_a_log_that_does_not_exist_is_not_made_to_replay_it(nats: NatsServer) -> None:
     for _ in range(2):
         with pytest.raises(ValueError, match='the servers have no log "site"'):
-            LogFollower("site", [nats.url], [("plant", plant())])
+            LogReader("site", [nats.url], [("plant", plant())])

@@ -11,7 +11,7 @@ from holdfast.config.models.outputs import MqttOutputConfig
 from holdfast.outputs import sending
 from holdfast.outputs.device_access import DeviceInfo
 from holdfast.outputs.mqtt.home_assistant import Discovery
-from holdfast.outputs.mqtt.payloads import Payloads
+from holdfast.outputs.mqtt.messages import Payloads
 from holdfast.tags import Tag
 from holdfast.tags.scale import RegisterScale
 from support import wire

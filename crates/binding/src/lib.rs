@@ -63,7 +63,7 @@ mod _core {
     #[pymodule_export]
     use super::listener::{Listener, RawRule, Rule};
     #[pymodule_export]
-    use super::log::{Log, LogError, LogFollower};
+    use super::log::{Log, LogError, LogReader};
     #[pymodule_export]
     use super::memory::{Memory, OutOfRange, Stale};
     #[pymodule_export]

@@ -1,12 +1,12 @@
-//! `Log` and `LogFollower`: memories that several nodes share.
+//! `Log` and `LogReader`: memories that several nodes share.
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use holdfast_journal::log::{
-    Follower, Log as Core, LogError as CoreError, Login, Next, Phase, Record, Settings, Tls, Until,
-    WhenBehind,
+    Log as Core, LogError as CoreError, LogReader as CoreReader, Login, Next, Phase, Record,
+    Settings, Tls, Until, WhenBehind,
 };
 use holdfast_memory::{Access, Action, Memory as CoreMemory, Step, StepWrite};
 use pyo3::exceptions::{PyException, PyValueError};
@@ -178,14 +178,14 @@ impl Log {
 }
 
 #[pyclass(frozen, module = "holdfast")]
-pub struct LogFollower {
-    core: Mutex<Follower>,
+pub struct LogReader {
+    core: Mutex<CoreReader>,
     names: Vec<String>,
 }
 
 #[pymethods]
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
-impl LogFollower {
+impl LogReader {
     #[new]
     #[pyo3(signature = (name, servers, memories, *, sequence=None, time_ns=None, follow=false, timeout=10.0, connect_timeout=None, user=None, password_file=None, token_file=None, credentials_file=None, tls=None))]
     fn new(
@@ -203,7 +203,7 @@ impl LogFollower {
         token_file: Option<PathBuf>,
         credentials_file: Option<PathBuf>,
         tls: Option<TlsFiles>,
-    ) -> PyResult<LogFollower> {
+    ) -> PyResult<LogReader> {
         let until = match (sequence, time_ns, follow) {
             (Some(sequence), None, false) => Until::Sequence(sequence),
             (None, Some(time), false) => Until::Time(time),
@@ -224,8 +224,8 @@ impl LogFollower {
         let members = named(&memories);
         let mut names: Vec<String> = members.iter().map(|(name, _)| name.clone()).collect();
         names.sort();
-        let core = py.detach(|| Follower::open(&settings, members, until, timeout));
-        Ok(LogFollower { core: Mutex::new(core.map_err(raised)?), names })
+        let core = py.detach(|| CoreReader::open(&settings, members, until, timeout));
+        Ok(LogReader { core: Mutex::new(core.map_err(raised)?), names })
     }
 
     fn next<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Bound<'py, PyDict>>> {
@@ -261,8 +261,8 @@ impl LogFollower {
     }
 }
 
-impl LogFollower {
-    fn locked<T>(&self, of: impl FnOnce(&mut Follower) -> T) -> T {
+impl LogReader {
+    fn locked<T>(&self, of: impl FnOnce(&mut CoreReader) -> T) -> T {
         of(&mut self.core.lock().unwrap_or_else(PoisonError::into_inner))
     }
 

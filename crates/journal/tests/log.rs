@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use futures_util::StreamExt;
-use holdfast_journal::log::{Follower, LogError, Next, Phase, Settings, Until};
+use holdfast_journal::log::{LogError, LogReader, Next, Phase, Settings, Until};
 use holdfast_memory::{
     Access, Action, Area, Freshness, Memory, Mirrored, Operation, Read, Refusal, Refused, Span,
     Step, StepWrite, Write, write_across,
@@ -441,12 +441,12 @@ fn a_replay_goes_on_behind_headers_that_nobody_can_read() {
     let memory = memory_of(100);
     let members = vec![("plant".to_owned(), Arc::clone(&memory))];
     let settings = Settings::new("site", "replay", vec![server.url()]);
-    let mut follower = Follower::open(&settings, members, Until::Now, nodes::DEADLINE).unwrap();
+    let mut reader = LogReader::open(&settings, members, Until::Now, nodes::DEADLINE).unwrap();
     let mut foreign = 0;
-    while let Next::Record(record) = follower.next(nodes::DEADLINE).unwrap() {
+    while let Next::Record(record) = reader.next(nodes::DEADLINE).unwrap() {
         foreign += usize::from(record.origin.is_none());
     }
-    assert!(follower.has_ended());
+    assert!(reader.has_ended());
     assert_eq!(foreign, HEADERS.len());
     assert_eq!(Memory::contents(&[memory])[0].areas[2][..2], 500_u16.to_be_bytes());
 }

@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use holdfast_journal::log::{Follower, Next, Settings, Until};
+use holdfast_journal::log::{LogReader, Next, Settings, Until};
 use holdfast_memory::{Action, Area, Layout, Memory, Span};
 use nodes::process::{Answer, Process};
 use nodes::{Server, cluster, until};
@@ -221,11 +221,10 @@ impl Run {
         let memory = Arc::new(Memory::new(layout, None).unwrap());
         let settings = Settings::new("torture", "reader", self.urls.clone());
         let memories = vec![("plant".to_owned(), memory)];
-        let mut follower =
-            Follower::open(&settings, memories, Until::Now, nodes::DEADLINE).unwrap();
+        let mut reader = LogReader::open(&settings, memories, Until::Now, nodes::DEADLINE).unwrap();
         let mut found: BTreeMap<(u64, u16), u32> = BTreeMap::new();
         loop {
-            let record = match follower.next(nodes::DEADLINE).unwrap() {
+            let record = match reader.next(nodes::DEADLINE).unwrap() {
                 Next::Record(record) => record,
                 Next::End => break,
                 Next::Nothing => panic!("the stream does not go on"),
@@ -238,7 +237,7 @@ impl Run {
                 }
             }
         }
-        println!("{} writes in the log, up to {}", found.len(), follower.sequence());
+        println!("{} writes in the log, up to {}", found.len(), reader.sequence());
         let history = self.history.lock().unwrap();
         for write in history.iter().filter(|operation| operation.is_write) {
             let count = found.get(&(write.register, write.value)).copied().unwrap_or_default();

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from holdfast.discovery import address_search, device_search, segments, sunspec
+from holdfast.discovery import address_search, byte_order_habits, device_search, segments, sunspec
 from holdfast.discovery.device_search import Identity
 from holdfast.errors import ModbusException
 from holdfast.protocol import READ_LIMITS
@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
     from holdfast.client import SyncClient
     from holdfast.discovery.address_search import Survey
-    from holdfast.discovery.segments import Habit, Value
+    from holdfast.discovery.byte_order_habits import Habit
+    from holdfast.discovery.segments import Value
     from holdfast.discovery.sunspec import Model, Point, SunSpec
     from holdfast.types import Area
 
@@ -159,7 +160,7 @@ def conclude(found: Description, now: float | None = None) -> None:
             found.reads[area, extent] = [[found.seen[area][each] for each in extent]]
     pieces = list(_pieces(found))
     habits = _habits(pieces, now)
-    found.orders = segments.order_shares(habits)
+    found.orders = byte_order_habits.order_shares(habits)
     tags = list(_of_sunspec(found.sunspec)) if found.sunspec is not None else []
     for (area, extent), contents in found.reads.items():
         if area in BIT_AREAS:

@@ -17,10 +17,20 @@ import math
 import struct
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast import values
 from holdfast.discovery import clock_fields, plausibility, text_fields
+from holdfast.discovery.byte_order_habits import (
+    COMMON,
+    HABITS,
+    MIXED,
+    ORDER_HABITS,
+    ORDERS,
+    PREFERENCES,
+    PREFERRED,
+    Habit,
+)
 from holdfast.values import ConversionError
 from holdfast.values.orders import SWAPPED_BYTES
 
@@ -64,56 +74,6 @@ SIZES = {kind: values.register_count(kind) for kind in RARE if kind not in ("str
 
 NARROW = {PART, *(kind for kind, size in SIZES.items() if size == 1)}
 """The types of one register, in which words have no order."""
-
-ORDERS = ("ABCD", "CDAB", "DCBA", "BADC")
-
-
-class Habit(NamedTuple):
-    """How a device orders bytes, and which values it prefers."""
-
-    order: str
-    swaps_registers: bool = False
-    """Whether the bytes of values of one register are swapped too."""
-    prefers: str = ""
-    """A key of `PREFERENCES`."""
-
-
-ORDER_HABITS = {
-    Habit("ABCD"): 0.8,
-    Habit("CDAB"): 1.2,
-    Habit("DCBA"): 4.0,
-    Habit("BADC"): 4.0,
-    Habit("DCBA", swaps_registers=True): 5.0,
-    Habit("BADC", swaps_registers=True): 5.0,
-}
-"""How rare a habit with bytes is among devices, in bits."""
-
-PREFERENCES = {"": 0.7, "short": 2.3, "long": 2.3, "floats": 2.5}
-"""How rare a preference is among devices, in bits."""
-
-PREFERRED = {
-    "": {},
-    "short": {"uint16": -0.4, "float32": 3.0, "uint32": 3.0, "int32": 3.0},
-    "long": {"uint16": 3.0, "int16": 3.0, "uint32": -2.0, "int32": -2.0},
-    "floats": {"uint16": 1.0, "float32": -2.0, "uint32": 1.0, "int32": 1.0},
-}
-"""What a preference adds to the bits of a type. Many devices have numbers of one register only, and
-many have long ones throughout, also for states and other small numbers, or floats. So one evident
-value tells something about all the others.
-"""
-
-HABITS = {
-    Habit(habit.order, habit.swaps_registers, preference): rare + more
-    for habit, rare in ORDER_HABITS.items()
-    for preference, more in PREFERENCES.items()
-}
-"""How rare a habit is among devices, in bits."""
-
-COMMON = ("ABCD", "CDAB")
-MIXED = 4.0
-"""The common orders, and how rare it is that a value has one that is not that of its device: a
-single register between long values would else be half of one in the other order.
-"""
 
 TRUST = {"float32": 1.4, "int32": 0.65, "string": 0.6, "uint16": 0.76}
 OTHER_TRUST = 0.78
@@ -323,14 +283,6 @@ def _totals(
         best = max(totals.values())
         orders = [each for each in orders if totals[each] > best - IMPROBABLE]
     return totals, found
-
-
-def order_shares(habits: Mapping[Habit, float]) -> dict[str, float]:
-    """The probability of each order, from that of each habit."""
-    shares: dict[str, float] = {}
-    for habit, share in habits.items():
-        shares[habit.order] = shares.get(habit.order, 0.0) + share
-    return shares
 
 
 def _shares(weights: Mapping[Habit, float]) -> dict[Habit, float]:

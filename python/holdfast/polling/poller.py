@@ -16,7 +16,7 @@ from holdfast.polling.faults import fault_text
 from holdfast.polling.readings import Batch, Reader
 from holdfast.protocol import READ_BITS, READ_REGISTERS
 from holdfast.tags import Tag, TagList
-from holdfast.tags.base import DEFAULT_MAX_GAP
+from holdfast.tags.read_gap import DEFAULT_MAX_GAP
 
 if TYPE_CHECKING:
     import asyncio

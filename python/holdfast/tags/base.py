@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 Marker: TypeAlias = bool | int | float | str
 """What registers hold when a device has no value."""
 
-DEFAULT_MAX_GAP = 10
-"""The largest gap between tags, in bits or registers, that is read with them by default."""
-
 
 class TagError(ValueError):
     """A tag that can't be: `key` is the wrong part, such as `scale`."""

@@ -19,8 +19,8 @@ mod clock;
 mod defaults;
 mod digests;
 mod error;
-mod follower;
 mod layout;
+mod log_reader;
 mod parts;
 #[cfg(feature = "fuzz")]
 pub mod replica;
@@ -40,7 +40,7 @@ use holdfast_memory::{Journal, Memory};
 pub use clock::time_since_boot;
 pub use defaults::{MAX_LAG, WHEN_BEHIND, WRITE_TIMEOUT};
 pub use error::LogError;
-pub use follower::{Follower, Next, Record, Until};
+pub use log_reader::{LogReader, Next, Record, Until};
 pub use settings::{CONTACTS_PER_LAG, Login, Servers, Settings, Tls, WhenBehind};
 pub use shared::Checkpoint;
 pub use status::{Digest, Event, Node, Phase, Status};

@@ -12,7 +12,7 @@ from holdfast.appliance.parts.part import Part
 from holdfast.config.values.urls import parse_syslog
 from holdfast.events import log_lines
 from holdfast.events.audit import Audit, Copies, Journal, Syslog
-from holdfast.events.audit.refusals import INTERVAL_S, Refusals
+from holdfast.events.audit.refusal_summaries import INTERVAL_S, Refusals
 from holdfast.runtime.heartbeat import PERIOD_S, Heartbeat
 from holdfast.runtime.standstill import WallClock
 

@@ -171,7 +171,7 @@ def servers(settings: SharedLogConfig) -> list[str]:
 
 
 def credentials(settings: SharedLogConfig) -> dict[str, Any]:
-    """The credentials for the NATS servers, as arguments of `Log` and `LogFollower`."""
+    """The credentials for the NATS servers, as arguments of `Log` and `LogReader`."""
     files = tls_files(settings.tls)
     return {
         "user": settings.username,

@@ -87,7 +87,7 @@ def replay(
         try:
             sequence, time_ns = _end(to)
             running.enter_context(log_servers.running(log, settings))
-            replaying = _core.LogFollower(
+            replaying = _core.LogReader(
                 log,
                 servers(settings),
                 memories,
@@ -132,7 +132,7 @@ def _within(number: int, most: int) -> int:
     raise ValueError
 
 
-def _check_end(replaying: _core.LogFollower, sequence: int | None, time_ns: int | None) -> None:
+def _check_end(replaying: _core.LogReader, sequence: int | None, time_ns: int | None) -> None:
     """Raises `ValueError` for a sequence that the log does not have, and notes a time after it."""
     when = log_lines.timestamp(replaying.time_ns / 1e9)
     end = f"the log ends at sequence {replaying.sequence}, {when}"
@@ -145,7 +145,7 @@ def _check_end(replaying: _core.LogFollower, sequence: int | None, time_ns: int 
 
 def _tell(
     file: Path,
-    replaying: _core.LogFollower,
+    replaying: _core.LogReader,
     memories: list[tuple[str, _core.Memory]],
     *,
     values: bool,

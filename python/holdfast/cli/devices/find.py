@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli.devices.find_hosts import find_hosts
+from holdfast.cli.devices.find_hosts import (
+    MAX_ADDRESSES,
+    MAX_ADDRESSES_LARGE,
+    check_size,
+    find_hosts,
+)
 from holdfast.cli.devices.find_line import find_line
 from holdfast.cli.devices.find_units import find_units
 from holdfast.cli.options.duration import Duration, time_option, timeout_option
@@ -26,10 +31,6 @@ if TYPE_CHECKING:
 
     from holdfast.client.url import Parity
     from holdfast.net.addresses import Network
-
-MAX_ADDRESSES = 1024
-"""The most addresses without `--large`, and with it."""
-MAX_ADDRESSES_LARGE = 65_536
 
 LINE_TIMEOUT_S = 0.5
 RATES = DecimalNumber(0.1, 1000)
@@ -123,11 +124,5 @@ def _networks(texts: Iterable[str], large: bool) -> list[Network]:
                 f"{text!r} is not a network (192.168.0.0/24), a URL or a serial line "
                 f"(/dev/ttyUSB0). For the unit ids behind a host, type 'holdfast find tcp://{text}'."
             ) from error
-    count = device_search.size(networks)
-    most = MAX_ADDRESSES_LARGE if large else MAX_ADDRESSES
-    if count > most:
-        raise click.UsageError(
-            f"{count} addresses, allowed: {most}"
-            + ("." if large else "; --large allows more. Name a smaller network, or several.")
-        )
+    check_size(networks, large=large)
     return networks

@@ -25,8 +25,23 @@ if TYPE_CHECKING:
 MAX_CONCURRENT_HOSTS = 64
 """Hosts at a time."""
 
+MAX_ADDRESSES = 1024
+"""The most addresses without `--large`, and with it."""
+MAX_ADDRESSES_LARGE = 65_536
+
 LISTED_STATES = ("modbus", "open")
 """The states of hosts that are listed; others are counted."""
+
+
+def check_size(networks: Sequence[Network], *, large: bool) -> None:
+    """Raises `click.UsageError` if the networks have too many addresses."""
+    count = device_search.size(networks)
+    most = MAX_ADDRESSES_LARGE if large else MAX_ADDRESSES
+    if count > most:
+        raise click.UsageError(
+            f"{count} addresses, allowed: {most}"
+            + ("." if large else "; --large allows more. Name a smaller network, or several.")
+        )
 
 
 def find_hosts(

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli import terminal_text
+from holdfast.cli import device_errors, terminal_text
 from holdfast.cli.live import schedule
-from holdfast.cli.options import device, device_errors, item
+from holdfast.cli.options import device, item
 from holdfast.cli.options.duration import every_option
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import flag, json_option, number_option, option

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
-from holdfast.cli import terminal_text
+from holdfast.cli import device_errors, terminal_text
 from holdfast.cli.exit_codes import ExitCode
-from holdfast.cli.options import device, device_errors
+from holdfast.cli.options import device
 from holdfast.cli.options.option import json_option
 from holdfast.cli.options.url import url_argument
 from holdfast.cli.terminal_text import print_json

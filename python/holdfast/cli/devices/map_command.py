@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli import terminal_text
+from holdfast.cli import device_errors, terminal_text
 from holdfast.cli.devices import coverage
 from holdfast.cli.devices.search_report import Ended, RangeReport, Report, ended_to_json
 from holdfast.cli.exit_codes import fail
-from holdfast.cli.options import device, device_errors
+from holdfast.cli.options import device
 from holdfast.cli.options.option import json_option
 from holdfast.cli.options.search import announced, planned, survey_options
 from holdfast.cli.options.url import url_argument

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast.cli import answers, terminal_text
+from holdfast.cli import answers, device_errors, terminal_text
 from holdfast.cli.devices import device_items
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.live import schedule
 from holdfast.cli.old_spellings import hint
-from holdfast.cli.options import device, device_errors, item
+from holdfast.cli.options import device, item
 from holdfast.cli.options.duration import every_option
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import json_option, number_option

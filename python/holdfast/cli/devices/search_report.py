@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli import terminal_text
-from holdfast.cli.options import device_errors
+from holdfast.cli import device_errors, terminal_text
 from holdfast.cli.progress import bar
 from holdfast.cli.signals import Interrupted
 from holdfast.discovery.address_search import LimitReached

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli import terminal_text
+from holdfast.cli import device_errors, terminal_text
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.live import schedule, sources
 from holdfast.cli.live.changes import Tracker
 from holdfast.cli.live.sources import Unreadable, Unwatchable, WatchedRange
-from holdfast.cli.options import device, device_errors, item
+from holdfast.cli.options import device, item
 from holdfast.cli.options.duration import every_option
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import json_option, number_option, option, require_known

@@ -11,10 +11,10 @@ import click
 
 from holdfast import values
 from holdfast._core import Request
-from holdfast.cli import terminal_text
+from holdfast.cli import device_errors, terminal_text
 from holdfast.cli.devices import device_items
 from holdfast.cli.exit_codes import ExitCode
-from holdfast.cli.options import device, device_errors, item
+from holdfast.cli.options import device, item
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import flag, json_option
 from holdfast.cli.options.plc_addresses import modicon_option

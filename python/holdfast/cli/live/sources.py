@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, NoReturn, Protocol
 import click
 
 from holdfast.cli import terminal_text
+from holdfast.cli.device_errors import hint, problem
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options.device import read_raw
-from holdfast.cli.options.device_errors import hint, problem
 from holdfast.cli.terminal_text import print_json
 
 if TYPE_CHECKING:

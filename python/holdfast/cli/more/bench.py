@@ -10,9 +10,9 @@ from dataclasses import asdict
 
 import click
 
-from holdfast.cli import terminal_text
+from holdfast.cli import device_errors, terminal_text
 from holdfast.cli.exit_codes import ExitCode
-from holdfast.cli.options import device, device_errors, item
+from holdfast.cli.options import device, item
 from holdfast.cli.options.duration import time_option
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import json_option, number_option

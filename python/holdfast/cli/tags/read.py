@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast.cli import answers, terminal_text
+from holdfast.cli import answers, device_errors, terminal_text
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.live import schedule
-from holdfast.cli.options import device_errors
 from holdfast.cli.tags import recording
 from holdfast.cli.terminal_text import print_json
 from holdfast.errors import ModbusError, RequestTimeout

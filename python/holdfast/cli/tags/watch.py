@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from holdfast.cli import terminal_text
+from holdfast.cli.device_errors import hint
 from holdfast.cli.live import schedule
 from holdfast.cli.live.sources import fail_first, print_error
-from holdfast.cli.options.device_errors import hint
 from holdfast.cli.tags import recording
 from holdfast.cli.tags.changes import TagTracker, common_error
 from holdfast.cli.tags.read import problem, value_shown

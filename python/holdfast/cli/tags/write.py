@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, NoReturn
 
 import click
 
-from holdfast.cli import terminal_text
+from holdfast.cli import device_errors, terminal_text
 from holdfast.cli.exit_codes import ExitCode
-from holdfast.cli.options import device, device_errors
+from holdfast.cli.options import device
 from holdfast.cli.tags.read import value_shown
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.tag_writing import prepared

@@ -37,7 +37,7 @@ from holdfast.config.values.scalars import (
     whole_number,
 )
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
-from holdfast.tags.base import DEFAULT_MAX_GAP
+from holdfast.tags.read_gap import DEFAULT_MAX_GAP
 from holdfast.types import WRITABLE_AREAS, Area, RegisterArea
 
 if TYPE_CHECKING:

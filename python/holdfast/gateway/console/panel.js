@@ -3,6 +3,7 @@
 import { meaning } from "./api.js";
 import { clock, h } from "./dom.js";
 
+/** How long a value that has changed is marked, in milliseconds. */
 const MARKED = 1500;
 
 /** The values of one part of a view. `render(index, mark)` shows one of them. */

@@ -10,7 +10,7 @@ from holdfast.outputs.mqtt.availability import OFFLINE, ONLINE, Availability
 from holdfast.outputs.mqtt.commands import Commands
 from holdfast.outputs.mqtt.delivery import Message, packed_topic
 from holdfast.outputs.mqtt.home_assistant import Discovery
-from holdfast.outputs.mqtt.payloads import Payloads
+from holdfast.outputs.mqtt.messages import Payloads
 from holdfast.outputs.mqtt.receiver import BrokerReceiver
 from holdfast.outputs.mqtt.session import Session
 

@@ -9,7 +9,7 @@ from holdfast._core import plan_blocks
 from holdfast.protocol import READ_BITS, READ_REGISTERS
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.subscriptions.tag import AREA_OF_CODE
-from holdfast.tags.base import DEFAULT_MAX_GAP
+from holdfast.tags.read_gap import DEFAULT_MAX_GAP
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -1,4 +1,5 @@
-//! The pause after a failed connect: until it is over, requests fail at once, with the same error.
+//! The pause after a failed connect: until it is over, requests fail at once, with the same error. How long it is,
+//! and how it grows, is in `holdfast_runtime::Retry`.
 
 use std::cell::{Cell, RefCell};
 use std::sync::Arc;

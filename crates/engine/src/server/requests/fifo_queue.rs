@@ -5,7 +5,7 @@ use holdfast_memory::{Access, Area, Memory, Read};
 use holdfast_protocol::pdu::{Buffer, ExceptionCode, limit, reply};
 
 use crate::items::Items;
-use crate::server::requests::memory_operations::{exception_of, out_of_ranges};
+use crate::server::requests::exceptions::{exception_of, out_of_ranges};
 use crate::server::rights::peer_rights::PeerRights;
 
 /// The most registers of a queue, with that of the count.

@@ -5,8 +5,9 @@ use holdfast_memory::{Access, Area, Memory, Operation, Outcome, Write};
 use holdfast_protocol::pdu::{self, ExceptionCode, Request, reply};
 
 use crate::link::{PendingReply, Reply, ReplyTo, confirmation, exception, pending_reply};
+use crate::server::requests::exceptions::exception_of;
 use crate::server::requests::file_records;
-use crate::server::requests::memory_operations::{exception_of, writing};
+use crate::server::requests::memory_operations::writing;
 
 /// Gives a write to the journal.
 ///

@@ -1,7 +1,7 @@
-//! What requests ask of a memory, and the exceptions that its refusals become.
+//! What requests ask of a memory.
 
-use holdfast_memory::{Area, Memory, Read, Refusal, Write};
-use holdfast_protocol::pdu::{ExceptionCode, Range};
+use holdfast_memory::{Area, Read, Write};
+use holdfast_protocol::pdu::Range;
 
 #[inline]
 pub(in crate::server) fn reading<const MAX: u16>(
@@ -15,31 +15,4 @@ pub(in crate::server) fn reading<const MAX: u16>(
 #[inline]
 pub(in crate::server) fn writing(area: Area, address: u16, count: u16, bytes: &[u8]) -> Write<'_> {
     Write { area, address, count: usize::from(count), bytes }
-}
-
-#[cold]
-pub(in crate::server) fn exception_of(refusal: Refusal) -> ExceptionCode {
-    match refusal {
-        Refusal::Sealed => ExceptionCode::ServerDeviceBusy,
-        Refusal::OutOfRange | Refusal::GateBit | Refusal::Mirrored => {
-            ExceptionCode::IllegalDataAddress
-        }
-        Refusal::WrongLength | Refusal::NotRegisters => ExceptionCode::IllegalDataValue,
-        Refusal::Stale => ExceptionCode::GatewayTargetFailedToRespond,
-        Refusal::Unavailable | Refusal::Behind => ExceptionCode::ServerDeviceBusy,
-        Refusal::NotStored | Refusal::NotConfirmed | Refusal::Differs => {
-            ExceptionCode::ServerDeviceFailure
-        }
-        Refusal::NotOneStep => unreachable!("a request writes to one memory"),
-        Refusal::Unsealed => unreachable!("clients never restore"),
-    }
-}
-
-/// The refusal of a request outside the ranges of a peer: a sealed memory is busy for every request.
-pub(in crate::server) fn out_of_ranges(memory: &Memory) -> ExceptionCode {
-    if memory.sealed() {
-        ExceptionCode::ServerDeviceBusy
-    } else {
-        ExceptionCode::IllegalDataAddress
-    }
 }

@@ -21,12 +21,13 @@ use crate::link::{Asker, PendingReply};
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::comm_events::{CommEvents, Received};
 use crate::server::reports::counters::{Bus, Counters, FrameCounters};
+use crate::server::requests::exceptions::{NOT_ALLOWED, exception_of, out_of_ranges};
 use crate::server::requests::identity::Identity;
 use crate::server::requests::listen_only::ListenOnly;
-use crate::server::requests::memory_operations::{exception_of, out_of_ranges, reading, writing};
+use crate::server::requests::memory_operations::{reading, writing};
 use crate::server::requests::{fifo_queue, file_records, journaled_write};
 use crate::server::rights::functions::is_write;
-use crate::server::rights::peer_rights::{NOT_ALLOWED, PeerRights};
+use crate::server::rights::peer_rights::PeerRights;
 use crate::server::rights::policy::Elsewhere;
 
 /// What all units of a listener do.

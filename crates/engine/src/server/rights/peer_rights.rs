@@ -6,12 +6,10 @@ use std::sync::Arc;
 use holdfast_memory::{Area, Memory};
 use holdfast_protocol::pdu::{ExceptionCode, Function, Request, SubFunction};
 
+use crate::server::requests::exceptions::NOT_ALLOWED;
 use crate::server::rights::functions::{AccessMode, Answerer, Codes, only_reads};
 use crate::server::rights::policy::{Elsewhere, Rule};
 use crate::server::rights::ranges::Ranges;
-
-/// The exception for what a peer may not do: for a peer that may only read, a write is no function.
-pub(crate) const NOT_ALLOWED: ExceptionCode = ExceptionCode::IllegalFunction;
 
 /// The rights of a peer, compiled to a table by unit id.
 #[derive(Debug)]

@@ -1,4 +1,4 @@
-//! Access rules: which of them are for a peer.
+//! Access rules: which of them are for a peer. [`PeerRights`] takes the first of these that names a unit.
 
 use std::collections::HashMap;
 use std::net::IpAddr;

@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::log::digests::{Digests, Verdict};
 use crate::log::error::{End, LogError};
-use crate::log::follower::digest_at;
 use crate::log::layout::copies;
+use crate::log::log_reader::digest_at;
 use crate::log::parts::background::{Background, Report};
 use crate::log::settings::{Settings, is_word};
 use crate::log::shared::Shared;

@@ -43,7 +43,7 @@ pub struct Record {
 }
 
 /// Reads a log from a snapshot on.
-pub struct Follower {
+pub struct LogReader {
     runtime: tokio::runtime::Runtime,
     reading: Reading,
     until: Until,
@@ -51,7 +51,7 @@ pub struct Follower {
     ended: bool,
 }
 
-/// What [`Follower::next`] found.
+/// What [`LogReader::next`] found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Next {
     Record(Record),
@@ -66,7 +66,7 @@ struct Reading {
     messages: Fetched,
 }
 
-impl Follower {
+impl LogReader {
     /// Connects, and loads the newest snapshot that is not behind the end. The contents of the
     /// memories are replaced.
     ///
@@ -77,7 +77,7 @@ impl Follower {
         mut members: Vec<(String, Arc<Memory>)>,
         until: Until,
         timeout: Duration,
-    ) -> Result<Follower, LogError> {
+    ) -> Result<LogReader, LogError> {
         settings.check()?;
         members.sort_by(|(one, _), (other, _)| one.cmp(other));
         let runtime = tokio::runtime::Builder::new_current_thread()
@@ -99,7 +99,9 @@ impl Follower {
         let timed = async { tokio::time::timeout(timeout, opening).await };
         let last = "the servers do not answer".to_owned();
         match runtime.block_on(timed) {
-            Ok(Ok((reading, last))) => Ok(Follower { runtime, reading, until, last, ended: false }),
+            Ok(Ok((reading, last))) => {
+                Ok(LogReader { runtime, reading, until, last, ended: false })
+            }
             Ok(Err(End::Fatal(error))) => Err(error),
             Ok(Err(End::Lost(last))) => Err(LogError::NoConnection { within: timeout, last }),
             Ok(Err(End::Stopped)) | Err(_) => Err(LogError::NoConnection { within: timeout, last }),
@@ -109,7 +111,7 @@ impl Follower {
     /// Applies the next message, if one comes within this time.
     ///
     /// # Errors
-    /// [`LogError`]. The follower is at its end then.
+    /// [`LogError`]. The reader is at its end then.
     pub fn next(&mut self, timeout: Duration) -> Result<Next, LogError> {
         let end = match self.until {
             Until::Sequence(end) => Some(end.min(self.last)),
