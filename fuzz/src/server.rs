@@ -7,8 +7,8 @@ use holdfast_engine::server::requests::identity::Identity;
 use holdfast_engine::server::requests::unit_server::{UnitServer, UnitSettings};
 use holdfast_engine::server::rights::functions::{AccessMode, Functions};
 use holdfast_engine::server::rights::peer_rights::PeerRights;
-use holdfast_engine::server::rights::policy::{Narrowed, Rule};
 use holdfast_engine::server::rights::ranges::Ranges;
+use holdfast_engine::server::rights::rule::{Narrowed, Rule};
 use holdfast_memory::{Access, Area, Layout, Memory, Read, Span};
 use holdfast_protocol::pdu;
 

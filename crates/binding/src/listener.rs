@@ -7,8 +7,8 @@ use std::time::Duration;
 use holdfast_engine::items::Items;
 use holdfast_engine::server::requests::unit_server::UnitSettings;
 use holdfast_engine::server::rights::functions::{AccessMode, Functions};
-use holdfast_engine::server::rights::policy::{Elsewhere, Narrowed, Rule as CoreRule};
 use holdfast_engine::server::rights::ranges::Ranges;
+use holdfast_engine::server::rights::rule::{Elsewhere, Narrowed, Rule as CoreRule};
 use holdfast_engine::server::{
     AfterRefusal, ConnectionLimits, DatagramFraming, Flags, ListenerKind, ListenerSettings,
     PacketsPerConnection, RawRule as CoreRawRule, RawSettings, SerialSettings, StreamFraming,

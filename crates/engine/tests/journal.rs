@@ -11,7 +11,7 @@ use holdfast_engine::server::reports::audit::Unrecordable;
 use holdfast_engine::server::reports::event::Verbosity;
 use holdfast_engine::server::requests::unit_server::UnitSettings;
 use holdfast_engine::server::rights::functions::{AccessMode, Functions};
-use holdfast_engine::server::rights::policy::Rule;
+use holdfast_engine::server::rights::rule::Rule;
 use holdfast_engine::server::{
     AfterRefusal, ConnectionLimits, DatagramFraming, Engine, Flags, ListenerKind, ListenerSettings,
     Listening, PacketsPerConnection, RawRule, RawSettings, Settings, StreamFraming, StreamSettings,

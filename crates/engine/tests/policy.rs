@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use holdfast_engine::server::rights::functions::{AccessMode, Functions};
 use holdfast_engine::server::rights::peer_rights::PeerRights;
-use holdfast_engine::server::rights::policy::{Policy, Rule};
+use holdfast_engine::server::rights::policy::Policy;
+use holdfast_engine::server::rights::rule::Rule;
 use holdfast_memory::{Layout, Memory};
 
 fn rule(sources: &[&str], unit: u8, rights: AccessMode, functions: Functions) -> Rule {

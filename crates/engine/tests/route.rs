@@ -15,7 +15,7 @@ use holdfast_engine::poller::Poller;
 use holdfast_engine::server::reports::event::Verbosity;
 use holdfast_engine::server::requests::unit_server::UnitSettings;
 use holdfast_engine::server::rights::functions::{AccessMode, Functions};
-use holdfast_engine::server::rights::policy::{Elsewhere, Rule};
+use holdfast_engine::server::rights::rule::{Elsewhere, Rule};
 use holdfast_engine::server::{
     ConnectionLimits, Engine, ListenerKind, ListenerSettings, Listening, Settings, StreamFraming,
     StreamSettings, WhenFull,

@@ -591,7 +591,7 @@ mod tests {
     use crate::server::requests::identity::Identity;
     use crate::server::requests::unit_server::UnitSettings;
     use crate::server::rights::functions::{AccessMode, Functions};
-    use crate::server::rights::policy::Rule;
+    use crate::server::rights::rule::Rule;
     use crate::server::transports::cut_tests::assert_same_outcome;
     use crate::server::transports::framing::MbapBesidePackets;
 

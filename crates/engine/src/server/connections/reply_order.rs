@@ -19,7 +19,7 @@ use crate::server::reports::audit::{Forwarded, Permit};
 use crate::server::reports::refused_request::RefusedRequest;
 use crate::server::requests::unit_server::UnitServer;
 use crate::server::rights::peer_rights::PeerRights;
-use crate::server::rights::policy::Elsewhere;
+use crate::server::rights::rule::Elsewhere;
 
 /// The most requests of a connection that wait for replies.
 pub(in crate::server) const MAX_WAITING: usize = 16;

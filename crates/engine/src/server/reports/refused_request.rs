@@ -110,7 +110,7 @@ mod tests {
 
     use super::*;
     use crate::server::rights::functions::{AccessMode, Functions};
-    use crate::server::rights::policy::Rule;
+    use crate::server::rights::rule::Rule;
 
     const READ: [u8; 5] = [3, 0, 0, 0, 1];
     const WRITE: [u8; 5] = [6, 0, 0, 0, 1];

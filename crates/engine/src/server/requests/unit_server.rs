@@ -28,7 +28,7 @@ use crate::server::requests::memory_operations::{reading, writing};
 use crate::server::requests::{fifo_queue, file_records, journaled_write};
 use crate::server::rights::functions::is_write;
 use crate::server::rights::peer_rights::PeerRights;
-use crate::server::rights::policy::Elsewhere;
+use crate::server::rights::rule::Elsewhere;
 
 /// What all units of a listener do.
 #[derive(Debug, Clone, Copy, Default)]

@@ -4,3 +4,4 @@ pub mod functions;
 pub mod peer_rights;
 pub mod policy;
 pub mod ranges;
+pub mod rule;

@@ -8,8 +8,8 @@ use holdfast_protocol::pdu::{ExceptionCode, Function, Request, SubFunction};
 
 use crate::server::requests::exceptions::NOT_ALLOWED;
 use crate::server::rights::functions::{AccessMode, Answerer, Codes, only_reads};
-use crate::server::rights::policy::{Elsewhere, Rule};
 use crate::server::rights::ranges::Ranges;
+use crate::server::rights::rule::{Elsewhere, Rule};
 
 /// The rights of a peer, compiled to a table by unit id.
 #[derive(Debug)]

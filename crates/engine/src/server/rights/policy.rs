@@ -4,53 +4,10 @@ use std::collections::HashMap;
 use std::net::IpAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use holdfast_memory::{Area, Memory};
 use ipnet::IpNet;
 
-use crate::link::Route;
-use crate::poller::Passage;
-use crate::server::rights::functions::{AccessMode, Functions};
 use crate::server::rights::peer_rights::PeerRights;
-use crate::server::rights::ranges::Ranges;
-
-/// The rights of peers from some networks.
-#[derive(Debug, Clone)]
-pub struct Rule {
-    pub sources: Vec<IpNet>,
-    /// The roles that a rule applies to; empty text is the null role, `None` is any role. Only TLS
-    /// has roles.
-    pub roles: Option<Vec<String>>,
-    pub units: Vec<(u8, Arc<Memory>)>,
-    /// Units whose requests, or some of them, go to devices.
-    pub elsewhere: Vec<(u8, Elsewhere)>,
-    pub access: AccessMode,
-    pub functions: Functions,
-    /// Units with rights of their own, in place of those of the rule.
-    pub narrowed: Vec<(u8, Narrowed)>,
-}
-
-/// The rights of one unit.
-#[derive(Debug, Clone)]
-pub struct Narrowed {
-    pub access: AccessMode,
-    pub functions: Functions,
-    pub ranges: Ranges,
-    /// Area and address of the eight bits that function 7 reads; with `None`, the unit does not have it.
-    pub exception_status: Option<(Area, u16)>,
-    /// The holding registers that function 24 finds a queue at; without any, the unit does not have it.
-    pub queues: Box<[u16]>,
-}
-
-/// Where requests to a unit go that its memory does not answer.
-#[derive(Debug, Clone)]
-pub enum Elsewhere {
-    /// All go to a device. The unit has no memory.
-    Device(Route),
-    /// Writes into some ranges of its memory are passed on.
-    Mirror(Arc<Passage>),
-    /// Writes are carried out by the journal of its memory.
-    Journal(Arc<Memory>),
-}
+use crate::server::rights::rule::Rule;
 
 /// The rights of some peers.
 #[derive(Debug)]

@@ -27,7 +27,7 @@ use crate::server::requests::unit_server::{
     ASCII_DELIMITER, UnitServer, UnitSettings, changed_delimiter,
 };
 use crate::server::rights::peer_rights::PeerRights;
-use crate::server::rights::policy::Rule;
+use crate::server::rights::rule::Rule;
 use crate::server::transports::framing::{Framing, Rtu};
 
 /// The unit id that addresses all units (Modbus over Serial Line V1.02, 2.2).

@@ -20,7 +20,8 @@ use crate::server::connections::reloadable::Reloadable;
 use crate::server::connections::reply_order::{Asked, Expected};
 use crate::server::reports::refused_request::RefusedRequest;
 use crate::server::requests::unit_server::{UnitServer, UnitSettings};
-use crate::server::rights::policy::{Policy, Rule};
+use crate::server::rights::policy::Policy;
+use crate::server::rights::rule::Rule;
 use crate::server::transports::framing::{Datagram, Mbap, Next, Rtu};
 
 /// Bytes per read of a socket. The system may deliver several datagrams of one peer at once.
