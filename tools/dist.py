@@ -8,13 +8,16 @@ are built from it, without a network.
 
 from __future__ import annotations
 
+import base64
 import gzip
+import hashlib
 import os
 import shutil
 import subprocess
 import sys
 import tarfile
 import time
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -115,7 +118,30 @@ def wheel(system: System, folder: Path) -> Path:
     out = BUILD / system.name
     run("maturin", "build", *options, "--out", str(out), folder=folder, **variables)
     [built] = out.glob("*.whl")
-    return Path(shutil.move(built, DIST / built.name))
+    return without_folder(built, folder, DIST / built.name)
+
+
+def without_folder(built: Path, folder: Path, made: Path) -> Path:
+    """Writes a wheel anew whose list of components does not name the folder of the build."""
+    with zipfile.ZipFile(built) as wheel:
+        files = {each: wheel.read(each) for each in wheel.infolist()}
+    record = next(each for each in files if each.filename.endswith(".dist-info/RECORD"))
+    for each, content in files.items():
+        if "/sboms/" in each.filename:
+            files[each] = content.replace(f"{folder}/".encode(), b"/")
+            files[record] = files[record].replace(
+                recorded(each, content), recorded(each, files[each])
+            )
+    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as wheel:
+        for each, content in files.items():
+            wheel.writestr(each, content)
+    return made
+
+
+def recorded(file: zipfile.ZipInfo, content: bytes) -> bytes:
+    """The line of a file in RECORD."""
+    digest = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+    return f"{file.filename},sha256={digest},{len(content)}\n".encode()
 
 
 def needs_target(target: str) -> None:
