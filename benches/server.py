@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
@@ -20,11 +21,12 @@ import common
 from common import Result, Server, TurnFailed
 
 FLOOD = (2, 3000)
-ENOUGH = 10
+BOUND_ROUNDS = 10
+"""The fewest rounds for a bound of their mean."""
 STUDENT_T = 1.833
 """The 95 % quantile for 9 degrees of freedom; it is smaller for more."""
 
-SHAPES = ("1x1", "1x16", "64x1", "64x16")
+SHAPES = [(connections, in_flight) for connections in (1, 64) for in_flight in (1, 16)]
 
 
 @dataclass
@@ -43,8 +45,7 @@ def main() -> None:
     with ExitStack() as stack:
         servers = start_servers(options, stack)
         scenarios = []
-        for shape in options.shape or SHAPES:
-            connections, in_flight = map(int, shape.split("x"))
+        for connections, in_flight in options.shape or SHAPES:
             scenarios.append(measure(servers, connections, in_flight, options))
             show(scenarios[-1], list(servers))
         is_all = not (options.null or options.shape)
@@ -67,13 +68,22 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--shape",
         action="append",
+        type=shape,
         metavar="CONNECTIONSxIN_FLIGHT",
-        help=f"only this, without pymodbus; can be repeated; default {', '.join(SHAPES)}",
+        help="only this, without pymodbus, such as 64x1; can be repeated",
     )
     options = common.parsed(parser)
     if not 1 <= options.quantity <= 125:
         parser.error("--quantity must be 1 to 125")
     return options
+
+
+def shape(text: str) -> tuple[int, int]:
+    """Parses the connections, and the requests in flight on each."""
+    found = re.fullmatch("([1-9][0-9]*)x([1-9][0-9]*)", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not CONNECTIONSxIN_FLIGHT, as in 64x1")
+    return int(found[1]), int(found[2])
 
 
 def start_servers(options: argparse.Namespace, stack: ExitStack) -> dict[str, Server]:
@@ -174,7 +184,7 @@ def compared(rounds: list[dict[str, Result]], first: str, second: str) -> str:
     shown = common.ratio(rounds, first, second)
     both = [one for one in rounds if first in one and second in one]
     ratios = [log(one[first]["rate"] / one[second]["rate"]) for one in both]
-    if len(ratios) < ENOUGH:
+    if len(ratios) < BOUND_ROUNDS:
         return shown
     bound = fmean(ratios) - STUDENT_T * stdev(ratios) / sqrt(len(ratios))
     return f"{shown}, mean {exp(fmean(ratios)):.3f}, at least {exp(bound):.3f}"

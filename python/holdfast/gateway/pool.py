@@ -1,6 +1,6 @@
 """A pool of connections to devices. All requests to one device share one connection, in turns.
 
-In an appliance, devices that it uses itself are asked over its own connections (`sharing`).
+In an appliance, devices that it uses itself are asked over its own connections (`shared_devices`).
 
 A connection is opened when it is needed. It is closed when it is idle for some time, and when the
 last request on it had no response, because the state of the connection is then unknown. Where

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from holdfast.events.audit.forwarding import Copies
+from holdfast.events.audit.copies import Copies
 from holdfast.events.audit.log import Audit, Unrecorded
 from holdfast.events.audit.receivers import Journal, Syslog
 from holdfast.events.audit.verification import Findings, verify

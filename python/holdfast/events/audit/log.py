@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     import msgspec
 
-    from holdfast.events.audit.forwarding import Copies
+    from holdfast.events.audit.copies import Copies
 
     Line: TypeAlias = Mapping[str, object] | msgspec.Raw
     """The fields of a line, also as JSON."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.events.audit import Audit, Copies, Journal, Syslog, forwarding
+from holdfast.events.audit import Audit, Copies, Journal, Syslog, copies
 from support import wire
 from support.audits import full, lines
 
@@ -34,7 +34,7 @@ MESSAGE = re.compile(
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forwarding, "RETRY_DELAY_S", 0.01)
+    monkeypatch.setattr(copies, "RETRY_DELAY_S", 0.01)
 
 
 @pytest.fixture
@@ -154,7 +154,7 @@ def test_lines_wait_for_a_receiver_that_is_down(
 def test_lines_that_find_no_room_are_dropped_and_counted(
     tmp_path: Path, audit: Callable[..., Audit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(forwarding, "MAX_WAITING_BYTES", 1000)
+    monkeypatch.setattr(copies, "MAX_WAITING_BYTES", 1000)
     file = tmp_path / "audit.log"
     log = audit(Copies("syslog", Syslog("unix", str(tmp_path / "none"))), file=file)
     log.write_all([{"number": number} for number in range(100)])
@@ -231,7 +231,7 @@ def test_the_last_lines_are_sent_before_the_end(
 def test_the_end_does_not_wait_for_a_receiver_that_is_down(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(forwarding, "CLOSE_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(copies, "CLOSE_TIMEOUT_S", 0.01)
     receiver = Copies("syslog", Syslog("unix", str(tmp_path / "none")))
     log = Audit(None, max_bytes=10**6, keep=1, copies=[receiver])
     log.write_all([{"number": 1}, {"number": 2}])
