@@ -1,4 +1,5 @@
-//! Converts writes into the dictionaries of the audit log, and those of JSON commands into its lines.
+//! Converts writes into the dictionaries of the audit log, and those of JSON commands into its lines. The number, the
+//! time and the link to the line before are added by `events/audit/chain.py`.
 
 use std::io::Write as _;
 

@@ -1,4 +1,4 @@
-"""What commands print after an error of a device: its text, its JSON, and a hint what to do."""
+"""How commands end after an error of a device: its text, its JSON, a hint, and the exit code."""
 
 from __future__ import annotations
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import json
-import math
 import os
 import sys
 import time
@@ -95,15 +94,6 @@ def shown(value: Any, kind: str) -> str:
     if isinstance(value, str):
         return plain(json.dumps(value, ensure_ascii=False))
     return str(value)
-
-
-def jsonable(value: Any) -> Any:
-    """A typed value for JSON: bytes in hex, `None` for NaN and infinity."""
-    if isinstance(value, bytes):
-        return value.hex()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def print_json(answer: object, indent: int | None = None) -> None:

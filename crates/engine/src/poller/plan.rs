@@ -4,7 +4,8 @@
 //! The rules of this file: a field is never split; a block is within the limits of the device; a
 //! gap is read only where that is allowed. [`Strategy::Gap`] reads every gap up to a size.
 //! [`Strategy::Cost`] finds the cheapest plan for a given cost of a request and of a register: with
-//! a high cost of a request it reads all allowed gaps, with cost 0 none.
+//! a high cost of a request it reads all allowed gaps, with cost 0 none. The size comes from the caller, by default
+//! from `tags/read_gap.py`.
 
 use holdfast_memory::Area;
 use holdfast_protocol::pdu::limit;

@@ -1,5 +1,6 @@
 //! When a device that does not answer is polled again: after the third poll without an answer, the pauses
-//! double, until it answers. While its address cannot be reached, the link decides.
+//! double, until it answers. How long they are is in `holdfast_runtime::Retry`. While its address cannot be reached, the
+//! link decides.
 
 use std::cell::Cell;
 

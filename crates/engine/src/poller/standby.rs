@@ -1,5 +1,6 @@
 //! When a node polls a device that several nodes share: while the fence of its lease is open, and once nothing that
 //! the former holder has sent can arrive any more.
+//! What it sends without the lease is refused in `link/limits/lease_fence.rs`.
 
 use std::future::pending;
 use std::time::Instant;

@@ -1,8 +1,7 @@
-"""The application of REST: what a token grants, and what each operation does.
+"""The application of REST: what each operation does.
 
-`operations` says which operations need no token.
-
-The memory access checks everything about memories. A request that is refused here never reaches it.
+`operations` says which operations need no token, `grants` what a token grants. The memory access
+checks everything about memories. A request that is refused here never reaches it.
 """
 
 from __future__ import annotations
@@ -14,9 +13,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import msgspec
 
 from holdfast.adapters.rest.changes import MAX_VALUES, ChangeStreams
+from holdfast.adapters.rest.grants import ANYONE, Grants
 from holdfast.adapters.rest.refusals import REFUSALS
 from holdfast.adapters.sessions import parse_session_id
-from holdfast.ingest import Grant, Refused
+from holdfast.ingest import Refused
 from holdfast.net.http import events
 from holdfast.net.http.application import Application, json_response
 from holdfast.net.http.fields import malformed
@@ -30,7 +30,6 @@ from holdfast.net.http.requests import (
     response,
     shown,
 )
-from holdfast.types import AREAS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.sessions import SessionControl
     from holdfast.config.models.services import RestConfig
-    from holdfast.ingest import MemoryAccess, Written
+    from holdfast.ingest import Grant, MemoryAccess, Written
     from holdfast.net.http.operations import Later, Operation
 
     Given: TypeAlias = Mapping[str, Any]
@@ -48,8 +47,6 @@ MAX_ANSWERS = 64
 """Answers to writes that are kept: sources write the same ranges again and again."""
 
 INGEST = "/api/v1/ingest"
-ANYONE = "anyone"
-"""The name of the client when no tokens are configured."""
 
 
 class EndSession(msgspec.Struct, forbid_unknown_fields=True):
@@ -71,34 +68,20 @@ class App(Application):
         *,
         is_https: bool = False,
     ) -> None:
-        tokens = () if settings.tokens == "none" else settings.tokens
+        self.grants = Grants(settings, memory_access.memories)
         allowed = " without tokens: an IP address, localhost, or a name in rest.hosts"
-        names = None if tokens else frozenset(settings.hosts)
+        names = None if self.grants.secrets else frozenset(settings.hosts)
         super().__init__(
             operations,
             Origins(names=names, allowed=allowed, is_https=is_https),
-            tokens=[(token.name, bytes.fromhex(token.sha256)) for token in tokens],
+            tokens=self.grants.secrets,
             anyone=ANYONE,
             max_body=settings.max_body,
         )
         self._memory_access = memory_access
         self._diagnostics = diagnostics
         self._sessions = sessions
-        self._grants = {
-            token.name: Grant(
-                token.name,
-                frozenset(token.memories),
-                frozenset(token.areas),
-                token.access == "read-write",
-                frozenset(token.while_sealed or ()),
-            )
-            for token in tokens
-        }
-        if not tokens:
-            everything = Grant(ANYONE, frozenset(memory_access.memories), frozenset(AREAS))
-            self._grants = {ANYONE: everything}
         self._parsing: dict[str, tuple[Commands, Callable[[ParsedWrites], object]]] = {}
-        self._managers = {token.name for token in tokens if token.manage}
         self._streams = ChangeStreams(settings.max_connections)
 
     @property
@@ -125,7 +108,7 @@ class App(Application):
 
     def ingest(self, request: Request, body: bytes) -> Response | Later:
         """Writes one command or a batch."""
-        access, grant = self._memory_access, self._grants[request.who]
+        access, grant = self._memory_access, self.grants.of(request.who)
         if COMMANDS not in request.kept:
             # From now on, the core parses what comes with this head.
             request.kept[COMMANDS] = self._parser(grant)
@@ -155,7 +138,7 @@ class App(Application):
 
     def read(self, request: Request, given: Given) -> Response:
         """Reads a range."""
-        grant = self._grants[request.who]
+        grant = self.grants.of(request.who)
         values = self._memory_access.read(**given, grant=grant, peer=request.peer)
         return json_response({"values": values})
 
@@ -163,7 +146,7 @@ class App(Application):
         """Follows ranges."""
         memory, ranges = given["memory"], _ranges(given)
         self._streams.check_room()
-        grant = self._grants[request.who]
+        grant = self.grants.of(request.who)
         follower = self._memory_access.follow(memory, ranges, grant, request.peer)
         if request.method == "HEAD":
             return Response(200, headers=list(events.HEADERS))
@@ -176,7 +159,7 @@ class App(Application):
 
     def memories(self, request: Request, _: Given) -> Response:
         """Lists the memories of the token."""
-        granted = self._grants[request.who].memories
+        granted = self.grants.of(request.who).memories
         memories = self._diagnostics.memories()
         return json_response(
             {"memories": {name: entry for name, entry in memories.items() if name in granted}}
@@ -194,14 +177,12 @@ class App(Application):
         least: dict[str, object] = {"connected": False, "broker": None, "topics": []}
         return json_response(least | status)
 
-    def sessions(self, request: Request, _: Given) -> Response:
+    def sessions(self, _: Request, __: Given) -> Response:
         """Lists the connections of listeners."""
-        self._check_manager(request)
         return json_response({"sessions": self._sessions.sessions()})
 
     async def end_session(self, request: Request, body: bytes) -> Response:
         """Ends a connection of a listener."""
-        self._check_manager(request)
         try:
             request_body = msgspec.json.decode(body, type=EndSession)
             listener, number = parse_session_id(request_body.id)
@@ -211,12 +192,6 @@ class App(Application):
         if not await asyncio.to_thread(self._sessions.end_session, listener, number, by):
             raise BadRequest("unknown_session", f"no session {shown(request_body.id)}")
         return json_response({"status": "ended", "id": request_body.id})
-
-    def _check_manager(self, request: Request) -> None:
-        """Raises `BadRequest` for a client that may not manage the appliance."""
-        if request.who not in self._managers:
-            detail = f"{request.who} may not manage sessions, allowed: tokens with manage: true"
-            raise BadRequest("not_granted", detail)
 
 
 async def _written(ingest: Callable[[], Written]) -> Response:

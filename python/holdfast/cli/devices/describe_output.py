@@ -11,6 +11,7 @@ from holdfast.cli.terminal_text import number_ranges
 from holdfast.config.tag_files.write import scale_as_data
 from holdfast.discovery.segments import FILL_REASONS
 from holdfast.tags.scale import RegisterScale
+from holdfast.values.json import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -212,6 +213,6 @@ def _tag(each: Described) -> dict[str, object]:
         "scale": scale_as_data(tag.scale) if isinstance(tag.scale, RegisterScale) else tag.scale,
         "unit": tag.unit,
         "confidence": round(each.confidence, 4),
-        "values": [terminal_text.jsonable(value) for value in each.values],
+        "values": [jsonable(value) for value in each.values],
         "reasons": list(each.reasons),
     }

@@ -21,6 +21,7 @@ from holdfast.discovery import type_guess
 from holdfast.errors import ModbusError
 from holdfast.protocol import READ_REGISTERS
 from holdfast.types import BIT_AREAS
+from holdfast.values.json import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -162,5 +163,5 @@ def _to_json(guess: Guess, address: int) -> dict[str, object]:
         "also": guess.also,
         "score": round(guess.score, 4),
         "reasons": guess.reasons,
-        "values": [terminal_text.jsonable(value) for value in guess.values],
+        "values": [jsonable(value) for value in guess.values],
     }

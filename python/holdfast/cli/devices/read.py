@@ -26,6 +26,7 @@ from holdfast.errors import ModbusError, ModbusException, RequestTimeout
 from holdfast.protocol import ADDRESSES, ILLEGAL_ADDRESS, LAST_ADDRESS
 from holdfast.types import BIT_AREAS
 from holdfast.values import ConversionError
+from holdfast.values.json import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -209,10 +210,7 @@ class _Query:
         items: dict[str, object] = {f"{self.noun}s": list(raw)}
         if self.typed is not None:
             found = self.typed.decode(raw)
-            items["values"] = [
-                None if isinstance(each, ConversionError) else terminal_text.jsonable(each)
-                for each in found
-            ]
+            items["values"] = [jsonable(each) for each in found]
             wrong = {
                 str(index): {"reason": "undecodable", "detail": str(each)}
                 for index, each in enumerate(found)

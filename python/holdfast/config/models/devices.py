@@ -37,7 +37,7 @@ from holdfast.config.values.scalars import (
     whole_number,
 )
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
-from holdfast.tags.read_gap import DEFAULT_MAX_GAP
+from holdfast.tags.read_gap import gap_of_device
 from holdfast.types import WRITABLE_AREAS, Area, RegisterArea
 
 if TYPE_CHECKING:
@@ -272,8 +272,8 @@ def takes_writes(area: object, into: object) -> bool:
 
 
 def _max_gap(data: dict[str, Any]) -> int:
-    only_tags = not data.get("reads") and (data.get("tags") or data.get("profile"))
-    return DEFAULT_MAX_GAP if only_tags else 0
+    has_tags = bool(data.get("tags") or data.get("profile"))
+    return gap_of_device(has_reads=bool(data.get("reads")), has_tags=has_tags)
 
 
 class DeviceConfig(Model):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ from holdfast.net.http.fields import malformed
 from holdfast.protocol import WRITE_REGISTERS
 from holdfast.values import ConversionError, WrongArea
 from holdfast.values.digits import shortest
+from holdfast.values.json import jsonable
 from holdfast.values.orders import DEFAULT_ORDER
 from holdfast.values.types import FIXED
 
@@ -47,7 +47,7 @@ class Typed:
             if isinstance(each, ConversionError)
         }
         return {
-            "typed": [_jsonable(each) for each in found],
+            "typed": [jsonable(each) for each in found],
             "typedText": [self._text(each) for each in found],
             **({"typedErrors": wrong} if wrong else {}),
         }
@@ -184,13 +184,3 @@ def quantity_of(given: int | None, kind: Typed | None) -> int:
         takes = f"{whole}" if kind.count is not None else f"a multiple of {kind.width}"
         raise malformed(f"quantity is {given}, the datatype requires {takes}")
     return given
-
-
-def _jsonable(value: Any) -> Any:
-    if isinstance(value, bytes):
-        return value.hex()
-    if isinstance(value, ConversionError) or (
-        isinstance(value, float) and not math.isfinite(value)
-    ):
-        return None
-    return value

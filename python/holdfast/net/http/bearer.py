@@ -1,4 +1,7 @@
-"""Whose request it is: the token in `Authorization: Bearer TOKEN` (RFC 6750)."""
+"""Whose request it is: the token in `Authorization: Bearer TOKEN` (RFC 6750).
+
+Which operations need none is in the table of each service: `Operation.is_open`.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Operations: what an HTTP application offers.
 
 An operation is a row of the application's table: its route, its parameters or its body, its
-answers, its refusals, and the function that carries it out. `web.application` routes and validates
-by the table, `web.openapi` makes the document from it.
+answers, its refusals, and the function that carries it out. `application` routes and validates by
+the table, `openapi` makes the document from it.
 """
 
 from __future__ import annotations

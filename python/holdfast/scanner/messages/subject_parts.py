@@ -4,7 +4,8 @@ A device id may have blanks and dots, a part of a subject may not. Callers of te
 replace only the characters that NATS does not allow, and listen there. So the data of a device is
 published under both names if they differ.
 
-Programs of tentacle-next replace other characters, and listen to one subject for each tag.
+Programs of tentacle-next replace other characters, and listen to one subject for each tag. Whole
+subjects are made by `data_subject` of each dialect.
 """
 
 from __future__ import annotations
