@@ -110,9 +110,9 @@ CARGO_DENY := 0.20.2
 audit: .venv/core.stamp .venv/dev.stamp .venv/release.stamp .cache/tools/cargo-deny-$(CARGO_DENY).stamp
 	PATH="$(CURDIR)/.cache/tools/bin:$$PATH" $(BIN)/python tools/dependencies.py
 
-# A tool of Rust and its version: cargo-NAME-VERSION.
+# A tool of Rust and its version: cargo-NAME-VERSION. Optimizing it would take longer than what it does.
 .cache/tools/cargo-%.stamp: $(TOOLCHAIN)
-	cargo install --locked --quiet --root .cache/tools cargo-$(subst -,@,$*)
+	CARGO_PROFILE_DEV_DEBUG=0 cargo install --debug --locked --quiet --root .cache/tools cargo-$(subst -,@,$*)
 	@touch $@
 
 # Links a program without the standard library with the protocol crate: for this machine, and for a
