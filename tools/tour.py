@@ -22,7 +22,8 @@ END = "Ctrl-C stops it."
 
 def main() -> int:
     """Runs both until Ctrl-C or SIGTERM. Returns the exit code."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: sys.exit(1))
     text = Path(EXAMPLE).read_text(encoding="utf-8")
     [device] = re.findall(r"url: tcp://(\S+)", text)
     if taken := [place for place in (device, *re.findall(r"bind: (\S+)", text)) if is_taken(place)]:
@@ -36,13 +37,15 @@ def main() -> int:
         port = device.rpartition(":")[2]
         # In a group of its own: Ctrl-C ends the appliance first, which would miss its device.
         simulated = started(running, "simulate", "--port", port, process_group=0)
+        if not greeting(simulated):
+            return simulated.wait()  # It has printed why.
+        # Only now: an appliance that misses its device at first refuses writes to it for a moment.
         appliance = started(running, "run", EXAMPLE)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: appliance.terminate())
-        if greeting(simulated) and (served := greeting(appliance)):
+        if served := greeting(appliance):
             print("\n".join([served, "", *suggestions(served, device), "", END]), flush=True)
-            return appliance.wait()
-        return simulated.poll() or appliance.wait()  # It has printed why.
+        return appliance.wait()  # Without a greeting, it has printed why.
 
 
 def is_taken(place: str) -> bool:
