@@ -40,15 +40,21 @@ def fingerprint(*settings: object) -> str:
     return digest.hexdigest()
 
 
+def tls_of_url(settings: Model) -> Tls | None:
+    """The TLS files in the URL of a device, a link or a receiver; `None` for other settings."""
+    # The `target` of a receiver is the unit id of its packets.
+    url = getattr(settings, "receiver", None) or getattr(settings, "target", None)
+    tls: Tls | None = getattr(url, "tls", None)
+    return tls
+
+
 def _files(value: Any) -> Iterator[Path]:
     """The files that settings name: as a path, or in the URL of a device or receiver."""
     if isinstance(value, Path):
         yield value
     elif isinstance(value, Model):
-        for named in ("target", "receiver"):
-            tls: Tls | None = getattr(getattr(value, named, None), "tls", None)
-            if tls is not None:
-                yield from (Path(file) for _, file in tls.files())
+        if (tls := tls_of_url(value)) is not None:
+            yield from (Path(file) for _, file in tls.files())
         for name in type(value).model_fields:
             if name not in value.own_files:
                 yield from _files(getattr(value, name))

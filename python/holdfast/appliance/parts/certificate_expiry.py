@@ -1,4 +1,4 @@
-"""The certificates that a configuration names: doubts about them, and when they expire."""
+"""The certificates that a configuration names: warnings, and when they expire."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from holdfast.appliance.parts.part import Part
-from holdfast.client.url import NetworkTarget
-from holdfast.config.models.listeners import tls_of
-from holdfast.config.models.services import HTTP_SERVICES
+from holdfast.config.fingerprint import tls_of_url
+from holdfast.config.models.base import Model
+from holdfast.config.models.server_tls import HttpsConfig, ServerTlsConfig
 from holdfast.events import log_lines
 from holdfast.runtime import extras
 
@@ -18,34 +18,29 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from holdfast.appliance.parts.part import Plan
-    from holdfast.client.url import Target
     from holdfast.config import Config
-    from holdfast.config.models.services import ClientTlsConfig
     from holdfast.config.text.yaml_document import KeyPath
     from holdfast.net.certificates.expiry import Expiry
-    from holdfast.net.tls import Tls
 
 Kind: TypeAlias = Literal["server", "certificates", "revocation_lists"]
 
 Expiries: TypeAlias = "dict[str, dict[str, float]]"
 """The earliest expiry in each configured file, in seconds of Unix time, by the kind of files."""
 
-SOON_S = 30 * 24 * 3600.0
+WARN_WITHIN_S = 30 * 24 * 3600.0
 """A certificate that expires within this time is logged."""
 
 REPEAT_S = 24 * 3600.0
 """A certificate is logged again after this time."""
 
 KINDS: dict[str, Kind] = {
-    "cert_file": "server",
+    "cert_file": "certificates",
     "ca_file": "certificates",
     "client_ca_file": "certificates",
     "crl_file": "revocation_lists",
 }
-"""The keys with certificates of servers."""
-
-CLIENTS = (("mqtt", "tls"), ("nats", "tls"), ("nats", "device_tls"), ("gateway", "device_tls"))
-"""The keys with certificates of clients."""
+"""The keys of files that expire, with the kind of their files; a `cert_file` of a TLS server is of
+the kind `server`."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +84,7 @@ class CertificateExpiry(Part):
         for kinds, ends in expiries.items():
             kind = kinds.removesuffix("s").replace("_", " ")
             for file, end in ends.items():
-                if end - now > SOON_S:
+                if end - now > WARN_WITHIN_S:
                     continue
                 event = "certificate_expired" if end <= now else "certificate_expires"
                 logged = self._logged.get((event, kind, file))
@@ -113,7 +108,7 @@ def expiries(config: Config) -> Expiries:
 
 
 def doubts(config: Config) -> list[tuple[KeyPath, str]]:
-    """Returns what is doubtful about the certificates: each key and a warning."""
+    """Returns warnings about the certificates, each with its key."""
     found: dict[str, tuple[KeyPath, str]] = {}
     reason = extras.missing("certs")
     for each in _named(config):
@@ -142,35 +137,24 @@ def _dates(named: _Named) -> list[Expiry]:
     return expiry.of_certificates(named.file)
 
 
-def _named(config: Config) -> Iterator[_Named]:
-    servers: list[tuple[KeyPath, object]] = [
-        (("listeners", name, "tls"), tls_of(listener))
-        for name, listener in config.listeners.items()
-    ]
-    servers += [((key, "tls"), getattr(getattr(config, key), "tls", None)) for key in HTTP_SERVICES]
-    for place, tls in servers:
-        for key, kind in KINDS.items():
-            if (file := getattr(tls, key, None)) is not None:
-                yield _Named((*place, key), str(file), kind, by_core=True)
-    for section, part in CLIENTS:
-        client: ClientTlsConfig | None = getattr(getattr(config, section), part, None)
-        for key in ("ca_file", "cert_file"):
-            if (file := getattr(client, key, None)) is not None:
-                yield _Named((section, part, key), str(file), "certificates")
-    for name, device in config.devices.items():
-        yield from _of_url(("devices", name, "url"), device.target)
-        for index, forward in enumerate(device.forward):
-            yield from _of_client(("devices", name, "forward", index, "url"), forward.receiver.tls)
-    for name, link in config.links.items():
-        yield from _of_url(("links", name, "url"), link.target)
-
-
-def _of_url(place: KeyPath, target: Target) -> Iterator[_Named]:
-    if isinstance(target, NetworkTarget):
-        yield from _of_client(place, target.tls)
-
-
-def _of_client(place: KeyPath, tls: Tls | None) -> Iterator[_Named]:
-    for file in () if tls is None else (tls.ca, tls.cert):
-        if file is not None:
-            yield _Named(place, file, "certificates")
+def _named(settings: object, place: KeyPath = ()) -> Iterator[_Named]:
+    """The files that expire: in all sections of the configuration, and in URLs."""
+    if isinstance(settings, Model):
+        if (tls := tls_of_url(settings)) is not None:
+            for file in (tls.ca, tls.cert):
+                if file is not None:
+                    yield _Named((*place, "url"), file, "certificates")
+        is_server = isinstance(settings, ServerTlsConfig | HttpsConfig)
+        for key in type(settings).model_fields:
+            value = getattr(settings, key)
+            if key not in KINDS:
+                yield from _named(value, (*place, key))
+            elif value is not None:
+                kind = "server" if is_server and key == "cert_file" else KINDS[key]
+                yield _Named((*place, key), str(value), kind, by_core=is_server)
+    elif isinstance(settings, dict):
+        for key, value in settings.items():
+            yield from _named(value, (*place, key))
+    elif isinstance(settings, list | tuple):
+        for index, value in enumerate(settings):
+            yield from _named(value, (*place, index))
