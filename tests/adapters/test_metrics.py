@@ -79,6 +79,21 @@ LINK: dict[str, int] = {
     "floods": 34,
 }
 
+LOG: dict[str, Any] = {
+    "phase": "running",
+    "connected": True,
+    "digest": (9, "abc", False),
+    "contact_age": 0.5,
+    "sequence": 9,
+    "lag": 1,
+    "steps": 61,
+    "unavailable": 62,
+    "not_confirmed": 63,
+    "not_stored": 64,
+    "refused": 65,
+    "ignored": 66,
+}
+
 METER: dict[str, Any] = {
     "health": "error",
     "last_error": 0x8001,
@@ -124,6 +139,7 @@ def memory_access(memories: dict[str, holdfast.Memory]) -> MemoryAccess:
 @pytest.fixture
 def diagnostics(memories: dict[str, holdfast.Memory], memory_access: MemoryAccess) -> Diagnostics:
     others = web.StandIn({"scada": LISTENER, "replication": RAW}, events_lost=11)
+    others.logs = {"site": LOG}
     others.threads = [("holdfast-io-0", 0.25, threading.get_native_id()), ("gone", 7.5, None)]
     made = web.diagnostics_of(memories, others, devices())
     status = {
@@ -286,6 +302,17 @@ def scraped(client: web.Client) -> dict[tuple[str, ...], float]:
         (("holdfast_link_requests_total", "bus", "withdrawn"), 0),
         (("holdfast_link_exceptions_total", "bus"), 2),
         (("holdfast_link_waiting", "bus"), 8),
+        (("holdfast_log_up", "site"), 1),
+        (("holdfast_log_lag", "site"), 1),
+        (("holdfast_log_sequence", "site"), 9),
+        (("holdfast_log_contact_age_seconds", "site"), 0.5),
+        (("holdfast_log_differs", "site"), 1),
+        (("holdfast_log_messages_ignored_total", "site"), 66),
+        (("holdfast_log_steps_total", "site", "done"), 61),
+        (("holdfast_log_steps_total", "site", "unavailable"), 62),
+        (("holdfast_log_steps_total", "site", "not_confirmed"), 63),
+        (("holdfast_log_steps_total", "site", "not_stored"), 64),
+        (("holdfast_log_steps_total", "site", "refused"), 65),
         (("holdfast_adapter_state", "rest", "running"), 1),
         (("holdfast_adapter_state", "rest", "failed"), 0),
         (("holdfast_adapter_state", "mqtt", "failed"), 1),

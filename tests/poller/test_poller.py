@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
+from holdfast.appliance import Appliance
+from holdfast.config import load
 from holdfast.events import log_lines
 from holdfast.polling.faults import fault_word
 from holdfast.types import AREAS
@@ -42,7 +44,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from holdfast.appliance import Appliance
     from holdfast.types import Area
     from support.polled import Status
     from support.running import Run, Serve
@@ -1101,12 +1102,8 @@ class Altered:
         told: dict[str, dict[str, Any]] = self._poller.counters(of=of)
         return {name: {**counted, **self.counters_instead} for name, counted in told.items()}
 
-    @property
-    def heartbeat(self) -> Any:
-        return self._poller.heartbeat
-
-    def stop(self) -> None:
-        self._poller.stop()
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._poller, name)
 
 
 @pytest.mark.usefixtures("health_is_checked_at_once")
@@ -1142,6 +1139,40 @@ def test_a_missing_plan_and_refused_results_are_logged(run: Run, records: web.Re
     assert errors == ["not stored", "internal error"]
     levels = {line.split()[0] for line in records.lines if "device_un" in line}
     assert levels == {"ERROR"}
+
+
+@pytest.mark.usefixtures("health_is_checked_at_once")
+def test_refused_results_are_not_logged_again_after_a_reload(
+    tmp_path: Path, records: web.Records
+) -> None:
+    file = tmp_path / "appliance.yaml"
+    reads = [read("coils", 0, 8, ("coils", 0))]
+    with Fake(data) as fake:
+
+        def loaded(**more: Any) -> Any:
+            file.write_text(configuration({"meter": device(fake.url, *reads, **more)}))
+            return load(file)
+
+        with Appliance(loaded()) as appliance:
+            devices: Any = appliance._parts().devices
+            devices.poller = altered = Altered(devices.poller)
+
+            def refused(count: int) -> None:
+                altered.counters_instead = {"unstored": count}
+                appliance.log_events(timeout=0)
+
+            until_polled(appliance, "meter")
+            refused(5)
+            polls = counters(appliance, "meter")["polls"]
+            assert appliance.reload(loaded(timeout=4)) == ["devices.meter"]
+            assert counters(appliance, "meter")["polls"] >= polls, "counters go on"
+            refused(5)
+            refused(6)
+            appliance.reload(loaded(enabled=False))
+            appliance.reload(loaded())
+            assert counters(appliance, "meter")["polls"] < polls, "counters begin again"
+            refused(2)
+    assert [each["count"] for each in records.of("device_unstored")] == [5, 1, 2]
 
 
 def test_rest_and_metrics_tell_of_devices(run: Run) -> None:

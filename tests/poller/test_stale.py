@@ -278,6 +278,32 @@ def test_status_metrics_and_log_say_since_when(
     wire.until(lambda: is_logged(appliance, records, "mirror_fresh"), "that is logged too")
 
 
+@pytest.mark.usefixtures("health_is_checked_at_once")
+def test_stale_values_are_not_fresh_because_their_source_has_changed(
+    tmp_path: Path, meter: Meter, records: web.Records
+) -> None:
+    file = tmp_path / "appliance.yaml"
+
+    def loaded(**more: Any) -> Any:
+        file.write_text(config(meter, {"after": AFTER}, **more))
+        return load(file)
+
+    with Appliance(loaded()) as appliance:
+
+        def ages() -> list[float | None]:
+            return [each["age"] for each in counters(appliance, "meter")["mirrors"]]
+
+        wire.until(lambda: None not in ages(), "the device was read")
+        meter.is_gone = True
+        wire.until(lambda: is_logged(appliance, records, "mirror_stale"), "it is logged")
+        appliance.reload(loaded(unit=2))
+        assert ages() == [None, None], "another unit was not read yet"
+        appliance.log_events(timeout=0)
+        assert not records.of("mirror_fresh")
+        meter.is_gone = False
+        wire.until(lambda: is_logged(appliance, records, "mirror_fresh"), "it was read")
+
+
 def test_the_clock_alone_makes_values_old() -> None:
     memory = holdfast.Memory(holding_registers=10)
     age = _core.MirrorAge(3600, refuses=True)

@@ -129,17 +129,19 @@ class StandIn:
     events_lost: int = 0
     threads: list[ThreadHeartbeat] = field(default_factory=list)
     audit: dict[str, object] | None = None
+    logs: dict[str, Any] = field(default_factory=dict)
 
     def heartbeats(self) -> list[ThreadHeartbeat]:
         return self.threads
 
     def stats(self) -> dict[str, Any]:
-        of_no_part = ("devices", "links", "memory_files", "logs", "certificates")
+        of_no_part = ("devices", "links", "memory_files", "certificates")
         return {
             **{key: {} for key in (*of_no_part, "revocation_lists")},
             "listeners": self.listeners,
             "events_lost": self.events_lost,
             "audit": self.audit,
+            "logs": self.logs,
         }
 
 

@@ -1,4 +1,4 @@
-"""The metrics: which figures of the diagnostics each has, with its name, text and labels."""
+"""The metrics: their names, texts and labels, and the diagnostics that they show."""
 
 from __future__ import annotations
 
@@ -54,6 +54,8 @@ CLOSED = {
     "broken_request": "broken_request",
 }
 """The reasons of connections that were closed by this side, by their keys in the counters."""
+LOG_OUTCOMES = ("unavailable", "not_confirmed", "not_stored", "refused")
+"""The outcomes of writes of this node to a log, besides `done`."""
 LINK_OUTCOMES = (
     "replies",
     "timeouts",
@@ -151,14 +153,14 @@ def _figures(
 
 
 MEMORY_FILE_COUNTERS = {
-    "commits": ("memory_file_commits", "Times that writes were put on the disk."),
+    "commits": ("memory_file_commits", "How often writes were stored on the disk."),
     "refused": ("memory_file_refused", "Writes refused because of the disk."),
 }
 MEMORY_FILE_GAUGES = {
     "is_failing": ("memory_file_failing", "1 if the file could not be written last time."),
     "stored_at": (
         "memory_file_stored_timestamp_seconds",
-        "Unix time of the last step on the disk.",
+        "Unix time of the last write to the disk.",
     ),
     "bytes": ("memory_file_bytes", "Size of the file."),
 }
@@ -166,7 +168,7 @@ LOG_COUNTERS = {"ignored": ("log_messages_ignored", "Messages that no node has s
 LOG_GAUGES = {
     "is_up": ("log_up", "1 if the node is connected to the log and follows it."),
     "lag": ("log_lag", "Messages of the log that are not applied yet."),
-    "contact_age": ("log_contact_age_seconds", "Time since the last contact to the log."),
+    "contact_age": ("log_contact_age_seconds", "Time since contents were surely current."),
     "sequence": ("log_sequence", "The sequence that was applied last."),
     "differs": ("log_differs", "1 if other nodes have other contents."),
 }
@@ -193,7 +195,7 @@ def _stray_counters(owner: str) -> dict[str, tuple[str, str]]:
         "unexpected_replies": "Replies that no request asked for.",
         "stray_bytes": "Bytes received that are no part of a reply to a request.",
         "late_replies": "Replies that came after the timeout of their request.",
-        "raised_timeouts": "Requests with more than their timeout, because late replies repeat.",
+        "raised_timeouts": "Requests with a raised timeout, because of repeated late replies.",
         "floods": "Pauses because of too many stray bytes.",
     }
     return {key: (f"{owner}_{key}", text) for key, text in texts.items()}
@@ -236,8 +238,7 @@ def _log_metrics(logs: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
         differs = stats["digest"] is not None and stats["digest"][2] is False
         figures[name] = {**stats, "is_up": is_up, "differs": differs}
         # A label has the name in docs/metrics.md, the key that of the core.
-        outcomes = {key: stats[key] for key in ("unavailable", "not_confirmed", "refused")}
-        _add(steps, name, {"done": stats["steps"], **outcomes})
+        _add(steps, name, {"done": stats["steps"], **{key: stats[key] for key in LOG_OUTCOMES}})
     yield from _figures("log", figures, LOG_COUNTERS, LOG_GAUGES)
     yield steps
 
@@ -312,7 +313,7 @@ def _device_metrics(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric
     labels = ("device", "memory", "area", "address")
     stale = _gauge("mirror_stale", "1 while the values of a device are stale.", *labels)
     since = _gauge(
-        "mirror_stale_since_timestamp_seconds", "Unix time since which they are stale.", *labels
+        "mirror_stale_since_timestamp_seconds", "Unix time at which values became stale.", *labels
     )
     for name, stats in devices.items():
         for mirror in stats.get("mirrors", ()):

@@ -33,9 +33,12 @@ class DeviceEvents:
     def replace(self, gone: Iterable[str], polled: Collection[str]) -> None:
         """Forgets devices that are gone, or polled with other settings from now on."""
         names = {*gone, *polled}
-        for known in (self.health, self._plan_errors, self._unstored):
+        for known in (self.health, self._plan_errors):
             for name in names & known.keys():
                 del known[name]
+        # The poller keeps the counters of a replaced device, except those of its receivers.
+        for name in gone:
+            self._unstored.pop(name, None)
         self._forwarded = {key: at for key, at in self._forwarded.items() if key[0] not in names}
         self._unreachable = {key for key in self._unreachable if key[0] not in names}
         self.health |= dict.fromkeys(polled, "unknown")

@@ -40,7 +40,7 @@ class Mirror(NamedTuple):
 
     device: str
     source: tuple[object, ...]
-    """Where the values come from. With another source, the values in memory are not of it."""
+    """Where the values come from. If it changes, those in memory are of the old source."""
     place: Place
     age: _core.MirrorAge
 
@@ -58,7 +58,7 @@ class Mirrors(Part):
         return lambda: self.adopt(plan.config, plan.memories)
 
     def adopt(self, config: Config, memories: Mapping[str, Memory]) -> None:
-        """Takes over a configuration. Ages of ranges that are read as before stay."""
+        """Takes over a configuration. Ranges that are read as before keep their age."""
         known = {(mirror.source, mirror.place): mirror.age for mirror in self._mirrors}
         mirrors = []
         reserved: dict[str, list[tuple[Area, int, int]]] = {}
@@ -101,8 +101,10 @@ class Mirrors(Part):
     def log_changes(self) -> None:
         """Logs which ranges have become stale, or are read again, since the last call."""
         for device, place, age in ((each.device, each.place, each.age) for each in self._mirrors):
-            is_stale = age.stale_for is not None and age.seconds is not None
-            if is_stale == (place in self._stale):
+            was_stale = place in self._stale
+            # A range whose source has changed stays stale until it is read.
+            is_stale = age.stale_for is not None and (was_stale or age.seconds is not None)
+            if is_stale == was_stale:
                 continue
             self._stale ^= {place}
             log_lines.write(
