@@ -1,8 +1,10 @@
-"""A fleet whose NATS servers, connections, clocks or names fail."""
+"""A fleet whose NATS servers, stored values, connections, clocks or names fail."""
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import json
 import logging
 import os
 import signal
@@ -133,6 +135,21 @@ def is_used(judge: Judge) -> bool:
     return judge.is_connected() or judge.busy is not None
 
 
+def key_of(device: str) -> str:
+    """The key of a device in the bucket of subscriptions."""
+    return "device." + base64.urlsafe_b64encode(device.encode()).rstrip(b"=").decode()
+
+
+def stored(caller: Caller, key: str) -> bytes:
+    """A value in the bucket of subscriptions."""
+
+    async def get() -> bytes:
+        bucket = await caller.client.jetstream().key_value(WANTS)
+        return (await bucket.get(key)).value or b""
+
+    return caller.do(get())
+
+
 def check(judges: Judges) -> None:
     for judge in judges.devices:
         assert not judge.overlaps
@@ -237,6 +254,59 @@ def first_of(cluster: NatsCluster, node: Callable[..., Running]) -> Running:
     first = node("a", *cluster.urls)
     share(first)
     return first
+
+
+def test_malformed_values_are_logged_and_stop_no_node(
+    server: NatsServer,
+    node: Callable[..., Running],
+    judges: Judges,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    values = {
+        "d1": b"{",
+        "d2": b"7",
+        "d3": b'{"requests":[],"renewed":{"\xff":1}}',
+        "d4": b'{"requests":[' + b"[" * 5000 + b"]" * 5000 + b"]}",
+    }
+
+    def are_logged() -> bool:
+        keys = {each["key"] for each in logged(caplog, "kept_entry_malformed")}
+        return keys == set(map(key_of, values))
+
+    first = node("a", server.url)
+    with Caller(server.url) as caller:
+        for number in (0, 1):
+            subscribed(caller, number, judges.devices[number], scanRate=100)
+        for device, value in values.items():
+            caller.put(WANTS, key_of(device), value)
+        wire.until(are_logged, "the node that runs has logged all")
+        wire.until(lambda: known(caller) == {"d0": ["hmi"]}, "only d0 has subscriptions")
+        first.stop()
+        caplog.clear()
+        share(node("b", server.url))
+        wire.until(are_logged, "the node that starts has logged all")
+        assert {each["bucket"] for each in logged(caplog, "kept_entry_malformed")} == {WANTS}
+        assert known(caller) == {"d0": ["hmi"]}
+        # A subscription replaces a malformed value.
+        subscribed(caller, 1, judges.devices[1], scanRate=100)
+        assert json.loads(stored(caller, key_of("d1")))["requests"]
+        polls = [len(judge.polls) for judge in judges.devices[:2]]
+        wire.until(partial(are_polled, judges.devices[:2], polls), "both are scanned")
+    check(judges)
+
+
+@pytest.mark.parametrize("value", [b"{", b'{"prefix":"\xff"}', b"[" * 5000])
+def test_malformed_terms_are_replaced(
+    server: NatsServer, node: Callable[..., Running], value: bytes
+) -> None:
+    former = node("a", server.url)
+    share(former)
+    former.stop()
+    with Caller(server.url) as caller:
+        terms = stored(caller, "terms")
+        caller.put(WANTS, "terms", value)
+        share(node("b", server.url))
+        wire.until(lambda: stored(caller, "terms") == terms, "they are replaced")
 
 
 def test_without_a_quorum_devices_rest(

@@ -336,6 +336,26 @@ async def let_pass(ttls: SubscriptionTtls, seconds: float) -> None:
     ttls._changed.set()
 
 
+def test_times_of_subscriptions_that_ended_are_forgotten(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    nodes = [node("a"), node("b")]
+    share(*nodes)
+    for subscriber in ("hmi", "log"):
+        request = wanted(judges.devices[0], subscriberId=subscriber, ttl=3600)
+        assert caller.request("modbus.subscribe", request)["success"]
+
+    def noted() -> list[dict[str, set[str]]]:
+        members = [member_of(each.scanner) for each in nodes]
+        return [{id: set(times) for id, times in each._renewed.items()} for each in members]
+
+    wire.until(lambda: noted() == [{"d0": {"hmi", "log"}}] * 2, "both nodes know both")
+    print("ANSWER", caller.request("modbus.unsubscribe", {"deviceId": "d0", "subscriberId": "hmi", "tagIds": []}), noted())
+    wire.until(lambda: noted() == [{"d0": {"log"}}] * 2, "one is left")
+    caller.request("modbus.unsubscribe", {"deviceId": "d0", "subscriberId": "log", "tagIds": []})
+    wire.until(lambda: noted() == [{}, {}], "none is left")
+
+
 def test_one_node_or_all_are_shut_down(node: Callable[..., Running], caller: Caller) -> None:
     one, two = node("a"), node("b")
     share(one, two)

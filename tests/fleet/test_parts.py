@@ -3,10 +3,33 @@
 from __future__ import annotations
 
 import asyncio
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+from nats.errors import TimeoutError as NoAnswer
 
 from holdfast.net.nats import batch
 from holdfast.net.nats.outbox import Outbox
+from holdfast.scanner.fleet import desired_state
 from holdfast.scanner.fleet.agreement import Terms
+from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+TERMS = Terms(
+    protocol=1,
+    partitions=256,
+    prefix="modbus",
+    allow=[],
+    writes="tags",
+    strict=False,
+    defaults="",
+    limits="",
+    profiles="",
+)
 
 
 def test_a_message_with_the_revision_of_its_lease_has_a_header() -> None:
@@ -39,17 +62,77 @@ def test_a_node_that_was_stopped_for_too_long_drops_what_waits() -> None:
 
 
 def test_the_first_difference_of_terms_is_named() -> None:
-    own = Terms(
-        protocol=1,
-        partitions=256,
-        prefix="modbus",
-        allow=[],
-        writes="tags",
-        strict=False,
-        defaults="",
-        limits="",
-        profiles="",
-    )
-    assert own.difference(own) is None
-    other = Terms(**{key: getattr(own, key) for key in own.__struct_fields__} | {"strict": True})
-    assert own.difference(other) == "strict is False, and True in the fleet"
+    assert TERMS.difference(TERMS) is None
+    other = msgspec.structs.replace(TERMS, strict=True)
+    assert TERMS.difference(other) == "strict is False, and True in the fleet"
+
+
+class Bucket:
+    """As much of a `KeyBucket` as is used, in memory."""
+
+    client = None
+    TURNS = 20
+    """Turns of the event loop that a write takes."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        """Which bucket of this name it is."""
+        self.stored: dict[str, bytes] = {}
+        self.under_way = 0
+        self.has_failed = False
+        self._revision = 0
+
+    def lose(self) -> None:
+        """Is another bucket now, without contents. Its first write fails."""
+        self.number += 1
+        self.stored = {}
+        self.has_failed = False
+
+    async def make(self, *_: int) -> Any:
+        state = SimpleNamespace(last_seq=self._revision)
+        return SimpleNamespace(created=self.number, state=state)
+
+    async def publish(self, key: str, value: bytes, _: int, __: dict[str, str]) -> int:
+        if self.number and not self.has_failed and key != desired_state.TERMS:
+            self.has_failed = True
+            raise NoAnswer
+        self.under_way += 1
+        for _turn in range(self.TURNS):
+            await asyncio.sleep(0)
+        self.under_way -= 1
+        self.stored[key] = value
+        self._revision += 1
+        return self._revision
+
+    async def last(self, _: str) -> None:
+        return None
+
+    async def follow_keys(self, _: str, __: object, read: Callable[[], None]) -> None:
+        read()
+
+    async def unfollow(self) -> None:
+        pass
+
+
+def test_an_attempt_to_restore_ends_before_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    bucket = Bucket()
+    monkeypatch.setattr(desired_state, "KeyBucket", lambda *_: bucket)
+
+    async def work() -> None:
+        desired = DesiredState("plant", lambda _: None, lambda: None)
+
+        async def opened() -> None:
+            await desired.open(None, TERMS, lambda _: True, has_joined=True)  # type: ignore[arg-type]
+
+        await opened()
+        for device in "abc":
+            await desired.store(device, DesiredDevice(requests=[]), 0)
+        before = dict(bucket.stored)
+        bucket.lose()
+        with pytest.raises(NoAnswer):
+            await opened()
+        assert bucket.under_way == 0
+        await opened()
+        assert bucket.stored == before
+
+    asyncio.run(work())

@@ -238,6 +238,7 @@ def test_what_is_not_a_subscription_or_no_longer_allowed_is_logged_and_left_alon
     put(caller, "modbus.subscription.hmi.bad.0", b'"nonsense"')
     put(caller, "modbus.subscription.hmi.worse.x", b"\xff{")
     put(caller, "modbus.status.bad", b"7")
+    put(caller, "modbus.status.worse", b'{"deviceId":"\xff"}')
     second = run_scanner()
     assert caller.request("modbus.browse", b"")["count"] == 1
     [refused] = logged(caplog, "not_restored")
@@ -247,6 +248,7 @@ def test_what_is_not_a_subscription_or_no_longer_allowed_is_logged_and_left_alon
         "modbus.subscription.hmi.bad.0",
         "modbus.subscription.hmi.worse.x",
         "modbus.status.bad",
+        "modbus.status.worse",
     }
     second.stop()
     # With the device allowed, its subscription is there again; callers can also end it.

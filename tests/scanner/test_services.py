@@ -166,7 +166,18 @@ def test_another_service_is_noticed_by_its_heartbeat(
 
 
 @pytest.mark.usefixtures("scanner")
-@pytest.mark.parametrize("text", [b"", b"7", b"{}", b'{"startedAt": "x"}', b"\xff"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"7",
+        b"{}",
+        b'{"startedAt": "x"}',
+        b"\xff",
+        b'{"startedAt":1,"fleet":"\xff"}',
+        b"[" * 5000,
+    ],
+)
 def test_a_malformed_announcement_is_ignored(caller: Caller, text: bytes) -> None:
     caller.publish("modbus.scanner", text)
     assert "otherScanners" not in caller.request("modbus.browse", b"")["service"]

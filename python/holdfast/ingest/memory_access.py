@@ -32,6 +32,7 @@ from holdfast.ingest.refusals import (
     unrecorded,
 )
 from holdfast.protocol import EXCEPTIONS, MAX_WORD
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
@@ -505,7 +506,7 @@ _DOCUMENT = msgspec.json.Decoder(_SCALAR | list[_COMMAND] | dict[str, _FIELD])
 def _decoded(body: bytes | bytearray | memoryview) -> object:
     try:
         return _DOCUMENT.decode(body)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+    except MALFORMED_JSON as error:
         raise Refused("malformed", f"not JSON: {error}") from None
 
 

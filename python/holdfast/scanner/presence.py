@@ -19,6 +19,7 @@ from holdfast import _core
 from holdfast.events import log_lines
 from holdfast.net.nats import batch
 from holdfast.runtime import tasks
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.jetstream.heartbeat import HEARTBEAT_INTERVAL_S, HeartbeatKey
 from holdfast.scanner.messages.types import Announcement, HeartbeatMetadata, OtherScanner
 
@@ -119,7 +120,7 @@ class Presence:
 
     async def announced(self, message: Msg) -> None:
         """Handles the announcement of another scanner, or of this one."""
-        with contextlib.suppress(msgspec.DecodeError):
+        with contextlib.suppress(*MALFORMED_JSON):
             other = msgspec.json.decode(message.data, type=Announcement)
             # The nodes of a fleet share their devices: they are no competitors.
             if other.fleet is None or other.fleet != self._placement.fleet_name:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.runtime.text import quote
 from holdfast.values.digits import FLOATS
 
@@ -70,7 +71,7 @@ def _bytes(text: str, named: str) -> bytes:
 def _array(text: str, type: Type, named: str) -> list[Any]:
     try:
         items = msgspec.json.decode(text)
-    except (msgspec.DecodeError, RecursionError):
+    except MALFORMED_JSON:
         items = None
     if not isinstance(items, list):
         raise ValueError(f"{quote(text)} is not a valid {named}, allowed: a JSON array")

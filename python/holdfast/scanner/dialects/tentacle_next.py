@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.subject_parts import next_name
 
@@ -72,7 +73,7 @@ def _command_text(data: bytes) -> str:
         value = msgspec.json.decode(raw)
     except msgspec.ValidationError as error:
         raise Refused(f"{error}, {COMMAND_FORM}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+    except MALFORMED_JSON as error:
         raise Refused(f"not JSON: {error}; {COMMAND_FORM}") from None
     if value is None or type(value) is dict:
         found = "null" if value is None else "an object"

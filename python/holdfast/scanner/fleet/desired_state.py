@@ -1,4 +1,4 @@
-"""What the subscribers of a fleet desired: a key for each device, in a bucket."""
+"""The subscriptions of a fleet, stored in a bucket: a key for each device."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from nats.errors import Error
 
 from holdfast.events import log_lines
 from holdfast.replication.leases.bucket import KeyBucket, Outdated
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ VISIBLE_AFTER_S = 1.0
 """Time in which nodes that start at the same time see each other."""
 
 MAX_CONCURRENT_WRITES = 32
-"""Values of a lost bucket that are stored again at once."""
+"""Values of a lost bucket that are stored again concurrently."""
 
 FORMER_HEADER = "Holdfast-Former"
 """The header of a value that is from a lost bucket: which one, and its revision there."""
@@ -96,7 +97,7 @@ class DesiredState:
     ) -> None:
         """Makes the bucket, agrees on the terms, and begins to follow the values.
 
-        Raises `FleetRefused` for terms in force that are others, and errors of nats-py.
+        Raises `FleetRefused` if other terms are in force, and errors of nats-py.
         """
         if self._bucket is None or self._bucket.client is not client:
             self._bucket = KeyBucket(client, self.bucket, TIMEOUT_S, TIMEOUT_S)
@@ -134,12 +135,17 @@ class DesiredState:
         stored, left = 0, list(self._former)
         while left:
             batch, left = left[:MAX_CONCURRENT_WRITES], left[MAX_CONCURRENT_WRITES:]
-            stored += sum(await asyncio.gather(*map(self._restore_one, batch)))
+            # All must have ended before an error is raised: it starts another attempt.
+            works = map(self._restore_one, batch)
+            for outcome in await asyncio.gather(*works, return_exceptions=True):
+                if isinstance(outcome, BaseException):
+                    raise outcome
+                stored += outcome
         fields = {"fleet": self._fleet, "bucket": self.bucket, "devices": stored}
         log_lines.write(logging.INFO, "subscriptions_restored", **fields)
 
     async def _restore_one(self, device: str) -> bool:
-        """Returns whether the value is stored now. One that is newer stays as it is."""
+        """Returns whether subscriptions were stored. A newer value stays as it is."""
         former, key = self._former[device], DEVICE + _token(device)
         is_stored, revision = False, 0
         while not is_stored:
@@ -172,8 +178,8 @@ class DesiredState:
     ) -> None:
         """The first node decides the terms. Others replace those of nodes that have ended.
 
-        `is_in_force` returns whether a live node has these terms. Only a node that others see may
-        replace them: two may start at the same time. Raises `FleetRefused` for terms in force.
+        `is_in_force` returns whether a live node has these terms. `may_replace` is true once others
+        see this node: two may start at once. Raises `FleetRefused` if other terms are in force.
         """
         value, has_waited = terms.encoded(), False
         while True:
@@ -181,7 +187,7 @@ class DesiredState:
             if found:
                 try:
                     difference = terms.difference(msgspec.json.decode(found, type=Terms))
-                except msgspec.DecodeError:
+                except MALFORMED_JSON:
                     difference = "the protocol is another one"
                 if difference is None:
                     return
@@ -208,7 +214,7 @@ class DesiredState:
         return [device for device, (_, value) in self._values.items() if value]
 
     async def store(self, device: str, desired: DesiredDevice | None, revision: int) -> int:
-        """Replaces that revision of a device. Returns the new one.
+        """Replaces `revision` of a device. Returns the new one.
 
         Raises `Outdated` and errors of nats-py.
         """
@@ -227,8 +233,19 @@ class DesiredState:
     def _learn(self, device: str, revision: int, value: bytes) -> bool:
         if revision <= self._values.get(device, (0, b""))[0]:
             return False
-        self._values[device] = (revision, value)
+        self._values[device] = (revision, self._checked(device, value))
         return True
+
+    def _checked(self, device: str, value: bytes) -> bytes:
+        """The value; a malformed one is logged, and counts as one without subscriptions."""
+        try:
+            if value:
+                msgspec.json.decode(value, type=DesiredDevice)
+        except MALFORMED_JSON as error:
+            fields = {"bucket": self.bucket, "key": DEVICE + _token(device), "reason": str(error)}
+            log_lines.refused("kept_entry_malformed", kind="fleet", **fields)
+            return b""
+        return value
 
     def _on_message(self, key: str, message: Msg) -> None:
         with contextlib.suppress(ValueError):

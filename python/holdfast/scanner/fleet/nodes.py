@@ -14,6 +14,7 @@ from nats.errors import TimeoutError as NoAnswer
 
 from holdfast.events import log_lines
 from holdfast.net.nats.connection import nats_reason
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.errors import Moved, Refused
 from holdfast.scanner.reports.variables import joined
 
@@ -178,7 +179,7 @@ class OtherNodes:
         answer: Msg = await client.request(where, msgspec.json.encode(request), timeout=seconds)
         try:
             return msgspec.json.decode(answer.data, type=kind)
-        except msgspec.DecodeError as error:
+        except MALFORMED_JSON as error:
             raise OSError(f"node {node.node} sent a malformed answer: {error}") from None
 
 

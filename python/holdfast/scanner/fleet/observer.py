@@ -15,6 +15,7 @@ from nats.js.errors import NotFoundError
 from holdfast.net.nats.connection import ANSWERING, connected_once, nats_reason
 from holdfast.replication.leases.bucket import Holding, LeaseBucket
 from holdfast.replication.leases.times import LEASE_TIMES
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.fleet.nodes import subject
 from holdfast.scanner.fleet.partition_leases import NODE, PARTITION, leases_of
 
@@ -152,7 +153,7 @@ class FleetObserver:
                 raise FleetUnavailable(f"node {node} does not leave")
         except NoRespondersError:
             raise FleetUnavailable(f"there is no node {node} at {prefix}.fleet") from None
-        except (Error, OSError, msgspec.DecodeError) as error:
+        except (Error, OSError, *MALFORMED_JSON) as error:
             raise FleetUnavailable(f"node {node} does not answer: {nats_reason(error)}") from None
         end = time.monotonic() + LEAVE_TIMEOUT_S
         while node in (await self.look()).nodes:

@@ -12,6 +12,7 @@ from holdfast.events import log_lines
 from holdfast.net.nats import batch
 from holdfast.net.nats.connection import Broker
 from holdfast.net.nats.outbox import Outbox
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.fleet.agreement import Terms
 from holdfast.scanner.fleet.member import FleetMember
 from holdfast.scanner.fleet.nodes import NodeAnswers, OtherNodes, subject
@@ -88,7 +89,7 @@ class FleetPlacement(FleetMember):
             return True
         try:
             node = msgspec.json.decode(payload, type=dict[str, str]).get("node")
-        except msgspec.DecodeError as error:
+        except MALFORMED_JSON as error:
             log_lines.refused("message_malformed", kind="shutdown", reason=str(error))
             return False
         return node in (None, self.fleet.node)

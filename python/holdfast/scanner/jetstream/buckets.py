@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 import msgspec
 
 from holdfast.events import log_lines
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.entry_subscriptions import EntryHost, EntrySubscriptions
 from holdfast.scanner.jetstream.key_watch import KeyWatch
@@ -60,7 +61,7 @@ class EnabledKey:
         written = found.get(self._key)
         try:
             enabled = written is None or msgspec.json.decode(written.value, type=_State).enabled
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        except MALFORMED_JSON as error:
             log_lines.refused(
                 "enabled_entry_malformed", kind="enabled", key=self._key, reason=str(error)
             )

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import msgspec
 
 from holdfast.events import log_lines
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.key_watch import KeyWatch
 from holdfast.scanner.subscriptions.key import SubscriptionKey
@@ -272,7 +273,7 @@ def _subject_of(value: bytes) -> tuple[str | None, list[str]]:
     """Returns the device and the tags of a refused value, as far as it can be read."""
     try:
         decoded = msgspec.json.decode(value)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+    except MALFORMED_JSON:
         return None, []
     device = _text_value(decoded, "deviceId")
     tags = decoded.get("tags") if type(decoded) is dict else None

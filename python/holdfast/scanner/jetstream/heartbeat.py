@@ -12,6 +12,7 @@ import msgspec
 from nats.js.errors import KeyNotFoundError, NotFoundError
 
 from holdfast.events import log_lines
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.jetstream.availability import JETSTREAM_TIMEOUT_S, Availability
 from holdfast.scanner.messages.types import Announcement, Heartbeat
 
@@ -83,7 +84,7 @@ class HeartbeatKey:
             if found.revision == self._revision:
                 return
             other = msgspec.json.decode(found.value or b"", type=Announcement)
-        except (KeyNotFoundError, msgspec.DecodeError):
+        except (KeyNotFoundError, *MALFORMED_JSON):
             return
         if other.started_at != self.started:
             self._on_other(other.started_at)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from holdfast.events import log_lines
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.availability import MAX_RETRY_S
 from holdfast.scanner.jetstream.entries import (
@@ -136,7 +137,7 @@ class StoredSubscriptions(Placement):
                     owners[key] = SubscriptionKey(msgspec.json.decode(value, type=Status).device_id)
                     continue
                 request = restored(value)
-            except (Refused, msgspec.DecodeError) as error:
+            except (Refused, *MALFORMED_JSON) as error:
                 log_lines.refused("kept_entry_malformed", kind="kept", key=key, reason=str(error))
                 continue
             owner = SubscriptionKey(request.device_id, request.subscriber_id)

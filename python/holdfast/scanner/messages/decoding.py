@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, get_args
 import msgspec
 
 from holdfast.config.values.scanner_settings import Publish
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.runtime.text import clip, quote
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.types import (
@@ -119,8 +120,6 @@ CHOICES: dict[str, Sequence[str]] = {
 }
 """The words that a key accepts. `tagIds` accepts a list as well."""
 
-_MALFORMED = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
-
 
 def decode(data: bytes, kind: type[Decoded], max_bytes: int) -> Decoded:
     """Parses a request strictly. Raises `Refused`, also for more than `max_bytes`."""
@@ -167,7 +166,7 @@ def _exact(data: bytes, kind: type[Decoded]) -> Decoded:
             return msgspec.json.decode(data, type=kind)
         except msgspec.ValidationError:
             return _converted(msgspec.json.decode(data), kind)
-    except _MALFORMED as error:
+    except MALFORMED_JSON as error:
         raise Refused(f"not JSON: {error}") from None
 
 
@@ -186,7 +185,7 @@ def _object(data: bytes) -> dict[str, Any] | None:
     """Returns a JSON object; `None` for everything else."""
     try:
         found = msgspec.json.decode(data)
-    except _MALFORMED:
+    except MALFORMED_JSON:
         return None
     return found if type(found) is dict else None
 
