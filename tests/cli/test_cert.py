@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import ssl
 import stat
 import subprocess
@@ -242,9 +244,25 @@ def test_nothing_is_overwritten(plant: Pki) -> None:
     assert {file: file.read_bytes() for file in plant.path.iterdir()} == before
 
 
-@pytest.mark.parametrize("name", ["../panel", "a/b", "ca", "", ".hidden", "a b", "x" * 65])
+@pytest.mark.parametrize(
+    "name", ["../panel", "a/b", "ca", "crl", "CRL", "", ".hidden", "a b", "x" * 65]
+)
 def test_names_stay_in_the_folder(pki: Pki, name: str) -> None:
-    assert "allowed: 1 to 64 letters" in pki.refuses("client", name)
+    told = pki.refuses("client", name)
+    assert "allowed: 1 to 64 letters" in told
+    assert "neither `ca` nor `crl`" in told
+
+
+def test_a_write_that_fails_is_reported_with_its_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    told = Pki(tmp_path).refuses("ca", "Plant authority")
+    assert told == f"holdfast: [Errno {errno.ENOSPC}] No space left on device"
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["a b", "*.*.example", "-a", "10.0.0.256/8", "ä.example", ""])

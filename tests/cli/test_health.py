@@ -6,6 +6,8 @@ import contextlib
 import json
 import signal
 import socket
+import subprocess
+import sys
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -133,6 +135,24 @@ def test_https_is_verified_where_authorities_are_given(
         result = invoke("health", "--url", url, *unverified, *own)
         assert (result.exit_code, "CERTIFICATE_VERIFY_FAILED" in result.stderr) == (1, True)
     assert invoke("health", file).exit_code == 1
+
+
+def test_an_encrypted_key_is_unusable_and_no_passphrase_is_asked_for(tmp_path: Path) -> None:
+    issued = Certificates(tmp_path).issue("probe", "DNS:probe", "-passout", "pass:secret")
+    own = ("--tls-cert", str(issued.certificate), "--tls-key", str(issued.key))
+    # Without a terminal, OpenSSL would read the passphrase from standard input.
+    ended = subprocess.run(
+        [sys.executable, "-m", "holdfast", "health", "--url", "https://127.0.0.1:1", *own],
+        input="secret\n",
+        capture_output=True,
+        text=True,
+        check=False,
+        start_new_session=True,
+        timeout=wire.DEADLINE,
+    )
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert "Error: TLS: [SSL] " in ended.stderr
+    assert "pass phrase" not in ended.stderr
 
 
 @pytest.fixture

@@ -17,6 +17,8 @@ from multiprocessing.connection import Client, Listener
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from holdfast.runtime.backoff import Backoff
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from multiprocessing.connection import Connection
@@ -25,16 +27,21 @@ if TYPE_CHECKING:
 
 MAX_REQUEST_BYTES = 64 * 1024
 MAX_ANSWER_BYTES = 64 * 1024 * 1024
-"""Bytes of a message."""
+"""The size limits of messages."""
 
 TIMEOUT_S = 5.0
 """Seconds in which a request must arrive."""
 
 ANSWER_S = 3.0
-"""Seconds in which an appliance must answer, unless what it was asked takes longer."""
+"""Seconds in which an appliance must answer, unless the request takes longer."""
 
 RELOAD_TIMEOUT_S = 60.0
-"""Seconds in which it must have reloaded."""
+"""Seconds in which a reload must be complete."""
+
+FIRST_PAUSE_S = 0.05
+MAX_PAUSE_S = 1.0
+"""Pauses while no connection can be accepted, for example without free file descriptors: Linux
+returns that error at once."""
 
 MODE = 0o700
 
@@ -48,7 +55,7 @@ class Control:
 
     def __init__(self, file: Path, handlers: Mapping[str, Handler]) -> None:
         self._handlers: Mapping[str, Handler] = {"ping": dict, **handlers}
-        self._closed = False
+        self._closed = threading.Event()
         self.address = _own_address(file)
         self._listener = _listen(self.address)
         self._thread = threading.Thread(target=self._accept, name="holdfast-control", daemon=True)
@@ -56,18 +63,21 @@ class Control:
 
     def close(self) -> None:
         """Frees the socket."""
-        self._closed = True
+        self._closed.set()
         with contextlib.suppress(OSError, EOFError), Client(self.address):
             pass  # Wakes the thread.
         self._thread.join(TIMEOUT_S)
         self._listener.close()
 
     def _accept(self) -> None:
-        while not self._closed:
+        backoff = Backoff(FIRST_PAUSE_S, MAX_PAUSE_S, jitter=False)
+        while not self._closed.is_set():
             try:
                 connection = self._listener.accept()
             except (OSError, EOFError):
+                self._closed.wait(backoff.failed())
                 continue
+            backoff.succeeded()
             threading.Thread(
                 target=self._serve, args=(connection,), name="holdfast-control", daemon=True
             ).start()
@@ -98,8 +108,8 @@ def ask(
 ) -> dict[str, Any]:
     """Sends a request to the appliance that runs this configuration. Raises `NotRunning`.
 
-    If the answer may take longer than `ping_s`, a ping is sent before: one that hangs does not
-    answer it.
+    If the answer may take longer than `ping_s`, a ping is sent first: an appliance that hangs
+    does not answer it.
     """
     if within_s > ping_s:
         ask(file, "ping", within_s=ping_s, ping_s=ping_s)

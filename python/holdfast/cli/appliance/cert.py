@@ -48,6 +48,8 @@ REASONS = {
     if reason.value not in ("certificateHold", "removeFromCRL")
 }
 CRL = "crl.pem"
+RESERVED = ("ca", "crl")
+"""Names of the files of the authority and of its revocation list."""
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 
 
@@ -82,7 +84,7 @@ class NewKey:
     passphrase_file: Path | None
 
     def secret(self) -> bytes | None:
-        """The passphrase of the new key, if it gets one."""
+        """The passphrase of the new key, if it is to be encrypted."""
         if self.asked and self.passphrase_file is not None:
             raise click.UsageError("--passphrase and --passphrase-file can't be used together.")
         if self.passphrase_file is not None:
@@ -147,8 +149,8 @@ def _reporting(command: Command) -> Command:
         except (UnusableFile, making.Refused, FileExistsError) as error:
             fail(error, ExitCode.WRONG, reason="file")
         except OSError as error:
-            told = f"{error.filename}: {error.strerror}" if error.strerror else str(error)
-            fail(told, ExitCode.WRONG, reason="file")
+            message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+            fail(message, ExitCode.WRONG, reason="file")
 
     return reported  # type: ignore[return-value]
 
@@ -249,7 +251,7 @@ def show(file: Path, passphrase_file: Path | None, as_json: bool) -> None:
     """Show the certificates, keys and revocation lists in a PEM file.
 
     Names the requirements of MB-TCP-Security that a certificate fails, by number, and exits with 1
-    if there is one. Never prints a key.
+    if there are any. Never prints a key.
     """
     secret = None if passphrase_file is None else passphrase(passphrase_file)
     described = inspection.describe(file, secret)
@@ -277,15 +279,15 @@ def _issue(
 
 def _prompt(what: str, *, again: bool = False) -> bytes:
     if not sys.stdin.isatty():
-        told = f"{what}: there is no terminal to ask on; use a file with the passphrase"
-        fail(told, ExitCode.WRONG)
+        message = f"{what}: there is no terminal to ask on; use a file with the passphrase"
+        fail(message, ExitCode.WRONG)
     text: str = click.prompt(what, hide_input=True, confirmation_prompt=again, err=True)
     return text.encode()
 
 
 def _check_name(name: str) -> None:
-    if not NAME.fullmatch(name) or name == "ca":
-        form = "1 to 64 letters, digits, `_`, `.` and `-`, and not `ca`"
+    if not NAME.fullmatch(name) or name.lower() in RESERVED:
+        form = "1 to 64 letters, digits, `_`, `.` and `-`, and neither `ca` nor `crl`"
         raise click.BadParameter(f"found {name!r}, allowed: {form}", param_hint="'NAME'")
 
 

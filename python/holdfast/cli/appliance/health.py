@@ -30,7 +30,7 @@ MAX_ANSWER_BYTES = 1 << 20
 """The most bytes of an answer that are read."""
 
 SERVICES = ("metrics", "gateway")
-"""The sections of services that answer probes, the one to ask first."""
+"""The sections of services that answer probes, in the order to try."""
 
 
 class _NoAnswer(Exception):
@@ -49,12 +49,11 @@ def health(
 ) -> None:
     """Ask the appliance that runs FILE on this machine whether it is ready.
 
-    The address is that of the section `metrics` in FILE, otherwise of `gateway`. With --url,
-    nothing is read from FILE, which is faster. A certificate is verified with --url, and with
-    --tls-ca.
+    The address is that of the section `metrics` in FILE, otherwise of `gateway`. --url is faster,
+    because no configuration is read. A certificate is verified only with --url or --tls-ca.
 
-    Exit codes: 0 ready (with --live: live), 1 not ready or no answer in time, 2 wrong usage, or
-    FILE has errors or none of the sections.
+    Exit codes: 0 ready (with --live: live), 1 not ready or no valid answer, 2 wrong usage, or
+    FILE has errors or neither section.
     """
     if (file is None) == (url is None):
         raise click.UsageError("Give either FILE or --url.")
@@ -119,7 +118,7 @@ def _context(tls: Tls, *, verified: bool) -> ssl.SSLContext:
         require_stored(tls.ca, tls.cert, tls.key)
         context = ssl.create_default_context(cafile=tls.ca)
         if tls.cert is not None:
-            context.load_cert_chain(tls.cert, tls.key)
+            context.load_cert_chain(tls.cert, tls.key, password="")  # Never ask on the terminal.
     except (OSError, ValueError) as error:
         raise click.UsageError(f"TLS: {error}") from error
     if not verified:
@@ -131,7 +130,7 @@ def _context(tls: Tls, *, verified: bool) -> ssl.SSLContext:
 def _probe(base: str, path: str, timeout: float, context: ssl.SSLContext) -> dict[str, Any]:
     """The answer to a probe. Raises `_NoAnswer`."""
     found: list[dict[str, Any] | _NoAnswer] = []
-    # Names are looked up, and answers arrive, in steps that no timeout of a socket covers together.
+    # A socket timeout limits each step; nothing limits the name lookup and all steps together.
     asking = threading.Thread(
         target=lambda: found.append(_response(base, path, timeout, context)), daemon=True
     )
