@@ -640,6 +640,8 @@ def test_a_url_is_a_text() -> None:
 
 def test_all_errors_are_modbus_errors() -> None:
     assert issubclass(holdfast.ModbusException, holdfast.ModbusError)
+    uncertain = [code for code in range(256) if holdfast.ModbusException(code).maybe_executed]
+    assert uncertain == [0x05, 0x0B]
     assert issubclass(holdfast.InvalidResponse, holdfast.ModbusError)
     assert issubclass(holdfast.ConnectionLost, holdfast.ModbusError)
     assert issubclass(holdfast.ConnectionLost, ConnectionError)

@@ -182,6 +182,54 @@ def test_devices_can_be_added_and_removed(device: holdfast.Server, poller: Polle
         poller.remove(names[0])
 
 
+def test_queued_polls_of_a_removed_device_are_not_those_of_the_next(
+    device: holdfast.Server, poller: Poller
+) -> None:
+    tags = {"t": ("holding_registers", 0)}
+    earlier = holdfast.Memory(holding_registers=1)
+    earlier.write("holding_registers", 0, [215])
+    with holdfast.Server({1: earlier}, bind="127.0.0.1:0", access="read-only") as server:
+        poller.add(url(server), tags, name="oven", interval=0.01)
+        wire.until(lambda: poller.counters()["oven"]["polls"] >= 3, "polls are queued")
+        poller.remove("oven")
+        poller.add(url(device), tags, name="oven", interval=0.01)
+        wire.until(lambda: poller.counters()["oven"]["polls"] >= 3, "polls of the next are queued")
+    assert {(reading.device, reading.value) for reading in taken(poller)} == {("oven", 0)}
+    poller.write("oven", "t", 5)
+    assert list(poller.counters()) == ["oven"]
+    with pytest.raises(ValueError, match="device oven: the name is already in use"):
+        poller.add(url(device), tags, name="oven")
+
+
+def test_a_tag_has_the_name_of_its_key(
+    device: holdfast.Server, memory: holdfast.Memory, poller: Poller
+) -> None:
+    scale = RegisterScale("exponent", "power")
+    tags = {
+        "flow": Tag("x", "holding_registers", 5, scale=0.1, writable=True),
+        "level": Tag("y", "input_registers", 300, "int16", scale=scale),
+        "power": Tag("z", "input_registers", 301, "int16"),
+    }
+    memory.write("input_registers", 300, [3, 2])
+    poller.add(url(device), tags, name="oven")
+    assert values(poller) == {"flow": 21.5, "level": 300, "power": 2}
+    poller.write("oven", "flow", 19.5)
+    assert memory.read("holding_registers", 5, 1) == [195]
+    with pytest.raises(KeyError):
+        poller.write("oven", "x", 1)
+
+
+def test_a_scale_that_no_request_can_reach_is_told(device: holdfast.Server, poller: Poller) -> None:
+    source = Tag("", "input_registers", 100, "int16")
+    power = Tag("power", "input_registers", 0, scale=RegisterScale("exponent", source=source))
+    poller.add(url(device), {"power": power, "on": ("coils", 3)}, max_registers=10)
+    found = {each.name: (each.value, each.fault, each.error) for each in taken(poller)}
+    assert found == {
+        "power": (None, 0, "no request has read it together with its scale"),
+        "on": (True, 0, None),
+    }
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -42,7 +42,8 @@ def test_a_value_without_a_valid_scale_is_undecoded() -> None:
 
 
 def test_a_scale_of_another_request_is_never_taken() -> None:
-    assert read(block(0, 432), block(3, 1)) == {"sf": (1, 0, None)}
-    assert read(block(0, 432, 0), block(2, 0, 1)) == {"sf": (1, 0, None)}
+    none = (None, 0, "no request has read it together with its scale")
+    assert read(block(0, 432), block(3, 1)) == {"power": none, "sf": (1, 0, None)}
+    assert read(block(0, 432, 0), block(2, 0, 1)) == {"power": none, "sf": (1, 0, None)}
     failed: PolledBlock = (HR, 0, 4, None, 2, 1.0)
     assert read(failed, block(3, 1)) == {"power": (None, 2, None), "sf": (1, 0, None)}

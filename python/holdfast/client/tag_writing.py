@@ -31,6 +31,8 @@ class TagWrite:
     request: Request
     scaled: Tag | None = None
     """The tag of the list, if a register contains its scale."""
+    content: Any = None
+    """What that register contained before the write."""
 
     def send(self, client: SyncClient) -> None:
         """Writes the value. Raises `ModbusError`."""
@@ -42,7 +44,8 @@ class TagWrite:
         tag, scaled = self.tag, self.scaled
         if scaled is not None:
             found = _value_now(client, scaled)
-            return found == tag.value(self._as_read()), found
+            wrote = scaled.scaled(self._as_read(), self.content)
+            return found == scaled.value(wrote), found
         now = client.read(tag.area, tag.address, tag.type, tag.order, encoding=tag.encoding)
         return now == self._as_read(), tag.value(now)
 
@@ -81,7 +84,7 @@ def prepared(
 def _checked(tag: Tag, text: str, others: Iterable[Tag], client: SyncClient | None) -> TagWrite:
     if not tag.writable:
         raise ValueError(f"{tag.unwritable or 'not writable in the tag list'}")
-    scaled, source = tag, tag.source
+    scaled, source, content = tag, tag.source, None
     if source is not None and client is not None:
         changed = [other.name for other in others if _overlap(other, source)]
         if changed:
@@ -94,7 +97,7 @@ def _checked(tag: Tag, text: str, others: Iterable[Tag], client: SyncClient | No
         tag.area, tag.address, raw, tag.type, tag.order, tag.encoding, split=False
     )
     [request] = steps
-    return TagWrite(tag, value, raw, request, None if source is None else scaled)
+    return TagWrite(tag, value, raw, request, None if source is None else scaled, content)
 
 
 def _overlap(one: Tag, other: Tag) -> bool:

@@ -59,7 +59,11 @@ class Poller:
         self._results = self._poller.receiver()
         self._gather = gather
         self._readers: dict[str, Reader] = {}
+        """By the name in the core, see `_core_names`."""
+        self._core_names: dict[str, str] = {}
+        """A device that is added again has a new one: polls of the earlier device may be queued."""
         self._names = itertools.count(1)
+        self._generations = itertools.count(1)
         self._pending: asyncio.Future[Batch | None] | None = None
         self._has_ended = False
 
@@ -92,10 +96,13 @@ class Poller:
             raise ValueError("tags is empty, allowed: at least one tag")
         if name is None:
             name = self._free(url.partition("://")[2] or url)
+        if name in self._core_names:
+            raise ValueError(f"device {name}: the name is already in use")
+        core_name = f"{name}#{next(self._generations)}"
         reader = Reader(name, listed)
         self._poller.add(
             _core.PolledDevice(
-                name,
+                core_name,
                 endpoint(target),
                 unit=unit,
                 interval=interval,
@@ -110,16 +117,18 @@ class Poller:
                 start_within=min(interval, SIGNAL_CHECK_S * len(self._readers)),
             )
         )
-        self._readers[name] = reader
+        self._readers[core_name] = reader
+        self._core_names[name] = core_name
         return name
 
     def _free(self, name: str) -> str:
-        return name if name not in self._readers else f"{name}#{next(self._names)}"
+        return name if name not in self._core_names else f"{name}#{next(self._names)}"
 
     def remove(self, name: str) -> None:
         """Stops polling a device. Raises `KeyError` for an unknown name."""
-        del self._readers[name]
-        self._poller.remove(name)
+        core_name = self._core_names.pop(name)
+        del self._readers[core_name]
+        self._poller.remove(core_name)
 
     def write(self, name: str, tag: str, value: Any) -> None:
         """Writes a value, or the name of a state, between two reads of the device.
@@ -128,7 +137,8 @@ class Poller:
         `ValueError` for a tag that is not `writable` or a value that does not fit, `WriteFailed`,
         and `RuntimeError` after `close`.
         """
-        of = next((each for each in self._readers[name].tags if each.name == tag), None)
+        core_name = self._core_names[name]
+        of = self._readers[core_name].named.get(tag)
         if of is None:
             raise KeyError(tag)
         if not of.writable:
@@ -138,7 +148,7 @@ class Poller:
             of.area, of.address, raw, of.type, of.order, of.encoding, split=False
         )
         writing = self._poller.receiver()
-        number = self._poller.write(name, request, writing)
+        number = self._poller.write(core_name, request, writing)
         while True:
             results = writing.take(SIGNAL_CHECK_S)
             if results is None:
@@ -151,7 +161,12 @@ class Poller:
 
     def counters(self) -> dict[str, dict[str, Any]]:
         """Health and counters of each device, by name."""
-        return self._poller.counters()
+        counters = self._poller.counters()
+        return {
+            name: counters[core_name]
+            for name, core_name in list(self._core_names.items())
+            if core_name in counters
+        }
 
     @property
     def dropped(self) -> int:
@@ -218,7 +233,7 @@ class Poller:
 def _tags(tags: Mapping[str, Tag | tuple[Any, ...]]) -> Iterator[Tag]:
     for name, tag in tags.items():
         if isinstance(tag, Tag):
-            yield tag
+            yield tag if tag.name == name else replace(tag, name=name)
         elif isinstance(tag, tuple) and 2 <= len(tag) <= 4:
             # Only a tag list says what may not be written.
             tuple_tag = Tag(name, *tag)

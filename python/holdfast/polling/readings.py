@@ -134,6 +134,11 @@ class Reader:
                 yield tag.name, self._reading(tag, value_of(tag, data, tag.address), pieces[-1][5])
             elif faulty:
                 yield tag.name, self._none(tag, faulty[0][5], faulty[0][4])
+            elif blocks:
+                # A request of at most `max_registers` may not reach from a value to its scale.
+                whole = "whole" if tag.source is None else "together with its scale"
+                why = f"no request has read it {whole}"
+                yield tag.name, Reading(self.device, tag, None, blocks[-1][5], 0, why)
 
     def _inside(self, area: Area, address: int, count: int) -> tuple[Sequence[Tag], Decoder | None]:
         key = (area, address, count)
