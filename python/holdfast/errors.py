@@ -1,7 +1,8 @@
 """Errors of clients, as a tree of exceptions.
 
     ModbusError
-    ├── ModbusException      the device answered with an exception: code, name
+    ├── ModbusException      the device answered with an exception: code, name,
+    │                        maybe_executed
     ├── ConnectionLost       the connection ended before the reply
     │   ├── ConnectFailed    could not connect: nothing was sent
     │   └── TlsFailed        TLS failed: reason
@@ -12,6 +13,14 @@ Messages are for people. Programs should use classes and attributes.
 """
 
 from __future__ import annotations
+
+from holdfast.protocol import ACKNOWLEDGE, TARGET_SILENT
+
+UNCERTAIN = (ACKNOWLEDGE, TARGET_SILENT)
+"""Exceptions after which a device may execute the request, or have executed it.
+
+With 0B, a gateway answers a request that it has sent and whose reply did not come in time.
+"""
 
 
 class ModbusError(Exception):
@@ -31,6 +40,11 @@ class ModbusException(ModbusError):
 
     def __str__(self) -> str:
         return f"exception {self.code:02X} ({self.name})"
+
+    @property
+    def maybe_executed(self) -> bool:
+        """Whether the device may have executed the request: after 05 and 0B."""
+        return self.code in UNCERTAIN
 
 
 class ConnectionLost(ModbusError, ConnectionError):

@@ -122,6 +122,7 @@ _EXCEPTION = {name: code for code, name in EXCEPTIONS.items()}
 ILLEGAL_FUNCTION = _EXCEPTION["Illegal Function"]
 ILLEGAL_ADDRESS = _EXCEPTION["Illegal Data Address"]
 ILLEGAL_VALUE = _EXCEPTION["Illegal Data Value"]
+ACKNOWLEDGE = _EXCEPTION["Acknowledge"]
 BUSY = _EXCEPTION["Server Device Busy"]
 PATH_UNAVAILABLE = _EXCEPTION["Gateway Path Unavailable"]
 TARGET_SILENT = _EXCEPTION["Gateway Target Device Failed To Respond"]

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast import SyncClient
-from holdfast.cli.signals import Interrupted, interruptions
+from holdfast import SyncClient, _core
+from holdfast.cli.signals import Interrupted, ending_signals, interruptions
 from support.cli import invoke
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from holdfast.cli.signals import Signals
 
 
@@ -75,3 +77,38 @@ def test_a_command_that_is_interrupted_says_so(monkeypatch: pytest.MonkeyPatch) 
         1,
         {"ok": False, "reason": "interrupted", "detail": "interrupted"},
     )
+
+
+@pytest.mark.parametrize("values", [(), ("--values",)])
+def test_a_replay_that_is_interrupted_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, values: tuple[str, ...]
+) -> None:
+    class Reader:
+        """Reads a log whose end never comes."""
+
+        ended = False
+
+        def __init__(self, *_arguments: object, **_more: object) -> None:
+            pass
+
+        def next(self, _timeout: float) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    config = tmp_path / "plant.yaml"
+    plant = {"holding_registers": 10, "replicate": {"log": "site"}}
+    log = {"servers": ["nats://127.0.0.1:1"], "node": "a"}
+    rest = {"bind": "127.0.0.1:0", "sources": ["127.0.0.0/8"], "tokens": "none"}
+    parts = {"memories": {"plant": plant}, "logs": {"site": log}, "rest": rest}
+    config.write_text(json.dumps(parts))
+    monkeypatch.setattr(_core, "LogReader", Reader)
+    replay = ("log", "replay", str(config), *values)
+    before = {number: signal.getsignal(number) for number in ending_signals()}
+    try:
+        result = invoke(*replay)
+        assert (result.exit_code, result.output) == (1, "holdfast: interrupted\n")
+        result = invoke(*replay, "--json")
+        found = json.loads(result.stdout)
+        assert (result.exit_code, found["ok"], found["reason"]) == (1, False, "interrupted")
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -140,6 +140,16 @@ def test_with_several_memories_one_is_named(tmp_path: Path) -> None:
     assert (registers(file, "first")[0], registers(file, "second")[0]) == (1, 9)
 
 
+def test_a_file_without_memories_says_so(tmp_path: Path) -> None:
+    keep(tmp_path / "empty.redb")
+    file, values = str(tmp_path / "empty.redb"), tmp_path / "v.csv"
+    values.write_text("holding_registers,60,9\n")
+    for words in (("export", file), ("import", file, str(values))):
+        for more in ((), ("--memory", "plant")):
+            message = usage_error("memory", *words, *more)
+            assert message == f"Error: {file} has no memories."
+
+
 def test_a_form_is_chosen_by_its_ending(file: str, tmp_path: Path) -> None:
     message = usage_error("memory", "export", file, "--output", str(tmp_path / "v.txt"))
     assert message.endswith("found v.txt, allowed: a file with one of .csv, .yaml, .yml.")

@@ -115,6 +115,12 @@ def test_silence_is_told() -> None:
     assert (result.exit_code, answer["reason"], answer["maybe_written"]) == (1, "timeout", True)
 
 
+def test_an_address_without_a_colon_is_never_another_address() -> None:
+    for words in (("hr100", "1", "5"), ("hr1:0-5",)):
+        told = usage_error("raw://127.0.0.1:1", *words, "--unit", "1")
+        assert f"{words[0].partition(':')[0]!r} is not an area, allowed: coils, " in told
+
+
 @pytest.mark.parametrize(
     ("arguments", "packet"),
     [

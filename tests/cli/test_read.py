@@ -358,6 +358,12 @@ def test_a_wrong_url_is_wrong_usage() -> None:
         (("hr", "0", "--type", "UNIT16"), "did you mean 'uint16'?"),
         (("hr:0:unit32[4]",), "did you mean 'uint32[4]'?"),
         (("Holding-Registres", "0"), "did you mean 'holding_registers'?"),
+        (("hr100", "1"), "did you mean 'hr:100'?"),
+        (("hr100:7",), "did you mean 'hr:100'?"),
+        (("co.1",), "did you mean 'co:1'?"),
+        (("holding registers7", "1"), "did you mean 'holding registers:7'?"),
+        (("hr_1", "1"), "did you mean 'hr:1'?"),
+        (("4hr", "1"), "did you mean 'hr'?"),
     ],
 )
 def test_a_suggestion_ends_an_error(words: tuple[str, ...], told: str) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from support import cli
+from support.brokers import free_port
 from support.cli import answer, done, failure, usage_error
 from support.fake_device import FakeDevice, exception
 
@@ -226,3 +227,28 @@ def test_records_of_a_file_are_written_and_read_back() -> None:
 )
 def test_what_cannot_be_written_to_a_file_is_wrong_usage(words: tuple[str, ...], told: str) -> None:
     assert told in usage_error("write", NOWHERE, *words)
+
+
+@pytest.mark.parametrize("area", ["hr100", "hr100:7", "hr40001", "4hr", "hr.1", "hr²", "_", " "])
+def test_an_address_without_a_colon_is_never_another_address(area: str) -> None:
+    told = usage_error("write", NOWHERE, area, "1", "5", "--dry-run")
+    assert told.startswith(f"Error: {area.partition(':')[0]!r} is not an area, allowed: coils, ")
+
+
+@pytest.mark.parametrize(
+    "area", ["hr", "HR", "holding_registers", "holding-registers", "Holding R"]
+)
+def test_an_area_can_be_written_with_blanks_and_hyphens(area: str) -> None:
+    assert done("write", NOWHERE, area, "1", "5", "--dry-run") == ["0600010005"]
+
+
+@pytest.mark.parametrize("code", [0x05, 0x0B])
+def test_an_exception_that_leaves_it_open_whether_something_was_written(code: int) -> None:
+    with FakeDevice(lambda pdu: exception(pdu, code)) as device:
+        found = answer("write", device.url, "hr", "0", "1", code=1)
+    assert (found["code"], found["maybe_written"]) == (code, True)
+
+
+def test_without_a_connection_nothing_was_written() -> None:
+    found = answer("write", f"tcp://127.0.0.1:{free_port()}", "hr", "0", "1", code=1)
+    assert (found["reason"], found["maybe_written"]) == ("connection", False)

@@ -124,6 +124,16 @@ def test_a_write_without_a_reply_was_possibly_carried_out(tags: tuple[str, str])
         assert answer(*arguments, code=1)["maybe_written"]
 
 
+@pytest.mark.parametrize("code", [0x05, 0x0B])
+def test_an_exception_can_leave_it_open_whether_a_write_was_carried_out(
+    tags: tuple[str, str], code: int
+) -> None:
+    with FakeDevice(lambda pdu: exception(pdu, code)) as device:
+        arguments = ("write", device.url, "pump=run", *tags)
+        assert failure(*arguments)[1] == "hint: pump was possibly written"
+        assert answer(*arguments, code=1)["maybe_written"]
+
+
 def test_a_value_that_is_read_back_different_is_a_failure(tags: tuple[str, str]) -> None:
     def stubborn(pdu: bytes) -> bytes:
         return pdu if pdu[0] == 6 else registers(pdu, 200)
@@ -170,6 +180,18 @@ def test_a_scale_in_a_register_is_read_before_the_write(
     changed = usage_error(*words, "sf=1")
     assert "limit: sf changes its scale, allowed: one write after the other" in changed
     assert memory.read("holding_registers", 0, 1) == [43200]
+
+
+@pytest.mark.parametrize("kind", ["float16", "float32", "float64"])
+def test_floats_with_a_scale_in_a_register_are_read_back_alike(
+    server: holdfast.Server, memory: holdfast.Memory, tmp_path: Path, kind: str
+) -> None:
+    file = tmp_path / "inverter.yaml"
+    file.write_text(SCALED.replace("address: 0,", f"address: 0, type: {kind},"))
+    memory.write("holding_registers", 5, [0xFFFF])
+    for text in ("0.01", "-4.32", "0.3", "1"):
+        words = ("write", cli.url(server), f"limit={text}", "--tags", str(file), "--verify")
+        assert done(*words)[-1] == "Read back alike."
 
 
 def test_a_scale_that_moves_during_a_write_is_noticed(scaled: tuple[str, str]) -> None:

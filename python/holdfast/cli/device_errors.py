@@ -37,6 +37,13 @@ def problem(error: object) -> dict[str, object]:
     return {"reason": reason, **code, "detail": str(error)}
 
 
+def maybe_written(error: ModbusError) -> bool:
+    """Whether the device may have carried out the write that ended with this error."""
+    if isinstance(error, ModbusException):
+        return error.maybe_executed
+    return getattr(error, "maybe_sent", True)
+
+
 def differs(wrong: Sequence[str]) -> dict[str, object]:
     """The error of values that were read back otherwise than written, for JSON."""
     return {"reason": "differs", "detail": "; ".join(wrong)} if wrong else {}

@@ -66,7 +66,7 @@ def replay(
     """Rebuild the memories of a log in FILE as they were, without changing the log.
 
     Prints the digest of the contents, which all nodes have at the same sequence. Exit codes: 0
-    done, 1 the log can't be read, 2 wrong usage.
+    done, 1 the log can't be read or the command was interrupted, 2 wrong usage.
     """
     if bind is not None and not bind.address.is_loopback:
         raise click.UsageError(f"--bind {bind}: a replay is only served to this machine.")
@@ -102,8 +102,9 @@ def replay(
                 if record is not None and follow:
                     click.echo(_line(file, record, as_json=as_json))
             if not follow:
-                if replaying.ended:
-                    _check_end(replaying, sequence, time_ns)
+                if not replaying.ended:
+                    fail("interrupted", reason="interrupted")
+                _check_end(replaying, sequence, time_ns)
                 _tell(file, replaying, memories, values=values, as_json=as_json)
         except (_core.LogError, ServerUnusable, ValueError) as error:
             shown = nats_servers(settings).shown

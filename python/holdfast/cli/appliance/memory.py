@@ -156,6 +156,8 @@ def _show(name: str, areas: dict[Area, KeptArea]) -> None:
 def _chosen(
     found: dict[str, dict[Area, KeptArea]], name: str | None, file: Path
 ) -> dict[Area, KeptArea]:
+    if not found:
+        raise click.UsageError(f"{file} has no memories")
     if name is None and len(found) == 1:
         return next(iter(found.values()))
     if name is None:

@@ -23,7 +23,7 @@ from holdfast.cli.tags import options as tag_options
 from holdfast.cli.tags.options import TagFiles
 from holdfast.cli.terminal_text import print_json
 from holdfast.client import requests
-from holdfast.errors import ModbusError, ModbusException
+from holdfast.errors import ModbusError
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.types import BIT_AREAS
 
@@ -154,8 +154,8 @@ def _carry_out(
         try:
             job.write(client)
         except ModbusError as error:
-            refused = isinstance(error, ModbusException) and len(job.requests) == 1
-            shown = fields | {"maybe_written": not refused} if as_json else None
+            maybe = len(job.requests) > 1 or device_errors.maybe_written(error)
+            shown = fields | {"maybe_written": maybe} if as_json else None
             device_errors.fail(error, url, shown, is_in_area=isinstance(job, _Job))
         try:
             differing = job.differing(client) if verify else {}

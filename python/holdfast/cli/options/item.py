@@ -62,15 +62,30 @@ def span(text: str, last: int = LAST_ADDRESS) -> range | None:
 
 def area_of(text: str) -> Area:
     """Parses the name of an area, a short form or an unambiguous prefix, in any case."""
-    name = re.sub("[^a-z]", "", text.lower())
+    area = _area_named(text)
+    if area is not None:
+        return area
+    known = (*AREAS, *SHORT_AREAS)
+    near = _with_colon(text) or suggestion(text.lower().replace("-", "_"), known)
+    raise click.UsageError(f"{text!r} is not an area, allowed: {listing(known)}{near}")
+
+
+def _area_named(text: str) -> Area | None:
+    if re.fullmatch("[A-Za-z_ -]+", text) is None:
+        return None
+    name = re.sub("[_ -]", "", text.lower())
     if name in SHORT_AREAS:
         return SHORT_AREAS[name]
     found = [area for area in AREAS if name and area.replace("_", "").startswith(name)]
-    if len(found) == 1 and re.fullmatch("[A-Za-z_ -]+", text):
-        return found[0]
-    known = (*AREAS, *SHORT_AREAS)
-    near = suggestion(text.lower().replace("-", "_"), known)
-    raise click.UsageError(f"{text!r} is not an area, allowed: {listing(known)}{near}")
+    return found[0] if len(found) == 1 else None
+
+
+def _with_colon(text: str) -> str:
+    """A suggestion for `hr100` and `co.1`, else ""."""
+    match = re.fullmatch("(.*[A-Za-z])[^A-Za-z0-9]?([0-9]+)", text)
+    if match is None or _area_named(match[1]) is None or MODICON_NUMBER.fullmatch(match[2]):
+        return ""  # `hr40001` may mean the address 40001, or 0.
+    return f"; did you mean '{match[1]}:{match[2]}'?"
 
 
 def areas_of(text: str) -> tuple[Area, ...]:

@@ -13,7 +13,7 @@ from holdfast.cli.options import device
 from holdfast.cli.tags.read import value_shown
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.tag_writing import prepared
-from holdfast.errors import ModbusError, ModbusException
+from holdfast.errors import ModbusError
 from holdfast.runtime.text import listing, suggestion
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def _fail(
 ) -> NoReturn:
     """Prints which tag failed, and which ones were written and not sent."""
     names = [write.tag.name for write in writes]
-    maybe = not isinstance(error, ModbusException)
+    maybe = device_errors.maybe_written(error)
     if as_json:
         fields = {
             "target": of.url,
