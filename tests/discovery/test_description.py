@@ -21,6 +21,7 @@ from holdfast.discovery.description import Description
 from holdfast.tags.scale import RegisterScale
 from support import cli, plant_data, sunspec_device
 from support.cases import examples
+from support.fake_device import FakeDevice, exception, registers
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -176,3 +177,16 @@ def test_what_was_seen_is_described_if_the_search_ends_early(serve: Serve) -> No
     description.conclude(found)
     assert found.tags[0].values == (455,)
     assert found.survey.areas[0].state == "partly"
+
+
+def test_a_device_that_does_not_answer_absent_addresses_is_described() -> None:
+    def answers(pdu: bytes) -> bytes | None:
+        if pdu[0] != 3:
+            return exception(pdu, 1)
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        return registers(pdu, 455) if first + count <= 9 else None
+
+    found = Description(1, Survey(["holding_registers"], span=range(12)))
+    with FakeDevice(answers) as device, holdfast.SyncClient(device.url, timeout=0.05) as client:
+        description.describe(found, client, reads=1, every=1, delay=0)
+    assert found.survey.areas[0].ranges == [range(9)]

@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 
 from holdfast import values
 from holdfast.discovery import sunspec
-from holdfast.errors import ModbusException, RequestTimeout
+from holdfast.errors import (
+    ConnectFailed,
+    ConnectionLost,
+    InvalidResponse,
+    ModbusError,
+    ModbusException,
+    RequestTimeout,
+)
 from support import sunspec_device
 
 if TYPE_CHECKING:
@@ -132,11 +139,56 @@ def test_unknown_models_are_passed_over_without_being_read() -> None:
 def test_a_device_without_models_is_none_and_a_silent_one_an_error() -> None:
     assert sunspec.find(reader([0] * 10)) is None
 
+    asked = []
+
     def silent(address: int, count: int) -> list[int]:
+        asked.append(address)
         raise RequestTimeout(f"no reply to {count} from {address}")
 
     with pytest.raises(RequestTimeout):
         sunspec.find(silent)
+    assert asked == [40000, 0, 50000]
+
+
+UNANSWERED = [
+    RequestTimeout("no reply"),
+    InvalidResponse("other bytes"),
+    ConnectionLost("closed"),
+]
+
+
+@pytest.mark.parametrize("error", UNANSWERED, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize("base", [0, 50000])
+def test_absent_addresses_may_have_no_answer(base: int, error: ModbusError) -> None:
+    registers = [*sunspec_device.text("SunS", 4), *sunspec_device.inverter()]
+
+    def read(address: int, count: int) -> list[int]:
+        try:
+            return reader(registers, base)(address, count)
+        except ModbusException:
+            raise error from None
+
+    found = sunspec.find(read)
+    assert found is not None
+    assert ([each.id for each in found.models], found.is_complete) == ([103], False)
+    registers[0] = 0
+    if base == 0:
+        assert sunspec.find(read) is None
+
+
+@pytest.mark.parametrize("answered", [0, 2])
+def test_without_a_connection_the_search_ends(answered: int) -> None:
+    asked = []
+
+    def read(address: int, count: int) -> list[int]:
+        asked.append(address)
+        if len(asked) > answered:
+            raise ConnectFailed("tcp://10.0.0.1", "refused")
+        return reader([*sunspec_device.text("SunS", 4), *sunspec_device.inverter()])(address, count)
+
+    with pytest.raises(ConnectFailed):
+        sunspec.find(read)
+    assert len(asked) == answered + 1
 
 
 @given(

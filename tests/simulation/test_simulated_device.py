@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -181,6 +182,7 @@ def test_generators_do_what_they_are_called() -> None:
         (Tag("t", "input_registers", 0), "ramp:0:nan:1", "is not ramp:"),
         (Tag("t", "input_registers", 0), "constant:1,5", "decimal comma"),
         (Tag("t", "input_registers", 0), "constant:1.5", "between two values"),
+        (Tag("t", "input_registers", 0), "constant:1e999", "'1e999' is not a finite number"),
         (Tag("t", "input_registers", 0), "cycle:5", "cycle requires states, or a tag with one bit"),
         (Tag("t", "input_registers", 0), "counter", "is not counter:PER_SECOND"),
     ],
@@ -312,6 +314,7 @@ def test_values_are_played_back_and_begin_again(tmp_path: Path) -> None:
         ("t\n1\nmuch\n", ":3: t: 'much' is not a number"),
         ("time,t\n1\n", ":2: found 1 cells, allowed: 2"),
         ('t\n"1,5"\n', ":2: t: '1,5' has a decimal comma"),
+        ("t\n1e999\n", ":2: t: '1e999' is not a finite number"),
         ("t\n1\n70000\n", r":3: t holds 0 to 65535 \(uint16\), found 70000; the nearest is 65535"),
     ],
 )
@@ -323,6 +326,28 @@ def test_a_file_that_can_not_be_played_back_is_refused(
     tags = TagList([Tag("t", "holding_registers", 0)])
     with pytest.raises(playback.Unplayable, match=message):
         playback.load(file, tags)
+
+
+def test_a_cell_that_is_not_finite_is_refused_without_a_known_scale(tmp_path: Path) -> None:
+    file = tmp_path / "values.csv"
+    file.write_text("power\n-1e999\n")
+    with pytest.raises(playback.Unplayable, match=":2: power: '-1e999' is not a finite number"):
+        playback.load(file, scaled_tags())
+    with pytest.raises(ValueError, match="'1e999' is not a finite number"):
+        generators.parsed(scaled_tags()["power"], "constant:1e999")
+
+
+@pytest.mark.parametrize(
+    "value", [math.inf, -math.inf, math.nan, 10**400], ids=["inf", "-inf", "nan", "too large"]
+)
+@pytest.mark.parametrize("kind", ["uint16", "float32"])
+@pytest.mark.parametrize("writable", [False, True])
+def test_numbers_that_are_not_finite_are_refused(kind: str, value: float, writable: bool) -> None:
+    tags = TagList([Tag("t", "holding_registers", 0, kind, writable=writable)])
+    with pytest.raises(Refused, match=r"^t: .* is not a finite number$"):
+        SimulatedDevice(tags, played={"t": [value]})
+    with pytest.raises(Refused, match=r"^t: .* is not a finite number$"):
+        SimulatedDevice(tags, chosen={"t": generators.constant(value)})
 
 
 def scaled_tags(**source: Any) -> TagList:

@@ -12,7 +12,14 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast.errors import ModbusError
+from holdfast.errors import (
+    ConnectFailed,
+    ConnectionLost,
+    InvalidResponse,
+    ModbusError,
+    ModbusException,
+    RequestTimeout,
+)
 from holdfast.protocol import ADDRESSES, READ_REGISTERS
 from holdfast.values import decode, register_count
 
@@ -27,6 +34,9 @@ BASES = (40000, 0, 50000)
 
 MARK = [0x5375, 0x6E53]
 """`SunS`"""
+
+UNANSWERED = (RequestTimeout, InvalidResponse, ConnectionLost)
+"""How reads of absent addresses end on devices that do not refuse them."""
 
 END = 0xFFFF
 """The id after the last model."""
@@ -126,14 +136,23 @@ class SunSpec:
 
 
 def find(read: Read) -> SunSpec | None:
-    """Looks for `SunS`, and reads all models. Raises `ModbusError` if the device is silent."""
+    """Looks for `SunS`, and reads all models.
+
+    Raises `ConnectFailed`, and `ModbusError` if the device answers at none of the places.
+    """
+    silences: list[ModbusError] = []
     for base in BASES:
         try:
             if read(base, len(MARK)) == MARK:
                 return _models(read, base)
-        except ModbusError as error:
-            if not _is_refused(error):
+        except ModbusException:
+            continue
+        except UNANSWERED as error:
+            if isinstance(error, ConnectFailed):
                 raise
+            silences.append(error)
+    if len(silences) == len(BASES):
+        raise silences[0]
     return None
 
 
@@ -150,9 +169,9 @@ def _models(read: Read, base: int) -> SunSpec:
             known = str(number) in definitions()
             registers = _block(read, at + 2, length) if known else []
             models.append(_model(number, at, length, registers))
-        except ModbusError as error:
-            if not _is_refused(error):
-                raise
+        except ConnectFailed:
+            raise
+        except (ModbusException, *UNANSWERED):
             break
         at += 2 + length
     return SunSpec(base, tuple(models), is_complete=False)
@@ -164,10 +183,6 @@ def _block(read: Read, address: int, count: int) -> list[int]:
         part = min(READ_REGISTERS, count - len(registers))
         registers += read(address + len(registers), part)
     return registers
-
-
-def _is_refused(error: ModbusError) -> bool:
-    return hasattr(error, "code")
 
 
 def _model(number: int, address: int, length: int, registers: list[int]) -> Model:

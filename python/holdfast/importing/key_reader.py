@@ -86,7 +86,10 @@ class Section:
         """The text at a key, stripped; `None` if it is empty."""
         value = self._present(key, "text", required)
         if isinstance(value, str):
-            return value.strip() or None
+            text = value.strip()
+            if required and not text:
+                self.desk.problem(self.at(key), "found an empty text, allowed: text")
+            return text or None
         self._wrong(key, value, "text")
         return None
 

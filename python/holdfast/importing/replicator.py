@@ -101,10 +101,7 @@ class _Units:
         return {name: unit.device for name, unit in kept}
 
     def _id(self, unit: Section) -> str:
-        name = unit.name("id", required=True)
-        if name is None and isinstance(unit.get("id"), str):
-            self.desk.problem(unit.at("id"), "found an empty text, allowed: text")
-        return name or "unit"
+        return unit.name("id", required=True) or "unit"
 
     def _unit(self, one: Section) -> _Unit:
         unit = _Unit()

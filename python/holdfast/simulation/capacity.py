@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 from typing import TYPE_CHECKING, Any
 
-from holdfast.tags.scale import Linear, RegisterScale
+from holdfast.tags.scale import Linear, RegisterScale, is_finite
 from holdfast.tags.text import text_of
 from holdfast.values import DoesNotFit, codec_for
 from holdfast.values.digits import shortest
+from holdfast.values.errors import shown
 from holdfast.values.numeric import MAX
 
 if TYPE_CHECKING:
@@ -85,6 +86,8 @@ class Capacity:
             value = next((number for number, name in tag.states.items() if name == value), value)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise DoesNotFit(f"{tag.name}: {value!r} is not a number")
+        if not is_finite(value):
+            raise DoesNotFit(f"{tag.name}: {shown(value)} is not a finite number")
         if not tag.null and self._least <= value <= self._most:
             return
         number = _linear(tag).number(value)

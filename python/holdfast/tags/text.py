@@ -87,7 +87,10 @@ def value_from(tag: Tag, text: str) -> Any:
     if _HEX.fullmatch(word) and not tag.is_float and (tag.scale, tag.offset) == (1, 0):
         return int(word, 16)
     if _DECIMAL.fullmatch(word):
-        return float(word)
+        number = float(word)
+        if math.isinf(number):
+            raise DoesNotFit(f"{quote(text)} is not a finite number")
+        return number
     if _COMMA.fullmatch(word):
         point = word.replace(",", ".")
         raise DoesNotFit(f"{text!r} has a decimal comma, allowed: a decimal point, as in {point}")
