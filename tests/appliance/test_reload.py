@@ -229,6 +229,12 @@ def test_what_requires_a_restart_is_refused(
     assert client.ask(WRITE) == WRITE
 
 
+LINK_CHANGED = "links.line: settings of a connection in use changed"
+DEVICE_CHANGED = (
+    "devices.pump: in_flight, retry, tolerance or serial settings of a connection in use changed"
+)
+
+
 def test_each_reason_for_a_restart_is_told_in_the_order_of_the_docs(rig: Rig) -> None:
     def config(number: int) -> Config:
         kept = {"coils": 8, "keep": {"file": f"{number}.hfm"}}
@@ -252,9 +258,57 @@ def test_each_reason_for_a_restart_is_told_in_the_order_of_the_docs(rig: Rig) ->
         "memories.only2: added with keep or replicate",
         "workers: changed",
         "audit: changed",
-        "links.line: settings of a connection in use changed",
-        "devices.pump: in_flight, retry or tolerance of a connection in use changed",
+        LINK_CHANGED,
+        DEVICE_CHANGED,
     ]
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "is_refused"),
+    [
+        ("rtu:///dev/ttyS9?baud=9600", "rtu:///dev/ttyS9?baud=19200", True),
+        ("rtu:///dev/ttyS9", "rtu:///dev/ttyS9?parity=none", True),
+        ("rtu:///dev/ttyS9", "ascii:///dev/ttyS9", True),
+        ("rtu:///dev/ttyS9", "rtu:///dev/ttyS9?pad=1", True),
+        ("tcp://plc.local", "tcp://plc.local?pause=1", True),
+        ("tcp://plc.local", "tcp://PLC.local:502?retries=1", True),
+        ("tcp://plc.local", "tcp://PLC.local:502", False),
+        ("rtu:///dev/ttyS9", "rtu:///dev/ttyS9?baud=19200&parity=even", False),
+        ("rtu:///dev/ttyS9", "rtu:///dev/ttyS8?baud=9600", False),
+        ("tcp://plc.local:802", "tls://plc.local:802?pause=1", False),
+    ],
+)
+def test_options_in_the_url_of_a_connection_in_use_require_a_restart(
+    rig: Rig, before: str, now: str, *, is_refused: bool
+) -> None:
+    def reasons(before: Settings, now: Settings) -> list[str]:
+        return list(restart_reasons(rig.load(plant(**before)), rig.load(plant(**now))))
+
+    def device(url: str, **more: Any) -> Settings:
+        return {"devices": {"pump": {"url": url, "interval": 1, **more}}}
+
+    def link(url: str) -> Settings:
+        return {"links": {"line": {"url": url}}}
+
+    refused = [DEVICE_CHANGED] if is_refused else []
+    assert reasons(device(before), device(now)) == refused
+    assert reasons(link(before), device(now)) == refused
+    assert reasons(device(before, enabled=False), device(now)) == []
+    assert reasons(device(before), device(now, enabled=False)) == []
+    refused = [LINK_CHANGED] if is_refused else []
+    assert reasons(link(before), link(now)) == refused
+    assert reasons(device(before), link(now)) == refused
+    # A device at the address of a link has the settings of the link.
+    assert reasons(link(before) | device(before), link(before) | device(before)) == []
+
+
+def test_options_that_move_from_the_url_to_the_tolerance_change_nothing(rig: Rig) -> None:
+    def config(url: str, **more: Any) -> Any:
+        return rig.load(plant(devices={"pump": {"url": url, "interval": 1, **more}}))
+
+    before = config("tcp://plc.local?pause=1")
+    now = config("tcp://plc.local", tolerance={"pause": 1})
+    assert list(restart_reasons(before, now)) == []
 
 
 def test_memories_are_added_and_initial_values_are_not_written_again(
@@ -535,7 +589,7 @@ def test_devices_come_change_and_go(rig: Rig, serve: Serve, connect: Connect) ->
     assert rig.appliance.diagnostics.stats()["devices"]["pump"]["polls"] >= polls
     rig.appliance.log_events(0)
 
-    with pytest.raises(ReloadRefused, match=r"devices\.pump: in_flight, retry or tolerance of"):
+    with pytest.raises(ReloadRefused, match=r"devices\.pump: in_flight, retry, tolerance or"):
         rig.reload(plant(devices={"pump": polled(second, in_flight=2)}))
 
     rig.reload(plant(devices={"pump": polled(second, enabled=False)}))

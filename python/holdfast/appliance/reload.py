@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from holdfast.client.url import SerialTarget, connection_of
+from holdfast.config.checks.units import routed
 from holdfast.config.fingerprint import fingerprint
 from holdfast.runtime.bounded_files import answered
 
@@ -82,16 +84,57 @@ def restart_reasons(before: Config, now: Config) -> Iterator[str]:
     # Threads and services use the audit log as it is.
     if fingerprint(before.audit) != fingerprint(now.audit):
         yield "audit: changed"
-    links = {link.url: link for link in before.links.values()}
+    in_use = _connections_in_use(before)
+    links = {_address(link): link for link in before.links.values()}
     for name, link in now.links.items():
-        own = set(type(link).model_fields) - {"url", "timeout"}
-        if _differs(links.get(link.url), link, own):
+        own = set(type(link).model_fields) - {"url", "timeout", "tolerance"}
+        if _is_changed(in_use, link) or _differs(links.get(_address(link)), link, own):
             yield f"links.{name}: settings of a connection in use changed"
-    devices = {device.url: device for device in before.devices.values()}
-    for name, device in now.devices.items():
-        if _differs(devices.get(device.url), device, {"in_flight", "retry", "tolerance"}):
-            message = "in_flight, retry or tolerance of a connection in use changed"
-            yield f"devices.{name}: {message}"
+    for name, device in _deciding_devices(now):
+        if _is_changed(in_use, device):
+            keys = "in_flight, retry, tolerance or serial settings"
+            yield f"devices.{name}: {keys} of a connection in use changed"
+
+
+def _connections_in_use(config: Config) -> dict[tuple[str, str], list[object]]:
+    """The settings of each connection, by its address."""
+    found: dict[tuple[str, str], list[object]] = {}
+    users: list[DeviceConfig | LinkConfig] = list(config.links.values())
+    users += [device for _, device in _deciding_devices(config)]
+    for user in users:
+        found.setdefault(_address(user), []).append(_connection_settings(user))
+    return found
+
+
+def _deciding_devices(config: Config) -> Iterator[tuple[str, DeviceConfig]]:
+    """The devices that are used, and whose connection does not have the settings of a link."""
+    linked = {_address(link) for link in config.links.values()}
+    named = routed(config)
+    for name, device in config.devices.items():
+        if (device.enabled or name in named) and _address(device) not in linked:
+            yield name, device
+
+
+def _address(user: DeviceConfig | LinkConfig) -> tuple[str, str]:
+    target = user.target
+    # TLS and plain TCP at one address are two connections.
+    transport = "" if isinstance(target, SerialTarget) else target.transport
+    return transport, connection_of(target)
+
+
+def _connection_settings(user: DeviceConfig | LinkConfig) -> object:
+    """What a connection or line has from its first user."""
+    target = user.target
+    line = target.settings if isinstance(target, SerialTarget) else None
+    return line, target.tolerance, user.in_flight, user.retry
+
+
+def _is_changed(
+    in_use: Mapping[tuple[str, str], list[object]], user: DeviceConfig | LinkConfig
+) -> bool:
+    """Whether the connection of a device or link is in use with other settings."""
+    known = in_use.get(_address(user))
+    return known is not None and _connection_settings(user) not in known
 
 
 def _layout(settings: MemoryConfig) -> object:
@@ -99,6 +142,5 @@ def _layout(settings: MemoryConfig) -> object:
     return areas, settings.files, settings.seal
 
 
-def _differs(before: DeviceConfig | LinkConfig | None, now: object, keys: set[str]) -> bool:
-    """Whether a connection that is in use has other settings."""
+def _differs(before: LinkConfig | None, now: LinkConfig, keys: set[str]) -> bool:
     return before is not None and any(getattr(before, key) != getattr(now, key) for key in keys)
