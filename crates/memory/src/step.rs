@@ -62,7 +62,8 @@ pub trait Journal: fmt::Debug + Send + Sync {
     /// [`Refusal::NotStored`] or [`Refusal::NotConfirmed`].
     fn submit(&self, step: Step, done: Done);
 
-    /// Whether [`Journal::admit`] is asked before each access. Asked once.
+    /// Whether [`Journal::admit`] is asked before each access: several nodes share the contents. It stays
+    /// the same.
     fn guards(&self) -> bool {
         false
     }

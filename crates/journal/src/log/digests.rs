@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-/// The most sequences whose digests are remembered: of those that this node has reached, and of others.
+/// The most sequences that are remembered of those that this node has reached; as many of the others.
 const MAX_SEQUENCES: usize = 16;
 
 #[derive(Debug)]
@@ -18,7 +18,7 @@ pub(super) enum Verdict {
     Agrees,
     /// The majority has this other digest.
     Differs(String),
-    /// Nodes differ, and no digest has a majority. The other one is of this node.
+    /// Nodes differ, and no digest has a majority. This one is of another node.
     Unclear(String),
 }
 
@@ -31,7 +31,7 @@ impl Digests {
         let digests = self.by_sequence.entry(sequence).or_default();
         digests.insert(node.to_owned(), digest.to_owned());
         let verdict = judge(digests, &self.node);
-        // Counted apart: other nodes can't displace what this node has reached, wherever they say they are.
+        // Counted separately, so that no sequence of another node displaces those that this node has reached.
         for is_own in [true, false] {
             let is_of = |digests: &BTreeMap<_, _>| digests.contains_key(&self.node) == is_own;
             let of = self.by_sequence.iter().filter(|(_, digests)| is_of(digests));
@@ -45,6 +45,12 @@ impl Digests {
 
     pub(super) fn own(&self, sequence: u64) -> Option<&str> {
         self.by_sequence.get(&sequence)?.get(&self.node).map(String::as_str)
+    }
+
+    /// The last sequence of which this node has a digest.
+    pub(super) fn last_own(&self) -> Option<u64> {
+        let mut last_first = self.by_sequence.iter().rev();
+        last_first.find(|(_, digests)| digests.contains_key(&self.node)).map(|(at, _)| *at)
     }
 }
 
@@ -101,5 +107,6 @@ mod tests {
         assert_eq!(digests.by_sequence.len(), 2 * MAX_SEQUENCES);
         assert_eq!(digests.own(999), Some("1"));
         assert_eq!(digests.own(983), None);
+        assert_eq!(digests.last_own(), Some(999));
     }
 }

@@ -256,7 +256,10 @@ impl Shared {
             "log_failed",
             &[("kind", error.kind()), ("reason", &error.to_string())],
         ));
-        self.update(|view| view.phase = Phase::Failed(error));
+        self.update(|view| {
+            view.server = None;
+            view.phase = Phase::Failed(error);
+        });
     }
 
     /// The contents are wrong. They are replaced, and reads are refused until they are right.
@@ -403,6 +406,14 @@ mod tests {
         assert_eq!(shared.admit(), Err(Refusal::Behind));
         shared.contact(shared.now());
         assert_eq!(shared.admit(), Ok(()));
+    }
+
+    #[test]
+    fn a_log_that_has_failed_is_not_connected() {
+        let shared = Shared::new(&Settings::new("site", "a", Vec::new()));
+        shared.update(|view| view.server = Some("10.0.0.1:4222".to_owned()));
+        shared.fail(LogError::NameTaken("a".to_owned()));
+        assert_eq!(shared.view().server, None);
     }
 
     #[test]

@@ -27,7 +27,8 @@ pub(in crate::log) struct Comparer {
     settings: Arc<Settings>,
     shared: Arc<Shared>,
     digests: Digests,
-    is_replaying: bool,
+    /// The digest of this node that a replay checks: many other sequences may be compared meanwhile.
+    replaying: Option<String>,
 }
 
 /// What a node stores as its digest.
@@ -40,8 +41,6 @@ struct Published {
 /// What a replay of the log says about the digest of this node.
 pub(in crate::log) enum Replayed {
     Agrees,
-    /// This node has forgotten its digest, or had none.
-    Unknown,
     Failed,
 }
 
@@ -49,12 +48,12 @@ impl Comparer {
     pub(in crate::log) fn new(settings: &Arc<Settings>, shared: &Arc<Shared>) -> Comparer {
         let digests = Digests::new(&settings.node);
         let (settings, shared) = (Arc::clone(settings), Arc::clone(shared));
-        Comparer { settings, shared, digests, is_replaying: false }
+        Comparer { settings, shared, digests, replaying: None }
     }
 
     /// A replay ends with the session that has begun it.
     pub(in crate::log) fn begin_session(&mut self) {
-        self.is_replaying = false;
+        self.replaying = None;
     }
 
     /// What was compared before is void: the contents were wrong.
@@ -121,6 +120,11 @@ impl Comparer {
         LogError::Differs { sequence, found, other }.into()
     }
 
+    /// The last sequence from this one on at which this node has a digest.
+    pub(in crate::log) fn last_compared(&self, from: u64) -> Option<u64> {
+        self.digests.last_own().filter(|last| *last >= from)
+    }
+
     /// Finds out what the log leads to, beside the session: no majority of nodes says it. Returns
     /// whether that has begun.
     pub(in crate::log) fn replay(
@@ -131,7 +135,7 @@ impl Comparer {
         sequence: u64,
     ) -> bool {
         let Some(pointer) = pointer.cloned() else { return false };
-        if std::mem::replace(&mut self.is_replaying, true) {
+        if !self.begin_replay(sequence) {
             return false;
         }
         // The memories themselves go on with the session.
@@ -146,6 +150,15 @@ impl Comparer {
         true
     }
 
+    /// Whether a replay can begin: none is running, and this node has a digest to check.
+    fn begin_replay(&mut self, sequence: u64) -> bool {
+        if self.replaying.is_some() {
+            return false;
+        }
+        self.replaying = self.digests.own(sequence).map(str::to_owned);
+        self.replaying.is_some()
+    }
+
     /// A replay has ended.
     ///
     /// # Errors
@@ -155,18 +168,72 @@ impl Comparer {
         sequence: u64,
         digest: Result<String, String>,
     ) -> Result<Replayed, End> {
-        self.is_replaying = false;
+        let own = self.replaying.take();
         match digest {
-            Ok(digest) => match self.digests.own(sequence) {
-                None => Ok(Replayed::Unknown),
-                Some(own) if own == digest => Ok(Replayed::Agrees),
-                Some(_) => Err(self.differs(sequence, format!("the log leads to {digest}"))),
-            },
+            Ok(digest) if own.as_ref() == Some(&digest) => Ok(Replayed::Agrees),
+            Ok(digest) => {
+                let other = format!("the log leads to {digest}");
+                let found = own.unwrap_or_default();
+                Err(LogError::Differs { sequence, found, other }.into())
+            }
             Err(reason) => {
                 let fields = [("sequence", &*sequence.to_string()), ("reason", &reason)];
                 self.shared.event(Event::new("log_replay_failed", &fields));
                 Ok(Replayed::Failed)
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn comparer() -> Comparer {
+        let settings = Arc::new(Settings::new("site", "a", Vec::new()));
+        let shared = Arc::new(Shared::new(&settings));
+        Comparer::new(&settings, &shared)
+    }
+
+    #[test]
+    fn a_replay_checks_the_digest_that_this_node_had_when_it_began() {
+        for (of_log, agrees) in [("right", true), ("wrong", false)] {
+            let mut comparer = comparer();
+            comparer.digests.add("a", 7, "right");
+            assert!(comparer.begin_replay(7));
+            for sequence in 8..100 {
+                comparer.digests.add("a", sequence, "later");
+            }
+            assert_eq!(comparer.digests.own(7), None, "it is forgotten");
+            assert!(!comparer.begin_replay(99), "one at a time");
+            match comparer.replayed(7, Ok(of_log.to_owned())) {
+                Ok(replayed) => assert!(agrees && matches!(replayed, Replayed::Agrees)),
+                Err(End::Fatal(LogError::Differs { sequence, found, .. })) => {
+                    assert_eq!((agrees, sequence, &*found), (false, 7, "right"));
+                }
+                Err(_) => panic!("another error"),
+            }
+            assert!(comparer.begin_replay(99));
+        }
+    }
+
+    #[test]
+    fn a_replay_without_a_digest_to_check_does_not_begin() {
+        let mut comparer = comparer();
+        for sequence in 0..100 {
+            comparer.digests.add("a", sequence, "right");
+        }
+        assert!(!comparer.begin_replay(7), "it is forgotten");
+        assert_eq!((comparer.last_compared(7), comparer.last_compared(100)), (Some(99), None));
+        assert!(comparer.begin_replay(99), "a later one is as good");
+    }
+
+    #[test]
+    fn a_replay_that_fails_confirms_nothing() {
+        let mut comparer = comparer();
+        comparer.digests.add("a", 7, "right");
+        assert!(comparer.begin_replay(7));
+        let replayed = comparer.replayed(7, Err("the servers do not answer".to_owned()));
+        assert!(matches!(replayed, Ok(Replayed::Failed)));
     }
 }

@@ -136,10 +136,8 @@ impl InFlight {
 
     /// Answers steps that were not confirmed in time.
     pub(in crate::log) fn expire(&mut self, now: Instant, counters: &Counters) {
-        for message in &mut self.messages {
-            if message.until > now {
-                break;
-            }
+        // A probe that was sent before a step may have to be confirmed later than the step.
+        for message in self.messages.iter_mut().filter(|message| message.until <= now) {
             let steps = message.take_steps();
             self.open -= usize::from(!steps.is_empty());
             refuse_all(steps, Refusal::NotConfirmed, &counters.not_confirmed);
@@ -237,6 +235,20 @@ mod tests {
         assert!(two.try_recv().is_err());
         assert_eq!(in_flight.applied(1, vec![Ok(CarriedOut::default())], &counters), None);
         assert_eq!(counters.not_confirmed.get(), 1);
+    }
+
+    #[test]
+    fn steps_are_answered_in_time_behind_a_message_that_may_take_longer() {
+        let (mut in_flight, counters) = (InFlight::default(), Counters::default());
+        let now = Instant::now();
+        let waiting = push(&mut in_flight, 1, later());
+        let late = [2, 3].map(|counter| push(&mut in_flight, counter, now));
+        in_flight.expire(now, &counters);
+        for late in late {
+            assert_eq!(late.try_recv(), Ok(refused(Refusal::NotConfirmed)));
+        }
+        assert!(waiting.try_recv().is_err());
+        assert_eq!(counters.not_confirmed.get(), 2);
     }
 
     #[test]

@@ -305,7 +305,6 @@ impl<'n> Session<'n> {
                 snapshotter.store(&self.background, sequence);
                 rejoin.confirm(sequence);
             }
-            Replayed::Unknown => snapshotter.store(&self.background, sequence),
             Replayed::Failed => rejoin.postpone(),
         }
         // If that was it, it is being stored.
@@ -330,13 +329,14 @@ impl<'n> Session<'n> {
         }
         self.prove_contact(now).await?;
         self.send_waiting().await?;
-        let Node { applier, snapshotter, rejoin, .. } = &mut *self.node;
+        let Node { applier, snapshotter, comparer, rejoin, .. } = &mut *self.node;
         snapshotter.store_undisputed(&self.background, now);
         // Only a node that is up to date and sure of its contents takes a snapshot.
         if rejoin.contents_are_right() && self.catch_up == CatchUp::CaughtUp {
             snapshotter.consider(&self.background, applier.state(), now);
         }
-        if let Some(sequence) = rejoin.overdue(now) {
+        // The digest of an old sequence may be forgotten, and the log may not reach back to it any more.
+        if let Some(sequence) = rejoin.overdue(now).and_then(|from| comparer.last_compared(from)) {
             self.replay(sequence);
         }
         Ok(())
