@@ -225,6 +225,18 @@ impl Memory {
         self.journal.get().is_some()
     }
 
+    /// Whether other nodes have the same contents: the journal carries out their writes too.
+    pub fn is_replicated(&self) -> bool {
+        self.journal.get().is_some_and(|(journal, _)| journal.guards())
+    }
+
+    /// Whether a write that was checked can still be refused: a journal carries it out, or its values can
+    /// become stale.
+    pub fn can_refuse_checked(&self, area: Area, address: u16, count: usize) -> bool {
+        let ages = |range: &Mirrored| range.freshness.is_some();
+        self.has_journal() || self.mirrored().touched(area, address, count).any(ages)
+    }
+
     /// Gives a write to the journal, without waiting for it.
     ///
     /// # Errors
@@ -1006,6 +1018,22 @@ mod tests {
     }
 
     #[test]
+    fn a_checked_write_can_be_refused_where_values_become_stale() {
+        let (memory, _) = aging(true);
+        for (address, count, can_refuse) in
+            [(0, 5, false), (5, 1, true), (2, 9, true), (8, 3, false)]
+        {
+            assert_eq!(
+                memory.can_refuse_checked(REGISTERS, address, count),
+                can_refuse,
+                "{address} {count}"
+            );
+            assert!(!memory.can_refuse_checked(Area::Coils, address, count));
+        }
+        assert!(!mirroring().can_refuse_checked(REGISTERS, 5, 3), "it is refused at once");
+    }
+
+    #[test]
     fn a_follower_of_a_stale_range_sees_all_of_it_when_it_is_fresh_again() {
         let (memory, aged) = aging(true);
         let memory = Arc::new(memory);
@@ -1091,7 +1119,9 @@ mod tests {
             memory.mirror(Vec::new()).unwrap();
             let (refusal, members) = (std::sync::Mutex::default(), Arc::downgrade(&memory));
             let guard = Arc::new(Guard { guards, refusal, members });
+            assert!(!memory.is_replicated());
             memory.keep_in(Arc::clone(&guard) as Arc<dyn Journal>, 0);
+            assert_eq!(memory.is_replicated(), guards);
             let write = writing(REGISTERS, 0, &[1, 2]);
             memory.write(Access::Client, write).unwrap();
             let mut follower = Follower::new(Arc::clone(&memory), [(REGISTERS, 0, 2)]).unwrap();

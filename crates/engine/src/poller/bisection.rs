@@ -73,7 +73,11 @@ pub(super) async fn search(
             }
         }
         for run in parts.split(|part| part.refused.is_some()) {
-            join(device, block, run).await?;
+            if let Err(fault) = join(device, block, run).await {
+                // Otherwise the next poll would search again for what is known now.
+                device.draw_plan();
+                return Err(fault);
+            }
         }
     }
     device.draw_plan();
@@ -120,7 +124,11 @@ async fn join(device: &impl Searched, refused: &Block, run: &[Part]) -> Result<(
             && match device.ask(&joined).await {
                 Ok(_) => true,
                 Err(fault) if is_illegal(fault) => false,
-                Err(other) => return Err(other),
+                Err(other) => {
+                    // They were answered apart, so they are read apart.
+                    device.learned().cut(block.area, block.address.into());
+                    return Err(other);
+                }
             };
         if together {
             whole = joined;

@@ -126,7 +126,11 @@ enum Message {
 
 impl Inbox {
     pub(super) fn succeed(&self, successor: Device) {
-        *self.successor.borrow_mut() = Some(successor);
+        let earlier = self.successor.take();
+        if earlier.is_some_and(|earlier| earlier.schedule.is_wanted_soon()) {
+            successor.want_soon();
+        }
+        self.successor.replace(Some(successor));
         self.arrived.notify_one();
     }
 
@@ -243,6 +247,8 @@ impl Device {
     /// Sends no requests, and keeps the error in the status block, until the device is replaced.
     async fn wait_until_replaced(&self, inbox: &Inbox) -> Box<Device> {
         self.state.set_broken(true);
+        // The poll has ended without it.
+        self.turn.polls(false);
         loop {
             self.publish_status();
             tokio::select! {
@@ -291,8 +297,8 @@ impl Device {
             self.state.counters.missed.add_many(self.schedule.skip_until(Instant::now()));
             if let Some(until) = self.poll_pause.after_poll(self.link.retry_at(), self.link.retry) {
                 // Polls that are skipped on purpose do not count as missed. An exact pause ends when it
-                // ends, and the schedule begins anew then.
-                if self.link.retry.jitter {
+                // ends, and the schedule begins anew then. Without an interval, there is no poll to skip.
+                if self.link.retry.jitter && !self.settings.interval.is_zero() {
                     self.schedule.skip_until(until);
                 } else {
                     self.schedule.begin_at(until);
@@ -375,7 +381,7 @@ impl Device {
         let known: Vec<usize> =
             (0..self.fields.len()).filter(|at| !learned.is_refused(&self.fields[*at])).collect();
         let fields: Vec<Field> = known.iter().map(|at| self.fields[*at]).collect();
-        let limits = learned.limits(&self.settings.limits, &self.fields);
+        let limits = learned.limits(&self.settings.limits, &fields);
         let mut drawn = plan::plan(&fields, &limits, self.strategy.get());
         if let Ok(plan) = &mut drawn {
             for at in plan.iter_mut().flat_map(|block| &mut block.fields) {
@@ -427,14 +433,14 @@ impl Device {
             return self.leave_out(due, gathered);
         };
         self.state.counters.polls.add();
-        let (mut fault, mut answered) = (None, false);
+        let mut fault = None;
         let known = self.learned().unreadable().to_vec();
         let first = self.first.take();
         for index in (0..plan.len()).map(|offset| (first + offset) % plan.len()) {
             match self.read(&plan[index], &mut gathered).await {
-                Ok(()) => answered = true,
+                Ok(()) => gathered.answered = true,
                 Err(refused) if refused.is_answer() => {
-                    answered = true;
+                    gathered.answered = true;
                     fault = Some(refused);
                 }
                 Err(Fault::Standby) => return,
@@ -446,6 +452,7 @@ impl Device {
                 }
             }
         }
+        let mut answered = gathered.answered;
         if answered || plan.is_empty() {
             fault = fault.or(self.look_at_unreadable(&known, &mut gathered).await);
             if fault == Some(Fault::Standby) {
@@ -521,6 +528,7 @@ impl Device {
                 Ok(())
             }
             Err(fault) if bisection::is_illegal(fault) => {
+                gathered.answered = true;
                 bisection::search(&mut Search { device: self, gathered }, block, fault).await
             }
             Err(other) => {
@@ -642,7 +650,7 @@ impl Device {
     fn publish_status(&self) {
         let status = self.state.status();
         if let Some(to) = &self.settings.status
-            && !(self.state.stands_by() && to.memory.has_journal())
+            && !(self.state.stands_by() && to.memory.is_replicated())
             && status.write_by(to, |write| self.store(&to.memory, Access::Ingest, write)).is_err()
         {
             self.state.count_unstored();
@@ -662,10 +670,11 @@ fn data(mut pdu: Vec<u8>) -> Vec<u8> {
     pdu
 }
 
-/// The data of one poll: reads with several parts, with the number of missing items; and all
-/// blocks, if they are reported.
+/// The data of one poll: reads with several parts, with the number of missing items; all blocks,
+/// if they are reported; and whether the device has answered a request.
 #[derive(Default)]
 struct Gathered {
+    answered: bool,
     parts: HashMap<usize, Partial>,
     blocks: Vec<BlockResult>,
     report: bool,

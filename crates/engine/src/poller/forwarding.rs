@@ -35,7 +35,7 @@ const NO_FILES: &str = "files of devices are not polled";
 const CHUNK_BYTES: usize = 1024;
 
 /// A receiver of Raw Ingest packets.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ForwardSettings {
     pub host: String,
     pub port: u16,

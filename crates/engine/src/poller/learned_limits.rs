@@ -84,12 +84,14 @@ impl Learned {
         self.remember();
     }
 
-    /// The device refuses this block.
+    /// The device refuses this block. Replaces what is known about an equal one.
     pub(super) fn refused(&mut self, block: &Block, fault: Fault) {
         let Block { area, address, count, .. } = *block;
         debug_assert!(count > 0);
         let retry_at = Instant::now() + RETRY_INTERVAL;
-        self.unreadable.push(Unreadable { area, address, count, fault, retry_at });
+        let range = Unreadable { area, address, count, fault, retry_at };
+        self.unreadable.retain(|known| !known.is(&range));
+        self.unreadable.push(range);
         self.remember();
     }
 
@@ -124,7 +126,7 @@ impl Learned {
         self.unreadable.iter().any(|range| range.holds(field))
     }
 
-    /// The limits of a device with these fields. They never make a field unreadable.
+    /// The limits for requests that read these fields. They never make a field unreadable.
     pub(super) fn limits(&self, of: &PlanLimits, fields: &[Field]) -> PlanLimits {
         let longest = |bits: bool| {
             let alike = fields.iter().filter(|field| field.area.is_bits() == bits);
@@ -146,5 +148,25 @@ impl Learned {
 
     fn remember(&mut self) {
         self.until.get_or_insert_with(|| Instant::now() + FORGET_AFTER);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_range_that_is_refused_again_is_known_once() {
+        let mut learned = Learned::default();
+        let block = |address| {
+            let area = Area::HoldingRegisters;
+            Block { area, address, count: 1, fields: vec![0], gaps: 0 }
+        };
+        for (address, code) in [(7, 2), (8, 2), (7, 3)] {
+            learned.refused(&block(address), Fault::Exception(code));
+        }
+        let known = learned.unreadable().iter().map(|range| (range.address, range.fault));
+        let expected = [(8, Fault::Exception(2)), (7, Fault::Exception(3))];
+        assert_eq!(known.collect::<Vec<_>>(), expected);
     }
 }

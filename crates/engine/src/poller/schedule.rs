@@ -41,6 +41,11 @@ impl Schedule {
         self.off_schedule.set(Some(Instant::now()));
     }
 
+    /// Whether a poll outside the schedule was requested and has not begun.
+    pub(super) fn is_wanted_soon(&self) -> bool {
+        self.off_schedule.get().is_some()
+    }
+
     /// When the next poll begins.
     pub(super) fn next(&self) -> Instant {
         let due = self.due.get();

@@ -13,7 +13,7 @@ pub const STATUS_BLOCK_LEN: u16 = 30;
 const NAME_BYTES: usize = 16;
 
 /// Place and content of the block of a device: at `slot` × 30 of an area of registers.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BlockSettings {
     pub area: Area,
     pub slot: u16,

@@ -73,6 +73,8 @@ pub struct Polled {
     pub forwards: Vec<Arc<ForwardCounters>>,
     /// The queue that receives its polls.
     pub report: Option<Arc<Results>>,
+    /// The settings of `forwards`.
+    receivers: Arc<[ForwardSettings]>,
     address: Arc<Address>,
 }
 
@@ -86,7 +88,18 @@ impl Polled {
             state,
             forwards,
             report: device.report.clone(),
+            receivers: device.forward.as_slice().into(),
             address,
+        }
+    }
+
+    /// Goes on with the counters of receivers that the device before has too.
+    fn keep_forwards(&mut self, before: &Polled) {
+        let mut known: Vec<_> = before.receivers.iter().zip(&before.forwards).collect();
+        for (settings, counters) in self.receivers.iter().zip(&mut self.forwards) {
+            if let Some(at) = known.iter().position(|(other, _)| *other == settings) {
+                *counters = Arc::clone(known.remove(at).1);
+            }
         }
     }
 }
@@ -204,7 +217,7 @@ impl Poller {
     }
 
     /// Replaces the device called `name` after its current poll. The new device may have the same
-    /// name. It keeps counters, connection and schedule. With `at_once`, it also reads once outside
+    /// name. It keeps counters, connection, schedule and what waits for its receivers. With `at_once`, it also reads once outside
     /// the schedule; at most once per second, or per interval if that is shorter.
     ///
     /// # Errors
@@ -224,7 +237,8 @@ impl Poller {
         let Some(before) = all.get(name) else {
             return Err(PollerError::Unknown { device: name.to_owned() });
         };
-        let polled = Polled::new(settings, Arc::clone(&before.state));
+        let mut polled = Polled::new(settings, Arc::clone(&before.state));
+        polled.keep_forwards(before);
         let device = Box::new(device);
         let sent = polled.clone();
         self.send(Command::Replace { name: name.to_owned(), device, polled: sent, at_once })?;
@@ -366,13 +380,41 @@ struct Running {
     fence: Option<Arc<Fence>>,
     inbox: Rc<Inbox>,
     device: AbortHandle,
-    forwards: Vec<AbortHandle>,
+    forwards: Vec<RunningForward>,
 }
 
 impl Drop for Running {
     fn drop(&mut self) {
         self.device.abort();
-        self.stop_forwards();
+    }
+}
+
+/// A receiver and the task that sends to it.
+struct RunningForward {
+    forward: Rc<Forward>,
+    task: AbortHandle,
+}
+
+impl RunningForward {
+    fn start(
+        settings: ForwardSettings,
+        counters: Arc<ForwardCounters>,
+        state: &Arc<DeviceState>,
+    ) -> RunningForward {
+        let forward = Forward::new(settings, counters);
+        let task = spawn_guarded(Rc::clone(&forward).run(), Arc::clone(state));
+        RunningForward { forward, task }
+    }
+
+    /// Whether it has these counters, and has not panicked.
+    fn goes_on(&self, counters: &Arc<ForwardCounters>) -> bool {
+        Arc::ptr_eq(&self.forward.counters, counters) && !self.task.is_finished()
+    }
+}
+
+impl Drop for RunningForward {
+    fn drop(&mut self) {
+        self.task.abort();
     }
 }
 
@@ -475,7 +517,7 @@ impl Running {
         let turn = Rc::new(Turn::default());
         let to = (Rc::clone(&link), Rc::clone(&turn));
         let state = Arc::clone(&polled.state);
-        let (device, forwards) = made(planned, polled, to);
+        let (device, forwards) = made(planned, polled, to, Vec::new());
         let device = spawn_guarded(device.run(phase, Rc::clone(&inbox)), state);
         Running { link, turn, unit_id, timeout, release, fence, inbox, device, forwards }
     }
@@ -486,12 +528,12 @@ impl Running {
     }
 
     fn replace(&mut self, planned: Planned, polled: Polled, link: Rc<Link>, at_once: bool) {
-        self.stop_forwards();
         let settings = &planned.settings;
         (self.unit_id, self.timeout) = (settings.unit_id, settings.timeout);
         (self.release, self.link) = (settings.release, Rc::clone(&link));
         self.fence.clone_from(&settings.fence);
-        let (device, forwards) = made(planned, polled, (link, Rc::clone(&self.turn)));
+        let before = std::mem::take(&mut self.forwards);
+        let (device, forwards) = made(planned, polled, (link, Rc::clone(&self.turn)), before);
         self.forwards = forwards;
         if at_once {
             device.want_soon();
@@ -554,12 +596,6 @@ impl Running {
             }
         });
     }
-
-    fn stop_forwards(&mut self) {
-        for task in self.forwards.drain(..) {
-            task.abort();
-        }
-    }
 }
 
 /// Whether a device stands by, so that a write leaves no connection behind.
@@ -567,24 +603,27 @@ fn has_ended(fence: Option<&Arc<Fence>>) -> bool {
     fence.is_some_and(|fence| fence.stage() != Stage::Open)
 }
 
-/// Creates a device, and starts the tasks that forward its reads.
-fn made(planned: Planned, polled: Polled, to: (Rc<Link>, Rc<Turn>)) -> (Device, Vec<AbortHandle>) {
+/// Creates a device, and starts the tasks that forward its reads. Those of the device before that have
+/// the same receiver go on: they send what is waiting, and what the current poll reads.
+fn made(
+    planned: Planned,
+    polled: Polled,
+    to: (Rc<Link>, Rc<Turn>),
+    mut before: Vec<RunningForward>,
+) -> (Device, Vec<RunningForward>) {
     polled.state.set_broken(false);
     polled.state.set_strays(to.0.strays());
     let settings = &planned.settings;
     debug_assert_eq!(settings.forward.len(), polled.forwards.len());
-    let forwards: Vec<_> = settings
-        .forward
-        .iter()
-        .cloned()
-        .zip(polled.forwards)
-        .map(|(settings, counters)| Forward::new(settings, counters))
+    let receivers = settings.forward.iter().cloned().zip(polled.forwards);
+    let running: Vec<RunningForward> = receivers
+        .map(|(settings, counters)| match before.iter().position(|old| old.goes_on(&counters)) {
+            Some(at) => before.swap_remove(at),
+            None => RunningForward::start(settings, counters, &polled.state),
+        })
         .collect();
-    let tasks = forwards
-        .iter()
-        .map(|forward| spawn_guarded(Rc::clone(forward).run(), Arc::clone(&polled.state)));
-    let tasks = tasks.collect();
-    (Device::new(planned, polled.state, to, forwards), tasks)
+    let forwards = running.iter().map(|running| Rc::clone(&running.forward)).collect();
+    (Device::new(planned, polled.state, to, forwards), running)
 }
 
 /// The links to all addresses, each shared by all that ask for it.
@@ -837,6 +876,64 @@ mod tests {
         assert!(poller.remove("c") && !poller.remove("c"));
         poller.add(named("c")).unwrap();
         assert_eq!(names(), ["d", "a", "b", "c"]);
+    }
+
+    fn receiver(target: u16) -> ForwardSettings {
+        ForwardSettings {
+            host: "127.0.0.1".into(),
+            port: 1,
+            tls: None,
+            format: Format::V1,
+            target,
+            timeout: Duration::from_secs(1),
+            offsets: Vec::new(),
+            status: None,
+        }
+    }
+
+    #[test]
+    fn receivers_that_stay_keep_their_counters() {
+        let with = |targets: &[u16]| {
+            let forward = targets.iter().copied().map(receiver).collect();
+            DeviceSettings { forward, ..settings() }
+        };
+        let poller = Poller::start(vec![with(&[1, 2, 2])]).unwrap();
+        let counters = || poller.devices().remove(0).forwards;
+        let before = counters();
+        poller.replace("meter", with(&[2, 3, 2, 2]), false).unwrap();
+        let now = counters();
+        let kept = now.iter().map(|each| before.iter().position(|other| Arc::ptr_eq(each, other)));
+        assert_eq!(kept.collect::<Vec<_>>(), [Some(1), None, Some(2), None]);
+    }
+
+    #[test]
+    fn a_receiver_that_stays_gets_what_is_waiting_for_it_and_one_that_goes_ends() {
+        let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let with = |targets: [u16; 2]| {
+                let device = DeviceSettings { forward: targets.map(receiver).into(), ..settings() };
+                checked(device).unwrap()
+            };
+            let mut links = Links::default();
+            let mut link =
+                || links.to(&settings().endpoint, (InFlight::Fixed(1), Retry::default()));
+            let (first, second) = (with([1, 2]), with([2, 3]));
+            let before = Polled::new(&first.settings, Arc::default());
+            let mut polled = Polled::new(&second.settings, Arc::clone(&before.state));
+            polled.keep_forwards(&before);
+            let hour = Duration::from_secs(3600);
+            let mut running = Running::start(first, before, link(), hour);
+            let forward = |running: &Running, at: usize| Rc::clone(&running.forwards[at].forward);
+            let (goes, stays) = (forward(&running, 0), forward(&running, 1));
+            let ended = running.forwards[0].task.clone();
+            running.replace(second, polled, link(), false);
+            assert!(Rc::ptr_eq(&forward(&running, 0), &stays));
+            assert!(!Rc::ptr_eq(&forward(&running, 1), &goes));
+            while !ended.is_finished() {
+                tokio::task::yield_now().await;
+            }
+            assert!(!running.forwards[0].task.is_finished());
+        });
     }
 
     #[test]

@@ -1,7 +1,9 @@
 //! Tests a device in states that its checks normally exclude: it writes nothing wrong to memory,
 //! and reports an error.
 
-use holdfast_memory::{Access, Layout, Memory, Read, Span};
+use holdfast_memory::{Access, Done, Journal, Layout, Memory, Read, Span, Step};
+use std::sync::Weak;
+
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Builder;
@@ -14,6 +16,7 @@ use crate::poller::BlockSettings;
 use crate::poller::health::Health;
 use crate::poller::panic_guard::spawn_guarded;
 use crate::poller::results::Receivers;
+use crate::poller::write_through::Change;
 
 #[test]
 fn reads_are_split_into_parts_that_fit_into_one_request() {
@@ -31,15 +34,32 @@ fn reads_are_split_into_parts_that_fit_into_one_request() {
 
 const TIMEOUT: Duration = Duration::from_secs(60);
 
+/// What a device does with a read.
+enum Reply {
+    /// All registers are 0x0102.
+    Data,
+    Exception(u8),
+    /// Closes the connection.
+    Close,
+}
+
 /// Runs a test with a device whose registers are all 0x0102.
 fn with_device<F: Future<Output = ()>>(test: impl FnOnce(Endpoint) -> F) {
+    with_replies(|_, _| Reply::Data, test);
+}
+
+/// Runs a test with a device that replies to reads, by address and count.
+fn with_replies<F: Future<Output = ()>>(
+    reply: fn(u16, u16) -> Reply,
+    test: impl FnOnce(Endpoint) -> F,
+) {
     let runtime = Builder::new_current_thread().enable_all().build().unwrap();
     LocalSet::new().block_on(&runtime, async {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let port = listener.local_addr().unwrap().port();
         spawn_local(async move {
             while let Ok((stream, _)) = listener.accept().await {
-                spawn_local(answer(stream));
+                spawn_local(answer(stream, reply));
             }
         });
         let host = "127.0.0.1".to_owned();
@@ -47,14 +67,25 @@ fn with_device<F: Future<Output = ()>>(test: impl FnOnce(Endpoint) -> F) {
     });
 }
 
-async fn answer(mut stream: TcpStream) {
+async fn answer(mut stream: TcpStream, of: fn(u16, u16) -> Reply) {
     let mut request = [0; 12];
     while stream.read_exact(&mut request).await.is_ok() {
-        let len = request[11] * 2;
+        let address = u16::from_be_bytes([request[8], request[9]]);
         let mut reply = request[..8].to_vec();
-        (reply[4], reply[5]) = (0, len + 3);
-        reply.push(len);
-        reply.extend([1, 2].repeat(usize::from(request[11])));
+        match of(address, request[11].into()) {
+            Reply::Data => {
+                let len = request[11] * 2;
+                (reply[4], reply[5]) = (0, len + 3);
+                reply.push(len);
+                reply.extend([1, 2].repeat(usize::from(request[11])));
+            }
+            Reply::Exception(code) => {
+                (reply[4], reply[5]) = (0, 3);
+                reply[7] |= 0x80;
+                reply.push(code);
+            }
+            Reply::Close => return,
+        }
         if stream.write_all(&reply).await.is_err() {
             return;
         }
@@ -209,13 +240,16 @@ fn a_device_that_panics_writes_nothing_and_is_in_error_until_it_is_replaced() {
         // The block does not contain its field.
         let block = Block { area: AREA, address: 11, count: 4, fields: vec![0], gaps: 0 };
         device.adopt(Ok(vec![block]));
-        let inbox = Rc::new(Inbox::default());
+        let (inbox, turn) = (Rc::new(Inbox::default()), Rc::clone(&device.turn));
         let successor = made(settings, &state, &results);
         let running = spawn_local(device.run(Duration::ZERO, Rc::clone(&inbox)));
         let status = || registers(&blocks)[..4].to_vec();
         until(|| status() == [0, 2, 0x80, 7]).await;
         assert_eq!((state.health(), state.last_error()), (Health::Error, 0x8007));
         assert_eq!((state.counters.reads.get(), registers(&memory)), (0, vec![0; 80]));
+        let change = Change { area: AREA, address: 10, count: 1, bytes: vec![9, 9] };
+        turn.note(change);
+        assert_eq!(turn.amend(0, (AREA, 10, 1), &mut [0; 2]), 0, "no poll needs the write");
 
         state.set_broken(false);
         inbox.succeed(successor);
@@ -257,6 +291,140 @@ fn an_exact_pause_ends_when_it_ends_and_not_with_the_next_interval() {
         until(|| state.failures() > 3).await;
         assert_eq!((state.last_error(), state.counters.missed.get()), (0x8002, 0));
         running.abort();
+    });
+}
+
+#[test]
+fn a_pause_holds_without_an_interval_too() {
+    with_device(async |_| {
+        let pause = Duration::from_secs(3600);
+        let retry = Retry { first: pause, most: pause, jitter: true };
+        let settings = DeviceSettings {
+            retry,
+            interval: Duration::ZERO,
+            ..settings(closed_port(), &memory(), 0)
+        };
+        let (device, state, _) = device(settings);
+        let is_left_alone = || device.schedule.next() > Instant::now() + pause / 4;
+        let inbox = Inbox::default();
+        tokio::select! {
+            _ = device.poll_until_replaced(&inbox) => {}
+            () = until(|| is_left_alone() || state.failures() > 100) => {}
+        }
+        assert!(is_left_alone());
+        assert_eq!(state.last_error(), 0x8002);
+    });
+}
+
+/// Settings that read single registers, each on its own.
+fn single_registers(endpoint: Endpoint, addresses: std::ops::Range<u16>) -> DeviceSettings {
+    let reads = addresses.map(|address| ReadSettings {
+        area: AREA,
+        address,
+        count: 1,
+        into: None,
+        forward: true,
+    });
+    DeviceSettings { reads: reads.collect(), ..settings(endpoint, &memory(), 0) }
+}
+
+/// The address and the count of each request of a poll.
+fn planned(device: &Device) -> Vec<(u16, u16)> {
+    let plan = device.plan.borrow().clone().unwrap();
+    plan.iter().map(|block| (block.address, block.count)).collect()
+}
+
+#[test]
+fn a_search_that_ends_while_it_joins_has_learned_and_its_device_has_answered() {
+    let reply = |address, count| match (address, count) {
+        // It can be read as 10 and 11, and as 12.
+        (10, 3) => Reply::Close,
+        (address, count) if address + count > 13 => Reply::Exception(2),
+        _ => Reply::Data,
+    };
+    with_replies(reply, async |endpoint| {
+        let retry = Retry { jitter: false, ..Retry::default() };
+        let settings = DeviceSettings { retry, ..single_registers(endpoint, 10..14) };
+        let (device, state, _) = device(settings);
+        assert_eq!(planned(&device), [(10, 4)]);
+        device.poll(Instant::now()).await;
+        assert_eq!((state.counters.requests.get(), state.health()), (6, Health::Error));
+        assert_eq!(planned(&device), [(10, 2), (12, 1)]);
+        assert!(!device.poll_pause.is_doubtful());
+    });
+}
+
+#[test]
+fn a_field_that_is_refused_does_not_make_the_other_requests_longer() {
+    let reply = |address, count| match (address, count) {
+        (10, _) => Reply::Exception(2),
+        (_, 3..) => Reply::Exception(3),
+        _ => Reply::Data,
+    };
+    with_replies(reply, async |endpoint| {
+        let long = settings(endpoint.clone(), &memory(), 0).reads;
+        let mut settings = single_registers(endpoint, 20..28);
+        settings.reads.extend(long);
+        let (device, _, _) = device(settings);
+        assert_eq!(planned(&device), [(10, 4), (20, 8)]);
+        device.poll(Instant::now()).await;
+        assert_eq!(planned(&device), [(20, 2), (22, 2), (24, 2), (26, 2)]);
+    });
+}
+
+#[test]
+fn a_poll_that_was_wanted_soon_is_so_for_each_later_successor() {
+    with_device(async |endpoint| {
+        let settings = settings(endpoint, &memory(), 0);
+        let inbox = Inbox::default();
+        for at_once in [true, false, false] {
+            let (successor, ..) = device(settings.clone());
+            if at_once {
+                successor.want_soon();
+            }
+            inbox.succeed(successor);
+        }
+        let Message::Successor(successor) = inbox.next().await else { panic!("a successor") };
+        assert!(successor.schedule.is_wanted_soon());
+    });
+}
+
+/// Carries out each step at once.
+#[derive(Debug)]
+struct AtOnce {
+    is_replicated: bool,
+    memory: Weak<Memory>,
+}
+
+impl Journal for AtOnce {
+    fn submit(&self, step: Step, done: Done) {
+        done(step.carry_out(&[self.memory.upgrade().unwrap()]));
+    }
+
+    fn guards(&self) -> bool {
+        self.is_replicated
+    }
+}
+
+#[test]
+fn a_device_that_stands_by_shows_it_unless_another_node_writes_the_block() {
+    with_device(async |endpoint| {
+        for is_replicated in [false, true] {
+            let memory = memory();
+            let journal = AtOnce { is_replicated, memory: Arc::downgrade(&memory) };
+            memory.keep_in(Arc::new(journal), 0);
+            let status = StatusSettings { memory: Arc::clone(&memory), block: block(AREA, 0) };
+            let settings = settings(endpoint.clone(), &memory, 30);
+            let (device, state, _) = device(DeviceSettings { status: Some(status), ..settings });
+            device.poll(Instant::now()).await;
+            device.publish_status();
+            let shown = || u16::from_be_bytes([registers(&memory)[0], registers(&memory)[1]]);
+            assert_eq!(shown(), Health::Ok.code());
+            state.set_standby(true);
+            device.publish_status();
+            let expected = if is_replicated { Health::Ok } else { Health::Standby };
+            assert_eq!(shown(), expected.code());
+        }
     });
 }
 
