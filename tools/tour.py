@@ -36,7 +36,7 @@ def main() -> int:
     with ExitStack() as running:
         port = device.rpartition(":")[2]
         # In a group of its own: Ctrl-C ends the appliance first, which would miss its device.
-        simulated = started(running, "simulate", "--port", port, process_group=0)
+        simulated = started(running, "simulate", "--bind", f":{port}", process_group=0)
         if not greeting(simulated):
             return simulated.wait()  # It has printed why.
         # Only now: an appliance that misses its device at first refuses writes to it for a moment.

@@ -134,7 +134,7 @@ def test_a_right_device_is_right(folder: Folder) -> None:
         ("    reads", "    tolerance: {echo: true}\n    reads",
          "8: tolerance.echo: found true, allowed with RTU and ASCII frames only"),
         ("url: tcp://10.0.0.9\n", "url: tcp://10.0.0.9?pad=1\n    tolerance: {retries: 1}\n",
-         "6: tolerance: found together with options of the URL, allowed: one of both"),
+         "6: tolerance: found together with options of the URL, allowed: only one of them"),
         ("    reads", "    cost: {per_request: 1, per_register: 1}\n    reads",
          "8: cost: removed, allowed: max_gap: auto, which measures the device, or max_gap: N with "
          "N = per_request / per_register"),

@@ -1,4 +1,4 @@
-//! `HttpExchange`: a request of HTTP and its response, for an event loop.
+//! `HttpExchange`: an HTTP request and its response, for an event loop.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -62,7 +62,7 @@ impl HttpExchange {
         self.core.end(is_complete);
     }
 
-    /// There will be no response: the connection is cut off.
+    /// Cuts off the connection, unless there has been a response.
     fn abandon(&self) {
         self.core.abandon();
     }
@@ -98,7 +98,7 @@ pub struct Answers(Mutex<Option<(Py<PyTuple>, ResponseHead)>>);
 
 impl Answers {
     fn head(&self, status: u16, headers: &Bound<'_, PyAny>) -> PyResult<ResponseHead> {
-        // A list can have changed.
+        // Only a tuple can't have changed.
         let Ok(given) = headers.cast_exact::<PyTuple>() else {
             return response_head(status, &headers.extract::<Headers>()?);
         };

@@ -59,17 +59,17 @@ impl Fence {
     }
 }
 
-/// A time of Python's `time.monotonic`, or now if it has passed.
+/// A time of Python's `time.monotonic`, limited to the next hour; now if it has passed.
 ///
-/// The clock of this side is read first: if the process is stopped in between, the result is too early,
-/// never too late.
+/// Rust's clock is read first: if the process is stopped in between, the result is too early, never
+/// too late.
 fn instant(py: Python<'_>, time: f64) -> PyResult<Instant> {
     static CLOCK: PyOnceLock<Py<PyAny>> = PyOnceLock::new();
-    let here = Instant::now();
+    let now = Instant::now();
     let clock = CLOCK.import(py, "time", "monotonic")?;
     let left = time - clock.call0()?.extract::<f64>()?;
     if left.is_nan() {
         return Err(PyValueError::new_err("the time is not a number"));
     }
-    Ok(here + Duration::from_secs_f64(left.clamp(0.0, 3600.0)))
+    Ok(now + Duration::from_secs_f64(left.clamp(0.0, 3600.0)))
 }

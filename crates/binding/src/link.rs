@@ -111,7 +111,7 @@ impl Link {
     }
 }
 
-/// What a connection has received without a request, or late.
+/// Adds the counters of unexpected and late data of a connection.
 pub fn add_strays(all: &Bound<'_, PyDict>, strays: Option<&StrayCounters>) -> PyResult<()> {
     let count = |of: fn(&StrayCounters) -> u64| strays.map_or(0, of);
     all.set_item("unexpected_replies", count(|strays| strays.replies.get()))?;
@@ -199,18 +199,18 @@ impl Passage {
         within("number of values", values.len() as i128, 1..=most.into())?;
         let items: Vec<bool> = values.iter().map(|value| *value != 0).collect();
         let mut room = [0; pdu::MAX_LEN];
-        let few = "there are no more values than a request has room for";
+        let fits = "there are no more values than a request has room for";
         let request = match (area, &values[..]) {
             (Area::Coils, [value]) => CoreRequest::WriteSingleCoil { address, value: *value != 0 },
             (Area::Coils, _) => {
-                let bits = Bits::pack(&items, &mut room).expect(few);
+                let bits = Bits::pack(&items, &mut room).expect(fits);
                 CoreRequest::WriteMultipleCoils { address, bits }
             }
             (Area::HoldingRegisters, [value]) => {
                 CoreRequest::WriteSingleRegister { address, value: *value }
             }
             (Area::HoldingRegisters, values) => {
-                let registers = Registers::pack(values, &mut room).expect(few);
+                let registers = Registers::pack(values, &mut room).expect(fits);
                 CoreRequest::WriteMultipleRegisters { address, registers }
             }
             _ => {

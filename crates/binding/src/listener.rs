@@ -33,7 +33,7 @@ use crate::server_tls::ServerTls;
 const ACCESS: [(&str, AccessMode); 2] =
     [("read-only", AccessMode::ReadOnly), ("read-write", AccessMode::ReadWrite)];
 
-/// The idle time of connections that may be idle for as long as they want.
+/// Replaces an idle timeout of 0, which means no limit.
 const UNLIMITED: Duration = Duration::from_secs(366 * 24 * 3600);
 
 /// Area, first address, how many items.
@@ -167,7 +167,7 @@ pub struct Listener {
     pub core: ListenerSettings,
 }
 
-/// What a listener for connections has beside its address and rules, see `StreamOptions` in
+/// The options of a listener for connections, see `StreamOptions` in
 /// `python/holdfast/server/options.py`. Here and below, other keys of the mapping are ignored.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
@@ -251,7 +251,7 @@ impl Listener {
             }
             Some(_) => {
                 let message =
-                    "raw_ingest takes a Raw Ingest listener, with framing mbap and no tls";
+                    "raw_ingest must be a Raw Ingest listener; framing must be mbap, without tls";
                 return Err(PyValueError::new_err(message));
             }
         };

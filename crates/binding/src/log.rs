@@ -24,7 +24,7 @@ pyo3::create_exception!(
     "A log can't be used. `kind` tells why, as one word."
 );
 
-/// The longest time between two looks for signals.
+/// The longest time between two checks for signals.
 const SLICE: Duration = Duration::from_millis(100);
 
 /// Names and memories.
@@ -210,7 +210,7 @@ impl LogReader {
             (None, None, true) => Until::Forever,
             (None, None, false) => Until::Now,
             _ => {
-                let message = "give one of sequence, time_ns and follow";
+                let message = "give at most one of sequence, time_ns and follow";
                 return Err(PyValueError::new_err(message));
             }
         };
@@ -262,8 +262,8 @@ impl LogReader {
 }
 
 impl LogReader {
-    fn locked<T>(&self, of: impl FnOnce(&mut CoreReader) -> T) -> T {
-        of(&mut self.core.lock().unwrap_or_else(PoisonError::into_inner))
+    fn locked<T>(&self, work: impl FnOnce(&mut CoreReader) -> T) -> T {
+        work(&mut self.core.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
     fn shown<'py>(&self, py: Python<'py>, record: &Record) -> PyResult<Bound<'py, PyDict>> {

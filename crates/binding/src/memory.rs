@@ -202,10 +202,11 @@ impl Memory {
 
     /// Writes bits (0, 1, False, True) or registers (integers 0 to 65535) in one step.
     ///
-    /// Raises `OutOfRange` outside the area, `ValueError` for no values, a value out of range or an
-    /// unknown area, `TypeError` for a value of another type, `OSError` if the memory is kept in a
-    /// file or a log that can't be written. An error changes nothing, except that a log may still
-    /// carry out a write that it did not confirm in time.
+    /// Raises `OutOfRange` outside the area, `ValueError` for no values, a value out of range, an
+    /// unknown area or a reserved range, `TypeError` for a value of another type, `OSError` if the
+    /// memory is kept in a file or a log that can't be written, or the values of a mirrored device
+    /// are too old. An error changes nothing, except that a log may still carry out a write that it
+    /// did not confirm in time.
     fn write(
         &self,
         py: Python<'_>,
@@ -333,11 +334,11 @@ impl Range {
                 out_of_range(memory, self.area, i128::from(self.address), self.count as i128)
             }
             stale @ Refusal::Stale => Stale::new_err(stale.to_string()),
-            kept @ (Refusal::Unavailable
+            journal @ (Refusal::Unavailable
             | Refusal::NotStored
             | Refusal::NotConfirmed
             | Refusal::Behind
-            | Refusal::Differs) => PyOSError::new_err(kept.to_string()),
+            | Refusal::Differs) => PyOSError::new_err(journal.to_string()),
             other => PyValueError::new_err(other.to_string()),
         }
     }
@@ -385,7 +386,7 @@ fn out_of_range(memory: &Core, area: Area, address: i128, count: i128) -> PyErr 
 /// A Python integer. An integer beyond 128 bits is clamped: the result is still out of range for
 /// every address, count and value.
 pub fn integer(value: &Bound<'_, PyAny>) -> PyResult<i128> {
-    // With the stable interface of Python, those that have more than 64 bits take ten times as long.
+    // With Python's stable ABI, extracting an `i128` takes ten times as long as an `i64`.
     if value.is_exact_instance_of::<PyInt>()
         && let Ok(number) = value.extract::<i64>()
     {
@@ -422,10 +423,10 @@ pub fn put(area: Area, bytes: &mut [u8], index: usize, item: u16) {
 
 /// Extracts and checks the integers of a Python iterable.
 pub fn numbers<'py>(area: Area, values: &Bound<'py, PyAny>) -> PyResult<Vec<u16>> {
-    let whole = |value: &Bound<'py, PyAny>| value.repr().map(Bound::into_any);
+    let shown = |value: &Bound<'py, PyAny>| value.repr().map(Bound::into_any);
     if let Ok(list) = values.cast_exact::<PyList>() {
         let items = list.iter().enumerate();
-        return items.map(|(index, value)| number(area, index, &value, whole)).collect();
+        return items.map(|(index, value)| number(area, index, &value, shown)).collect();
     }
     if is_text(values) {
         let found = values.get_type().name()?;
@@ -435,7 +436,7 @@ pub fn numbers<'py>(area: Area, values: &Bound<'py, PyAny>) -> PyResult<Vec<u16>
     }
     let mut numbers = Vec::with_capacity(values.len().unwrap_or(0).min(Span::MAX_SIZE as usize));
     for (index, value) in values.try_iter()?.enumerate() {
-        numbers.push(number(area, index, &value?, whole)?);
+        numbers.push(number(area, index, &value?, shown)?);
     }
     Ok(numbers)
 }

@@ -27,7 +27,7 @@ use crate::memory::{Memory, named};
 const MAX_REGISTERS: i128 = limit::READ_REGISTERS as i128;
 const MAX_BITS: i128 = limit::READ_BITS as i128;
 
-/// An area, its first address, and the one behind its last.
+/// An area, the first address of a range, and the address after its last.
 type Range = (String, u32, u32);
 
 /// A memory, an area and an address.
@@ -39,8 +39,8 @@ type Read<'py> = (String, i128, i128, Option<Place<'py>>);
 /// Area and slot of a status block, its name, and whether it keeps the last error.
 type StatusBlock = (String, u16, String, bool);
 
-/// Format, crc, unit or memory id, timeout, offsets by area, and the unit or memory id of the status
-/// block with the block.
+/// Format, crc, unit or memory id, timeout, offsets by area, and the status block with its unit or
+/// memory id.
 type Forward = (String, String, u16, f64, Vec<(String, u16)>, Option<(u16, StatusBlock)>);
 
 /// Area, address, count, indexes of fields, number of items that no field covers.
@@ -74,7 +74,7 @@ impl PolledDevice {
         start_within: Option<f64>,
         in_flight: Option<i128>,
         report: Option<PyRef<'_, Results>>,
-        fields: Option<Vec<Range>>,
+        fields: Option<Vec<(String, u32, u32)>>,
         release: bool,
         measured: bool,
         retry: Option<(f64, f64)>,
@@ -94,7 +94,7 @@ impl PolledDevice {
             let (area, address, count) = place(area, address.into(), count.into())?;
             Ok(ReadSettings { area, address, count, into: None, forward: false })
         });
-        let forward = forward.unwrap_or_default().into_iter().map(target);
+        let forward = forward.unwrap_or_default().into_iter().map(forwarding);
         let status = status.map(|(memory, of)| self::status(&memory, of));
         let core = DeviceSettings {
             name,
@@ -326,10 +326,10 @@ fn block((area, slot, name, keep_last_error): StatusBlock) -> PyResult<BlockSett
     Ok(BlockSettings { area: named(&area)?, slot, name, keep_last_error })
 }
 
-fn target((receiver, forward): (PyRef<'_, Endpoint>, Forward)) -> PyResult<ForwardSettings> {
+fn forwarding((receiver, forward): (PyRef<'_, Endpoint>, Forward)) -> PyResult<ForwardSettings> {
     let (format, crc, target, timeout, offsets, status) = forward;
     let HostPlace::Tcp { host, port, tls } = receiver.core.place.clone() else {
-        return Err(PyValueError::new_err("the endpoint of a receiver is not one of TCP or TLS"));
+        return Err(PyValueError::new_err("the endpoint of a receiver must be TCP or TLS"));
     };
     let format = packet_format(&format, &crc)?;
     let timeout = seconds("timeout", timeout)?;

@@ -3,7 +3,7 @@
 use std::hash::{BuildHasher, RandomState};
 use std::time::Duration;
 
-/// When what failed is tried again: a device, a server.
+/// How long to wait before a failed device or server is retried.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Retry {
     /// The pause after the first failure.
@@ -22,7 +22,7 @@ impl Default for Retry {
 }
 
 impl Retry {
-    /// With no pause longer than this.
+    /// The same, with no pause longer than `most`.
     #[must_use]
     pub fn up_to(self, most: Duration) -> Retry {
         Retry { most: self.most.min(most), ..self }
@@ -57,10 +57,10 @@ mod tests {
             check(Retry::default(), failures, Duration::from_secs(most));
         }
         let most = Duration::from_secs(3600);
-        let soon = Retry { first: Duration::from_millis(50), most, jitter: true };
+        let quick = Retry { first: Duration::from_millis(50), most, jitter: true };
         for (failures, most) in [(1, 50), (5, 800), (13, 204_800), (32, 3_600_000)] {
-            check(soon, failures, Duration::from_millis(most));
-            check(soon.up_to(soon.first), failures, soon.first);
+            check(quick, failures, Duration::from_millis(most));
+            check(quick.up_to(quick.first), failures, quick.first);
         }
     }
 

@@ -49,7 +49,7 @@ class ServiceManager:
             self.ready()
 
     def feed_watchdog(self) -> None:
-        """Notifies that the appliance is live, as often as that is due."""
+        """Notifies that the appliance is live, if a notification is due."""
         now = time.monotonic()
         if self._interval and now - self._fed >= self._interval:
             self._fed = now

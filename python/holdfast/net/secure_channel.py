@@ -1,4 +1,4 @@
-"""TLS of connections to brokers: the core judges their certificates like those of devices."""
+"""TLS for connections to brokers: the core verifies their certificates like those of devices."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def failure_text(error: BaseException) -> str:
 class SecureChannel:
     """The client side of TLS 1.2 and 1.3 over a connection whose socket belongs to the caller.
 
-    Send `outgoing` after the start, and after each call of `receive`, also if that fails.
+    Send `outgoing` after the start, and after each call of `receive`, even if that fails.
     """
 
     def __init__(self, host: str, tls: Tls) -> None:

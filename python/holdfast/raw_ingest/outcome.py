@@ -42,7 +42,7 @@ class RawTlsFailed(RawError):
 
 
 class TlsLost(OSError):
-    """TLS ended a connection, for a reason. `maybe_sent`: the peer may have executed the packet."""
+    """TLS has failed; the connection ended. `maybe_sent`: the peer may have executed the packet."""
 
     def __init__(self, reason: str, text: str, maybe_sent: bool) -> None:
         super().__init__(text)
@@ -68,7 +68,7 @@ class Attempt:
         self.sent = False
 
     def failed(self, error: OSError) -> RawError:
-        """The error of a connection as an outcome."""
+        """Converts an error of the connection."""
         if isinstance(error, TimeoutError):
             what = "reply" if self.connected else "connection"
             text = f"{self.peer}: no {what} within {self.timeout:g} s"

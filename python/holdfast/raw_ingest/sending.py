@@ -70,11 +70,11 @@ async def send_packet(
     """Sends an encoded packet. Returns when the receiver has written it.
 
     `timeout`, in seconds, covers name resolution, connection, packet and reply together. `tls` has
-    the files for TLS, which are read at each call. Raises `ValueError` and `OSError` for files that
-    can't be used.
+    the files for TLS, which are read at each call. Raises `ValueError` for an invalid argument, and
+    `ValueError` or `OSError` for files that can't be used.
 
     Raises `RawRefused`, `RawTimeout`, `RawTlsFailed`, or `RawError` for all other failures; all are
-    `RawError`, and `maybe_written` says whether the packet may have been written. Always closes the
+    `RawError`, and `maybe_written` is true if the packet may have been written. Always closes the
     connection, also when the task is cancelled.
     """
     attempt = Attempt(host, port, timeout)

@@ -52,8 +52,9 @@ class Server:
     """Serves memories over Modbus, from `start` (or `with`) to `stop`.
 
     `units` maps unit ids, 0 to 255, to memories. Peers from `sources` have `access` to them,
-    limited by `functions` or `deny`, lists of function codes. Alternatively, set `rules`: the first
-    rule whose sources contain the peer applies. A peer without a rule is disconnected at once.
+    limited by `functions` or `deny`, lists of function codes. Alternatively, set `rules`: for each
+    unit id, the first rule that matches the peer and has the unit id applies. A peer without a rule
+    is disconnected at once.
     `bind` is `address:port` for Modbus TCP, or a URL with the schemes of clients: `tcp`, `tls`,
     `udp`, `rtu+tcp`, `rtu+udp` and `ascii+tcp` with an IP address and a port, `rtu` and `ascii`
     with a serial line, as in `rtu:///dev/ttyUSB0?baud=19200&parity=even`. Port 0 lets the system

@@ -23,7 +23,7 @@ FIXED = {
     "bcd16": 2,
     "bcd32": 4,
 }
-"""Types without a parameter, with the bytes of an element in registers."""
+"""Types without a parameter, and how many bytes an element has in registers."""
 
 ALLOWED = f"bit:0 to bit:15, {', '.join(FIXED)}, string:N, bytes:N, and arrays: float32[10]"
 MAX_REGISTERS = ADDRESSES
@@ -110,7 +110,7 @@ def _unknown(name: object) -> UnknownType:
         word = {"u": "uint", "i": "int", "f": "float"}[short[1]] + short[2]
     base, bracket, count = word.partition("[")
     near = ""
-    # Imported here, for a fast start: few words are wrong.
+    # Imported here, for a fast start: only wrong names need it.
     import difflib
 
     for close in difflib.get_close_matches(base, (*FIXED, *USUAL_NAMES), 1):

@@ -71,7 +71,7 @@ impl TlsStream {
         let mut chunk = [0; CHUNK_BYTES];
         let len = self.stream.receive(&mut chunk, deadline)?;
         self.feed(&chunk[..len]);
-        // What the channel answers is sent even if the deadline was only the end of a slice.
+        // The channel's answer is sent even if the deadline only ended a slice of the wait.
         // A TLS failure takes precedence over a failure to send its alert.
         self.flush(deadline.max(Instant::now() + SIGNAL_CHECK_INTERVAL))
             .or_else(|error| if self.broken.is_some() { Ok(()) } else { Err(error) })
@@ -94,7 +94,7 @@ impl TlsStream {
     }
 
     /// Interprets the end of the connection: a peer may refuse a certificate without an alert.
-    fn unheard(&self, error: StreamError) -> StreamError {
+    fn closed_before_reply(&self, error: StreamError) -> StreamError {
         match error {
             StreamError::Io(error)
                 if !self.heard
@@ -130,7 +130,7 @@ impl ByteStream for TlsStream {
             if self.channel.has_ended() {
                 return Err(StreamError::Ended);
             }
-            self.take(deadline).map_err(|error| self.unheard(error))?;
+            self.take(deadline).map_err(|error| self.closed_before_reply(error))?;
         }
         let len = self.plain.len().min(buffer.len());
         buffer[..len].copy_from_slice(&self.plain[..len]);
@@ -153,7 +153,7 @@ impl ByteStream for TlsStream {
         self.flush(deadline).map_err(|error| {
             // A peer that has closed the connection may have sent an alert.
             self.look();
-            self.broken.clone().map_or(self.unheard(error), StreamError::Tls)
+            self.broken.clone().map_or(self.closed_before_reply(error), StreamError::Tls)
         })
     }
 

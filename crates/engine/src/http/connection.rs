@@ -36,7 +36,7 @@ use crate::server::transports::stream::Stream;
 /// How long a peer is read after its last response.
 const LINGER: Duration = Duration::from_secs(2);
 
-/// So many bytes of a body that nobody wants are read, then dropped, then the next.
+/// A body that nobody wants is read and dropped in chunks of about this size.
 const SKIPPED_CHUNK_BYTES: usize = 65_536;
 
 /// The type of a TLS record that begins a handshake (RFC 8446, 5.1).
@@ -48,11 +48,11 @@ const NEVER: Duration = Duration::from_secs(3600);
 /// How a connection ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum End {
-    /// After a response. The peer may still send: it is read to its end, so that it gets the response.
+    /// After a response. What the peer still sends is read for a while, so that it gets the response.
     Answered,
-    /// Between requests: the end is announced, if the connection has a way to.
+    /// Between requests. With TLS, the end is announced.
     Idle,
-    /// At once: the peer is gone, or does not do its part.
+    /// At once: the peer is gone or late, its request is broken, or the handler has abandoned it.
     Dropped,
 }
 
@@ -244,17 +244,17 @@ fn answered(
     let exchange = front.exchange();
     let len = request.body().size_hint().exact();
     let expects = request.headers().contains_key(EXPECT);
-    let (is_ambiguous, is_here) = {
+    let (is_ambiguous, has_body) = {
         let mut line = line.lock();
-        let is_here = !expects && len.is_some_and(|len| line.has(len));
-        (line.begin(Arc::clone(&exchange), len), is_here)
+        let has_body = !expects && len.is_some_and(|len| line.has(len));
+        (line.begin(Arc::clone(&exchange), len), has_body)
     };
     async move {
         if is_ambiguous {
             front.ended(Kind::BrokenRequest, line.lock().peer.clone());
             return Ok(refused(&front, exchange, line));
         }
-        handled(front, line, exchange, request, is_here).await
+        handled(front, line, exchange, request, has_body).await
     }
 }
 
@@ -263,7 +263,7 @@ async fn handled(
     line: SharedLine,
     exchange: Arc<Exchange>,
     request: Request<Incoming>,
-    is_here: bool,
+    has_body: bool,
 ) -> Result<Response<Output>, Abandoned> {
     let (parts, body) = request.into_parts();
     let len = body.size_hint().exact();
@@ -283,7 +283,7 @@ async fn handled(
             upload.is_over = true;
             Some(Bytes::new())
         }
-        Some(_) if is_here => upload.whole().await,
+        Some(_) if has_body => upload.whole().await,
         _ => None,
     };
     let head = Box::new(RequestHead { parts, peer, len });

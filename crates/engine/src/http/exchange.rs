@@ -46,7 +46,7 @@ impl ResponseHead {
     }
 }
 
-/// What a handler wants of the connection.
+/// What a handler asks of the connection.
 #[derive(Debug)]
 pub(super) enum Order {
     /// The body of the request, of at most this many bytes.
@@ -76,7 +76,7 @@ pub enum Event {
     Broken { number: u64 },
     /// The client is gone, before it had its response.
     Gone { number: u64 },
-    /// The client has taken the data before: the stream has room.
+    /// The socket has taken the data before: the stream has room.
     Room { number: u64 },
 }
 
@@ -105,11 +105,11 @@ struct State {
     waker: Option<Waker>,
 }
 
-/// What became of data for a stream.
+/// The result of sending data of a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sent {
     Taken,
-    /// The data before are not sent: `Event::Room` tells when they are.
+    /// The data before is not sent yet: `Event::Room` reports when it is.
     Full,
     /// The client is gone.
     Gone,
@@ -140,8 +140,8 @@ impl Exchange {
         }
     }
 
-    /// Answers the request with a stream. A client that sends no more is gone from here on, because a
-    /// stream has no other end.
+    /// Answers the request with a stream. From now on, a client that sends no more counts as gone: a
+    /// stream may have no other end.
     pub fn begin(&self, head: ResponseHead) {
         self.state().leaves = true;
         self.order(Order::Begin(head));
@@ -233,7 +233,7 @@ impl Exchange {
             state.is_unsent = true;
             return Poll::Ready(Some(Ok(data)));
         }
-        // The handler may be dropped without a word.
+        // A handler may be dropped without `end`.
         let is_abandoned = matches!(state.orders.front(), Some(Order::Abandon));
         match state.end {
             Some(true) => return Poll::Ready(None),

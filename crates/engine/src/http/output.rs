@@ -91,7 +91,7 @@ impl Body for Output {
 
 impl Drop for Output {
     fn drop(&mut self) {
-        // hyper drops a body without asking for it in the response to HEAD.
+        // In a response to HEAD, hyper drops the body without polling it.
         let is_complete = !matches!(self.content, Content::Stream);
         self.exchange.finish(is_complete);
         self.line.lock().note_answered();

@@ -4,7 +4,7 @@
 /// The largest header of a request, in bytes.
 pub(super) const MAX_HEADER_BYTES: usize = 65_536;
 
-/// What of a request is still to come.
+/// The part of a request that is still to be read.
 #[derive(Debug)]
 pub(super) enum Portion {
     /// Its header.
@@ -53,7 +53,7 @@ impl Portion {
     }
 }
 
-/// How far bytes were searched.
+/// How far bytes were searched, and where the end was found.
 #[derive(Debug, Default)]
 struct Search {
     searched: usize,
@@ -67,7 +67,7 @@ impl Search {
     }
 }
 
-/// Finds the end of a header: an empty line. A CR before a line feed does not count.
+/// Finds the end of a header: an empty line. CRs are ignored.
 #[derive(Debug, Default)]
 pub(super) struct HeadEnd {
     search: Search,
@@ -106,8 +106,8 @@ impl HeadEnd {
         }
     }
 
-    /// Whether hyper gets nothing before the end has arrived. Once it has read a part of a header, it looks for
-    /// the end by other rules, and judges the rest later. What can't be a request is refused at once.
+    /// Whether hyper gets nothing before the end has arrived. Once hyper has read a part of a header, it looks
+    /// for the end by other rules, and judges the rest later. What can't be a request is refused at once.
     fn is_awaited(&self, bytes: &[u8]) -> bool {
         let first = bytes.iter().find(|byte| !matches!(byte, b'\r' | b'\n'));
         !self.is_begun && bytes.len() <= MAX_HEADER_BYTES && first.is_none_or(u8::is_ascii_graphic)
@@ -141,7 +141,7 @@ enum Part {
     Size(u64),
     /// What follows the size in its line.
     Extension(u64),
-    /// Data, and the line end behind them.
+    /// Data, and the line end after it.
     Data(u64),
     /// A line of the trailer: its length so far, and whether a CR was last. For hyper, only CR and LF end it.
     Trailer(usize, bool),
@@ -202,7 +202,7 @@ impl ChunksEnd {
 mod tests {
     use super::*;
 
-    /// Gives bytes in all ways to cut them in two, and returns what belongs to the request.
+    /// Passes the bytes cut in two at every place. Returns how many belong to the request.
     fn ends(portion: impl Fn() -> Portion, bytes: &[u8]) -> usize {
         let mut lens = Vec::new();
         for cut in 0..=bytes.len() {

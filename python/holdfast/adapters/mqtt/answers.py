@@ -1,8 +1,8 @@
 """Answers to messages with a response topic (MQTT 5, section 4.10).
 
 Answers are best effort: they must neither delay later messages nor fill memory. An answer is
-dropped and counted when too many answers are unsent, when it is larger than the broker accepts,
-and when the response topic matches a subscription, so that the answer would come back as a message.
+dropped and counted if too many packets are unsent, if it is larger than the broker accepts, or if
+its topic is invalid or matches a subscription, so that the answer would come back as a message.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Answers:
         """Answers a message, if it has a response topic."""
         if message.response_topic is None:
             return
-        if self._sent(link, message, message.response_topic, answer):
+        if self._try_send(link, message, message.response_topic, answer):
             self.sent += 1
         else:
             self.dropped += 1
@@ -46,7 +46,7 @@ class Answers:
         """Whether an answer would come back as a message."""
         return topic in self._values or self._filters.grant(topic) is not None
 
-    def _sent(
+    def _try_send(
         self,
         link: BrokerConnection,
         message: Publish,

@@ -1,4 +1,4 @@
-"""What the adapter subscribes to: when again, and when with retained messages."""
+"""Subscribes to the topics of the adapter, and avoids repeated retained messages."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ class Subscriptions:
     def _subscribe(self, link: BrokerConnection, topic: _Topic) -> None:
         """Subscribes, so that no retained message comes twice in a session.
 
-        With MQTT 5, an option of SUBSCRIBE prevents that. With MQTT 3.1.1, a topic is skipped that
-        this process subscribed to in the session before.
+        With MQTT 5, an option of SUBSCRIBE prevents that. With MQTT 3.1.1, topics are skipped that
+        this process has already subscribed to in this session.
         """
         entry = topic.entry
         if self._is_version_5:
@@ -76,7 +76,7 @@ class Subscriptions:
             self._unanswered[identifier] = topic
 
     def answered(self, identifier: int, reasons: Iterable[ReasonCode]) -> str | None:
-        """Takes the broker's answer to SUBSCRIBE; returns the topic if it refused it."""
+        """Handles the answer to SUBSCRIBE. Returns the topic if the broker refused it."""
         topic = self._unanswered.pop(identifier, None)
         reason = next(iter(reasons), None)
         if topic is None or reason is None:

@@ -36,7 +36,7 @@ RETRY_S = 1.0
 
 
 class NoAudit(Part):
-    """An appliance without an audit log. The times of its log lines are watched nevertheless."""
+    """An appliance without an audit log. Steps of the wall clock are still logged."""
 
     log: Audit | None = None
 
@@ -64,7 +64,7 @@ class NoAudit(Part):
 class AuditLog(NoAudit):
     """The audit log: opened before anything listens, closed after the last write."""
 
-    # A service that hangs may wait for a shared log, and writes its record when that is left.
+    # A hanging service may wait for a shared log, and writes its record when the log is closed.
     closing_rank = 1
 
     def open(self, plan: Plan) -> None:
@@ -90,7 +90,7 @@ class AuditLog(NoAudit):
         self.closing.callback(self._recorder.finish)
 
     def prepare(self, plan: Plan) -> Callable[[], None]:  # noqa: ARG002
-        """The file may have been renamed."""
+        """Reopens the file after a rename."""
         return self._reopen
 
     def _note(self, event: str, **fields: object) -> None:

@@ -28,7 +28,7 @@ _END_TIMEOUT_S = 5.0
 
 
 class Devices(Part):
-    """All that uses the native poller. There is none until something requires it."""
+    """Everything that uses the native poller, which is created when needed."""
 
     def __init__(
         self, config: Config, audit: NoAudit, leases: DeviceLeases, mirrors: Mirrors
@@ -37,7 +37,7 @@ class Devices(Part):
         self._audit, self._leases, self._mirrors = audit, leases, mirrors
         self.poller: _core.Poller | None = None
         self.values: TagValues | None = None
-        """The values of tags, once there are tags; `writes` with them."""
+        """The values of tags. `None` until there are tags, as is `writes`."""
         self.writes: TagWrites | None = None
         self.passages: dict[str, _core.Passage] = {}
         """How services write to memories whose writes go to devices."""

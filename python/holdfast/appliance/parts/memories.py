@@ -96,7 +96,7 @@ class Memories(Part):
         return self._of_logs.get(log)
 
     def note(self, log: str) -> bytes | None:
-        """What that file has noted of the log."""
+        """The state of the log in its file, for `Log.resume`."""
         path = self.of_log(log)
         return None if path is None else self._files[path].note
 
@@ -116,7 +116,7 @@ class Memories(Part):
         return {"memory_files": {str(path): dict(file.status()) for path, file in files}}
 
     def log_changes(self) -> None:
-        """Logs files that can't be written any more, and those that can again."""
+        """Logs when a file can't be written any more, and when it can again."""
         for path, file in self._files.items():
             error = file.status()["failing"]
             if error is not None and self._failing.get(path) is None:
@@ -131,7 +131,7 @@ def created(config: Config, name: str) -> Memory:
     settings = config.memories[name]
     made = empty(settings)
     if settings.keep is None:
-        # Of a log, the first node has them; the others get those of the log.
+        # The first node of a log begins with them; others get those of the log.
         fill(made, settings)
     return made
 
@@ -154,7 +154,7 @@ def fill(made: Memory, settings: MemoryConfig) -> None:
 
 
 def _close(path: Path, file: _core.MemoryFile) -> None:
-    """Stores what is left."""
+    """Stores pending writes."""
     try:
         file.stop()
     except OSError as error:

@@ -97,7 +97,7 @@ def device(
 ) -> _core.PolledDevice:
     """Creates the native poller's device of that name. Raises `OSError` for unusable files.
 
-    `report` takes the polls of devices with tags. With a `fence`, it is polled while that is open.
+    `report` takes the polls of devices with tags. A `fence` stops polls while it is closed.
     """
     settings = config.devices[name]
     fields = Reader(name, config.tags(name)).fields

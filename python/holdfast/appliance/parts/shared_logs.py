@@ -37,11 +37,11 @@ EVENTS = {
     "log_snapshot_failed": logging.WARNING,
     "log_snapshot_damaged": logging.WARNING,
 }
-"""The levels of what the native log tells."""
+"""The levels of native log events."""
 
 
 class LogNotJoined(OSError):
-    """A log can't be used. `is_settings` tells whether another start can't change that."""
+    """A log can't be used. With `is_settings`, starting again does not help."""
 
     def __init__(self, message: str, *, is_settings: bool) -> None:
         super().__init__(message)
@@ -146,7 +146,7 @@ class SharedLogs(Part):
         """Logs what has happened since the last call."""
         for name, log in self._logs.items():
             for event, fields in log.events(0):
-                # Whoever may publish to a log can cause these.
+                # Limited: any publisher can cause these events.
                 log_lines.limited(EVENTS[event], event, kind=name, log=name, **fields)
 
 

@@ -33,7 +33,7 @@ class GatewayService(Service):
                 raise OSError(f"gateway.device_tls: {error}") from error
 
     def adapters(self, config: Config, running: Services) -> Iterator[Supervisor]:
-        """Yields the adapter, if there is the section."""
+        """Yields the adapter, if configured."""
         if config.gateway is None:
             return
         from holdfast.gateway import Gateway

@@ -22,7 +22,7 @@ class ScannerService(Service):
     """The service of the section `nats`."""
 
     def adapters(self, config: Config, running: Services) -> Iterator[Supervisor]:
-        """Yields the adapter, if there is the section."""
+        """Yields the adapter, if configured."""
         if config.nats is None:
             return
         from holdfast.scanner.adapter import ScannerAdapter

@@ -37,8 +37,8 @@ def fleet() -> None:
 def status(fleet: str, servers: Servers, as_json: bool, watch: bool) -> None:
     """Show the nodes of the fleet NAME, and what each of them does.
 
-    Exit codes: 0 every partition has a node, 1 NATS can't be reached, 3 there is no live node, or
-    a partition has none.
+    Exit codes: 0 every partition has a node, 1 NATS can't be reached or has no such fleet, 3 there
+    is no live node, or a partition has none.
     """
     try:
         is_well = event_loop.run(_status(fleet, servers, as_json, watch))
@@ -97,10 +97,10 @@ def _lines(shown: dict[str, Any]) -> list[str]:
 @option("--prefix", "SUBJECT", "First part of all subjects.", default=PREFIX)
 @nats_options
 def drain(name: str, node: str, prefix: str, servers: Servers) -> None:
-    """Have NODE of the fleet NAME hand its devices over to the other nodes, and end.
+    """Make NODE of the fleet NAME hand over its devices to the other nodes, and exit.
 
-    Returns when the node has left. Exit codes: 0 it has left, 1 there is no such node, or it did
-    not leave.
+    Returns when the node has left. Exit codes: 0 it has left, 1 NATS or the node can't be reached,
+    or the node did not leave.
     """
     try:
         event_loop.run(_drain(name, node, prefix, servers))

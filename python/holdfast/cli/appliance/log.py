@@ -1,4 +1,4 @@
-"""`holdfast log`: the logs that appliances share: nodes, past, backups, and servers."""
+"""`holdfast log`: status, replay, backup, restore and replicas of shared logs."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ def backup(file: Path, folder: Path, name: str | None) -> None:
 @click.argument("folder", type=FOLDER)
 @log_option
 def restore(file: Path, folder: Path, name: str | None) -> None:
-    """Put the backup FOLDER on the servers of the configuration FILE, which don't have the log.
+    """Restore the backup FOLDER to the servers of FILE, which must not have the log yet.
 
-    The log has as many `replicas` as FILE says. No node of it may run.
+    The log gets the `replicas` of FILE. No node of it may run.
     """
     with _servers(file, name) as (found, settings, servers):
         messages = log_backup.restore(servers, found, settings.replicas, folder)
@@ -74,7 +74,7 @@ def restore(file: Path, folder: Path, name: str | None) -> None:
 @config_argument
 @log_option
 def replicas(file: Path, name: str | None) -> None:
-    """Have the log kept by as many servers as `replicas` in FILE says. Nodes may run."""
+    """Set the number of servers that store the log to `replicas` in FILE. Nodes may run."""
     with _servers(file, name) as (found, settings, servers):
         changed = log_backup.set_replicas(servers, found, settings.replicas)
     for stream, (before, now) in changed.items():

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 FILE = "file:"
-"""Before the number of a file, in the place of an area."""
+"""Prefix of a file number, in place of an area."""
 
 
 class KeptArea(NamedTuple):
@@ -34,7 +34,7 @@ class KeptArea(NamedTuple):
 def contents(file: Path, *, set_aside: bool = False) -> dict[str, dict[Area, KeptArea]]:
     """The areas of each memory in a file, after a check of the whole file. Raises `OSError`.
 
-    With `set_aside`, what was cut from them because their configuration had other areas.
+    With `set_aside`, the values that were cut because the configured areas had changed.
     """
     found = _core.read_memory_file(str(file), set_aside=set_aside)
     return {
@@ -47,7 +47,7 @@ def contents(file: Path, *, set_aside: bool = False) -> dict[str, dict[Area, Kep
 
 
 def replace(file: Path, memory: str, runs: Iterable[InitialRun], *, merge: bool) -> None:
-    """Stores values in a memory of the file; all others become 0, unless they are merged.
+    """Stores values in a memory of the file. Without `merge`, all its other values become 0.
 
     Raises `OSError` for a file that can't be used, and `OutOfRange`.
     """
@@ -71,12 +71,12 @@ def replace(file: Path, memory: str, runs: Iterable[InitialRun], *, merge: bool)
 
 
 def release(file: Path, memory: str) -> None:
-    """Deletes what is set aside of a memory of the file. Raises `OSError`."""
+    """Deletes what a memory of the file has set aside. Raises `OSError`."""
     _core.release_memory_file(str(file), memory)
 
 
 def csv_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]:
-    """Lines of area,address,value; those with the value 0 only if `zeros` are wanted."""
+    """Lines of area,address,value; those with the value 0 only with `zeros`."""
     yield "area,address,value"
     for area, kept in areas.items():
         for address, value in zip(kept.addresses, kept.values, strict=True):

@@ -55,7 +55,7 @@ class _Shared:
 class AddressChecks:
     """Checks the URLs of devices, links and receivers of one file; files are relative to `folder`.
 
-    A link decides for the devices at its address, except for what they set differently.
+    Devices at the address of a link use its settings, and may not set different ones.
     """
 
     scope: Scope
@@ -107,12 +107,12 @@ class AddressChecks:
             check_readable(path, Path(file), self.report, shown=f"{key}={show(name)}")
 
     def _tolerance(self, path: KeyPath, target: Target, user: User) -> Target:
-        """The target with what its device needs tolerated."""
+        """The target with the tolerance of its user, checked."""
         if not given(user, "tolerance"):
             return target
         where = (*path, "tolerance")
         if target.tolerance != STRICT:
-            message = "found together with options of the URL, allowed: one of both"
+            message = "found together with options of the URL, allowed: only one of them"
             self.report.add_key(where, message)
         with until_invalid():
             block = user.tolerance
@@ -125,7 +125,7 @@ class AddressChecks:
         return replace(target, tolerance=STRICT)
 
     def _shared(self, path: KeyPath, target: NetworkTarget, retry: RetryConfig, user: User) -> None:
-        """What all at one network address share."""
+        """Checks that all users of an address have equal settings."""
         key = (target.transport, target.host, target.port)
         settings = _Shared(target.tolerance, user.in_flight, retry)
         first, other = self._addresses.setdefault(key, (path, settings))
@@ -159,7 +159,7 @@ class AddressChecks:
         port = os.path.realpath(target.device)
         if port in self._listener_ports:
             self._refuse_used((*path, "url"), target.device, self._listener_ports[port])
-        first, other, pauses = self._lines.setdefault(port, (path, target, retry))
+        first, other, other_retry = self._lines.setdefault(port, (path, target, retry))
         if path[0] == "links" and first != path:
             self._second_link(path, first)
             return
@@ -168,7 +168,7 @@ class AddressChecks:
         if replace(target, device=other.device) != other:
             message = f"found line settings that differ from those of {self.report.named(first)}"
             self.report.add((*path, "url"), f"{message}, allowed: the same settings")
-        elif retry != pauses and not (first[0] == "links" and not given(user, "retry")):
+        elif retry != other_retry and not (first[0] == "links" and not given(user, "retry")):
             self._different(path, "retry", user, first)
 
     def _second_link(self, path: KeyPath, first: KeyPath) -> None:

@@ -108,7 +108,8 @@ class RestConfig(Model):
     sources: Sources
     """Networks and addresses of the clients, IPv4 or IPv6."""
     tokens: Tokens[TokenConfig]
-    """The tokens. none: everyone can do everything; only on a loopback address."""
+    """The tokens. none: everyone can read and write all memories, but nobody can list or end
+    sessions; only on a loopback address."""
     max_body: Annotated[int, Field(ge=1024, le=2**30)] = 8 * 2**20
     """Maximum number of bytes in the body of a request."""
     max_connections: Connections = 64

@@ -30,7 +30,7 @@ KIND = ("listener", "adapter", "reason", "role")
 # Refused connections and failed handshakes.
 CONNECTIONS = ("refused_source", "refused_full", "refused_role", "tls_failed")
 
-# Refused requests of listeners. They are reported once for each connection.
+# Refused requests of listeners. All but refused_listen_only are reported once for each connection.
 REQUESTS = ("refused_function", "refused_unit", "refused_address", "refused_listen_only")
 
 # Requests over HTTP from somebody without the right.

@@ -35,7 +35,7 @@ PRIVATE = tuple(
 )
 """The default allow list."""
 
-WHERE = "allow it with --allow, or in nats.devices of the configuration"
+HINT = "allow it with --allow, or in nats.devices of the configuration"
 
 
 class AllowedDevices:
@@ -47,7 +47,7 @@ class AllowedDevices:
         tls: Tls = NO_FILES,
         shared_poller: Poller | None = None,
     ) -> None:
-        """`shared_poller` may have connections of others to the same devices."""
+        """`shared_poller` may already have connections to the same devices."""
         self._list = AllowList(tuple(entries) or PRIVATE)
         self._tls = tls
         self._shared_poller = shared_poller
@@ -57,8 +57,8 @@ class AllowedDevices:
         """Returns the address of a target, see `address`, and its endpoint. Raises `Refused`."""
         address = await self.address(target, after=after)
         if self._shared_poller is not None and target != address:
-            # The appliance may use the device by its name, and a device may accept no second
-            # connection. Then its link is used, which a name identifies.
+            # The appliance may be connected to the device by its name, and a device may accept
+            # no second connection. Then the link of the appliance is used.
             by_name = endpoint_of(target, self._tls)
             if self._shared_poller.known_link(str(target), by_name) is not None:
                 return address, by_name
@@ -72,7 +72,7 @@ class AllowedDevices:
         """
         if isinstance(target, SerialTarget):
             if not self._list.allows_device(target.device):
-                raise Refused(f"{target.device} is not allowed; {WHERE}")
+                raise Refused(f"{target.device} is not allowed; {HINT}")
             return target
         allowed = await self._addresses(target)
         last = after.host if isinstance(after, NetworkTarget) else ""

@@ -1,7 +1,7 @@
 """The registry of all subscriptions. A request is carried out completely or not at all.
 
-All checks run before the first change, without an await in between. A `Subscription` was checked
-alone before; the registry compares it with those that it has.
+All checks run before the first change, without an await in between. A `Subscription` is already
+checked on its own; the registry checks it against all others.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Change:
     fresh: Collection[str] = ()
     """The tags whose next values are published even if unchanged: the subscriber waits for them."""
     only_adds_tags: bool = False
-    """Whether a known subscriber has requested only tags that are new."""
+    """Whether a known subscriber requested no tag that the device already had."""
 
 
 class Registry:
@@ -211,7 +211,7 @@ class Registry:
         matches = {
             (device, id) for id in self._ids(name) for device in self._devices_of_tag.get(id, ())
         }
-        # Device ids and tag ids may have dots, so each dot may be the border between them.
+        # Device ids and tag ids may have dots, so each dot may separate the two.
         parts = name.split(".")
         for at in range(1, len(parts)):
             device = ".".join(parts[:at])
@@ -249,7 +249,7 @@ class Registry:
             )
 
     def _check_shared(self, subscription: Subscription) -> None:
-        """Checks that a new device has the settings of the devices that share its connection."""
+        """Checks that a device has the settings of others on its connection. Raises `Refused`."""
         target = subscription.source.target
         place = _connection(target)
         sharing = (

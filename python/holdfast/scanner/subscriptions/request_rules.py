@@ -1,4 +1,4 @@
-"""How requests are understood: limits, what they leave out, and how strictly they are checked."""
+"""The rules for requests: limits, default values, and how strictly requests are checked."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ScannerLimits:
 
     @property
     def connections(self) -> int:
-        """The most connections to devices: one to each, and one beside it that is being closed."""
+        """The maximum number of connections to devices: one each."""
         return self.devices
 
 

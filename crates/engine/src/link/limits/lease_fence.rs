@@ -17,7 +17,7 @@ use tokio::time::sleep_until;
 pub enum Stage {
     /// Nothing is sent, and connections are closed.
     Closed,
-    /// Polls that have begun end, and none begins.
+    /// Running polls may finish; no new ones begin.
     Ending,
     Open,
 }
@@ -29,7 +29,7 @@ pub struct Fence {
     zero: Instant,
     /// In nanoseconds after `zero`; 0 if it was never opened, or is closed.
     until: AtomicU64,
-    /// When everything that a former holder has sent has ended, but for the timeout of the device.
+    /// When requests of a former holder arrive no more, not counting the timeout of the device.
     settled: AtomicU64,
     is_ending: AtomicBool,
     /// Polls, writes and connections.
@@ -75,7 +75,7 @@ impl Fence {
         }
     }
 
-    /// Lets polls that have begun end, and none begin. The end must still be moved meanwhile.
+    /// Lets running polls finish, and no new ones begin. Go on to renew it meanwhile.
     pub fn end(&self) {
         self.is_ending.store(true, Ordering::Release);
         self.announce();
@@ -147,7 +147,7 @@ impl Fence {
 
     async fn wait(&self, is_reached: impl Fn(Stage) -> bool) {
         let mut stage = self.stage.subscribe();
-        // What was announced may be over: the clock decides.
+        // The announced stage may be out of date: the clock decides.
         while !is_reached(self.stage()) {
             if is_reached(*stage.borrow_and_update()) {
                 self.announce();

@@ -15,8 +15,8 @@ const MAX_AUTO_IN_FLIGHT: usize = 16;
 /// Answers after which `auto` judges how many are in flight.
 const ANSWERS_PER_DECISION: usize = 20;
 
-/// A round trip may take so much longer than that of a single request before the device is held to
-/// answer one request after the other.
+/// Round trips may take so many times as long as that of a single request before the device is assumed
+/// to answer one request after the other.
 const MAX_FLAT_RATIO: f64 = 1.25;
 
 /// `auto` tries more requests in flight again after this time.
@@ -26,7 +26,7 @@ const RETRY_AFTER: Duration = Duration::from_secs(300);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InFlight {
     Fixed(u16),
-    /// More while round trips stay as short as those of single requests, one after a timeout.
+    /// More while round trips stay as short as those of single requests; after a timeout, one.
     Auto,
 }
 
@@ -51,7 +51,7 @@ struct Places {
     owed: Cell<usize>,
 }
 
-/// A request may be in flight while it lasts.
+/// Lets a request be in flight while it lasts.
 pub(in crate::link) type Place<'p> = (Free, Option<SemaphorePermit<'p>>, RwLockReadGuard<'p, ()>);
 
 /// While it lasts, no other request is in flight.
@@ -66,7 +66,7 @@ struct Auto {
     answers: Vec<Duration>,
     /// The median round trip of single requests.
     alone: Option<Duration>,
-    /// No more places before.
+    /// No places are added before this time.
     settled: Option<Instant>,
 }
 
@@ -190,7 +190,7 @@ impl Auto {
     }
 
     fn answered(&mut self, took: Duration, was_full: bool, now: Instant) -> Change {
-        // Answers while places are free say nothing of more requests.
+        // While places are free, answers don't show whether more requests help.
         if !was_full {
             return Change::None;
         }
@@ -215,7 +215,7 @@ impl Auto {
         Change::More
     }
 
-    /// Places that are too many now.
+    /// Lowers the limit. Returns how many places are too many now.
     fn back_to(&mut self, limit: usize, now: Instant) -> usize {
         let fewer = self.limit - limit;
         *self = Auto { alone: self.alone, limit, ..Auto::new() };

@@ -9,7 +9,7 @@ use std::task::{Context, Poll};
 use tokio::sync::oneshot;
 use tokio::sync::oneshot::error::RecvError;
 
-/// A request and its reply.
+/// The two ends of a reply: where it is sent, and where it is awaited.
 pub(crate) fn pending_reply() -> (ReplyTo, PendingReply) {
     let (to, from) = oneshot::channel();
     let unwanted = Arc::new(AtomicBool::new(false));
@@ -21,7 +21,7 @@ pub(crate) fn pending_reply() -> (ReplyTo, PendingReply) {
 pub(crate) struct Reply {
     /// Empty after a broadcast.
     pub(crate) pdu: Vec<u8>,
-    /// Where the log of a memory has the write. `None` for devices.
+    /// The sequence of the write in the log of a memory. `None` without a log.
     pub(crate) log_sequence: Option<u64>,
 }
 
@@ -43,7 +43,7 @@ impl ReplyTo {
         self.send_written(pdu, None);
     }
 
-    /// Sends the reply to a write, which a log may have.
+    /// Sends the reply to a write, with its sequence if a log has it.
     pub(crate) fn send_written(self, pdu: Vec<u8>, log_sequence: Option<u64>) {
         // Fails if the client has disconnected.
         let _ = self.to.send(Reply { pdu, log_sequence });

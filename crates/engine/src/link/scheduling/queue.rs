@@ -29,12 +29,12 @@ pub(crate) enum Priority {
     Doubtful,
     /// A read of a preferred source.
     Preferred,
-    /// A write, or a request with a person or program waiting for it.
+    /// A request that may change a device, or a read that is a part of one.
     Urgent,
 }
 
 impl Priority {
-    /// That of a request of `peer`, which is `None` on a serial line and for an event loop.
+    /// The priority of a request of `peer`: `None` on a serial line and for an event loop.
     pub(in crate::link) fn of(
         request: &EncodedRequest,
         peer: Option<IpAddr>,
@@ -58,7 +58,7 @@ impl Priority {
 }
 
 pub(in crate::link) struct Queue<T> {
-    ranks: [TakingTurns<T>; RANKS],
+    ranks: [RoundRobin<T>; RANKS],
     passed_over: [u32; RANKS],
 }
 
@@ -88,18 +88,18 @@ impl<T> Queue<T> {
 }
 
 /// Sources that take turns.
-struct TakingTurns<T> {
+struct RoundRobin<T> {
     /// Every source has at least one item.
     sources: VecDeque<(u64, VecDeque<T>)>,
 }
 
-impl<T> Default for TakingTurns<T> {
-    fn default() -> TakingTurns<T> {
-        TakingTurns { sources: VecDeque::new() }
+impl<T> Default for RoundRobin<T> {
+    fn default() -> RoundRobin<T> {
+        RoundRobin { sources: VecDeque::new() }
     }
 }
 
-impl<T> TakingTurns<T> {
+impl<T> RoundRobin<T> {
     fn is_empty(&self) -> bool {
         self.sources.is_empty()
     }

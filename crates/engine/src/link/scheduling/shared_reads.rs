@@ -43,7 +43,7 @@ impl SharedReads {
         SharedReads { coalesce, keep, waiting: RefCell::default(), cached: RefCell::default() }
     }
 
-    /// Waits with an equal read if there is one: then it has the reply, and this is `None`.
+    /// Adds the reply to an equal read that waits, and returns `None`; without one, returns a `Joining`.
     pub(in crate::link) fn join(&self, read: Option<Read>, reply: Reply) -> Option<Joining<'_>> {
         let Some(read) = read.filter(|_| self.coalesce) else {
             return Some(Joining { reads: self, read: None, first: Some(reply) });
@@ -57,7 +57,7 @@ impl SharedReads {
         Some(Joining { reads: self, read: Some(read), first: None })
     }
 
-    /// A reply to an equal read that still holds. `changes` counts what may have changed devices.
+    /// A valid reply to an equal read. `changes` counts requests that may have changed a device.
     pub(in crate::link) fn cached(&self, read: &Read, changes: u64) -> Option<Vec<u8>> {
         if self.keep.is_zero() {
             return None;
@@ -92,7 +92,7 @@ pub(in crate::link) struct Joining<'r> {
 }
 
 impl Joining<'_> {
-    /// It is sent now: equal reads from now on are answered by a later request.
+    /// The request is sent now: later equal reads are answered by another one.
     pub(in crate::link) fn leave(mut self) -> Vec<Reply> {
         let joined =
             self.read.take().and_then(|read| self.reads.waiting.borrow_mut().remove(&read));
