@@ -240,10 +240,11 @@ class Memory:
     def write(self, area: str, address: int, values: Iterable[int]) -> None:
         """Writes bits (0, 1, False, True) or registers (integers 0 to 65535) in one step.
 
-        Raises `OutOfRange` outside the area, `ValueError` for no values, a value out of range or an
-        unknown area, `TypeError` for a value of another type, `OSError` if the memory is kept in a
-        file or a log that can't be written. An error changes nothing, except that a log may still
-        carry out a write that it did not confirm in time.
+        Raises `OutOfRange` outside the area, `ValueError` for no values, a value out of range, an
+        unknown area or a reserved range, `TypeError` for a value of another type, `OSError` if the
+        memory is kept in a file or a log that can't be written, or the values of a mirrored device
+        are too old. An error changes nothing, except that a log may still carry out a write that it
+        did not confirm in time.
         """
 
     def write_many(self, writes: Sequence[tuple[str, int, Iterable[int]]]) -> None:
@@ -461,6 +462,7 @@ class BatchRefused(ValueError):
         "wrong_length",
         "not_registers",
         "mirrored",
+        "stale",
         "not_one_step",
         "not_stored",
         "log_unavailable",
@@ -1327,7 +1329,7 @@ class Fence:
         """Moves the end, never to an earlier time. Without effect if it was closed."""
 
     def end(self) -> None:
-        """Lets polls that have begun end, and none begin. Go on to renew it meanwhile."""
+        """Lets running polls finish, and no new ones begin. Go on to renew it meanwhile."""
 
     def close(self) -> None: ...
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import threading
 from hashlib import sha256
@@ -161,7 +162,7 @@ def test_datagrams_and_packets_are_audited(run: Run, tmp_path: Path) -> None:
     ]
 
 
-def test_what_comes_by_a_door_is_audited_before_it_is_answered(run: Run, tmp_path: Path) -> None:
+def test_what_a_service_writes_is_audited_before_it_is_answered(run: Run, tmp_path: Path) -> None:
     appliance = run(CONFIGURATION)
     audit = appliance._parts().audit.log
     assert audit is not None
@@ -178,6 +179,25 @@ def test_what_comes_by_a_door_is_audited_before_it_is_answered(run: Run, tmp_pat
         {**rest, **place, "values": [1, 0], "outcome": "done"},
         {**rest, **place, "index": 0, "value": "2", "command": 1, "outcome": "invalid_value"},
     ]
+
+
+def test_a_write_of_values_that_become_stale_after_its_check_is_recorded_as_refused(
+    tmp_path: Path,
+) -> None:
+    memory, age = holdfast.Memory(holding_registers=8), _core.MirrorAge(3600, refuses=False)
+    memory.mirror([], [("holding_registers", 0, 4, age)])
+    audit = Audit(tmp_path / "audit.log", max_bytes=65536, keep=1)
+    memory_access = MemoryAccess("rest", {"plant": memory}, audit)
+    grant = Grant("gateway", ("plant",), ("holding_registers",))
+    command = {"memory": "plant", "area": "holding_registers", "address": 3, "values": [7]}
+    finish = memory_access.begin(json.dumps(command).encode(), grant, "127.0.0.1:9")
+    age.set(3600, refuses=True)
+    with pytest.raises(Refused, match="too old"):
+        finish()
+    assert [line["outcome"] for line in audited(tmp_path, 1)] == ["stale"]
+    age.set(3600, refuses=False)
+    memory_access.write([command], grant, "127.0.0.1:9")
+    assert [line["outcome"] for line in audited(tmp_path, 2)] == ["stale", "done"]
 
 
 def test_a_record_is_written_without_waiting_for_a_timeout(

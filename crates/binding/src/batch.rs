@@ -77,8 +77,8 @@ impl Batch {
         checked.map_err(|error| refused(py, error))
     }
 
-    /// The lines of the audit log for its writes, without time and place: `origin` is the beginning of
-    /// each, `names` are those of the memories in JSON.
+    /// The lines of the audit log for its writes, without time and place in the chain. Each begins
+    /// with `origin`; `names` are the names of the memories in JSON.
     #[pyo3(signature = (origin, names, outcome, sequence=None))]
     fn lines<'py>(
         &self,
@@ -93,11 +93,13 @@ impl Batch {
         lines.iter().map(|line| PyBytes::new(py, line)).collect()
     }
 
-    /// Whether `write` can still refuse it: a journal, or because a memory is not sealed.
+    /// Whether `write` can still refuse: by a journal, or because a memory is not sealed, or values are stale.
     #[getter]
     fn is_refusable(&self) -> bool {
-        let mut memories = self.writes.iter().map(|write| &*write.memory.get().core);
-        self.access == Access::Restore || memories.any(Core::has_journal)
+        let can_refuse = |&Checked { ref memory, area, address, count }: &Checked| {
+            memory.get().core.can_refuse_checked(area, address, count)
+        };
+        self.access == Access::Restore || self.writes.iter().any(can_refuse)
     }
 
     /// Writes all values atomically. Returns their number, and the sequence of the step if a log has
@@ -122,7 +124,7 @@ impl Batch {
         Ok((self.writes.iter().map(|write| write.count).sum(), sequence))
     }
 
-    /// The lines of the audit log, without time and place.
+    /// The lines of the audit log, without time and place in the chain.
     pub fn records(
         &self,
         origin: &[u8],

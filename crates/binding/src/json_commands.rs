@@ -1,8 +1,8 @@
 //! `Commands` and `ParsedWrites`: JSON commands in their plain form, which nearly all have: one object,
 //! without escapes in its text, and integers as values.
 //!
-//! Nothing is refused here: what has another form, or can't be carried out, takes the way of all other
-//! commands.
+//! Nothing is refused here: what has another form, or can't be carried out, is handled as any other
+//! request.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -29,7 +29,7 @@ pub struct Commands {
     most: usize,
 }
 
-/// The name of a memory, the same in JSON, the memory, and areas.
+/// A memory's name, its name in JSON, the memory, and the areas.
 type Given<'py> = (Bound<'py, PyString>, Vec<u8>, Py<Memory>, Vec<String>);
 
 struct Target {
@@ -54,8 +54,8 @@ impl Commands {
 }
 
 impl Commands {
-    /// The memory's name, the same in JSON, and the write, if the command has the plain form and is granted, and its
-    /// memory takes it at once.
+    /// The memory's name, its name in JSON, and the write. `None` if the command has another form or is not granted,
+    /// or its memory does not take it at once.
     pub fn parsed(&self, py: Python<'_>, body: &[u8]) -> Option<(Py<PyString>, Bytes, Batch)> {
         if body.len() > self.most {
             return None;
@@ -64,7 +64,8 @@ impl Commands {
         let target = self.targets.get(memory)?;
         let area = target.areas.iter().copied().find(|known| known.name() == area)?;
         let (core, count) = (&target.memory.get().core, values.len());
-        if core.has_journal() || !core.span(area).holds(address, count) {
+        let is_there = core.span(area).holds(address, count);
+        if !is_there || core.can_refuse_checked(area, address, count) {
             return None;
         }
         let mut bytes = vec![0; area.byte_len(count)];
@@ -118,8 +119,8 @@ impl ParsedWrites {
 
 #[pymethods]
 impl ParsedWrites {
-    /// The lines of the audit log, without time and place. Each begins with the first part, the address
-    /// of the peer, and the second part.
+    /// The lines of the audit log, without time and place in the chain. Each begins with `before`, the
+    /// address of the peer, and `after`.
     fn lines<'py>(&self, py: Python<'py>, before: &[u8], after: &[u8]) -> Vec<Bound<'py, PyBytes>> {
         let writes = self.writes();
         let lines = writes.open.iter().map(|write| {
