@@ -6,6 +6,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -195,6 +196,78 @@ def test_a_full_disk_leaves_the_file_as_it_was(opened: Opened, tmp_path: Path) -
     assert (stored.count, numbers(stored.first())) == (3, [0, 1, 2])
     stored.remove_first()
     assert stored.count == 0
+
+
+def test_a_removal_that_fails_changes_nothing(opened: Opened, tmp_path: Path) -> None:
+    stored = opened(tmp_path / "b.db")
+    stored.add(numbered(3))
+    # The commit fails, because a row refers to the one that is removed.
+    stored._db.executescript(
+        "PRAGMA foreign_keys=ON;"
+        "CREATE TABLE other (id REFERENCES readings DEFERRABLE INITIALLY DEFERRED);"
+        "INSERT INTO other SELECT id FROM readings"
+    )
+    for _ in range(2):
+        assert numbers(stored.first()) == [0, 1, 2]
+        with pytest.raises(OSError, match="FOREIGN KEY constraint failed"):
+            stored.remove_first()
+        assert stored.count == 3
+    stored._db.execute("DROP TABLE other")
+    stored.remove_first()
+    assert (stored.first(), stored.count) == ([], 0)
+
+
+def test_an_empty_file_is_small(opened: Opened, tmp_path: Path) -> None:
+    file = tmp_path / "b.db"
+    stored = opened(file)
+    empty = file.stat().st_size
+    stored.add([reading("x" * 1_000_000)])
+    assert file.stat().st_size > 1_000_000
+    stored.first()
+    stored.remove_first()
+    assert file.stat().st_size <= 2 * empty
+
+
+def test_a_batch_that_the_file_has_dropped_takes_no_other_with_it(
+    opened: Opened, tmp_path: Path
+) -> None:
+    """It is sent all the same, and only then removed."""
+    buffer = Buffer()
+    buffer.stored = opened(tmp_path / "b.db", max_bytes=250)
+    for start in range(0, 8, 4):
+        buffer.offer(numbered(4, start))
+        buffer.keep()
+    assert numbers(buffer.take(9, 0)) == [0, 1, 2, 3]
+    buffer.offer(numbered(4, 8))
+    buffer.keep()
+    assert buffer.dropped == 4
+    assert drained(buffer) == list(range(12))
+
+
+def test_a_value_of_a_changed_tag_keeps_its_meaning(opened: Opened, tmp_path: Path) -> None:
+    stored = opened(tmp_path / "b.db")
+    before = tag("t", type="uint16", scale=0.1, description="before")
+    stored.add([reading(21.5, tag=before)])
+    stored.close()
+    for now, kind in (
+        (tag("t", type="uint16"), "float64"),
+        (tag("t", type="uint16", scale=0.1, unit="V"), "float64"),
+        (tag("t", type="uint16", scale=0.1, description="after"), "uint16"),
+    ):
+        again = opened(tmp_path / "b.db", known=[now])
+        [found] = again.first()
+        assert (found.value, found.tag.type) == (21.5, kind)
+        again.close()
+
+
+def test_a_file_of_an_earlier_version_has_values_without_a_meaning(
+    opened: Opened, tmp_path: Path
+) -> None:
+    stored = opened(tmp_path / "b.db")
+    plain = msgspec.msgpack.encode([("pump", "t", 21.5, 1.0, 0, None)])
+    stored._db.execute("INSERT INTO readings (count, data) VALUES (1, ?)", (plain,))
+    stored.close()
+    assert opened(tmp_path / "b.db").first() == [reading(21.5, 1.0)]
 
 
 @settings(max_examples=examples(60), deadline=None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import http.client
 import socket
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -35,7 +36,7 @@ class Database(ThreadingHTTPServer):
         self.requests: list[tuple[str, dict[str, str]]] = []
         self.connections = 0
         self.status, self.answer = 204, b""
-        self.closes = False
+        self.closes = self.says_so = False
 
     @property
     def url(self) -> str:
@@ -59,6 +60,8 @@ class Handler(BaseHTTPRequestHandler):
             self.server.points += parsed(body)
         self.send_response(self.server.status)
         self.send_header("Content-Length", str(len(self.server.answer)))
+        if self.server.says_so:
+            self.send_header("Connection", "close")
         self.end_headers()
         self.wfile.write(self.server.answer)
         self.close_connection = self.server.closes
@@ -128,6 +131,17 @@ def test_a_token_is_read_for_each_request(database: Database, tmp_path: Path) ->
     assert tokens == ["Token one", "Token two"]
 
 
+@pytest.mark.parametrize("token", ["tokén", "to‑ken", "one\ntwo"])
+def test_a_token_that_no_header_can_have_is_an_error_of_its_file(
+    database: Database, tmp_path: Path, token: str
+) -> None:
+    (tmp_path / "t").write_text(token, encoding="utf-8")
+    output = influx(database.url, bucket="b", token_file=str(tmp_path / "t"))
+    with pytest.raises(OSError, match=r"t is not one line of printable ASCII"):
+        output.send(numbered(1))
+    output.close()
+
+
 @pytest.mark.parametrize(
     ("status", "error"),
     [
@@ -152,11 +166,23 @@ def test_what_is_not_taken_says_why(
     assert len(database.points) == 1
 
 
-def test_a_connection_that_was_closed_meanwhile_is_opened_again(database: Database) -> None:
-    output = influx(database.url, bucket="b")
-    database.closes = True
+@pytest.mark.parametrize("says_so", [False, True])
+def test_a_connection_that_was_closed_meanwhile_is_opened_again(
+    database: Database, says_so: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    timeouts: list[float | None] = []
+    getresponse = http.client.HTTPConnection.getresponse
+
+    def noted(connection: http.client.HTTPConnection) -> http.client.HTTPResponse:
+        timeouts.append(connection.sock.gettimeout())
+        return getresponse(connection)
+
+    monkeypatch.setattr(http.client.HTTPConnection, "getresponse", noted)
+    output = influx(database.url, bucket="b", timeout=60)
+    database.closes, database.says_so = True, says_so
     for start in range(3):
         output.send(numbered(1, start))
+    assert set(timeouts) == {60}
     output.close()
     assert [point.fields["t"] for point in database.points] == [0, 1, 2]
     assert database.connections == 3

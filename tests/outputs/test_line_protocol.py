@@ -56,8 +56,12 @@ def test_floats_have_their_digits_and_wide_integers_are_floats() -> None:
         reading(230.10000610351562, tag=tag("v", type="float32")),
         reading(7, tag=tag("n", type="uint64")),
         reading(None, tag=tag("m", type="uint64")),
+        reading([1, 2**64 - 1, None], tag=tag("a", type="uint64[3]")),
+        # It waited since its tag had another type.
+        reading("on", tag=tag("s", type="uint64")),
     ]
-    expected = f"modbus,device=pump v=230.1,n=7.0 {AT}\n"
+    fields = 'v=230.1,n=7.0,a[0]=1.0,a[1]=1.8446744073709552e+19,s="on"'
+    expected = f"modbus,device=pump {fields} {AT}\n"
     assert lines(readings, "modbus", {}).decode() == expected
 
 

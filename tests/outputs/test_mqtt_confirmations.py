@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
 
 from holdfast.config.models.outputs import MqttOutputConfig
 from holdfast.net.mqtt.packets import parse_publish
 from holdfast.net.mqtt.stream import Packets
-from holdfast.outputs.mqtt import MqttOutput
+from holdfast.outputs.mqtt import MqttOutput, session
 from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES
 from holdfast.runtime.stop import Stop
-from support.readings import numbered
+from support.mqtt_peer import CONNECT, DISCONNECT, FakeBroker, Peer
+from support.readings import TIME, numbered, reading, tag
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from holdfast.polling import Reading
+    from holdfast.tags import Tag
 
 
 class Broker:
@@ -27,7 +33,7 @@ class Broker:
 
     def __init__(self, *confirms: int) -> None:
         self._confirms = confirms
-        self.seen: list[list[int]] = []
+        self.seen: list[list[Any]] = []
         self.availability: list[bytes] = []
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port = self._server.getsockname()[1]
@@ -47,7 +53,7 @@ class Broker:
 
     def _serve(self, connection: socket.socket, most: int) -> None:
         packets, confirmed = Packets(MAX_PACKET_BYTES), 0
-        seen: list[int] = []
+        seen: list[Any] = []
         self.seen.append(seen)
         while data := connection.recv(65536):
             for first, body, size in packets.feed(data):
@@ -60,7 +66,7 @@ class Broker:
                 if is_value and confirmed == most:
                     return
                 if is_value:
-                    seen.append(int(float(bytes(message.payload))))
+                    seen.append(msgspec.json.decode(message.payload))
                     confirmed += 1
                 elif message.topic.endswith("/pump"):
                     self.availability.append(bytes(message.payload))
@@ -94,6 +100,21 @@ class Site:
         raise AssertionError("no test of this file writes")
 
 
+class Reloaded(Site):
+    """A site whose tags change."""
+
+    def __init__(self, **tags: list[Tag]) -> None:
+        super().__init__()
+        self._tags = tags
+
+    def tags(self) -> dict[str, Any]:
+        return self._tags
+
+    def reload(self, **tags: list[Tag]) -> None:
+        self.revision += 1
+        self._tags = tags
+
+
 class Pump(Site):
     """A site with one device, which can stop answering right after a look at it."""
 
@@ -118,9 +139,10 @@ def stop() -> Iterator[Stop]:
     made.set()
 
 
-def made(broker: Broker, site: Site, stop: Stop) -> MqttOutput:
-    url = f"mqtt://127.0.0.1:{broker.port}"
-    output = MqttOutput("home", MqttOutputConfig.model_validate({"type": "mqtt", "url": url}), site)
+def made(broker: Broker | FakeBroker, site: Site, stop: Stop, **more: Any) -> MqttOutput:
+    url = broker.url if isinstance(broker, FakeBroker) else f"mqtt://127.0.0.1:{broker.port}"
+    settings = MqttOutputConfig.model_validate({"type": "mqtt", "url": url} | more)
+    output = MqttOutput("home", settings, site)
     output.until(stop)
     return output
 
@@ -136,6 +158,95 @@ def test_a_step_goes_on_where_it_was(stop: Stop) -> None:
     output.close()
     broker.thread.join()
     assert broker.seen == [list(range(4)), list(range(4, 7)), list(range(7, 20))]
+
+
+def test_what_waits_of_a_tag_that_is_removed_is_not_published(stop: Stop) -> None:
+    """Its retained message was removed; the value of a removed tag must not replace it."""
+    broker = Broker(0, 100)
+    site = Reloaded(pump=[tag()], fan=[tag()])
+    output = made(broker, site, stop, retain=False)
+    readings = [reading(1), reading(2, device="fan"), reading(3)]
+    with pytest.raises(OSError, match="connection"):
+        output.send(readings)
+    site.reload(pump=[tag()])
+    output.send(readings)
+    output.close()
+    broker.thread.join()
+    assert broker.seen == [[], [1, 3]]
+
+
+def test_an_object_for_a_device_has_no_tag_that_was_removed(stop: Stop) -> None:
+    broker = Broker(1, 100)
+    site = Reloaded(pump=[tag("a"), tag("b")])
+    output = made(broker, site, stop, retain=False, payload="device", topic="plant/{device}/t")
+    output.send([reading(1, tag=tag("a")), reading(2, tag=tag("b"))])
+    readings = [reading(3, TIME + 5, tag=tag("a")), reading(4, TIME + 5, tag=tag("b"))]
+    with pytest.raises(OSError, match="connection"):
+        output.send(readings)
+    site.reload(pump=[tag("a")])
+    output.send(readings)
+    output.send([reading(5, TIME + 10, tag=tag("a"))])
+    output.close()
+    broker.thread.join()
+    values = [[message["values"] for message in seen] for seen in broker.seen]
+    assert values == [[{"a": 1, "b": 2}], [{"a": 3}, {"a": 5}]]
+
+
+def test_a_device_that_is_removed_while_its_values_wait_is_forgotten(stop: Stop) -> None:
+    broker = Broker(0, 100)
+    site = Reloaded(pump=[tag()], fan=[tag()])
+    output = made(broker, site, stop, retain=False, payload="device", topic="plant/{device}/t")
+    with pytest.raises(OSError, match="connection"):
+        output.send([reading(1)])
+    site.reload(fan=[tag()])
+    output.send([reading(2, device="fan")])
+    output.close()
+    broker.thread.join()
+    assert [[message["values"] for message in seen] for seen in broker.seen] == [[], [{"t": 2}]]
+
+
+def kinds_until_closed(peer: Peer) -> set[int]:
+    """The types of all packets up to the end of the connection."""
+    kinds = set()
+    with contextlib.suppress(EOFError, ConnectionError):
+        while True:
+            kinds.add(peer.receive().kind)
+    return kinds
+
+
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+@pytest.mark.parametrize("ends", [False, True])
+def test_a_broker_that_confirms_nothing_publishes_the_will(
+    stop: Stop, version: str, ends: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A DISCONNECT would remove the will, and the retained `online` would stay."""
+    monkeypatch.setattr(session, "CONFIRM_TIMEOUT_S", 0.0)
+    monkeypatch.setattr(session, "STOP_TIMEOUT_S", 0.0)
+    with FakeBroker(version) as broker, ThreadPoolExecutor(1) as threads:
+        output = made(broker, Site(), stop, version=version)
+        sent = threads.submit(output.idle) if ends else threads.submit(output.send, numbered(1))
+        with broker.accept() as peer:
+            peer.expect(CONNECT)
+            peer.connack()
+            if ends:
+                sent.result()
+                sent = threads.submit(output.close)
+            kinds = kinds_until_closed(peer)
+        if ends:
+            sent.result()
+        else:
+            with pytest.raises(TimeoutError, match="confirmed no message"):
+                sent.result()
+    assert DISCONNECT not in kinds
+
+
+def test_a_password_that_is_too_long_is_an_error_of_its_file(stop: Stop, tmp_path: Path) -> None:
+    (tmp_path / "p").write_bytes(b"x" * 65_536)
+    options = {"username": "me", "password_file": str(tmp_path / "p")}
+    with FakeBroker() as broker:
+        output = made(broker, Site(), stop, **options)
+        with pytest.raises(OSError, match="p holds more than 65535 bytes"):
+            output.idle()
 
 
 def test_a_device_that_stops_answering_between_two_looks_becomes_offline(stop: Stop) -> None:

@@ -176,6 +176,38 @@ def test_what_is_refused_is_counted_and_not_tried_again(
     assert count(caplog, "output_refused") == 1
 
 
+def test_of_a_step_that_is_refused_in_part_the_rest_counts_as_sent(output: Running) -> None:
+    output.receiver.error = Refused("of another type", 1)
+    output.buffer.offer(numbered(3))
+    wire.until(lambda: refused(output) == 1, "it is refused")
+    counted = output.sending.status()["readings"]
+    assert counted == {"sent": 2, "refused": 1, "dropped": 0}
+
+
+def test_what_is_refused_at_the_end_is_not_kept(tmp_path: Path) -> None:
+    output = Running()
+    output.end()
+    output.buffer.offer(numbered(3))
+    output.buffer.stored = Stored(tmp_path / "b.db", 2**30, lambda *_: tag())
+    output.receiver.error = Refused("HTTP 400")
+    output.sending._finish()
+    assert (refused(output), len(output.buffer)) == (3, 0)
+    output.buffer.detach()
+
+
+def test_an_error_that_ends_an_output_leaves_its_values_in_the_file(tmp_path: Path) -> None:
+    receiver, buffer = Fake(), Buffer()
+    receiver.error = RuntimeError("a bug")
+    buffer.offer(numbered(1500))
+    file = tmp_path / "b.db"
+    sending = Sending("out", receiver, buffer, lambda: Stored(file, 2**30, lambda *_: tag()))
+    with pytest.raises(RuntimeError, match="a bug"):
+        sending.run(Stop())
+    stored = Stored(file, 2**30, lambda *_: tag())
+    assert stored.count == 1500
+    stored.close()
+
+
 def test_what_is_left_at_the_end_is_sent() -> None:
     output = Running()
     output.buffer.offer(numbered(2500))

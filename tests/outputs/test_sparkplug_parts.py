@@ -12,10 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from holdfast.config.models.outputs import SparkplugConfig
+from holdfast.outputs import Refused
 from holdfast.outputs.sparkplug.datatypes import datatype_of, value_of
 from holdfast.outputs.sparkplug.definition import Metric, parsed
 from holdfast.outputs.sparkplug.node import EdgeNode, Names
-from holdfast.outputs.sparkplug.output import PrimaryHost
+from holdfast.outputs.sparkplug.output import PrimaryHost, SparkplugOutput
 from holdfast.polling import Reading
 from holdfast.polling.faults import FAULTS
 from holdfast.tags import Tag
@@ -323,6 +325,90 @@ def test_a_tag_that_is_no_more_has_no_data() -> None:
     made = node(reading(5, 10.0))
     gone = Tag("gone", "input_registers", 5)
     assert kinds(made.data([reading(5, 11.0, gone), reading(5, 11.0, device="fan")], latest)) == []
+
+
+FLOW = Tag("flow", "input_registers", 2, "uint16[2]", null=frozenset({65535}))
+"""Each item has a metric of its own."""
+
+
+@pytest.mark.parametrize(
+    ("value", "of"),
+    [
+        (7, Tag("speed", "input_registers", 0, scale=0.1)),
+        ("on", Tag("speed", "input_registers", 0, "string:2")),
+        # The tag of a value that was stored by an earlier version is that of now.
+        ("on", SPEED),
+        ([1, 2], SPEED),
+        (1.5, SPEED),
+        (-1, SPEED),
+        ([1], FLOW),
+        (7, FLOW),
+    ],
+)
+def test_a_value_from_before_a_change_of_its_tag_is_left_out(value: Any, of: Tag) -> None:
+    made = EdgeNode(Names("group", "edge"))
+    made.begin()
+    made.adopt({"pump": [SPEED, LEVEL, FLOW]})
+    list(made.births({"pump": True}, lambda: latest(reading(5, 10.0))))
+    old = reading(value, 10.5, of)
+    some = [reading(6, 11.0), reading(8, 11.0, LEVEL), old, reading(9, 12.0, LEVEL)]
+    messages = list(made.data(some, latest))
+    found = [[metric.int_value for metric in payload(message).metrics] for message in messages]
+    assert found == [[6, 8], [9]]
+    assert made.unfit == 1
+    assert list(made.data([old], latest)) == []
+    assert made.unfit == 1
+    # No value fits any type.
+    assert kinds(made.data([reading(None, 13.0, of, fault=2)], latest)) == ["DDATA"]
+    assert made.unfit == 0
+
+
+def test_a_birth_has_no_value_from_before_a_change_of_its_tag() -> None:
+    made = EdgeNode(Names("group", "edge"))
+    made.begin()
+    made.adopt({"pump": [SPEED]})
+    old = reading("on", 10.0, Tag("speed", "input_registers", 0, "string:2"))
+    *_, birth = made.births({"pump": True}, lambda: latest(old))
+    [metric] = payload(birth).metrics
+    assert metric.is_null
+
+
+class Pump:
+    """A site with one device, which answers."""
+
+    revision = answers = 0
+
+    def tags(self) -> dict[str, Any]:
+        return {"pump": [SPEED]}
+
+    def devices(self) -> dict[str, Any]:
+        return {}
+
+    def answering(self) -> dict[str, bool]:
+        return {"pump": True}
+
+    def latest(self) -> list[Reading]:
+        return []
+
+    def refresh(self) -> None:
+        raise AssertionError("not called")
+
+    def write(self, *_: object) -> None:
+        raise AssertionError("not called")
+
+
+def test_an_output_refuses_what_is_left_out_and_publishes_the_rest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    published: list[Message] = []
+    settings = {"type": "sparkplug", "url": "mqtt://h", "group": "g", "edge_node": "e"}
+    output = SparkplugOutput("scada", SparkplugConfig.model_validate(settings), Pump())
+    monkeypatch.setattr(output, "_ready", lambda: output._node.adopt({"pump": [SPEED]}))
+    monkeypatch.setattr(output, "_publish", lambda _, messages: published.extend(messages))
+    with pytest.raises(Refused, match="before their tags were changed") as refused:
+        output.send([reading("on", 1.0), reading(5, 2.0)])
+    assert refused.value.count == 1
+    assert kinds(published) == ["DBIRTH", "DDATA"]
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,8 @@ def read_secret(file: Path) -> str:
 def read_password(file: Path | None) -> bytes | None:
     """Returns the password for an MQTT broker, which may be any bytes.
 
-    Called at each attempt to connect, so that a new password needs no restart.
+    Called at each attempt to connect, so that a new password needs no restart. Raises `OSError` for
+    an unusable file.
     """
     if file is None:
         return None
@@ -30,5 +31,5 @@ def read_password(file: Path | None) -> bytes | None:
     newline = b"\r\n" if content.endswith(b"\r\n") else b"\n"
     password = content.removesuffix(newline)
     if len(password) > MAX_TEXT:
-        raise ValueError(f"{file} holds more than {MAX_TEXT} bytes")
+        raise OSError(f"{file} holds more than {MAX_TEXT} bytes")
     return password

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from holdfast.outputs.tag_meaning import meaning_of
 from holdfast.polling import Reading
 from holdfast.tags import Tag
 
@@ -44,6 +45,8 @@ class Stored:
         """How many readings there are."""
         self._max_bytes, self._find = max_bytes, find
         self._bytes = 0
+        self._first: int | None = None
+        """The row that `first` returned."""
         with file_errors(file):
             self._db = sqlite3.connect(
                 file, timeout=lock_timeout, isolation_level=None, check_same_thread=False
@@ -59,11 +62,11 @@ class Stored:
         """Stores readings durably. Returns how many old readings were dropped for them."""
         data = msgspec.msgpack.encode([_plain(reading) for reading in readings])
         dropped = 0
-        # The rollback may undo removals that `_remove_first` has counted.
+        # The rollback may undo removals that `_remove` has counted.
         with file_errors(self.file, self._recount), self._db:
             self._db.execute("BEGIN")
             while self._bytes + len(data) > self._max_bytes and self.count:
-                dropped += self._remove_first()
+                dropped += self._remove("(SELECT min(id) FROM readings)")
             if len(data) > self._max_bytes:
                 return dropped + len(readings)
             self._db.execute(
@@ -76,27 +79,31 @@ class Stored:
     def first(self) -> list[Reading]:
         """The oldest readings that were stored together; empty if there are none."""
         with file_errors(self.file):
-            row = self._db.execute("SELECT data FROM readings ORDER BY id LIMIT 1").fetchone()
+            row = self._db.execute("SELECT id, data FROM readings ORDER BY id LIMIT 1").fetchone()
         if row is None:
+            self.count = self._bytes = 0
             return []
-        return [self._reading(*plain) for plain in msgspec.msgpack.decode(row[0])]
+        self._first, data = row
+        return [self._reading(*plain) for plain in msgspec.msgpack.decode(data)]
 
     def remove_first(self) -> None:
-        """Removes what `first` returns."""
-        with file_errors(self.file), self._db:
+        """Removes what `first` returned last, unless `add` has dropped it since."""
+        with file_errors(self.file, self._recount), self._db:
             self._db.execute("BEGIN")
-            self._remove_first()
-            if not self.count:
-                self._db.execute("PRAGMA incremental_vacuum")
+            self._remove("?", self._first)
+        if not self.count:
+            # The readings are removed already. If this fails, pages stay free for the next ones.
+            with contextlib.suppress(sqlite3.Error):
+                # `execute` would free one page, `executescript` frees all.
+                self._db.executescript("PRAGMA incremental_vacuum")
 
     def close(self) -> None:
         """Closes the file."""
         self._db.close()
 
-    def _remove_first(self) -> int:
+    def _remove(self, id: str, *parameters: int | None) -> int:
         row = self._db.execute(
-            "DELETE FROM readings WHERE id = (SELECT min(id) FROM readings) "
-            "RETURNING count, length(data)"
+            f"DELETE FROM readings WHERE id = {id} RETURNING count, length(data)", parameters
         ).fetchone()
         if row is None:
             return 0
@@ -109,9 +116,19 @@ class Stored:
         self.count, self._bytes = self._db.execute(query).fetchone()
 
     def _reading(
-        self, device: str, name: str, value: Any, time: float, fault: int, undecoded: str | None
+        self,
+        device: str,
+        name: str,
+        value: Any,
+        time: float,
+        fault: int,
+        undecoded: str | None,
+        meaning: int | None = None,
     ) -> Reading:
-        tag = self._find(device, name) or _stand_in(name, value)
+        """Files of earlier versions have no meaning."""
+        tag = self._find(device, name)
+        if tag is None or meaning not in (None, meaning_of(tag)):
+            tag = _stand_in(name, value)
         return Reading(device, tag, value, time, fault, undecoded)
 
 
@@ -128,11 +145,11 @@ def file_errors(file: Path, undo: Callable[[], object] = lambda: None) -> Iterat
 
 def _plain(reading: Reading) -> tuple[Any, ...]:
     device, tag, value, time, fault, undecoded = reading
-    return device, tag.name, value, time, fault, undecoded
+    return device, tag.name, value, time, fault, undecoded, meaning_of(tag)
 
 
 def _stand_in(name: str, value: Any) -> Tag:
-    """A tag for a value whose own tag is not in the configuration any more."""
+    """A tag for a value whose own tag was changed, or is not in the configuration any more."""
     first = value[0] if isinstance(value, list) and value else value
     if isinstance(first, bool):
         return Tag(name, "coils", 0)

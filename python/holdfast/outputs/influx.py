@@ -102,7 +102,8 @@ class Influx(Receiver):
             self._connection.request("POST", self._path, body, headers)
             answer = self._connection.getresponse()
             text = answer.read(MAX_RESPONSE_BYTES)
-            if not answer.isclosed():
+            # Without a socket, `http.client` would open one with the timeout for connecting.
+            if not answer.isclosed() or self._connection.sock is None:
                 self.close()
         except http.client.HTTPException as error:
             self.close()
@@ -141,7 +142,10 @@ class Influx(Receiver):
         """The credentials, read each time, so that a new token needs no restart."""
         settings = self._settings
         if settings.token_file is not None:
-            return {"Authorization": f"Token {read_secret(settings.token_file).strip()}"}
+            token = read_secret(settings.token_file).strip()
+            if not (token.isascii() and token.isprintable()):
+                raise OSError(f"{settings.token_file} is not one line of printable ASCII")
+            return {"Authorization": f"Token {token}"}
         if settings.username is not None and settings.password_file is not None:
             pair = f"{settings.username}:{read_secret(settings.password_file).strip()}"
             return {"Authorization": f"Basic {base64.b64encode(pair.encode()).decode()}"}

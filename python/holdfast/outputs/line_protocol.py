@@ -30,8 +30,7 @@ def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]
         at = round(time * 1_000_000) * 1000
         fields = points.setdefault((device, at), [])
         # Some integers of this type do not fit, so that all are floats: a field has one kind.
-        is_wide = tag.type == "uint64" and value is not None
-        shown = plain(tag, float(value) if is_wide else value)
+        shown = plain(tag, _as_float(value) if tag.of_type.base == "uint64" else value)
         fields += [f"{key.translate(_KEY)}={written}" for key, written in _fields(tag.name, shown)]
     name = measurement.translate(_NAME)
     more = "".join(f",{key.translate(_KEY)}={_tag(value)}" for key, value in tags.items())
@@ -40,6 +39,13 @@ def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]
         for (device, at), fields in points.items()
         if fields
     ).encode()
+
+
+def _as_float(value: Any) -> Any:
+    """An integer, or each one of an array, as a float."""
+    if isinstance(value, list):
+        return [_as_float(item) for item in value]
+    return float(value) if type(value) is int else value
 
 
 def _tag(value: str) -> str:

@@ -34,7 +34,14 @@ STOP_TIMEOUT_S = 2.0
 
 
 class Refused(Exception):
-    """The receiver refused readings for good. They are dropped and counted."""
+    """The receiver refused readings for good. They are dropped and counted.
+
+    With `count`, it refused only that many, and the others were sent.
+    """
+
+    def __init__(self, message: str, count: int | None = None) -> None:
+        super().__init__(message)
+        self.count = count
 
 
 class Receiver(Protocol):
@@ -102,6 +109,7 @@ class Sending:
                     self._wait(stop)
             self._finish()
         finally:
+            self._keep()  # Also what waits when an error ends the output.
             self._receiver.close()
             self._buffer.detach()
 
@@ -131,23 +139,12 @@ class Sending:
         except OSError as error:
             return self._failed(error)
         try:
-            self._receiver.send(readings)
-        except Refused as error:
-            self._refused += len(readings)
-            log_lines.refused(
-                "output_refused",
-                kind=self._name,
-                output=self._name,
-                count=len(readings),
-                error=error,
-            )
+            self._send(readings)
         except OSError as error:
             return self._failed(error)
-        else:
-            self._sent += len(readings)
-            if self._is_failing:
-                waiting = len(self._buffer) - len(readings)
-                log_lines.write(logging.INFO, "output_back", output=self._name, waiting=waiting)
+        if self._is_failing:
+            waiting = len(self._buffer) - len(readings)
+            log_lines.write(logging.INFO, "output_back", output=self._name, waiting=waiting)
         self._is_failing = False
         self._backoff.succeeded()
         try:
@@ -155,6 +152,23 @@ class Sending:
         except OSError as error:
             return self._failed(error)
         return True
+
+    def _send(self, readings: list[Reading]) -> None:
+        """Sends readings, and counts them. Raises `OSError` if it should be tried again."""
+        refused = 0
+        try:
+            self._receiver.send(readings)
+        except Refused as error:
+            refused = len(readings) if error.count is None else error.count
+            log_lines.refused(
+                "output_refused",
+                kind=self._name,
+                output=self._name,
+                count=refused,
+                error=error,
+            )
+        self._refused += refused
+        self._sent += len(readings) - refused
 
     def _failed(self, error: OSError) -> bool:
         self._last_error = str(error) or type(error).__name__
@@ -179,9 +193,9 @@ class Sending:
         if not self._is_failing:
             while len(self._buffer) and time.monotonic() < end:
                 try:
-                    self._receiver.send(self._buffer.take(MAX_READINGS, 0.0))
+                    self._send(self._buffer.take(MAX_READINGS, 0.0))
                     self._buffer.done()
-                except (OSError, Refused):
+                except OSError:
                     break
         self._keep()
         unsent = len(self._buffer) - (self._buffer.stored.count if self._buffer.stored else 0)

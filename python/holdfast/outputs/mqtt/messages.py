@@ -30,11 +30,16 @@ class Payloads:
         self._names, self._retain = settings.topics, settings.retain
         self._form = settings.payload
         self._topics: dict[tuple[str, str], bytes] = {}
+        self._tags: dict[str, set[str]] | None = None
+        """The tags of the configuration; `None` until they are known."""
         self._known: dict[str, dict[str, dict[str, Any]]] = {}
         self._before: dict[str, dict[str, dict[str, Any]] | None] = {}
 
     def messages(self, readings: list[Reading]) -> list[Message]:
-        """The messages of readings, in their order."""
+        """The messages of readings of configured tags, in their order."""
+        tags = self._tags
+        if tags is not None:
+            readings = [each for each in readings if each.name in tags.get(each.device, ())]
         if self._form == "device":
             return list(self._of_devices(readings))
         payload = _text if self._form == "plain" else _object
@@ -53,12 +58,13 @@ class Payloads:
             return
         for device, known in before.items():
             if known is None:
-                del self._known[device]
+                self._known.pop(device, None)
             else:
                 self._known[device] = known
 
-    def forget(self, tags: dict[str, set[str]]) -> None:
-        """Forgets all devices and tags but these."""
+    def keep_only(self, tags: dict[str, set[str]]) -> None:
+        """Forgets all other devices and tags, also those of the last `messages`."""
+        self._tags = tags
         self._topics.clear()
         self._known = {
             device: {

@@ -115,7 +115,11 @@ class MqttOutput(BrokerReceiver):
         if self._settings.writes:
             session.subscribe(self._commands.adopt(tags), retained=False)
         names = {device: {tag.name for tag in some} for device, some in tags.items()}
-        self._payloads.forget(names)
+        if names != self._tags:
+            # What waits for its confirmation may be of tags that are gone: it is made again.
+            self._payloads.settle(sent=False)
+            self._taken, self._messages = [], ()
+            self._payloads.keep_only(names)
         gone = dict.fromkeys(self._topics_of(self._tags) - self._topics_of(names), b"")
         self._tags = names
         self._publish(session, gone)
@@ -161,6 +165,7 @@ class MqttOutput(BrokerReceiver):
             session.publish([Message(packed_topic(key), text, True) for key, text in messages])
 
     def _disconnect(self, *last: Message) -> None:
+        """Ends the session, if there is one. Without a last message, the broker sends the will."""
         session, self._session = self._session, None
         if session is not None:
             session.close(last)

@@ -134,17 +134,19 @@ class Session:
     def close(self, last: Sequence[Message] = (), *, with_will: bool = False) -> None:
         """Publishes the last messages, and ends the connection.
 
-        `with_will`: the broker publishes the will too. MQTT 3.1.1 has no way to ask for it, so the
-        connection is cut if the last messages were not confirmed.
+        `with_will`: the broker publishes the will too. MQTT 3.1.1 has no way to ask for it. Without
+        last messages, or if they were not confirmed, the connection is cut: the broker then
+        publishes the will instead of them.
         """
         if with_will and self._settings.version == "5":
             self._ending = Ending.WITH_WILL
+        elif not last:
+            self._ending = Ending.CUT
         if last and not self._is_over:
             delivery = self.publish(last)
             with self._news:
                 self._news.wait_for(lambda: delivery.is_done or self._is_over, STOP_TIMEOUT_S)
-            # MQTT 3.1.1 publishes the will only if there was no DISCONNECT.
-            if with_will and not delivery.is_done and self._ending is Ending.DISCONNECT:
+            if not delivery.is_done and self._ending is Ending.DISCONNECT:
                 self._ending = Ending.CUT
         self._end.set()
         self._thread.join()

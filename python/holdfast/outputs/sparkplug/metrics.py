@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import struct
 import time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from holdfast.outputs.sparkplug.datatypes import INT32, STRING, Datatype, datatype_of
+from holdfast.outputs.tag_meaning import meaning_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -15,6 +17,10 @@ if TYPE_CHECKING:
 
 GOOD, BAD = 192, 0
 """Quality codes of the specification."""
+
+
+UNFIT = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, struct.error)
+"""Errors of a value that is not of the type of its metric."""
 
 
 class Entry(NamedTuple):
@@ -34,7 +40,7 @@ class DeviceMetrics:
     def __init__(self, device: str, tags: Sequence[Tag], *, always_typed: bool) -> None:
         self.device = device
         self._always_typed = always_typed
-        self._tags = tags
+        self._tags = {tag.name: tag for tag in tags}
         self._entries: dict[str, list[Entry]] = {}
         self.by_name: dict[str, Entry] = {}
         """The metrics by name. This and `by_alias` are for all threads."""
@@ -45,12 +51,15 @@ class DeviceMetrics:
     def birth(self, payload: Any, latest: Mapping[str, Reading], aliases: Iterator[int]) -> None:
         """Adds all metrics with their current values, and with new aliases."""
         self._bad.clear()
-        self._entries = {tag.name: _entries(self.device, tag, aliases) for tag in self._tags}
+        tags = self._tags.values()
+        self._entries = {tag.name: _entries(self.device, tag, aliases) for tag in tags}
         every = [entry for entries in self._entries.values() for entry in entries]
         self.by_name = {entry.name: entry for entry in every}
         self.by_alias = {entry.alias: entry for entry in every}
         for name, entries in self._entries.items():
             reading = latest.get(name)
+            if reading is not None and not self._is_of_same_meaning(reading):
+                reading = None
             at = time.time() if reading is None else reading.time
             self._born[name] = at
             for entry in entries:
@@ -72,23 +81,39 @@ class DeviceMetrics:
         name = reading.tag.name
         return name not in self._entries or reading.time == self._born.get(name)
 
-    def add(self, payload: Any, reading: Reading) -> None:
-        """Adds the metrics of a reading. It is historical if the birth had a newer one."""
+    def add(self, payload: Any, reading: Reading) -> bool:
+        """Adds the metrics of a reading. It is historical if the birth had a newer one.
+
+        Returns whether the reading fits: it may have waited since before the tag was changed.
+        """
         name = reading.tag.name
+        if not self._is_of_same_meaning(reading):
+            return False
         is_historical = reading.time < self._born[name]
-        for entry in self._entries[name]:
-            metric = payload.metrics.add(alias=entry.alias, timestamp=int(reading.time * 1000))
+        entries, first = self._entries[name], len(payload.metrics)
+        try:
+            have_values = [_fill(payload.metrics.add(), entry, reading.value) for entry in entries]
+        except UNFIT:
+            del payload.metrics[first:]
+            return False
+        metrics = payload.metrics[first:]
+        for metric, entry, has_value in zip(metrics, entries, have_values, strict=True):
+            metric.alias, metric.timestamp = entry.alias, int(reading.time * 1000)
             if self._always_typed:
                 metric.datatype = entry.datatype.number
             if is_historical:
                 metric.is_historical = True
-            has_value = _fill(metric, entry, reading.value)
             if is_historical:
                 if not has_value:
                     _property(metric, "Quality", INT32, BAD)
             elif has_value is (entry.name in self._bad):
                 _property(metric, "Quality", INT32, GOOD if has_value else BAD)
                 (self._bad.discard if has_value else self._bad.add)(entry.name)
+        return True
+
+    def _is_of_same_meaning(self, reading: Reading) -> bool:
+        tag, current = reading.tag, self._tags[reading.tag.name]
+        return reading.value is None or tag is current or meaning_of(tag) == meaning_of(current)
 
 
 def _entries(device: str, tag: Tag, aliases: Iterator[int]) -> list[Entry]:

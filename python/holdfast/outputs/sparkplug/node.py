@@ -73,6 +73,8 @@ class EdgeNode:
         self._aliases = itertools.count(random.SystemRandom().randrange(1, MAX_FIRST_ALIAS))
         self._devices: dict[str, DeviceMetrics] = {}
         self._alive: set[str] = set()
+        self.unfit = 0
+        """The readings that the last `data` left out: they are of an earlier form of their tag."""
 
     def begin(self) -> None:
         """Begins a session, before its CONNECT."""
@@ -148,6 +150,7 @@ class EdgeNode:
         latest: Latest,
     ) -> Iterator[Message]:
         """DDATA of readings. A device that does not answer is born for values that had to wait."""
+        self.unfit = 0
         open_payloads: dict[str, tuple[Any, set[str]]] = {}
         for reading in readings:
             device = self._devices.get(reading.device)
@@ -162,10 +165,13 @@ class EdgeNode:
                 yield self._ddata(device.device, payload)
                 payload, names = Payload(), set()
             open_payloads[device.device] = payload, names
-            names.add(reading.tag.name)
-            device.add(payload, reading)
+            if device.add(payload, reading):
+                names.add(reading.tag.name)
+            else:
+                self.unfit += 1
         for name, (payload, _) in open_payloads.items():
-            yield self._ddata(name, payload)
+            if payload.metrics:
+                yield self._ddata(name, payload)
 
     def _dbirth(self, device: str, latest: Mapping[str, Reading]) -> Message:
         self._alive.add(device)

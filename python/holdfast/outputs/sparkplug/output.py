@@ -10,8 +10,10 @@ import msgspec
 from holdfast.events import log_lines
 from holdfast.outputs.mqtt.receiver import BrokerReceiver
 from holdfast.outputs.mqtt.session import Session
+from holdfast.outputs.sending import Refused
 from holdfast.outputs.sparkplug.commands import Commands
 from holdfast.outputs.sparkplug.node import EdgeNode, Names, state_topic
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -76,12 +78,15 @@ class SparkplugOutput(BrokerReceiver):
     def send(self, readings: list[Reading]) -> None:
         """Publishes readings, and waits until the broker must have them.
 
-        If it fails, the same readings follow in the next session, as historical values.
+        If it fails, the same readings follow in the next session, as historical values. Raises
+        `Refused` for those that are of an earlier form of their tag.
         """
         session = self._ready()
         data = list(self._node.data(readings, self._latest))
         deaths = self._node.device_deaths(self._site.answering(), readings)
         self._publish(session, [*data, *deaths])
+        if unfit := self._node.unfit:
+            raise Refused("they were read before their tags were changed", unfit)
 
     def idle(self) -> None:
         """Keeps the session, and publishes which devices answer."""
@@ -201,7 +206,7 @@ class SparkplugOutput(BrokerReceiver):
 def _parsed(payload: bytes) -> tuple[bool, int]:
     try:
         found: Any = msgspec.json.decode(payload)
-    except (msgspec.DecodeError, RecursionError):
+    except MALFORMED_JSON:
         found = None
     if isinstance(found, dict):
         online, timestamp = found.get("online"), found.get("timestamp")
