@@ -350,9 +350,10 @@ def test_times_of_subscriptions_that_ended_are_forgotten(
         return [{id: set(times) for id, times in each._renewed.items()} for each in members]
 
     wire.until(lambda: noted() == [{"d0": {"hmi", "log"}}] * 2, "both nodes know both")
-    print("ANSWER", caller.request("modbus.unsubscribe", {"deviceId": "d0", "subscriberId": "hmi", "tagIds": []}), noted())
+    ended = {"deviceId": "d0", "tagIds": "all"}
+    caller.request("modbus.unsubscribe", ended | {"subscriberId": "hmi"})
     wire.until(lambda: noted() == [{"d0": {"log"}}] * 2, "one is left")
-    caller.request("modbus.unsubscribe", {"deviceId": "d0", "subscriberId": "log", "tagIds": []})
+    caller.request("modbus.unsubscribe", ended | {"subscriberId": "log"})
     wire.until(lambda: noted() == [{}, {}], "none is left")
 
 

@@ -93,6 +93,28 @@ def test_commands_are_scaled_and_have_the_limits_of_the_profile(
 
 
 @pytest.mark.parametrize(
+    "request_",
+    [
+        {"tags": [tag("water", 0, profile="heater")]},
+        {"tags": [tag("water", 0, profile="heater")], "profile": "heater"},
+        {"tags": [tag("water", 0, profile="heater", writable=True)]},
+    ],
+)
+def test_a_request_does_not_make_a_tag_of_a_profile_writable(
+    caller: Caller, server: holdfast.Server, request_: dict[str, Any]
+) -> None:
+    caller.request("modbus.subscribe", subscription(server) | request_)
+    answer = caller.request("modbus.command.plc1.water", "20")
+    assert answer == {
+        "success": False,
+        "error": "tag 'water' of plc1 is not writable: writable is not true in the profile heater",
+    }
+    [device] = caller.request("modbus.browse", b"")["devices"]
+    assert {each["id"]: each["writable"] for each in device["tags"]}["water"] is False
+    caller.request("modbus.unsubscribe", leaving())
+
+
+@pytest.mark.parametrize(
     ("request_", "error"),
     [
         ({"profile": "pump"}, "profile is 'pump', allowed: heater, meter"),

@@ -19,7 +19,7 @@ from holdfast.scanner.subscriptions.request_rules import Defaults
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag
-from support.scanner_parts import allowed_of
+from support.scanner_parts import allowed_of, polling_of, registry_of
 from support.tentacle_next import (
     BUCKET,
     ENABLED,
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from support.nats_bus import Inbox, Run, Running
+    from support.running import Serve
 
 NEXT: dict[str, Any] = {
     "dialect": "tentacle-next",
@@ -611,6 +612,32 @@ def test_a_deleted_or_malformed_state_does_not_disable_the_scanner(
     caller.put(ENABLED, "modbus", '{"enabled":"no"}')
     wire.until(lambda: logged(caplog, "enabled_entry_malformed") != [], "it is logged")
     assert caller.request("modbus.browse", b"")["service"]["enabled"] is True
+
+
+def test_devices_can_go_and_move_while_the_scanner_is_disabled(
+    caller: Caller, server: holdfast.Server, serve: Serve, scanner: Running
+) -> None:
+    for device in ("plc1", "plc2", "plc3"):
+        entry = gateway_entry(server, gateway_tag(device, 0), device=device, rate=50)
+        caller.put(BUCKET, key(device), entry)
+    good = dict.fromkeys(("plc1", "plc2", "plc3"), (0, "good"))
+    wire.until(lambda: variables(caller) == good, "all are read")
+    caller.put(ENABLED, "modbus", enabled(False))
+    wire.until(lambda: server.counters()["connections"]["open"] == 0, "the connection is closed")
+    caller.delete(BUCKET, key("plc1"))
+    wire.until(lambda: devices(caller).keys() == {"plc2", "plc3"}, "one is gone")
+    memory = holdfast.Memory(holding_registers=1)
+    memory.write("holding_registers", 0, [7])
+    other = serve({1: memory})
+    entry = gateway_entry(other, gateway_tag("plc2", 0), device="plc2", rate=50)
+    caller.put(BUCKET, key("plc2"), entry)
+    url = f"tcp://127.0.0.1:{other.address[1]}"
+    wire.until(lambda: devices(caller)["plc2"]["url"] == url, "another has moved")
+    caller.put(ENABLED, "modbus", enabled(True))
+    now = {"plc2": (7, "good"), "plc3": (0, "good")}
+    wire.until(lambda: variables(caller) == now, "the others are read")
+    polled = polling_of(scanner.scanner)._devices.values()
+    assert set(polled) == set(registry_of(scanner.scanner).devices.values())
 
 
 def test_a_disabled_scanner_does_not_poll_when_it_starts(

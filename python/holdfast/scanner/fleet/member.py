@@ -95,7 +95,8 @@ class FleetMember(Placement):
         self._has_touched = asyncio.Event()
         self._touched: set[str] = set()
         self._failed: set[str] = set()
-        self._renewed: dict[tuple[str, str], int] = {}
+        self._renewed: dict[str, dict[str, int]] = {}
+        """When subscribers with a time to live have renewed it, by device and subscriber."""
         self._applied: dict[str, int] = {}
         """The revision of each device that is carried out here. Only that one may be replaced: one
         that is newer has what others have changed."""
@@ -223,7 +224,8 @@ class FleetMember(Placement):
         """Returns why it is refused here."""
         revision, desired = self.desired.value(device)
         times = {} if desired is None else desired.renewed
-        renewed = {each for each, at in times.items() if self._renewed.get((device, each)) != at}
+        before = self._renewed.get(device, {})
+        renewed = {each for each, at in times.items() if before.get(each) != at}
         try:
             by_subscriber: dict[str, list[SubscribeRequest]] = {}
             for text in () if desired is None else desired.requests:
@@ -235,8 +237,13 @@ class FleetMember(Placement):
             self._failed.add(device)
             return refused
         self._applied[device] = revision
-        self._renewed |= {(device, each): at for each, at in times.items()}
+        self._note_renewed(device, times)
         return None
+
+    def _note_renewed(self, device: str, times: dict[str, int]) -> None:
+        self._renewed.pop(device, None)
+        if times:
+            self._renewed[device] = dict(times)
 
     async def store(
         self,
@@ -251,8 +258,9 @@ class FleetMember(Placement):
         for _ in range(MAX_STORE_ATTEMPTS):
             changed = await change()
             now = int(time.time() * 1000)
+            before = self._renewed.get(device, {})
             renewed = {
-                each: now if each == subscriber else self._renewed.get((device, each), now)
+                each: now if each == subscriber else before.get(each, now)
                 for each in self._subscribers_with_ttl(device)
             }
             requests = [msgspec.Raw(each) for each in self._requests(device)]
@@ -277,7 +285,7 @@ class FleetMember(Placement):
                 is_certain = isinstance(error, NoStreamResponseError)
                 outcome = "not stored in" if is_certain else "not confirmed by"
                 raise Refused(f"{outcome} {self.desired.bucket}: {reason}") from None
-            self._renewed |= {(device, each): at for each, at in renewed.items()}
+            self._note_renewed(device, renewed)
             return changed
         raise Refused(
             f"{device} was changed by other nodes {MAX_STORE_ATTEMPTS} times meanwhile: try again"

@@ -125,8 +125,7 @@ class Devices:
         """Removes a device without subscribers."""
         self._publishers.remove(device)
         self._placement.dropped(device)
-        if device.polled_as:
-            self._polling.drop(device)
+        self._polling.drop(device)
 
     def begin(self, device: ScannedDevice) -> None:
         """Polls a device that another node has polled until now."""
@@ -138,9 +137,8 @@ class Devices:
 
     def end(self, device: ScannedDevice) -> None:
         """Polls a device no more: another node will."""
-        if device.polled_as:
-            self._polling.drop(device)
-            device.polled_as = ""
+        self._polling.drop(device)
+        device.polled_as = ""
 
     def pause(self) -> None:
         """Stops polling all devices until `resume`."""

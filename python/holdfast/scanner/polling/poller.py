@@ -129,9 +129,10 @@ class Polling:
         self._changed_at[device] = self._loop.time()
 
     def drop(self, device: ScannedDevice) -> None:
-        """Stops polling a device and closes its connection."""
+        """Stops polling a device and closes its connection, if it is polled."""
         if self._paused is not None:
             self._paused.discard(device)
+        if not device.polled_as:
             return
         waiting = self._pending_changes.pop(device, None)
         if waiting is not None:

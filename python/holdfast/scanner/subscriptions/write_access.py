@@ -37,6 +37,8 @@ def unwritable(device: ScannedDevice, tag: Tag) -> str | None:
     """
     if (flaw := read_only(tag)) is not None:
         return flaw
+    if tag.meaning is not None and not tag.meaning.writable:
+        return f"writable is not true in the profile {tag.profile}"
     if device.writes == "none":
         return "this scanner writes nothing (nats.writes is none)"
     choices = {
