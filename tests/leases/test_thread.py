@@ -6,11 +6,12 @@ import asyncio
 import threading
 import time
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from holdfast.net.nats.connection import Broker, Ping, Servers
+from holdfast.replication.leases.bucket import LeaseBucket
 from holdfast.replication.leases.leases import Leases
 from holdfast.replication.leases.thread import LeaseThread, Relay
 from holdfast.replication.leases.times import LeaseTimes
@@ -143,6 +144,42 @@ def test_the_end_of_the_thread_gives_everything_back(node: Callable[..., Node]) 
     assert threads() == ["leases of b"]
     assert not first.leases.fence("x").allows
     second.has("x", "y")
+
+
+def test_the_end_of_the_thread_gives_back_what_is_being_taken(
+    node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored = threading.Event()
+    order: list[str] = []
+    original_put, original_delete, original_end = LeaseBucket.put, LeaseBucket.delete, tasks.end
+
+    async def put(bucket: LeaseBucket, *arguments: Any) -> int:
+        done = await original_put(bucket, *arguments)
+        stored.set()
+        while first.leases._wanted:
+            await asyncio.sleep(0.001)
+        return done
+
+    async def delete(bucket: LeaseBucket, *arguments: Any, **more: Any) -> None:
+        await original_delete(bucket, *arguments, **more)
+        order.append("given back")
+
+    async def end(running: Any) -> None:
+        if not first.leases._wanted:
+            order.append("end")
+        await original_end(running)
+
+    first, second = node("a", ENDLESS), node("b", ENDLESS)
+    with monkeypatch.context() as patched:
+        patched.setattr(LeaseBucket, "put", put)
+        patched.setattr(LeaseBucket, "delete", delete)
+        first.thread.want(["x"])
+        assert stored.wait(wire.DEADLINE)
+        patched.setattr(tasks, "end", end)
+        first.thread.stop(LIMIT)
+    assert order[:2] == ["given back", "end"]
+    second.thread.want(["x"])
+    second.has("x")
 
 
 def test_what_is_asked_of_a_thread_that_has_ended_has_no_effect(

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from holdfast.appliance.parts.part import Plan
     from holdfast.appliance.parts.shared_logs import SharedLogs
     from holdfast.config import Config
+    from holdfast.replication.leases.bucket import Holding
     from holdfast.replication.leases.times import LeaseTimes
     from holdfast.types import ThreadHeartbeat
 
@@ -52,6 +53,12 @@ def _log_of(config: Config, name: str) -> str | None:
 def key_of(config: Config, device: str) -> str:
     """The key of the lease of a device: its address, in characters that a key may have."""
     return connection_of(config.devices[device].target).encode().hex()
+
+
+def _has(holder: Holding, device: str) -> bool:
+    """Whether the holder of an address has a device there. Without a list, it has all of them."""
+    devices = holder.about.get("devices")
+    return not isinstance(devices, list) or device in devices
 
 
 class DeviceLeases(Part):
@@ -174,7 +181,7 @@ class _LogLeases:
         for key, devices in dict(self._devices).items():
             holder = self.leases.holder(key)
             for device in devices:
-                known = holder is None or device in holder.about.get("devices", [device])
+                known = holder is None or _has(holder, device)
                 found[device] = {
                     "node": holder.node if holder is not None and known else None,
                     "polled_here": self.leases.is_held(key),
@@ -204,7 +211,7 @@ class _LogLeases:
             if holder is None:
                 continue
             for device in devices:
-                unknown = device not in holder.about.get("devices", [device])
+                unknown = not _has(holder, device)
                 if unknown and (device, holder.node) not in self._missing:
                     self._missing.add((device, holder.node))
                     fields = {"device": device, "log": self.log, "node": holder.node}

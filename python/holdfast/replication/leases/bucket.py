@@ -7,12 +7,14 @@ server has deleted. Here every change names the revision that it replaces.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+from nats.errors import Error
 from nats.errors import TimeoutError as NoAnswer
 from nats.js.api import (
     AckPolicy,
@@ -25,6 +27,7 @@ from nats.js.api import (
 from nats.js.errors import APIError, NoStreamResponseError, NotFoundError
 
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
+from holdfast.runtime.malformed_json import MALFORMED_JSON
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -77,7 +80,7 @@ def entry(revision: int, headers: dict[str, str] | None, value: bytes, now: floa
         return Entry(revision, None, now, is_given_back=given_back)
     try:
         return Entry(revision, msgspec.json.decode(value, type=Holding), now)
-    except msgspec.DecodeError:
+    except MALFORMED_JSON:
         return Entry(revision, None, now)
 
 
@@ -277,7 +280,13 @@ class KeyBucket:
         following = self.following = await jetstream.subscribe(
             f"{self._pre}{keys}", stream=self._stream, config=config, cb=taken
         )
-        info = await following.consumer_info()
+        try:
+            info = await following.consumer_info()
+        except Exception:
+            # The caller may use another bucket next.
+            with contextlib.suppress(Error, OSError):
+                await self.unfollow()
+            raise
         if not info.num_pending and not (info.delivered and info.delivered.consumer_seq):
             read()
 
@@ -333,9 +342,13 @@ class LeaseBucket(KeyBucket):
         ttl = {"Nats-TTL": f"{self._times.server_ttl_s}s"}
         return await self.publish(key, value, revision, ttl)
 
-    async def delete(self, key: str, revision: int) -> None:
-        """Deletes a key, which is given back. Raises as `put` does."""
-        headers = {"KV-Operation": "DEL", "Nats-TTL": f"{MARKER_TTL_S:.0f}s"}
+    async def delete(self, key: str, revision: int, *, is_clean: bool = True) -> None:
+        """Deletes a key, so that others take it at once. Raises as `put` does.
+
+        `is_clean` says that nothing of any holder can be on its way: the next one does not wait.
+        """
+        operation = "DEL" if is_clean else "PURGE"
+        headers = {"KV-Operation": operation, "Nats-TTL": f"{MARKER_TTL_S:.0f}s"}
         await self.publish(key, b"", revision, headers)
 
     async def get(self, key: str) -> Entry | None:

@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 from nats.errors import Error
-from nats.js.errors import NoStreamResponseError
+from nats.errors import TimeoutError as NoAnswer
+from nats.js.errors import APIError, NoStreamResponseError
 
 from holdfast import _core
 from holdfast.net.nats.connection import nats_reason
@@ -82,6 +83,8 @@ class _Held:
     """The revision with which it was taken. It grows with each holder."""
     until: float
     """When it must not be used any more."""
+    is_late: bool = False
+    """Whether the last renewal was not confirmed."""
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     """Held while the key is being written."""
 
@@ -126,6 +129,8 @@ class Leases:
         self.reason: str | None = "not connected"
         """Why the bucket does not work; `None` if it does."""
         self._is_opening = self._is_checked = self._is_settling = False
+        self._is_refused = False
+        """Whether JetStream has refused a write, and none was accepted since."""
         self._backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S, jitter=True)
         self._made_at: datetime | None = None
         self._may_settle_at = 0.0
@@ -184,14 +189,15 @@ class Leases:
                 now = time.monotonic()
                 self._check_bucket(now)
                 withheld = self._withheld()
-                if now >= due:
-                    due = now + self.times.renewal_s
-                    if withheld is None:
-                        for key, held in self._held.items():
-                            self._begin(self._renew(key, held))
-                if withheld is None:
-                    self._take_free(now)
                 self._note_lapsed(now, withheld or "it could not be renewed")
+                is_due = now >= due
+                if is_due:
+                    due = now + self.times.renewal_s
+                if withheld is None:
+                    for key, held in self._held.items():
+                        if is_due or held.is_late:
+                            self._begin(self._renew(key, held))
+                    self._take_free(now)
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(min(TICK_S, max(due - now, 0.0))):
                         await self._news.wait()
@@ -243,6 +249,17 @@ class Leases:
             self._ending.discard(key)
             self._watcher.changed()
 
+    async def give_all_back(self, limit: float) -> None:
+        """Gives back all leases that are held or being taken, as `give_back` does.
+
+        Nothing may be wanted any more.
+        """
+        while self._held or self._taking:
+            returned = (self.give_back(key, limit) for key in self._held.copy())
+            await asyncio.gather(*returned, return_exceptions=True)
+            if self._taking:
+                await asyncio.sleep(USE_CHECK_S)
+
     def _check_bucket(self, now: float) -> None:
         """Opens the bucket at first, after each connect, and when nothing is seen of it.
 
@@ -272,20 +289,24 @@ class Leases:
             return
         finally:
             self._is_opening = False
-        if self._client is client:
-            self._bucket = bucket
-            self._is_checked = True
-            self._heard = time.monotonic()
-            self._backoff.succeeded()
+        if self._client is not client:
+            with contextlib.suppress(Error, OSError):
+                await bucket.unfollow()
+            return
+        self._bucket = bucket
+        self._is_checked = True
+        self._heard = time.monotonic()
+        self._backoff.succeeded()
+        if not self._is_refused:
             self.works(None)
-            self._news.set()
+        self._news.set()
 
     def _identify(self, identity: BucketIdentity) -> None:
         """Forgets what is known of a bucket that is lost, or was set back: revisions begin anew."""
         if identity.created != self._made_at or identity.last_revision < self._latest:
             self._made_at = identity.created
             self.seen.clear()
-            self.is_read = False
+            self.is_read = self._is_refused = False
             self._may_settle_at = time.monotonic() + self.times.settle_s
 
     @property
@@ -302,12 +323,26 @@ class Leases:
             self.reason = reason
             self._watcher.works(reason)
 
+    def _note_failure(self, error: Exception) -> None:
+        """Reports that JetStream refuses writes. A missing answer is not a refusal."""
+        if isinstance(error, APIError):
+            self._is_refused = True
+            self.works(nats_reason(error))
+
+    def _note_write(self) -> None:
+        """Notes that a write of this or another node was accepted."""
+        if self._is_refused:
+            self._is_refused = False
+            self.works(None)
+
     def _saw(self, key: str, entry: Entry) -> None:
         self._heard = time.monotonic()
         before = self.seen.get(key)
         if before is not None and entry.revision <= before.revision:
             return
         self.seen[key] = entry
+        if entry.holding is not None or key == SETTLED:
+            self._note_write()
         was, now = (None if each is None else each.holding for each in (before, entry))
         same = was is not None and now is not None and was.process == now.process
         if not same:
@@ -338,15 +373,26 @@ class Leases:
         """Says that no lease of a former bucket can be in use any more."""
         made_at = self._made_at
         try:
-            with contextlib.suppress(Error, OSError, Outdated):
-                entry = await bucket.settle()
-                if made_at == self._made_at:
-                    self.seen.setdefault(SETTLED, entry)
+            entry = await bucket.settle()
+        except Outdated:
+            return  # Another node was first, and this one is about to hear of it.
+        except (Error, OSError) as error:
+            self._note_failure(error)
+            return
         finally:
             self._is_settling = False
-            self._news.set()
+        self._note_write()
+        if made_at == self._made_at:
+            self.seen.setdefault(SETTLED, entry)
+        self._news.set()
 
     async def _take(self, bucket: LeaseBucket, key: str, entry: Entry | None) -> None:
+        try:
+            await self._begin_to_hold(bucket, key, entry)
+        finally:
+            self._taking.discard(key)
+
+    async def _begin_to_hold(self, bucket: LeaseBucket, key: str, entry: Entry | None) -> None:
         holding = Holding(
             node=self.node,
             process=self.process,
@@ -364,19 +410,23 @@ class Leases:
         except NoStreamResponseError:
             self._is_checked = False  # It is made again.
             return
-        except (Error, OSError):
+        except (Error, OSError) as error:
+            self._note_failure(error)
             # If it was taken all the same, it is taken again.
             await self._read(bucket, key)
             return
-        finally:
-            self._taking.discard(key)
         self._acknowledged = time.monotonic()
+        self._note_write()
         if made_at != self._made_at:
             return
         self.seen[key] = Entry(revision, holding, sent)
+        clean = entry is not None and entry.is_given_back
+        if key not in self._wanted:
+            with contextlib.suppress(Outdated, Error, OSError):
+                await bucket.delete(key, revision, is_clean=clean)
+            return
         until = sent + self.times.hold_s
         self._held[key] = _Held(revision, holding, revision, until)
-        clean = entry is not None and entry.is_given_back
         self.fence(key).open(until, settle=0.0 if clean else self.times.settle_s)
         self._watcher.taken(key)
 
@@ -390,43 +440,58 @@ class Leases:
                 self._saw(key, entry)
 
     async def _renew(self, key: str, held: _Held) -> None:
-        bucket = self._bucket
-        if bucket is None or self._client is None or held.lock.locked():
+        if held.lock.locked():
             return
         async with held.lock:
             if self._held.get(key) is not held:
                 return
-            held.holding = msgspec.structs.replace(held.holding, about=self._about(key))
-            value = msgspec.json.encode(held.holding)
-            sent = time.monotonic()
+            held.is_late = True
             try:
-                held.revision = await bucket.put(key, value, held.revision)
+                await self._put_again(key, held)
             except Outdated:
-                await self._look(bucket, key, held)
-                return
-            except (Error, OSError):
-                return  # The next renewal tries again, until the lease has lapsed.
-            self._acknowledged = time.monotonic()
-            held.until = sent + self.times.hold_s
-            self._fences[key].renew(held.until)
+                pass
+            except NoAnswer:
+                self._news.set()  # Waiting for it has used up most of the time.
+            except (Error, OSError) as error:
+                self._note_failure(error)
 
-    async def _look(self, bucket: LeaseBucket, key: str, held: _Held) -> None:
-        """Finds out who has written a key: another holder, or an own renewal without an answer."""
+    async def _put_again(self, key: str, held: _Held) -> None:
+        """Renews a lease. Raises as `LeaseBucket.put` does."""
+        bucket = self._bucket
+        if bucket is None or self._client is None:
+            return
         try:
-            entry = await bucket.get(key)
-        except (Error, OSError):
-            return
-        if (
-            entry is not None
-            and entry.holding is not None
-            and entry.holding.process == self.process
-        ):
+            await self._put(bucket, key, held)
+        except Outdated:
+            if await self._is_still_own(bucket, key, held):
+                await self._put(bucket, key, held)
+
+    async def _put(self, bucket: LeaseBucket, key: str, held: _Held) -> None:
+        held.holding = msgspec.structs.replace(held.holding, about=self._about(key))
+        value = msgspec.json.encode(held.holding)
+        sent = time.monotonic()
+        held.revision = await bucket.put(key, value, held.revision)
+        self._acknowledged = time.monotonic()
+        self._note_write()
+        held.is_late = False
+        held.until = sent + self.times.hold_s
+        self._fences[key].renew(held.until)
+
+    async def _is_still_own(self, bucket: LeaseBucket, key: str, held: _Held) -> bool:
+        """Finds out who has written a key: another holder, or an own renewal without an answer.
+
+        Takes over the revision of an own one; gives the lease up otherwise. Raises the errors of
+        nats-py.
+        """
+        entry = await bucket.get(key)
+        if entry is not None and self._is_own(entry):
             held.revision = entry.revision
-            return
+            return True
         if entry is not None:
             self._saw(key, entry)
         ended = entry is None or entry.holding is None
         self._give_up(key, "it has ended" if ended else "another node holds it")
+        return False
 
     def _note_lapsed(self, now: float, reason: str) -> None:
         """Gives up leases that could not be renewed for so long that others may have taken them."""

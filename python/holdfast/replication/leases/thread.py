@@ -131,8 +131,7 @@ class LeaseThread:
         async with tasks.beating(self._heartbeat):
             await self._stopping.wait()
             self._leases.want(())
-            returned = (self._leases.give_back(key, self._ending) for key in self._leases.held)
-            await asyncio.gather(*returned, return_exceptions=True)
+            await self._leases.give_all_back(self._ending)
             await tasks.end(running)
 
     async def _keep_connected(self) -> None:

@@ -36,7 +36,8 @@ class LeaseTimes:
 
     @property
     def answer_timeout_s(self) -> float:
-        """The time for one answer: if it is lost, the next renewal still comes in time."""
+        """The time for one answer: if it is lost, another renewal is sent before `hold_s` is over,
+        and does not wait for the next `renewal_s`."""
         return 0.9 * (self.hold_s - self.renewal_s)
 
 
