@@ -14,6 +14,7 @@ from holdfast.tags import Tag
 from support import wire
 from support.config_folder import Folder, written
 from support.mqtt_rig import Rig, Running, settings
+from support.nats_bus import logged
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -145,6 +146,29 @@ def test_of_the_bad_values_of_a_topic_one_is_logged(
     counts: Any = rig.memory_access.counts()
     assert counts["refused"] == {"invalid_value": 9}
     assert [fields["value"] for fields in refusals(caplog)] == ["0.5"]
+
+
+def test_the_bad_values_of_each_topic_are_logged_and_the_others_counted(
+    rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The broker has an IP address: it is one source for all topics."""
+    topics = [f"sensors/{number}" for number in range(20)]
+    tag: dict[str, Any] = REGISTER | {"round": "exact"}
+    broker = rig.broker()
+    entries = [{"topic": topic, "memory": "plant", "tag": tag} for topic in topics]
+    mapped = {topic: MappedTag("plant", Tag("tag", **tag)) for topic in topics}
+    running = rig.run(settings(broker.url, map=entries), mapped=mapped)
+    running.wait_until_connected()
+    probe = rig.probe(broker)
+    for topic in topics * 3:
+        probe.publish(topic, "0.5")
+    running.wait_until_received(60)
+    assert [fields["source"] for fields in refusals(caplog)] == topics
+    running.stop()
+    held_back = logged(caplog, "held_back")
+    assert [(fields["source"], fields["count"]) for fields in held_back] == [
+        (topic, 2) for topic in topics
+    ]
 
 
 def refusals(caplog: pytest.LogCaptureFixture) -> list[dict[str, Any]]:

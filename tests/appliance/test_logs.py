@@ -64,6 +64,28 @@ def test_what_was_held_back_is_told_even_if_nothing_follows(
     assert told == {"of": "refused_source", "kind": "scada", "count": 3}
 
 
+def test_what_an_own_limit_holds_back_is_told_while_there_is_one(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def told() -> list[int]:
+        records = [each for each in caplog.records if each.message == "held_back"]
+        return [vars(each)["fields"]["count"] for each in records]
+
+    def count(times: int) -> None:
+        log_lines.count(logging.INFO, "event", {}, kind="a", times=times, throttle=throttle)
+
+    throttle = Throttle(window=0.0)
+    with log_lines.own_limit(throttle):
+        count(4)
+        log_lines.tell_held_back()
+        assert told() == [3]
+        count(3)
+    assert told() == [3, 2]
+    count(4)
+    log_lines.tell_held_back(all_of_them=True)
+    assert told() == [3, 2]
+
+
 def test_a_flood_is_held_back_and_its_number_told() -> None:
     throttle = Throttle(burst=2, window=10.0)
     assert [throttle.admit("kind", now) for now in (0.0, 1.0, 2.0, 3.0)] == [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -14,6 +14,7 @@ from holdfast.gateway import pool
 from holdfast.gateway.egress import Route
 from holdfast.gateway.pool import Pool
 from holdfast.gateway.shared_devices import Turns
+from holdfast.net.http.requests import BadRequest
 from support import wire
 
 READ = Request.read("coils", 0, 1)
@@ -93,3 +94,72 @@ def test_a_call_of_which_a_part_was_sent_is_not_repeated_elsewhere() -> None:
     refused = ConnectFailed("tcp://127.0.0.1:502", "refused")
     assert asyncio.run(asyncio.wait_for(run([7], refused), wire.DEADLINE))
     assert dialed == [first]
+
+
+async def ask(pool: Pool, target: NetworkTarget) -> Any:
+    return await pool.run(Route(target, (target,)), 60, lambda turns: turns.call(READ, 1, 60))
+
+
+@pytest.mark.parametrize(("transport", "may_come"), [("udp", True), ("tcp", False)])
+def test_a_connection_that_may_have_late_replies_is_not_pushed_out(
+    transport: Literal["udp", "tcp"], *, may_come: bool
+) -> None:
+    """Another connection to the same device could take a late reply for its own."""
+
+    async def run() -> Any:
+        failing = Failing(RequestTimeout("no reply"), [7])
+        failing.may_fail.set()
+        failing.is_closing.set()
+        pool = failing_pool(failing, [])
+        first, second = (NetworkTarget(transport, f"127.0.0.{number}", 502) for number in (1, 2))
+        with pytest.raises(RequestTimeout):
+            await ask(pool, first)
+        try:
+            return await ask(pool, second)
+        except BadRequest as error:
+            return error.reason
+
+    assert asyncio.run(asyncio.wait_for(run(), wire.DEADLINE)) == ("busy" if may_come else [7])
+
+
+class Unstoppable(Failing):
+    """Answers when it may, also after it was cancelled."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls = 0
+        self.may_answer = [asyncio.Event(), asyncio.Event()]
+
+    async def call(self, request: Request, unit: int, timeout: float) -> Any:  # noqa: ARG002
+        event = self.may_answer[self.calls]
+        self.calls += 1
+        try:
+            await event.wait()
+        except asyncio.CancelledError:
+            await event.wait()
+        return [7]
+
+
+def test_a_connection_with_a_call_that_still_runs_is_not_pushed_out() -> None:
+    async def run() -> None:
+        transport = Unstoppable()
+        pool = failing_pool(transport, [])
+        used, other = (NetworkTarget("tcp", f"127.0.0.{number}", 502) for number in (1, 2))
+        first = asyncio.create_task(ask(pool, used))
+        while not transport.calls:
+            await asyncio.sleep(0)
+        second = asyncio.create_task(ask(pool, used))
+        await asyncio.sleep(0)
+        transport.may_answer[0].set()
+        assert await first == [7]
+        while transport.calls < 2:
+            await asyncio.sleep(0)
+        second.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await second
+        with pytest.raises(BadRequest):
+            await ask(pool, other)
+        transport.may_answer[1].set()
+        transport.may_fail.set()
+
+    asyncio.run(asyncio.wait_for(run(), wire.DEADLINE))

@@ -47,9 +47,11 @@ class Diagnostics:
 
     def stats(self) -> dict[str, Any]:
         """Returns all counters: those of the parts, of adapters, threads, and the log."""
+        # A reload may have removed one since the list was made.
+        adapters = [(name, self.adapter(name)) for name in list(self.adapters)]
         found = {
             "uptime": round(time.monotonic() - self._began, 3),
-            "adapters": {name: self.adapter(name) for name in list(self.adapters)},
+            "adapters": {name: status for name, status in adapters if status is not None},
             "log_dropped": log_lines.dropped(),
             "threads": self._liveness.threads(),
         }

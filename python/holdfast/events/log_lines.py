@@ -5,6 +5,7 @@ Log lines never contain secrets or values from memory.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import sys
@@ -16,7 +17,7 @@ from holdfast.events.throttle import Throttle, origin
 from holdfast.events.writer import QueuedHandler
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from holdfast.events import Format
     from holdfast.events.throttle import Origin
@@ -79,7 +80,8 @@ def count(
 ) -> None:
     """Does what `limited` does for an event that occurred so many `times`.
 
-    Observers get it if `observed`. `throttle` is the limit, in place of that of all events.
+    Observers get it if `observed`. `throttle` is the limit, in place of that of all events; see
+    `own_limit`.
     """
     by = origin(event, fields)
     limit = _REFUSALS if throttle is None else throttle
@@ -104,7 +106,23 @@ def tell_held_back(*, all_of_them: bool = False) -> None:
 
     At the end, have it log `all_of_them`, also where more could follow.
     """
-    held_back = _REFUSALS.rest() if all_of_them else _REFUSALS.over(time.monotonic())
+    for throttle in (_REFUSALS, *_OWN_LIMITS):
+        _tell_held_back(throttle, all_of_them=all_of_them)
+
+
+@contextlib.contextmanager
+def own_limit(throttle: Throttle) -> Iterator[None]:
+    """Has `tell_held_back` log what this throttle holds back too, and logs the rest at the end."""
+    _OWN_LIMITS.append(throttle)
+    try:
+        yield
+    finally:
+        _OWN_LIMITS.remove(throttle)
+        _tell_held_back(throttle, all_of_them=True)
+
+
+def _tell_held_back(throttle: Throttle, *, all_of_them: bool) -> None:
+    held_back = throttle.rest() if all_of_them else throttle.over(time.monotonic())
     for kind, by, count in held_back:
         event, of = kind if isinstance(kind, tuple) else (kind, "")
         parts = of if isinstance(of, tuple) else (of,)
@@ -175,6 +193,7 @@ def timestamp(seconds: float) -> str:
 
 
 _REFUSALS = Throttle()
+_OWN_LIMITS: list[Throttle] = []
 
 Observer: TypeAlias = "Callable[[str, Mapping[str, object], Origin, int], object]"
 _OBSERVERS: list[Observer] = []

@@ -133,6 +133,11 @@ class _Device:
             del self.reads[read]
 
 
+def _is_needed(device: _Device) -> bool:
+    """Returns whether late replies may come that only this client knows."""
+    return device.key.transport not in IN_FLIGHT and time.monotonic() < device.needed
+
+
 class _PoolTurns(Turns):
     """Turns on a connection of the pool."""
 
@@ -360,7 +365,11 @@ class Pool:
 
     def _pushed_out(self) -> _Device:
         """Removes the least recently used idle entry. Raises `BadRequest` if all are in use."""
-        free = [each for each in self._entries.values() if each.users == 0]
+        free = [
+            each
+            for each in self._entries.values()
+            if not (each.users or each.in_flight or _is_needed(each))
+        ]
         if not free:
             raise BadRequest("busy", "too many devices are in use, try again later")
         return self._entries.pop(min(free, key=lambda each: each.used).key)
@@ -385,8 +394,7 @@ class Pool:
         for key, entry in list(self._entries.items()):
             if entry.users or entry.in_flight:
                 continue
-            is_needed = key.transport not in IN_FLIGHT and time.monotonic() < entry.needed
-            if is_needed and not self._is_shared(key):
+            if _is_needed(entry) and not self._is_shared(key):
                 if entry.doubtful:
                     entry.in_flight += 1
                     self._start(entry, close=True)

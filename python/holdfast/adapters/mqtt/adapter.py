@@ -82,7 +82,8 @@ class Mqtt:
     def run(self, stop: Stop) -> None:
         """Stays connected until `stop` is set; reconnects when the connection ends."""
         backoff = Backoff(*self._pauses, jitter=True, proven_s=RESET_BACKOFF_AFTER_S)
-        with Waiter(stop) as waiter, contextlib.suppress(Ended):
+        limit = log_lines.own_limit(self._inbox.bad_values)
+        with limit, Waiter(stop) as waiter, contextlib.suppress(Ended):
             while not stop.wait(backoff.failed(self._connection(waiter))):
                 pass
 

@@ -85,6 +85,9 @@ class Values:
     def __contains__(self, topic: str) -> bool:
         return topic in self._values
 
+    def __len__(self) -> int:
+        return len(self._values)
+
     def get(self, topic: str) -> Value | None:
         """What the messages of a topic write; `None` if it has no plain values."""
         return self._values.get(topic)
@@ -111,7 +114,10 @@ class Inbox:
         self._memory_access = memory_access
         self._filters, self._values = filters, values
         self._broker = broker
-        self._bad_values = Throttle(burst=0, window=BAD_VALUE_LOG_INTERVAL_S)
+        topics = len(values)
+        self.bad_values = Throttle(
+            burst=0, window=BAD_VALUE_LOG_INTERVAL_S, most=topics, of_source=topics
+        )
         self.received = 0
 
     def take(self, message: Publish) -> dict[str, object]:
@@ -132,7 +138,7 @@ class Inbox:
             self._memory_access.refuse(refused, grant.name, peer)
         except BadValue as error:
             refused = Refused("invalid_value", str(error), **error.where)
-            self._memory_access.refuse(refused, grant.name, peer, throttle=self._bad_values)
+            self._memory_access.refuse(refused, grant.name, peer, throttle=self.bad_values)
         except Refused as error:
             refused = error
         except Exception:  # An error in one message must not stop the adapter.
