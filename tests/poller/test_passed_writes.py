@@ -14,7 +14,7 @@ from support import web, wire
 from support.audits import writes
 from support.fake_device import Asked, Stream, exception, good
 from support.polled import configuration, counters, device, read, until_polled
-from support.running import endpoint
+from support.running import endpoint, log_events
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -254,7 +254,7 @@ def test_a_device_that_has_gone_is_exception_10(run: Run) -> None:
         assert scada.read_holding_registers(11, 1) == [501]
 
 
-def test_a_sealed_memory_passes_nothing_on(run: Run) -> None:
+def test_a_sealed_memory_passes_nothing_on(run: Run, caplog: pytest.LogCaptureFixture) -> None:
     with plc() as source:
         meter = device(source.url, *READS, **RARELY)
         text = configuration({"meter": meter}, **MORE)
@@ -265,6 +265,8 @@ def test_a_sealed_memory_passes_nothing_on(run: Run) -> None:
         with client(appliance) as scada, refused_with(6):
             scada.write_register(11, 7)
         assert writes_of(source) == []
+        log_events(appliance)
+        assert caplog.messages.count("refused_sealed") == 1
 
 
 def test_a_read_that_takes_several_requests_keeps_what_was_written_meanwhile(run: Run) -> None:

@@ -396,12 +396,13 @@ def test_a_unit_that_a_peer_does_not_have_is_logged(
     assert logged(plant, caplog) == [("refused_unit", 9, 3)]
 
 
+@pytest.mark.parametrize("keep", [{}, {"keep": {"file": "plant.redb", "sync": 0}}])
 def test_a_write_to_a_sealed_memory_is_logged_but_not_a_read(
-    run: Run, caplog: pytest.LogCaptureFixture
+    run: Run, caplog: pytest.LogCaptureFixture, keep: dict[str, Any]
 ) -> None:
     seal = {"area": "discrete_inputs", "address": 9, "mode": "level"}
     text = configuration(
-        "tcp", rules=[rule(["127.0.0.1"])], memories={"plant": {**ALL, "seal": seal}}
+        "tcp", rules=[rule(["127.0.0.1"])], memories={"plant": {**ALL, **keep, "seal": seal}}
     )
     with ExitStack() as opened:
         plant = Plant("tcp", run(text), opened)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import sys
 from contextlib import closing
 from ipaddress import ip_network
 
 import pytest
 
+from holdfast._core import HttpServer
 from holdfast.net.http.host import ConnectionLimits, Host
 from holdfast.net.http.port import listen
 from holdfast.net.http.requests import Request, Response
-from support import web
+from support import web, wire
 
 
 def loop_of_a_handler() -> str:
@@ -37,3 +39,30 @@ def test_a_host_runs_in_uvloop_where_it_is_installed() -> None:
 def test_a_host_runs_without_uvloop(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "uvloop", None)
     assert loop_of_a_handler() == "asyncio"
+
+
+def test_a_server_that_could_not_start_starts_later() -> None:
+    resource = pytest.importorskip("resource", reason="Windows has no limit of open files")
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with closing(listen("127.0.0.1", 0)) as listener:
+        server = HttpServer(
+            "x",
+            listener,
+            sources=["127.0.0.0/8"],
+            max_connections=1,
+            grace=0,
+            request_timeout=wire.DEADLINE,
+            idle_timeout=wire.DEADLINE,
+            refusals=[(name, [], b"no") for name in ("not_http", "header_too_large", "not_tls")],
+        )
+        with closing(server):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
+            try:
+                with pytest.raises(OSError, match="Too many open files"):
+                    server.start()
+            finally:
+                resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+            server.start()
+            with socket.create_connection(listener.getsockname(), wire.DEADLINE) as client:
+                client.sendall(b"\0\r\n\r\n")
+                assert client.recv(1000).endswith(b"no")

@@ -18,7 +18,7 @@ use tokio::sync::oneshot;
 pub(crate) enum Unresolved {
     /// The deadline passed.
     TooLate,
-    /// What the system says of the name.
+    /// The lookup failed.
     Failed(io::Error),
 }
 
@@ -34,7 +34,7 @@ static LOOKUPS: LazyLock<Mutex<Lookups>> = LazyLock::new(Mutex::default);
 
 #[derive(Default)]
 struct Lookups {
-    /// A process that is forked from this one does not have the threads.
+    /// The process that has the threads: a forked child does not have them.
     process: u32,
     threads: usize,
     /// Who waits for each name.
@@ -65,7 +65,7 @@ fn addresses_by(
     resolve: impl FnOnce(&str) -> io::Result<Vec<SocketAddr>> + Send + 'static,
 ) -> Result<Vec<SocketAddr>, Unresolved> {
     let (sender, found) = sync_channel(1);
-    // Whoever was too late does not receive it.
+    // Fails if the caller's time is over.
     look_up(host, Box::new(move |found| drop(sender.send(found))), resolve);
     let left = deadline.saturating_duration_since(Instant::now());
     match found.recv_timeout(left) {
@@ -88,7 +88,7 @@ pub(crate) async fn addresses_of(host: &str, port: u16) -> io::Result<Vec<Socket
     with_port(found.await.expect("a lookup has a result"), port)
 }
 
-/// The time for one address of a name, if so many follow it. Each gets the same share of what is left, so that
+/// The time for one address of a name that `others` follow. Each gets the same share of what is left, so that
 /// one dead address does not use it up.
 pub(crate) fn share(deadline: Instant, others: usize) -> Duration {
     let addresses = u32::try_from(others + 1).unwrap_or(u32::MAX);
@@ -100,8 +100,7 @@ fn resolve(host: &str) -> io::Result<Vec<SocketAddr>> {
 }
 
 fn with_port(found: Found, port: u16) -> io::Result<Vec<SocketAddr>> {
-    // The system's error has no kind that says so.
-    let mut addresses = found.map_err(|error| io::Error::new(io::ErrorKind::NotFound, error))?;
+    let mut addresses = found.map_err(|error| io::Error::new(error.kind(), error))?;
     addresses.iter_mut().for_each(|address| address.set_port(port));
     Ok(addresses)
 }
@@ -115,7 +114,7 @@ fn look_up(
     if all.process != process::id() {
         let of_parent =
             mem::replace(&mut *all, Lookups { process: process::id(), ..Lookups::default() });
-        // To drop what waits would wake tasks of the parent's event loops.
+        // Dropping what waits would wake tasks of the parent's event loops.
         mem::forget(of_parent);
     }
     if let Some(others) = all.waiting.get_mut(host) {
@@ -123,7 +122,11 @@ fn look_up(
     }
     all.waiting.insert(host.to_owned(), vec![waiting]);
     let name = host.to_owned();
-    all.queue.push_back(Box::new(move || finish(&name, &resolve(&name).map_err(Arc::new))));
+    all.queue.push_back(Box::new(move || {
+        // The errors of the resolver have no useful kind.
+        let unknown = |error| Arc::new(io::Error::new(io::ErrorKind::NotFound, error));
+        finish(&name, &resolve(&name).map_err(unknown));
+    }));
     if all.threads == MAX_THREADS {
         return;
     }
@@ -232,5 +235,13 @@ mod tests {
             }
             other => panic!("{other:?}"),
         }
+    }
+
+    #[test]
+    fn a_lookup_that_has_no_thread_is_not_an_unknown_name() {
+        let no_thread = Arc::new(io::Error::other("can't start a thread to look up the name"));
+        let error = with_port(Err(no_thread), 502).unwrap_err();
+        assert_eq!(error.kind(), io::ErrorKind::Other);
+        assert_eq!(error.to_string(), "can't start a thread to look up the name");
     }
 }

@@ -3,8 +3,9 @@
 use std::collections::VecDeque;
 use std::env;
 use std::io::{ErrorKind, Read, Write};
-use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Barrier, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -17,8 +18,8 @@ use holdfast_engine::server::requests::unit_server::UnitSettings;
 use holdfast_engine::server::rights::functions::{AccessMode, Functions};
 use holdfast_engine::server::rights::rule::{Elsewhere, Rule};
 use holdfast_engine::server::{
-    ConnectionLimits, Engine, ListenerKind, ListenerSettings, Listening, Settings, StreamFraming,
-    StreamSettings, WhenFull,
+    ConnectionLimits, DatagramFraming, Engine, ListenerKind, ListenerSettings, Listening, Settings,
+    StreamFraming, StreamSettings, UdpSettings, WhenFull,
 };
 use holdfast_protocol::frame::{mbap, rtu};
 use holdfast_runtime::Retry;
@@ -60,15 +61,10 @@ fn answer(stream: &mut TcpStream, baud: Option<u32>, seen: &Seen) {
     stream.set_nodelay(true).unwrap();
     let mut request = [0; 8];
     while stream.read_exact(&mut request).is_ok() {
-        let (unit_id, pdu) = rtu::decode(&request).expect("the link sends whole frames");
-        let address = u16::from_be_bytes([pdu[1], pdu[2]]);
-        let mut reply = vec![3, 4];
-        reply.extend(address.to_be_bytes());
-        reply.extend((!address).to_be_bytes());
-        let mut frame = [0; rtu::MAX_LEN];
-        let len = rtu::encode(unit_id, &reply, &mut frame).unwrap();
+        let reply = reply(address_of(&request));
         if let Some(baud) = baud {
-            thread::sleep(Duration::from_secs(1) * (request.len() + len) as u32 * CHARACTER / baud);
+            let characters = (request.len() + reply.len()) as u32 * CHARACTER;
+            thread::sleep(Duration::from_secs(1) * characters / baud);
         }
         seen.requests.fetch_add(1, Ordering::Relaxed);
         stream.set_nonblocking(true).unwrap();
@@ -80,11 +76,48 @@ fn answer(stream: &mut TcpStream, baud: Option<u32>, seen: &Seen) {
             }
         }
         stream.set_nonblocking(false).unwrap();
-        stream.write_all(&frame[..len]).unwrap();
+        stream.write_all(&reply).unwrap();
     }
 }
 
-/// A listener whose unit 1 is the device.
+/// The address that an RTU frame reads.
+fn address_of(request: &[u8]) -> u16 {
+    let (_, pdu) = rtu::decode(request).expect("the link sends whole frames");
+    u16::from_be_bytes([pdu[1], pdu[2]])
+}
+
+/// The RTU frame of unit 1 with two registers.
+fn reply(address: u16) -> Vec<u8> {
+    let mut frame = [0; rtu::MAX_LEN];
+    let len = rtu::encode(1, &registers(address), &mut frame).unwrap();
+    frame[..len].to_vec()
+}
+
+fn registers(address: u16) -> Vec<u8> {
+    [&[3, 4], &address.to_be_bytes()[..], &(!address).to_be_bytes()].concat()
+}
+
+/// The same device, which sends no reply until the sender is dropped. It keeps the addresses in the order of
+/// their requests.
+fn held_device() -> (SocketAddr, Sender<()>, Arc<Mutex<Vec<u16>>>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let (address, asked) = (listener.local_addr().unwrap(), Arc::<Mutex<Vec<u16>>>::default());
+    let (release, held) = channel();
+    let shared = Arc::clone(&asked);
+    thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        let mut request = [0; 8];
+        while stream.read_exact(&mut request).is_ok() {
+            let address = address_of(&request);
+            shared.lock().unwrap().push(address);
+            let _ = held.recv();
+            stream.write_all(&reply(address)).unwrap();
+        }
+    });
+    (address, release, asked)
+}
+
+/// Listeners for Modbus TCP and Modbus UDP whose unit 1 is the device.
 struct Setup {
     engine: Engine,
     poller: Poller,
@@ -93,6 +126,10 @@ struct Setup {
 
 impl Setup {
     fn new(device: SocketAddr) -> Setup {
+        Setup::with(device, 1000, false)
+    }
+
+    fn with(device: SocketAddr, queue: usize, coalesce: bool) -> Setup {
         let poller = Poller::start(Vec::new()).unwrap();
         let place = Place::RtuOverTcp { host: "127.0.0.1".into(), port: device.port() };
         let link = LinkSettings {
@@ -100,8 +137,8 @@ impl Setup {
             endpoint: place.into(),
             in_flight: InFlight::Fixed(1),
             retry: Retry::default(),
-            queue: 1000,
-            coalesce: false,
+            queue,
+            coalesce,
             cache: Duration::ZERO,
             preferred: Vec::new(),
         };
@@ -109,7 +146,7 @@ impl Setup {
         let (name, timeout) = ("device".into(), TIMEOUT);
         let route = Route { name, link: Arc::clone(&link), unit_id: None, timeout };
         let rule = Rule {
-            sources: vec!["127.0.0.1/32".parse().unwrap()],
+            sources: vec!["127.0.0.0/8".parse().unwrap()],
             roles: None,
             units: Vec::new(),
             elsewhere: vec![(1, Elsewhere::Device(route))],
@@ -117,10 +154,11 @@ impl Setup {
             functions: Functions::All,
             narrowed: Vec::new(),
         };
+        let bind = "127.0.0.1:0".parse().unwrap();
         let stream = StreamSettings {
-            bind: "127.0.0.1:0".parse().unwrap(),
+            bind,
             framing: StreamFraming::Mbap,
-            rules: vec![rule],
+            rules: vec![rule.clone()],
             limits: ConnectionLimits {
                 max_connections: 100,
                 max_connections_per_source: None,
@@ -136,10 +174,21 @@ impl Setup {
             tls: None,
             raw_ingest: None,
         };
-        let kind = ListenerKind::ModbusStream(stream);
+        let datagrams = UdpSettings {
+            bind,
+            framing: DatagramFraming::Mbap,
+            rules: vec![rule],
+            units: UnitSettings::default(),
+        };
+        let listeners = [
+            ("tcp", ListenerKind::ModbusStream(stream)),
+            ("udp", ListenerKind::ModbusUdp(datagrams)),
+        ];
+        let listeners =
+            listeners.map(|(name, kind)| ListenerSettings { name: name.into(), kind }).into();
         let engine = Engine::start(Settings {
             listening: Listening {
-                listeners: vec![ListenerSettings { name: "device".into(), kind }],
+                listeners,
                 identity: vec![(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())],
                 unit_names: Vec::new(),
             },
@@ -156,6 +205,14 @@ impl Setup {
         stream.set_nodelay(true).unwrap();
         stream.set_read_timeout(Some(TIMEOUT)).unwrap();
         stream
+    }
+
+    /// A client over UDP with a source address; `None` if the system does not have it.
+    fn datagrams(&self, source: &str) -> Option<UdpSocket> {
+        let socket = UdpSocket::bind((source, 0)).ok()?;
+        socket.connect(self.engine.addresses()[1].unwrap()).unwrap();
+        socket.set_read_timeout(Some(TIMEOUT)).unwrap();
+        Some(socket)
     }
 
     fn stop(self) {
@@ -177,11 +234,7 @@ impl Master {
     fn ask(&mut self) {
         let (id, address) = (self.sent.wrapping_mul(7), self.number * 1000 + self.sent % 1000);
         self.sent = self.sent.wrapping_add(1);
-        let mut frame = mbap::header(id, 1, 5).to_vec();
-        frame.push(3);
-        frame.extend(address.to_be_bytes());
-        frame.extend([0, 2]);
-        self.stream.write_all(&frame).unwrap();
+        self.stream.write_all(&read(id, address)).unwrap();
         self.open.push_back((id, address));
     }
 
@@ -189,12 +242,15 @@ impl Master {
         let mut reply = [0; 13];
         self.stream.read_exact(&mut reply).unwrap();
         let (id, address) = self.open.pop_front().unwrap();
-        let mut expected = mbap::header(id, 1, 6).to_vec();
-        expected.extend([3, 4]);
-        expected.extend(address.to_be_bytes());
-        expected.extend((!address).to_be_bytes());
+        let expected = [&mbap::header(id, 1, 6)[..], &registers(address)].concat();
         assert_eq!(reply, expected[..], "master {}", self.number);
     }
+}
+
+/// A request for two registers.
+fn read(id: u16, address: u16) -> Vec<u8> {
+    let [high, low] = address.to_be_bytes();
+    [&mbap::header(id, 1, 5)[..], &[3, high, low, 0, 2]].concat()
 }
 
 /// Asks until each master has asked `each` times, or until `enough`. Returns how often each was answered,
@@ -285,5 +341,41 @@ fn a_master_that_has_gone_is_not_asked_for() {
     let asked = seen.requests.load(Ordering::Relaxed);
     assert_eq!(asked + setup.link.counters.withdrawn.get(), 160);
     assert!(asked < 120, "{asked} requests were sent");
+    setup.stop();
+}
+
+#[test]
+fn udp_clients_take_turns_and_leave_places_to_each_other() {
+    let (address, held, asked) = held_device();
+    let setup = Setup::with(address, 20, true);
+    let many = setup.datagrams("127.0.0.1").unwrap();
+    // macOS has no second address by default.
+    let Some(few) = setup.datagrams("127.0.0.2") else { return setup.stop() };
+    let expect = |client: &UdpSocket, pdu: &[u8]| {
+        let mut reply = [0; mbap::MAX_LEN];
+        let len = client.recv(&mut reply).unwrap();
+        assert_eq!(reply[..len], [&mbap::header(1, 1, pdu.len())[..], pdu].concat());
+    };
+    for address in 0..11 {
+        many.send(&read(1, address)).unwrap();
+    }
+    expect(&many, &[0x83, 6]);
+    for address in [100, 101] {
+        few.send(&read(1, address)).unwrap();
+    }
+    // The link takes requests in order: once it has this one, it has them all.
+    few.send(&read(1, 101)).unwrap();
+    while setup.link.counters.coalesced.get() == 0 {
+        assert_eq!(setup.link.counters.refused_full.get(), 1);
+        thread::yield_now();
+    }
+    drop(held);
+    for address in 0..10 {
+        expect(&many, &registers(address));
+    }
+    for address in [100, 101, 101] {
+        expect(&few, &registers(address));
+    }
+    assert_eq!(*asked.lock().unwrap(), [0, 1, 100, 2, 101, 3, 4, 5, 6, 7, 8, 9]);
     setup.stop();
 }

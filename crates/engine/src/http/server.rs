@@ -1,4 +1,4 @@
-//! A server of HTTP: its listening socket, its thread, and its end.
+//! An HTTP server: its listening socket, its thread, and its end.
 
 use std::io;
 use std::net::{IpAddr, TcpListener};
@@ -27,7 +27,7 @@ use crate::wake::Wakes;
 
 pub use crate::server::connections::listener::bind_tcp as bind;
 
-/// How often the end of the last connection is looked for when the server ends.
+/// How often a server that ends checks whether its last connection has ended.
 const ENDING_PERIOD: Duration = Duration::from_millis(5);
 
 impl Service for Front {
@@ -61,7 +61,7 @@ pub struct HttpServer {
     heartbeat: Arc<Heartbeat>,
     events: Events,
     wakes: Mutex<Option<Wakes>>,
-    /// Until it starts.
+    /// `None` once the server has started.
     socket: Mutex<Option<TcpListener>>,
 }
 
@@ -91,13 +91,14 @@ impl HttpServer {
         })
     }
 
-    /// Serves in a thread of its own. A second call does nothing.
+    /// Serves in a thread of its own. Once it has started, another call does nothing.
     ///
     /// # Errors
-    /// The system has no threads left.
+    /// The system has no threads or file descriptors left.
     pub fn start(&self) -> io::Result<()> {
-        let socket = self.socket.lock().unwrap_or_else(PoisonError::into_inner).take();
-        let Some(socket) = socket else { return Ok(()) };
+        let mut unstarted = self.socket.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(socket) = &*unstarted else { return Ok(()) };
+        let socket = socket.try_clone()?;
         let runtime = Builder::new_current_thread().enable_io().enable_time().build()?;
         let name = self.heartbeat.thread().to_owned();
         let (front, heartbeat) = (Arc::clone(&self.front), Arc::clone(&self.heartbeat));
@@ -118,6 +119,7 @@ impl HttpServer {
         };
         let work = move || runtime.block_on(heartbeat.during(work));
         self.threads.push(thread::Builder::new().name(name).spawn(work)?);
+        *unstarted = None;
         Ok(())
     }
 
@@ -136,7 +138,7 @@ impl HttpServer {
         self.events.next(Duration::ZERO)
     }
 
-    /// The socket that becomes readable when there is something to take. Only the first call has it.
+    /// The socket that becomes readable when there is something to take. Only the first call returns it.
     pub fn wakes(&self) -> Option<Wakes> {
         self.wakes.lock().unwrap_or_else(PoisonError::into_inner).take()
     }

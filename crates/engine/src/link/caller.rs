@@ -74,7 +74,7 @@ impl Caller {
         Ok((Arc::new(caller), wakes))
     }
 
-    /// A new call, which ends at the end of its timeout at the latest.
+    /// A new call. Nothing ends it at its timeout if its turn has not come: its caller must withdraw it.
     pub(super) fn begin(
         self: &Arc<Caller>,
         request: &EncodedRequest,

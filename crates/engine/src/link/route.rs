@@ -48,9 +48,9 @@ counters! {
         /// Answered by the device, with exceptions too.
         replies,
         exceptions,
-        /// Sent, and not answered in time.
+        /// Not answered in time, or the connection took too long.
         timeouts,
-        /// Invalid replies and lost connections.
+        /// No connection, a lost connection, or an invalid reply.
         failures,
         /// Refused because the queue was full.
         refused_full,

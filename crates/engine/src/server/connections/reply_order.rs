@@ -11,6 +11,7 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 
 use holdfast_protocol::pdu::ExceptionCode;
+use tokio::sync::watch;
 
 use crate::link::{Asker, PendingReply, Reply, exception, source};
 use crate::server::connections::listener::ListenerContext;
@@ -104,9 +105,10 @@ impl Deferred {
             _ => return Deferral::Wait,
         };
         let asker = Asker { source: self.source, peer: Some(peer), waiting: self.waiting.len() };
-        let (asked, reply, refused) = Asked::send(context, (tag, unit_id, request), |permitted| {
-            unit_server.forward(rights, place, &asker, unit_id, request, permitted)
-        });
+        let (asked, reply, refused) =
+            Asked::send(context, place, (tag, unit_id, request), |permitted| {
+                unit_server.forward(rights, place, &asker, unit_id, request, permitted)
+            });
         let is_step = matches!(place, Elsewhere::Journal(_));
         self.waiting.push_back(Waiting { asked, reply, is_step });
         Deferral::Later(refused)
@@ -174,12 +176,13 @@ impl Asked {
     /// at once.
     pub(in crate::server) fn send(
         context: &ListenerContext,
+        place: &Elsewhere,
         (tag, unit_id, request): (u16, u8, &[u8]),
         forward: impl FnOnce(bool) -> Result<(Option<Arc<str>>, PendingReply), ExceptionCode>,
     ) -> (Asked, Expected, Option<RefusedRequest>) {
         let permit = context.permit_forwarded(request);
         let sent = forward(permit.is_some());
-        let refused = RefusedRequest::before_device(unit_id, request, &sent);
+        let refused = RefusedRequest::before_sending(place, unit_id, request, &sent);
         let (route, reply) = match sent {
             Ok((route, pending)) => (route, Expected::Pending(pending)),
             Err(code) => {
@@ -188,6 +191,24 @@ impl Asked {
             }
         };
         (Asked { tag, unit_id, route, request: request.to_vec(), permit }, reply, refused)
+    }
+
+    /// Waits for the reply, and counts and records it: in a task of its own, which goes on if the caller does not.
+    /// The engine waits until `running` is dropped.
+    pub(in crate::server) fn answered(
+        self,
+        pending: PendingReply,
+        (unit_server, context): (Arc<UnitServer>, Arc<ListenerContext>),
+        peer: Option<Peer>,
+        running: watch::Receiver<bool>,
+    ) -> impl Future<Output = Reply> + use<> {
+        let answering = tokio::spawn(async move {
+            let reply = self.count(&unit_server, pending.await.ok());
+            self.record(&context, peer.as_ref(), &reply);
+            drop(running);
+            reply
+        });
+        async move { answering.await.unwrap_or_default() }
     }
 
     /// Counts the reply, and returns it. `None` means that the link has ended.

@@ -3,7 +3,7 @@
 use std::sync::{Mutex, PoisonError};
 
 use holdfast_protocol::pdu::ExceptionCode;
-use holdfast_protocol::raw_ingest::Refusal;
+use holdfast_protocol::raw_ingest::{Header, Refusal};
 
 use crate::counter::{Counter, ReasonCounters, counters};
 
@@ -55,6 +55,12 @@ counters! {
 }
 
 impl PacketCounters {
+    /// Counts a packet that was written.
+    pub fn accept(&self, header: &Header) {
+        self.accepted.add();
+        self.values.add_many(u64::from(header.count.get()));
+    }
+
     pub fn refuse(&self, refusal: Refusal) {
         self.refused[usize::from(refusal.code())].add();
     }

@@ -3,10 +3,12 @@
 
 use std::sync::atomic::{AtomicU8, Ordering};
 
+use holdfast_memory::Memory;
 use holdfast_protocol::pdu::ExceptionCode;
 
 use crate::server::rights::functions::is_write;
 use crate::server::rights::peer_rights::PeerRights;
+use crate::server::rights::rule::Elsewhere;
 
 /// A refused request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -66,13 +68,20 @@ impl RefusedRequest {
         Some(RefusedRequest::new(unit_id, request, why))
     }
 
-    /// The refusal of a request that was not sent to its device; `None` if it was, or can't be.
-    pub(crate) fn before_device<T>(
+    /// The refusal of a request that was not sent to its place; `None` if it was, or can't be.
+    pub(crate) fn before_sending<T>(
+        place: &Elsewhere,
         unit_id: u8,
         request: &[u8],
         sent: &Result<T, ExceptionCode>,
     ) -> Option<RefusedRequest> {
-        RefusedRequest::with(unit_id, request, *sent.as_ref().err()?)
+        match *sent.as_ref().err()? {
+            // A full queue and a log that can't be used have the same exception.
+            ExceptionCode::ServerDeviceBusy if place.memory().is_some_and(Memory::sealed) => {
+                Some(RefusedRequest::new(unit_id, request, Why::Sealed))
+            }
+            code => RefusedRequest::with(unit_id, request, code),
+        }
     }
 
     fn with(unit_id: u8, request: &[u8], code: ExceptionCode) -> Option<RefusedRequest> {
@@ -106,7 +115,7 @@ impl Reported {
 mod tests {
     use std::sync::Arc;
 
-    use holdfast_memory::{Layout, Memory};
+    use holdfast_memory::{Area, Gate, GateMode, Layout, Memory, Span};
 
     use super::*;
     use crate::server::rights::functions::{AccessMode, Functions};
@@ -143,6 +152,21 @@ mod tests {
         assert_eq!(why(&READ, &[0x83, 2]), Some(Why::Address));
         assert_eq!(why(&WRITE, &[0x86, 6]), Some(Why::Sealed));
         assert_eq!(why(&READ, &[0x83, 0x0B]), Some(Why::Unit));
+    }
+
+    #[test]
+    fn a_busy_journal_is_refused_as_sealed_only_if_its_memory_is() {
+        let layout = Layout::default().with(Area::Coils, Span::new(0, 1).unwrap());
+        let gate = Gate { area: Area::Coils, address: 0, mode: GateMode::Once };
+        let refused = |gate, code| {
+            let place = Elsewhere::Journal(Arc::new(Memory::new(layout.clone(), gate).unwrap()));
+            let refused = RefusedRequest::before_sending::<()>(&place, 1, &WRITE, &Err(code));
+            refused.map(|refused| refused.why)
+        };
+        let busy = ExceptionCode::ServerDeviceBusy;
+        assert_eq!(refused(Some(gate), busy), Some(Why::Sealed));
+        assert_eq!(refused(None, busy), None);
+        assert_eq!(refused(Some(gate), ExceptionCode::IllegalFunction), Some(Why::Function));
     }
 
     #[test]

@@ -48,3 +48,14 @@ pub enum Elsewhere {
     /// Writes are carried out by the journal of its memory.
     Journal(Arc<Memory>),
 }
+
+impl Elsewhere {
+    /// The memory of the unit; `None` if it is a device.
+    pub(crate) fn memory(&self) -> Option<&Memory> {
+        match self {
+            Elsewhere::Device(_) => None,
+            Elsewhere::Mirror(passage) => Some(&passage.memory),
+            Elsewhere::Journal(memory) => Some(memory),
+        }
+    }
+}

@@ -62,6 +62,13 @@ pub(crate) struct ModbusSerial {
     reported: Reported,
 }
 
+/// What an answer needs of the listener.
+struct Serving {
+    context: Arc<ListenerContext>,
+    /// The engine waits until all of it is dropped.
+    running: watch::Receiver<bool>,
+}
+
 impl ModbusSerial {
     pub(crate) fn new(
         line: SerialLine,
@@ -85,17 +92,18 @@ impl ModbusSerial {
         mut port: SerialPort,
         mut stop: watch::Receiver<bool>,
     ) {
+        let serving = Serving { context, running: stop.clone() };
         let mut stopping = std::pin::pin!(stop.wait_for(|stop| *stop));
         loop {
             let lost = async {
                 match self.line.mode {
-                    LineMode::Rtu { .. } => self.serve_rtu(&context, &port).await,
-                    LineMode::Ascii => self.serve_ascii(&context, &port).await,
+                    LineMode::Rtu { .. } => self.serve_rtu(&serving, &port).await,
+                    LineMode::Ascii => self.serve_ascii(&serving, &port).await,
                 }
             };
             tokio::select! {
                 _ = &mut stopping => return,
-                _ = lost => context.report(Kind::LineLost, None),
+                _ = lost => serving.context.report(Kind::LineLost, None),
             }
             port = loop {
                 tokio::select! {
@@ -106,12 +114,12 @@ impl ModbusSerial {
                     break port;
                 }
             };
-            context.report(Kind::LineBack, None);
+            serving.context.report(Kind::LineBack, None);
         }
     }
 
     /// Serves RTU frames until the device is lost.
-    async fn serve_rtu(&self, context: &ListenerContext, port: &SerialPort) -> io::Error {
+    async fn serve_rtu(&self, serving: &Serving, port: &SerialPort) -> io::Error {
         let silence = self.line.silence();
         // One byte more than the longest frame, so that a longer one is detected.
         let mut frame = [0; rtu::MAX_LEN + 1];
@@ -125,7 +133,7 @@ impl ModbusSerial {
                 biased;
                 read = port.read(&mut frame[at..]) => read,
                 () = &mut quiet, if len > 0 => {
-                    if let Err(error) = self.answer_rtu(context, port, &frame[..len]).await {
+                    if let Err(error) = self.answer_rtu(serving, port, &frame[..len]).await {
                         return error;
                     }
                     len = 0;
@@ -143,7 +151,7 @@ impl ModbusSerial {
 
     async fn answer_rtu(
         &self,
-        context: &ListenerContext,
+        serving: &Serving,
         port: &SerialPort,
         frame: &[u8],
     ) -> io::Result<()> {
@@ -155,7 +163,7 @@ impl ModbusSerial {
         let Some(buffer) = reply[Rtu::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return Ok(());
         };
-        match self.answer(context, unit_id, request, buffer).await {
+        match self.answer(serving, unit_id, request, buffer).await {
             None => Ok(()),
             Some(len) => {
                 let len = Rtu::complete(&mut reply, 0, unit_id, len);
@@ -165,7 +173,7 @@ impl ModbusSerial {
     }
 
     /// Serves ASCII frames until the device is lost.
-    async fn serve_ascii(&self, context: &ListenerContext, port: &SerialPort) -> io::Error {
+    async fn serve_ascii(&self, serving: &Serving, port: &SerialPort) -> io::Error {
         let mut input = [0; 256];
         let mut frame: Vec<u8> = Vec::with_capacity(ascii::MAX_LEN);
         loop {
@@ -204,7 +212,7 @@ impl ModbusSerial {
                 }
                 frame.push(character);
                 if ends {
-                    if let Err(error) = self.answer_ascii(context, port, &mut frame).await {
+                    if let Err(error) = self.answer_ascii(serving, port, &mut frame).await {
                         return error;
                     }
                     frame.clear();
@@ -215,7 +223,7 @@ impl ModbusSerial {
 
     async fn answer_ascii(
         &self,
-        context: &ListenerContext,
+        serving: &Serving,
         port: &SerialPort,
         frame: &mut [u8],
     ) -> io::Result<()> {
@@ -228,7 +236,7 @@ impl ModbusSerial {
             return Ok(());
         };
         let mut buffer = [0; pdu::MAX_LEN];
-        let Some(len) = self.answer(context, unit_id, request, &mut buffer).await else {
+        let Some(len) = self.answer(serving, unit_id, request, &mut buffer).await else {
             return Ok(());
         };
         let mut reply = [0; ascii::MAX_LEN];
@@ -245,11 +253,12 @@ impl ModbusSerial {
     /// Returns the length of the reply, if there is one.
     async fn answer(
         &self,
-        context: &ListenerContext,
+        serving: &Serving,
         unit_id: u8,
         request: &[u8],
         reply: &mut pdu::Buffer,
     ) -> Option<usize> {
+        let Serving { context, running } = serving;
         if unit_id == BROADCAST {
             self.broadcast(context, request).await;
             return None;
@@ -257,16 +266,21 @@ impl ModbusSerial {
         let rights = self.rights.get();
         if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
             let asker = Asker { source: self.source, peer: None, waiting: 0 };
-            let asked = Asked::send(context, (0, unit_id, request), |permitted| {
+            let asked = Asked::send(context, place, (0, unit_id, request), |permitted| {
                 self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted)
             });
             let (asked, answered, refused) = asked;
             self.note_refused(context, refused);
             let answered = match answered {
-                Expected::Pending(pending) => asked.count(&self.unit_server, pending.await.ok()),
-                Expected::Known(reply) => reply,
+                Expected::Pending(pending) => {
+                    let ours = (Arc::clone(&self.unit_server), Arc::clone(context));
+                    asked.answered(pending, ours, None, running.clone()).await
+                }
+                Expected::Known(reply) => {
+                    asked.record(context, None, &reply);
+                    reply
+                }
             };
-            asked.record(context, None, &answered);
             let answered = answered.pdu;
             reply[..answered.len()].copy_from_slice(&answered);
             return (!answered.is_empty()).then_some(answered.len());

@@ -1,8 +1,10 @@
 //! Modbus over UDP and RTU over UDP: one request per datagram. The reply comes from the address that
 //! received the request.
 
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::io::{self, ErrorKind, IoSliceMut};
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 
 use holdfast_protocol::frame::{mbap, rtu};
@@ -14,7 +16,7 @@ use tokio::net::UdpSocket;
 use tokio::sync::watch;
 use tokio::task::{JoinSet, yield_now};
 
-use crate::link::{Asker, Reply, source};
+use crate::link::{Asker, source};
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::connections::reply_order::{Asked, Expected};
@@ -79,7 +81,7 @@ impl ModbusUdp {
     pub(crate) async fn serve(
         self,
         context: Arc<ListenerContext>,
-        socket: std::net::UdpSocket,
+        socket: Arc<UdpSocket>,
         stop: watch::Receiver<bool>,
     ) {
         match self.framing {
@@ -90,15 +92,14 @@ impl ModbusUdp {
 
     async fn serve_framed<D: Datagram>(
         &self,
-        context: &ListenerContext,
-        socket: std::net::UdpSocket,
+        context: &Arc<ListenerContext>,
+        socket: Arc<UdpSocket>,
         mut stop: watch::Receiver<bool>,
     ) {
-        let Ok(state) = UdpSocketState::new((&socket).into()) else { return };
-        let Ok(socket) = UdpSocket::from_std(socket) else { return };
+        let Ok(state) = UdpSocketState::new((&*socket).into()) else { return };
         let socket = Datagrams { socket, state };
         let mut input = vec![0; INPUT_BYTES].into_boxed_slice();
-        let mut later = Later { source: source(), replies: JoinSet::new() };
+        let mut later = Later::new(stop.clone());
         let mut turns = 0;
         loop {
             turns += 1;
@@ -111,7 +112,7 @@ impl ModbusUdp {
                 biased;
                 _ = stop.wait_for(|stop| *stop) => break,
                 Some(Ok(completed)) = later.replies.join_next(), if !later.replies.is_empty() => {
-                    self.complete::<D>(context, &socket, completed);
+                    complete::<D>(&socket, completed, &mut later);
                     continue;
                 }
                 ready = socket.socket.readable() => ready,
@@ -133,14 +134,14 @@ impl ModbusUdp {
         }
         // The engine drops listeners whose devices take too long.
         while let Some(Ok(completed)) = later.replies.join_next().await {
-            self.complete::<D>(context, &socket, completed);
+            complete::<D>(&socket, completed, &mut later);
         }
     }
 
     /// Answers all datagrams of one read. All have the same length, except the last.
     fn take<D: Datagram>(
         &self,
-        context: &ListenerContext,
+        context: &Arc<ListenerContext>,
         socket: &Datagrams,
         meta: &RecvMeta,
         input: &[u8],
@@ -161,29 +162,10 @@ impl ModbusUdp {
         }
     }
 
-    /// Sends the reply of a device.
-    fn complete<D: Datagram>(
-        &self,
-        context: &ListenerContext,
-        socket: &Datagrams,
-        Completed { asked, meta, reply }: Completed,
-    ) {
-        let reply = asked.count(&self.unit_server, reply);
-        let (tag, unit_id) = (asked.tag, asked.unit_id);
-        asked.record(context, Some(&meta.addr.into()), &reply);
-        let pdu = &reply.pdu[..];
-        if !pdu.is_empty() {
-            let mut frame = [0; MAX_FRAME_LEN];
-            frame[D::HEADER_LEN..][..pdu.len()].copy_from_slice(pdu);
-            let len = D::complete(&mut frame, tag, unit_id, pdu.len());
-            socket.send(&frame[..len], &meta);
-        }
-    }
-
     /// Returns the length of the reply, 0 when there is none, or none yet.
     fn answer<D: Datagram>(
         &self,
-        context: &ListenerContext,
+        context: &Arc<ListenerContext>,
         meta: &RecvMeta,
         datagram: &[u8],
         output: &mut [u8; MAX_FRAME_LEN],
@@ -213,10 +195,9 @@ impl ModbusUdp {
             return 0;
         };
         if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
-            let waiting = later.replies.len();
-            let asker = Asker { source: later.source, peer: Some(peer.ip()), waiting };
-            let asked = Asked::send(context, (tag, unit_id, request), |permitted| {
-                if waiting >= MAX_PENDING_REPLIES {
+            let asker = later.asker(peer.ip());
+            let asked = Asked::send(context, place, (tag, unit_id, request), |permitted| {
+                if later.is_full(asker.waiting) {
                     return Err(ExceptionCode::ServerDeviceBusy);
                 }
                 self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted)
@@ -226,9 +207,12 @@ impl ModbusUdp {
             return match reply {
                 Expected::Pending(pending) => {
                     let meta = *meta;
-                    later
-                        .replies
-                        .spawn(async move { Completed { asked, meta, reply: pending.await.ok() } });
+                    let ours = (Arc::clone(&self.unit_server), Arc::clone(context));
+                    let reply =
+                        asked.answered(pending, ours, Some(peer.into()), later.running.clone());
+                    later.begin(&asker, peer.ip(), async move {
+                        Completed { meta, tag, unit_id, pdu: reply.await.pdu }
+                    });
                     0
                 }
                 Expected::Known(reply) => {
@@ -245,17 +229,78 @@ impl ModbusUdp {
     }
 }
 
-/// Requests to devices, whose replies come later.
+/// Requests whose replies come later.
 struct Later {
-    source: u64,
+    /// The clients that wait for replies.
+    clients: HashMap<IpAddr, Client>,
     replies: JoinSet<Completed>,
+    /// The engine waits until it is dropped.
+    running: watch::Receiver<bool>,
 }
 
-/// A request to a device, with its reply; `None` when the link has ended.
+/// All requests from one address: a client may send each from another port.
+struct Client {
+    source: u64,
+    waiting: usize,
+}
+
+impl Later {
+    fn new(running: watch::Receiver<bool>) -> Later {
+        Later { clients: HashMap::new(), replies: JoinSet::new(), running }
+    }
+
+    fn asker(&self, address: IpAddr) -> Asker {
+        let (source, waiting) = match self.clients.get(&address) {
+            Some(client) => (client.source, client.waiting),
+            None => (source(), 0),
+        };
+        Asker { source, peer: Some(address), waiting }
+    }
+
+    /// Whether a client with so many requests must wait: it may have no more than it leaves to others.
+    fn is_full(&self, own: usize) -> bool {
+        MAX_PENDING_REPLIES.saturating_sub(self.replies.len()) <= own
+    }
+
+    fn begin(
+        &mut self,
+        asker: &Asker,
+        address: IpAddr,
+        completed: impl Future<Output = Completed> + Send + 'static,
+    ) {
+        let client = Client { source: asker.source, waiting: 0 };
+        self.clients.entry(address).or_insert(client).waiting += 1;
+        self.replies.spawn(completed);
+    }
+
+    fn end(&mut self, address: IpAddr) {
+        if let Entry::Occupied(mut client) = self.clients.entry(address) {
+            client.get_mut().waiting -= 1;
+            if client.get().waiting == 0 {
+                client.remove();
+            }
+        }
+    }
+}
+
+/// The reply of a device.
 struct Completed {
-    asked: Asked,
     meta: RecvMeta,
-    reply: Option<Reply>,
+    tag: u16,
+    unit_id: u8,
+    pdu: Vec<u8>,
+}
+
+/// Sends the reply of a device.
+fn complete<D: Datagram>(socket: &Datagrams, completed: Completed, later: &mut Later) {
+    let Completed { meta, tag, unit_id, pdu } = completed;
+    later.end(meta.addr.ip());
+    if !pdu.is_empty() {
+        let mut frame = [0; MAX_FRAME_LEN];
+        frame[D::HEADER_LEN..][..pdu.len()].copy_from_slice(&pdu);
+        let len = D::complete(&mut frame, tag, unit_id, pdu.len());
+        socket.send(&frame[..len], &meta);
+    }
 }
 
 fn note_refused(context: &ListenerContext, refused: Option<RefusedRequest>, peer: SocketAddr) {
@@ -266,14 +311,14 @@ fn note_refused(context: &ListenerContext, refused: Option<RefusedRequest>, peer
 
 /// A socket that reports the local address of each datagram.
 struct Datagrams {
-    socket: UdpSocket,
+    socket: Arc<UdpSocket>,
     state: UdpSocketState,
 }
 
 impl Datagrams {
     fn receive(&self, input: &mut [u8]) -> io::Result<RecvMeta> {
         let mut meta = [RecvMeta::default()];
-        self.state.recv((&self.socket).into(), &mut [IoSliceMut::new(input)], &mut meta)?;
+        self.state.recv((&*self.socket).into(), &mut [IoSliceMut::new(input)], &mut meta)?;
         Ok(meta[0])
     }
 
@@ -287,7 +332,7 @@ impl Datagrams {
             src_ip: to.dst_ip,
         };
         // Sends directly by the system: the runtime may not know yet that the socket is writable.
-        if self.state.try_send((&self.socket).into(), &transmit).is_err() {
+        if self.state.try_send((&*self.socket).into(), &transmit).is_err() {
             // The request may have been sent to a broadcast address, which cannot be the source of
             // a reply.
             let _ = SockRef::from(&self.socket).send_to(reply, &to.addr.into());
@@ -303,6 +348,27 @@ mod tests {
     use crate::server::connections::listener::bind_udp;
     use crate::server::requests::identity::Identity;
     use crate::server::rights::functions::{AccessMode, Functions};
+
+    #[test]
+    fn a_client_leaves_pending_replies_to_others_and_is_forgotten_after_its_last_one() {
+        let [one, other] = [1, 2].map(|last| IpAddr::from([127, 0, 0, last]));
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let _context = runtime.enter();
+        let mut later = Later::new(watch::channel(false).1);
+        let first = later.asker(one);
+        later.begin(&first, one, std::future::pending());
+        while !later.is_full(later.asker(one).waiting) {
+            let asker = later.asker(one);
+            assert_eq!(asker.source, first.source);
+            later.begin(&asker, one, std::future::pending());
+        }
+        assert_eq!(later.replies.len(), MAX_PENDING_REPLIES / 2);
+        let asker = later.asker(other);
+        assert_eq!((asker.waiting, later.is_full(asker.waiting)), (0, false));
+        assert_ne!(asker.source, first.source);
+        (0..later.asker(one).waiting).for_each(|_| later.end(one));
+        assert!(later.clients.is_empty());
+    }
 
     #[test]
     fn other_tasks_run_between_many_datagrams_that_have_arrived() {
@@ -334,6 +400,7 @@ mod tests {
         let read = || unit_server.counters.requests().map(|(_, count)| count).sum::<u64>();
         let most = runtime.block_on(async {
             let context = Arc::new(ListenerContext::for_tests());
+            let socket = Arc::new(UdpSocket::from_std(socket).unwrap());
             let _serving = tokio::spawn(service.serve(context, socket, stop));
             let (mut most, mut before) = (0, 0);
             while before < DATAGRAMS as u64 {
