@@ -5,10 +5,12 @@ from __future__ import annotations
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from holdfast.config import load
 from support import routed, wire
 from support.audits import await_writes
 from support.fake_device import FakeDevice, Serial, Stream, Udp, exception, good, silent
@@ -485,6 +487,7 @@ def test_a_device_that_can_t_be_reached_is_exception_0a(run: Run, connect: Conne
     front = connect(scada(appliance))
 
     assert front.ask(READ) == exception(READ, 0x0A)
+    await_count(appliance, "failures", 1)
     assert front.ask(WRITE) == exception(WRITE, 0x0A)
 
 
@@ -497,6 +500,7 @@ def test_a_device_whose_machine_drops_packets_is_exception_0a(
         front = connect(scada(appliance))
 
         assert front.ask(READ) == exception(READ, 0x0A)
+        await_count(appliance, "timeouts", 1)
         assert front.ask(WRITE) == exception(WRITE, 0x0A)
 
 
@@ -725,9 +729,11 @@ def test_what_is_passed_on_is_in_the_audit_log(
     assert len(found) == 4
 
 
+@pytest.mark.parametrize("is_ended", [False, True])
 def test_a_write_under_way_is_recorded_although_its_client_has_gone(
-    device: Stream, run: Run, connect: Connect, tmp_path: Path
+    device: Stream, run: Run, connect: Connect, tmp_path: Path, is_ended: bool
 ) -> None:
+    """Also if it is the appliance that ends the connection."""
     held = Held()
     device.script = [held]
     appliance = run(configuration(device.url, audit={"file": "audit.log"}))
@@ -735,7 +741,11 @@ def test_a_write_under_way_is_recorded_although_its_client_has_gone(
     gone.send(wire.frame(WRITE, 1, 1) + wire.frame(WRITE, 2, 2))
     device.await_requests(1)
     await_count(appliance, "waiting", 2)
-    gone.reset()
+    if is_ended:
+        [session] = appliance.sessions()
+        assert appliance.end_session("scada", session["id"], {})
+    else:
+        gone.reset()
     await_nobody(appliance)
     held.release()
 
@@ -743,6 +753,34 @@ def test_a_write_under_way_is_recorded_although_its_client_has_gone(
     [line] = await_writes(tmp_path / "audit.log", 1)
     assert (line["unit"], line["function"], line["outcome"]) == (1, 6, "done")
     device.await_requests(1)
+
+
+@pytest.mark.parametrize("kind", ["tcp", "udp", "serial"])
+def test_a_write_under_way_is_recorded_although_its_listener_was_removed(
+    device: Stream, run: Run, tmp_path: Path, kind: str
+) -> None:
+    held = Held()
+    device.script = [held]
+    audit = {"file": "audit.log"}
+    with ExitStack() as clients:
+        if kind == "serial":
+            line = clients.enter_context(Line(tmp_path / "line", RTU))
+            text = routed.serial_configuration(device.url, RTU.listener, line.device, audit=audit)
+            appliance = run(text)
+            line.send(RTU.frame(WRITE, 1))
+        else:
+            appliance = run(configuration(device.url, kind=kind, audit=audit))
+            front = clients.enter_context(client(kind, scada(appliance)))
+            assert isinstance(front, wire.Connection | Datagrams)
+            front.send(wire.frame(WRITE))
+        device.await_requests(1)
+        file = tmp_path / "appliance.yaml"
+        file.write_text(configuration(device.url, audit=audit).replace("scada:", "other:"))
+        appliance.reload(load(file))
+        assert list(appliance.diagnostics.stats()["listeners"]) == ["other"]
+        held.release()
+        [found] = await_writes(tmp_path / "audit.log", 1)
+    assert (found["function"], found["outcome"]) == (6, "done")
 
 
 # The end

@@ -51,7 +51,7 @@ def configuration(
     )
 
 
-def serial_configuration(url: str, kind: str, device: Path) -> str:
+def serial_configuration(url: str, kind: str, device: Path, **more: Any) -> str:
     """One listener, `line`, on a serial line; all its unit ids are behind the link `bus`."""
     rules = [{"access": "read-write", "units": {"1-247": {"route": "bus"}}}]
     serial = {"device": str(device), "parity": "none"}
@@ -59,6 +59,7 @@ def serial_configuration(url: str, kind: str, device: Path) -> str:
         {
             "listeners": {"line": {"type": kind, "serial": serial, "rules": rules}},
             "links": {"bus": {"url": url, "timeout": wire.DEADLINE}},
+            **more,
         }
     )
 

@@ -14,6 +14,7 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 
 use holdfast_protocol::pdu;
+use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::task::yield_now;
 use tokio::time::{Instant, Sleep, sleep_until};
@@ -104,6 +105,8 @@ struct Answering<F: Framing> {
     reported: Reported,
     /// `None` until a request is answered later.
     deferred: Option<Box<Deferred>>,
+    /// The engine waits until it is dropped; `None` before the connection is served.
+    running: Option<watch::Receiver<bool>>,
 }
 
 /// The result of answering some input.
@@ -153,11 +156,11 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
     /// Serves until the connection ends. The end is counted before the peer can see it. As a block: an
     /// `async fn` would have room for the connection twice.
     pub(crate) fn run(mut self, mut stop: watch::Receiver<bool>) -> Serving {
+        self.answering.running = Some(stop.clone());
         Box::pin(async move {
             match self.serve(&mut stop).await {
                 Some(end) => {
-                    // The engine waits until all receivers are dropped.
-                    self.answering.give_up(stop);
+                    self.answering.give_up();
                     self.answering.ended(end);
                     // After replies that were cut off, a closing message would be misread.
                     if self.unsent.is_empty() {
@@ -369,6 +372,16 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
     }
 }
 
+impl<F: Framing> Drop for Answering<F> {
+    /// Also when the task of the connection is aborted: a client can't keep a write out of the audit log by its end.
+    fn drop(&mut self) {
+        // Without a runtime, the engine is gone.
+        if Handle::try_current().is_ok() {
+            self.give_up();
+        }
+    }
+}
+
 impl<F: Framing> Answering<F> {
     fn new(
         context: Arc<ListenerContext>,
@@ -386,6 +399,7 @@ impl<F: Framing> Answering<F> {
             delimiter: ASCII_DELIMITER,
             reported: Reported::default(),
             deferred: None,
+            running: None,
         }
     }
 
@@ -504,11 +518,12 @@ impl<F: Framing> Answering<F> {
         self.context.ended(end, self.peer.clone());
     }
 
-    /// The peer has disconnected. Replies of devices that still come are recorded.
-    fn give_up(&mut self, running: watch::Receiver<bool>) {
+    /// The connection has ended. Replies of devices that still come are recorded.
+    fn give_up(&mut self) {
         let Some(deferred) = self.deferred.take().filter(|deferred| !deferred.is_empty()) else {
             return;
         };
+        let running = self.running.take();
         let (context, unit_server) = (Arc::clone(&self.context), Arc::clone(&self.unit_server));
         let (peer, given_up) = (self.peer.clone(), deferred.give_up());
         tokio::spawn(async move {
@@ -517,7 +532,6 @@ impl<F: Framing> Answering<F> {
                     asked.record(&context, Some(&peer), &reply);
                 }
             }
-            // The engine waits for this until all receivers are dropped.
             drop(running);
         });
     }
@@ -810,7 +824,10 @@ mod tests {
         );
         let limits = ConnectionLimits { max_connections: 1, ..ConnectionLimits::NONE };
         let (ticket, _) = Arc::new(Admission::new(limits)).admit(peer).unwrap();
-        let Answering { context, unit_server, rights, .. } = answering::<F>();
+        let answering = answering::<F>();
+        let (context, unit_server) =
+            (Arc::clone(&answering.context), Arc::clone(&answering.unit_server));
+        let rights = Arc::clone(&answering.rights);
         let timeouts = Timeouts { idle: None, request: Duration::ZERO, frame: None };
         let (terms, renewal) = (Terms { rights, timeouts }, Arc::new(NoRights));
         let stream = (stream, peer.into());

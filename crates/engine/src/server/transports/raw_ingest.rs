@@ -16,7 +16,7 @@ use std::sync::Arc;
 use std::task::ready;
 use std::time::Duration;
 
-use holdfast_memory::{Access, Area, Memory, Operation, Refusal as MemoryRefusal, Write};
+use holdfast_memory::{Access, Area, Memory, Operation, Outcome, Refusal as MemoryRefusal, Write};
 use holdfast_protocol::raw_ingest::{DONE, Format, Header, REFUSED, Refusal};
 use ipnet::IpNet;
 use socket2::SockRef;
@@ -109,6 +109,8 @@ pub enum AfterRefusal {
 
 #[derive(Debug)]
 pub(crate) struct RawGrant {
+    /// Decides what the numbers of the targets mean.
+    format: Format,
     targets: HashMap<u16, Arc<Memory>>,
     areas: Vec<Area>,
 }
@@ -215,7 +217,8 @@ impl RawIngest {
     pub(crate) fn new(settings: &RawSettings, packets: Arc<PacketCounters>) -> RawIngest {
         let rules = settings.rules.iter().map(|rule| {
             let targets = rule.targets.iter().cloned().collect();
-            let rights = Arc::new(RawGrant { targets, areas: rule.areas.clone() });
+            let (format, areas) = (settings.format, rule.areas.clone());
+            let rights = Arc::new(RawGrant { format, targets, areas });
             PolicyEntry { sources: rule.sources.clone(), roles: rule.roles.clone(), rights }
         });
         let (many, after_refusal) = match settings.packets {
@@ -225,7 +228,11 @@ impl RawIngest {
         RawIngest {
             packets,
             policy: Grants(rules.collect()),
-            no_rights: Arc::new(RawGrant { targets: HashMap::new(), areas: Vec::new() }),
+            no_rights: Arc::new(RawGrant {
+                format: settings.format,
+                targets: HashMap::new(),
+                areas: Vec::new(),
+            }),
             tls: settings.tls.clone(),
             format: settings.format,
             flags: settings.flags,
@@ -314,6 +321,9 @@ impl RawIngest {
         let (time_limit, stopping) = (self.request_timeout, stop.clone());
         let secured = secured(tls, &context, (stream, peer), &ticket, time_limit, stopping).await;
         let Some((stream, peer)) = secured else { return };
+        if context.end_after_reload(self, &live, (&ticket, &peer)) {
+            return;
+        }
         // A reload reviews connections by their roles. This one looks up its rights only now.
         let rights = live.get().granted(&peer).unwrap_or_else(|| {
             // Each packet is refused, which tells the sender more than the end of the connection.
@@ -380,16 +390,27 @@ impl RawIngest {
         }
         let permit = context.permit_packet(payload).ok_or(Refusal::Unrecorded)?;
         let (done, outcome) = oneshot::channel();
-        let kept = Box::new(|outcome| {
+        let packets = Arc::clone(&self.packets);
+        let recording = context
+            .auditor
+            .clone()
+            .map(|auditor| (auditor, self.record(context, peer, (Some(header), payload), None)));
+        // Counted and recorded by the journal's thread: the connection may have ended meanwhile.
+        let kept = Box::new(move |outcome: Outcome| {
+            if let Ok(carried_out) = &outcome {
+                packets.accept(&header);
+                if let Some((auditor, record)) = recording {
+                    let log_sequence = carried_out.sequence;
+                    auditor.send(Record { log_sequence, ..record }, Some(permit));
+                }
+            }
             let _ = done.send(outcome);
         });
         memory
             .submit(Access::Ingest, Operation::Write(&[writing(&header, payload)]), kept)
             .map_err(refusal)?;
         let outcome = outcome.await.map_err(|_| Refusal::NotConfirmed)?;
-        let done = outcome.map_err(|refused| refusal(refused.refusal))?;
-        self.accepted(context, peer, (header, payload), (done.sequence, permit));
-        Ok(())
+        outcome.map(|_| ()).map_err(|refused| refusal(refused.refusal))
     }
 
     /// Writes a complete packet to a memory without a journal.
@@ -402,31 +423,31 @@ impl RawIngest {
         debug_assert!(!memory.has_journal(), "a journal would block the thread");
         let permit = context.permit_packet(payload).ok_or(Refusal::Unrecorded)?;
         memory.write(Access::Ingest, writing(&header, payload)).map_err(refusal)?;
-        self.accepted(context, peer, (header, payload), (None, permit));
+        self.packets.accept(&header);
+        self.audit(context, peer, (Some(header), payload), Ok(permit));
         Ok(())
     }
 
-    fn accepted(
-        &self,
-        context: &ListenerContext,
-        peer: &Peer,
-        (header, payload): (Header, &[u8]),
-        recorded: (Option<u64>, Permit),
-    ) {
-        self.packets.accepted.add();
-        self.packets.values.add_many(u64::from(header.count.get()));
-        self.audit(context, peer, (Some(header), payload), Ok(recorded));
+    /// Looks up the rights of a connection again after a reload.
+    fn renew<S>(&self, sending: &mut Sending<S>, renewal: &Renewal) -> Result<(), Kind> {
+        if sending.ticket.take_outdated() {
+            let renewed = renewal().filter(|rights| rights.format == self.format);
+            sending.rights = renewed.ok_or(Kind::RightsRevoked)?;
+        }
+        Ok(())
     }
 
     /// Receives a packet. The inner error is a refusal; the outer one says why no reply is due.
     async fn receive<S: Stream>(
         &self,
         sending: &mut Sending<S>,
+        renewal: &Renewal,
         mut stop: watch::Receiver<bool>,
     ) -> Result<Result<(), Refusal>, Kind> {
         let deadline = Instant::now() + self.request_timeout;
         loop {
             sending.ticket.set_amid_packet(sending.is_amid_packet());
+            self.renew(sending, renewal)?;
             let missing = match self.judge(&sending.rights, &sending.bytes) {
                 Ok(Packet::Incomplete { missing }) => missing,
                 Ok(Packet::Whole { .. }) => return Ok(Ok(())),
@@ -459,7 +480,7 @@ impl RawIngest {
         if let Some(idle) = self.many {
             return self.serve_many(context, sending, renewal, idle, stop).await;
         }
-        let judged = match self.receive(&mut sending, stop.clone()).await {
+        let judged = match self.receive(&mut sending, &renewal, stop.clone()).await {
             Err(end) => {
                 context.ended(end, sending.peer.clone());
                 return sending.end();
@@ -523,12 +544,9 @@ impl RawIngest {
         let mut answered = 0;
         let mut packets: usize = 0;
         loop {
-            if sending.ticket.take_outdated() {
-                let Some(renewed) = renewal() else {
-                    end = Kind::RightsRevoked;
-                    break;
-                };
-                sending.rights = renewed;
+            if let Err(revoked) = self.renew(&mut sending, &renewal) {
+                end = revoked;
+                break;
             }
             let waiting = &sending.bytes[answered..];
             let first = self.first_of(&context, &sending.peer, &sending.rights, waiting).await;
@@ -694,22 +712,31 @@ impl RawIngest {
         self.audit(context, peer, (header, &[]), Err(refusal));
     }
 
+    /// Records a packet that was carried out or refused.
     fn audit(
         &self,
         context: &ListenerContext,
         peer: &Peer,
-        (header, payload): (Option<Header>, &[u8]),
-        outcome: Result<(Option<u64>, Permit), Refusal>,
+        packet: (Option<Header>, &[u8]),
+        outcome: Result<Permit, Refusal>,
     ) {
         if let Some(auditor) = &context.auditor {
-            let (format, payload, refused) =
-                (self.format, payload.to_vec(), outcome.as_ref().err());
-            let write = Written::Packet { format, header, payload, refused: refused.copied() };
-            let (listener, peer) = (Arc::clone(&context.name), Some(peer.clone()));
-            let (log_sequence, permit) = outcome.ok().unzip();
-            let log_sequence = log_sequence.flatten();
-            auditor.send(Record { listener, peer, write, log_sequence }, permit);
+            let record = self.record(context, peer, packet, outcome.as_ref().err().copied());
+            auditor.send(record, outcome.ok());
         }
+    }
+
+    fn record(
+        &self,
+        context: &ListenerContext,
+        peer: &Peer,
+        (header, payload): (Option<Header>, &[u8]),
+        refused: Option<Refusal>,
+    ) -> Record {
+        let (format, payload) = (self.format, payload.to_vec());
+        let write = Written::Packet { format, header, payload, refused };
+        let (listener, peer) = (Arc::clone(&context.name), Some(peer.clone()));
+        Record { listener, peer, write, log_sequence: None }
     }
 }
 
@@ -751,7 +778,7 @@ impl Service for RawIngest {
     }
 
     fn ends(&self, before: &RawIngest, peer: &Peer) -> Option<Kind> {
-        let is_other = self.tls.is_some() != before.tls.is_some();
+        let is_other = self.format != before.format || self.tls.is_some() != before.tls.is_some();
         if is_other || self.rights(peer.ip()).is_none() {
             return Some(Kind::RightsRevoked);
         }
@@ -853,7 +880,8 @@ mod tests {
     fn rights() -> RawGrant {
         let layout = Layout::default().with(Area::HoldingRegisters, Span::new(0, 8).unwrap());
         let memory = Arc::new(Memory::new(layout, None).unwrap());
-        RawGrant { targets: HashMap::from([(1, memory)]), areas: vec![Area::HoldingRegisters] }
+        let targets = HashMap::from([(1, memory)]);
+        RawGrant { format: Format::V1, targets, areas: vec![Area::HoldingRegisters] }
     }
 
     /// Both ends of a connection.
