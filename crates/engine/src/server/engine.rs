@@ -2,14 +2,16 @@
 
 use std::io;
 use std::mem;
-use std::net::{SocketAddr, TcpListener, UdpSocket};
+use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread;
 use std::time::Duration;
 
 use holdfast_protocol::pdu::identification::ObjectError;
+use socket2::{SockRef, Socket};
 use thiserror::Error;
+use tokio::net::{TcpListener, UdpSocket};
 use tokio::runtime::{Builder, Handle, Runtime};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
@@ -18,7 +20,9 @@ use crate::heartbeat::Heartbeat;
 use crate::own_threads::OwnThreads;
 use crate::serial_line::SerialLine;
 use crate::server::connections::admission::{ConnectionLimits, OpenConnection};
-use crate::server::connections::listener::{ListenerContext, Service, accept, bind_tcp, bind_udp};
+use crate::server::connections::listener::{
+    ListenerContext, Service, accept_shared, bind_tcp, bind_udp,
+};
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::audit::{Auditor, Record, Records, Unrecordable, auditing};
 use crate::server::reports::counters::{ConnectionCounters, PacketCounters};
@@ -122,9 +126,17 @@ struct Listener {
     bind: Option<SocketAddr>,
     /// `None` on a serial line.
     address: Option<SocketAddr>,
+    /// `None` on a serial line.
+    copy_socket: Option<CopySocket>,
     served: Served,
     task: OnceLock<AbortHandle>,
 }
+
+/// Copies the socket of a listener, unless its task has ended.
+type CopySocket = Box<dyn Fn() -> Option<Socket> + Send + Sync>;
+
+/// The socket of a new listener, its address, and what copies it.
+type Bound<S> = (Arc<S>, SocketAddr, CopySocket);
 
 enum Served {
     Stream(Arc<Reloadable<ModbusStream>>, Arc<UnitServer>),
@@ -202,7 +214,8 @@ impl Engine {
     /// Serves these listeners from now on. A listener with the name, protocol and address of a
     /// running one takes over its socket, its counters and its connections: those that have no
     /// rights any more are ended, the others get their new rights before their next request. Other
-    /// running listeners are ended.
+    /// running listeners are ended. A new listener takes over the socket of one that ends and has
+    /// exactly its address.
     ///
     /// # Errors
     /// [`StartError`]. Nothing has changed then.
@@ -211,14 +224,19 @@ impl Engine {
         let identity = || Identity::new(&identity, &unit_names);
         identity()?;
         let mut listeners = self.listeners();
+        let mut ending = listeners.clone();
+        let kept = |ListenerSettings { name, kind }: &ListenerSettings| {
+            let at = ending.iter().position(|running| *running.context.name == **name)?;
+            let update = ending[at].update(kind, identity().ok()?)?;
+            Some(Change::Keep(ending.remove(at), update))
+        };
+        let kept: Vec<_> = settings.iter().map(kept).collect();
         let mut changes = Vec::new();
-        for ListenerSettings { name, kind } in settings {
-            let running = listeners.iter().find(|running| *running.context.name == *name);
-            let update = running.and_then(|running| running.update(&kind, identity().ok()?));
-            changes.push(match (running, update) {
-                (Some(running), Some(update)) => Change::Keep(Arc::clone(running), update),
-                _ => {
-                    let (listener, task) = self.listener(&name, kind, identity()?)?;
+        for (ListenerSettings { name, kind }, kept) in settings.into_iter().zip(kept) {
+            changes.push(match kept {
+                Some(kept) => kept,
+                None => {
+                    let (listener, task) = self.listener(&name, kind, identity()?, &mut ending)?;
                     Change::Start(Arc::new(listener), task)
                 }
             });
@@ -245,51 +263,52 @@ impl Engine {
         Ok(())
     }
 
-    /// Binds a listener. Nothing is served before its task runs.
+    /// Binds a listener, or takes over the socket of one of those that end. Nothing is served before
+    /// its task runs.
     fn listener(
         &self,
         name: &str,
         kind: ListenerKind,
         identity: Identity,
+        ending: &mut Vec<Arc<Listener>>,
     ) -> Result<(Listener, Task), StartError> {
+        let _runtime = self.handles[0].enter();
         let context = |limits: Option<ConnectionLimits>| {
             let (reporter, auditor) = (self.reporter.clone(), self.auditor.clone());
             Arc::new(ListenerContext::new(name, limits, reporter, auditor))
         };
         let unit_server = |settings| Arc::new(UnitServer::new(identity, settings));
         let (workers, stopping) = (self.handles.clone(), self.stop.subscribe());
-        let (context, bind, address, served, task): (_, _, _, _, Task) = match kind {
+        let (context, bound, served, task): (_, _, _, Task) = match kind {
             ListenerKind::ModbusStream(stream) => {
-                let (socket, address) =
-                    bound(name, stream.bind, bind_tcp, TcpListener::local_addr)?;
+                let (socket, address, copy) = bound_tcp(name, stream.bind, ending)?;
                 let context = context(Some(stream.limits));
                 let unit_server = unit_server(stream.units);
                 let service = ModbusStream::new(&stream, Arc::clone(&unit_server), None);
                 let live = Arc::new(Reloadable::new(service));
                 let served = Served::Stream(Arc::clone(&live), unit_server);
-                let task = accept(Arc::clone(&context), live, socket, workers, stopping);
-                (context, Some(stream.bind), Some(address), served, Box::pin(task))
+                let task = accept_shared(Arc::clone(&context), live, socket, workers, stopping);
+                (context, Some((stream.bind, address, copy)), served, Box::pin(task))
             }
             ListenerKind::RawIngest(raw) => {
-                let (socket, address) = bound(name, raw.bind, bind_tcp, TcpListener::local_addr)?;
+                let (socket, address, copy) = bound_tcp(name, raw.bind, ending)?;
                 let context = context(Some(raw.limits));
                 let live = Arc::new(Reloadable::new(RawIngest::new(&raw, Arc::default())));
                 let served = Served::Packets(Arc::clone(&live));
-                let task = accept(Arc::clone(&context), live, socket, workers, stopping);
-                (context, Some(raw.bind), Some(address), served, Box::pin(task))
+                let task = accept_shared(Arc::clone(&context), live, socket, workers, stopping);
+                (context, Some((raw.bind, address, copy)), served, Box::pin(task))
             }
             ListenerKind::ModbusUdp(udp) => {
-                let (socket, address) = bound(name, udp.bind, bind_udp, UdpSocket::local_addr)?;
+                let (socket, address, copy) = bound_udp(name, udp.bind, ending)?;
                 let (context, unit_server) = (context(None), unit_server(udp.units));
                 let policy = Arc::new(Reloadable::new(Policy::of(&udp.rules)));
                 let (rules, units) = (Arc::clone(&policy), Arc::clone(&unit_server));
                 let service = ModbusUdp::new(udp.framing, rules, units);
                 let served = Served::Datagrams(udp.framing, policy, unit_server);
                 let task = service.serve(Arc::clone(&context), socket, stopping);
-                (context, Some(udp.bind), Some(address), served, Box::pin(task))
+                (context, Some((udp.bind, address, copy)), served, Box::pin(task))
             }
             ListenerKind::ModbusSerial(SerialSettings { line, rule, units }) => {
-                let _context = self.handles[0].enter();
                 let port = line.open().map_err(|error| StartError::Open {
                     listener: name.to_owned(),
                     device: line.device.clone(),
@@ -301,10 +320,15 @@ impl Engine {
                 let service = ModbusSerial::new(line.clone(), own, units);
                 let served = Served::Serial(line, rights, unit_server);
                 let task = service.serve(Arc::clone(&context), port, stopping);
-                (context, None, None, served, Box::pin(task))
+                (context, None, served, Box::pin(task))
             }
         };
-        let listener = Listener { context, bind, address, served, task: OnceLock::new() };
+        let (bind, address, copy_socket) = match bound {
+            Some((bind, address, copy)) => (Some(bind), Some(address), Some(copy)),
+            None => (None, None, None),
+        };
+        let listener =
+            Listener { context, bind, address, copy_socket, served, task: OnceLock::new() };
         Ok((listener, task))
     }
 
@@ -382,12 +406,8 @@ impl Engine {
         if self.workers.are_of_another_process() || !self.workers.are_running() {
             return Vec::new();
         }
-        let kind = |served: &Served| match served {
-            Served::Datagrams(..) => SocketKind::Udp,
-            Served::Stream(..) | Served::Serial(..) | Served::Packets(_) => SocketKind::Tcp,
-        };
         let listeners = self.listeners();
-        listeners.iter().filter_map(|each| Some((kind(&each.served), each.address?))).collect()
+        listeners.iter().filter_map(|each| Some((each.socket_kind()?, each.address?))).collect()
     }
 
     /// The counters of each listener, in the order of the settings.
@@ -449,6 +469,15 @@ fn heartbeat(index: usize) -> Arc<Heartbeat> {
 }
 
 impl Listener {
+    /// `None` on a serial line.
+    fn socket_kind(&self) -> Option<SocketKind> {
+        match self.served {
+            Served::Datagrams(..) => Some(SocketKind::Udp),
+            Served::Stream(..) | Served::Packets(_) => Some(SocketKind::Tcp),
+            Served::Serial(..) => None,
+        }
+    }
+
     fn counters(&self) -> ListenerCounters {
         let protocol = match &self.served {
             Served::Stream(live, unit_server) => {
@@ -528,26 +557,66 @@ impl Listener {
         if let Some(task) = self.task.get() {
             task.abort();
         }
-        for (peer, kind) in self.context.admission.review(|_| Some(Kind::RightsRevoked)) {
-            self.context.ended(kind, peer);
+        // The task may be about to admit a connection: it ends at its next await.
+        for peer in self.context.admission.close() {
+            self.context.ended(Kind::RightsRevoked, peer);
         }
     }
 }
 
-/// Binds a socket and returns its address.
-fn bound<S>(
+/// Binds a socket, or takes over that of a listener that ends. Must be called in the context of a
+/// runtime.
+fn bound_tcp(
     listener: &str,
+    bind: SocketAddr,
+    ending: &mut Vec<Arc<Listener>>,
+) -> Result<Bound<TcpListener>, StartError> {
+    let socket = match taken_over(ending, SocketKind::Tcp, bind) {
+        Some(socket) => Ok(socket.into()),
+        None => bind_tcp(bind),
+    };
+    let socket = socket.and_then(TcpListener::from_std);
+    let bound = socket.and_then(|socket| Ok((socket.local_addr()?, Arc::new(socket))));
+    let (address, socket) = bound.map_err(bind_error(listener, bind))?;
+    let weak = Arc::downgrade(&socket);
+    let copy = move || SockRef::from(&*weak.upgrade()?).try_clone().ok();
+    Ok((socket, address, Box::new(copy)))
+}
+
+/// As `bound_tcp`.
+fn bound_udp(
+    listener: &str,
+    bind: SocketAddr,
+    ending: &mut Vec<Arc<Listener>>,
+) -> Result<Bound<UdpSocket>, StartError> {
+    let socket = match taken_over(ending, SocketKind::Udp, bind) {
+        Some(socket) => Ok(socket.into()),
+        None => bind_udp(bind),
+    };
+    let socket = socket.and_then(UdpSocket::from_std);
+    let bound = socket.and_then(|socket| Ok((socket.local_addr()?, Arc::new(socket))));
+    let (address, socket) = bound.map_err(bind_error(listener, bind))?;
+    let weak = Arc::downgrade(&socket);
+    let copy = move || SockRef::from(&*weak.upgrade()?).try_clone().ok();
+    Ok((socket, address, Box::new(copy)))
+}
+
+/// Copies the socket of the listener with that address, if it is one of those that end. Each of them
+/// is taken over once.
+fn taken_over(
+    ending: &mut Vec<Arc<Listener>>,
+    kind: SocketKind,
     address: SocketAddr,
-    bind: impl Fn(SocketAddr) -> io::Result<S>,
-    local: impl Fn(&S) -> io::Result<SocketAddr>,
-) -> Result<(S, SocketAddr), StartError> {
-    let socket = bind(address).and_then(|socket| Ok((local(&socket)?, socket)));
-    let (address, socket) = socket.map_err(|error| StartError::Bind {
-        listener: listener.to_owned(),
-        address,
-        error,
-    })?;
-    Ok((socket, address))
+) -> Option<Socket> {
+    let has_socket =
+        |each: &Arc<Listener>| each.address == Some(address) && each.socket_kind() == Some(kind);
+    let at = ending.iter().position(has_socket)?;
+    ending.remove(at).copy_socket.as_ref()?()
+}
+
+fn bind_error(listener: &str, address: SocketAddr) -> impl FnOnce(io::Error) -> StartError {
+    let listener = listener.to_owned();
+    move |error| StartError::Bind { listener, address, error }
 }
 
 impl Drop for Engine {
@@ -555,3 +624,6 @@ impl Drop for Engine {
         self.stop();
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -243,6 +243,18 @@ impl Admission {
         ending.into_iter().filter_map(ended).collect()
     }
 
+    /// Ends all connections. From now on, none is admitted. Returns their peers.
+    pub(crate) fn close(&self) -> Vec<Peer> {
+        let mut table = self.table();
+        table.limits = ConnectionLimits::NONE;
+        let ids: Vec<u64> = table.held().map(|(id, _)| *id).collect();
+        ids.into_iter().filter_map(|id| table.end(id)).map(|held| held.peer).collect()
+    }
+
+    pub(crate) fn is_closed(&self) -> bool {
+        self.table().limits == ConnectionLimits::NONE
+    }
+
     /// Ends one connection. Returns its peer, `None` if there is no such connection.
     pub(crate) fn end(&self, id: u64) -> Option<Peer> {
         self.table().end(id).map(|held| held.peer)
@@ -608,6 +620,27 @@ mod tests {
         assert_eq!(admission.admit(peer(1, 2)).unwrap_err(), Full);
         drop(ticket);
         assert!(admission.admit(peer(1, 2)).is_ok());
+    }
+
+    #[test]
+    fn a_closed_listener_ends_its_connections_and_admits_none() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        for (admission, when_full) in
+            [WhenFull::Refuse, WhenFull::Evict].into_iter().flat_map(|when| {
+                [(admission(9, None, when), when), (with_handshakes(9, 9, None, when), when)]
+            })
+        {
+            let tickets = [1, 2, 3].map(|port| begin(&admission, &runtime, peer(1, port)).0);
+            assert_eq!(tickets[0].establish(), Ok(None));
+            tickets[0].set_answered();
+            assert!(!admission.is_closed());
+            let mut ended = admission.close();
+            ended.sort_unstable_by_key(|peer| peer.address.port());
+            assert_eq!(ended, [1, 2, 3].map(|port| peer(1, port).into()), "{when_full:?}");
+            assert_eq!(admission.admit(peer(1, 4)).unwrap_err(), Full, "{when_full:?}");
+            assert_eq!(tickets[1].establish(), Ok(None), "it ends at the next await");
+            assert!(admission.is_closed() && admission.open() == 0);
+        }
     }
 
     #[test]

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use holdfast_protocol::pdu::Buffer;
 use socket2::{Domain, Protocol, SockRef, Socket, TcpKeepalive, Type};
-use tokio::net::TcpStream;
+use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 
@@ -127,6 +127,26 @@ impl ListenerContext {
         }
     }
 
+    /// Ends a connection that a reload during its handshake would have ended, if that reload had known
+    /// its certificate. `before` performed the handshake. Returns whether the connection has ended.
+    pub(crate) fn end_after_reload<S: Service>(
+        &self,
+        before: &S,
+        live: &Reloadable<S>,
+        (ticket, peer): (&Ticket, &Peer),
+    ) -> bool {
+        let service = live.get();
+        if std::ptr::eq(before, &*service) {
+            return false;
+        }
+        let Some(kind) = service.ends(before, peer) else { return false };
+        // `None` if the reload did know it, and has counted its end.
+        if self.admission.end(ticket.id()).is_some() {
+            self.ended(kind, peer.clone());
+        }
+        true
+    }
+
     /// Counts and reports a connection that was closed for another.
     pub(crate) fn evicted(&self, evicted: Option<Evicted>) {
         match evicted {
@@ -241,11 +261,22 @@ pub(crate) async fn accept<S: Service>(
     service: Arc<Reloadable<S>>,
     socket: std::net::TcpListener,
     workers: Vec<Handle>,
-    mut stop: watch::Receiver<bool>,
+    stop: watch::Receiver<bool>,
 ) {
-    let Ok(socket) = tokio::net::TcpListener::from_std(socket) else {
+    let Ok(socket) = TcpListener::from_std(socket) else {
         return;
     };
+    accept_shared(context, service, Arc::new(socket), workers, stop).await;
+}
+
+/// The same, from a socket that a reload can hand to another listener.
+pub(crate) async fn accept_shared<S: Service>(
+    context: Arc<ListenerContext>,
+    service: Arc<Reloadable<S>>,
+    socket: Arc<TcpListener>,
+    workers: Vec<Handle>,
+    mut stop: watch::Receiver<bool>,
+) {
     loop {
         let accepted = tokio::select! {
             biased;
@@ -278,6 +309,8 @@ fn admit<S: Service>(
     }
     let (ticket, evicted) = match context.admission.admit(peer) {
         Ok(admitted) => admitted,
+        // A reload has just removed the listener.
+        Err(Full) if context.admission.is_closed() => return,
         Err(Full) => return context.refuse_full(peer),
     };
     context.evicted(evicted);

@@ -147,6 +147,9 @@ impl ModbusStream {
         let (time_limit, stopping) = (self.timeouts.request, stop.clone());
         let secured = secured(&tls, &context, (stream, peer), &ticket, time_limit, stopping).await;
         let Some((stream, peer)) = secured else { return };
+        if context.end_after_reload(&*self, &live, (&ticket, &peer)) {
+            return;
+        }
         // A reload reviews connections by their roles. This one looks up its rights only now.
         let rights = live.get().terms(&peer).map(|terms| terms.rights).unwrap_or_else(|| {
             // The session stays, and each request gets exception 01 (MB-TCP-Security, R-23, R-31).
@@ -177,7 +180,6 @@ impl ModbusStream {
     /// Serves a connection that may begin with a packet: its first bytes decide.
     async fn shared(
         self: Arc<Self>,
-        raw: Arc<RawIngest>,
         live: Arc<Reloadable<ModbusStream>>,
         context: Arc<ListenerContext>,
         mut admitted: Admitted<PeerRights>,
@@ -196,6 +198,10 @@ impl ModbusStream {
                 }
                 Beginning::Packet => {
                     let Admitted { stream, peer, received, ticket, .. } = admitted;
+                    // A reload may have changed the settings of packets, or removed them.
+                    let Some(raw) = live.get().raw_ingest.clone() else {
+                        return context.ended(Kind::RightsRevoked, peer);
+                    };
                     let Some(rights) = raw.rights(peer.ip()) else {
                         ticket.set_answered();
                         return raw.refuse_peer(&context, (stream, peer), &received, stop).await;
@@ -276,8 +282,8 @@ impl Service for ModbusStream {
         stop: watch::Receiver<bool>,
     ) -> Serving {
         set_options(&connection.stream, self.keepalive);
-        if let Some(raw) = self.raw_ingest.clone() {
-            return Box::pin(self.shared(raw, live, context, connection, stop));
+        if self.raw_ingest.is_some() {
+            return Box::pin(self.shared(live, context, connection, stop));
         }
         match self.framing {
             StreamFraming::Mbap => self.connection::<Mbap>(live, context, connection, stop),
