@@ -775,7 +775,7 @@ def test_a_write_under_way_is_recorded_although_its_listener_was_removed(
             front.send(wire.frame(WRITE))
         device.await_requests(1)
         file = tmp_path / "appliance.yaml"
-        file.write_text(configuration(device.url, audit=audit).replace("scada:", "other:"))
+        file.write_text(configuration(device.url, audit=audit).replace('"scada"', '"other"'))
         appliance.reload(load(file))
         assert list(appliance.diagnostics.stats()["listeners"]) == ["other"]
         held.release()

@@ -56,7 +56,7 @@ def test_a_server_that_could_not_start_starts_later() -> None:
             refusals=[(name, [], b"no") for name in ("not_http", "header_too_large", "not_tls")],
         )
         with closing(server):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
+            resource.setrlimit(resource.RLIMIT_NOFILE, (4, hard))
             try:
                 with pytest.raises(OSError, match="Too many open files"):
                     server.start()
