@@ -33,6 +33,8 @@ def device(caller: Caller, id: str) -> Any:
     [found] = caller.request("modbus.browse", {"deviceId": id})["devices"]
     moving = {"scans", "missed", "roundTrip", "lastAnswer", "state", "stateSince", "blocks"}
     moving |= {"failures", "error", "lastError", "lastErrorAt"}
+    for each in found["tags"]:
+        each.pop("error", None)
     return {key: value for key, value in found.items() if key not in moving}
 
 
