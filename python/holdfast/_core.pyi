@@ -1104,8 +1104,11 @@ class Connection:
     def flush(self) -> None:
         """Writes the bytes to send now."""
 
+    def data_received(self, data: bytes, /) -> None:
+        """Processes received bytes."""
+
     def get_buffer(self, size: int, /) -> bytearray:
-        """Where the loop puts received bytes."""
+        """Where the loop may put received bytes instead."""
 
     def buffer_updated(self, len: int, /) -> None:
         """Processes so many bytes of the buffer."""

@@ -12,10 +12,9 @@ use holdfast_engine::tls::TlsFailure;
 use holdfast_protocol::client::{
     Attempt as CoreAttempt, Closed, Connection as Core, Done, Failure, Ticket, Transport,
 };
-use pyo3::buffer::{PyBuffer, ReadOnlyCell};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyByteArray, PyBytes};
+use pyo3::types::{PyByteArray, PyBytes, PySlice};
 use pyo3::{PyTraverseError, PyVisit, intern};
 
 use crate::arguments::{byte, seconds};
@@ -33,9 +32,8 @@ pub struct Connection {
     /// `create_future` and `time` of the loop.
     create_future: Py<PyAny>,
     time: Py<PyAny>,
-    /// Where the loop puts received bytes, and a view of it.
+    /// Received bytes, until they are processed.
     buffer: Py<PyByteArray>,
-    received: PyBuffer<u8>,
 }
 
 /// The bytes that are received at once: seven of the longest replies.
@@ -129,8 +127,7 @@ impl Connection {
         let create_future = event_loop.getattr("create_future")?.unbind();
         let (time, state) = (time.unbind(), Mutex::new(state));
         let buffer = PyByteArray::new(event_loop.py(), &[0; BUFFER_LEN]);
-        let received = PyBuffer::get(&buffer)?;
-        Ok(Connection { state, to, create_future, time, buffer: buffer.unbind(), received })
+        Ok(Connection { state, to, create_future, time, buffer: buffer.unbind() })
     }
 
     /// Takes the methods of the owner of the socket.
@@ -230,23 +227,24 @@ impl Connection {
         self.buffer.clone_ref(py)
     }
 
-    /// Processes so many bytes of the buffer, and completes the requests that they answer.
+    /// Processes so many bytes of the buffer.
     #[pyo3(signature = (len, /))]
-    fn buffer_updated(&self, py: Python<'_>, len: usize) -> PyResult<()> {
-        // Only what has come: a copy of the whole buffer would go through the caches of all connections.
-        let filled = self.received.as_slice(py).and_then(|buffer| buffer.get(..len));
-        let filled = filled.ok_or_else(|| {
-            PyValueError::new_err(format!("{len} bytes received, allowed: up to {BUFFER_LEN}"))
-        })?;
-        let data: Vec<u8> = filled.iter().map(ReadOnlyCell::get).collect();
+    fn buffer_updated(&self, py: Python<'_>, len: i16) -> PyResult<()> {
+        let filled = self.buffer.bind(py).get_item(PySlice::new(py, 0, len.into(), 1))?;
+        self.data_received(py, &filled.cast_into::<PyByteArray>()?.to_vec())
+    }
+
+    /// Processes received bytes, and completes the requests that they answer.
+    #[pyo3(signature = (data, /))]
+    fn data_received(&self, py: Python<'_>, data: &[u8]) -> PyResult<()> {
         let now = clock(self.time.bind(py).call0()?.extract()?)?;
         let mut state = self.state();
         let was_handshaking = state.is_handshaking();
         let completed = self.complete(py, &mut state, |core, tls, ending, add| {
             let Some(tls) = tls else {
-                return core.receive(&data, now, |done| add(ending, done));
+                return core.receive(data, now, |done| add(ending, done));
             };
-            let received = tls.receive(&data);
+            let received = tls.receive(data);
             core.receive(&tls.plain, now, |done| add(ending, done));
             if received.is_err() || tls.has_ended() {
                 *ending =

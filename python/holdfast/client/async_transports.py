@@ -205,6 +205,7 @@ class _LoopConnection:
         self._max_in_flight = max_in_flight
         self._target = target
         self._endpoint = endpoint
+        self._kind = _Buffered if isinstance(loop, asyncio.BaseEventLoop) else _Streamed
         self._late_before = late
         self._longest_late_before = longest_late
         """The late replies of connections that have ended."""
@@ -287,7 +288,7 @@ class _LoopConnection:
         if self._connect_at > self.loop.time():
             await asyncio.sleep(min(self._connect_at - self.loop.time(), timeout))
         self._newest = core = Connection(self._endpoint, self.loop, self._newest)
-        protocol = _Protocol(self, core)
+        protocol = self._kind(self, core)
         deadline = self.loop.time() + timeout
         try:
             async with asyncio.timeout_at(deadline):
@@ -331,12 +332,10 @@ class _LoopConnection:
             self._protocol = self.open = None
 
 
-class _Protocol(asyncio.BufferedProtocol):
+class _Protocol(asyncio.BaseProtocol):
     """The socket of one connection, and its timer. Received bytes go to the native connection."""
 
     def __init__(self, here: _LoopConnection, core: Connection) -> None:
-        self.get_buffer = core.get_buffer  # type: ignore[assignment, method-assign]
-        self.buffer_updated = core.buffer_updated  # type: ignore[assignment, method-assign]
         self.core = core
         self._here = here
         self._loop = here.loop
@@ -418,6 +417,23 @@ class _Protocol(asyncio.BufferedProtocol):
             self._flush()
         if deadline is not None and self._transport is not None:
             self._wake_at(deadline)
+
+
+class _Buffered(_Protocol, asyncio.BufferedProtocol):
+    """For loops of asyncio, which would allocate 256 KB for each reply."""
+
+    def __init__(self, here: _LoopConnection, core: Connection) -> None:
+        super().__init__(here, core)
+        self.get_buffer = core.get_buffer  # type: ignore[assignment, method-assign]
+        self.buffer_updated = core.buffer_updated  # type: ignore[assignment, method-assign]
+
+
+class _Streamed(_Protocol, asyncio.Protocol):
+    """For loops that allocate what they have received, such as uvloop."""
+
+    def __init__(self, here: _LoopConnection, core: Connection) -> None:
+        super().__init__(here, core)
+        self.data_received = core.data_received  # type: ignore[assignment, method-assign]
 
 
 def explained(error: Exception) -> str:
