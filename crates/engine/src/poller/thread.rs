@@ -217,8 +217,9 @@ impl Poller {
     }
 
     /// Replaces the device called `name` after its current poll. The new device may have the same
-    /// name. It keeps counters, connection, schedule and what waits for its receivers. With `at_once`, it also reads once outside
-    /// the schedule; at most once per second, or per interval if that is shorter.
+    /// name. It keeps counters, connection, schedule and what waits for its receivers. With `at_once`,
+    /// it also reads once outside the schedule; at most once per second, or per interval if that is
+    /// shorter.
     ///
     /// # Errors
     /// [`PollerError`]. Nothing has changed then.

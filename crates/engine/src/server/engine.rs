@@ -263,8 +263,8 @@ impl Engine {
         Ok(())
     }
 
-    /// Binds a listener, or takes over the socket of one of those that end. Nothing is served before
-    /// its task runs.
+    /// Binds a listener, or takes over the socket of an ending one. Nothing is served before its task
+    /// runs.
     fn listener(
         &self,
         name: &str,
@@ -583,7 +583,7 @@ fn bound_tcp(
     Ok((socket, address, Box::new(copy)))
 }
 
-/// As `bound_tcp`.
+/// As `bound_tcp`: two functions, because Windows has another trait for what both sockets are.
 fn bound_udp(
     listener: &str,
     bind: SocketAddr,
@@ -601,8 +601,7 @@ fn bound_udp(
     Ok((socket, address, Box::new(copy)))
 }
 
-/// Copies the socket of the listener with that address, if it is one of those that end. Each of them
-/// is taken over once.
+/// Copies the socket of the ending listener with that address. Each is taken over once.
 fn taken_over(
     ending: &mut Vec<Arc<Listener>>,
     kind: SocketKind,

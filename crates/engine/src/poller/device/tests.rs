@@ -1,9 +1,9 @@
 //! Tests a device in states that its checks normally exclude: it writes nothing wrong to memory,
 //! and reports an error.
 
-use holdfast_memory::{Access, Done, Journal, Layout, Memory, Read, Span, Step};
 use std::sync::Weak;
 
+use holdfast_memory::{Access, Done, Journal, Layout, Memory, Read, Span, Step};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Builder;
