@@ -50,11 +50,12 @@ test-rust: $(TOOLCHAIN)
 	@awk '/^test result/ {passed += $$4} END {print "Rust: " passed " passed"}' $(RUST_LOG)
 
 # The cases of tests/slow.txt, and the tests of the protocol crate once more, without its default features. With
-# RERUN=--last-failed, of the Python cases only those that failed in the last run.
+# RERUN=--last-failed, of the Python cases only those that failed in the last run. Three workers, because half of
+# them drive browsers: six would take longer, and wait for each other until a case gives up.
 test-slow: .venv/core.stamp .venv/dev.stamp
 	cargo test --locked --quiet -p holdfast-journal --test torture
 	cargo test --locked --quiet $(PROTOCOL) --no-default-features
-	$(PYTEST) --slow only $(RERUN)
+	$(BIN)/pytest -n 3 --dist worksteal --slow only $(RERUN)
 
 # New cases for all property tests, and more of them. A case that fails is printed and kept: as a patch of the
 # Python test (`git apply`), and for Rust as a line of a proptest-regressions file. Commit it with the mend. Each check

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import shutil
 import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
@@ -182,7 +183,7 @@ class Opened:
 def browsing() -> Iterator[Browser]:
     """A browser."""
     # Before Playwright, which requires libraries that come with it.
-    chromium = tool("chromium")
+    chromium = shutil.which("chromium-headless-shell") or tool("chromium")
     with sync_playwright() as playwright:
         launched = playwright.chromium.launch(
             executable_path=chromium, args=["--no-sandbox", NO_NETWORK]
