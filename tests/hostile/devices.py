@@ -283,6 +283,9 @@ class Device:
 
     def _act(self, now: float) -> None:
         while self._due and self._due[0][0] <= now:
+            if time.monotonic() > now + HELD_UP:
+                self._fall_silent()
+                return
             _, _, turn, action = heapq.heappop(self._due)
             if action.executes:
                 self._execute(turn)
