@@ -86,6 +86,10 @@ impl Client {
         self.connection.receive(bytes, self.now, |done| noted(got, again, &done));
     }
 
+    fn cancel(&mut self, ticket: Ticket) {
+        self.connection.cancel(ticket, self.now);
+    }
+
     fn after(&mut self, time: Duration) {
         self.now += time;
         let (got, again) = (&mut self.got, &mut self.again);
@@ -141,10 +145,103 @@ fn replies_in_any_order_and_pieces_match_their_requests() {
 }
 
 #[test]
+fn a_silent_connection_ends_however_many_requests_are_in_flight() {
+    let mut client = Client::new(Transport::Tcp);
+    let start = client.now;
+    client.send(read());
+    while client.connection.closed().is_none() {
+        // Whoever had a timeout asks again at once, and another one has asked half a second before.
+        client.after(SECOND / 2);
+        if client.connection.closed().is_none() {
+            client.send(read());
+        }
+        assert!(client.now < start + 10 * SECOND, "three timeouts are enough");
+    }
+    assert!(client.now >= start + 3 * SECOND);
+    assert!(client.connection.closed() == Some(Closed::Silent));
+}
+
+#[test]
+fn a_slow_request_is_not_ended_by_timeouts_of_others() {
+    let mut client = Client::new(Transport::Tcp);
+    let request = EncodedRequest::new(&read());
+    let slow = client.connection.send(7, &request, 20 * SECOND, client.now).unwrap();
+    for _ in 0..10 {
+        client.send(read());
+        client.after(SECOND);
+    }
+    client.got();
+    client.receive(&mbap_frame(0, 7, &[3, 2, 0, 1]));
+    assert_eq!(client.got(), [(slow, Ok(vec![0, 1]))]);
+}
+
+#[test]
+fn a_request_that_is_cancelled_counts_for_the_pause_and_the_number_of_requests() {
+    let tolerance = Tolerance { pause: SECOND, close_after: 2, ..STRICT };
+    let mut client = Client::tolerant(Transport::Tcp, tolerance);
+    let ticket = client.send(read());
+    client.outgoing();
+    client.cancel(ticket);
+    let ticket = client.send(read());
+    assert_eq!(client.outgoing(), [], "it waits for the pause");
+    client.after(SECOND);
+    assert_ne!(client.outgoing(), []);
+    client.cancel(ticket);
+    assert_eq!(client.connection.closed(), Some(Closed::BySelf));
+}
+
+#[test]
+fn a_request_that_is_cancelled_before_it_is_sent_is_not_sent_on_a_line() {
+    let mut client = Client::new(RTU);
+    client.send(read());
+    client.outgoing();
+    client.receive(&rtu_frame(7, &[3, 2, 0, 42]));
+    let ticket = client.send(WRITE);
+    assert_eq!(client.outgoing(), [], "the line is not silent yet");
+    client.cancel(ticket);
+    assert!(client.connection.has_room());
+    client.after(SECOND);
+    assert_eq!(client.outgoing(), []);
+}
+
+#[test]
+fn a_line_of_noise_before_the_echo_loses_no_ascii_reply() {
+    let tolerance = Tolerance { echo: Echo::Always, ..STRICT };
+    let mut client = Client::tolerant(Transport::AsciiOverTcp, tolerance);
+    let ticket = client.send(read());
+    let echo = client.outgoing();
+    client.receive(&[b"\0\r\n", &echo[..], &ascii_frame(7, &[3, 2, 0, 42])].concat());
+    assert_eq!(client.got(), [(ticket, Ok(vec![0, 42]))]);
+}
+
+#[test]
+fn the_wait_for_a_second_reply_does_not_count_as_response_time() {
+    let mut client = Client::new(Transport::RtuOverTcp);
+    let ms = SECOND / 1000;
+    for address in 0..8 {
+        let range = Range::new(address, 1).unwrap();
+        let before = client.now;
+        let ticket = client.send(Request::ReadHoldingRegisters(range));
+        while client.outgoing().is_empty() {
+            client.after(ms);
+        }
+        client.after(5 * ms);
+        client.receive(&rtu_frame(7, &[3, 2, 0, 0]));
+        let mut got = client.got();
+        while got.is_empty() {
+            client.after(ms);
+            got = client.got();
+        }
+        assert_eq!(got, [(ticket, Ok(vec![0, 0]))]);
+        assert!(client.now - before <= 100 * ms, "{:?}", client.now - before);
+    }
+}
+
+#[test]
 fn a_late_reply_is_dropped_and_counted_and_a_second_one_is_an_error() {
     let mut client = Client::new(Transport::Tcp);
     let [first, second] = [(); 2].map(|()| client.send(read()));
-    client.connection.cancel(first);
+    client.cancel(first);
     let late = mbap_frame(0, 7, &[3, 2, 0, 1]);
     client.receive(&late);
     assert_eq!((client.got(), client.connection.late()), (vec![], 1));
@@ -192,7 +289,7 @@ fn transaction_ids_in_use_are_not_reused() {
     let mut client = Client::new(Transport::Tcp);
     for _ in 0..65_536 {
         let ticket = client.send(read());
-        client.connection.cancel(ticket);
+        client.cancel(ticket);
     }
     assert_eq!(client.try_send(read()), Err(Closed::NoTransactionId));
     client.receive(&mbap_frame(4711, 7, &[3, 2, 0, 1]));
@@ -710,7 +807,7 @@ fn without_an_echo_the_request_sent_back_is_no_reply() {
 fn the_reply_to_a_dropped_request_on_a_line_is_not_taken_for_another() {
     let mut client = Client::new(Transport::RtuOverTcp);
     let ticket = client.send(read());
-    client.connection.cancel(ticket);
+    client.cancel(ticket);
     assert!(!client.connection.has_room());
     client.receive(&rtu_frame(7, &[3, 2, 0, 42]));
     assert_eq!(client.got(), []);
@@ -930,7 +1027,7 @@ fn a_request_that_is_cancelled_during_a_pause_is_not_sent() {
     for cancelled in 0..3 {
         let mut client = Client::tolerant(Transport::Tcp, tolerance);
         let tickets = [client.send(read()), client.send(WRITE), client.send(read())];
-        client.connection.cancel(tickets[cancelled]);
+        client.cancel(tickets[cancelled]);
         assert_eq!(client.outgoing(), []);
         client.after(SECOND);
         let pdus = [&[3, 0, 3, 0, 1][..], &[6, 0, 3, 0, 7], &[3, 0, 3, 0, 1]];
@@ -951,7 +1048,7 @@ fn a_request_that_is_cancelled_during_a_pause_is_not_sent() {
     client.receive(&mbap_frame(0, 7, &[3, 2, 0, 1]));
     client.outgoing();
     let ticket = client.send(WRITE);
-    client.connection.cancel(ticket);
+    client.cancel(ticket);
     assert_eq!(client.connection.deadline(), None);
     client.send(read());
     client.after(SECOND);

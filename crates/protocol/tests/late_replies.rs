@@ -378,7 +378,7 @@ fn replies_to_requests_that_their_callers_have_ended_raise_nothing() {
     for id in 0..3 {
         let ticket = connection.send(1, &request, TIMEOUT, now).unwrap();
         connection.sent(12);
-        connection.cancel(ticket);
+        connection.cancel(ticket, now);
         let late = [&mbap::header(id, 1, 4)[..], &[3, 2, 0, 9]].concat();
         now += 200 * MS;
         connection.receive(&late, now, |_| panic!("nobody waits for it"));

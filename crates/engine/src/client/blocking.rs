@@ -122,17 +122,19 @@ impl BlockingClient {
     }
 
     /// The same, unless `interrupted` returns true. It is asked at most every 0.1 s. Returns `None`
-    /// then, and the connection is closed: a reply would still come.
+    /// then, and the connection is closed: a reply would still come. `to_begin` is as in [`Conditions`].
     pub fn interruptible_call<T>(
         &self,
         interrupted: &mut dyn FnMut() -> bool,
+        to_begin: &dyn Fn() -> Result<(), ClientError>,
         unit_id: u8,
         request: &EncodedRequest,
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Option<Result<T, ClientError>> {
         let interrupt = Interrupt::new(Some(interrupted));
-        self.call_unless(interrupt, (unit_id, request, &Conditions::NONE), timeout, take)
+        let conditions = Conditions { to_begin, to_go_on: None };
+        self.call_unless(interrupt, (unit_id, request, &conditions), timeout, take)
     }
 
     /// The same as [`BlockingClient::call`], under conditions.
@@ -346,8 +348,8 @@ impl State {
     fn end(&mut self) {
         if let Some(mut open) = self.open.take() {
             self.past = open.connection.take_past(open.epoch.elapsed());
+            self.ended = Some(Instant::now());
         }
-        self.ended = Some(Instant::now());
     }
 }
 
@@ -451,6 +453,8 @@ impl Open {
         let Call { unit_id, request, attempt, .. } = *call;
         let sent = self.connection.send_again(unit_id, request, timeout, attempt, now - self.epoch);
         if let Err(why) = sent {
+            // All transaction ids wait for late replies.
+            call.refused = Some(ClientError::new(why.failure(), timeout));
             self.connection.close(why, sink);
             return Ok(());
         }
@@ -565,6 +569,34 @@ mod tests {
             let pdu = client.call(1, &request, Duration::from_secs(60), |_, pdu| pdu.to_vec());
             assert_eq!(pdu.unwrap(), [3, 2, 0, address as u8]);
         }
+    }
+
+    #[test]
+    fn a_connection_without_a_free_transaction_id_ends() {
+        let place = Place::Tcp { host: String::new(), port: 0, tls: None };
+        let client = BlockingClient::new(Endpoint { place, tolerance: Tolerance::default() });
+        let range = Range::new(0, 1).unwrap();
+        let request = EncodedRequest::new(&Request::ReadHoldingRegisters(range));
+        let mut connection = Connection::new(Transport::Tcp);
+        let (timeout, now) = (Duration::from_secs(60), Duration::ZERO);
+        while let Ok(ticket) = connection.send(9, &request, timeout, now) {
+            connection.cancel(ticket, now);
+            connection.sent(connection.outgoing().len());
+        }
+        client.state.lock().unwrap().open = Some(Open {
+            stream: Box::new(Stalled { waiting: VecDeque::new(), copy: None }),
+            connection,
+            transport: Transport::Tcp,
+            epoch: client.epoch,
+            used: Instant::now(),
+            late: 0,
+        });
+        let answer = client.call(1, &request, timeout, |_, _| ());
+        let expected = Lost::Closed(Closed::NoTransactionId);
+        assert!(
+            matches!(&answer, Err(ClientError::Lost(why)) if why.to_string() == expected.to_string())
+        );
+        assert!(client.state.lock().unwrap().open.is_none());
     }
 
     #[test]

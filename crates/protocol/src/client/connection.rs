@@ -151,8 +151,8 @@ impl Connection {
         }
     }
 
-    /// Sends a request, or queues it until the line is silent. `timeout` runs from now, and again
-    /// from each reply to a request that was sent before it. If late replies of the unit repeat, it is
+    /// Sends a request, or queues it until the line is silent. `timeout` runs from when it is sent, and
+    /// again from each reply to a request that was sent before it. If late replies of the unit repeat, it is
     /// longer, up to four times; end the request with [`Connection::cancel`] if it must not be.
     ///
     /// # Errors
@@ -301,11 +301,19 @@ impl Connection {
     }
 
     /// Drops a request: it gets no [`Done`]. Without transaction ids, it stays in flight until its
-    /// reply or timeout, so that its reply is not taken for another one.
-    pub fn cancel(&mut self, ticket: Ticket) {
+    /// reply or timeout, so that its reply is not taken for another one. A request that was not sent
+    /// yet is not sent.
+    pub fn cancel(&mut self, ticket: Ticket, now: Time) {
         match &mut self.wire {
-            Wire::Stream(stream) => stream.cancel(&mut self.flights, ticket),
-            Wire::Datagrams(_) | Wire::OneAtATime(_) => self.flights.abandon(ticket),
+            Wire::Stream(stream) => {
+                let (waiting, was_sent) = (self.flights.len(), self.flights.held.is_none());
+                stream.cancel(&mut self.flights, ticket);
+                if was_sent {
+                    self.after(waiting, now, |_| unreachable!("no other is in flight"));
+                }
+            }
+            Wire::OneAtATime(line) => line.cancel(&mut self.flights, ticket, now),
+            Wire::Datagrams(_) => self.flights.abandon(ticket),
         }
     }
 

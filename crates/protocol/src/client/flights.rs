@@ -151,6 +151,11 @@ impl Flights {
         self.longest_late = self.longest_late.max(took);
     }
 
+    /// The longest timeout of a request in flight; 0 if there is none.
+    pub(super) fn longest_timeout(&self) -> Duration {
+        self.waiting.iter().map(|flight| flight.timeout).max().unwrap_or_default()
+    }
+
     /// When the timeout of a request ends.
     pub(super) fn deadline_of(&self, ticket: Ticket) -> Option<Time> {
         self.waiting.iter().find(|flight| flight.ticket == ticket).map(|flight| flight.deadline)

@@ -25,8 +25,9 @@ pub(super) struct Stream {
     pub(super) lateness: Lateness,
     /// The beginning of a frame.
     partial: Vec<u8>,
-    /// The number of timeouts since the last received byte, and the time of the last one.
+    /// The number of timeouts since the last received byte, and the times of the first and the last one.
     timeouts: u32,
+    silent_since: Time,
     timed_out: Time,
     /// Bytes that the header of an exception reply counted beyond its end. They may come, or not.
     surplus: usize,
@@ -235,6 +236,9 @@ impl Stream {
             timed_out = true;
             self.given_up.insert(flight.transaction_id, GivenUp::new(&flight));
             if self.timeouts == 0 || flight.sent >= self.timed_out {
+                if self.timeouts == 0 {
+                    self.silent_since = now;
+                }
                 self.timeouts += 1;
                 self.timed_out = now;
             }
@@ -242,7 +246,9 @@ impl Stream {
         }
         if timed_out && self.has_broken_off(flights) {
             flights.close(Closed::BrokenOff, sink);
-        } else if self.timeouts >= MAX_CONSECUTIVE_TIMEOUTS && flights.len() == 0 {
+        } else if self.timeouts >= MAX_CONSECUTIVE_TIMEOUTS
+            && flights.longest_timeout() <= now.saturating_sub(self.silent_since)
+        {
             flights.close(Closed::Silent, sink);
         }
     }

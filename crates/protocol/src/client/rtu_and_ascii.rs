@@ -47,8 +47,8 @@ pub(super) struct OneAtATime {
     repeats: bool,
     /// A frame came right behind the reply.
     behind: Behind,
-    /// The reply that is believed if no other follows.
-    doubted: Option<(u8, Vec<u8>)>,
+    /// The reply that is believed if no other follows, and when it came.
+    doubted: Option<(u8, Vec<u8>, Time)>,
     /// It may be an echo, before the same bytes as the reply.
     is_maybe_echo: bool,
     state: State,
@@ -149,6 +149,16 @@ impl OneAtATime {
         self.state = State::Quieting { until };
         self.transmit(flights, now);
         ticket
+    }
+
+    /// Drops a request, or leaves it in flight with nobody who waits for its result.
+    pub(super) fn cancel(&mut self, flights: &mut Flights, ticket: Ticket, now: Time) {
+        flights.abandon(ticket);
+        if let State::Quieting { .. } = self.state
+            && flights.take(ticket).is_some()
+        {
+            self.rest(now);
+        }
     }
 
     /// From when on no reply can come that could be taken for the one to this request.
@@ -355,7 +365,7 @@ impl OneAtATime {
         let is_like_echo = self.is_like_echo(flights, &pdu);
         if is_like_echo && behind == Behind::Same {
             self.late_replies.echoes = self.late_replies.echoes.saturating_add(1);
-            return self.replied(flights, unit_id, &pdu, now, sink);
+            return self.replied(flights, (unit_id, &pdu, now), now, sink);
         }
         if behind != Behind::NoFrame && !flights.tolerance.pad {
             self.late_replies.stray(Duration::ZERO);
@@ -379,12 +389,12 @@ impl OneAtATime {
                 // The unit may take as long as usual.
                 false => flight.sent + self.late_replies.longest(flight.unit_id) * 2,
             });
-            (self.doubted, self.is_maybe_echo) = (Some((unit_id, pdu)), is_like_echo);
+            (self.doubted, self.is_maybe_echo) = (Some((unit_id, pdu, now)), is_like_echo);
             self.received.clear();
             self.state = State::Doubting { until: until.max(now + GUARD) };
             return;
         }
-        self.replied(flights, unit_id, &pdu, now, sink);
+        self.replied(flights, (unit_id, &pdu, now), now, sink);
     }
 
     /// Whether the line can't have carried the request and its reply by now.
@@ -446,8 +456,8 @@ impl OneAtATime {
         now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
-        let (unit_id, pdu) = self.doubted.take().expect("a reply is doubted");
-        self.replied(flights, unit_id, &pdu, now, sink);
+        let (unit_id, pdu, came) = self.doubted.take().expect("a reply is doubted");
+        self.replied(flights, (unit_id, &pdu, came), now, sink);
     }
 
     /// Believes a reply that is doubted: the stream has ended, so no other follows.
@@ -470,8 +480,7 @@ impl OneAtATime {
     fn replied(
         &mut self,
         flights: &mut Flights,
-        found: u8,
-        pdu: &[u8],
+        (found, pdu, came): (u8, &[u8], Time),
         now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
@@ -484,7 +493,7 @@ impl OneAtATime {
         if let Some(flight) = flights.first() {
             let request = (flight.unit_id, flight.request.pdu());
             self.late_replies.believed(request, pdu, doubted, now);
-            let took = now.saturating_sub(flight.sent);
+            let took = came.saturating_sub(flight.sent);
             self.late_replies.answered(flight.unit_id, took, self.timeout);
             let (request, times) = ((flight.unit_id, &flight.request), (flight.sent, self.timeout));
             if self.repeats {
@@ -671,19 +680,24 @@ impl OneAtATime {
     }
 
     /// Parses the reply in the received characters; `None` while more are needed.
-    fn ascii(&mut self, flights: &Flights, echoed: &mut bool) -> Result<Option<Reply>, FrameError> {
-        let Some(flight) = flights.first() else { return Ok(None) };
+    fn ascii(
+        &mut self,
+        flights: &mut Flights,
+        echoed: &mut bool,
+    ) -> Result<Option<Reply>, FrameError> {
         while let Some(end) = self.received.windows(2).position(|pair| pair == b"\r\n") {
             let line: Vec<u8> = self.received.drain(..end + 2).collect();
             let start = line.iter().rposition(|byte| *byte == b':').unwrap_or(0);
             let behind = if flights.tolerance.pad { 0 } else { self.received.len() };
             let line = &line[start..];
+            let Some(flight) = flights.first() else { return Ok(None) };
             if !*echoed && self.may_be_echo(flight) && line == self.frame {
                 *echoed = true;
                 continue;
             }
             if self.awaits_echo(flight) && !*echoed {
-                return Ok(None);
+                flights.strays.bytes += (start + line.len()) as u64;
+                continue;
             }
             self.behind = behind_reply(Framing::Ascii, line, &self.received);
             let mut body = [0; pdu::MAX_LEN + 2];

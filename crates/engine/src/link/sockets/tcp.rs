@@ -371,12 +371,16 @@ impl Drop for Sent<'_> {
             return;
         }
         self.outcome.close();
-        if let Some(open) = self.link.open.borrow_mut().as_mut()
+        let mut open = self.link.open.borrow_mut();
+        if let Some(found) = open.as_mut()
             // A new connection counts its tickets anew: this one may be of another request.
-            && open.waiting.get(self.ticket).is_some_and(oneshot::Sender::is_closed)
+            && found.waiting.get(self.ticket).is_some_and(oneshot::Sender::is_closed)
         {
-            open.waiting.remove(self.ticket);
-            open.connection.cancel(self.ticket);
+            found.waiting.remove(self.ticket);
+            found.connection.cancel(self.ticket, found.epoch.elapsed());
+            if found.connection.closed().is_some() {
+                *open = None;
+            }
         }
     }
 }
@@ -405,7 +409,7 @@ impl Open {
     /// Drops the requests that have waited for a pause for too long.
     fn give_up_held(&mut self) {
         let now = Instant::now();
-        let Open { connection, waiting, held, .. } = self;
+        let Open { connection, waiting, held, epoch, .. } = self;
         if !connection.is_held() {
             held.clear();
         }
@@ -413,7 +417,7 @@ impl Open {
             if now < *until {
                 return true;
             }
-            connection.cancel(*ticket);
+            connection.cancel(*ticket, now.saturating_duration_since(*epoch));
             if let Some(sender) = waiting.remove(*ticket) {
                 // A device that was stopped does not wait.
                 let _ = sender.send(None);
