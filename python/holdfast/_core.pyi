@@ -122,13 +122,13 @@ SUB_FUNCTIONS: Final[tuple[tuple[int, str, bool], ...]]
 """Each sub-function of function 8: code, name, and whether it changes the device."""
 
 READ_RECORDS: Final[int]
-WRITE_RECORDS: Final[int]
-LAST_RECORD: Final[int]
 """Maximum number of file records that one request reads."""
 
-"""Functions of the standard that only read, and that memories do not serve."""
+WRITE_RECORDS: Final[int]
+"""Maximum number of file records that one request writes."""
 
-"""The function that writes file records, which memories do not serve."""
+LAST_RECORD: Final[int]
+"""The last record number of a file."""
 
 EXCEPTIONS: Final[dict[int, str]]
 """The names of exceptions, by code."""
@@ -1031,10 +1031,17 @@ class BlockingClient:
     """
 
     def __new__(cls, endpoint: Endpoint) -> BlockingClient: ...
-    def call(self, request: Request, unit: int, timeout: float) -> Any:
+    def call(
+        self,
+        request: Request,
+        unit: int,
+        timeout: float,
+        is_cancelled: Callable[[], bool] | None = None,
+    ) -> Any:
         """Sends a request and returns its result: values, bytes, or `None` for a write.
 
-        Raises `holdfast.ModbusError`.
+        Raises `holdfast.ModbusError`. `is_cancelled` is asked right before the request is sent,
+        which it is not if the answer is true.
         """
 
     def end_call(self) -> None:
@@ -1116,8 +1123,11 @@ class Connection:
     def advance(self) -> float | None:
         """Ends requests whose deadline has passed. Returns the next time to call it."""
 
-    def cancel(self, future: Future[Any]) -> None:
-        """Drops a request whose caller no longer waits. Its reply, if one arrives, is counted."""
+    def cancel(self, future: Future[Any], now: float) -> None:
+        """Drops a request whose caller no longer waits. Its reply, if one arrives, is counted.
+
+        The connection may have ended then: the device closes it after so many requests.
+        """
 
     def close(self) -> None:
         """Closes the connection and ends all requests. `flush` may still write bytes."""
@@ -1577,7 +1587,7 @@ def encode_raw_ingest(
 def write_disabled_status(memory: Memory, block: StatusBlock) -> None:
     """Writes the status block of a device that is not polled.
 
-    Raises `ValueError` if it does not fit.
+    Raises `ValueError` if it does not fit, `OSError` if the memory can't take it now.
     """
 
 def plan_blocks(

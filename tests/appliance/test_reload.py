@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast import raw_ingest
+from holdfast import _core, raw_ingest
 from holdfast.appliance import Appliance
 from holdfast.appliance.parts.mirrors import Mirrors
 from holdfast.appliance.reload import ReloadIncomplete, ReloadRefused, restart_reasons
@@ -597,6 +597,22 @@ def test_devices_come_change_and_go(rig: Rig, serve: Serve, connect: Connect) ->
     rig.reload(plant())
     assert rig.appliance.diagnostics.stats()["devices"] == {}
     assert client.ask(into_mirrored) == into_mirrored
+
+
+def test_a_memory_that_can_not_be_written_now_ends_no_reload(
+    rig: Rig, serve: Serve, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuses(*_: object) -> None:
+        raise OSError("what keeps the memory can't be reached, and nothing was written")
+
+    server = serve({1: holdfast.Memory(holding_registers=10)}, access="read-only")
+    status = {"memory": "plant", "area": "holding_registers", "slot": 0}
+    rig.start(plant())
+    monkeypatch.setattr(_core, "write_disabled_status", refuses)
+    rig.reload(plant(devices={"pump": polled(server, enabled=False, status=status)}))
+    [told] = [vars(each)["fields"] for each in caplog.records if each.msg == "status_not_written"]
+    assert (told["device"], told["memory"]) == ("pump", "plant")
+    assert "can't be reached" in told["error"]
 
 
 def test_links_are_added_and_used_ones_keep_their_settings(

@@ -8,6 +8,7 @@ import asyncio
 import doctest
 import gc
 import itertools
+import pickle
 import re
 import signal
 import socket
@@ -23,13 +24,18 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
+from holdfast._core import Request
+from holdfast.client.endpoint import blocking
+from holdfast.client.requests import TooManyValues
 from holdfast.client.url import NetworkTarget, SerialTarget, Tls, Tolerance, parse
 from holdfast.net import event_loop
+from holdfast.polling import WriteFailed
 from holdfast.server import Identity
+from holdfast.simulation.device import Refused
 from holdfast.types import AREAS
 from support import lines, transports, wire
 from support.faces import FACES, Awaited, Dial, Face, dialling, run
-from support.fake_device import ScriptedDevice, Stream, Udp, good, silent
+from support.fake_device import Asked, ScriptedDevice, Stream, Udp, good, silent
 from support.paths import DOCS
 from support.running import endpoint
 
@@ -649,6 +655,22 @@ def test_all_errors_are_modbus_errors() -> None:
     assert issubclass(holdfast.RequestTimeout, TimeoutError)
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        holdfast.ModbusException(2, "illegal data address"),
+        holdfast.ConnectionLost("closed"),
+        WriteFailed("meter", "power", 3),
+        TooManyValues(200, 123),
+        Refused("power", "power: too large"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_an_error_survives_a_process_pool(error: Exception) -> None:
+    copied = pickle.loads(pickle.dumps(error))
+    assert (type(copied), str(copied), vars(copied)) == (type(error), str(error), vars(error))
+
+
 # Threads
 
 
@@ -1000,6 +1022,115 @@ def test_calls_that_wait_for_a_thread_are_told_that_the_client_was_closed() -> N
             await plc.close()
 
     run(main)
+
+
+def test_a_call_whose_turn_comes_at_a_close_is_not_sent_after_it() -> None:
+    async def main() -> None:
+        with Stream("tcp", silent) as device:
+            plc = holdfast.Client(device.url, timeout=wire.DEADLINE, max_in_flight=1)
+
+            async def reads() -> None:
+                await plc.read_holding_registers(0, 1)
+                # The place is the writer's now, who does not know it yet.
+                await plc.close()
+
+            tasks = [asyncio.create_task(call) for call in (reads(), plc.write_register(1, 1))]
+            await asyncio.to_thread(device.await_requests, 1)
+            device.requests[0].answer()
+            await tasks[0]
+            with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+                await tasks[1]
+            assert (len(device.requests), device.connections) == (1, 1)
+
+    run(main)
+
+
+def test_a_call_that_waits_to_be_sent_again_ends_with_the_client() -> None:
+    async def main() -> None:
+        hangs_up = threading.Event()
+
+        def hang_up(asked: Asked) -> None:
+            asked.peer.hang_up()
+            hangs_up.set()
+
+        with Stream("tcp", hang_up) as device:
+            plc = holdfast.Client(f"{device.url}?retries=3&pause=1", timeout=wire.DEADLINE)
+            task = asyncio.create_task(plc.read_coils(0, 1))
+            await asyncio.to_thread(hangs_up.wait, wire.DEADLINE)
+            here = plc._transport._last
+            while here.open is not None:
+                await asyncio.sleep(0)
+            await plc.close()
+            with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+                await task
+            assert (len(device.requests), device.connections) == (1, 1)
+
+    run(main)
+
+
+def test_whoever_closes_a_client_may_be_cancelled() -> None:
+    async def main() -> None:
+        problems: list[dict[str, Any]] = []
+        asyncio.get_running_loop().set_exception_handler(lambda _, told: problems.append(told))
+        with Stream("tcp") as device:
+            plc = holdfast.Client(device.url, timeout=wire.DEADLINE)
+            await plc.read_coils(0, 1)
+            task = asyncio.create_task(plc.close())
+            await asyncio.sleep(0)
+            await cancelled(task)
+            await plc.close()
+            assert await plc.read_holding_registers(7, 1) == [7]
+            await plc.close()
+        assert problems == []
+
+    run(main)
+
+
+def test_a_call_that_is_cancelled_before_its_first_byte_is_not_sent() -> None:
+    with Stream("rtu+tcp") as device:
+        client = blocking(parse(device.url))
+        answers = iter([False, True])  # Before it connects, and before it sends.
+        with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+            client.call(Request.write_register(0, 1), 1, wire.DEADLINE, lambda: next(answers))
+        assert client.call(Request.read("holding_registers", 7, 1), 1, wire.DEADLINE) == [7]
+        assert [asked.pdu[0] for asked in device.requests] == [3]
+
+
+def test_a_connection_without_a_free_transaction_id_is_replaced() -> None:
+    async def main() -> None:
+        with Stream("tcp", good, then=silent) as device:
+            async with holdfast.Client(device.url, timeout=wire.DEADLINE) as plc:
+                await plc.read_coils(0, 1)
+                connection, now = plc._transport._last.open, asyncio.get_running_loop().time()
+                request = Request.read("coils", 0, 1)
+                for _ in range(65_536):
+                    connection.cancel(connection.send(request, 1, wire.DEADLINE, now), now)
+                with pytest.raises(holdfast.ConnectionLost, match="no transaction id is free"):
+                    await plc.read_coils(0, 1)
+                device.then = good
+                assert await plc.read_holding_registers(7, 1) == [7]
+                assert device.connections == 2
+
+    run(main)
+
+
+def test_a_pause_before_the_next_connection_may_be_longer_than_the_timeout(dial: Dial) -> None:
+    def hang_up(asked: Asked) -> None:
+        asked.answer()
+        asked.peer.hang_up()
+
+    with Stream("tcp", hang_up) as device:
+        client = dial(f"{device.url}?reconnect=0.4", timeout=0.1)
+        assert client.read_holding_registers(7, 1) == [7]
+        failures = 0
+        while True:
+            try:
+                assert client.read_holding_registers(8, 1) == [8]
+                break
+            except holdfast.ModbusError:
+                failures += 1
+                assert failures < 100
+        assert device.connections == 2
 
 
 # Event loops

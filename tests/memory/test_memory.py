@@ -146,7 +146,10 @@ def test_an_area_may_have_all_65536_addresses(area: Area) -> None:
 
 
 @each_area
-@pytest.mark.parametrize(("start", "size"), [(0, 65537), (1, 65536), (65535, 2), (0, 2**31)])
+@pytest.mark.parametrize(
+    ("start", "size"),
+    [(0, 65537), (1, 65536), (65535, 2), (0, 2**31), (0, -1), (0, 2**200), (65536, 1), (-1, 1)],
+)
 def test_an_area_beyond_address_65535_is_a_value_error(area: Area, start: int, size: int) -> None:
     with pytest.raises(ValueError, match=area):
         of_one_area(area, start, size)
@@ -241,7 +244,9 @@ def test_a_bool_is_no_register(area: Area, memory: holdfast.Memory) -> None:
 
 
 @each_area
-@pytest.mark.parametrize("values", ["101", b"\x01\x00", bytearray(b"\x01"), 1, None])
+@pytest.mark.parametrize(
+    "values", ["101", b"\x01\x00", bytearray(b"\x01"), 1, None, {1: 0}, {1, 0}, frozenset({1})]
+)
 def test_values_that_are_no_sequence_of_numbers_are_a_type_error(
     area: Area, values: Wrong, memory: holdfast.Memory
 ) -> None:
@@ -424,6 +429,7 @@ def test_python_reads_and_writes_a_sealed_memory() -> None:
     [
         (("holding_registers", 5), "coils or discrete_inputs"),
         (("coils", 10), "10"),
+        (("coils", 65536), "65536"),
         (("discrete_inputs", 0), "0"),
         (("relays", 5), "relays"),
         (("coils", 5, "twice"), "twice.*once, level"),

@@ -362,6 +362,7 @@ def test_the_server_asks_silent_peers_whether_they_are_there(
         ({"idle_timeout": float("nan")}, "idle_timeout"),
         ({"request_timeout": 0}, "request_timeout"),
         ({"workers": -1}, "workers"),
+        ({"workers": 65}, "workers"),
     ],
     ids=str,
 )

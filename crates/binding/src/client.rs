@@ -6,12 +6,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use holdfast_engine::client::{
-    BlockingClient as Core, ClientError, Endpoint as CoreEndpoint, Place,
+    BlockingClient as Core, ClientError, Endpoint as CoreEndpoint, Lost, Place,
 };
 use holdfast_engine::tls::FileError;
 use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
 use holdfast_engine::{LineDirection, LineMode, LineParity, SerialLine};
-use holdfast_protocol::client::{AcceptUnit, Echo, Tolerance};
+use holdfast_protocol::client::{AcceptUnit, Closed, Echo, Tolerance};
 use holdfast_protocol::frame::rtu;
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
@@ -339,19 +339,28 @@ impl BlockingClient {
     }
 
     /// Sends a request and returns its result as a Python object.
+    #[pyo3(signature = (request, unit, timeout, is_cancelled=None))]
     fn call<'py>(
         &self,
         py: Python<'py>,
         request: &Request,
         unit: i128,
         timeout: f64,
+        is_cancelled: Option<Py<PyAny>>,
     ) -> PyResult<Bound<'py, PyAny>> {
         let unit = byte("unit", unit)?;
         let timeout = seconds("timeout", timeout)?;
         let request = &request.encoded;
         let take = |response: Response<'_>, _: &[u8]| Reply::new(response);
+        let to_begin = || {
+            let Some(is_cancelled) = &is_cancelled else { return Ok(()) };
+            match Python::attach(|py| is_cancelled.call0(py)?.is_truthy(py)) {
+                Ok(false) => Ok(()),
+                Ok(true) | Err(_) => Err(ClientError::Lost(Lost::Closed(Closed::BySelf))),
+            }
+        };
         let result = self.interruptible(py, |interrupted| {
-            self.core.interruptible_call(interrupted, unit, request, timeout, take)
+            self.core.interruptible_call(interrupted, &to_begin, unit, request, timeout, take)
         })?;
         let result = result.ok_or_else(|| ConnectionLost::new_err(CLOSED))?;
         result.map_err(raised)?.into_python(py)

@@ -277,13 +277,15 @@ impl Connection {
     }
 
     /// Drops a request whose caller no longer waits. A late reply to it is counted.
-    fn cancel(&self, future: &Bound<'_, PyAny>) {
+    fn cancel(&self, future: &Bound<'_, PyAny>, now: f64) -> PyResult<()> {
+        let now = clock(now)?;
         let mut state = self.state();
         if let Some(at) = state.waiting.iter().position(|(_, other)| other.is(future))
             && let Some((ticket, _)) = state.waiting.remove(at)
         {
-            state.core.cancel(Ticket(ticket));
+            state.core.cancel(Ticket(ticket), now);
         }
+        Ok(())
     }
 
     /// Ends the connection and all its requests. `flush` may still have bytes to write.

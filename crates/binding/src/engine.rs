@@ -13,10 +13,11 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::arguments::{os_error, seconds, within, word};
+use crate::arguments::{byte, os_error, seconds, within, word};
 use crate::audit_fields;
 use crate::heartbeat;
 use crate::listener::Listener;
+use crate::memory::Integer;
 use crate::peer;
 
 #[pyclass(frozen, weakref, module = "holdfast")]
@@ -31,8 +32,8 @@ impl Engine {
     fn new(
         py: Python<'_>,
         listeners: Vec<PyRef<'_, Listener>>,
-        identity: Vec<(u8, String)>,
-        unit_names: Option<Vec<(u8, String)>>,
+        identity: Vec<(Integer, String)>,
+        unit_names: Option<Vec<(Integer, String)>>,
         workers: i128,
         events: &str,
         audit: Option<&str>,
@@ -40,7 +41,7 @@ impl Engine {
         let workers = within("workers", workers, 1..=64)?;
         let unrecordable = [("open", Unrecordable::Write), ("closed", Unrecordable::Refuse)];
         let audit = audit.map(|given| word("audit", given, &unrecordable)).transpose()?;
-        let listening = listening(listeners, identity, unit_names);
+        let listening = listening(listeners, identity, unit_names)?;
         let settings = Settings { listening, workers, events: verbosity(events)?, audit };
         let core = py.detach(|| Core::start(settings)).map_err(start_error)?;
         Ok(Engine { core })
@@ -51,12 +52,12 @@ impl Engine {
         &self,
         py: Python<'_>,
         listeners: Vec<PyRef<'_, Listener>>,
-        identity: Vec<(u8, String)>,
-        unit_names: Option<Vec<(u8, String)>>,
+        identity: Vec<(Integer, String)>,
+        unit_names: Option<Vec<(Integer, String)>>,
         events: &str,
     ) -> PyResult<()> {
         let (verbosity, listening) =
-            (verbosity(events)?, listening(listeners, identity, unit_names));
+            (verbosity(events)?, listening(listeners, identity, unit_names)?);
         py.detach(|| self.core.reload(listening)).map_err(start_error)?;
         self.core.set_verbosity(verbosity);
         Ok(())
@@ -145,17 +146,18 @@ impl Engine {
 
 fn listening(
     listeners: Vec<PyRef<'_, Listener>>,
-    identity: Vec<(u8, String)>,
-    unit_names: Option<Vec<(u8, String)>>,
-) -> Listening {
-    let bytes = |texts: Vec<(u8, String)>| {
-        texts.into_iter().map(|(id, text)| (id, text.into_bytes())).collect()
+    identity: Vec<(Integer, String)>,
+    unit_names: Option<Vec<(Integer, String)>>,
+) -> PyResult<Listening> {
+    let bytes = |what, texts: Vec<(Integer, String)>| {
+        let texts = texts.into_iter();
+        texts.map(|(id, text)| Ok((byte(what, id.0)?, text.into_bytes()))).collect::<PyResult<_>>()
     };
-    Listening {
+    Ok(Listening {
         listeners: listeners.iter().map(|listener| listener.core.clone()).collect(),
-        identity: bytes(identity),
-        unit_names: bytes(unit_names.unwrap_or_default()),
-    }
+        identity: bytes("object id", identity)?,
+        unit_names: bytes("unit id", unit_names.unwrap_or_default())?,
+    })
 }
 
 fn verbosity(events: &str) -> PyResult<Verbosity> {

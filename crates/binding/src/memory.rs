@@ -10,7 +10,9 @@ use holdfast_memory::{
 use holdfast_protocol::pdu::limit;
 use pyo3::exceptions::{PyIndexError, PyOSError, PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyBool, PyByteArray, PyBytes, PyDict, PyInt, PyList, PyString};
+use pyo3::types::{
+    PyBool, PyByteArray, PyBytes, PyDict, PyFrozenSet, PyInt, PyList, PySet, PyString,
+};
 
 use crate::arguments::within;
 use crate::mirror_age::MirrorAge;
@@ -34,14 +36,14 @@ pyo3::create_exception!(
 /// A size from address 0, or a start and a size.
 #[derive(FromPyObject)]
 enum Extent {
-    Size(u32),
-    From(u16, u32),
+    Size(Integer),
+    From(Integer, Integer),
 }
 
 #[derive(FromPyObject)]
 enum Seal {
-    Once(String, u16),
-    Mode(String, u16, String),
+    Once(String, Integer),
+    Mode(String, Integer, String),
 }
 
 /// Four areas of bits and 16-bit registers, of fixed size, initially 0.
@@ -69,7 +71,7 @@ impl Memory {
         discrete_inputs: Option<Extent>,
         holding_registers: Option<Extent>,
         input_registers: Option<Extent>,
-        files: Option<BTreeMap<i128, i128>>,
+        files: Option<Bound<'_, PyDict>>,
         seal: Option<Seal>,
     ) -> PyResult<Memory> {
         let extents = [coils, discrete_inputs, holding_registers, input_registers];
@@ -77,17 +79,20 @@ impl Memory {
         for (area, extent) in Area::ALL.into_iter().zip(extents) {
             let (start, size) = match extent {
                 None => continue,
-                Some(Extent::Size(size)) => (0, size),
-                Some(Extent::From(start, size)) => (start, size),
+                Some(Extent::Size(size)) => (0, size.0),
+                Some(Extent::From(start, size)) => (start.0, size.0),
             };
+            let name = area.name();
+            let start = within(&format!("start of {name}"), start, 0..=65_535)? as u16;
+            let size = within(&format!("size of {name}"), size, 0..=65_536)? as u32;
             let span = Span::new(start, size)
-                .map_err(|error| PyValueError::new_err(format!("{}: {error}", area.name())))?;
+                .map_err(|error| PyValueError::new_err(format!("{name}: {error}")))?;
             layout = layout.with(area, span);
         }
-        for (number, records) in files.unwrap_or_default() {
-            let number = within("file", number, 1..=usize::from(u16::MAX))? as u16;
+        for (number, records) in files.iter().flatten() {
+            let number = within("file", integer(&number)?, 1..=usize::from(u16::MAX))? as u16;
             let most = usize::from(limit::LAST_RECORD) + 1;
-            let records = within("number of records", records, 1..=most)? as u32;
+            let records = within("number of records", integer(&records)?, 1..=most)? as u32;
             let span =
                 Span::new(0, records).map_err(|error| PyValueError::new_err(error.to_string()))?;
             layout = layout.with(Area::File(number), span);
@@ -367,6 +372,7 @@ fn gate(seal: Seal) -> PyResult<Gate> {
             }
         },
     };
+    let address = within("address of seal", address.0, 0..=65_535)? as u16;
     Ok(Gate { area: named(&area)?, address, mode })
 }
 
@@ -428,7 +434,7 @@ pub fn numbers<'py>(area: Area, values: &Bound<'py, PyAny>) -> PyResult<Vec<u16>
         let items = list.iter().enumerate();
         return items.map(|(index, value)| number(area, index, &value, shown)).collect();
     }
-    if is_text(values) {
+    if is_text(values) || is_unordered(values) {
         let found = values.get_type().name()?;
         return Err(PyTypeError::new_err(format!(
             "values are {found}, not a sequence of integers"
@@ -446,6 +452,13 @@ pub fn is_text(values: &Bound<'_, PyAny>) -> bool {
     values.is_instance_of::<PyString>()
         || values.is_instance_of::<PyBytes>()
         || values.is_instance_of::<PyByteArray>()
+}
+
+/// Whether this is a mapping, whose keys would be its values, or a set.
+fn is_unordered(values: &Bound<'_, PyAny>) -> bool {
+    values.is_instance_of::<PyDict>()
+        || values.is_instance_of::<PySet>()
+        || values.is_instance_of::<PyFrozenSet>()
 }
 
 /// Why an object is not a value of an area.

@@ -11,6 +11,7 @@ use holdfast_engine::poller::{
     self, Batch, BlockSettings, Destination, DeviceSettings, DeviceState, ForwardSettings, Poll,
     Polled, Poller as Core, PollerError, ReadSettings, StatusSettings,
 };
+use holdfast_memory::Refusal;
 use holdfast_protocol::pdu::limit;
 use holdfast_runtime::Retry;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
@@ -313,9 +314,19 @@ fn destination((memory, area, address): Place<'_>) -> PyResult<Destination> {
 
 /// Writes the status block of a device that is not polled.
 #[pyfunction]
-pub fn write_disabled_status(memory: PyRef<'_, Memory>, block: StatusBlock) -> PyResult<()> {
-    let refused = |_| PyValueError::new_err("the status block does not fit into its memory");
-    status(&memory, block)?.write_disabled_status().map_err(refused)
+pub fn write_disabled_status(
+    py: Python<'_>,
+    memory: PyRef<'_, Memory>,
+    block: StatusBlock,
+) -> PyResult<()> {
+    let status = status(&memory, block)?;
+    // What keeps the memory may be slow.
+    py.detach(|| status.write_disabled_status()).map_err(|refusal| match refusal {
+        Refusal::OutOfRange => {
+            PyValueError::new_err("the status block does not fit into its memory")
+        }
+        other => PyOSError::new_err(other.to_string()),
+    })
 }
 
 fn status(memory: &Memory, of: StatusBlock) -> PyResult<StatusSettings> {

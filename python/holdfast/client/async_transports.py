@@ -12,17 +12,18 @@ from __future__ import annotations
 
 import asyncio
 import copy
-import os
 import socket
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor, wait
 from math import inf
+from threading import Event
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from holdfast._core import Attempt, Connection
 from holdfast.client.endpoint import blocking
 from holdfast.client.tcp_connect import addresses, connected
 from holdfast.errors import ConnectFailed, ConnectionLost, ModbusError, RequestTimeout
+from holdfast.runtime.text import error_text
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable
@@ -66,17 +67,19 @@ class ThreadedConnection:
         """Sends a request after the calls before it, and waits for the result."""
         if self._executor is None:
             self._executor = ThreadPoolExecutor(1, "holdfast-client")
-        loop = asyncio.get_running_loop()
-        executor = self._executor
-        return await loop.run_in_executor(executor, self._carry, executor, request, unit, timeout)
+        loop, executor, cancelled = asyncio.get_running_loop(), self._executor, Event()
 
-    def _carry(
-        self, executor: ThreadPoolExecutor, request: Request, unit: int, timeout: float
-    ) -> Any:
-        # The client was closed, and possibly used again, while this call waited for its turn.
-        if executor is not self._executor:
-            raise ConnectionLost(CLOSED)
-        return self._core.call(request, unit, timeout)
+        def carry() -> Any:
+            # The client was closed, and possibly used again, while this call waited for its turn.
+            if executor is not self._executor:
+                raise ConnectionLost(CLOSED)
+            return self._core.call(request, unit, timeout, cancelled.is_set)
+
+        try:
+            return await loop.run_in_executor(executor, carry)
+        except asyncio.CancelledError:
+            cancelled.set()
+            raise
 
     async def close(self) -> None:
         """Closes the connection; the current call and waiting calls fail."""
@@ -120,11 +123,14 @@ class AsyncConnection:
         here = self._last
         if here is None or here.loop is not asyncio.get_running_loop():
             here = self._here()
+        closes = here.closes
         if here.free:
             here.free -= 1
         else:
             await here.turn()
         try:
+            if here.closes != closes:
+                raise ConnectionLost(CLOSED)
             now, left, attempt = here.time(), timeout, None
             deadline = now + timeout
             while True:
@@ -135,16 +141,24 @@ class AsyncConnection:
                 if here.has_pauses or attempt is not None:
                     now = here.time()
                     left = max(deadline - now, 0.0)
-                future = connection.send(request, unit, left, now, attempt)
+                try:
+                    future = connection.send(request, unit, left, now, attempt)
+                except ConnectionLost:
+                    here.end(connection)
+                    raise
                 try:
                     result = await future
                 except asyncio.CancelledError:
-                    connection.cancel(future)
+                    connection.cancel(future, here.time())
+                    if connection.closed is not None:
+                        here.end(connection)
                     raise
                 if type(result) is not Attempt:
                     return result
                 attempt = result
                 await asyncio.sleep(attempt.pause)
+                if here.closes != closes:
+                    raise ConnectionLost(CLOSED)
                 if attempt.has_own_timeout:
                     deadline = here.time() + timeout
         finally:
@@ -202,6 +216,8 @@ class _LoopConnection:
         self.queue: deque[asyncio.Future[None]] = deque()
         """The calls that wait for one to end."""
         self.open: Connection | None = None
+        self.closes = 0
+        """How often the client was closed: no call from before is sent after that."""
         self._max_in_flight = max_in_flight
         self._target = target
         self._endpoint = endpoint
@@ -218,7 +234,14 @@ class _LoopConnection:
         """Whether the attempt to connect waits, or has waited, for the addresses of the host."""
         self._connect_at = -inf
 
+    def end(self, connection: Connection) -> None:
+        """Ends a connection that can't send any more: it has had its number of requests, or all
+        its transaction ids wait for late replies."""
+        if self._protocol is not None and self._protocol.core is connection:
+            self._protocol.close()
+
     async def close(self) -> None:
+        self.closes += 1
         for turn in self.queue:
             if not turn.done():
                 turn.set_exception(ConnectionLost(CLOSED))
@@ -229,7 +252,8 @@ class _LoopConnection:
         if self._protocol is not None:
             ended = self._protocol.ended
             self._protocol.close()
-            await ended
+            # Not the future itself: whoever cancels this must not cancel what the connection sets.
+            await asyncio.wait([ended])
 
     @property
     def in_use(self) -> bool:
@@ -286,7 +310,7 @@ class _LoopConnection:
         target = self._target
         self._is_looking_up = False
         if self._connect_at > self.loop.time():
-            await asyncio.sleep(min(self._connect_at - self.loop.time(), timeout))
+            await asyncio.sleep(self._connect_at - self.loop.time())
         self._newest = core = Connection(self._endpoint, self.loop, self._newest)
         protocol = self._kind(self, core)
         deadline = self.loop.time() + timeout
@@ -441,5 +465,5 @@ def explained(error: Exception) -> str:
     if isinstance(error, socket.gaierror):
         return error.strerror or str(error)
     if isinstance(error, OSError) and error.errno is not None:
-        return os.strerror(error.errno)
+        return error_text(error.errno)
     return str(error)

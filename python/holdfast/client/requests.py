@@ -192,12 +192,15 @@ class TooManyValues(ValueError):
     """A write does not fit in one request, and `split` is not set."""
 
     def __init__(self, count: int, limit: int) -> None:
-        super().__init__(
-            f"{count} values, one request writes at most {limit}; use split=True for several "
-            "requests, which the device does not execute in one step"
-        )
+        super().__init__(count, limit)
         self.count = count
         self.limit = limit
+
+    def __str__(self) -> str:
+        return (
+            f"{self.count} values, one request writes at most {self.limit}; use split=True for "
+            "several requests, which the device does not execute in one step"
+        )
 
 
 def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) -> Steps[None]:

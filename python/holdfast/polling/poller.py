@@ -36,9 +36,13 @@ class WriteFailed(Exception):
     """A write that a device did not confirm. It may have carried it out all the same."""
 
     def __init__(self, device: str, tag: str, fault: int) -> None:
-        super().__init__(f"{device}.{tag}: {fault_text(fault)}")
+        super().__init__(device, tag, fault)
+        self.device, self.tag = device, tag
         self.fault = fault
         """The code, see `holdfast.polling.faults`."""
+
+    def __str__(self) -> str:
+        return f"{self.device}.{self.tag}: {fault_text(self.fault)}"
 
 
 class Poller:

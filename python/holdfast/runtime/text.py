@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -9,6 +11,9 @@ if TYPE_CHECKING:
 
 MAX_CHARACTERS = 40
 """A longer value is cut."""
+
+_FIRST_OF_WINSOCK = 10_000
+"""Errors of sockets on Windows, which `os.strerror` does not know, have no lower number."""
 
 
 def clip(text: str, most: int = MAX_CHARACTERS) -> str:
@@ -44,6 +49,15 @@ def extent(numbers: range) -> str:
 def sentence(text: str) -> str:
     """A text with a full stop, unless it has an end of its own, such as that of `suggestion`."""
     return text if not text or text.endswith((".", "?", "!")) else f"{text}."
+
+
+def error_text(number: int) -> str:
+    """The system's text for an error number."""
+    if sys.platform == "win32" and number >= _FIRST_OF_WINSOCK:
+        import ctypes
+
+        return ctypes.FormatError(number)
+    return os.strerror(number)
 
 
 def _listed(values: Iterable[object], word: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from operator import index
 from typing import TYPE_CHECKING, Literal, Self, TypeAlias, Unpack, cast
 from urllib.parse import urlsplit
 
@@ -97,7 +98,7 @@ class Server:
             rules = [rule]
         elif units is not None or access is not None:
             raise TypeError("a server requires units and access, or rules, not both")
-        if not 1 <= workers <= MAX_WORKERS:
+        if not 1 <= index(workers) <= MAX_WORKERS:
             raise ValueError(f"workers is {workers}, allowed: 1 to {MAX_WORKERS}")
         self._listener = _listener(bind, list(rules), options)
         self._identity = identity or Identity()
@@ -108,7 +109,8 @@ class Server:
     def start(self) -> Self:
         """Listens and serves until `stop`.
 
-        Raises `OSError` if the address can't be bound, `RuntimeError` if the server is running.
+        Raises `OSError` if the address can't be bound, `RuntimeError` if the server is running,
+        `ValueError` for an identity that can't be sent.
         """
         with self._starting:
             if self._engine is not None:

@@ -29,8 +29,11 @@ class Refused(ValueError):
     """Values that a tag can't have."""
 
     def __init__(self, tag: str, message: str) -> None:
-        super().__init__(message)
-        self.tag = tag
+        super().__init__(tag, message)
+        self.tag, self.message = tag, message
+
+    def __str__(self) -> str:
+        return self.message
 
 
 class SimulatedDevice:

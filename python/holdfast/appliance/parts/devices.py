@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Any
 
 from holdfast import _core
@@ -11,6 +12,7 @@ from holdfast.appliance.parts.part import Part
 from holdfast.appliance.parts.tag_values import TagValues
 from holdfast.appliance.parts.tag_writes import TagWrites
 from holdfast.config.checks.units import routed
+from holdfast.events import log_lines
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -159,5 +161,10 @@ class Devices(Part):
     def _show_disabled(self, plan: Plan) -> None:
         """Writes the status blocks of disabled devices."""
         for name, device in plan.config.devices.items():
-            if not device.enabled and device.status is not None:
+            if device.enabled or device.status is None:
+                continue
+            try:
                 native_devices.show_disabled(name, device.status, plan.memories)
+            except OSError as error:
+                fields = {"device": name, "memory": device.status.memory, "error": str(error)}
+                log_lines.write(logging.WARNING, "status_not_written", **fields)
