@@ -114,7 +114,10 @@ def test_a_program_is_restarted_after_pauses_that_grow() -> None:
     running.check()
     running.stop()
     # What a run has said is no reason for the end of the next one.
-    assert ended == [("error: no space", 0.01), ("killed by signal 9", 0.02)]
+    assert ended == [
+        ("killed by signal 9; its last error: error: no space", 0.01),
+        ("killed by signal 9", 0.02),
+    ]
 
 
 def test_a_stop_ends_the_pause_before_a_restart() -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import math
+import socket
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, cast
+from urllib.parse import urlparse
 
 import pytest
 from hypothesis import given
@@ -17,6 +19,7 @@ from holdfast.net.nats.outbox import Outbox
 from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.scanner.messages.types import Answer
 from support.nats_bus import Caller
+from support.wire import DEADLINE
 from support.wire import until as wire_until
 
 if TYPE_CHECKING:
@@ -206,6 +209,45 @@ def test_a_line_that_no_server_sends_ends_the_connection(line: bytes) -> None:
 
     with pytest.raises(ProtocolError):
         asyncio.run(parse())
+
+
+@pytest.mark.parametrize(
+    "line", [b"INFO [1]\r\n", b"INFO", b"220 INFORMATION\r\n", b"hello\r\n", b"INFO {\r\n"]
+)
+def test_a_first_line_of_something_else_is_an_error_of_nats(line: bytes) -> None:
+    async def begin() -> None:
+        client = _Heard()
+        client.reader.feed_data(line)
+        client.reader.feed_eof()
+        await client.transport.readline()
+
+    with pytest.raises(Error):
+        asyncio.run(begin())
+
+
+def test_addresses_of_servers_that_are_none_are_left_out() -> None:
+    async def begin() -> bytes:
+        client = _Heard()
+        client.reader.feed_data(b'INFO {"connect_urls": ["[x", 1, "a:b", "10.0.0.9:4222"]}\r\n')
+        return await client.transport.readline()
+
+    assert asyncio.run(begin()) == b'INFO {"connect_urls": ["10.0.0.9:4222"]}\r\n'
+
+
+def test_a_server_that_takes_no_more_bytes_does_not_hold_up_the_end_of_a_connection() -> None:
+    async def ends(port: int) -> None:
+        transport = SafeClient().transport
+        await transport.connect(urlparse(f"nats://127.0.0.1:{port}"), 65_536, 5)
+        transport.write(b"x" * 2**26)
+        assert transport.unsent > 0
+        transport.close()
+        async with asyncio.timeout(DEADLINE):
+            await transport.wait_closed()
+            while transport.unsent:
+                await asyncio.sleep(0)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        asyncio.run(ends(listener.getsockname()[1]))
 
 
 def test_a_first_line_that_is_too_long_is_an_error_of_nats() -> None:

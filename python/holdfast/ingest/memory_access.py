@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import msgspec
 
 from holdfast import _core
+from holdfast.errors import UNCERTAIN
 from holdfast.events import log_lines
 from holdfast.events.audit import Unrecorded
 from holdfast.events.audit.chain import encoded
@@ -381,6 +382,8 @@ class MemoryAccess:
             return len(values)
         name = EXCEPTIONS.get(code, "unknown")
         detail = f"{begun.device} did not take the write: exception {code:02X} ({name})"
+        if code in UNCERTAIN:
+            detail += "; it may still be carried out, or have been"
         raise Refused("device_refused", detail, **where)
 
     def _checked(self, command: object, grant: Grant, index: int | None) -> Write:

@@ -17,7 +17,7 @@ MAX_SHOWN = 40
 
 
 class Refused(Exception):
-    """A command was refused; nothing has changed.
+    """A command was refused: nothing has changed, or `detail` says that it may have.
 
     `reason` is a word for programs, `detail` a message for people. `where` locates the error:
     `command` is the index of the command in a batch, `index` the index of the value in the command.

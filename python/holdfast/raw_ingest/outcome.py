@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 import reprlib
 import socket
 
 from holdfast.net.addresses import joined
 from holdfast.raw_ingest.encoding import checked_field
+from holdfast.runtime.text import error_text
 
 DONE, REFUSED = b"\x00", b"\x01"
 
@@ -78,7 +78,7 @@ class Attempt:
             return RawTlsFailed(f"{self.peer}: {error}", error.reason, maybe_written=written)
         what = error.strerror or str(error)
         if error.errno is not None and not isinstance(error, socket.gaierror):
-            what = os.strerror(error.errno)
+            what = error_text(error.errno)
         return RawError(f"{self.peer}: {what}", maybe_written=self.sent)
 
     def conclude(self, reply: bytes) -> None:

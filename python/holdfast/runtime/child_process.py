@@ -152,7 +152,11 @@ class ChildProcess:
         with self._lock:
             self._process = None
         ending = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
-        return self._output.error or ending
+        error = self._output.error
+        if not error:
+            return ending
+        # One that was ready may have said it long before, of something else.
+        return f"{ending}; its last error: {error}" if self._output.is_ready else error
 
     def _started(self) -> subprocess.Popen[str]:
         command, inherited = self._command, self._inherited
@@ -169,5 +173,6 @@ class ChildProcess:
             errors="replace",
             # Ctrl-C must not reach the program: this process still needs it for its last work.
             start_new_session=True,
+            creationflags=subprocess.CREATE_NEW_PROCESS_GROUP if sys.platform == "win32" else 0,
             pass_fds=() if sys.platform == "win32" or inherited is None else (inherited,),
         )

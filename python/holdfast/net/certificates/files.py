@@ -44,6 +44,8 @@ def write_new(contents: Mapping[Path, tuple[bytes, int]]) -> None:
 def replace(file: Path, content: bytes, mode: int = PUBLIC) -> None:
     """Writes a file that programs may read at the same time. Raises `OSError`."""
     new = file.with_name(f".{file.name}.{os.getpid()}")
+    # One that a power cut has left: in a container, the next process has the same number.
+    new.unlink(missing_ok=True)
     write_new({new: (content, mode)})
     try:
         new.replace(file)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import socket
 import time
 from concurrent.futures import wait
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.net.mqtt.stream import BrokerSocket
 from holdfast.net.resolver import CONFIGURED
 from holdfast.net.secure_channel import SecureChannel
+from holdfast.runtime.text import error_text
 
 if TYPE_CHECKING:
     from holdfast.net.mqtt.selector import Waiter
@@ -89,7 +89,7 @@ def _agree(broker: BrokerSocket, channel: SecureChannel, waiter: Waiter, deadlin
 
 def _raise_for(code: int) -> None:
     if code not in _UNDER_WAY:
-        raise OSError(code, os.strerror(code))
+        raise OSError(code, error_text(code))
 
 
 def _wait(

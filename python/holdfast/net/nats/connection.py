@@ -187,7 +187,8 @@ class Broker:
                 max_outstanding_pings=self.ping.outstanding,
                 pending_size=MAX_PENDING_BYTES,
             )
-        except Error as error:
+        # nats-py takes what a server says of itself as it comes.
+        except (Error, AttributeError, LookupError, TypeError, ValueError) as error:
             self._note(client, error)
             return
         self._note_connected(client)
@@ -298,12 +299,19 @@ async def connected_once(
 
 
 async def _given_up(client: Client, ended: asyncio.Event) -> None:
-    """Returns when nats-py has closed a client. It does not always call the callback."""
-    while not (ended.is_set() or client.is_closed):
+    """Returns when nats-py has closed a client, or connects no more. It does not always call the
+    callback."""
+    while not (ended.is_set() or client.is_closed or _is_left(client)):
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CHECK_INTERVAL_S):
                 await ended.wait()
     ended.set()
+
+
+def _is_left(client: Client) -> bool:
+    """Whether the task of nats-py has failed that makes the connection again."""
+    task = client._reconnection_task
+    return client.is_reconnecting and task is not None and task.done()
 
 
 async def _closed(client: Client) -> None:

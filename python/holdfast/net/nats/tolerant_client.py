@@ -18,6 +18,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
+from urllib.parse import urlsplit
 
 from nats.aio.client import Client
 from nats.aio.msg import Msg
@@ -36,6 +37,9 @@ if TYPE_CHECKING:
 END = b"\r\n"
 CHUNK_BYTES = 65_536
 PING, PONG = b"PING\r\n", b"PONG\r\n"
+CLOSE_TIMEOUT_S = 1.0
+"""Seconds to send the last bytes of a connection that is closed."""
+
 MAX_LINE_BYTES = 1024 * 1024
 """The longest line of the protocol in bytes. INFO lines are the longest."""
 
@@ -112,6 +116,18 @@ class MessageTransport(TcpTransport):
             super().write(channel.end())  # type: ignore[no-untyped-call]
         super().close()  # type: ignore[no-untyped-call]
 
+    async def wait_closed(self) -> None:
+        """Waits until the connection is closed, but not for a server that takes no more bytes.
+
+        What it has not taken is dropped: nats-py would otherwise never try another server.
+        """
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT_S):
+                await super().wait_closed()  # type: ignore[no-untyped-call]
+        except TimeoutError:
+            assert self._io_writer is not None, "it was connected"
+            self._io_writer.transport.abort()
+
     async def connect_tls(
         self, uri: str | ParseResult, ssl_context: Any, buffer_size: int, connect_timeout: int
     ) -> None:
@@ -164,8 +180,13 @@ class MessageTransport(TcpTransport):
         line = await self._line()
         if line.startswith(PONG):
             self._answer()
-        elif self._requires_tls and line.startswith(b"INFO"):
-            _check_tls(_decoded(line.removeprefix(b"INFO")))
+        elif line.startswith(b"INFO"):
+            info = _decoded(line.removeprefix(b"INFO"))
+            if self._requires_tls:
+                _check_tls(info)
+            return _info_line(info)
+        elif not line.startswith((b"+OK", b"-ERR")):
+            raise ProtocolError("nats: unknown protocol")
         return line
 
     async def _line(self) -> bytes:
@@ -235,7 +256,7 @@ class MessageTransport(TcpTransport):
         elif word == b"PONG":
             return b"" if self._answer() else PONG
         elif word == b"INFO":
-            return b"INFO " + json.dumps(_decoded(rest)).encode() + END
+            return _info_line(_decoded(rest))
         elif word == b"-ERR":
             return b"-ERR '%b'" % _error_text(rest) + END
         elif word != b"+OK":
@@ -268,7 +289,21 @@ def _decoded(info: bytes) -> dict[str, Any]:
         found = None
     if not isinstance(found, dict):
         raise ProtocolError("nats: malformed INFO")
+    if (urls := found.pop("connect_urls", None)) and isinstance(urls, list):
+        found["connect_urls"] = [url for url in urls if _is_url(url)]
     return found
+
+
+def _is_url(url: object) -> bool:
+    """Whether nats-py can use the address of another server."""
+    try:
+        return isinstance(url, str) and urlsplit(f"nats://{url}").port is not None
+    except ValueError:
+        return False
+
+
+def _info_line(info: dict[str, Any]) -> bytes:
+    return b"INFO " + json.dumps(info).encode() + END
 
 
 def _check_tls(info: dict[str, Any]) -> None:
