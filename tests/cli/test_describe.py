@@ -77,6 +77,14 @@ def test_every_unit_id_has_a_file(plant: str, tmp_path: Path) -> None:
     place = {"area": "holding_registers", "address": 40076, "type": "int16"}
     assert (current["values"], current["confidence"]) == ([215], 1.0)
     assert current["scale"] == {"from": place, "as": "exponent"}
+    again = ("describe", plant, "--units", "1-4", *QUICK, "--output", str(file))
+    edited = tmp_path / "device-unit1.csv"
+    edited.write_text("by hand")
+    refused = answer(*again, code=1)
+    detail = f"{edited} exists; --force replaces it"
+    assert (refused["reason"], refused["detail"], refused["files"]) == ("file", detail, [])
+    assert edited.read_text() == "by hand"
+    assert answer(*again, "--force")["files"] == found["files"]
     tags = load_tags(tmp_path / "device-unit4.csv")
     assert tags["inverter_three_phase_A"].with_scale(-1).scale == 0.1
 

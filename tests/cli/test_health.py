@@ -191,6 +191,7 @@ def http(status: str, body: bytes) -> bytes:
         (http("200 OK", b'{"status":"ok"}'), "status 200, not the answer of an appliance"),
         (http("404 Not Found", b"[]"), "status 404, not the answer of an appliance"),
         (http("200 OK", b'{"checks":{"a":1}}'), "status 200, not the answer of an appliance"),
+        (http("200 OK", b"[" * 100_000), "status 200, not the answer of an appliance"),
     ],
 )
 def test_what_is_not_an_answer_is_a_failure(
@@ -200,6 +201,13 @@ def test_what_is_not_an_answer_is_a_failure(
     result = invoke("health", "--url", server(reply), "--timeout", timeout)
     assert (result.exit_code, result.stdout) == (1, "")
     assert told in result.stderr
+
+
+@pytest.mark.parametrize("host", ["a..b", "x y", "a" * 64])
+def test_a_host_that_is_no_name_gives_no_answer(host: str) -> None:
+    result = invoke("health", "--url", f"http://{host}:80", "--timeout", "60")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "no answer in" not in result.stderr
 
 
 def test_a_slow_answer_does_not_take_longer_than_the_timeout() -> None:
@@ -241,6 +249,7 @@ def test_texts_of_a_stranger_are_shown_without_control_characters(
         (("--url", "127.0.0.1:9464"), "allowed: http://HOST:PORT"),
         (("--url", "http://127.0.0.1:9464/metrics"), "allowed: http://HOST:PORT"),
         (("--url", "http://127.0.0.1:99999"), "allowed: http://HOST:PORT"),
+        (("--url", "http://[::1:80"), "allowed: http://HOST:PORT"),
         (("--url", "http://127.0.0.1:1", "--timeout", "0"), "is not a time"),
         (("--url", "https://127.0.0.1:1", "--tls-cert", __file__), "requires --tls-key"),
     ],

@@ -79,6 +79,26 @@ def test_a_command_that_is_interrupted_says_so(monkeypatch: pytest.MonkeyPatch) 
     )
 
 
+def test_a_write_that_is_interrupted_was_possibly_carried_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(*_arguments: object, **_more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(SyncClient, "write", interrupted)
+    url = "tcp://127.0.0.1:1"
+    write = ("write", url, "hr", "3", "1")
+    result = invoke(*write)
+    assert result.output.splitlines() == [
+        f"holdfast: {url}: interrupted",
+        "hint: holding_registers was possibly written",
+    ]
+    result = invoke(*write, "--json")
+    found = json.loads(result.output)
+    assert (result.exit_code, found["ok"], found["reason"]) == (1, False, "interrupted")
+    assert (found["target"], found["maybe_written"]) == (url, True)
+
+
 @pytest.mark.parametrize("values", [(), ("--values",)])
 def test_a_replay_that_is_interrupted_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, values: tuple[str, ...]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from holdfast import __version__
-from holdfast.cli import answers
+from holdfast.cli import answers, standard_output
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.old_spellings import OLD_NAMES, hint, renewed
 from holdfast.runtime import extras
@@ -167,6 +167,17 @@ class Program(SuggestingGroup):
     """All commands. Each is imported on its first use; old names lead to the new ones."""
 
     old_names = OLD_NAMES
+
+    def main(self, *args: Any, **more: Any) -> Any:
+        """Runs the program. Ends with 1 if standard output can't be written."""
+        standard_output.prepare()
+        try:
+            return super().main(*args, **more)
+        except OSError as error:
+            if not standard_output.is_unwritable(error):
+                raise
+            standard_output.leave()
+            fail(f"standard output: {error.strerror}")
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """The names of all commands."""

@@ -14,18 +14,26 @@ from holdfast.errors import (
     InvalidResponse,
     ModbusError,
     ModbusException,
-    RequestTimeout,
 )
 from holdfast.protocol import ILLEGAL_ADDRESS, TARGET_SILENT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-REASONS: tuple[tuple[type[ModbusError], str], ...] = (
+
+class WriteInterrupted(ModbusError):
+    """Ctrl-C has ended a write, which the device may carry out all the same."""
+
+    def __str__(self) -> str:
+        return "interrupted"
+
+
+REASONS: tuple[tuple[type[Exception], str], ...] = (
     (ModbusException, "exception"),
-    (RequestTimeout, "timeout"),
+    (TimeoutError, "timeout"),
     (ConnectionLost, "connection"),
     (InvalidResponse, "invalid"),
+    (WriteInterrupted, "interrupted"),
 )
 
 
@@ -35,6 +43,11 @@ def problem(error: object) -> dict[str, object]:
     reason = next(reasons, "connection" if isinstance(error, OSError) else "failed")
     code = {"code": error.code} if isinstance(error, ModbusException) else {}
     return {"reason": reason, **code, "detail": str(error)}
+
+
+def of_write(found: ModbusError | KeyboardInterrupt) -> ModbusError:
+    """The error of a write that has failed or was interrupted."""
+    return WriteInterrupted() if isinstance(found, KeyboardInterrupt) else found
 
 
 def maybe_written(error: ModbusError) -> bool:
@@ -71,11 +84,12 @@ def fail(
     error: ModbusError,
     url: str,
     answer: Mapping[str, object] | None,
+    first: str | None = None,
     *,
     is_in_area: bool = True,
 ) -> NoReturn:
     """Prints an error as `print_error` does, and exits with 1."""
-    print_error(error, url, answer, is_in_area=is_in_area)
+    print_error(error, url, answer, first, is_in_area=is_in_area)
     sys.exit(ExitCode.FAILED)
 
 

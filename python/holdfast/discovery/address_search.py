@@ -122,7 +122,7 @@ class Unfinished(ModbusError):
     """The survey ended early; it has the results so far."""
 
 
-class DeviceSilent(Unfinished):
+class DeviceSilent(Unfinished, TimeoutError):
     """The device has stopped answering."""
 
 

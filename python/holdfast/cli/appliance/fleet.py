@@ -45,7 +45,9 @@ def status(fleet: str, servers: Servers, as_json: bool, watch: bool) -> None:
     except (FleetUnavailable, OSError) as error:
         fail(error, reason="connection")
     except KeyboardInterrupt:
-        return
+        if watch:
+            return
+        raise
     if not is_well:
         sys.exit(ExitCode.ATTENTION)
 

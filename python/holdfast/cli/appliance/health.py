@@ -101,11 +101,11 @@ def _configured(file: Path) -> str:
 
 def _checked(url: str) -> str:
     """The scheme, host and port of a URL. Raises `click.BadParameter`."""
-    parts = urlsplit(url)
     try:
+        parts = urlsplit(url)
         valid = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
     except ValueError:
-        valid = False
+        valid, parts = False, urlsplit("")
     if not valid or parts.path not in ("", "/") or parts.query or parts.fragment or parts.username:
         allowed = "allowed: http://HOST:PORT or https://HOST:PORT"
         raise click.BadParameter(f"found {url!r}, {allowed}.", param_hint="'--url'")
@@ -146,27 +146,27 @@ def _response(
     base: str, path: str, timeout: float, context: ssl.SSLContext
 ) -> dict[str, Any] | _NoAnswer:
     parts = urlsplit(base)
-    connection = (
-        http.client.HTTPSConnection(
-            parts.hostname or "", parts.port, timeout=timeout, context=context
-        )
-        if parts.scheme == "https"
-        else http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=timeout)
-    )
+    host, port = parts.hostname or "", parts.port
     try:
+        connection = (
+            http.client.HTTPSConnection(host, port, timeout=timeout, context=context)
+            if parts.scheme == "https"
+            else http.client.HTTPConnection(host, port, timeout=timeout)
+        )
         with contextlib.closing(connection):
             connection.request("GET", path)
             response = connection.getresponse()
             status, body = response.status, response.read(MAX_ANSWER_BYTES)
     except TimeoutError:
         return _NoAnswer(f"no answer in {timeout:g} s")
-    except (OSError, http.client.HTTPException) as error:
+    # A `ValueError`: a host that is no name.
+    except (OSError, http.client.HTTPException, ValueError) as error:
         return _NoAnswer(plain(str(error)) or type(error).__name__)
     try:
         answer = json.loads(body)
         checks = answer["checks"]
         [each["ok"] for each in checks.values()]
-    except (ValueError, TypeError, KeyError, AttributeError):
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return _NoAnswer(f"status {status}, not the answer of an appliance to a probe")
     return {"ok": status == http.client.OK, "checks": checks}
 

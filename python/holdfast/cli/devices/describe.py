@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -126,7 +126,8 @@ def describe(
         raise click.UsageError(f"{output} exists; --force replaces it.")
     with interruptions() as signals:
         report = Report({"target": url} if as_json else None, signals)
-        plan = _Plan(settings, times, every, output, None if everything else MAX_LINES)
+        most = None if everything else MAX_LINES
+        plan = _Plan(settings, times, every, output, force, most)
         run = _Run(url, asked, plan, report)
         with device.connect(url, asked[0], timeout) as client:
             why = run.carry_out(client, is_line=is_line)
@@ -143,6 +144,8 @@ class _Plan:
     times: int
     every: float
     output: Path | None
+    replaces: bool
+    """Whether a file may be replaced."""
     most: int | None
     """The most lines of tags in the text."""
 
@@ -184,8 +187,13 @@ class _Run:
             why = self._attempt(partial(self._describe, unit, client))
             self._conclude(unit)
             if why is not None:
-                return why
-        return self._unwritten if self._found else Ended("nothing", "no unit id answered")
+                break
+        unwritten = self._unwritten
+        if why is not None and unwritten is not None:
+            return replace(why, detail=f"{why}; {unwritten}")
+        if why is not None:
+            return why
+        return unwritten if self._found else Ended("nothing", "no unit id answered")
 
     def end(self, why: Ended | None) -> None:
         """Prints what is known when the search has ended."""
@@ -252,15 +260,20 @@ class _Run:
             return None
         if len(self._to_describe) > 1:
             path = path.with_stem(f"{path.stem}-unit{found.unit}")
+            if path.exists() and not self._plan.replaces:
+                self._fail_to_write(f"{path} exists; --force replaces it")
+                return None
         tags = [each.tag for each in found.tags]
         text = tags_as_csv(tags) if path.suffix.lower() == ".csv" else tags_as_yaml(tags)
         try:
             files.replace(path, text.encode())
         except OSError as error:
-            text = f"{path} can't be written: {error.strerror}"
-            self._unwritten = self._unwritten or Ended("file", text)
+            self._fail_to_write(f"{path} can't be written: {error.strerror}")
             return None
         return path
+
+    def _fail_to_write(self, why: str) -> None:
+        self._unwritten = self._unwritten or Ended("file", why)
 
 
 class _UnitReport:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast.cli import terminal_text
+from holdfast.cli import standard_output, terminal_text
 from holdfast.cli.exit_codes import fail
 from holdfast.cli.live import schedule
 from holdfast.cli.options.device import unit_option
@@ -126,7 +126,7 @@ def simulate(
             where = _serve(running, simulated, bind, unit, sources or LOOPBACK, faults, seed)
         except OSError as error:
             fail(f"{unbindable(bind, error)}; --bind sets another port")
-        click.echo(_greeting(file, profile, tags, where, unit))
+        standard_output.announce(_greeting(file, profile, tags, where, unit))
 
         def wait(seconds: float) -> None:
             if signals.received:

@@ -153,10 +153,12 @@ def _carry_out(
     with device.connect(url, unit, timeout) as client:
         try:
             job.write(client)
-        except ModbusError as error:
+        except (ModbusError, KeyboardInterrupt) as found:
+            error = device_errors.of_write(found)
             maybe = len(job.requests) > 1 or device_errors.maybe_written(error)
             shown = fields | {"maybe_written": maybe} if as_json else None
-            device_errors.fail(error, url, shown, is_in_area=isinstance(job, _Job))
+            first = f"{job.where} was possibly written" if maybe else None
+            device_errors.fail(error, url, shown, first, is_in_area=isinstance(job, _Job))
         try:
             differing = job.differing(client) if verify else {}
         except ModbusError as error:

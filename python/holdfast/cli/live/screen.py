@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 import signal
 import time
 from abc import ABC, abstractmethod
@@ -36,6 +37,9 @@ TURNS = {
     **dict.fromkeys(("p", "b", "\x1b[5~", "\x1b[A"), -1),
 }
 """Keys that turn pages: letters, page down and up, arrows."""
+
+_KEYS = re.compile(r"\x1b\[[0-9;]*[~A-Za-z]|\x1b.?|.", re.DOTALL)
+"""A key: several may have been pressed since the last look."""
 
 
 class Quit(Exception):
@@ -95,7 +99,7 @@ class Screen(ABC):
     def _pause(self, left: float) -> None:
         """Waits for a key or a short time, and handles keys."""
         pressed = self._wait(min(left, SIZE_CHECK_INTERVAL_S))
-        for key in [pressed] if pressed.startswith("\x1b") else pressed:
+        for key in _KEYS.findall(pressed):
             if key in ("q", "Q", keys.END):
                 raise Quit
             self._page = max(0, min(self._page + TURNS.get(key, 0), self._pages - 1))

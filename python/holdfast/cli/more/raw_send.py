@@ -160,7 +160,9 @@ def raw_send(
 def _reason(error: raw_ingest.RawError) -> str:
     if isinstance(error, raw_ingest.RawRefused):
         return "refused"
-    return "timeout" if isinstance(error, raw_ingest.RawTimeout) else "failed"
+    if isinstance(error, raw_ingest.RawTimeout):
+        return "timeout"
+    return "connection" if isinstance(error.__cause__, OSError) else "failed"
 
 
 def _values(file: IO[str]) -> list[int]:

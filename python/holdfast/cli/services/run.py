@@ -21,6 +21,7 @@ from holdfast.appliance.parts.shared_logs import LogNotJoined
 from holdfast.appliance.service_manager import ServiceManager
 from holdfast.appliance.services.gateway import gateway_settings
 from holdfast.appliance.services.scanner import scanner_settings
+from holdfast.cli import standard_output
 from holdfast.cli.configuration import load_or_exit, load_whole
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.option import config_argument
@@ -142,7 +143,7 @@ def serve(
         if reloading is not None and file is not None:
             parts.callback(_control(appliance, reloading, file))
         spare_what_stays()
-        click.echo(greeting(appliance))
+        standard_output.announce(greeting(appliance))
         manager.ready()
         while not signals.received:
             appliance.log_events(timeout=SIGNAL_INTERVAL_S)

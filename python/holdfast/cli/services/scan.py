@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 import click
 
 from holdfast import __version__
+from holdfast.cli import standard_output
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.old_spellings import hint
 from holdfast.cli.options.duration import Duration, time_option, timeout_option
@@ -164,7 +165,7 @@ def scan(
                 server = stack.enter_context(TemporaryServer(_embedded_port(servers), store))
                 servers, check = Servers((server.url,)), server.check
             settings = _settings(options, servers, allow, limits, device_tls)
-            click.echo(_greeting(settings))
+            standard_output.announce(_greeting(settings))
             event_loop.run(_serve(settings, check))
         except FleetRefused as refused:
             fail(f"fleet {options['fleet']}: {refused}", ExitCode.WRONG)

@@ -46,8 +46,8 @@ def write_tags(
         for at, write in enumerate(writes):
             try:
                 write.send(client)
-            except ModbusError as error:
-                _fail(of, writes, at, error, as_json)
+            except (ModbusError, KeyboardInterrupt) as found:
+                _fail(of, writes, at, device_errors.of_write(found), as_json)
             if not as_json:
                 click.echo(f"Written: {_text(write)}")
         differing = _differing(of, client, writes, as_json) if verify else {}

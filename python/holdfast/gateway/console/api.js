@@ -166,8 +166,8 @@ const WORDS = {
   ]],
   tls_failed: ["The TLS handshake failed.", [
     "Is the certificate for another name? If it is the right device, enter that name as the name in its certificate.",
-    "Is the issuer unknown? The gateway trusts the certificates in --tls-ca, or in tls in its configuration.",
-    "Does the device require a certificate, or refuse the gateway's? Set --tls-cert and --tls-key, or tls in the configuration.",
+    "Is the issuer unknown? The gateway trusts the certificates in --device-ca, or in device_tls in its configuration.",
+    "Does the device require a certificate, or refuse the gateway's? Set --device-cert and --device-key, or device_tls in the configuration.",
     "Is this the TLS port? It is usually 802.",
   ]],
   invalid_reply: ["The response is not valid Modbus.", [

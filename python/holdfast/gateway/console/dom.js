@@ -68,6 +68,6 @@ export function tabs(list) {
 /** Returns the current value of a custom property of the style sheet, for canvases. */
 export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
-/** Calls `callback` when the color scheme changes. */
-export const onTheme = (callback) =>
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", callback);
+/** Calls `callback` when the color scheme changes, until `signal` is aborted. */
+export const onTheme = (callback, signal) =>
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", callback, { signal });

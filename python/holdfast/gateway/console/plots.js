@@ -31,7 +31,8 @@ export class Plots {
     this.timer = setInterval(() => this.draw(), TICK);
     this.resized = new ResizeObserver(() => this.fit());
     this.resized.observe(this.place);
-    onTheme(() => this.restyle());
+    this.ended = new AbortController();
+    onTheme(() => this.restyle(), this.ended.signal);
   }
 
   /** Returns what chooses a value: an address of the only range, or one of all values. */
@@ -158,6 +159,7 @@ export class Plots {
   end() {
     this.stop();
     this.resized.disconnect();
+    this.ended.abort();
     for (const key of [...this.shown.keys()]) this.remove(key);
     this.place.hidden = true;
   }

@@ -262,10 +262,16 @@ function tagHelp({ unit, min, max, states, type }) {
   const names = Object.values(states);
   const limits = [min === null ? "" : `from ${min}`, max === null ? "" : `to ${max}`].filter(Boolean).join(" ");
   return [
-    names.length > 0 ? `One of ${names.join(", ")}.` : type === "bool" || type.startsWith("bit") ? "0, 1, on or off." : "A number, with a decimal point.",
+    names.length > 0 ? `One of ${names.join(", ")}.` : valueHelp(type),
     unit ? `In ${unit}.` : "",
     limits ? `Allowed: ${limits}.` : "",
   ].filter(Boolean).join(" ");
+}
+
+function valueHelp(type) {
+  if (type.includes("[")) return "A list in JSON, as in [1, 2].";
+  if (type.startsWith("string")) return "Text.";
+  return type === "bool" || type.startsWith("bit") ? "0, 1, on or off." : "A number, with a decimal point.";
 }
 
 /** Describes the values that were read back after a failed write. */

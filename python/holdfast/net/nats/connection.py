@@ -298,20 +298,14 @@ async def connected_once(
         await _closed(client)
 
 
-async def _given_up(client: Client, ended: asyncio.Event) -> None:
+async def _given_up(client: SafeClient, ended: asyncio.Event) -> None:
     """Returns when nats-py has closed a client, or connects no more. It does not always call the
     callback."""
-    while not (ended.is_set() or client.is_closed or _is_left(client)):
+    while not (ended.is_set() or client.is_closed or client.is_left):
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CHECK_INTERVAL_S):
                 await ended.wait()
     ended.set()
-
-
-def _is_left(client: Client) -> bool:
-    """Whether the task of nats-py has failed that makes the connection again."""
-    task = client._reconnection_task
-    return client.is_reconnecting and task is not None and task.done()
 
 
 async def _closed(client: Client) -> None:

@@ -336,6 +336,12 @@ class SafeClient(Client):
         self._transport = self.transport
         self.msg_class = self._with_age  # type: ignore[assignment]
 
+    @property
+    def is_left(self) -> bool:
+        """Whether the task of nats-py has failed that makes the connection again."""
+        task = self._reconnection_task
+        return self.is_reconnecting and task is not None and task.done()
+
     async def prove(self, since: float) -> None:
         """Pings the server, unless that was done after `since`."""
         if self.is_connected and self.transport.pinged < since:

@@ -1,0 +1,77 @@
+"""Commands whose standard output can't take what they print."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+import holdfast
+from holdfast.server import Identity
+from support import cli, wire
+from support.brokers import free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+HOLDFAST = (sys.executable, "-m", "holdfast")
+FULL = Path("/dev/full")
+
+with_full = pytest.mark.skipif(not FULL.exists(), reason="the system has no /dev/full")
+
+
+@with_full
+@pytest.mark.parametrize("words", [("--help",), ("find", "--help"), ("cert", "--help")])
+def test_a_full_disk_is_one_line_of_error(words: Sequence[str]) -> None:
+    with FULL.open("wb") as full:
+        ended = subprocess.run(
+            [*HOLDFAST, *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    told = "holdfast: standard output: No space left on device\n"
+    assert (ended.returncode, ended.stderr) == (1, told)
+
+
+@with_full
+def test_a_service_runs_although_nobody_can_read_its_greeting() -> None:
+    port = free_port()
+    with FULL.open("wb") as full:
+        running = subprocess.Popen(
+            [*HOLDFAST, "simulate", "--bind", f"127.0.0.1:{port}"], stdout=full
+        )
+    try:
+
+        def serves() -> bool:
+            try:
+                with holdfast.SyncClient(f"tcp://127.0.0.1:{port}", timeout=1) as client:
+                    return len(client.read_input_registers(0, 1)) == 1
+            except holdfast.ConnectionLost:
+                assert running.poll() is None
+                return False
+
+        wire.until(serves, "it serves")
+        running.send_signal(signal.SIGTERM)
+        assert running.wait(wire.DEADLINE) == 0
+    finally:
+        running.kill()
+        running.wait()
+
+
+def test_text_of_a_device_that_the_encoding_does_not_have_is_escaped() -> None:
+    memory = holdfast.Memory(holding_registers=10)
+    identity = Identity(vendor_name="Ωmega")
+    with holdfast.Server(
+        {1: memory}, bind="127.0.0.1:0", access="read-only", identity=identity
+    ) as server:
+        ended = subprocess.run(
+            [*HOLDFAST, "describe", "identify", cli.url(server)],
+            env={**os.environ, "PYTHONIOENCODING": "cp1252"},
+            capture_output=True,
+            check=False,
+        )
+    assert (ended.returncode, ended.stderr) == (0, b"")
+    assert rb"\u03a9mega" in ended.stdout
