@@ -375,8 +375,9 @@ def test_a_topic_is_subscribed_once(folder: Folder) -> None:
          "7: audit.syslog: found 'unix://log', allowed: udp://host:port, tcp://host:port or "
          "unix:///path, with an absolute path"),
         ("audit.log", "none/audit.log", "7: audit.file: found 'none/audit.log', "
+         "whose folder does not exist, allowed: a file in an existing folder"),
+        ("audit.log", ".", "7: audit.file: found '.', which is a folder, "
          "allowed: a file in an existing folder"),
-        ("audit.log", ".", "7: audit.file: found '.', which is a folder, allowed: a file"),
         ("audit.log", "audit.log, max_bytes: 65535",
          "7: audit.max_bytes: found 65535, allowed: an integer of at least 65536"),
         ("audit.log", "audit.log, keep: 1001",

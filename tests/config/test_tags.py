@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.config import ConfigError, load
+from holdfast.config.checks import listeners
 from holdfast.config.tag_files.read import load_tags
+from holdfast.net.addresses import covers
 from holdfast.tags import Tag
 
 if TYPE_CHECKING:
@@ -319,3 +321,99 @@ def test_one_entry_makes_many_devices(tmp_path: Path) -> None:
 def test_a_wrong_entry_is_refused_once(tmp_path: Path, entry: str, expected: str) -> None:
     [found] = problems(written(tmp_path, f"devices:\n  {entry}\n"))
     assert found.startswith(f"p.yaml:2: {expected}")
+
+
+LISTENER = (
+    "listeners: {s: {type: modbus-tcp, bind: '127.0.0.1:0', rules: ["
+    "{sources: [127.0.0.1], access: read-only, units: {1: %s}}]}}\n"
+)
+QUOTES = "allowed: 1 to 64 letters, digits, '_', '.' and '-'; write '1' to make it text"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            "memories: {1: {coils: 5}}\n" + LISTENER % "plant",
+            [f"memories.1: found 1, {QUOTES}", "units.1: found 'plant', allowed: 1"],
+        ),
+        (
+            "profiles: {1: {tags: {a: {area: coils, address: 0}}}}\n"
+            "devices: {d: {url: tcp://a, interval: 1, profile: '1'}}\n",
+            [f"profiles.1: found 1, {QUOTES}"],
+        ),
+        (
+            DEVICE.replace("{a:", "{1:") + "outputs: {m: {type: mqtt, url: 'mqtt://a'}}\n",
+            [f"devices.1: found 1, {QUOTES}"],
+        ),
+        (
+            DEVICE.replace("interval", "forbidden: [{area: coils, start: 0, end: 5}], interval"),
+            [
+                "devices.a.tags.x.address: found 1, which overlaps the forbidden range 0 to 5, "
+                "allowed: other addresses"
+            ],
+        ),
+        (DEVICE + LISTENER % "{memory: plant}", ["memories: missing, allowed: a mapping"]),
+        (
+            "devices: {'d{n}': {for: {n: 1-999999999}, url: tcp://a, interval: 1}}\n",
+            ["makes more than 10000 devices, allowed: up to 10000"],
+        ),
+        (
+            DEVICE + "outputs: {n: {type: nats, servers: 'nats://u:s3cret@h'}}\n",
+            ["outputs.n.servers: found text of 17 characters, allowed: a list"],
+        ),
+        (
+            DEVICE + "outputs: {n: {type: influx, url: 'http://h/x', tags: {device: x}}}\n",
+            ["tags.device: found device, which has the name of the device, allowed: another name"],
+        ),
+        (
+            DEVICE + "outputs: {n: {type: influx, url: 'http://h/x', tags: {site: ''}}}\n",
+            ["outputs.n.tags.site: found '', allowed: text"],
+        ),
+        (
+            DEVICE.replace("address: 1", "address: 1, states: {on: up}"),
+            ["states.on: found 'on', allowed: an integer"],
+        ),
+        (
+            "logs: {a.b: {servers: ['nats://127.0.0.1:1'], node: n}}\n" + DEVICE,
+            ["logs.'a.b': found 'a.b', allowed: a name without '.', which streams can't have"],
+        ),
+        (
+            f"memories: {{plant: {{coils: 5, keep: {{file: {'a' * 300}/b}}}}}}\n"
+            + LISTENER % "plant",
+            ["which can't be used: File name too long"],
+        ),
+    ],
+)
+def test_what_would_fail_at_the_start_is_a_problem(
+    tmp_path: Path, text: str, expected: list[str]
+) -> None:
+    found = problems(written(tmp_path, text))
+    assert len(found) == len(expected), found
+    for problem, part in zip(found, expected, strict=True):
+        assert part in problem
+
+
+def test_what_is_called_options_is_printed_like_all_else(tmp_path: Path) -> None:
+    config = load(written(tmp_path, DEVICE.replace("{a:", "{options:")))
+    assert load(written(tmp_path, config.dump())) == config
+    assert "id: null" not in config.dump()
+
+
+def test_the_rules_of_many_units_are_compared_once_for_equal_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def counted(networks: object, network: object) -> bool:
+        asked.append(network)
+        return covers(networks, network)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(listeners, "covers", counted)
+    rules = ", ".join(
+        f"{{sources: [10.0.0.{number}], access: read-only, units: {{0-255: m}}}}"
+        for number in range(20)
+    )
+    text = "memories: {m: {coils: 5}}\nlisteners: {s: {type: modbus-tcp, bind: '127.0.0.1:0', "
+    load(written(tmp_path, f"{text}rules: [{rules}]}}}}\n"))
+    assert len(asked) <= 20 * 20

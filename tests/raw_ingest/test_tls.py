@@ -503,7 +503,11 @@ def test_raw_send_takes_a_url(plant: Appliance, party: Party) -> None:
     refused = invoke("raw-send", f"{url}&name=elsewhere", *arguments, "--json")
     told = json.loads(refused.stdout)
     assert refused.exit_code == 1
-    assert (told["reason"], told["tls"], told["maybe_written"]) == ("connection", "wrong_name", False)
+    assert (told["reason"], told["tls"], told["maybe_written"]) == (
+        "connection",
+        "wrong_name",
+        False,
+    )
     wrong = invoke("raw-send", f"raw+tls://127.0.0.1:{port}?ca=absent.pem", *arguments)
     assert (wrong.exit_code, "absent.pem" in wrong.stderr) == (2, True)
 

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 _KEY = "[key]"
 _NO_KIND = ("union_tag_invalid", "union_tag_not_found")
 _TOKENS = (("rest", "tokens"), ("gateway", "tokens"))
-_SERVERS = ("nats", "servers")
+_URLS = (("servers",), ("monitoring",))
+"""The keys of lists of URLs, which can contain passwords."""
 _CONSEQUENCES = ("default_factory_not_called",)
 """Errors that are only consequences of other errors."""
 
@@ -80,7 +81,7 @@ def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
         while not report.document.holds(path):
             path = path[:-1]
         near = suggestion(error["input"], _words(error)) if kind == "literal_error" else ""
-        words = f"{allowed(path, data)}{near}"
+        words = "an integer" if of_key and kind == "int_type" else f"{allowed(path, data)}{near}"
         report.add(path, f"found {_shown(path, error['input'])}, allowed: {words}")
 
 
@@ -102,7 +103,7 @@ def _add_kind(path: KeyPath, owner: dict[str, Any], report: Report) -> None:
 def _shown(path: KeyPath, value: object) -> str:
     """The value as text, or only its shape if it could contain a secret."""
     of_token = path[:2] in _TOKENS and len(path) <= 3
-    return shape(value) if of_token or path == _SERVERS else show(value)
+    return shape(value) if of_token or path[-1:] in _URLS else show(value)
 
 
 def _unknown(path: KeyPath, data: object) -> str:

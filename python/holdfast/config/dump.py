@@ -5,6 +5,7 @@ The functions take plain data, not models.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from functools import lru_cache
@@ -23,8 +24,8 @@ INDENT = 2
 NULL_IS_SAID = frozenset({"max_connections_per_source"})
 """Keys whose `None` is written as null; other keys without a value are omitted."""
 
-AS_WRITTEN = frozenset({"options"})
-"""Keys whose values belong to someone else, such as an adapter: a null in them is data."""
+OF_ADAPTER = ("adapters", "options")
+"""The section and the key whose values belong to someone else: a null in them is data."""
 
 PLAIN = re.compile(r"[A-Za-z0-9_./]([A-Za-z0-9_./+%@-]|:(?=[^ ])| (?=[^ ]))*", re.ASCII)
 """Text that is safe without quotes anywhere in YAML; all other text is quoted."""
@@ -33,20 +34,25 @@ ESCAPED = re.compile("[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
 """What JSON leaves as it is between quotes, and YAML does not allow or may take as a line break."""
 
 
-def effective(model: dict[Any, Any]) -> dict[Any, Any]:
-    """The data of a model for YAML and JSON, without keys that have no value."""
+def effective(model: dict[Any, Any], path: tuple[object, ...] = ()) -> dict[Any, Any]:
+    """The data of a model for YAML and JSON, without keys that have no value.
+
+    `path` are the keys that lead to it.
+    """
+    section, data_of_others = OF_ADAPTER
+    as_written = {data_of_others} if path[:1] == (section,) and len(path) == 2 else ()
     return {
-        key: value if key in AS_WRITTEN else _plain(value)
+        key: value if key in as_written else _plain(value, path, key)
         for key, value in model.items()
         if value is not None or key in NULL_IS_SAID
     }
 
 
-def _plain(value: object) -> object:
+def _plain(value: object, path: tuple[object, ...], key: object) -> object:
     if isinstance(value, dict):
-        return effective(value)
+        return effective(value, (*path, key))
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [_plain(item, path, key) for item in value]
     return str(value) if isinstance(value, Path) else value
 
 
@@ -103,5 +109,8 @@ def _text(value: object) -> str:
 def _quoted_if_needed(text: str) -> str:
     if PLAIN.fullmatch(text) and scalar(text) == text:
         return text
-    quoted = msgspec.json.encode(text).decode()
+    try:
+        quoted = msgspec.json.encode(text).decode()
+    except UnicodeEncodeError:
+        quoted = json.dumps(text)
     return ESCAPED.sub(lambda found: f"\\u{ord(found[0]):04X}", quoted)

@@ -65,11 +65,11 @@ def _listed(values: Iterable[object], word: str) -> str:
     return f"{', '.join(most)} {word} {last}" if most else last
 
 
-def suggestion(word: object, known: Iterable[str]) -> str:
+def suggestion(word: object, known: Iterable[object]) -> str:
     """`; did you mean 'x'?` if a known word is close, in any case, else ""."""
     import difflib
 
-    words, text = list(known), str(word)
+    words, text = list(map(str, known)), str(word)
     close = difflib.get_close_matches(text, words, 1)
     close = close or difflib.get_close_matches(text.lower(), words, 1)
     return f"; did you mean {close[0]!r}?" if close else ""

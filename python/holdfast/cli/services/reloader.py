@@ -38,6 +38,10 @@ PROMPT_MS = 100
 """Milliseconds that the thread of the appliance waits for files: most are read by then."""
 
 
+_REFUSALS = (ConfigError, click.UsageError, Unreadable, UnknownAdapter, OSError, ValueError)
+"""Errors of files that can't be taken over."""
+
+
 @dataclass(frozen=True)
 class _Read:
     """The result of reading the files, in a thread beside the appliance."""
@@ -193,8 +197,10 @@ class Reloader:
                 return {}  # The next looks tell whether somebody still writes.
             self._loaded_files, self._last_snapshot, self._snapshot = read.files, None, None
             self._logged.clear()
-            if read.error is not None:
+            if isinstance(read.error, _REFUSALS):
                 raise read.error
+            if read.error is not None:
+                raise ValueError(f"internal error: {read.error!r}") from read.error
             assert read.config is not None, "without an error, there is a configuration"
             config = read.config
             changed = self._appliance.reload(config)

@@ -42,8 +42,8 @@ class Scope:
 
     def names(self, section: str) -> Collection[str]:
         """The names in a section; none if the section is invalid."""
-        names: Collection[str] = self.config.__dict__.get(section, {})
-        return names
+        names = self.config.__dict__.get(section, {})
+        return [name for name in names if isinstance(name, str)]
 
 
 def items(path: KeyPath, entries: Mapping[Any, T] | Sequence[T]) -> Iterator[tuple[KeyPath, T]]:
@@ -74,9 +74,11 @@ def refuse_repeats(path: KeyPath, values: Iterable[object] | None, report: Repor
 
 def check_name(path: KeyPath, name: str, known: Iterable[str], what: str, report: Report) -> bool:
     """Reports a name that is not one of the known ones, which messages call `what`."""
-    names = [str(each) for each in known]
+    names = list(known)
     if name in names:
         return True
+    if name in map(str, names):
+        return False  # A name without quotes, which has been reported.
     words = listing(names) or f"none, there are no {what}"
     report.add(path, f"found {show(name)}, allowed: {words}{suggestion(name, names)}")
     return False
@@ -111,6 +113,18 @@ def unreadable(path: Path) -> str:
     if stat.S_ISDIR(mode):
         return os.strerror(errno.EISDIR)
     return bounded_files.unstored(path, mode) or ("" if may_read else os.strerror(errno.EACCES))
+
+
+def unplaceable(file: Path) -> str:
+    """Why a file can't be in its folder, or "" if it can."""
+    try:
+        if not bounded_files.call(file, file.parent.is_dir):
+            return "whose folder does not exist"
+        return "which is a folder" if bounded_files.call(file, file.is_dir) else ""
+    except bounded_files.NotAnswered:
+        raise
+    except OSError as error:
+        return f"which can't be used: {error.strerror}"
 
 
 def check_readable(

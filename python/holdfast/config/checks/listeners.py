@@ -232,8 +232,18 @@ def _holder(path: KeyPath, rule: AnyRule) -> _Holder:
 
 def _warn(rule: _Holder, earlier: list[_Holder], report: Report) -> None:
     decided: dict[Key | None, list[_Holder]] = {}
+    # Most unit ids of a range are in the same rules.
+    known: dict[tuple[int, ...], list[_Holder]] = {}
+
+    def deciding_for(unit: int) -> list[_Holder]:
+        naming = [each for each in earlier if each.names(unit)]
+        which = tuple(map(id, naming))
+        if which not in known:
+            known[which] = _deciding(rule, naming)
+        return known[which]
+
     for key, units in rule.units.items():
-        deciding = [_deciding(rule, unit, earlier) for unit in units]
+        deciding = [deciding_for(unit) for unit in units]
         if deciding and all(deciding):
             decided[key] = [each for each in earlier if any(each in one for one in deciding)]
     if decided and len(decided) == len(rule.units):
@@ -249,9 +259,10 @@ def _warn(rule: _Holder, earlier: list[_Holder], report: Report) -> None:
         report.warn((*rule.path, "units", key), message)
 
 
-def _deciding(rule: _Holder, unit: int, earlier: list[_Holder]) -> list[_Holder]:
-    """The earlier rules that decide for a unit and all peers of a rule; empty if a peer is left."""
-    naming = [each for each in earlier if each.names(unit)]
+def _deciding(rule: _Holder, naming: list[_Holder]) -> list[_Holder]:
+    """Those of the earlier rules with a unit that decide for all peers of a rule; empty if a peer
+    is left.
+    """
     found: list[_Holder] = []
     for role in rule.roles or (None,):
         before = [each for each in naming if each.roles is None or role in each.roles]

@@ -6,13 +6,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from holdfast.config import initial_values
-from holdfast.config.checks.common import Owners, given, items, refuse_repeats, until_invalid
+from holdfast.config.checks.common import (
+    Owners,
+    given,
+    items,
+    refuse_repeats,
+    unplaceable,
+    until_invalid,
+)
 from holdfast.config.models.base import INVALID
 from holdfast.config.models.listeners import RawRuleConfig
 from holdfast.config.models.services import AdapterConfig
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError
-from holdfast.runtime import bounded_files
 from holdfast.runtime.text import extent, listing, suggestion
 from holdfast.types import AREAS, BIT_AREAS
 
@@ -148,10 +154,8 @@ def _check_files(scope: Scope) -> None:
             file, where = memory.keep.file, (*path, "keep", "file")
             owner, other = first.setdefault(file, (path, memory))
             found = f"found {show(scope.report.raw(where))}"
-            if not bounded_files.call(str(file), file.parent.is_dir):
-                scope.report.add(where, f"{found}, whose folder does not exist")
-            elif bounded_files.call(str(file), file.is_dir):
-                scope.report.add(where, f"{found}, which is a folder")
+            if reason := unplaceable(file):
+                scope.report.add(where, f"{found}, {reason}")
             elif other.keep is not None and other.keep.sync != memory.keep.sync:
                 allowed = f"{other.keep.sync:g}, as {owner[-1]} has for the file"
                 message = f"found {memory.keep.sync:g}, allowed: {allowed}"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.checks.common import Owners, check_name, items, until_invalid
 from holdfast.config.checks.tls import check_client_tls, check_files
 from holdfast.config.models.base import INVALID
+from holdfast.config.models.logs import SharedLogConfig
 from holdfast.config.models.services import NatsConfig
 from holdfast.config.text.messages import show
 from holdfast.config.values.scanner_settings import check_dialect, parse_server
@@ -128,6 +129,9 @@ def check_nats(path: KeyPath, nats: NatsServersConfig, report: Report) -> None:
     if "password_file" in written and "username" not in written:
         report.add_key((*path, "password_file"), "found without username, allowed: both or neither")
     files = ("password_file", "token_file", "credentials_file")
+    with until_invalid():
+        if isinstance(nats, SharedLogConfig) and nats.makes_token:
+            files = ("password_file",)
     check_files(path, nats, tuple(key for key in files if key in written), report)
     first, *others = [key for key in _IDENTITIES if key in written] or [""]
     for key in others:
@@ -165,7 +169,10 @@ def check_dialect_of(path: KeyPath, nats: NatsConfig | NatsOutputConfig, report:
 
 def check_servers(path: KeyPath, log: SharedLogConfig, report: Report) -> None:
     """Reports missing servers, and settings that an embedded server does not have."""
-    written = report.raw(path)
+    written, name = report.raw(path), str(path[-1])
+    if "." in name:
+        message = f"found {show(name)}, allowed: a name without '.', which streams can't have"
+        report.add_key(path, message)
     if "embedded" not in written:
         if "servers" not in written:
             message = "missing, allowed: a list of nats://host:port (optional with embedded)"
@@ -175,7 +182,7 @@ def check_servers(path: KeyPath, log: SharedLogConfig, report: Report) -> None:
         if key in written:
             message = "found with embedded, allowed: username and password_file, or token_file"
             report.add_key((*path, key), message)
-    if "monitoring" in written:
+    if written.get("monitoring"):
         message = "found with embedded, allowed: without, its sync_interval is always"
         report.add_key((*path, "monitoring"), message)
     with until_invalid():

@@ -52,6 +52,10 @@ def _check_output(scope: Scope, path: KeyPath, output: Output) -> None:
 
 def _check_influx(scope: Scope, path: KeyPath, output: InfluxConfig) -> None:
     target, report = output.target, scope.report
+    with until_invalid():
+        if "device" in output.tags:
+            message = "found device, which has the name of the device, allowed: another name"
+            report.add_key((*path, "tags", "device"), message)
     if target.path in ("", "/") and not given(output, "bucket"):
         report.add_key((*path, "bucket"), "missing, allowed: a bucket, or a url with a path")
     if given(output, "tls") and not target.secure:

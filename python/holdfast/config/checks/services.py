@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.checks.common import Owners, check_name, given, items, until_invalid
+from holdfast.config.checks.common import (
+    Owners,
+    check_name,
+    given,
+    items,
+    unplaceable,
+    until_invalid,
+)
 from holdfast.config.checks.memories import check_grant, check_memory, layout
 from holdfast.config.checks.nats import check_dialect_of, check_nats
 from holdfast.config.checks.tls import check_client_tls, check_files, check_https
 from holdfast.config.models.base import INVALID, InvalidValue
+from holdfast.config.models.listeners import ModbusTcpListener, UnitMemoryConfig
 from holdfast.config.models.services import HTTP_SERVICES
 from holdfast.config.text.messages import show
-from holdfast.runtime import bounded_files
 from holdfast.runtime.text import either, listing, suggestion
 from holdfast.tags import Tag, TagError
 from holdfast.tags.scale import RegisterScale
@@ -87,9 +94,12 @@ def _add_empty(scope: Scope, key: str, unless: str) -> None:
 def _uses_memories(config: Config) -> bool:
     """Whether a listener or a device needs a memory: all do that only route or forward."""
     try:
-        rules = [rule for each in config.listeners.values() for rule in each.rules]
+        rules: list[Any] = [rule for each in config.listeners.values() for rule in each.rules]
+        for each in config.listeners.values():
+            if isinstance(each, ModbusTcpListener) and each.raw_ingest is not None:
+                rules += each.raw_ingest.rules
         stored = any(
-            isinstance(target, str)
+            isinstance(target, str | UnitMemoryConfig)
             for rule in rules
             for target in dict(rule.units).values() or [""]
         )
@@ -189,10 +199,8 @@ def _check_audit(scope: Scope, audit: AuditConfig) -> None:
 def _check_audit_file(scope: Scope, file: Path) -> None:
     path = ("audit", "file")
     found = f"found {show(scope.report.raw(path))}"
-    if bounded_files.call(file, file.is_dir):
-        scope.report.add(path, f"{found}, which is a folder, allowed: a file")
-    elif not bounded_files.call(file, file.parent.is_dir):
-        scope.report.add(path, f"{found}, allowed: a file in an existing folder")
+    if reason := unplaceable(file):
+        scope.report.add(path, f"{found}, {reason}, allowed: a file in an existing folder")
 
 
 def check_broker(path: KeyPath, settings: BrokerConfig, report: Report) -> None:

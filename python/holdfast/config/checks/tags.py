@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.config.checks.common import Scope, check_name, items, until_invalid
-from holdfast.runtime.text import suggestion
+from holdfast.runtime.text import extent, suggestion
 from holdfast.tags import Tag, TagError
 from holdfast.tags.scale import RegisterScale
 from holdfast.values.orders import DEFAULT_ORDER
@@ -53,6 +53,10 @@ def _check_device(
         own = _tags(scope, path, device.tags, order)
         tags = _resolved(scope, path, device.tags, own, tags)
     for tag in tags.values():
+        if tag.source is None and (flaw := _forbidden(tag, device)):
+            own = tag.name in device.tags
+            where = (*path, "tags", tag.name, "address") if own else (*path, "profile")
+            scope.report.add(where, flaw if own else f"{tag.name}: {flaw}")
         for flaw in _flaws(tag, device):
             assert isinstance(tag.scale, RegisterScale), "others have no flaws"
             message = f"the scale is from {tag.scale.where}, {flaw}"
@@ -73,7 +77,7 @@ def _tags(scope: Scope, path: KeyPath, tags: Mapping[str, TagConfig], order: str
             except TagError as error:
                 at = (*where, error.key)
                 if error.key == "order" and settings.order is None:
-                    at = (*path, "order")
+                    at = (*path, "order") if path[0] == "profiles" else where
                 scope.report.add(at, str(error))
     return found
 
@@ -103,6 +107,16 @@ def _resolved(
                 assert source is not None, "only a tag of the device can change it"
                 scope.report.add((*path, "tags", source), f"{name} has its scale here: {error}")
     return found
+
+
+def _forbidden(tag: Tag, device: DeviceConfig) -> str:
+    """Why no request to the device can read a value, or "" if one can."""
+    for start, stop in _stretches(device.forbidden, tag.area):
+        if start < tag.span.stop and tag.span.start < stop:
+            place = tag.address if len(tag.span) == 1 else extent(tag.span)
+            found = f"found {place}, which overlaps the forbidden range"
+            return f"{found} {start} to {stop - 1}, allowed: other addresses"
+    return ""
 
 
 def _flaws(tag: Tag, device: DeviceConfig) -> Iterator[str]:

@@ -44,6 +44,11 @@ class SharedLogConfig(NatsServersConfig):
     max_lag: Seconds = MAX_LAG
     """Seconds without contact to the log."""
 
+    @property
+    def makes_token(self) -> bool:
+        """Whether the embedded server makes the file of its token."""
+        return self.embedded is not None and self.token_file == self.embedded / TOKEN_FILE
+
     @model_validator(mode="before")
     @classmethod
     def _complete(cls, data: object) -> object:

@@ -77,7 +77,7 @@ class InfluxConfig(OutputConfig):
     """A file that contains the password of the user."""
     measurement: Annotated[str, Field(min_length=1)] = MEASUREMENT
     """The measurement of all points; each device is a tag, each tag of it a field."""
-    tags: dict[Name, str] = Field(default={})
+    tags: dict[Name, Annotated[str, Field(min_length=1)]] = Field(default={})
     """More tags of all points, such as the site."""
     gzip: bool = True
     """Whether requests are compressed."""

@@ -9,7 +9,7 @@ from pydantic import Field, PlainSerializer, PlainValidator, Strict
 from pydantic.config import JsonDict
 from pydantic.json_schema import WithJsonSchema
 
-from holdfast.config.models.base import Model
+from holdfast.config.models.base import INVALID, InvalidValue, Model
 from holdfast.config.models.memories import Register
 from holdfast.config.values.scalars import NAME_KEYS, Name, NotNull, whole_number
 from holdfast.config.values.tag_scale import SCALE_SCHEMA, ScaleConfig, parse_scale, written_scale
@@ -71,6 +71,8 @@ class TagConfig(Model):
         """The tag, with a default order. Raises `TagError`."""
         settings: dict[str, Any] = {key: getattr(self, key) for key in _KEYS}
         order = (self.order or order).upper()
+        if INVALID in self.null:
+            raise InvalidValue
         if isinstance(self.scale, ScaleConfig):
             settings["scale"] = self.scale.of(order)
         return Tag(name, null=frozenset(self.null), order=order, **settings)

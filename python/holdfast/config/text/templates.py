@@ -98,7 +98,8 @@ def _numbers(span: object) -> range | list[int] | None:
     match = _SPAN.fullmatch(span) if isinstance(span, str) else None
     if match is None or int(match[1]) > int(match[2]):
         return None
-    return range(int(match[1]), int(match[2]) + 1)
+    first, last = int(match[1]), int(match[2])
+    return range(first, min(last, first + MAX_DEVICES) + 1)
 
 
 def _filled(value: Any, values: Mapping[str, int]) -> Any:
