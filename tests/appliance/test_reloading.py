@@ -241,6 +241,18 @@ def test_a_wrong_file_is_refused_once(
 
 
 @pytest.mark.parametrize("function", ["open", "stat"])
+def test_an_internal_error_of_reading_refuses_the_reload(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(_: Path) -> Config:
+        raise KeyError("plant")
+
+    plant = Plant(tmp_path)
+    monkeypatch.setitem(globals(), "load_whole", fails)
+    assert plant.request() == {"problems": [f"{plant.file}: internal error: KeyError('plant')"]}
+    assert plant.taken == []
+
+
 def test_a_file_that_never_answers_is_a_problem_and_leaves_one_thread_behind(
     function: str, tmp_path: Path, log: web.Records, monkeypatch: pytest.MonkeyPatch
 ) -> None:
