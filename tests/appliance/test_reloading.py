@@ -240,7 +240,6 @@ def test_a_wrong_file_is_refused_once(
     assert len(log.of("reload_refused")) == 1
 
 
-@pytest.mark.parametrize("function", ["open", "stat"])
 def test_an_internal_error_of_reading_refuses_the_reload(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -253,6 +252,7 @@ def test_an_internal_error_of_reading_refuses_the_reload(
     assert plant.taken == []
 
 
+@pytest.mark.parametrize("function", ["open", "stat"])
 def test_a_file_that_never_answers_is_a_problem_and_leaves_one_thread_behind(
     function: str, tmp_path: Path, log: web.Records, monkeypatch: pytest.MonkeyPatch
 ) -> None:
