@@ -150,7 +150,9 @@ async def shared(bench: Bench) -> None:
             *status, "--nats", bench.url, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
         out, _ = await done.communicate()
-        counts = [each["partitions"] for each in json.loads(out)["nodes"]] if out else []
+        # There is no fleet before the first node is known.
+        nodes = json.loads(out).get("nodes", []) if out else []
+        counts = [each["partitions"] for each in nodes]
         if len(counts) == len(bench.nodes) and max(counts) <= min(counts) + 1:
             return
         await asyncio.sleep(0.5)

@@ -279,7 +279,8 @@ def main() -> None:
         of_system = f", and {found_of['system'] / 1e3:.1f} KB of the system"
         print(line + (of_system if number == count else ""), flush=True)
     for text, size in (
-        ("polled device with 10 reads", of_devices(count // 2)),
+        # A configuration has at most 1 MiB.
+        ("polled device with 10 reads", of_devices(min(count // 2, 600))),
         ("value that waits for an output", of_values(100 * count)),
     ):
         results[text] = size

@@ -60,8 +60,8 @@ class Bench:
 
     def nats_cpu(self) -> float:
         """Returns the processor time of the NATS server, a child process, in seconds."""
-        pid = self.nats.process.pid
-        child = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()[0]
+        threads = Path(f"/proc/{self.nats.process.pid}/task").glob("*/children")
+        [child] = [child for thread in threads for child in thread.read_text().split()]
         return _seconds(Path(f"/proc/{child}/stat"))
 
     def count(self) -> dict[str, float]:
