@@ -207,6 +207,13 @@ def ask(address: str, quantity: int) -> bytes:
         return reply
 
 
+def child(pid: int) -> int:
+    """Returns the number of the only child process, which any thread may have started."""
+    threads = Path(f"/proc/{pid}/task").glob("*/children")
+    [found] = [found for thread in threads for found in thread.read_text().split()]
+    return int(found)
+
+
 def memory(pid: int) -> dict[str, int]:
     """Returns the resident memory of a process, and its own without pages of files, in bytes."""
     found: dict[str, int] = {}

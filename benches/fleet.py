@@ -120,8 +120,7 @@ class Bench:
 
     def nats_cpu(self) -> float:
         """Returns the processor time of the NATS server, a child process, in seconds."""
-        pid = self.nats.process.pid
-        child = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()[0]
+        child = common.child(self.nats.process.pid)
         user, system = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[11:13]
         return (int(user) + int(system)) / TICKS
 

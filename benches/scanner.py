@@ -60,9 +60,7 @@ class Bench:
 
     def nats_cpu(self) -> float:
         """Returns the processor time of the NATS server, a child process, in seconds."""
-        threads = Path(f"/proc/{self.nats.process.pid}/task").glob("*/children")
-        [child] = [child for thread in threads for child in thread.read_text().split()]
-        return _seconds(Path(f"/proc/{child}/stat"))
+        return _seconds(Path(f"/proc/{common.child(self.nats.process.pid)}/stat"))
 
     def count(self) -> dict[str, float]:
         """Returns the listener's figures since the last call."""
