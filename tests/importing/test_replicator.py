@@ -181,6 +181,22 @@ def test_a_note_names_what_is_not_converted_unchanged(
          "2183"),
         ("device_name: P1", "device_name: Pümpe",
          "5: replicator.units[0].source.device_name: found 'Pümpe', allowed: ASCII characters"),
+        ("quantity: 128", "quantity: 128, invert: true",
+         "7: replicator.units[0].reads[0].invert: found true, allowed: false; nothing here inverts "
+         "bits"),
+        ("quantity: 128", "quantity: 128, addinvert: true",
+         "7: replicator.units[0].reads[0].addinvert: found true, allowed: false; nothing here "
+         "inverts bits"),
+        ("status_unit_id: 100", "status_unit_id: 0100",
+         "12: replicator.units[0].targets[0].status_unit_id: found 0100, which the source read as "
+         "octal, allowed: 64, or 100 if that is meant"),
+        ("{3: 1000}", "{'3': 1000}",
+         "14: replicator.units[0].targets[0].memories[0].offsets.3: found '3', allowed: a function "
+         "from 1 to 4, without quotes"),
+        ("status_unit_id: 100", "status_unit_id: 100\n          health_output: {enabled: true}",
+         "13: replicator.units[0].targets[0].health_output: found a coil that tells whether the "
+         "source answers, allowed: without: nothing here writes it; stale of a device refuses old "
+         "values"),
         ("id: 2\n", "id: 256\n",
          "2: replicator.units: no unit has a target that is written"),
     ],
@@ -192,6 +208,16 @@ def test_what_the_source_could_not_run_is_refused(
         imported(changed(old, new))
     told = [f"{each.line}: {each.key}: {each.message}" for each in refused.value.problems]
     assert problem in told
+
+
+def test_what_the_source_ignored_is_no_problem(imported: Callable[[str], Imported]) -> None:
+    found = imported(changed("quantity: 30", "quantity: 30, invert: true, addinvert: false"))
+    assert found.data == imported(UNIT).data
+    off = changed(
+        "status_unit_id: 100", "status_unit_id: 100\n          health_output: {enabled: false}"
+    )
+    assert imported(off).data == imported(UNIT).data
+    assert imported(changed("address: 999", "address: 0999")).data == imported(UNIT).data
 
 
 def test_units_at_one_address_share_its_settings(

@@ -14,13 +14,15 @@ from holdfast.config.text.problems import ConfigError
 from holdfast.importing.notes import Desk, Note
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from holdfast.config.text.problems import Problem
+    from holdfast.config.text.yaml_document import KeyPath
 
 Generation: TypeAlias = Literal[1, 2]
 ORDINALS: dict[Generation, str] = {1: "first", 2: "second"}
 
+_OCTAL = re.compile(r"0[0-7]+(?![0-9A-Za-z_.:-])", re.ASCII)
 _SECRET = re.compile(r"(token|password|broker)[\"']?\s*:")
 
 
@@ -70,6 +72,7 @@ class Source:
             raise ConfigError(self.file, _without_secrets(text, error.problems)) from None
         self._problems = _without_secrets(text, found)
         self.desk = Desk(document)
+        self._refuse_octal(text.splitlines(), (), document.data)
 
     def is_mapping(self) -> bool:
         """Whether the file contains a mapping; adds a problem otherwise."""
@@ -78,6 +81,19 @@ class Source:
             found = "an empty file" if data is None else show(data)
             self.desk.problem((), f"found {found}, allowed: a mapping")
         return isinstance(data, dict)
+
+    def _refuse_octal(self, lines: Sequence[str], path: KeyPath, value: object) -> None:
+        """Adds a problem for each integer that is octal for the source, but not here."""
+        if isinstance(value, dict | list):
+            inside = value.items() if isinstance(value, dict) else enumerate(value)
+            for key, each in inside:
+                self._refuse_octal(lines, (*path, key), each)
+        elif type(value) is int:
+            place = self.desk.document.place(path)
+            written = _OCTAL.match(" ".join(lines[place.line - 1 : place.line]), place.column - 1)
+            if written is not None and (octal := int(written[0], 8)) != value:
+                message = f"found {written[0]}, which the source read as octal, allowed: {octal}"
+                self.desk.problem(path, f"{message}, or {value} if that is meant")
 
     def finish(self) -> None:
         """Raises `NotImportable` if there was any problem."""

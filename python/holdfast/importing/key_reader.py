@@ -106,11 +106,14 @@ class Section:
         self.desk.problem(self.at(key), "not text (value hidden), allowed: text in quotes")
         return None
 
-    def word(self, key: str, allowed: Sequence[str], *, required: bool = False) -> str | None:
+    def word(
+        self, key: str, allowed: Sequence[str], *, required: bool = False, any_case: bool = False
+    ) -> str | None:
         """The word at a key, one of those allowed."""
         value = self._present(key, either(allowed), required)
-        if isinstance(value, str) and value in allowed:
-            return value
+        word = value.strip().lower() if any_case and isinstance(value, str) else value
+        if isinstance(word, str) and word in allowed:
+            return word
         self._wrong(key, value, either(allowed))
         return None
 

@@ -26,7 +26,7 @@ TOP_REASONS = {
     "notify": "no notifications; programs read with Modbus or REST",
     "rbe": "no report by exception; programs read with Modbus or REST",
     "access_events": "the log has refused peers",
-    "persistence": "memory is not kept; initial values come from a file, see initial",
+    "persistence": "set keep for the memories; what was stored is not taken over",
     "memory": "each listener has its own memories in this generation: listeners[].memory",
 }
 _MEMORY_REASONS = {
@@ -174,7 +174,7 @@ class SecondGeneration(Reader):
         if sealing is None:
             return None
         enabled = sealing.flag("enabled") is not False
-        sealing.word("area", ["coil"], required=enabled)
+        sealing.word("area", ["coil"], required=enabled, any_case=True)
         address = sealing.integer("address", 0, LAST_ADDRESS, required=enabled)
         exception = sealing.integer("exception", 1, 255)
         sealing.close()

@@ -38,6 +38,8 @@ _TOP_REASONS = {
     "Status_Memory": "the source ignores it; each target has a status_unit_id",
 }
 
+_READ_REASONS = {"interval_ms": "each unit has one interval here, that of its poll"}
+
 
 @dataclass
 class _Read:
@@ -195,7 +197,12 @@ class _Units:
             function = read.integer("fc", 1, 4, required=True, what="a function")
             address = read.integer("address", 0, LAST_ADDRESS) or 0
             count = read.integer("quantity", 1, LAST_ADDRESS, required=True)
-            read.close()
+            for key in ("invert", "addinvert"):
+                # The source ignored them for registers.
+                if read.flag(key) and function in (1, 2):
+                    message = "found true, allowed: false; nothing here inverts bits"
+                    self.desk.problem(read.at(key), message)
+            read.close(_READ_REASONS)
             if function is None or count is None:
                 continue
             if address + count > ADDRESSES:
@@ -218,6 +225,12 @@ class _Units:
         status_unit = target.integer("status_unit_id", 0, MAX_UNIT, what="a unit id")
         memories = target.entries("memories") or []
         offsets = [self._offsets(path, value, reads) for path, value in memories]
+        for key in ("health_output", "health_control"):
+            health = target.get(key)
+            if isinstance(health, dict) and health.get("enabled") is not False:
+                message = "found a coil that tells whether the source answers, allowed: without"
+                hint = "nothing here writes it; stale of a device refuses old values"
+                self.desk.problem_of_key(target.at(key), f"{message}: {hint}")
         target.close()
         if block is not None and status_unit is None:
             message = f"missing with status_slot, allowed: a unit id from 0 to {MAX_UNIT}"
@@ -260,6 +273,10 @@ class _Units:
         if given is None:
             return found
         for function in list(given.data):
+            if isinstance(function, str):
+                message = f"found {show(function)}, allowed: a function from 1 to 4, without quotes"
+                self.desk.problem_of_key(given.at(function), message)
+                continue
             if function not in _AREAS:
                 self.desk.left_out(given.at(function), "no read has this function, allowed: 1 to 4")
                 continue
