@@ -99,7 +99,7 @@ impl Run {
             6 => {
                 if let Some((ticket, (_, is_wanted))) = self.waiting.iter_mut().next_back() {
                     *is_wanted = false;
-                    self.connection.cancel(*ticket);
+                    self.connection.cancel(*ticket, self.now);
                 }
                 behind
             }

@@ -136,6 +136,29 @@ def test_a_retained_message_is_not_delivered_again_when_only_the_connection_brok
 
 
 @pytest.mark.parametrize("version", VERSIONS)
+def test_a_retained_message_is_not_delivered_again_to_an_adapter_that_replaces_another(
+    rig: Rig, version: str
+) -> None:
+    broker = rig.broker()
+    broker.publish("plant/ingest", text(command([42])), "-r", "-q", "1")
+    broker.publish("plant/more", text(command([52], 1)), "-r", "-q", "1")
+    running = rig.run(settings(broker.url, version=version))
+    running.wait_until_received(1)
+    wire.until(lambda: "Received PUBACK from holdfast-test" in broker.log, "acknowledged")
+    rig.memory.write("holding_registers", 0, [43])
+    running.stop()
+
+    both = [subscription(), subscription("plant/more")]
+    after = rig.run(settings(broker.url, *both, version=version))
+    after.wait_until_received(1)
+    after.wait_until_connected()
+    rig.probe(broker).publish("plant/ingest", text(command([44], 2)))
+    after.wait_until_received(2)
+
+    assert rig.registers(0, 3) == [43, 52, 44]
+
+
+@pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("first", [0, 1])
 def test_the_first_of_overlapping_filters_gives_the_grant(
     rig: Rig, version: str, first: int

@@ -167,7 +167,10 @@ def test_a_message_of_qos_2_is_written_once_also_if_the_adapter_is_replaced(
 
     run(rig, fake, keep_alive=30)
     with fake.accept() as peer:
-        peer.welcome(resumed=True)
+        peer.expect(mqtt.CONNECT)
+        peer.connack(resumed=True)
+        if fake.version == "5":  # With 3.1.1, the retained message would come again.
+            peer.suback(peer.expect(mqtt.SUBSCRIBE).identifier, 1)
         peer.send(message)
         assert peer.expect(mqtt.PUBREC).identifier == 7
         assert rig.registers(0, 1) == [2]

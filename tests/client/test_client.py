@@ -1057,7 +1057,8 @@ def test_a_call_that_waits_to_be_sent_again_ends_with_the_client() -> None:
             plc = holdfast.Client(f"{device.url}?retries=3&pause=1", timeout=wire.DEADLINE)
             task = asyncio.create_task(plc.read_coils(0, 1))
             await asyncio.to_thread(hangs_up.wait, wire.DEADLINE)
-            here = plc._transport._last
+            transport: Any = plc._transport
+            here = transport._last
             while here.open is not None:
                 await asyncio.sleep(0)
             await plc.close()
@@ -1101,7 +1102,8 @@ def test_a_connection_without_a_free_transaction_id_is_replaced() -> None:
         with Stream("tcp", good, then=silent) as device:
             async with holdfast.Client(device.url, timeout=wire.DEADLINE) as plc:
                 await plc.read_coils(0, 1)
-                connection, now = plc._transport._last.open, asyncio.get_running_loop().time()
+                transport: Any = plc._transport
+                connection, now = transport._last.open, asyncio.get_running_loop().time()
                 request = Request.read("coils", 0, 1)
                 for _ in range(65_536):
                     connection.cancel(connection.send(request, 1, wire.DEADLINE, now), now)

@@ -244,6 +244,20 @@ def test_a_batch_that_the_file_has_dropped_takes_no_other_with_it(
     assert drained(buffer) == list(range(12))
 
 
+@pytest.mark.parametrize("data", [b"\xc1\xff", b"\x93\x01\x02\x03", b"\x91\x91\x01", b"\x01"])
+def test_a_row_that_can_not_be_read_is_dropped_and_counted(
+    opened: Opened, tmp_path: Path, data: bytes
+) -> None:
+    stored = opened(tmp_path / "b.db")
+    stored.add(numbered(3))
+    stored.add(numbered(2, 3))
+    stored._db.execute("UPDATE readings SET data = ? WHERE id = 1", (data,))
+    buffer = Buffer()
+    buffer.stored = stored
+    assert drained(buffer) == [3, 4]
+    assert (buffer.dropped, len(buffer)) == (3, 0)
+
+
 def test_a_value_of_a_changed_tag_keeps_its_meaning(opened: Opened, tmp_path: Path) -> None:
     stored = opened(tmp_path / "b.db")
     before = tag("t", type="uint16", scale=0.1, description="before")

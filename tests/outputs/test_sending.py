@@ -104,10 +104,11 @@ def test_a_receiver_without_readings_has_its_turn_every_second(
             return []
 
     class Idle(Fake):
-        def idle(self) -> None:
+        def idle(self) -> bool:
             self.attempts += 1
             if self.attempts == 3:
                 stop.set()
+            return False
 
     receiver = Idle()
     Sending("out", receiver, Empty()).run(stop)
@@ -161,6 +162,24 @@ def test_nothing_is_lost_in_an_outage(
     finally:
         output.end()
     assert count(caplog, "output_failed") == 1
+    assert count(caplog, "output_back") == 1
+
+
+def test_a_receiver_that_connects_without_readings_works_again(
+    output: Running, caplog: pytest.LogCaptureFixture
+) -> None:
+    works = threading.Event()
+
+    def idle() -> bool:
+        if not works.is_set():
+            raise OSError("no route to host")
+        return True
+
+    output.receiver.idle = idle  # type: ignore[method-assign]
+    wire.until(lambda: output.sending.status()["connected"] is False, "it has failed")
+    works.set()
+    wire.until(lambda: output.sending.status()["connected"] is True, "it works")
+    assert output.sending.status()["failures"] == 0
     assert count(caplog, "output_back") == 1
 
 

@@ -143,6 +143,14 @@ def test_to_leave_what_is_not_known_is_no_error(caller: Caller, server: holdfast
     assert [each["id"] for each in device(caller)["tags"]] == ["a"]
 
 
+def test_a_tag_may_be_left_twice_in_one_request(caller: Caller, server: holdfast.Server) -> None:
+    caller.request("modbus.subscribe", subscription(server, tag("a", 0), tag("b", 1)))
+    assert caller.request("modbus.unsubscribe", leaving("a", "a")) == {"success": True}
+    assert [each["id"] for each in device(caller)["tags"]] == ["b"]
+    assert caller.request("modbus.unsubscribe", leaving("b", "b")) == {"success": True}
+    assert caller.request("modbus.browse", b"")["devices"] == []
+
+
 def test_a_device_is_read_as_often_as_the_fastest_asks_and_each_tag_as_it_is_asked_for(
     caller: Caller, server: holdfast.Server
 ) -> None:

@@ -717,6 +717,8 @@ def test_bytes_that_are_no_text_are_refused() -> None:
         values.Undecodable, match=r"^values\[1\]: b'A\\xff' is not a string:2 in utf-8$"
     ):
         decode([0x4141, 0x41FF], "string:2[2]", encoding="utf-8")
+    with pytest.raises(values.Undecodable, match="is not a string:6 in utf-7"):
+        decode([0x2B32, 0x4141, 0x2D00], "string:6", encoding="utf-7")
 
 
 @pytest.mark.parametrize(

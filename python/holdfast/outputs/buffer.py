@@ -57,6 +57,8 @@ class Buffer:
         # The readings in the file are older than those in memory.
         if self.stored is not None and self.stored.count:
             self._batch, self._is_batch_stored = self.stored.first(), True
+            self.dropped += self.stored.damaged
+            self.stored.damaged = 0
             return self._batch
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._is_woken, timeout)

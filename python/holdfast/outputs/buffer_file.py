@@ -43,6 +43,8 @@ class Stored:
         self.file = file
         self.count = 0
         """How many readings there are."""
+        self.damaged = 0
+        """How many readings were removed because they could not be read."""
         self._max_bytes, self._find = max_bytes, find
         self._bytes = 0
         self._first: int | None = None
@@ -77,14 +79,23 @@ class Stored:
         return dropped
 
     def first(self) -> list[Reading]:
-        """The oldest readings that were stored together; empty if there are none."""
-        with file_errors(self.file):
-            row = self._db.execute("SELECT id, data FROM readings ORDER BY id LIMIT 1").fetchone()
-        if row is None:
-            self.count = self._bytes = 0
-            return []
-        self._first, data = row
-        return [self._reading(*plain) for plain in msgspec.msgpack.decode(data)]
+        """The oldest readings that were stored together; empty if there are none.
+
+        Removes those that can't be read, and counts them in `damaged`.
+        """
+        query = "SELECT id, data, count FROM readings ORDER BY id LIMIT 1"
+        while True:
+            with file_errors(self.file):
+                row = self._db.execute(query).fetchone()
+            if row is None:
+                self.count = self._bytes = 0
+                return []
+            self._first, data, count = row
+            try:
+                return [self._reading(*plain) for plain in msgspec.msgpack.decode(data)]
+            except (msgspec.MsgspecError, TypeError, ValueError):
+                self.remove_first()
+                self.damaged += count
 
     def remove_first(self) -> None:
         """Removes what `first` returned last, unless `add` has dropped it since."""

@@ -57,9 +57,9 @@ class Receiver(Protocol):
         Raises `OSError` if it should be tried again, `Refused` if not. Must end in bounded time.
         """
 
-    def idle(self) -> None:
-        """Called once a second while nothing is sent."""
-        return
+    def idle(self) -> bool:
+        """Called once a second while nothing is sent. Returns whether that shows that it works."""
+        return False
 
     def close(self) -> None:
         """Ends the connection, if there is one."""
@@ -134,7 +134,8 @@ class Sending:
         try:
             readings = self._buffer.take(MAX_READINGS, 0.0 if stop.is_set() else CHECK_INTERVAL_S)
             if not readings:
-                self._receiver.idle()
+                if self._receiver.idle():
+                    self._worked(0)
                 return True
         except OSError as error:
             return self._failed(error)
@@ -142,16 +143,19 @@ class Sending:
             self._send(readings)
         except OSError as error:
             return self._failed(error)
-        if self._is_failing:
-            waiting = len(self._buffer) - len(readings)
-            log_lines.write(logging.INFO, "output_back", output=self._name, waiting=waiting)
-        self._is_failing = False
-        self._backoff.succeeded()
+        self._worked(len(self._buffer) - len(readings))
         try:
             self._buffer.done()
         except OSError as error:
             return self._failed(error)
         return True
+
+    def _worked(self, waiting: int) -> None:
+        """Notes that the receiver works; so many readings wait for it."""
+        if self._is_failing:
+            log_lines.write(logging.INFO, "output_back", output=self._name, waiting=waiting)
+        self._is_failing = False
+        self._backoff.succeeded()
 
     def _send(self, readings: list[Reading]) -> None:
         """Sends readings, and counts them. Raises `OSError` if it should be tried again."""

@@ -18,6 +18,11 @@ if TYPE_CHECKING:
 
     from holdfast.runtime.backoff import Backoff
 
+if sys.platform == "win32":
+    _FLAGS = subprocess.CREATE_NEW_PROCESS_GROUP
+else:
+    _FLAGS = 0
+
 STOP_TIMEOUT_S = 10.0
 """Seconds that the program has to end, before it is killed."""
 
@@ -173,6 +178,6 @@ class ChildProcess:
             errors="replace",
             # Ctrl-C must not reach the program: this process still needs it for its last work.
             start_new_session=True,
-            creationflags=subprocess.CREATE_NEW_PROCESS_GROUP if sys.platform == "win32" else 0,
+            creationflags=_FLAGS,
             pass_fds=() if sys.platform == "win32" or inherited is None else (inherited,),
         )

@@ -56,7 +56,9 @@ class Text(Bytes):
         """The text without its padding. Raises `Undecodable`."""
         field = self.arrange(data)[: self.size]
         try:
-            return field.decode(self._encoding).rstrip("\0")
+            text = field.decode(self._encoding).rstrip("\0")
+            text.encode()  # Some encodings have halves of characters, which no JSON can contain.
+            return text
         except UnicodeError:
             raise Undecodable(f"{shown(field)} is not a {self.name} in {self._encoding}") from None
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
 
+    from holdfast.adapters.mqtt.subscriptions import Known
     from holdfast.config.models.root import MappedTag
     from holdfast.config.models.services import MqttConfig
     from holdfast.ingest import MemoryAccess
@@ -42,6 +43,9 @@ _UNRELEASED: dict[tuple[str, str], set[int]] = {}
 """QoS 2 packet identifiers of each session, by broker and client id. A session goes on when the
 adapter is replaced by another one, after a reload or a failure."""
 
+_KNOWN: dict[tuple[str, str], Known] = {}
+"""The topics of each session. A retained message that was written before is not written again when
+the adapter is replaced: another writer may have written a newer value since."""
 
 FIRST_PAUSE_S = 1.0
 MAX_PAUSE_S = 10.0
@@ -71,8 +75,9 @@ class Mqtt:
         values = Values(mapped or {})
         self._inbox = Inbox(memory_access, filters, values, self._broker)
         self._answers = Answers(filters, values)
-        self._subscriptions = Subscriptions(settings)
-        self._unreleased = _UNRELEASED.setdefault((self._broker, settings.client_id), set())
+        session = self._broker, settings.client_id
+        self._subscriptions = Subscriptions(settings, mapped or {}, _KNOWN.setdefault(session, {}))
+        self._unreleased = _UNRELEASED.setdefault(session, set())
         self._failures = _Failures(self._broker)
         self._connected_at: float | None = None
         self._connects = 0

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from paho.mqtt.reasoncodes import ReasonCode
 
     from holdfast.adapters.mqtt.connection import BrokerConnection
+    from holdfast.config.models.root import MappedTag
     from holdfast.config.models.services import MappingConfig, MqttConfig, SubscriptionConfig
 
 
@@ -23,14 +24,21 @@ class _Topic:
     entry: SubscriptionConfig | MappingConfig
     granted: int | None = None
     """In this connection."""
-    known: int | None = None
-    """In this session, as far as this process knows."""
+
+
+Meaning: TypeAlias = "tuple[SubscriptionConfig | MappingConfig, MappedTag | None]"
+"""The settings of a topic, and the tag that its values are for."""
+
+Known: TypeAlias = "dict[str, tuple[Meaning, int]]"
+"""Topics that a session has: what they mean, and the quality of service that was granted."""
 
 
 class Subscriptions:
     """The topics of one adapter, over all its connections."""
 
-    def __init__(self, settings: MqttConfig) -> None:
+    def __init__(self, settings: MqttConfig, mapped: Mapping[str, MappedTag], known: Known) -> None:
+        """`known` is what the process knows of the session, also from adapters before this one."""
+        self._mapped, self._known = mapped, known
         self._is_version_5 = settings.version == "5"
         self._topics = [_Topic(entry) for entry in settings.subscriptions]
         self._topics += [_Topic(entry) for entry in settings.map]
@@ -47,9 +55,9 @@ class Subscriptions:
     def begin(self, link: BrokerConnection, *, is_resumed: bool) -> None:
         """Subscribes over a new connection, in a session that is new or resumed."""
         self._unanswered.clear()
+        if not is_resumed:
+            self._known.clear()
         for topic in self._topics:
-            if not is_resumed:
-                topic.known = None
             self._subscribe(link, topic)
 
     def _subscribe(self, link: BrokerConnection, topic: _Topic) -> None:
@@ -59,18 +67,21 @@ class Subscriptions:
         this process has already subscribed to in this session.
         """
         entry = topic.entry
+        before, granted = self._known.get(entry.topic, (None, None))
+        # One that was changed is new: its values go elsewhere.
+        known = granted if before == self._meaning(entry) else None
         if self._is_version_5:
             retained = (
                 SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
-                if topic.known is None
+                if known is None
                 else SubscribeOptions.RETAIN_SEND_IF_NEW_SUB
             )
             options = SubscribeOptions(qos=entry.qos, retainHandling=retained)
             identifier = link.subscribe(entry.topic, options=options)[1]
-        elif topic.known is None:
+        elif known is None:
             identifier = link.subscribe(entry.topic, entry.qos)[1]
         else:
-            topic.granted = topic.known
+            topic.granted = known
             return
         if identifier is not None:
             self._unanswered[identifier] = topic
@@ -81,8 +92,14 @@ class Subscriptions:
         reason = next(iter(reasons), None)
         if topic is None or reason is None:
             return None
-        topic.granted = topic.known = None if reason.is_failure else reason.value
+        topic.granted = None if reason.is_failure else reason.value
+        self._known.pop(topic.entry.topic, None)
+        if topic.granted is not None:
+            self._known[topic.entry.topic] = (self._meaning(topic.entry), topic.granted)
         return topic.entry.topic if reason.is_failure else None
+
+    def _meaning(self, entry: SubscriptionConfig | MappingConfig) -> Meaning:
+        return entry, self._mapped.get(entry.topic)
 
     def ended(self) -> None:
         """Forgets what was granted in the connection that has ended."""

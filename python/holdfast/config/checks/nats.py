@@ -128,7 +128,7 @@ def check_nats(path: KeyPath, nats: NatsServersConfig, report: Report) -> None:
     written = report.raw(path)  # An embedded server adds keys that are not in the file.
     if "password_file" in written and "username" not in written:
         report.add_key((*path, "password_file"), "found without username, allowed: both or neither")
-    files = ("password_file", "token_file", "credentials_file")
+    files: tuple[str, ...] = ("password_file", "token_file", "credentials_file")
     with until_invalid():
         if isinstance(nats, SharedLogConfig) and nats.makes_token:
             files = ("password_file",)

@@ -54,9 +54,10 @@ def _check_device(
         tags = _resolved(scope, path, device.tags, own, tags)
     for tag in tags.values():
         if tag.source is None and (flaw := _forbidden(tag, device)):
-            own = tag.name in device.tags
-            where = (*path, "tags", tag.name, "address") if own else (*path, "profile")
-            scope.report.add(where, flaw if own else f"{tag.name}: {flaw}")
+            if tag.name in device.tags:
+                scope.report.add((*path, "tags", tag.name, "address"), flaw)
+            else:
+                scope.report.add((*path, "profile"), f"{tag.name}: {flaw}")
         for flaw in _flaws(tag, device):
             assert isinstance(tag.scale, RegisterScale), "others have no flaws"
             message = f"the scale is from {tag.scale.where}, {flaw}"

@@ -63,11 +63,12 @@ class MqttOutput(BrokerReceiver):
         self._taken, self._messages = [], ()
         self._publish_availability(session, answering=True)
 
-    def idle(self) -> None:
+    def idle(self) -> bool:
         """Keeps the connection, and publishes what has changed besides values."""
         session = self._connected()
         self._keep_up(session)
         self._publish_availability(session, answering=True)
+        return True
 
     def close(self) -> None:
         """Publishes that this output is offline, and ends the connection."""

@@ -88,10 +88,11 @@ class SparkplugOutput(BrokerReceiver):
         if unfit := self._node.unfit:
             raise Refused("they were read before their tags were changed", unfit)
 
-    def idle(self) -> None:
+    def idle(self) -> bool:
         """Keeps the session, and publishes which devices answer."""
         session = self._ready()
         self._publish(session, self._node.device_deaths(self._site.answering()))
+        return True
 
     def close(self) -> None:
         """Ends the session with NDEATH."""

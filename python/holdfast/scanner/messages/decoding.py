@@ -109,6 +109,9 @@ def _number(text: str) -> int | float | str:
 
 Decoded = TypeVar("Decoded", bound=Request)
 
+MAX_DEPTH = 10
+"""No request is nested deeper."""
+
 MAX_EXACT_FLOAT = 2.0**53
 """Floats below this represent every integer exactly."""
 
@@ -190,12 +193,14 @@ def _object(data: bytes) -> dict[str, Any] | None:
     return found if type(found) is dict else None
 
 
-def _with_integers(value: Any) -> Any:
+def _with_integers(value: Any, depth: int = 0) -> Any:
     """Converts whole floats to integers. JavaScript callers do not distinguish them."""
+    if depth > MAX_DEPTH:
+        return value
     if type(value) is dict:
-        return {key: _with_integers(item) for key, item in value.items()}
+        return {key: _with_integers(item, depth + 1) for key, item in value.items()}
     if type(value) is list:
-        return [_with_integers(item) for item in value]
+        return [_with_integers(item, depth + 1) for item in value]
     if type(value) is float and value.is_integer() and abs(value) < MAX_EXACT_FLOAT:
         return int(value)
     return value

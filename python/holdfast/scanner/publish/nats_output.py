@@ -67,10 +67,11 @@ class NatsOutput(Receiver):
             self._close_client()
             raise OSError(nats_reason(error)) from error
 
-    def idle(self) -> None:
+    def idle(self) -> bool:
         """Lets the client answer pings of the server."""
         if self._client is not None:
             self._runner.run(asyncio.sleep(0))
+        return False
 
     def close(self) -> None:
         """Closes the connection."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from itertools import chain, islice
 from typing import TYPE_CHECKING
 
@@ -35,7 +36,7 @@ def variables(
     The tags are sorted by device; `offset` of the request skips the first ones. The tags of
     `refused` follow.
     """
-    offset = request.offset or 0
+    offset = min(request.offset or 0, sys.maxsize)
     requested = [devices[id] for id in sorted(devices) if request.device_id in (None, id)]
     tags = ((device, tag) for device in requested for tag in device.tags.values())
     skipped = max(offset - sum(len(device.tags) for device in requested), 0)

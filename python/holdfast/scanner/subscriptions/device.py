@@ -128,7 +128,7 @@ class ScannedDevice:
     def forget(self, ids: Collection[str]) -> list[str]:
         """Removes the given tags that have no subscriber left. Returns the removed ids."""
         used = {id for subscriber in self.subscribers.values() for id in subscriber.tags}
-        unused = [id for id in ids if id in self.tags and id not in used]
+        unused = [id for id in dict.fromkeys(ids) if id in self.tags and id not in used]
         for id in unused:
             del self.tags[id]
         return unused
