@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import common
+from nats import errors
 from nats.aio.client import Client
 
 from holdfast.net.nats import batch
@@ -226,8 +227,11 @@ def main() -> None:
         (f"100 devices of {TAGS} tags, 20 times a second: 200,000 values/s", 100, 50),
         (f"300 devices of {TAGS} tags, 20 times a second: 600,000 values/s", 300, 50),
     ):
-        results[title] = found = measured(options, devices, rate, seconds, *fleet)
-        show(title, found)
+        try:
+            results[title] = found = measured(options, devices, rate, seconds, *fleet)
+            show(title, found)
+        except errors.TimeoutError:
+            print(f"\n{title}\n  too much: a request was not answered in {common.TIMEOUT} s")
         sys.stdout.flush()
     if options.json:
         options.json.write_text(json.dumps(results, indent=1))

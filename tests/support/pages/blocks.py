@@ -9,7 +9,10 @@ from dataclasses import dataclass
 
 from support.paths import DOCS, ROOT
 
-PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+PRINTED = DOCS / "benchmark-runs.md"
+"""What programs have printed: it has no examples."""
+
+PAGES = [ROOT / "README.md", *sorted({*DOCS.glob("*.md")} - {PRINTED})]
 SHELL = {"sh", "console"}
 
 
