@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import queue
+import time
 import urllib.request
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +12,7 @@ import pytest
 
 import holdfast
 from holdfast.appliance import Appliance
+from holdfast.appliance.parts.tag_values import TagValues
 from holdfast.config import load
 from holdfast.outputs.buffer_file import Stored
 from support import wire
@@ -193,6 +196,56 @@ def test_a_reload_can_add_the_first_tags(tmp_path: Path, device: int) -> None:
     with Appliance(load(saved(tmp_path, first))) as appliance:
         appliance.reload(load(saved(tmp_path, {**made, **first})))
         wire.until(lambda: len(rows(tmp_path)) == 4, "all values are there")
+
+
+class Polls:
+    """Hands out the polls of a test, as the native receiver does."""
+
+    def __init__(self) -> None:
+        self.waiting: queue.Queue[Any] = queue.Queue()
+        self.empty = 0
+        """How often there was none."""
+
+    def take(self, _: float) -> Any:
+        try:
+            return self.waiting.get(timeout=0.01)
+        except queue.Empty:
+            self.empty += 1
+            return [], []
+
+
+def test_a_poll_of_a_device_that_was_replaced_is_not_of_the_new_one(tmp_path: Path) -> None:
+    polls: Any = Polls()
+    found = TagValues(polls, time.monotonic())
+
+    def poll(start: float, value: int) -> None:
+        registers = value.to_bytes(2, "big") + bytes(10)
+        blocks = [("holding_registers", 0, 6, registers, 0, 0.0), ("coils", 0, 1, b"\0", 0, 0.0)]
+        polls.waiting.put(([("m", start, blocks)], []))
+
+    def power() -> list[Any]:
+        return [each.value for each in found.latest() if each.tag.name == "power"]
+
+    config = load(saved(tmp_path, settings(502)))
+    found.adopt(config)
+    found.start()
+    try:
+        poll(0.0, 10)
+        wire.until(lambda: power() == [1.0], "the first")
+        found.adopt(config, {"m"})
+        poll(1e9, 20)  # Between both, nobody knows whose it is.
+        wire.until(polls.waiting.empty, "it was taken")
+        empty = polls.empty
+        # It may have been taken together with one that was not there: then it is still used.
+        wire.until(lambda: polls.empty > empty + 1, "it was used")
+        found.have_begun({"m"})
+        poll(0.0, 30)
+        poll(1e9, 40)
+        wire.until(lambda: power() not in ([1.0], []), "the new one")
+        assert power() == [4.0]
+    finally:
+        polls.waiting.put(None)
+        found.join(wire.DEADLINE)
 
 
 def test_values_are_metrics(tmp_path: Path, device: int, memory: holdfast.Memory) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from typing import TYPE_CHECKING, Any
 
 from holdfast import _core
@@ -38,6 +39,8 @@ class Devices(Part):
         super().__init__(config)
         self._audit, self._leases, self._mirrors = audit, leases, mirrors
         self.poller: _core.Poller | None = None
+        self._began = 0.0
+        """When the poller was created."""
         self.values: TagValues | None = None
         """The values of tags. `None` until there are tags, as is `writes`."""
         self.writes: TagWrites | None = None
@@ -72,11 +75,12 @@ class Devices(Part):
         polled = {name for name, device in config.devices.items() if device.is_polled}
         poller, values, writes = self.poller, self.values, self.writes
         if poller is None and (polled or config.links or routed(config) or config.nats is not None):
+            self._began = time.monotonic()
             poller = _core.Poller([])
             plan.undo.callback(poller.stop)
         if poller is not None:
             if values is None and any(config.devices[name].has_tags for name in polled):
-                values = TagValues(poller.receiver())
+                values = TagValues(poller.receiver(), self._began)
                 writes = TagWrites(poller, self._audit.log, values.find)
             # The first use of an address decides the settings of its connection: links first.
             plan.links = native_devices.links(config, plan.memories, poller)
@@ -91,8 +95,9 @@ class Devices(Part):
 
         def adopt() -> None:
             self.poller, self.values, self.writes = poller, values, writes
+            replaced = made.keys() & self._polled
             if values is not None:
-                values.adopt(config)
+                values.adopt(config, replaced)
                 values.start()
             self.passages.update(plan.links.passages)
             for name in self.passages.keys() - plan.links.passages.keys():
@@ -103,10 +108,12 @@ class Devices(Part):
                 for name in gone:
                     poller.remove(name)
                 for name, device in made.items():
-                    if name in self._polled:
+                    if name in replaced:
                         poller.replace(name, device, at_once=False)
                     else:
                         poller.add(device)
+            if values is not None:
+                values.have_begun(replaced)
             self._polled = polled
             self._events.replace(gone, made)
 

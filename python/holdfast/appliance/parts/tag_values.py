@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import dataclass
+from math import inf
 from typing import TYPE_CHECKING
 
 from holdfast.client.url import NetworkTarget
@@ -16,7 +18,7 @@ from holdfast.polling.readings import Reader
 from holdfast.runtime.heartbeat import Heartbeat
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Collection, Iterable
 
     from holdfast._core import Results
     from holdfast.config import Config
@@ -61,10 +63,15 @@ class TagValues:
     Ends with the poller.
     """
 
-    def __init__(self, results: Results) -> None:
+    def __init__(self, results: Results, began: float) -> None:
+        """`began` is when the poller was created, by `time.monotonic`."""
         self.results = results
+        self._began = began
         self._lock = threading.Lock()
         self._readers: dict[str, Reader] = {}
+        self._since: dict[str, float] = {}
+        """When a replaced device began, in seconds since the poller's start: polls from before are
+        those of the device that it has replaced."""
         self._outputs: dict[str, _Output] = {}
         self._latest: dict[str, list[Reading]] = {}
         self._answering: dict[str, bool] = {}
@@ -88,8 +95,11 @@ class TagValues:
         if self._thread.ident is not None:
             self._thread.join(timeout)
 
-    def adopt(self, config: Config) -> None:
-        """Takes over devices and outputs. Outputs keep what they have to send."""
+    def adopt(self, config: Config, replaced: Collection[str] = ()) -> None:
+        """Takes over devices and outputs. Outputs keep what they have to send.
+
+        Polls of devices that will be `replaced` are dropped until `have_begun`.
+        """
         readers = {
             name: Reader(name, tags)
             for name, device in config.devices.items()
@@ -111,6 +121,7 @@ class TagValues:
             self._latest = {
                 name: found for name, found in self._latest.items() if name not in changed
             }
+            self._since |= dict.fromkeys(replaced, inf)
             outputs: dict[str, _Output] = {}
             for name, settings in config.outputs.items():
                 known = self._outputs.get(name)
@@ -122,6 +133,11 @@ class TagValues:
                 known.changes.forget(changed)
                 outputs[name] = known
             self._outputs = outputs
+
+    def have_begun(self, replaced: Collection[str]) -> None:
+        """Takes polls of these devices again: they are those of the new configuration."""
+        with self._lock:
+            self._since |= dict.fromkeys(replaced, time.monotonic() - self._began)
 
     def sending(self, name: str, receiver: Callable[[], Receiver]) -> Sending:
         """The adapter of an output."""
@@ -184,8 +200,8 @@ class TagValues:
                 with self._lock:
                     polls = [
                         self._readers[name].poll(blocks)
-                        for name, _, blocks in found
-                        if name in self._readers
+                        for name, start, blocks in found
+                        if name in self._readers and start >= self._since.get(name, 0.0)
                     ]
                     self._offer(polls)
             except Exception:  # A fault in one poll must not end all outputs.
