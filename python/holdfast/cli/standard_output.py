@@ -8,7 +8,6 @@ import errno
 import io
 import os
 import sys
-from pathlib import Path
 
 import click
 
@@ -29,8 +28,9 @@ def is_unwritable(error: OSError) -> bool:
 
 def leave() -> None:
     """Drops what is not printed: Python would fail again at its end."""
-    with Path(os.devnull).open("wb") as nowhere:
-        os.dup2(nowhere.fileno(), 1)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)
 
 
 def announce(text: str) -> None:
