@@ -95,6 +95,9 @@ def test_changes_of_values_reach_a_file(
             memory.write_many([("holding_registers", 0, [number]), ("coils", 0, [number % 2])])
             expected = [21.5, *(each / 10 for each in range(1, number + 1))]
             _until_power_is(tmp_path, expected)
+            # A poll reads both one after the other: the write may have come in between.
+            switched = [False, True, False, True][: number + 1]
+            wire.until(lambda: values(tmp_path, "on") == switched, "so is the coil")  # noqa: B023
     assert values(tmp_path, "power") == [21.5, 0.1, 0.2, 0.3]
     assert values(tmp_path, "on") == [False, True, False, True]
     assert len(values(tmp_path, "label")) == 1

@@ -14,6 +14,7 @@ from holdfast.errors import (
     InvalidResponse,
     ModbusError,
     ModbusException,
+    RequestTimeout,
 )
 from holdfast.protocol import ILLEGAL_ADDRESS, TARGET_SILENT
 
@@ -28,9 +29,9 @@ class WriteInterrupted(ModbusError):
         return "interrupted"
 
 
-REASONS: tuple[tuple[type[Exception], str], ...] = (
+REASONS: tuple[tuple[type[ModbusError], str], ...] = (
     (ModbusException, "exception"),
-    (TimeoutError, "timeout"),
+    (RequestTimeout, "timeout"),
     (ConnectionLost, "connection"),
     (InvalidResponse, "invalid"),
     (WriteInterrupted, "interrupted"),
@@ -40,7 +41,8 @@ REASONS: tuple[tuple[type[Exception], str], ...] = (
 def problem(error: object) -> dict[str, object]:
     """An error for JSON."""
     reasons = (word for kind, word in REASONS if isinstance(error, kind))
-    reason = next(reasons, "connection" if isinstance(error, OSError) else "failed")
+    other = "connection" if isinstance(error, OSError) else getattr(error, "reason", "failed")
+    reason = next(reasons, other)
     code = {"code": error.code} if isinstance(error, ModbusException) else {}
     return {"reason": reason, **code, "detail": str(error)}
 

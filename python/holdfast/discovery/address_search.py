@@ -119,11 +119,15 @@ class Finding(NamedTuple):
 
 
 class Unfinished(ModbusError):
-    """The survey ended early; it has the results so far."""
+    """The survey ended early; it has the results so far. `reason` is a word for programs."""
+
+    reason = "failed"
 
 
-class DeviceSilent(Unfinished, TimeoutError):
+class DeviceSilent(Unfinished):
     """The device has stopped answering."""
+
+    reason = "timeout"
 
 
 class LimitReached(Unfinished):
