@@ -356,6 +356,7 @@ impl BlockingClient {
             let Some(is_cancelled) = &is_cancelled else { return Ok(()) };
             match Python::attach(|py| is_cancelled.call0(py)?.is_truthy(py)) {
                 Ok(false) => Ok(()),
+                // Without an answer, nothing is sent.
                 Ok(true) | Err(_) => Err(ClientError::Lost(Lost::Closed(Closed::BySelf))),
             }
         };

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from holdfast.adapters.mqtt.answers import Answers
@@ -39,13 +40,21 @@ LOG_INTERVAL_S = 600.0
 _CHECK_INTERVAL_S = 1.0
 """Seconds between checks of the keep-alive."""
 
-_UNRELEASED: dict[tuple[str, str], set[int]] = {}
-"""QoS 2 packet identifiers of each session, by broker and client id. A session goes on when the
-adapter is replaced by another one, after a reload or a failure."""
 
-_KNOWN: dict[tuple[str, str], Known] = {}
-"""The topics of each session. A retained message that was written before is not written again when
-the adapter is replaced: another writer may have written a newer value since."""
+@dataclass
+class _Session:
+    """What the process knows of a session with a broker."""
+
+    unreleased: set[int] = field(default_factory=set)
+    """Packet identifiers of QoS 2."""
+    known: Known = field(default_factory=dict)
+    """Its topics. A retained message that was written is not written again when the adapter is
+    replaced: another writer may have written a newer value since."""
+
+
+_SESSIONS: dict[tuple[str, str], _Session] = {}
+"""By broker and client id. A session goes on when the adapter is replaced by another one, after a
+reload or a failure."""
 
 FIRST_PAUSE_S = 1.0
 MAX_PAUSE_S = 10.0
@@ -75,9 +84,9 @@ class Mqtt:
         values = Values(mapped or {})
         self._inbox = Inbox(memory_access, filters, values, self._broker)
         self._answers = Answers(filters, values)
-        session = self._broker, settings.client_id
-        self._subscriptions = Subscriptions(settings, mapped or {}, _KNOWN.setdefault(session, {}))
-        self._unreleased = _UNRELEASED.setdefault(session, set())
+        session = _SESSIONS.setdefault((self._broker, settings.client_id), _Session())
+        self._subscriptions = Subscriptions(settings, mapped or {}, session.known)
+        self._unreleased = session.unreleased
         self._failures = _Failures(self._broker)
         self._connected_at: float | None = None
         self._connects = 0

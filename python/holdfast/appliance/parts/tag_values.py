@@ -121,7 +121,8 @@ class TagValues:
             self._latest = {
                 name: found for name, found in self._latest.items() if name not in changed
             }
-            self._since |= dict.fromkeys(replaced, inf)
+            since = {name: at for name, at in self._since.items() if name in readers}
+            self._since = since | dict.fromkeys(replaced, inf)
             outputs: dict[str, _Output] = {}
             for name, settings in config.outputs.items():
                 known = self._outputs.get(name)

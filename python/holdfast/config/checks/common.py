@@ -39,11 +39,14 @@ class Scope:
     folder: Path
     """The folder that files are relative to."""
     report: Report
+    _names: dict[str, dict[str, None]] = field(default_factory=dict, init=False)
 
     def names(self, section: str) -> Collection[str]:
-        """The names in a section; none if the section is invalid."""
-        names = self.config.__dict__.get(section, {})
-        return [name for name in names if isinstance(name, str)]
+        """The valid names in a section; none if the section is invalid."""
+        if section not in self._names:
+            given = self.config.__dict__.get(section, {})
+            self._names[section] = {name: None for name in given if isinstance(name, str)}
+        return self._names[section]
 
 
 def items(path: KeyPath, entries: Mapping[Any, T] | Sequence[T]) -> Iterator[tuple[KeyPath, T]]:

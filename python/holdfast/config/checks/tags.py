@@ -112,11 +112,9 @@ def _resolved(
 
 def _forbidden(tag: Tag, device: DeviceConfig) -> str:
     """Why no request to the device can read a value, or "" if one can."""
-    for start, stop in _stretches(device.forbidden, tag.area):
-        if start < tag.span.stop and tag.span.start < stop:
-            place = tag.address if len(tag.span) == 1 else extent(tag.span)
-            found = f"found {place}, which overlaps the forbidden range"
-            return f"{found} {start} to {stop - 1}, allowed: other addresses"
+    for overlapped in _overlapped(tag, device):
+        place = tag.address if len(tag.span) == 1 else extent(tag.span)
+        return f"found {place}, which overlaps {overlapped}, allowed: other addresses"
     return ""
 
 
@@ -130,14 +128,20 @@ def _flaws(tag: Tag, device: DeviceConfig) -> Iterator[str]:
     if len(span) > device.max_registers:
         most = device.max_registers
         yield f"{place} are {len(span)} registers, max_registers is {most}, {both}"
-    for start, stop in _stretches(device.forbidden, tag.area):
-        if start < span.stop and span.start < stop:
-            yield f"{place} overlaps the forbidden range {start} to {stop - 1}, {both}"
+    for overlapped in _overlapped(tag, device):
+        yield f"{place} overlaps {overlapped}, {both}"
     first, last = sorted((tag, source), key=lambda each: each.address)
     allowed = list(_stretches(device.readable, tag.area))
     inside = any(start <= first.end and last.address <= stop for start, stop in allowed)
     if allowed and first.end < last.address and not inside:
         yield f"{first.end} to {last.address - 1} are not readable, {both}"
+
+
+def _overlapped(tag: Tag, device: DeviceConfig) -> Iterator[str]:
+    """The forbidden ranges that a read of the tag would touch."""
+    for start, stop in _stretches(device.forbidden, tag.area):
+        if start < tag.span.stop and tag.span.start < stop:
+            yield f"the forbidden range {start} to {stop - 1}"
 
 
 def _stretches(ranges: Sequence[RangeConfig], area: str) -> Iterator[tuple[int, int]]:

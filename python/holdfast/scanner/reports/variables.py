@@ -36,7 +36,7 @@ def variables(
     The tags are sorted by device; `offset` of the request skips the first ones. The tags of
     `refused` follow.
     """
-    offset = min(request.offset or 0, sys.maxsize)
+    offset = min(request.offset or 0, sys.maxsize)  # `islice` takes no larger number.
     requested = [devices[id] for id in sorted(devices) if request.device_id in (None, id)]
     tags = ((device, tag) for device in requested for tag in device.tags.values())
     skipped = max(offset - sum(len(device.tags) for device in requested), 0)
