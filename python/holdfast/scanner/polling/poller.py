@@ -3,8 +3,9 @@
 In an appliance, the poller is that of the appliance, so that devices at one address share one
 connection.
 
-The thread passes all waiting results at once, and fetches no more until they are handled. If the
-event loop can't keep up, results stay in the poller, which drops the oldest.
+The thread passes all waiting results at once, and fetches no more until they are handled. The event
+loop handles them in short turns, so that requests are answered in between. If it can't keep up,
+older polls of a device are skipped, and results stay in the poller, which drops the oldest.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from __future__ import annotations
 import asyncio
 import itertools
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -33,6 +36,12 @@ WAKE_INTERVAL_S = 0.1
 
 MIN_BATCH_INTERVAL_S = 0.005
 """The shortest time between two batches, so that batches have a useful size."""
+
+TURN_S = 0.01
+"""Time of polls that the event loop handles before it does anything else."""
+
+MAX_LAG_S = 1.0
+"""Time after which the result of a poll is skipped if a newer one of its device waits."""
 
 FIRST_POLL_SPREAD_S = 1.0
 """Time over which the first polls of new devices are spread."""
@@ -71,6 +80,7 @@ class Polling:
         """The devices to poll when polling is resumed; `None` while it is not paused."""
         self._urgent: set[ScannedDevice] = set()
         """Devices that must be polled immediately, because a new subscriber waits for values."""
+        self._skipped = 0
         self._writes: dict[int, asyncio.Future[int]] = {}
         """Futures of the faults of pending writes, by the number from the poller."""
         self._shared_poller = poller
@@ -212,7 +222,7 @@ class Polling:
     @property
     def dropped(self) -> int:
         """Polls lost because the event loop did not keep up."""
-        return self._results.dropped
+        return self._results.dropped + self._skipped
 
     async def stop(self) -> None:
         """Stops polling its devices, and closes the connections that nobody else uses."""
@@ -246,14 +256,38 @@ class Polling:
             self._stopping.wait(MIN_BATCH_INTERVAL_S)
 
     def _hand_over(self, polls: Sequence[Poll], writes: Sequence[tuple[int, int]]) -> None:
+        for number, fault in writes:
+            done = self._writes.get(number)
+            if done is not None and not done.done():
+                done.set_result(fault)
+        self._handle(deque(self._timely(polls)))
+
+    def _timely(self, polls: Sequence[Poll]) -> list[Poll]:
+        """All polls, or without those that are too late to matter."""
+        newest = {name: index for index, (name, _, _) in enumerate(polls)}
+        if len(newest) == len(polls):  # As long as the event loop keeps up.
+            return list(polls)
+        past = time.time() - MAX_LAG_S
+        timely = [
+            poll
+            for index, poll in enumerate(polls)
+            if newest[poll[0]] == index or not poll[2] or poll[2][-1][5] > past
+        ]
+        self._skipped += len(polls) - len(timely)
+        return timely
+
+    def _handle(self, polls: deque[Poll]) -> None:
+        until = self._loop.time() + TURN_S
         try:
-            for number, fault in writes:
-                done = self._writes.get(number)
-                if done is not None and not done.done():
-                    done.set_result(fault)
-            for name, due, blocks in polls:
+            while polls:
+                name, due, blocks = polls.popleft()
                 device = self._devices.get(name)
                 if device is not None:  # Else it was changed meanwhile, and has another name.
                     self._on_poll(device, due, blocks)
+                if self._loop.time() >= until:
+                    break
         finally:
-            self._may_take.release()
+            if polls:
+                self._loop.call_soon(self._handle, polls)
+            else:
+                self._may_take.release()
