@@ -125,6 +125,15 @@ def test_other_refusals_go_first(run: Run, connect: Connect) -> None:
     assert client.ask(WRITE, unit=9) == b"\x86\x01"
 
 
+@pytest.mark.parametrize("keep", ["", ", keep: {file: plant.keep, sync: 0}"])
+def test_a_malformed_write_is_refused_as_such(run: Run, connect: Connect, keep: str) -> None:
+    memory = f"holding_registers: 10{keep}}}"
+    appliance = run(CONFIGURATION.replace("holding_registers: 10}", memory) + FULL % "closed")
+    client = connect(endpoint(appliance, "scada"))
+    assert client.ask(WRITE) == bytes([0x86, FAILED])
+    assert client.ask(bytes.fromhex("1000010002030007")) == b"\x90\x03"
+
+
 def test_packets_are_refused_while_the_disk_is_full(run: Run) -> None:
     appliance = run(CONFIGURATION + FULL % "closed")
     for _ in range(2):

@@ -3,7 +3,7 @@
 
 use std::io::Write as _;
 
-use holdfast_engine::packet_area::of_packet;
+use holdfast_engine::raw_ingest_areas::of_packet;
 use holdfast_engine::server::reports::audit::{Record, Written};
 use holdfast_memory::{Area, Write};
 use holdfast_protocol::pdu::{ExceptionCode, Request};

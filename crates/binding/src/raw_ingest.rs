@@ -2,7 +2,7 @@
 
 use std::num::NonZeroU16;
 
-use holdfast_engine::packet_area::in_packet;
+use holdfast_engine::raw_ingest_areas::in_packet;
 use holdfast_protocol::raw_ingest::Header;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;

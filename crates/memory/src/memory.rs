@@ -603,20 +603,17 @@ impl Memory {
     ) -> Result<(), Refused> {
         for (index, write) in writes.iter().enumerate() {
             let fits = write.count > 0 && write.bytes.len() == write.area.byte_len(write.count);
-            let refusal = if !fits {
-                Refusal::WrongLength
-            } else if self.layout.offset(write.area, write.address, write.count).is_none() {
-                Refusal::OutOfRange
-            } else if access == Access::Client && self.gate.is_some_and(|gate| gate.is_in(write)) {
-                Refusal::GateBit
+            let Write { area, address, count, .. } = *write;
+            let admitted = if !fits {
+                Err(Refusal::WrongLength)
+            } else if self.layout.offset(area, address, count).is_none() {
+                Err(Refusal::OutOfRange)
             } else {
-                let Write { area, address, count, .. } = *write;
-                match self.unreserved(access, area, address, count, ranges) {
-                    Ok(()) => continue,
-                    Err(refusal) => refusal,
-                }
+                self.gate
+                    .map_or(Ok(()), |gate| gate.admit_write(access, write))
+                    .and_then(|()| self.unreserved(access, area, address, count, ranges))
             };
-            return Err(Refused { index, refusal });
+            admitted.map_err(|refusal| Refused { index, refusal })?;
         }
         Ok(())
     }

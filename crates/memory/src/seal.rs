@@ -23,10 +23,13 @@ pub struct Gate {
 }
 
 impl Gate {
+    /// Whether an access may write these addresses: clients can't open the memory.
     #[inline]
-    pub(crate) fn is_in(self, write: &Write<'_>) -> bool {
+    pub(crate) fn admit_write(self, access: Access, write: &Write<'_>) -> Result<(), Refusal> {
         let start = usize::from(write.address);
-        self.area == write.area && (start..start + write.count).contains(&usize::from(self.address))
+        let is_in = self.area == write.area
+            && (start..start + write.count).contains(&usize::from(self.address));
+        if is_in && access == Access::Client { Err(Refusal::GateBit) } else { Ok(()) }
     }
 
     /// Whether the memory is sealed after an ingest that has left the gate bit like this.

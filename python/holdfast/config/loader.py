@@ -11,8 +11,9 @@ from pathlib import Path
 
 from holdfast.config.allowed_words import allowed, known_keys
 from holdfast.config.build import build
+from holdfast.config.checks.bind_addresses import check_binds
 from holdfast.config.checks.common import Scope
-from holdfast.config.checks.connections import AddressChecks, check_sockets
+from holdfast.config.checks.connections import AddressChecks
 from holdfast.config.checks.devices import check_devices, warn_of_devices
 from holdfast.config.checks.extras import check_extras
 from holdfast.config.checks.former_keys import take_out_former_keys
@@ -102,7 +103,7 @@ def _check(scope: Scope) -> None:
     check_devices(scope)
     check_outputs(scope)
     check_tags(scope)
-    check_sockets(scope)
+    check_binds(scope)
     check_extras(scope)
 
 

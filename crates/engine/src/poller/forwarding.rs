@@ -21,7 +21,7 @@ use super::status::{BlockSettings, STATUS_BLOCK_LEN, Status};
 use crate::counter::Counter;
 use crate::link::{agree, dial};
 use crate::name_lookup;
-use crate::packet_area::in_packet;
+use crate::raw_ingest_areas::in_packet;
 use crate::tls::TlsFailure;
 use crate::tls::client::ClientTls;
 

@@ -1,4 +1,4 @@
-"""Checks what can't be used twice: sockets, serial lines, addresses of devices and links.
+"""Checks what can't be used twice: serial lines, addresses of devices and links.
 
 Devices and links at one address share a connection or line. A serial line that is polled for NATS
 subscribers can't have another user.
@@ -12,16 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.client.url import STRICT, SerialTarget, Tolerance, parse, parse_receiver
-from holdfast.config.checks.common import Owners, check_readable, given, items, until_invalid
+from holdfast.config.checks.common import check_readable, given, items, until_invalid
 from holdfast.config.models.devices import DeviceConfig, RetryConfig, tolerating
 from holdfast.config.models.listeners import (
-    CONNECTION_TYPES,
-    DATAGRAM_TYPES,
-    SERIAL_TYPES,
     ModbusAsciiListener,
     ModbusRtuListener,
 )
-from holdfast.config.models.services import HTTP_SERVICES
 from holdfast.config.text.messages import show
 from holdfast.config.values.scalars import NOT_ON_A_LINE
 from holdfast.net.allow_list import AllowedDevice
@@ -29,13 +25,12 @@ from holdfast.protocol import MAX_SERIAL_UNIT
 from holdfast.types import SERIAL_FRAMES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from holdfast.client.url import NetworkTarget, Target
     from holdfast.config.checks.common import Scope
     from holdfast.config.models.links import LinkConfig
     from holdfast.config.text.yaml_document import KeyPath
-    from holdfast.config.values.ip_addresses import Bind
     from holdfast.net.allow_list import AllowEntry
     from holdfast.net.tls import Tls
 
@@ -216,44 +211,3 @@ def _serial_listeners(scope: Scope) -> Iterator[tuple[str, KeyPath]]:
 
 def _has_echo(target: Target) -> bool:
     return isinstance(target, SerialTarget) or target.transport in SERIAL_FRAMES
-
-
-def check_sockets(scope: Scope) -> None:
-    """Reports TCP binds that overlap, UDP binds that overlap, and serial ports used twice."""
-    _check_overlaps(scope, [*_listeners(scope, CONNECTION_TYPES), *_services(scope)])
-    _check_overlaps(scope, _listeners(scope, DATAGRAM_TYPES))
-    devices = Owners(scope.report, "device")
-    for path, listener in _listeners(scope, SERIAL_TYPES):
-        with until_invalid():
-            device = listener.serial.device
-            port = os.path.realpath(device)
-            devices.claim((*path, "serial", "device"), port, show(device), path)
-
-
-def _listeners(scope: Scope, types: tuple[str, ...]) -> Iterator[tuple[KeyPath, Any]]:
-    with until_invalid():
-        for path, listener in items(("listeners",), scope.config.listeners):
-            if listener.__dict__.get("type") in types:
-                yield path, listener
-
-
-def _services(scope: Scope) -> Iterator[tuple[KeyPath, Any]]:
-    for name in HTTP_SERVICES:
-        with until_invalid():
-            if getattr(scope.config, name) is not None:
-                yield (name,), getattr(scope.config, name)
-
-
-def _check_overlaps(scope: Scope, servers: Iterable[tuple[KeyPath, Any]]) -> None:
-    earlier: list[tuple[KeyPath, Bind]] = []
-    for path, server in servers:
-        with until_invalid():
-            bind: Bind = server.bind
-            for other_path, other in earlier:
-                if bind.overlaps(other):
-                    line = scope.report.line((*other_path, "bind"))
-                    of = f"{other} of {scope.report.document.spell(other_path)} in line {line}"
-                    message = f"found {str(bind)!r}, which overlaps {of}"
-                    message += ", allowed: an unused address and port"
-                    scope.report.add((*path, "bind"), message)
-            earlier.append((path, bind))

@@ -23,8 +23,8 @@ from holdfast.config.checks.units import (
     warn_of_unit,
 )
 from holdfast.config.models.base import INVALID
+from holdfast.config.models.connection_limits import ConnectionLimits
 from holdfast.config.models.listeners import (
-    ConnectionLimits,
     ModbusTcpListener,
     RawIngestConfig,
     RawIngestListener,

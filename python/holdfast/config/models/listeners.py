@@ -11,6 +11,7 @@ from pydantic import Discriminator, Field, Strict, Tag
 
 from holdfast.client.url import Parity, Rs485, SerialTarget, stop_bits
 from holdfast.config.models.base import Model
+from holdfast.config.models.connection_limits import ConnectionLimits
 from holdfast.config.models.devices import RangeConfig
 from holdfast.config.models.server_tls import ServerTlsConfig
 from holdfast.config.values.scalars import (
@@ -20,7 +21,6 @@ from holdfast.config.values.scalars import (
     Areas,
     BindAddress,
     Codes,
-    Connections,
     DataBits,
     DeviceName,
     Duration,
@@ -173,19 +173,6 @@ class SecureRawRuleConfig(RawRuleConfig):
     role."""
 
 
-FEW = 16
-"""So many connections from one address are not limited by default."""
-
-
-def _per_source(data: dict[str, Any]) -> int:
-    """Leaves room for others: silent connections from one address can't fill the listener.
-
-    A listener for few connections often has a single client, or a gateway in front of all.
-    """
-    most: int = data["max_connections"]
-    return max((most + 1) // 2, min(most, FEW))
-
-
 class _BoundListener(Model):
     """Where a listener on a network listens."""
 
@@ -193,22 +180,6 @@ class _BoundListener(Model):
     """The protocol."""
     bind: BindAddress
     """Where to listen: an IP address and a port."""
-
-
-class ConnectionLimits(Model):
-    """Limits of all servers over TCP connections."""
-
-    max_connections: Connections = DEFAULTS["max_connections"]
-    """Maximum number of open connections."""
-    max_connections_per_source: Connections | None = Field(default_factory=_per_source)
-    """Maximum number of open connections from one address; null: unlimited. Default: half of
-    max_connections, but at least 16."""
-    when_full: Literal["refuse", "evict"] = DEFAULTS["when_full"]
-    """At the limit: refuse closes the new connection, evict the connection idle longest."""
-    idle_timeout: DurationOrZero = DEFAULTS["idle_timeout"]
-    """Seconds without a request after which a connection is closed; 0: unlimited."""
-    request_timeout: Duration = DEFAULTS["request_timeout"]
-    """Seconds from the first byte of a request to its last."""
 
 
 class _ModbusRules(Model):

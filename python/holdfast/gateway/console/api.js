@@ -3,7 +3,7 @@
 import { $, h } from "./dom.js";
 
 const KEY = "holdfast-token";
-const JSON_TYPE = { "Content-Type": "application/json" };
+export const JSON_TYPE = { "Content-Type": "application/json" };
 /** How long the gateway may need beyond the timeouts of the device, in milliseconds. */
 const GRACE = 10_000;
 
@@ -34,33 +34,8 @@ export const post = async (path, body, signal) =>
     extraTime: typeof body === "string" ? JSON.parse(body).timeout : body.timeout,
   }));
 
-/** Calls `onEvent(name, data)` for each event of a stream, until the stream ends. */
-export async function stream(path, options, onEvent) {
-  const headers = options.body ? JSON_TYPE : {};
-  const reply = await send(path, { ...options, headers });
-  if (!(reply.headers.get("Content-Type") ?? "").startsWith("text/event-stream")) {
-    await answer(reply);
-    throw new Problem("internal_error", "the gateway did not send an event stream");
-  }
-  const reader = reply.body.pipeThrough(new TextDecoderStream()).getReader();
-  let held = "";
-  for (;;) {
-    const { value, done } = await reader.read().catch((error) => {
-      if (error.name === "AbortError") throw error;
-      throw new Problem("gateway_gone", "the connection to the gateway ended");
-    });
-    if (done) return;
-    const events = (held + value).split("\n\n");
-    held = events.pop();
-    for (const event of events) {
-      const match = /^event: (.*)\ndata: (.*)$/.exec(event);
-      if (match) onEvent(match[1], JSON.parse(match[2]));
-    }
-  }
-}
-
 /** Sends a request, and waits for `extraTime` beyond the usual time for the answer to begin. */
-async function send(path, { extraTime = 0, signal, ...options } = {}) {
+export async function send(path, { extraTime = 0, signal, ...options } = {}) {
   for (;;) {
     const token = sessionStorage.getItem(KEY);
     const headers = { ...options.headers, ...(token ? { Authorization: `Bearer ${token}` } : {}) };
@@ -84,7 +59,7 @@ async function send(path, { extraTime = 0, signal, ...options } = {}) {
   }
 }
 
-async function answer(reply) {
+export async function answer(reply) {
   let body;
   try {
     body = await reply.json();

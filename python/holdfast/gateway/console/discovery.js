@@ -1,8 +1,9 @@
 // The map of a device: a picture of each area, and a list of its ranges.
 
-import { notice, stream } from "./api.js";
+import { notice } from "./api.js";
 import { $, colour, h, onTheme, say } from "./dom.js";
 import { AREAS } from "./standard.js";
+import { MAX_STREAMS, stream } from "./streams.js";
 
 const FAILURES = { timeout: "no response", connection: "connection lost", invalid: "invalid response" };
 const CELLS = 1024;
@@ -12,8 +13,6 @@ const ZOOM = 8;
 /** The fewest addresses that a picture shows. */
 const MIN_SIZE = 64;
 const LEGEND = { there: "valid", absent: "asked, absent", failed: "failed", unread: "not asked" };
-/** Streams of this browser, with this map: one connection is left for everything else. */
-const STREAMS = 5;
 
 /** The map view. `open` shows a range in the values view. */
 export class Discovery {
@@ -55,7 +54,7 @@ export class Discovery {
     const stopping = new AbortController();
     this.running = stopping;
     this.prepare(areas, first, last);
-    const body = JSON.stringify({ ...this.device, areas, first, last, exact: form.has("exact"), maxStreams: STREAMS });
+    const body = JSON.stringify({ ...this.device, areas, first, last, exact: form.has("exact"), maxStreams: MAX_STREAMS.map });
     try {
       await stream("/api/modbus/map", { method: "POST", body, signal: stopping.signal, extraTime: this.device.timeout * areas.length }, (name, data) => {
         if (this.running === stopping) this.happened(name, data);

@@ -2,7 +2,7 @@
 
 import { forgetToken, get, hasToken, notice, post, unmark } from "./api.js";
 import { $, h, say, tabs } from "./dom.js";
-import * as link from "./link.js";
+import * as pageUrl from "./page_url.js";
 import { Discovery } from "./discovery.js";
 import { Values } from "./values.js";
 
@@ -56,11 +56,11 @@ async function begin() {
 
 /** Stores the device in the page's URL, so that it can be bookmarked and shared. */
 function remember() {
-  link.put(Object.fromEntries(fields.map((id) => [id, id === "server" && !target().serverName ? null : $(id).value.trim()])));
+  pageUrl.put(Object.fromEntries(fields.map((id) => [id, id === "server" && !target().serverName ? null : $(id).value.trim()])));
 }
 
 function recall() {
-  for (const [id, value] of link.given()) {
+  for (const [id, value] of pageUrl.given()) {
     if (fields.includes(id)) $(id).value = value;
   }
   $("server-label").hidden = !isSecure();

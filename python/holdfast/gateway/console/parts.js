@@ -1,6 +1,6 @@
 // The parts of a view: ranges and tag lists, for requests and for the link.
 
-import { packed, unpacked } from "./link.js";
+import { packed, unpacked } from "./page_url.js";
 import { modicon, typeOf } from "./numbers.js";
 import { areaOf, LAST_ADDRESS } from "./standard.js";
 

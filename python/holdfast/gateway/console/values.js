@@ -1,14 +1,15 @@
 // The values view: reads or watches ranges and tag lists, and offers plots and writes.
 
-import { failure, notice, stream } from "./api.js";
+import { failure, notice } from "./api.js";
 import { save, stamp } from "./csv.js";
 import { $, h, pause, say, show } from "./dom.js";
 import { Lists } from "./lists.js";
-import * as link from "./link.js";
 import { flaw, modicon, typeOf } from "./numbers.js";
+import * as pageUrl from "./page_url.js";
 import * as parts from "./parts.js";
 import { Plots } from "./plots.js";
 import { areaOf, LAST_ADDRESS } from "./standard.js";
+import { MAX_STREAMS, stream } from "./streams.js";
 import { Table } from "./table.js";
 import { TagTable } from "./tags.js";
 import { Writer } from "./writing.js";
@@ -18,8 +19,6 @@ const SLACK = 2 * 1000;
 
 const PATH = "/api/modbus/watch/view";
 const RESUME = 1000;
-/** Streams of this browser. It allows six connections to a host; two are left for everything else. */
-const STREAMS = 4;
 const WRITTEN = { written: "Written", refused: "Not written", unknown: "Unknown whether it was written" };
 /** Errors after which a watch does not retry. */
 const FINAL = new Set(["malformed", "refused_target", "unauthorized", "foreign_page", "not_found"]);
@@ -66,7 +65,7 @@ export class Values {
 
   /** Fills in the view of the page's URL. Returns whether it is watched. */
   async recall() {
-    const query = link.given();
+    const query = pageUrl.given();
     for (const id of FIELDS) {
       const value = query.get(id);
       if (value !== null && (!$(id).options || [...$(id).options].some((each) => each.value === value))) $(id).value = value;
@@ -91,7 +90,7 @@ export class Values {
     const pinned = this.pinned;
     const spelled = await Promise.all(pinned.map(parts.spelled));
     if (this.pinned !== pinned) return;
-    link.put({
+    pageUrl.put({
       ...Object.fromEntries(FIELDS.map((id) => [id, $(id).disabled ? null : $(id).value])),
       part: spelled,
       watch: this.watching ? "1" : null,
@@ -333,7 +332,7 @@ export class Values {
       let streams = true;
       // The profiles of the gateway may change at any time, other lists never do.
       const describe = !this.polls || wanted.some((part) => part.source?.profile);
-      const more = { interval: this.interval, maxStreams: STREAMS, describe };
+      const more = { interval: this.interval, maxStreams: MAX_STREAMS.watch, describe };
       try {
         await stream(PATH, this.sent(wanted, more, stopping.signal), (name, data) => {
           if (this.watching !== stopping) return;
@@ -484,7 +483,7 @@ export class Values {
     this.plots?.stop();
     this.pressed(false);
     this.panels.forEach((panel) => panel.stale("No longer watched."));
-    link.put({ watch: null }); // At once: a reload now must not watch again.
+    pageUrl.put({ watch: null }); // At once: a reload now must not watch again.
     this.remember();
     say($("outcome"), "Stopped.");
   }

@@ -1,9 +1,10 @@
 // A write: the values that are typed, the request that sends them, and the registers or coils that it changes.
 
-import { failure, post, stream } from "./api.js";
+import { failure, post } from "./api.js";
 import { bit, literal, register, separated, swapsBytes } from "./numbers.js";
 import { same } from "./parts.js";
 import { areaOf, MAX_WORD } from "./standard.js";
+import { stream } from "./streams.js";
 
 /** Returns whether the values of a range are the registers as they are. */
 export const isPlain = ({ type, order }) => type.kind === "uint16" && !swapsBytes(order);

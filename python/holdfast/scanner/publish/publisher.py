@@ -7,7 +7,6 @@ costs only its own JSON and one formatting of bytes.
 
 from __future__ import annotations
 
-import math
 from itertools import compress
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -16,6 +15,7 @@ import msgspec
 from holdfast.net.nats import batch
 from holdfast.scanner.dialects import TENTACLE, Dialect
 from holdfast.scanner.messages.types import Data
+from holdfast.scanner.publish.due_time import DueTime
 from holdfast.scanner.subscriptions.groups import Group
 from holdfast.tags.deadband import differs
 from holdfast.tags.decoding import Places, Undecoded, decoder
@@ -36,9 +36,6 @@ Message: TypeAlias = tuple[str, bytes]
 
 MAX_SHAPES = 64
 """Limit of cached shapes. A device that refuses some blocks has more than one shape."""
-
-SLACK_S = 0.0005
-"""Tolerance for comparing scheduled times, which the poller rounds."""
 
 _UNKNOWN = object()
 _encode = msgspec.json.Encoder().encode
@@ -151,7 +148,7 @@ class Publisher:
         messages: list[Message] = []
         first: set[str] = set()
         for group, compiled in parts:
-            if not compiled or not group.claim(due):
+            if not compiled or not group.due_time.claim(due):
                 continue
             for block, part in compiled:
                 part_messages = self._part_messages(part, *answered[block])
@@ -313,14 +310,16 @@ _Placed: TypeAlias = tuple[int, _BlockPart]
 
 
 class _ScheduledGroup:
-    """A group, and the time of its last publication."""
+    """A group, and when it is due."""
 
     def __init__(
         self, group: Group, before: _ScheduledGroup | None, *, is_once: bool = False
     ) -> None:
         self.group = group
         self.is_once = is_once
-        self._last: float = -math.inf if before is None else before._last
+        self.due_time: DueTime = DueTime(
+            group.rate / 1000, None if before is None else before.due_time
+        )
         self.places = Places(group.tags)
         self.deadbands = {
             tag.id: deadband for tag, deadband in zip(group.tags, group.deadbands, strict=True)
@@ -331,18 +330,11 @@ class _ScheduledGroup:
     def publish_now(self, fresh: Collection[str]) -> Iterable[str]:
         """Makes the group due if all of its tags are fresh. Returns its tags if it is due then."""
         if all(id in fresh for id in self.deadbands):
-            self._last = -math.inf
-        return self.deadbands if self._last == -math.inf else ()
+            self.due_time.make_due()
+        return self.deadbands if self.due_time.is_due_at_once else ()
 
     def keep(self, place: Place, part: _BlockPart) -> None:
         """Caches a part. The cache is limited, because blocks may differ at every poll."""
         if len(self.parts) >= MAX_SHAPES + 2 * len(self.group.tags):
             self.parts.clear()
         self.parts[place] = part
-
-    def claim(self, due: float) -> bool:
-        """Returns whether the group is due at this scan, and records the publication if so."""
-        if due < self._last + self.group.rate / 1000 - SLACK_S:
-            return False
-        self._last = due
-        return True

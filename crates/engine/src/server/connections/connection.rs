@@ -21,10 +21,10 @@ use tokio::time::{Instant, Sleep, sleep_until};
 
 use crate::server::connections::admission::Ticket;
 use crate::server::connections::deadlines::{Deadlines, Exchange, Expired, NO_DEADLINE, Timeouts};
-use crate::server::connections::fair_share::{Share, WORK_OF_READ};
 use crate::server::connections::listener::{ListenerContext, Serving};
 use crate::server::connections::peer::Peer;
 use crate::server::connections::reply_order::{Deferral, Deferred, MAX_WAITING};
+use crate::server::connections::worker_share::{Share, WORK_OF_READ};
 use crate::server::reports::event::Kind;
 use crate::server::reports::refused_request::{RefusedRequest, Reported};
 use crate::server::requests::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};

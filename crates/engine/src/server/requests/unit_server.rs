@@ -195,6 +195,9 @@ impl UnitServer {
         let sent = match place {
             _ if !rights.allows(unit_id, function_code) => Err(NOT_ALLOWED),
             Elsewhere::Device(_) if rights.denies(unit_id, request) => Err(NOT_ALLOWED),
+            Elsewhere::Journal(_) if !permitted => {
+                Err(Request::parse(request).err().unwrap_or(ExceptionCode::ServerDeviceFailure))
+            }
             _ if !permitted => Err(ExceptionCode::ServerDeviceFailure),
             Elsewhere::Mirror(passage) if outside(rights, unit_id, request) => {
                 Err(out_of_ranges(&passage.memory))

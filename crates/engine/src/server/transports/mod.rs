@@ -4,6 +4,7 @@
 pub(crate) mod cut_tests;
 pub(crate) mod framing;
 pub(crate) mod raw_ingest;
+pub(crate) mod raw_ingest_input;
 pub(crate) mod secure;
 pub(crate) mod serial;
 pub(crate) mod shared_port;

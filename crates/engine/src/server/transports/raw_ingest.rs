@@ -25,21 +25,21 @@ use tokio::sync::{oneshot, watch};
 use tokio::task::yield_now;
 use tokio::time::{Instant, timeout_at};
 
-use crate::packet_area::of_packet;
+use crate::raw_ingest_areas::of_packet;
 
 use crate::server::connections::admission::{ConnectionLimits, Ticket};
 use crate::server::connections::closing::drain;
-use crate::server::connections::fair_share::{self, Share, WORK_OF_READ};
 use crate::server::connections::listener::{
     Admitted, KEEPALIVE, ListenerContext, Service, Serving, set_options,
 };
-use crate::server::connections::partial_packet::Incoming;
 use crate::server::connections::peer::Peer;
 use crate::server::connections::reloadable::Reloadable;
+use crate::server::connections::worker_share::{self, Share, WORK_OF_READ};
 use crate::server::reports::audit::{Permit, Record, Written};
 use crate::server::reports::counters::PacketCounters;
 use crate::server::reports::event::Kind;
 use crate::server::rights::policy::{Grants, PolicyEntry};
+use crate::server::transports::raw_ingest_input::Incoming;
 use crate::server::transports::secure::secured;
 use crate::server::transports::stream::{self, End, Stream, send_all};
 use crate::tls::server::ServerTls;
@@ -496,7 +496,7 @@ impl RawIngest {
             Ok(Packet::Incomplete { .. }) => Err(Refusal::Short),
             Err(refusal) => Err(refusal),
         };
-        sending.share.charge(fair_share::packet(sending.bytes.len() - behind));
+        sending.share.charge(worker_share::packet(sending.bytes.len() - behind));
         sending.ticket.set_amid_packet(false);
         if let Err(refusal) = written {
             self.refuse(&context, &sending.peer, &sending.bytes, refusal);
@@ -560,7 +560,7 @@ impl RawIngest {
                         end = slow;
                         break;
                     }
-                    sending.share.charge(fair_share::packet(len));
+                    sending.share.charge(worker_share::packet(len));
                     sending.share.come().await;
                     begun = Instant::now();
                     packets += 1;
@@ -963,7 +963,7 @@ mod tests {
                 .collect();
             let accepted = serve(([192, 0, 2, 2], 1).into(), 1).await.unwrap();
             // One share before the packet, and one before its sender is found to have left.
-            assert!(accepted <= 1 + 3 * u64::from(fair_share::PACKETS_PER_ROUND), "{accepted}");
+            assert!(accepted <= 1 + 3 * u64::from(worker_share::PACKETS_PER_ROUND), "{accepted}");
             for each in flood {
                 each.await.unwrap();
             }

@@ -1,0 +1,31 @@
+// Streams of events from the gateway, and how many of them a browser may have.
+
+import { answer, JSON_TYPE, Problem, send } from "./api.js";
+
+/** Streams of this browser, with the one that is wanted. A browser has six connections to a host. */
+export const MAX_STREAMS = { watch: 4, map: 5 };
+
+/** Calls `onEvent(name, data)` for each event of a stream, until the stream ends. */
+export async function stream(path, options, onEvent) {
+  const headers = options.body ? JSON_TYPE : {};
+  const reply = await send(path, { ...options, headers });
+  if (!(reply.headers.get("Content-Type") ?? "").startsWith("text/event-stream")) {
+    await answer(reply);
+    throw new Problem("internal_error", "the gateway did not send an event stream");
+  }
+  const reader = reply.body.pipeThrough(new TextDecoderStream()).getReader();
+  let held = "";
+  for (;;) {
+    const { value, done } = await reader.read().catch((error) => {
+      if (error.name === "AbortError") throw error;
+      throw new Problem("gateway_gone", "the connection to the gateway ended");
+    });
+    if (done) return;
+    const events = (held + value).split("\n\n");
+    held = events.pop();
+    for (const event of events) {
+      const match = /^event: (.*)\ndata: (.*)$/.exec(event);
+      if (match) onEvent(match[1], JSON.parse(match[2]));
+    }
+  }
+}
