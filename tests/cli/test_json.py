@@ -44,6 +44,7 @@ CASES = {
     "fleet status": ("plant --nats {nats}", "none --nats {nats}"),
     "audit verify": ("{audit}", "{absent}"),
     "memory verify": ("{folder}/plant.redb", "{mma}"),
+    "import home-assistant": ("{home_assistant}", "{absent}"),
     "import mma": ("{mma}", "{absent}"),
     "import replicator": ("{replicator}", "{absent}"),
     "cert show": ("{folder}/ca.pem", "{mma}"),
@@ -59,6 +60,11 @@ replicator:
       reads: [{fc: 3, address: 0, quantity: 10}]
       targets: [{id: 2, endpoint: "10.5.1.20:501", memories: [{memory_id: 1, offsets: {3: 0}}]}]
       poll: {interval_ms: 1000}
+"""
+
+HOME_ASSISTANT = """\
+modbus:
+  - {name: plc, type: tcp, host: 10.5.1.29, port: 502, sensors: [{name: level, address: 1}]}
 """
 
 NO_TARGET = {"token"}
@@ -130,12 +136,14 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     kept.stop()
     nodes.settle()
     (folder / "replicator.yaml").write_text(REPLICATOR)
+    (folder / "home_assistant.yaml").write_text(HOME_ASSISTANT)
     yield {
         "mma": str(DATA / "mma" / "plant.yaml"),
         "folder": str(folder),
         "file": str(file),
         "absent": str(folder / "absent.yaml"),
         "replicator": str(folder / "replicator.yaml"),
+        "home_assistant": str(folder / "home_assistant.yaml"),
         "audit": str(folder / "audit.log"),
         "nats": nats.url,
     }

@@ -21,11 +21,11 @@ from holdfast.config import load
 from holdfast.config.dump import to_yaml
 from holdfast.config.text.yaml_document import parse
 from holdfast.importing import NotImportable, read_mma
-from holdfast.importing.address_filters import EVERYBODY, Peers, parse_network, read_filter
-from holdfast.importing.function_rights import ALL, SOURCE, touching
 from holdfast.importing.key_reader import Section
+from holdfast.importing.mma.address_filters import EVERYBODY, Peers, parse_network, read_filter
+from holdfast.importing.mma.function_rights import ALL, SOURCE, touching
+from holdfast.importing.mma.policies import Policy, merged
 from holdfast.importing.notes import Desk
-from holdfast.importing.policies import Policy, merged
 from holdfast.types import AREAS
 from support.paths import DATA, DOCS
 

@@ -1,15 +1,24 @@
 """Converts configurations of other programs to Holdfast configurations.
 
-Call `read_mma` or `read_replicator`. A `Note` reports every setting that can't be converted;
-nothing is dropped silently. This package never starts anything, and secrets leave it only as
-hashes.
+Call the `read_…` of the program. A `Note` reports every setting that can't be converted; nothing is
+dropped silently. This package never starts anything, and secrets leave it only as hashes.
 """
 
 from __future__ import annotations
 
+from holdfast.importing.home_assistant import read_home_assistant
 from holdfast.importing.imported import ORDINALS, Imported, NotImportable
 from holdfast.importing.mma import read_mma
 from holdfast.importing.notes import Kind, Note
 from holdfast.importing.replicator import read_replicator
 
-__all__ = ["ORDINALS", "Imported", "Kind", "NotImportable", "Note", "read_mma", "read_replicator"]
+__all__ = [
+    "ORDINALS",
+    "Imported",
+    "Kind",
+    "NotImportable",
+    "Note",
+    "read_home_assistant",
+    "read_mma",
+    "read_replicator",
+]

@@ -62,17 +62,25 @@ class NotImportable(ConfigError):
 class Source:
     """A source file while it is read: its `desk` has its data, and takes notes and problems."""
 
-    def __init__(self, path: Path | str) -> None:
-        """Raises `ConfigError` for a file that can't be read."""
+    def __init__(self, path: Path | str, *, only: str | None = None) -> None:
+        """Raises `ConfigError` for a file that can't be read.
+
+        Of a file that has the section `only`, nothing else is read.
+        """
         self.file = str(path)
         text = yaml_document.read_text(Path(path), self.file)
         try:
             document, found = yaml_document.parse(text, self.file)
         except ConfigError as error:
             raise ConfigError(self.file, _without_secrets(text, error.problems)) from None
-        self._problems = _without_secrets(text, found)
+        self.problems = _without_secrets(text, found)
         self.desk = Desk(document)
-        self._refuse_octal(text.splitlines(), (), document.data)
+        data = document.data
+        section: KeyPath = ()
+        if only is not None and isinstance(data, dict) and only in data:
+            section, data = (only,), data[only]
+            self.problems = [each for each in self.problems if _is_in(only, each.key)]
+        self._refuse_octal(text.splitlines(), section, data)
 
     def is_mapping(self) -> bool:
         """Whether the file contains a mapping; adds a problem otherwise."""
@@ -97,9 +105,14 @@ class Source:
 
     def finish(self) -> None:
         """Raises `NotImportable` if there was any problem."""
-        problems = self._problems + self.desk.report.problems
+        problems = self.problems + self.desk.report.problems
         if problems:
             raise NotImportable(self.file, problems, self.desk.notes)
+
+
+def _is_in(section: str, key: str) -> bool:
+    """Whether the key of a problem is that of a section, or one inside it."""
+    return re.split(r"[.\[]", key, maxsplit=1)[0] == section
 
 
 def _without_secrets(text: str, problems: Iterable[Problem]) -> list[Problem]:

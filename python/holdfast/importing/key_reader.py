@@ -5,7 +5,9 @@ A value of the wrong type is a problem and counts as absent, so no error hides a
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.text.messages import show
@@ -67,9 +69,19 @@ class Section:
         """The integer at a key."""
         allowed = f"{what} from {least} to {most}"
         value = self._present(key, allowed, required)
-        if type(value) is int and least <= value <= most:
-            return value
+        number = self._number(value)
+        if type(number) is int and least <= number <= most:
+            return number
         self._wrong(key, value, allowed)
+        return None
+
+    def number(self, key: str) -> int | float | None:
+        """The number at a key."""
+        value = self.get(key)
+        number = self._number(value)
+        if isinstance(number, int | float) and not isinstance(number, bool) and isfinite(number):
+            return number
+        self._wrong(key, value, "a number")
         return None
 
     def flag(self, key: str) -> bool | None:
@@ -129,6 +141,14 @@ class Section:
                 continue
             message = (reasons or {}).get(key) or f"unknown key{suggestion(key, known)}"
             self.desk.left_out(self.at(key), message)
+
+    def _number(self, value: object) -> object:
+        """The number that a text contains, if the source accepted that; else the value."""
+        if isinstance(value, str) and self.desk.quoted_numbers:
+            for kind in (int, float):
+                with suppress(ValueError):
+                    return kind(value)
+        return value
 
     def _present(self, key: str | int, allowed: str, required: bool) -> Any:
         value = self.get(key)

@@ -43,6 +43,8 @@ class Desk:
 
     document: Document
     noted: dict[Note, None] = field(default_factory=dict)
+    quoted_numbers: bool = False
+    """Whether the source accepted numbers in quotes."""
 
     def __post_init__(self) -> None:
         self.report = Report(self.document)

@@ -21,7 +21,13 @@ from holdfast.cli.terminal_text import (
     show_problems,
 )
 from holdfast.config import ConfigError
-from holdfast.importing import ORDINALS, NotImportable, read_mma, read_replicator
+from holdfast.importing import (
+    ORDINALS,
+    NotImportable,
+    read_home_assistant,
+    read_mma,
+    read_replicator,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -99,6 +105,22 @@ def replicator(file: Path, output: Path | None, force: bool, as_json: bool) -> N
     OUT, 2 can't import FILE.
     """
     _convert(lambda: read_replicator(file), file, output, force, as_json)
+
+
+@import_.command(
+    "home-assistant",
+    epilog="Example: holdfast import home-assistant configuration.yaml --output plant.yaml",
+)
+@_common
+def home_assistant(file: Path, output: Path | None, force: bool, as_json: bool) -> None:
+    """Convert the modbus section of FILE, of Home Assistant, to a Holdfast configuration.
+
+    FILE can also contain only that section. Prints the new configuration: its devices appear in
+    Home Assistant over MQTT. Notes on standard error, and comments in the configuration, say what
+    was not converted, what was changed and what to check. Exit codes: 0 done, 1 can't write OUT,
+    2 can't import FILE.
+    """
+    _convert(lambda: read_home_assistant(file), file, output, force, as_json)
 
 
 def _convert(

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.importing.address_filters import read_filter
-from holdfast.importing.draft import Draft
 from holdfast.importing.imported import Generation, Imported, Source
 from holdfast.importing.key_reader import Section
-from holdfast.importing.listen_addresses import Binds
-from holdfast.importing.mma_adapters import Adapters
-from holdfast.importing.mma_first import FirstGeneration
-from holdfast.importing.mma_second import TOP_REASONS, SecondGeneration
+from holdfast.importing.mma.adapters import Adapters
+from holdfast.importing.mma.address_filters import read_filter
+from holdfast.importing.mma.draft import Draft
+from holdfast.importing.mma.first_generation import FirstGeneration
+from holdfast.importing.mma.listen_addresses import Binds
+from holdfast.importing.mma.second_generation import TOP_REASONS, SecondGeneration
 from holdfast.importing.notes import Choices
 
 if TYPE_CHECKING:

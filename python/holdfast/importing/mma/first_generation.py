@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.config.text.messages import show
 from holdfast.config.values.scalars import MAX_CONNECTIONS
-from holdfast.importing import function_rights as functions
-from holdfast.importing.address_filters import ALL, read_filter
-from holdfast.importing.draft import ADMISSION, Reader
 from holdfast.importing.key_reader import Section, section
-from holdfast.importing.memories import check_gate, read_areas, read_id
+from holdfast.importing.mma import function_rights as functions
+from holdfast.importing.mma.address_filters import ALL, read_filter
+from holdfast.importing.mma.draft import ADMISSION, Reader
+from holdfast.importing.mma.memories import check_gate, read_areas, read_id
 from holdfast.importing.names import unique_names
 from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, WRITING_CODES
 from holdfast.runtime.text import listing, suggestion

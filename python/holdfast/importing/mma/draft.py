@@ -10,8 +10,8 @@ from holdfast.types import AREAS
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from holdfast.importing.address_filters import Peers
-    from holdfast.importing.listen_addresses import Binds
+    from holdfast.importing.mma.address_filters import Peers
+    from holdfast.importing.mma.listen_addresses import Binds
     from holdfast.importing.notes import Choices, Desk
     from holdfast.types import Area
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.importing import function_rights as functions
-from holdfast.importing.address_filters import ALL, read_networks
-from holdfast.importing.draft import ADMISSION, Reader
 from holdfast.importing.key_reader import Section, section
-from holdfast.importing.memories import check_gate, read_areas, read_id
+from holdfast.importing.mma import function_rights as functions
+from holdfast.importing.mma.address_filters import ALL, read_networks
+from holdfast.importing.mma.draft import ADMISSION, Reader
+from holdfast.importing.mma.memories import check_gate, read_areas, read_id
+from holdfast.importing.mma.policies import Policy, merged, unserved
 from holdfast.importing.names import unique_names
-from holdfast.importing.policies import Policy, merged, unserved
 from holdfast.protocol import LAST_ADDRESS, MAX_UNIT
 
 if TYPE_CHECKING:
     from holdfast.config.text.yaml_document import KeyPath
-    from holdfast.importing.address_filters import Peers
+    from holdfast.importing.mma.address_filters import Peers
     from holdfast.net.addresses import Network
 
 TOP_REASONS = {

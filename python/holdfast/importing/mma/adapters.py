@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.text.messages import show
 from holdfast.config.values.topics import parse_topic_filter
 from holdfast.config.values.urls import parse_broker
-from holdfast.importing.address_filters import ALL, written
-from holdfast.importing.draft import ADMISSION, INGESTED, Reader
 from holdfast.importing.key_reader import seconds, section
+from holdfast.importing.mma.address_filters import ALL, written
+from holdfast.importing.mma.draft import ADMISSION, INGESTED, Reader
 from holdfast.importing.names import free_name, unique_names
 from holdfast.net.addresses import LOOPBACK
 from holdfast.protocol import MAX_WORD

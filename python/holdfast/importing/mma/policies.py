@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.importing import function_rights as functions
-from holdfast.importing.address_filters import Peers
+from holdfast.importing.mma import function_rights as functions
+from holdfast.importing.mma.address_filters import Peers
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

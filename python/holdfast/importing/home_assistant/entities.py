@@ -1,0 +1,384 @@
+"""What entities of Home Assistant's `modbus` section become: tags, by the kind of the entity."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from sys import float_info
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from holdfast.config.text.messages import show
+from holdfast.importing.names import MAX_LENGTH, free_name
+from holdfast.protocol import LAST_ADDRESS
+from holdfast.values import register_count
+
+if TYPE_CHECKING:
+    from holdfast.importing.key_reader import Section
+    from holdfast.importing.notes import Desk
+    from holdfast.types import Area
+
+_AREAS: dict[str, Area] = {
+    "coil": "coils",
+    "coils": "coils",
+    "discrete_input": "discrete_inputs",
+    "holding": "holding_registers",
+    "holdings": "holding_registers",
+    "input": "input_registers",
+}
+_REGISTERS = ("holding", "input")
+_BITS = ("coils", "discrete_inputs")
+
+_TYPES = ("int16", "uint16", "int32", "uint32", "int64", "uint64", "float16", "float32", "float64")
+_BY_COUNT = {
+    ("int", 1): "int16",
+    ("int", 2): "int32",
+    ("int", 4): "int64",
+    ("uint", 1): "uint16",
+    ("uint", 2): "uint32",
+    ("uint", 4): "uint64",
+    ("float", 1): "float16",
+    ("float", 2): "float32",
+    ("float", 4): "float64",
+}
+"""Types of former versions, by the number of registers."""
+
+_ORDERS = {"none": None, "word": "CDAB", "byte": "BADC", "word_byte": "DCBA"}
+_LITTLE_ORDERS = {"none": "DCBA", "word": "BADC", "byte": "CDAB", "word_byte": None}
+"""The byte orders by `swap`; of structures whose values have their last byte first."""
+
+_UTF_8 = {"encoding": "utf-8"}
+"""The source decoded every text as UTF-8."""
+
+_LARGEST = {"float16": 65504.0, "float32": (2 - 2.0**-23) * 2.0**127, "float64": float_info.max}
+
+_STRUCTURE = re.compile(r"([@=<>!]?)(\d*)([hHiIlLqQefds])")
+_CODES = dict(zip("hHiIqQefd", _TYPES, strict=True)) | {"l": "int32", "L": "uint32"}
+"""The types of one value of a structure, by its code."""
+
+_PREFIX = re.compile(r"^(swing_mode_)?(state_|action_)(fan_(?!only))?")
+"""What the name of a mode begins with."""
+
+_MODES = ("hvac_mode_register", "fan_mode_register", "swing_mode_register")
+
+
+@dataclass
+class Places:
+    """The tags of one device so far."""
+
+    desk: Desk
+    tags: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def add(self, name: str, area: Area, address: int, **settings: Any) -> None:
+        """Adds a tag; its name is that of an entity id, and `name` its description."""
+        plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
+        wanted = re.sub(r"[^a-z0-9]+", "_", plain).strip("_")[:MAX_LENGTH] or "entity"
+        tag = {"area": area, "address": address, **settings}
+        key = free_name(wanted, set(self.tags))
+        self.tags[key] = tag if key == name else {**tag, "description": name}
+
+
+Entities: TypeAlias = Callable[[Places, "Section"], None]
+"""Adds the tags of one entity."""
+
+
+def _name(entity: Section) -> str:
+    return entity.name("name") or "entity"
+
+
+def _address(entity: Section, key: str = "address", *, required: bool = True) -> int | None:
+    return entity.integer(key, 0, LAST_ADDRESS, required=required, what="an address")
+
+
+def _area(entity: Section, key: str, default: str, allowed: tuple[str, ...]) -> Area:
+    return _AREAS[entity.word(key, allowed) or default]
+
+
+def _sensor(places: Places, entity: Section) -> None:
+    """Registers with a type."""
+    area = _area(entity, "input_type", "holding", _REGISTERS)
+    address, settings = _address(entity), _typed(entity)
+    if address is None or settings is None:
+        return
+    settings |= _scaled(entity)
+    settings["unit"] = entity.text("unit_of_measurement")
+    settings["null"] = _null(entity, settings["type"])
+    size = register_count(settings["type"])
+    for index in range(_copies(entity) + 1):
+        name = f"{_name(entity)} {index}" if index else _name(entity)
+        places.add(name, area, address + index * size, **_given(settings))
+
+
+def _copies(entity: Section) -> int:
+    """How many sensors follow the first, each behind the one before it."""
+    key = "virtual_count" if entity.get("virtual_count") is not None else "slave_count"
+    return entity.integer(key, 0, 2000) or 0
+
+
+def _given(settings: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in settings.items() if value not in (None, [], 0, "")}
+
+
+def _scaled(entity: Section, prefix: str = "") -> dict[str, Any]:
+    """Scale and offset, those of this value or those of the entity."""
+    found: dict[str, Any] = {}
+    for key, plain in (("scale", 1), ("offset", 0)):
+        value = entity.number(f"{prefix}{key}") if prefix else None
+        value = entity.number(key) if value is None else value
+        found[key] = None if value == plain else value
+    if found["scale"] == 0:
+        entity.desk.problem(entity.at("scale"), "found 0, allowed: any other number")
+    return found
+
+
+def _typed(entity: Section) -> dict[str, Any] | None:
+    """Type, byte order and encoding; `None` if there is no such type here."""
+    kinds = (*_TYPES, "int", "uint", "float", "string", "custom")
+    kind = entity.word("data_type", kinds) or "int16"
+    count = entity.integer("count", 1, 125)
+    structure = entity.text("structure")
+    swap = entity.word("swap", tuple(_ORDERS)) or "none"
+    if entity.flag("reverse_order"):
+        swap = "word"
+    if kind == "custom":
+        return _structure(entity, structure, count, swap)
+    if kind == "string":
+        if count is None:
+            message = "missing, allowed: the number of registers with the text"
+            entity.desk.problem_of_key(entity.at("count"), message)
+            return None
+        return {"type": f"string:{2 * count}", "order": _ORDERS[swap], **_UTF_8}
+    kind = _BY_COUNT.get((kind, count or 1), kind)
+    if kind not in _TYPES:
+        message = f"found {count} with data_type {kind}, allowed: 1, 2 or 4"
+        entity.desk.problem(entity.at("count"), message)
+        return None
+    return {"type": kind, "order": _ORDERS[swap]}
+
+
+def _structure(
+    entity: Section, structure: str | None, count: int | None, swap: str
+) -> dict[str, Any] | None:
+    """The type of a structure with values of one kind."""
+    found = _STRUCTURE.fullmatch(structure or "")
+    number = int(found[2] or 1) if found else 0
+    if found is None or not number:
+        message = f"found {show(structure)}, which is several types: add a tag for each value"
+        entity.desk.left_out(entity.at("structure"), message)
+        return None
+    # Without a sign, the source used the order of its processor, which is the little one.
+    orders = _ORDERS if found[1] in (">", "!") else _LITTLE_ORDERS
+    if found[3] == "s":
+        return {"type": f"string:{number}", "order": _ORDERS[swap], **_UTF_8}
+    kind = _CODES[found[3]]
+    if found[3] in "lL" and count == 4 * number:  # A long of a processor of 64 bits.
+        kind = kind.replace("32", "64")
+    return {"type": kind if number == 1 else f"{kind}[{number}]", "order": orders[swap]}
+
+
+def _null(entity: Section, kind: str) -> list[int | float]:
+    """The numbers that mean no value: the one given, and its negative, as in the source."""
+    given = entity.get("nan_value")
+    if given is None:
+        return []
+    try:
+        number = int(given, 0) if isinstance(given, str) else given
+    except ValueError:
+        number = None
+    if type(number) is not int:
+        entity.desk.problem(entity.at("nan_value"), f"found {show(given)}, allowed: an integer")
+        return []
+    if kind not in _TYPES:
+        entity.desk.left_out(entity.at("nan_value"), f"values of type {kind} have none")
+        return []
+    candidates = [each for each in sorted({number, -number}) if each]
+    if kind.startswith("float"):
+        return [float(each) for each in candidates if abs(each) <= _LARGEST[kind]]
+    bits = 16 * register_count(kind)
+    least, most = (0, 2**bits) if kind.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1))
+    return [each for each in candidates if least <= each < most]
+
+
+def _binary_sensor(places: Places, entity: Section) -> None:
+    """A bit, or the lowest bit of a register, and those that follow it."""
+    kinds = ("coil", "discrete_input", *_REGISTERS)
+    area = _area(entity, "input_type", "coil", kinds)
+    address = _address(entity)
+    if address is None:
+        return
+    for index in range(_copies(entity) + 1):
+        name = f"{_name(entity)} {index}" if index else _name(entity)
+        settings = {} if area in _BITS else {"type": "bit:0"}
+        places.add(name, area, address + index, **settings)
+
+
+def _switch(places: Places, entity: Section) -> None:
+    """A coil, or a register with a number for on and one for off; and where its state is read."""
+    kinds = ("holding", "holdings", "coil", "coils")
+    area = _area(entity, "write_type", "holding", kinds)
+    address = _address(entity)
+    on = entity.integer("command_on", 0, 65535)
+    off = entity.integer("command_off", 0, 65535)
+    on, off = 1 if on is None else on, 0 if off is None else off
+    verify = entity.mapping("verify")
+    if address is None:
+        return
+    if area in _BITS and (on, off) != (1, 0) and not (on and not off):
+        message = f"found {on} for on and {off} for off of a coil, allowed: 1 and 0"
+        entity.desk.problem(entity.at("command_on"), message)
+    settings = _two_states(entity, area, [on], [off])
+    places.add(_name(entity), area, address, **settings, writable=True)
+    if verify is None:
+        if "verify" not in entity.data:
+            message = "its state is read from its address; the source did not read it"
+            entity.desk.check(entity.path, message)
+        return
+    _verify(places, entity, verify, (area, address, [on], [off]))
+
+
+_Written: TypeAlias = "tuple[Area, int, list[int], list[int]]"
+"""Where a switch is, and its numbers for on and off."""
+
+
+def _verify(places: Places, entity: Section, verify: Section, written: _Written) -> None:
+    """A tag of its own for a state that is read elsewhere."""
+    area, address, on, off = written
+    kind = verify.word("input_type", tuple(_AREAS))
+    its_area = _AREAS[kind] if kind else area
+    its_address = _address(verify, required=False)
+    its_address = address if its_address is None else its_address
+    its_on, its_off = _numbers(verify, "state_on") or on, _numbers(verify, "state_off") or off
+    verify.integer("delay", 0, 86_400)  # A write that is confirmed is read back at once.
+    verify.close()
+    if (its_area, its_address, its_on, its_off) == (area, address, on, off):
+        return
+    settings = _two_states(entity, its_area, its_on, its_off)
+    places.add(f"{_name(entity)} state", its_area, its_address, **settings)
+    entity.desk.changed(verify.path, "the state that is read is an entity of its own")
+
+
+def _numbers(entity: Section, key: str) -> list[int]:
+    """An integer, or a list of them."""
+    given = entity.get(key)
+    values = given if isinstance(given, list) else [] if given is None else [given]
+    if all(type(value) is int and 0 <= value <= 65535 for value in values):
+        return values
+    message = f"found {show(given)}, allowed: integers from 0 to 65535"
+    entity.desk.problem(entity.at(key), message)
+    return []
+
+
+def _two_states(entity: Section, area: Area, on: list[int], off: list[int]) -> dict[str, Any]:
+    """A bit, a register that is a bit, or one with names for its numbers."""
+    if area in _BITS:
+        return {}
+    if (on, off) == ([1], [0]):
+        return {"type": "bool"}
+    entity.desk.changed(entity.path, "a select of on and off instead of a switch")
+    return _states([*((number, "off") for number in off), *((number, "on") for number in on)])
+
+
+def _states(names: Iterable[tuple[int, str]]) -> dict[str, Any]:
+    """Names for the numbers of a register, each once."""
+    states: dict[int, str] = {}
+    for number, name in names:
+        states[number] = f"{name} ({number})" if name in states.values() else name
+    return {"states": dict(sorted(states.items()))}
+
+
+def _cover(places: Places, entity: Section) -> None:
+    """A coil, or a register with the numbers of open and closed."""
+    area = _area(entity, "input_type", "holding", ("holding", "coil"))
+    address = _address(entity)
+    defaults = {"closed": 0, "open": 1, "opening": 2, "closing": 3}
+    given = {name: entity.integer(f"state_{name}", 0, 65535) for name in defaults}
+    numbers = {name: defaults[name] if each is None else each for name, each in given.items()}
+    states = _states((number, name) for name, number in numbers.items())
+    status = _address(entity, "status_register", required=False)
+    status_area = _area(entity, "status_register_type", "holding", _REGISTERS)
+    if address is None:
+        return
+    kind = "switch" if area in _BITS else "select"
+    entity.desk.changed(entity.path, f"a {kind} instead of a cover")
+    settings = {} if area in _BITS else states
+    places.add(_name(entity), area, address, **settings, writable=True)
+    if status is not None:
+        places.add(f"{_name(entity)} status", status_area, status, **states)
+
+
+def _climate(places: Places, entity: Section) -> None:
+    """The temperature, its setpoint, and registers with modes."""
+    area = _area(entity, "input_type", "holding", _REGISTERS)
+    address, settings = _address(entity), _typed(entity)
+    target = _numbers(entity, "target_temp_register")
+    unit = {"F": "°F", "K": "K"}.get(entity.text("temperature_unit") or "C", "°C")
+    least, most = entity.number("min_temp"), entity.number("max_temp")
+    current = _scaled(entity, "current_temp_")
+    aim = _scaled(entity, "target_temp_")
+    if not target:
+        message = "missing, allowed: the address of the setpoint"
+        entity.desk.problem_of_key(entity.at("target_temp_register"), message)
+    for key in _MODES:
+        _mode(places, entity, key, writable=True)
+    _mode(places, entity, "hvac_action_register", writable=False)
+    _power(places, entity)
+    if address is None or settings is None or not target:
+        return
+    entity.desk.changed(entity.path, "a sensor, a number and selects instead of a thermostat")
+    if len(set(target)) > 1:
+        message = "the first register is the setpoint; the source had one for each mode"
+        entity.desk.changed(entity.at("target_temp_register"), message)
+    places.add(_name(entity), area, address, **_given({**settings, **current, "unit": unit}))
+    limits = {"min": 5 if least is None else least, "max": 35 if most is None else most}
+    written = {**_given({**settings, **aim, "unit": unit}), "writable": True, **limits}
+    places.add(f"{_name(entity)} setpoint", "holding_registers", target[0], **written)
+
+
+def _mode(places: Places, entity: Section, key: str, *, writable: bool) -> None:
+    """A register with a number for each mode."""
+    register = entity.mapping(key)
+    if register is None:
+        return
+    given = _numbers(register, "address")
+    values = register.mapping("values")
+    area = _area(register, "input_type", "holding", _REGISTERS)
+    register.close({"write_registers": "one register is written with function 6"})
+    if not given or values is None:
+        message = "without address and values, allowed: with both"
+        entity.desk.problem(entity.at(key), message)
+        return
+    names = ((str(name), _numbers(values, name)) for name in values.data)
+    settings = _states(
+        (number, _PREFIX.sub("", name)) for name, numbers in names for number in numbers
+    )
+    if writable:
+        settings["writable"] = True
+    title = key.removesuffix("_register").removeprefix("hvac_").replace("_", " ")
+    places.add(f"{_name(entity)} {title}", area, given[0], **settings)
+
+
+def _power(places: Places, entity: Section) -> None:
+    """A register or a coil that turns a thermostat on."""
+    coil = _address(entity, "hvac_onoff_coil", required=False)
+    register = _address(entity, "hvac_onoff_register", required=False)
+    on, off = entity.integer("hvac_on_value", 0, 65535), entity.integer("hvac_off_value", 0, 65535)
+    on, off = 1 if on is None else on, 0 if off is None else off
+    name = f"{_name(entity)} power"
+    if coil is not None:
+        places.add(name, "coils", coil, writable=True)
+    if register is not None:
+        settings = _two_states(entity, "holding_registers", [on], [off])
+        places.add(name, "holding_registers", register, **settings, writable=True)
+
+
+PLATFORMS: dict[str, Entities] = {
+    "sensors": _sensor,
+    "binary_sensors": _binary_sensor,
+    "switches": _switch,
+    "lights": _switch,
+    "fans": _switch,
+    "covers": _cover,
+    "climates": _climate,
+}
+"""The lists of a hub, and what their entities become."""

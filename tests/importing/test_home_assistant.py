@@ -1,0 +1,318 @@
+"""`holdfast import home-assistant`: what hubs and entities of Home Assistant become."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+
+from holdfast.cli import main
+from holdfast.config import load
+from holdfast.importing import NotImportable, read_home_assistant
+from holdfast.values import decode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from holdfast.importing import Imported
+
+HUB = """\
+default_config:
+automation: !include automations.yaml
+modbus:
+  - name: inverter
+    type: tcp
+    host: 192.168.1.50
+    port: 502
+    {entities}
+"""
+
+
+@pytest.fixture
+def imported(tmp_path: Path) -> Callable[..., Imported]:
+    def read(entities: str, hub: str = HUB) -> Imported:
+        file = tmp_path / "configuration.yaml"
+        file.write_text(hub.replace("{entities}", entities), encoding="utf-8")
+        found = read_home_assistant(file)
+        result = tmp_path / "plant.yaml"
+        result.write_text(found.to_yaml(), encoding="utf-8")
+        load(result)
+        return found
+
+    return read
+
+
+def tags(found: Imported, device: str = "inverter") -> dict[str, Any]:
+    entries: dict[str, Any] = found.data["devices"][device]["tags"]
+    return entries
+
+
+def notes(found: Imported) -> list[str]:
+    return [f"{note.line}: {note.key}: {note.kind}: {note.message}" for note in found.notes]
+
+
+def test_a_sensor_becomes_a_tag(imported: Callable[..., Imported]) -> None:
+    found = imported(
+        "sensors: [{name: Grid Power, slave: 3, address: 5016, input_type: input, swap: word, "
+        "data_type: uint32, scale: 0.1, offset: '-5', unit_of_measurement: W, "
+        "scan_interval: 5, nan_value: '0xFFFFFFFF', device_class: power}]"
+    )
+    assert found.data["devices"] == {
+        "inverter": {
+            "url": "tcp://192.168.1.50:502",
+            "unit": 3,
+            "interval": 5,
+            "timeout": 3,
+            "tags": {
+                "grid_power": {
+                    "area": "input_registers",
+                    "address": 5016,
+                    "type": "uint32",
+                    "order": "CDAB",
+                    "scale": 0.1,
+                    "offset": -5,
+                    "unit": "W",
+                    "null": [4294967295],
+                    "description": "Grid Power",
+                }
+            },
+        }
+    }
+    assert found.data["outputs"]["home"] == {
+        "type": "mqtt",
+        "url": "mqtt://homeassistant.local",
+        "discovery": "homeassistant",
+    }
+    key = "modbus[0].sensors[0].device_class"
+    assert f"8: {key}: left out: it comes from the unit, if that has only one meaning" in notes(
+        found
+    )
+
+
+TYPES = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q"}
+SWAPS = (None, "byte", "word", "word_byte")
+
+
+@given(
+    kind=st.sampled_from([*TYPES, "float16", "float32", "float64"]),
+    swap=st.sampled_from(SWAPS),
+    data=st.binary(min_size=8, max_size=8),
+)
+def test_each_type_and_order_has_the_value_that_the_source_had(
+    tmp_path_factory: pytest.TempPathFactory, kind: str, swap: str | None, data: bytes
+) -> None:
+    code = {**TYPES, "float16": "e", "float32": "f", "float64": "d"}[kind]
+    size = struct.calcsize(f">{code}")
+    if size == 2 and swap in ("word", "word_byte"):
+        swap = "byte"
+    registers = [int.from_bytes(data[at : at + 2], "big") for at in range(0, size, 2)]
+    swapped = [int.from_bytes(each.to_bytes(2, "big"), "little") for each in registers]
+    given_order = swapped if swap in ("byte", "word_byte") else registers
+    if swap in ("word", "word_byte"):
+        given_order = given_order[::-1]
+    [expected] = struct.unpack(f">{code}", b"".join(r.to_bytes(2, "big") for r in given_order))
+    more = f", swap: {swap}" if swap else ""
+    file = tmp_path_factory.mktemp("import") / "modbus.yaml"
+    entity = f"{{name: x, address: 1, data_type: {kind}{more}}}"
+    file.write_text(HUB.replace("{entities}", f"sensors: [{entity}]"))
+    tag = tags(read_home_assistant(file))["x"]
+    found = decode(registers, tag["type"], tag.get("order", "ABCD"))
+    assert found == expected or (found != found and expected != expected)
+
+
+@pytest.mark.parametrize(
+    ("structure", "count", "kind", "order"),
+    [
+        (">f", 2, "float32", None),
+        ("!d", 4, "float64", None),
+        ("<i", 2, "int32", "DCBA"),
+        ("h", 1, "int16", "DCBA"),
+        (">3H", 3, "uint16[3]", None),
+        (">l", 2, "int32", None),
+        ("@L", 4, "uint64", "DCBA"),
+        (">8s", 4, "string:8", None),
+    ],
+)
+def test_a_structure_of_one_kind_is_a_type(
+    imported: Callable[..., Imported], structure: str, count: int, kind: str, order: str | None
+) -> None:
+    entity = f"name: x, address: 1, data_type: custom, structure: '{structure}', count: {count}"
+    tag = tags(imported(f"sensors: [{{{entity}}}]"))["x"]
+    assert (tag["type"], tag.get("order")) == (kind, order)
+
+
+def test_a_structure_of_several_kinds_is_left_out(imported: Callable[..., Imported]) -> None:
+    found = imported(
+        "sensors: [{name: x, address: 1, data_type: custom, structure: '>hf', count: 3}, "
+        "{name: y, address: 9}]"
+    )
+    assert list(tags(found)) == ["y"]
+    message = "left out: found '>hf', which is several types: add a tag for each value"
+    assert f"8: modbus[0].sensors[0].structure: {message}" in notes(found)
+
+
+def test_types_of_former_versions(imported: Callable[..., Imported]) -> None:
+    found = imported(
+        "sensors: [{name: a, address: 1, data_type: uint, count: 2, reverse_order: true}, "
+        "{name: b, address: 3, data_type: float, count: 4}, {name: c, address: 7, data_type: int}]"
+    )
+    assert [tag["type"] for tag in tags(found).values()] == ["uint32", "float64", "int16"]
+    assert tags(found)["a"]["order"] == "CDAB"
+
+
+def test_sensors_that_follow_the_first_have_the_next_registers(
+    imported: Callable[..., Imported],
+) -> None:
+    found = imported(
+        "sensors: [{name: Phase, address: 100, data_type: float32, virtual_count: 2}]\n"
+        "    binary_sensors: [{name: Bit, address: 5, slave_count: 1}, "
+        "{name: Register, address: 9, input_type: holding}]"
+    )
+    places = {name: (tag["area"], tag["address"]) for name, tag in tags(found).items()}
+    assert places == {
+        "phase": ("holding_registers", 100),
+        "phase_1": ("holding_registers", 102),
+        "phase_2": ("holding_registers", 104),
+        "bit": ("coils", 5),
+        "bit_1": ("coils", 6),
+        "register": ("holding_registers", 9),
+    }
+    assert tags(found)["register"]["type"] == "bit:0"
+
+
+def test_switches_write_the_numbers_that_the_source_wrote(
+    imported: Callable[..., Imported],
+) -> None:
+    found = imported(
+        "switches:\n"
+        "      - {name: Coil, address: 1, write_type: coil, verify: }\n"
+        "      - {name: Register, address: 2, verify: }\n"
+        "      - {name: Numbers, address: 3, command_on: 170, command_off: 85, verify: }\n"
+        "      - {name: Elsewhere, address: 4, verify: "
+        "{input_type: input, address: 44, state_on: 2, state_off: [0, 1]}}\n"
+        "      - {name: Blind, address: 5}"
+    )
+    found_tags = tags(found)
+    assert found_tags["coil"] == {
+        "area": "coils",
+        "address": 1,
+        "writable": True,
+        "description": "Coil",
+    }
+    assert found_tags["register"]["type"] == "bool"
+    assert found_tags["numbers"]["states"] == {85: "off", 170: "on"}
+    assert found_tags["elsewhere_state"]["states"] == {0: "off", 1: "off (1)", 2: "on"}
+    assert (found_tags["elsewhere_state"]["area"], found_tags["elsewhere_state"]["address"]) == (
+        "input_registers",
+        44,
+    )
+    assert "writable" not in found_tags["elsewhere_state"]
+    assert found.data["outputs"]["home"]["writes"] is True
+    blind = "its state is read from its address; the source did not read it"
+    assert [note for note in notes(found) if blind in note] == [
+        f"13: modbus[0].switches[4]: check: {blind}"
+    ]
+
+
+def test_covers_and_climates_become_their_registers(imported: Callable[..., Imported]) -> None:
+    found = imported(
+        "covers: [{name: Gate, address: 20, state_open: 5, status_register: 21, "
+        "status_register_type: input}]\n"
+        "    climates: [{name: Hall, address: 30, input_type: input, scale: 0.1, "
+        "target_temp_register: [31, 31, 31, 31, 31, 31, 31], max_temp: 28, "
+        "hvac_onoff_coil: 7, "
+        "hvac_mode_register: {address: 32, values: {state_off: 0, state_fan_only: [2, 3]}}, "
+        "fan_mode_register: {address: 33, values: {state_fan_low: 1, state_fan_high: 2}}}]"
+    )
+    found_tags = tags(found)
+    states = {0: "closed", 2: "opening", 3: "closing", 5: "open"}
+    assert found_tags["gate"]["states"] == found_tags["gate_status"]["states"] == states
+    assert found_tags["hall"] == {
+        "area": "input_registers",
+        "address": 30,
+        "type": "int16",
+        "scale": 0.1,
+        "unit": "°C",
+        "description": "Hall",
+    }
+    setpoint = found_tags["hall_setpoint"]
+    assert (setpoint["area"], setpoint["address"]) == ("holding_registers", 31)
+    assert (setpoint["min"], setpoint["max"], setpoint["scale"]) == (5, 28, 0.1)
+    assert found_tags["hall_mode"]["states"] == {0: "off", 2: "fan_only", 3: "fan_only (3)"}
+    assert found_tags["hall_fan_mode"]["states"] == {1: "low", 2: "high"}
+    assert found_tags["hall_power"]["area"] == "coils"
+
+
+def test_each_unit_id_of_a_hub_is_a_device_with_its_own_interval(
+    imported: Callable[..., Imported],
+) -> None:
+    found = imported(
+        "sensors: [{name: a, address: 1, slave: 1, scan_interval: 30}, "
+        "{name: b, address: 2, device_address: 2, scan_interval: 5}, "
+        "{name: c, address: 3, slave: 1, scan_interval: 10}, {name: d, address: 4}]"
+    )
+    devices = found.data["devices"]
+    assert {name: (d["unit"], d["interval"]) for name, d in devices.items()} == {
+        "inverter-1": (1, 10),
+        "inverter-2": (2, 5),
+    }
+    message = "polled every 10 s, as the whole device; it was 30 s, and 1 more"
+    assert f"8: modbus[0].sensors[0].scan_interval: changed: {message}" in notes(found)
+
+
+def test_a_serial_line_and_pauses_are_in_the_url(imported: Callable[..., Imported]) -> None:
+    hub = (
+        "- {name: line, type: serial, method: rtu, port: /dev/ttyUSB0, baudrate: 9600, "
+        "bytesize: 8, parity: N, stopbits: 1, delay: 2, message_wait_milliseconds: 30, "
+        "timeout: 5, sensors: {name: a, address: 1}}\n"
+    )
+    device = imported("", hub).data["devices"]["line"]
+    line = "rtu:///dev/ttyUSB0?baud=9600&parity=none&stop_bits=1"
+    assert device["url"] == f"{line}&pause=0.03&pause_after_connect=2"
+    assert device["timeout"] == 5
+
+
+def test_every_mistake_is_told_with_its_line(imported: Callable[..., Imported]) -> None:
+    with pytest.raises(NotImportable) as raised:
+        imported(
+            "sensors: [{name: a, address: -1}, {address: 2}, {name: b, address: 1, scale: 0}, "
+            "{name: c, address: 1, data_type: string}, {name: d, address: 1, slave: 300}]\n"
+            "    switches: !include switches.yaml"
+        )
+    assert [(each.line, each.key) for each in raised.value.problems] == [
+        (8, "modbus[0].sensors[0].address"),
+        (8, "modbus[0].sensors[1].name"),
+        (8, "modbus[0].sensors[2].scale"),
+        (8, "modbus[0].sensors[3].count"),
+        (8, "modbus[0].sensors[4].slave"),
+        (9, "modbus[0].switches"),
+    ]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "modbus: []\n", "sensor: []\n", "3\n", "modbus: !include x\n"]
+)
+def test_a_file_without_hubs_is_refused(imported: Callable[..., Imported], text: str) -> None:
+    with pytest.raises(NotImportable):
+        imported("", text)
+
+
+def test_an_octal_number_is_refused(imported: Callable[..., Imported]) -> None:
+    with pytest.raises(NotImportable, match="which the source read as octal, allowed: 64"):
+        imported("sensors: [{name: a, address: 0100}]")
+
+
+def test_the_command_says_what_comes_next(tmp_path: Path) -> None:
+    file = tmp_path / "modbus.yaml"
+    file.write_text(HUB.replace("{entities}", "sensors: [{name: a, address: 1}]"))
+    output = tmp_path / "plant.yaml"
+    command = ["import", "home-assistant", str(file), "--output", str(output)]
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0, result.output
+    assert f"next: holdfast check {output}" in result.stderr
+    assert load(output).devices["inverter"].unit == 1
