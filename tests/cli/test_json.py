@@ -47,6 +47,7 @@ CASES = {
     "import home-assistant": ("{home_assistant}", "{absent}"),
     "import mma": ("{mma}", "{absent}"),
     "import replicator": ("{replicator}", "{absent}"),
+    "import telegraf": ("{telegraf}", "{absent}"),
     "cert show": ("{folder}/ca.pem", "{mma}"),
     "token": ("", "--name ?"),
 }
@@ -65,6 +66,14 @@ replicator:
 HOME_ASSISTANT = """\
 modbus:
   - {name: plc, type: tcp, host: 10.5.1.29, port: 502, sensors: [{name: level, address: 1}]}
+"""
+
+TELEGRAF = """\
+[[inputs.modbus]]
+  name = "plc"
+  slave_id = 1
+  controller = "tcp://10.5.1.29:502"
+  coils = [{name = "pump", address = [0]}]
 """
 
 NO_TARGET = {"token"}
@@ -137,6 +146,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     nodes.settle()
     (folder / "replicator.yaml").write_text(REPLICATOR)
     (folder / "home_assistant.yaml").write_text(HOME_ASSISTANT)
+    (folder / "telegraf.conf").write_text(TELEGRAF)
     yield {
         "mma": str(DATA / "mma" / "plant.yaml"),
         "folder": str(folder),
@@ -144,6 +154,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
         "absent": str(folder / "absent.yaml"),
         "replicator": str(folder / "replicator.yaml"),
         "home_assistant": str(folder / "home_assistant.yaml"),
+        "telegraf": str(folder / "telegraf.conf"),
         "audit": str(folder / "audit.log"),
         "nats": nats.url,
     }

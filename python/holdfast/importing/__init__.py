@@ -11,6 +11,7 @@ from holdfast.importing.imported import ORDINALS, Imported, NotImportable
 from holdfast.importing.mma import read_mma
 from holdfast.importing.notes import Kind, Note
 from holdfast.importing.replicator import read_replicator
+from holdfast.importing.telegraf import read_telegraf
 
 __all__ = [
     "ORDINALS",
@@ -21,4 +22,5 @@ __all__ = [
     "read_home_assistant",
     "read_mma",
     "read_replicator",
+    "read_telegraf",
 ]

@@ -27,6 +27,7 @@ from holdfast.importing import (
     read_home_assistant,
     read_mma,
     read_replicator,
+    read_telegraf,
 )
 
 if TYPE_CHECKING:
@@ -121,6 +122,18 @@ def home_assistant(file: Path, output: Path | None, force: bool, as_json: bool) 
     2 can't import FILE.
     """
     _convert(lambda: read_home_assistant(file), file, output, force, as_json)
+
+
+@import_.command(epilog="Example: holdfast import telegraf telegraf.conf --output plant.yaml")
+@_common
+def telegraf(file: Path, output: Path | None, force: bool, as_json: bool) -> None:
+    """Convert the Modbus inputs of FILE, of Telegraf, to a Holdfast configuration.
+
+    Prints the new configuration, with its first outputs.influxdb_v2. Notes on standard error, and
+    comments in the configuration, say what was not converted, what was changed and what to check.
+    Exit codes: 0 done, 1 can't write OUT, 2 can't import FILE.
+    """
+    _convert(lambda: read_telegraf(file), file, output, force, as_json)
 
 
 def _convert(

@@ -1,0 +1,234 @@
+"""Imports the Modbus inputs of Telegraf: their fields become tags of devices.
+
+An input becomes one device for each unit id that it reads. `outputs.influxdb_v2` becomes an
+output; tokens stay in the source.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from holdfast.config.values.scalars import NAME_FORM, is_name
+from holdfast.importing.imported import Imported, NotImportable
+from holdfast.importing.key_reader import Section, section
+from holdfast.importing.names import free_name, unique_names
+from holdfast.importing.notes import Desk
+from holdfast.importing.telegraf.durations import interval
+from holdfast.importing.telegraf.fields import MEASUREMENT, Field
+from holdfast.importing.telegraf.influx import Influx
+from holdfast.importing.telegraf.inputs import INTERVAL_S, Device, Input, share_connections
+from holdfast.importing.telegraf.reasons import LOGGED, NO_COUNTERPART
+from holdfast.importing.telegraf.toml_document import VARIABLE, document
+from holdfast.runtime.text import listing
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from holdfast.config.text.yaml_document import KeyPath
+
+_MAX_SHOWN_FIELDS = 5
+
+_UNREAD_TEXTS = ("alias", "log_level", "tags", "startup_error_behavior")
+"""Keys of an input that may contain environment variables, as nothing is made of them."""
+
+_AGENT_REASONS = {
+    "collection_jitter": "first polls are spread over the interval",
+    "debug": LOGGED,
+    "flush_interval": "values are sent when they are read",
+    "flush_jitter": "values are sent when they are read",
+    "hostname": "no point has the tag host; see tags of the output",
+    "metric_buffer_limit": "see buffer of the output, which counts values",
+    "omit_hostname": "no point has the tag host",
+    "precision": "times are those of the replies, in microseconds",
+    "quiet": LOGGED,
+    "round_interval": "polls start at whole intervals from the first",
+}
+_OTHER_OUTPUTS = {
+    "file": "add an output of type file, with format: influx for line protocol",
+    "influxdb": "add an output of type influx, with url: http://host:8086/write?db=NAME",
+    "mqtt": "its topics and messages have another form; add an output of type mqtt",
+    "prometheus_client": "use metrics with values: true",
+}
+
+
+def read_telegraf(path: Path | str) -> Imported:
+    """Converts the Modbus inputs of a configuration of Telegraf.
+
+    Raises `ConfigError` with every problem that prevents the import.
+    """
+    desk = Desk(document(path))
+    file = desk.document.file
+    root = Section(desk, (), desk.document.data)
+    if not _refuse_variables(desk):
+        config = _Import(desk, root).read()
+    if desk.report.problems:
+        raise NotImportable(file, desk.report.problems, desk.notes)
+    return Imported(file, "telegraf", "Telegraf", config, desk.notes)
+
+
+def _refuse_variables(desk: Desk) -> bool:
+    """Adds a problem for each environment variable in a value that is converted."""
+    data = desk.document.data
+    read: list[tuple[KeyPath, Any]] = [(("agent", "interval"), _at(data, "agent", "interval"))]
+    for path, value in _plugins(data, "inputs", "modbus"):
+        keys = value if isinstance(value, dict) else {}
+        read += [((*path, key), each) for key, each in keys.items() if key not in _UNREAD_TEXTS]
+    outputs = list(_plugins(data, "outputs", "influxdb_v2"))
+    for path, value in outputs:
+        read += [((*path, key), _at(value, key)) for key in Influx.SHOWN]
+    if outputs:
+        read.append((("global_tags",), _at(data, "global_tags")))
+    for path, value in read:
+        for place, text in _texts(path, value):
+            if (found := VARIABLE.search(text)) is not None:
+                name = found[1] or found[2]
+                message = f"found the environment variable {name}, which the source replaces"
+                desk.problem(place, f"{message}, allowed: its value")
+    return bool(desk.report.problems)
+
+
+def _at(data: Any, *keys: str) -> Any:
+    for key in keys:
+        data = data.get(key) if isinstance(data, dict) else None
+    return data
+
+
+def _texts(path: KeyPath, value: Any) -> Iterator[tuple[KeyPath, str]]:
+    """All texts inside a value, each with its path."""
+    if isinstance(value, str):
+        yield path, value
+    elif isinstance(value, dict | list):
+        inside = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, each in inside:
+            if key != "tags":
+                yield from _texts((*path, key), each)
+
+
+def _plugins(data: Any, kind: str, name: str) -> Iterator[tuple[KeyPath, Any]]:
+    """The tables of a plugin, which is one table or an array of them."""
+    found = _at(data, kind, name)
+    if isinstance(found, list):
+        yield from (((kind, name, index), each) for index, each in enumerate(found))
+    elif found is not None:
+        yield (kind, name), found
+
+
+@dataclass
+class _Import:
+    """Reads the whole file."""
+
+    desk: Desk
+    root: Section
+    found: list[Device] = field(default_factory=list)
+    interval: float | None = None
+
+    def read(self) -> dict[str, Any]:
+        """The configuration."""
+        agent = self.root.mapping("agent")
+        if agent is not None:
+            self.interval = interval(agent) or INTERVAL_S
+            agent.close({**dict.fromkeys(agent.data, NO_COUNTERPART), **_AGENT_REASONS})
+        for one in self._sections("inputs", "modbus", "not a Modbus input", {}):
+            self.found += Input(self.desk, one, self.interval).devices()
+        if not self.found and not self.desk.report.problems:
+            message = "no inputs.modbus with a field that can be converted, allowed: at least one"
+            self.desk.problem(("inputs",), message)
+        share_connections(self.desk, self.found)
+        devices = self._named()
+        outputs = self._outputs()
+        self.root.close(
+            dict.fromkeys(("processors", "aggregators"), "values are published as they are read")
+            | {"secretstores": "secrets are in files; see token_file and password_file"}
+        )
+        return {"devices": devices, **({"outputs": outputs} if outputs else {})}
+
+    def _sections(
+        self, kind: str, name: str, reason: str, reasons: Mapping[str, str] = _OTHER_OUTPUTS
+    ) -> list[Section]:
+        """The tables of a plugin; all others of its kind are left out."""
+        plugins = self.root.mapping(kind)
+        for key in plugins.data if plugins is not None else ():
+            if key != name:
+                self.desk.left_out((kind, key), reasons.get(key, reason))
+        found = _plugins(self.root.data, kind, name)
+        made = [section(self.desk, path, value) for path, value in found]
+        return [each for each in made if each is not None]
+
+    def _named(self) -> dict[str, dict[str, Any]]:
+        """The devices by name: that of the input, with the unit id if another has the same."""
+        names = [each.name for each in self.found]
+        wanted = [
+            (each.path, each.name if names.count(each.name) == 1 else f"{each.name}-{each.unit}")
+            for each in self.found
+        ]
+        unique = unique_names(self.desk, wanted)
+        return {name: each.data for name, each in zip(unique, self.found, strict=True)}
+
+    def _outputs(self) -> dict[str, dict[str, Any]]:
+        reason = "no output is like it; there are influx, mqtt, sparkplug, file and nats"
+        sections = self._sections("outputs", "influxdb_v2", reason)
+        tags = self.root.mapping("global_tags")
+        fields = [each for device in self.found for each in device.fields]
+        measurement = _measurement(self.desk, fields) if sections else MEASUREMENT
+        outputs: dict[str, dict[str, Any]] = {}
+        for one in sections:
+            made = Influx(self.desk, one).read()
+            if made is None:
+                continue
+            made |= {"measurement": measurement} if measurement != MEASUREMENT else {}
+            made |= {"tags": found} if (found := self._global_tags(tags)) else {}
+            outputs[free_name("influx", set(outputs))] = made
+            self._compare(one, fields)
+        if not outputs:
+            self._without_output(tags, fields)
+        return outputs
+
+    def _without_output(self, tags: Section | None, fields: list[Field]) -> None:
+        if tags is not None and tags.data:
+            self.desk.left_out(tags.path, "no output is converted; see tags of outputs")
+        for each in fields:
+            if each.measured_at is not None:
+                message = "no output is converted; see measurement of outputs"
+                self.desk.left_out(each.measured_at, message)
+
+    def _global_tags(self, tags: Section | None) -> dict[str, str]:
+        found = {}
+        for key in tags.data if tags is not None else ():
+            assert tags is not None, "there are keys"
+            value = tags.get(key)
+            if not is_name(key):
+                self.desk.left_out(tags.at(key), f"a tag of an output has {NAME_FORM}")
+            elif key == "device":
+                self.desk.left_out(tags.at(key), "the tag device is the name of the device")
+            elif isinstance(value, str) and value:
+                found[key] = value
+            else:
+                self.desk.left_out(tags.at(key), "a tag without text is not written")
+        return found
+
+    def _compare(self, output: Section, fields: list[Field]) -> None:
+        """Notes how points differ from those of the source."""
+        message = "points have the tag device in place of name, slave_id, type and host"
+        self.desk.changed(output.path, f"{message}: change the queries")
+        names = list(dict.fromkeys(each.name for each in fields if each.retyped))
+        if names:
+            some = listing(names[:_MAX_SHOWN_FIELDS])
+            more = f" and {len(names) - _MAX_SHOWN_FIELDS} more" * (len(names) > _MAX_SHOWN_FIELDS)
+            message = f"{some}{more} have another type than in the source (bits are booleans, "
+            message += "whole numbers integers, those of uint64 floats)"
+            advice = "InfluxDB refuses them in the same measurement of a bucket: use another bucket"
+            self.desk.check(output.path, f"{message}; {advice}")
+
+
+def _measurement(desk: Desk, fields: list[Field]) -> str:
+    """The measurement of all fields; if they have several, notes that the output has one."""
+    all_of_them = {each.measurement for each in fields}
+    if len(all_of_them) == 1:
+        return all_of_them.pop()
+    for each in fields:
+        if each.measured_at is not None:
+            message = "an output has one measurement; add outputs with devices for several"
+            desk.left_out(each.measured_at, message)
+    return MEASUREMENT

@@ -1,0 +1,295 @@
+"""Imports the Modbus inputs of Telegraf: each becomes one device for each unit id that it reads."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote, unquote, urlencode, urlsplit
+
+from holdfast.client.url import MAX_PAUSE_S, MAX_RETRIES, SerialTarget, connection_of, parse
+from holdfast.config.text.messages import show
+from holdfast.config.values.scalars import MIN_TIME
+from holdfast.importing.telegraf.durations import interval, seconds
+from holdfast.importing.telegraf.fields import STYLES, Field, Fields
+from holdfast.importing.telegraf.reasons import FILTERS, LOGGED
+from holdfast.net.addresses import joined
+from holdfast.protocol import MAX_SERIAL_UNIT, READ_BITS, READ_REGISTERS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from holdfast.config.text.yaml_document import KeyPath
+    from holdfast.importing.key_reader import Section
+    from holdfast.importing.notes import Desk
+
+INTERVAL_S = 10
+"""The default of the source."""
+
+TIMEOUT_S = 1
+"""Seconds for an input without a timeout. The source waits without an end."""
+
+_NETWORK_MODES = {"TCP": "tcp", "RTUoverTCP": "rtu+tcp", "ASCIIoverTCP": "ascii+tcp"}
+_SERIAL_MODES = {"RTU": "rtu", "ASCII": "ascii"}
+_PARITY = {"N": "none", "E": "even", "O": "odd"}
+_SERIAL_KEYS = ("baud_rate", "data_bits", "parity", "stop_bits", "rs485")
+
+
+_INPUT_REASONS = {
+    **FILTERS,
+    "alias": "a device has one name",
+    "always_include_global_tags": "an output adds its tags to all points",
+    "always_include_local_tags": "an output adds its tags to all points",
+    "collection_jitter": "first polls are spread over the interval",
+    "collection_offset": "first polls are spread over the interval",
+    "debug_connection": LOGGED,
+    "exclude_register_type_tag": "no point has the tag type",
+    "log_level": LOGGED,
+    "precision": "times are those of the replies, in microseconds",
+    "startup_error_behavior": "a device that can't be reached is tried again",
+    "tags": "add an output with these tags, and with devices: those of this input",
+}
+
+
+@dataclass
+class Device:
+    """A device, with the name that its input has."""
+
+    path: KeyPath
+    name: str
+    unit: int
+    data: dict[str, Any]
+    fields: list[Field]
+
+
+@dataclass
+class Input:
+    """Reads one input."""
+
+    desk: Desk
+    input: Section
+    agent_interval: float | None
+    """`None` if the file has no agent: that can be in another file."""
+    tolerance: dict[str, Any] = field(default_factory=dict)
+    limits: dict[str, int] = field(default_factory=dict)
+
+    def devices(self) -> list[Device]:
+        """A device for each unit id with a tag."""
+        one = self.input
+        name = one.name("name", required=True) or "device"
+        url = self._url()
+        timing = {"interval": self._interval(), "timeout": self._timeout()}
+        location = self._workarounds()
+        self._busy()
+        fields = Fields(self.desk, one, location)
+        style = fields.read()
+        self._rename_measurements(fields)
+        others = {key for each in STYLES if each != style for key in STYLES[each]}
+        reason = f"the source ignored it with configuration_type {style}"
+        one.close(_INPUT_REASONS | dict.fromkeys(others - set(STYLES[style]), reason))
+        made = []
+        for number, unit in fields.units.items():
+            if not unit.fields:
+                continue
+            if url is not None and url.startswith(("rtu:", "ascii:")):
+                self._check_serial_unit(number)
+            data: dict[str, Any] = {"url": url, "unit": number, **timing}
+            if self.tolerance:
+                data["tolerance"] = dict(self.tolerance)
+            data |= {"max_gap": unit.max_gap, **self.limits, "tags": unit.tags(self.desk)}
+            made.append(Device(one.at("name"), name, number, data, unit.fields))
+        return made
+
+    def _check_serial_unit(self, number: int) -> None:
+        if not 1 <= number <= MAX_SERIAL_UNIT:
+            allowed = f"allowed on a serial line: 1 to {MAX_SERIAL_UNIT}"
+            self.desk.problem(self.input.path, f"found slave_id {number}, {allowed}")
+
+    def _interval(self) -> float:
+        given = self.input.get("interval")
+        if given is not None and not isinstance(given, str):
+            message = "the source ignored an interval that is not text; see that of the agent"
+            self.desk.left_out(self.input.at("interval"), message)
+            return self.agent_interval or INTERVAL_S
+        found = interval(self.input)
+        if found is None and self.agent_interval is None:
+            message = f"no agent in this file: {INTERVAL_S} s, the default of the source"
+            self.desk.check(self.input.path, message)
+        return found or self.agent_interval or INTERVAL_S
+
+    def _timeout(self) -> float:
+        given = seconds(self.input, "timeout")
+        if given is None:
+            message = f"no timeout: {TIMEOUT_S} s; the source waited without an end"
+            self.desk.check(self.input.path, message)
+            return TIMEOUT_S
+        if given < MIN_TIME:
+            self.desk.changed(self.input.at("timeout"), "raised to 1 ms, the shortest timeout")
+        return max(given, MIN_TIME)
+
+    def _rename_measurements(self, fields: Fields) -> None:
+        """Applies the keys that change the measurement of all fields."""
+        override = self.input.text("name_override")
+        prefix, suffix = self.input.text("name_prefix"), self.input.text("name_suffix")
+        keys = ("name_override", "name_prefix", "name_suffix")
+        given = [key for key in keys if self.input.get(key)]
+        for each in (each for unit in fields.units.values() for each in unit.fields):
+            each.measurement = f"{prefix or ''}{override or each.measurement}{suffix or ''}"
+            each.measured_at = self.input.at(given[0]) if given else each.measured_at
+
+    def _busy(self) -> None:
+        """Retries of a busy device."""
+        times = self.input.integer("busy_retries", 0, 1_000_000)
+        if self.input.get("busy_retries_wait") is not None:
+            message = "the pause before a retry is at least 0.1 s; see pause of tolerance"
+            self.desk.left_out(self.input.at("busy_retries_wait"), message)
+        if times:
+            self.tolerance |= {"retries": min(times, MAX_RETRIES), "retry_busy": True}
+            message = f"{min(times, MAX_RETRIES)} retries, also after timeouts and lost connections"
+            self.desk.changed(self.input.at("busy_retries"), message)
+
+    def _workarounds(self) -> str | None:
+        """Reads the table of workarounds. Returns where text is in registers."""
+        table = self.input.mapping("workarounds")
+        if table is None:
+            return None
+        for key, ours in (
+            ("pause_after_connect", "pause_after_connect"),
+            ("pause_between_requests", "pause"),
+        ):
+            pause = seconds(table, key)
+            if pause is not None and pause > MAX_PAUSE_S:
+                message = f"found {pause} seconds, allowed: up to {MAX_PAUSE_S}"
+                self.desk.problem(table.at(key), message)
+            elif pause is not None:
+                self.tolerance[ours] = pause
+        if table.flag("close_connection_after_gather"):
+            self.tolerance["close_after"] = 1
+            message = "the connection is closed after each request"
+            self.desk.changed(table.at("close_connection_after_gather"), message)
+        for key, ours, most in (
+            ("max_bit_registers_per_request", "max_bits", READ_BITS),
+            ("max_word_registers_per_request", "max_registers", READ_REGISTERS),
+        ):
+            if number := table.integer(key, 0, most):
+                self.limits[ours] = number
+        location = table.text("string_register_location")
+        if location not in (None, "both", "lower", "upper"):
+            message = f"found {show(location)}, allowed: both, lower or upper"
+            self.desk.problem(table.at("string_register_location"), message)
+        for key in ("one_request_per_field", "read_coils_starting_at_zero"):
+            if table.flag(key):
+                message = "requests are planned from all tags; see max_registers and max_bits"
+                self.desk.left_out(table.at(key), message)
+        table.close()
+        return location
+
+    def _url(self) -> str | None:
+        """The URL of the controller."""
+        text = self.input.text("controller", required=True)
+        if text is None:
+            return None
+        try:
+            parts = urlsplit(text)
+            is_network, port = parts.scheme == "tcp", parts.port
+        except ValueError:
+            self._wrong_controller(text)
+            return None
+        if is_network:
+            made = self._network_url(parts.hostname or "127.0.0.1", port)
+        elif parts.scheme in ("", "file"):
+            made = self._serial_url(f"{parts.netloc}{unquote(parts.path)}")
+        else:
+            made = None
+        try:
+            parse(made or "")
+        except ValueError:
+            self._wrong_controller(text)
+            return None
+        return made
+
+    def _wrong_controller(self, text: str) -> None:
+        forms = "tcp://host:502, file:///dev/ttyUSB0 or COM1"
+        message = f"found {show(text)}, allowed: {forms}"
+        self.desk.problem(self.input.at("controller"), message)
+
+    def _mode(self, modes: Mapping[str, str]) -> str:
+        first = next(iter(modes.values()))
+        if self.input.get("transmission_mode") in (None, "", "auto"):
+            return first
+        return modes.get(self.input.word("transmission_mode", ("auto", *modes)) or "", first)
+
+    def _network_url(self, host: str, port: int | None) -> str | None:
+        mode = self._mode(_NETWORK_MODES)
+        for key in _SERIAL_KEYS:
+            if self.input.get(key) is not None:
+                self.desk.left_out(self.input.at(key), "the source used it for serial lines only")
+        return None if port is None else f"{mode}://{joined(host, port)}"
+
+    def _serial_url(self, device: str) -> str | None:
+        mode = self._mode(_SERIAL_MODES)
+        parity = self.input.get("parity")
+        options = {
+            "baud": self.input.integer("baud_rate", 0, 4_000_000) or 19200,
+            "parity": _PARITY[self.input.word("parity", tuple(_PARITY)) or "E" if parity else "E"],
+            "stop_bits": self.input.integer("stop_bits", 0, 2) or 1,
+        }
+        bits = self.input.integer("data_bits", 0, 8) or 8
+        if mode == "ascii" and bits in (7, 8):
+            options["data_bits"] = bits
+        elif bits != 8:
+            allowed = "7 or 8" if mode == "ascii" else "8 with transmission_mode RTU"
+            self.desk.problem(self.input.at("data_bits"), f"found {bits}, allowed: {allowed}")
+        if (rts := self._rs485()) is not None:
+            options["rs485"] = rts
+        if re.fullmatch(r"COM[0-9]+|\\\\\.\\.+", device):
+            device = f"/{device}"
+        return f"{mode}://{quote(device)}?{urlencode(options)}" if device[:1] == "/" else None
+
+    def _rs485(self) -> str | None:
+        """How the driver switches the direction of the line."""
+        table = self.input.mapping("rs485")
+        if table is None:
+            return None
+        during, after = table.flag("rts_high_during_send"), table.flag("rts_high_after_send")
+        for key in ("delay_rts_before_send", "delay_rts_after_send"):
+            if seconds(table, key):
+                self.desk.left_out(table.at(key), "RTS switches without a delay")
+        if table.flag("rx_during_tx"):
+            message = "an echo is detected; see echo of tolerance"
+            self.desk.left_out(table.at("rx_during_tx"), message)
+        table.close()
+        if bool(during) == bool(after):
+            message = "RTS is the same during and after sending, so it switches nothing"
+            self.desk.left_out(table.path, message)
+            return None
+        return "rts" if during else "rts-low"
+
+
+def share_connections(desk: Desk, devices: list[Device]) -> None:
+    """Devices at one address share a connection: its settings must be the same."""
+    groups: dict[str, list[Device]] = {}
+    for each in devices:
+        if each.data["url"] is not None:
+            groups.setdefault(connection_of(parse(each.data["url"])), []).append(each)
+    for group in groups.values():
+        shared: dict[str, Any] = {}
+        for each in group:
+            for key, value in each.data.get("tolerance", {}).items():
+                shared[key] = max(value, shared.get(key, value))
+            _compare_lines(desk, group[0], each)
+        for each in group:
+            if each.data.get("tolerance", {}) != shared:
+                message = "devices at one address share pauses and retries: those of another input"
+                desk.changed(each.path[:-1], message)
+                each.data["tolerance"] = dict(shared)
+
+
+def _compare_lines(desk: Desk, first: Device, other: Device) -> None:
+    """Refuses different settings of one serial line."""
+    one, two = parse(first.data["url"]), parse(other.data["url"])
+    if one != two and isinstance(one, SerialTarget):
+        line = desk.document.place(first.path, of_key=True).line
+        message = f"found other settings of the line than the input in line {line} has"
+        path = (*other.path[:-1], "controller")
+        desk.problem(path, f"{message}, allowed: the same settings")
