@@ -152,8 +152,8 @@ def test_a_structure_of_several_kinds_is_left_out(imported: Callable[..., Import
         "{name: y, address: 9}]"
     )
     assert list(tags(found)) == ["y"]
-    message = "left out: found '>hf', which is several types: add a tag for each value"
-    assert f"8: modbus[0].sensors[0].structure: {message}" in notes(found)
+    message = "left out: x has the structure '>hf', which is no type here: add a tag for each value"
+    assert f"8: modbus[0].sensors[0]: {message}" in notes(found)
 
 
 def test_types_of_former_versions(imported: Callable[..., Imported]) -> None:
@@ -292,6 +292,123 @@ def test_every_mistake_is_told_with_its_line(imported: Callable[..., Imported]) 
         (8, "modbus[0].sensors[4].slave"),
         (9, "modbus[0].switches"),
     ]
+
+
+def refusals(error: NotImportable) -> list[str]:
+    return [f"{each.line}: {each.key}: {each.message}" for each in error.problems]
+
+
+def test_secrets_are_read_from_the_file_beside_it(
+    imported: Callable[..., Imported], tmp_path: Path
+) -> None:
+    hub = HUB.replace("192.168.1.50", "!secret host").replace("502", "!secret port")
+    sensors = "sensors: [{name: a, address: 1}]"
+    with pytest.raises(NotImportable) as raised:
+        imported(sensors, hub)
+    missing = "which is not in secrets.yaml beside this file, allowed: its value"
+    assert refusals(raised.value) == [
+        f"6: modbus[0].host: found the secret host, {missing}",
+        f"7: modbus[0].port: found the secret port, {missing}",
+    ]
+    (tmp_path / "secrets.yaml").write_text("host: 10.0.0.9\nport: 1502\n")
+    device = imported(sensors, hub).data["devices"]["inverter"]
+    assert device["url"] == "tcp://10.0.0.9:1502"
+
+
+def test_merged_keys_are_those_of_the_entity_unless_it_has_its_own(
+    imported: Callable[..., Imported],
+) -> None:
+    found = imported(
+        "sensors:\n"
+        "      - &base {name: a, address: 1, data_type: uint32, swap: word, slave: 4}\n"
+        "      - {<<: *base, name: b, address: 3}\n"
+        "      - {<<: [{scale: 0.1}, *base], name: c, address: 5, data_type: int32}"
+    )
+    found_tags = tags(found)
+    assert {name: tag["type"] for name, tag in found_tags.items()} == {
+        "a": "uint32",
+        "b": "uint32",
+        "c": "int32",
+    }
+    assert found_tags["c"]["scale"] == 0.1
+    assert [tag["order"] for tag in found_tags.values()] == ["CDAB"] * 3
+
+
+def test_the_section_is_found_in_a_package(imported: Callable[..., Imported]) -> None:
+    inside = "".join(f"      {line}\n" for line in HUB.splitlines()[2:])
+    hub = f"homeassistant:\n  packages:\n    pv:\n{inside}"
+    assert list(tags(imported("sensors: [{name: a, address: 1}]", hub))) == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("port", "url"),
+    [
+        ("/dev/ttyUSB0", "rtu:///dev/ttyUSB0?baud=9600&parity=even&stop_bits=1&pause=0.03"),
+        ("COM3", "rtu:///COM3?baud=9600&parity=even&stop_bits=1&pause=0.03"),
+        ("socket://10.0.0.7:8899", "rtu+tcp://10.0.0.7:8899?pause=0.03"),
+        ("rfc2217://10.0.0.7:8899", None),
+    ],
+)
+def test_ports_of_serial_lines(
+    imported: Callable[..., Imported], port: str, url: str | None
+) -> None:
+    hub = (
+        f"- {{name: line, type: serial, method: rtu, port: '{port}', baudrate: 9600, "
+        "bytesize: 8, parity: E, stopbits: 1, sensors: {name: a, address: 1}}\n"
+    )
+    if url is None:
+        with pytest.raises(NotImportable, match="allowed: a serial port, or socket://host:port"):
+            imported("", hub)
+    else:
+        assert imported("", hub).data["devices"]["line"]["url"] == url
+
+
+def test_notes_that_are_alike_are_one(imported: Callable[..., Imported]) -> None:
+    sensors = ", ".join(f"{{name: s{at}, address: {at}, precision: 1}}" for at in range(9))
+    found = [note for note in notes(imported(f"sensors: [{sensors}]")) if "precision" in note]
+    message = "values are not rounded; Home Assistant can show fewer digits (and 8 more)"
+    assert found == [f"8: modbus[0].sensors[0].precision: left out: {message}"]
+
+
+@pytest.mark.parametrize(
+    ("entity", "message"),
+    [
+        ("data_type: uint16, count: 2", "count: found 2 with data_type uint16, allowed: 1"),
+        ("data_type: uint, count: 3", "count: found 3 with data_type uint, allowed: 1, 2 or 4"),
+        (
+            "data_type: custom, structure: '>2h', count: 2, swap: word",
+            "swap: found word with several values, whose order it changes, allowed: none or byte",
+        ),
+        ("nan_value: xyz", "nan_value: found 'xyz', allowed: an integer"),
+    ],
+)
+def test_what_would_be_another_value_is_refused(
+    imported: Callable[..., Imported], entity: str, message: str
+) -> None:
+    with pytest.raises(NotImportable) as raised:
+        imported(f"sensors: [{{name: x, address: 1, {entity}}}]")
+    assert refusals(raised.value) == [f"8: modbus[0].sensors[0].{message}"]
+
+
+def test_an_entity_ends_with_its_area(imported: Callable[..., Imported]) -> None:
+    with pytest.raises(NotImportable, match="x is at 65535 to 65536, allowed: up to 65535"):
+        imported("sensors: [{name: x, address: 65535, data_type: uint32}]")
+
+
+def test_details_that_mean_something_else_elsewhere(imported: Callable[..., Imported]) -> None:
+    found = imported(
+        "sensors: [{name: count, address: 1, count: 2}, "
+        "{name: text, address: 3, data_type: string, count: 2, scale: 0.1}, "
+        "{name: none, address: 5, data_type: uint16, nan_value: FFFF}]\n"
+        "    switches: [{name: 'on', address: 1, write_type: coil, "
+        "verify: {input_type: holding, address: 20, state_on: 3}}]"
+    )
+    found_tags = tags(found)
+    assert found_tags["count"]["type"] == "int32"
+    assert "scale" not in found_tags["text"]
+    assert found_tags["none"]["null"] == [65535]
+    assert found_tags["on_state"]["states"] == {0: "off", 3: "on"}
+    assert not [note for note in notes(found) if "instead of a switch" in note]
 
 
 @pytest.mark.parametrize(

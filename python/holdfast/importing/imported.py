@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from holdfast.config.text.problems import Problem
-    from holdfast.config.text.yaml_document import KeyPath
+    from holdfast.config.text.yaml_document import KeyPath, Resolve
 
 Generation: TypeAlias = Literal[1, 2]
 ORDINALS: dict[Generation, str] = {1: "first", 2: "second"}
@@ -62,25 +62,33 @@ class NotImportable(ConfigError):
 class Source:
     """A source file while it is read: its `desk` has its data, and takes notes and problems."""
 
-    def __init__(self, path: Path | str, *, only: str | None = None) -> None:
+    def __init__(self, path: Path | str, resolve: Resolve | None = None) -> None:
         """Raises `ConfigError` for a file that can't be read.
 
-        Of a file that has the section `only`, nothing else is read.
+        With `resolve`, for the tags of the source, it also accepted merge keys.
         """
         self.file = str(path)
         text = yaml_document.read_text(Path(path), self.file)
         try:
-            document, found = yaml_document.parse(text, self.file)
+            merges = resolve is not None
+            document, found = yaml_document.parse(text, self.file, resolve, merges=merges)
         except ConfigError as error:
             raise ConfigError(self.file, _without_secrets(text, error.problems)) from None
         self.problems = _without_secrets(text, found)
         self.desk = Desk(document)
-        data = document.data
-        section: KeyPath = ()
-        if only is not None and isinstance(data, dict) and only in data:
-            section, data = (only,), data[only]
-            self.problems = [each for each in self.problems if _is_in(only, each.key)]
-        self._refuse_octal(text.splitlines(), section, data)
+        self._lines = text.splitlines()
+        self._look_at((), document.data)
+
+    def narrow(self, path: KeyPath) -> None:
+        """Reads nothing but the value at a path: problems elsewhere do not matter."""
+        key = self.desk.document.spell(path)
+        self.problems = [each for each in self.problems if _is_in(key, each.key)]
+        self.desk.report.found.clear()
+        self._look_at(path, self.desk.report.raw(path))
+
+    def _look_at(self, path: KeyPath, value: object) -> None:
+        self.desk.broken = {each.key for each in self.problems}
+        self._refuse_octal(self._lines, path, value)
 
     def is_mapping(self) -> bool:
         """Whether the file contains a mapping; adds a problem otherwise."""
@@ -112,7 +120,7 @@ class Source:
 
 def _is_in(section: str, key: str) -> bool:
     """Whether the key of a problem is that of a section, or one inside it."""
-    return re.split(r"[.\[]", key, maxsplit=1)[0] == section
+    return key == section or key.startswith((f"{section}.", f"{section}["))
 
 
 def _without_secrets(text: str, problems: Iterable[Problem]) -> list[Problem]:

@@ -131,6 +131,8 @@ class Section:
 
     def close(self, reasons: Mapping[str, str] | None = None) -> None:
         """Adds a note for every unread key, with the reason if it is known."""
+        if self._has_problem():  # Keys may be unread because of it.
+            return
         known = [key for key in self._asked if isinstance(key, str)]
         for key in self.data:
             if key in self._asked:
@@ -142,6 +144,12 @@ class Section:
             message = (reasons or {}).get(key) or f"unknown key{suggestion(key, known)}"
             self.desk.left_out(self.at(key), message)
 
+    def _has_problem(self) -> bool:
+        """Whether a key of this mapping has a problem itself."""
+        depth = len(self.path)
+        paths = self.desk.report.found.values()
+        return any(path[:depth] == self.path and len(path) <= depth + 1 for path in paths)
+
     def _number(self, value: object) -> object:
         """The number that a text contains, if the source accepted that; else the value."""
         if isinstance(value, str) and self.desk.quoted_numbers:
@@ -152,6 +160,8 @@ class Section:
 
     def _present(self, key: str | int, allowed: str, required: bool) -> Any:
         value = self.get(key)
+        if self.desk.document.spell(self.at(key)) in self.desk.broken:
+            return None
         if value is None and required:
             self.desk.problem_of_key(self.at(key), f"missing, allowed: {allowed}")
         return value

@@ -5,7 +5,8 @@ Messages show found values, but never a secret.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections import Counter
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from holdfast.config.text.report import Report
@@ -45,6 +46,10 @@ class Desk:
     noted: dict[Note, None] = field(default_factory=dict)
     quoted_numbers: bool = False
     """Whether the source accepted numbers in quotes."""
+    folds: bool = False
+    """Whether notes with the same message become one, which counts them."""
+    broken: set[str] = field(default_factory=set)
+    """The keys whose values could not be read, which is a problem of its own."""
 
     def __post_init__(self) -> None:
         self.report = Report(self.document)
@@ -52,7 +57,17 @@ class Desk:
     @property
     def notes(self) -> tuple[Note, ...]:
         """The notes in the order of the file, each once."""
-        return tuple(sorted(self.noted, key=lambda note: (note.line, note.column)))
+        notes = sorted(self.noted, key=lambda note: (note.line, note.column))
+        if not self.folds:
+            return tuple(notes)
+        count = Counter((note.kind, note.message) for note in notes)
+        first = {(note.kind, note.message): note for note in reversed(notes)}
+        return tuple(
+            replace(note, message=f"{note.message} (and {count[same] - 1} more)")
+            if count[same] > 1
+            else note
+            for same, note in reversed(first.items())
+        )
 
     def note(self, kind: Kind, path: KeyPath, message: str) -> None:
         """Adds a note about the key at `path`."""

@@ -18,13 +18,15 @@ from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.runtime import bounded_files
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
     from pathlib import Path
 
     from holdfast.types import YamlEvent
 
 Key: TypeAlias = str | int
 KeyPath: TypeAlias = tuple[Key, ...]
+Resolve: TypeAlias = "Callable[[str, str], Any]"
+"""Returns the value of a scalar by its tag and text. Raises `ValueError`."""
 
 MAX_BYTES = 1 << 20
 """The size limit of a file. It has room for 6,300 devices, which take about 2 s and 80 MB."""
@@ -174,14 +176,21 @@ def read_bytes(path: Path, file: str, max_bytes: int = MAX_BYTES) -> bytes:
         raise _error(file, f"can't be read: {reason}") from None
 
 
-def parse(text: str, file: str) -> tuple[Document, list[Problem]]:
-    """Returns the document and its problems. Raises `ConfigError` if the YAML is not valid."""
+def parse(
+    text: str, file: str, resolve: Resolve | None = None, *, merges: bool = False
+) -> tuple[Document, list[Problem]]:
+    """Returns the document and its problems. Raises `ConfigError` if the YAML is not valid.
+
+    For files of other programs: `resolve` gives scalars with a tag of their own a value, and with
+    `merges` the key `<<` adds the keys of other mappings.
+    """
     if found := _NOT_ALLOWED.search(text):
         line = text[: found.start()].count("\n") + 1
         raise _error(file, f"the character U+{ord(found[0]):04X} is not allowed in YAML", line)
     try:
         # Text without a value has no events, from either parser.
-        reader = _Reader(yaml_events(text, MAX_WRITTEN) or _slow_events(text, file))
+        events = yaml_events(text, MAX_WRITTEN) or _slow_events(text, file)
+        reader = _Reader(events, resolve, merges=merges)
     except _TooMany:
         raise _error(file, f"more than {MAX_WRITTEN} keys and values, the limit") from None
     except RecursionError:
@@ -210,7 +219,11 @@ def _slow_events(text: str, file: str) -> Iterator[YamlEvent]:
 class _Reader:
     """Makes data of the events of one document."""
 
-    def __init__(self, events: Iterable[YamlEvent]) -> None:
+    def __init__(
+        self, events: Iterable[YamlEvent], resolve: Resolve | None, *, merges: bool
+    ) -> None:
+        self._resolve = resolve
+        self._merges = merges
         self.mistakes: list[tuple[Place, KeyPath, str]] = []
         self._events = iter(events)
         self._left = MAX_WRITTEN
@@ -246,7 +259,13 @@ class _Reader:
         if text is not None:
             kind = "" if tag is None and what == "plain" else (tag or "!").removeprefix(_TAG)
             try:
-                data = text if kind == "!" else scalar(text, kind)
+                data: Any
+                if kind == "!":
+                    data = text
+                elif kind.startswith("!") and self._resolve is not None:
+                    data = self._resolve(kind, text)
+                else:
+                    data = scalar(text, kind)
             except ValueError as error:
                 return self._refused(event, path, str(error))
             empty = text == "" and what == "plain"
@@ -270,8 +289,12 @@ class _Reader:
     def _mapping(self, start: YamlEvent, path: KeyPath) -> tuple[Any, _Spot]:
         spot = _Spot(_place(start))
         data: dict[Key, Any] = {}
+        merged: list[tuple[Any, _Spot]] = []
         for event in self._until_end():
             key = self._key(event, path)
+            if key == "<<" and self._merges:
+                merged.append(self._value(next(self._events), (*path, key)))
+                continue
             if key in data:
                 first = spot.children[key][0].line
                 name = str(key) if isinstance(key, int) else show(key)
@@ -285,7 +308,19 @@ class _Reader:
             data[key] = value
             spot.children[key] = (_place(event), child)
             spot.values += child.values
+        for value, child in merged:
+            self._merge(data, spot, value, child)
         return data, spot
+
+    def _merge(self, data: dict[Key, Any], spot: _Spot, value: Any, child: _Spot) -> None:
+        """Adds the keys of a mapping, or of a list of them, that are not there."""
+        spot.values += child.values
+        if isinstance(value, list):
+            for index, each in enumerate(value):
+                self._merge(data, spot, each, child.children[index][1])
+        elif isinstance(value, dict):
+            for key in [key for key in value if key not in data]:
+                data[key], spot.children[key] = value[key], child.children[key]
 
     def _until_end(self) -> Iterator[YamlEvent]:
         """The events of a list, or of the keys of a mapping, until it ends."""

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.config.text.messages import show
 from holdfast.importing.names import MAX_LENGTH, free_name
-from holdfast.protocol import LAST_ADDRESS
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.values import register_count
 
 if TYPE_CHECKING:
+    from holdfast.config.text.yaml_document import KeyPath
     from holdfast.importing.key_reader import Section
     from holdfast.importing.notes import Desk
     from holdfast.types import Area
@@ -69,6 +70,8 @@ class Places:
 
     desk: Desk
     tags: dict[str, dict[str, Any]] = field(default_factory=dict)
+    at: KeyPath = ()
+    """The place of the entity that is being read."""
 
     def add(self, name: str, area: Area, address: int, **settings: Any) -> None:
         """Adds a tag; its name is that of an entity id, and `name` its description."""
@@ -76,6 +79,10 @@ class Places:
         wanted = re.sub(r"[^a-z0-9]+", "_", plain).strip("_")[:MAX_LENGTH] or "entity"
         tag = {"area": area, "address": address, **settings}
         key = free_name(wanted, set(self.tags))
+        size = register_count(settings["type"]) if "type" in settings else 1
+        if address + size > ADDRESSES:
+            message = f"{name} is at {address} to {address + size - 1}"
+            self.desk.problem(self.at, f"{message}, allowed: up to {LAST_ADDRESS}")
         self.tags[key] = tag if key == name else {**tag, "description": name}
 
 
@@ -101,7 +108,12 @@ def _sensor(places: Places, entity: Section) -> None:
     address, settings = _address(entity), _typed(entity)
     if address is None or settings is None:
         return
-    settings |= _scaled(entity)
+    scaled = _scaled(entity)
+    if settings["type"].startswith("string"):
+        for key in [key for key, value in scaled.items() if value is not None]:
+            entity.desk.left_out(entity.at(key), "a text has none")
+            scaled[key] = None
+    settings |= scaled
     settings["unit"] = entity.text("unit_of_measurement")
     settings["null"] = _null(entity, settings["type"])
     size = register_count(settings["type"])
@@ -135,8 +147,8 @@ def _scaled(entity: Section, prefix: str = "") -> dict[str, Any]:
 def _typed(entity: Section) -> dict[str, Any] | None:
     """Type, byte order and encoding; `None` if there is no such type here."""
     kinds = (*_TYPES, "int", "uint", "float", "string", "custom")
-    kind = entity.word("data_type", kinds) or "int16"
     count = entity.integer("count", 1, 125)
+    kind = entity.word("data_type", kinds) or ("int16" if count is None else "int")
     structure = entity.text("structure")
     swap = entity.word("swap", tuple(_ORDERS)) or "none"
     if entity.flag("reverse_order"):
@@ -154,6 +166,9 @@ def _typed(entity: Section) -> dict[str, Any] | None:
         message = f"found {count} with data_type {kind}, allowed: 1, 2 or 4"
         entity.desk.problem(entity.at("count"), message)
         return None
+    if count not in (None, register_count(kind)):
+        message = f"found {count} with data_type {kind}, allowed: {register_count(kind)}"
+        entity.desk.problem(entity.at("count"), message)
     return {"type": kind, "order": _ORDERS[swap]}
 
 
@@ -164,9 +179,12 @@ def _structure(
     found = _STRUCTURE.fullmatch(structure or "")
     number = int(found[2] or 1) if found else 0
     if found is None or not number:
-        message = f"found {show(structure)}, which is several types: add a tag for each value"
-        entity.desk.left_out(entity.at("structure"), message)
+        message = f"{_name(entity)} has the structure {show(structure)}, which is no type here"
+        entity.desk.left_out(entity.path, f"{message}: add a tag for each value")
         return None
+    if number > 1 and swap in ("word", "word_byte") and found[3] != "s":
+        message = f"found {swap} with several values, whose order it changes, allowed: none or byte"
+        entity.desk.problem(entity.at("swap"), message)
     # Without a sign, the source used the order of its processor, which is the little one.
     orders = _ORDERS if found[1] in (">", "!") else _LITTLE_ORDERS
     if found[3] == "s":
@@ -183,9 +201,9 @@ def _null(entity: Section, kind: str) -> list[int | float]:
     if given is None:
         return []
     try:
-        number = int(given, 0) if isinstance(given, str) else given
+        number = int(given) if isinstance(given, str) else given
     except ValueError:
-        number = None
+        number = _hexadecimal(given)
     if type(number) is not int:
         entity.desk.problem(entity.at("nan_value"), f"found {show(given)}, allowed: an integer")
         return []
@@ -198,6 +216,13 @@ def _null(entity: Section, kind: str) -> list[int | float]:
     bits = 16 * register_count(kind)
     least, most = (0, 2**bits) if kind.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1))
     return [each for each in candidates if least <= each < most]
+
+
+def _hexadecimal(text: str) -> int | None:
+    try:
+        return int(text, 16)
+    except ValueError:
+        return None
 
 
 def _binary_sensor(places: Places, entity: Section) -> None:
@@ -253,7 +278,7 @@ def _verify(places: Places, entity: Section, verify: Section, written: _Written)
     verify.close()
     if (its_area, its_address, its_on, its_off) == (area, address, on, off):
         return
-    settings = _two_states(entity, its_area, its_on, its_off)
+    settings = _two_states(entity, its_area, its_on, its_off, writable=False)
     places.add(f"{_name(entity)} state", its_area, its_address, **settings)
     entity.desk.changed(verify.path, "the state that is read is an entity of its own")
 
@@ -269,13 +294,16 @@ def _numbers(entity: Section, key: str) -> list[int]:
     return []
 
 
-def _two_states(entity: Section, area: Area, on: list[int], off: list[int]) -> dict[str, Any]:
+def _two_states(
+    entity: Section, area: Area, on: list[int], off: list[int], *, writable: bool = True
+) -> dict[str, Any]:
     """A bit, a register that is a bit, or one with names for its numbers."""
     if area in _BITS:
         return {}
     if (on, off) == ([1], [0]):
         return {"type": "bool"}
-    entity.desk.changed(entity.path, "a select of on and off instead of a switch")
+    if writable:
+        entity.desk.changed(entity.path, "a select of on and off instead of a switch")
     return _states([*((number, "off") for number in off), *((number, "on") for number in on)])
 
 

@@ -6,10 +6,14 @@ A hub becomes one device for each unit id that its entities name.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlencode
 
+from holdfast.client.url import parse
+from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import show
+from holdfast.config.text.problems import ConfigError
 from holdfast.importing.home_assistant.entities import PLATFORMS, Entities, Places
 from holdfast.importing.imported import Imported, Source
 from holdfast.importing.key_reader import Section, section
@@ -18,14 +22,13 @@ from holdfast.net.addresses import joined
 from holdfast.protocol import MAX_UNIT
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from holdfast.config.text.yaml_document import KeyPath
     from holdfast.importing.notes import Desk
 
 TIMEOUT_S = 3
 SCAN_INTERVAL_S = 15
-"""Defaults of the source."""
+SERIAL_WAIT_MS = 30
+"""Defaults of the source; the last is the pause between two requests on a serial line."""
 
 BROKER = "mqtt://homeassistant.local"
 
@@ -38,21 +41,21 @@ _HUB_REASONS = {
     "retry_on_empty": "see retries of tolerance",
 }
 _ENTITY_REASONS = {
-    "lazy_error_count": "an entity is unavailable while its device does not answer",
-    "min_value": "values are not limited",
-    "max_value": "values are not limited",
-    "zero_suppress": "small values are not replaced by 0",
-    "temp_step": "the step is the scale",
-}
-_LOOKS = {
-    "precision": "values are not rounded; Home Assistant can show fewer digits",
+    "brightness_address": "brightness is not converted: add a tag",
     "device_class": "it comes from the unit, if that has only one meaning",
+    "lazy_error_count": "an entity is unavailable while its device does not answer",
+    "max_value": "values are not limited",
+    "min_value": "values are not limited",
+    "precision": "values are not rounded; Home Assistant can show fewer digits",
     "state_class": "numbers are measurements, and energies totals",
+    "target_temp_write_registers": "one register is written with function 6",
+    "temp_step": "the step is the scale",
     "unique_id": "the new entities have ids of their own",
     "write_registers": "one register is written with function 6",
-    "target_temp_write_registers": "one register is written with function 6",
+    "zero_suppress": "small values are not replaced by 0",
 }
-"""Keys that change no value, each with one note in all."""
+_MAX_DEPTH = 3
+"""How deep the section can be in a file: as in `homeassistant: packages: NAME: modbus`."""
 
 
 def read_home_assistant(path: Path | str) -> Imported:
@@ -60,25 +63,61 @@ def read_home_assistant(path: Path | str) -> Imported:
 
     Raises `ConfigError` with every problem that prevents the import.
     """
-    source = Source(path, only="modbus")
-    source.desk.quoted_numbers = True
-    data = source.desk.document.data
-    root: KeyPath = ("modbus",) if isinstance(data, dict) and "modbus" in data else ()
-    hubs = data["modbus"] if root else data
-    entries = [(root, hubs)] if isinstance(hubs, dict) else []
+    source = Source(path, _Tags(Path(path).parent).resolve)
+    desk = source.desk
+    desk.quoted_numbers = desk.folds = True
+    root = _modbus((), desk.document.data)
+    if root is not None:
+        source.narrow(root)
+    hubs = desk.report.raw(root or ())
+    entries = [(root or (), hubs)] if isinstance(hubs, dict) else []
     if isinstance(hubs, list):
-        entries = [((*root, index), hub) for index, hub in enumerate(hubs)]
+        entries = [((*(root or ()), index), hub) for index, hub in enumerate(hubs)]
     elif not entries and not source.problems:
         found = "nothing" if hubs is None else show(hubs)
-        source.desk.problem(root, f"found {found}, allowed: the hubs of modbus")
-    found_hubs = [section(source.desk, path, hub) for path, hub in entries]
-    devices = _devices(source.desk, [hub for hub in found_hubs if hub is not None])
-    if not devices and not source.desk.report.problems and not source.problems:
-        source.desk.problem(root, "no hub has an entity that can be converted")
+        desk.problem(root or (), f"found {found}, allowed: the hubs of modbus")
+    found_hubs = [section(desk, path, hub) for path, hub in entries]
+    devices = _devices(desk, [hub for hub in found_hubs if hub is not None])
+    if not devices and not desk.report.problems and not source.problems:
+        desk.problem(root or (), "no hub has an entity that can be converted")
     source.finish()
-    return Imported(
-        source.file, "home-assistant", "Home Assistant", _config(devices), source.desk.notes
-    )
+    return Imported(source.file, "home-assistant", "Home Assistant", _config(devices), desk.notes)
+
+
+def _modbus(path: KeyPath, data: Any) -> KeyPath | None:
+    """The path of the first section `modbus`."""
+    if not isinstance(data, dict) or len(path) > _MAX_DEPTH:
+        return None
+    if "modbus" in data:
+        return (*path, "modbus")
+    found = (_modbus((*path, key), value) for key, value in data.items())
+    return next((each for each in found if each is not None), None)
+
+
+class _Tags:
+    """Gives tags of the source a value: `!secret`, from the file beside it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = folder / "secrets.yaml"
+        self._secrets: dict[Any, Any] | None = None
+
+    def resolve(self, kind: str, text: str) -> Any:
+        if kind != "!secret":
+            raise ValueError(f"found {kind} {text}, allowed: what is in that file")
+        if self._secrets is None:
+            self._secrets = self._read()
+        if text not in self._secrets:
+            missing = f"which is not in {self._file.name} beside this file"
+            raise ValueError(f"found the secret {text}, {missing}, allowed: its value")
+        return self._secrets[text]
+
+    def _read(self) -> dict[Any, Any]:
+        try:
+            text = yaml_document.read_text(self._file, str(self._file))
+            data = yaml_document.parse(text, str(self._file))[0].data
+        except ConfigError:
+            return {}
+        return data if isinstance(data, dict) else {}
 
 
 def _config(devices: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -97,9 +136,9 @@ def _devices(desk: Desk, hubs: list[Section]) -> dict[str, dict[str, Any]]:
         for hub, number in zip(hubs, numbers, strict=True)
     ]
     names = unique_names(desk, wanted)
-    taken, devices, looks = set(names), {}, _Looks(desk)
+    taken, devices = set(names), dict[str, dict[str, Any]]()
     for name, hub in zip(names, hubs, strict=True):
-        read = _Hub(desk, hub, looks)
+        read = _Hub(desk, hub)
         read.read()
         units = {number: unit for number, unit in read.units.items() if unit.places.tags}
         for number, unit in units.items():
@@ -107,37 +146,17 @@ def _devices(desk: Desk, hubs: list[Section]) -> dict[str, dict[str, Any]]:
             taken.add(its_name)
             devices[its_name] = {"url": read.url, **unit.device(number, read.timeout)}
     if devices:
-        _to_check(desk, hubs[0].path, devices)
-    looks.note()
+        _to_check(desk, hubs[0].path)
     return devices
 
 
-def _to_check(desk: Desk, path: KeyPath, devices: dict[str, dict[str, Any]]) -> None:
+def _to_check(desk: Desk, path: KeyPath) -> None:
     """What a person must know before both run."""
     desk.check(path, f"the broker is {BROKER}: set its address, username and password_file")
     moved = "entities are new, under MQTT: remove this section, then rename them to keep their ids"
     desk.check(path, f"{moved} and their history")
-    tags = [tag for device in devices.values() for tag in device["tags"].values()]
-    if any(tag.get("type", "").startswith("float") for tag in tags):
-        desk.check(path, "floats are not rounded to two digits")
-
-
-@dataclass
-class _Looks:
-    """Notes on keys that many entities have, and that change no value."""
-
-    desk: Desk
-    found: dict[str, list[KeyPath]] = field(default_factory=dict)
-
-    def collect(self, entity: Section) -> None:
-        for key in _LOOKS:
-            if entity.get(key) is not None:
-                self.found.setdefault(key, []).append(entity.at(key))
-
-    def note(self) -> None:
-        for key, paths in self.found.items():
-            more = f" (and {len(paths) - 1} more)" if len(paths) > 1 else ""
-            self.desk.left_out(paths[0], f"{_LOOKS[key]}{more}")
+    digits = "the source had 2 digits of floats, none of integers"
+    desk.check(path, f"values are not rounded; {digits}")
 
 
 @dataclass
@@ -166,7 +185,6 @@ class _Hub:
 
     desk: Desk
     hub: Section
-    looks: _Looks
     url: str = ""
     timeout: float = TIMEOUT_S
     units: dict[int, _Unit] = field(default_factory=dict)
@@ -201,18 +219,21 @@ class _Hub:
         else:
             unit.intervals.append((entity.path, SCAN_INTERVAL_S))
         if entity.text("name", required=True) is not None:
+            unit.places.at = entity.path
             convert(unit.places, entity)
-        self.looks.collect(entity)
         entity.close(_ENTITY_REASONS)
 
     def _network_url(self, kind: str) -> str:
         host = self.hub.text("host", required=True) or ""
         port = self.hub.integer("port", 1, 65535, required=True, what="a port") or 0
-        return f"{_SCHEMES[kind]}://{joined(host, port)}{self._query({})}"
+        url = f"{_SCHEMES[kind]}://{joined(host, port)}"
+        if host and port:
+            self._check(url, "host")
+        return f"{url}{self._query({}, 0)}"
 
     def _serial_url(self) -> str:
         hub = self.hub
-        method = hub.word("method", ("rtu", "ascii"), required=True)
+        method = hub.word("method", ("rtu", "ascii"), required=True) or "rtu"
         port = hub.text("port", required=True) or ""
         parity = hub.word("parity", tuple(_PARITY), required=True, any_case=True)
         options = {
@@ -225,11 +246,29 @@ class _Hub:
             options["data_bits"] = bits
         elif bits == 7:
             self.desk.problem(hub.at("bytesize"), "found 7 with method rtu, allowed: 8")
-        return f"{method}://{quote(port)}{self._query(options)}"
+        scheme, mark, address = port.partition("://")
+        url, query = f"{method}://{quote(port)}", self._query(options, SERIAL_WAIT_MS)
+        if mark and scheme == "socket":
+            url, query = f"{method}+tcp://{address}", self._query({}, SERIAL_WAIT_MS)
+        elif mark:
+            message = f"found {show(port)}, allowed: a serial port, or socket://host:port"
+            self.desk.problem(hub.at("port"), message)
+        elif not port.startswith("/"):
+            url = f"{method}:///{quote(port)}"
+        if (port and not mark) or scheme == "socket":
+            self._check(url, "port")
+        return f"{url}{query}"
 
-    def _query(self, options: dict[str, Any]) -> str:
+    def _check(self, url: str, key: str) -> None:
+        try:
+            parse(url)
+        except ValueError as error:
+            self.desk.problem(self.hub.at(key), str(error))
+
+    def _query(self, options: dict[str, Any], usual_wait_ms: int) -> str:
         """Options of the line, and pauses that the source made."""
         wait = self.hub.integer("message_wait_milliseconds", 0, 60_000, what="milliseconds")
+        wait = usual_wait_ms if wait is None else wait
         delay = self.hub.integer("delay", 0, 60, what="seconds")
         pauses = {"pause": wait / 1000 if wait else None, "pause_after_connect": delay or None}
         given = {key: value for key, value in {**options, **pauses}.items() if value is not None}

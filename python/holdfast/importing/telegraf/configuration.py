@@ -58,7 +58,7 @@ def read_telegraf(path: Path | str) -> Imported:
 
     Raises `ConfigError` with every problem that prevents the import.
     """
-    desk = Desk(document(path))
+    desk = Desk(document(path), folds=True)
     file = desk.document.file
     root = Section(desk, (), desk.document.data)
     if not _refuse_variables(desk):
