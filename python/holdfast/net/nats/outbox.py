@@ -66,11 +66,11 @@ class Outbox:
         self._client = client
         self._has_messages.set()
 
-    def put(self, messages: Iterable[tuple[object, bytes]]) -> None:
-        """Adds messages. Each has a key, such as device and tag; a newer message replaces it."""
+    def put(self, messages: Iterable[tuple[object, bytes]], of: object = None) -> None:
+        """Adds messages `of` a device, each with a key such as its tag; a newer one replaces it."""
         if self._kept or self._queue_bytes > MAX_BACKLOG_BYTES or not self._accepts():
             for key, text in messages:
-                self._keep(key, text)
+                self._keep((of, key), text)
         else:
             texts = [text for _, text in messages]
             self._queue += texts

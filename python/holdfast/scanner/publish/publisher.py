@@ -2,7 +2,7 @@
 
 The blocks of a device nearly always have the same shape. For each shape, `_BlockPart` caches
 everything that does not depend on the values: their places, and the text around them. A value then
-costs only its own JSON and one formatting of bytes.
+costs only its own JSON and joining it with them.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ Place: TypeAlias = "tuple[Area, int, int]"
 """Area, address and count of a block."""
 
 Shape: TypeAlias = tuple[Place, ...]
+_Template: TypeAlias = tuple[bytes, int, bytes, bytes]
+"""A message around its value: what precedes the size of the payload, the size without value and
+time, and what is before and after the value."""
 Message: TypeAlias = tuple[str, bytes]
 """The id of a tag, and the text that publishes its value."""
 
@@ -151,13 +154,11 @@ class Publisher:
             if not compiled or not group.due_time.claim(due):
                 continue
             for block, part in compiled:
-                part_messages = self._part_messages(part, *answered[block])
+                found = self._part_messages(part, *answered[block])
                 # The group for first values comes first; no tag is published twice in one poll.
                 if first and not group.is_once:
-                    part_messages = (
-                        message for message in part_messages if message[0] not in first
-                    )
-                messages += part_messages
+                    found = [message for message in found if message[0] not in first]
+                messages += found
             if group.is_once:
                 first = {id for id, _ in messages}
         if self._fresh and any(id in self._fresh for id, _ in messages):
@@ -175,7 +176,7 @@ class Publisher:
         self._groups = groups
         self._shapes.clear()
 
-    def _part_messages(self, part: _BlockPart, data: bytes, timestamp: bytes) -> Iterable[Message]:
+    def _part_messages(self, part: _BlockPart, data: bytes, timestamp: bytes) -> list[Message]:
         """Returns the messages of the tags of one group in one block."""
         values = part.decoder(data)
         if part.needs_cleaning:
@@ -184,14 +185,15 @@ class Publisher:
             texts = _encode(values)[1:-1].split(b",")
         else:
             texts = [b"null" if type(value) is Undecoded else _encode(value) for value in values]
-        rows: Iterator[Any] = zip(part.ids, part.lengths, part.templates, texts, strict=True)
+        rows: Iterator[Any] = zip(part.ids, part.templates, texts, strict=True)
         if part.needs_filter:
             rows = compress(rows, self._filtered(part, values))
-        digits = len(timestamp)
-        return (
-            (id, template % (length + digits + len(text), text, timestamp))
-            for id, length, template, text in rows
-        )
+        end, digits = timestamp + b"}\r\n", len(timestamp)
+        join, sizes = b"".join, _SIZES
+        return [
+            (id, join((head, sizes[length + digits + len(text)], before, text, after, end)))
+            for id, (head, length, before, after), text in rows
+        ]
 
     def _filtered(self, part: _BlockPart, values: Sequence[Any]) -> list[bool]:
         """Returns which values to publish; in a group that publishes changes, the changed ones.
@@ -242,15 +244,13 @@ class Publisher:
     def _block_part(self, scheduled: _ScheduledGroup, tags: list[Tag], block: Place) -> _BlockPart:
         _, address, count = block
         group = scheduled.group
-        texts = [self._template(tag) for tag in tags]
         is_infallible = all(tag.type in _INFALLIBLE_TYPES and tag.source is None for tag in tags)
         remembered = group.change or any(tag.id in self._last for tag in tags)
         return _BlockPart(
             decoder(tags, address, count),
             tags,
             [tag.id for tag in tags],
-            [text for text, _ in texts],
-            [length for _, length in texts],
+            [self._template(tag) for tag in tags],
             [scheduled.deadbands[tag.id] for tag in tags],
             is_plain_json=is_infallible,
             needs_cleaning=remembered or any(tag.null or tag.meaning is not None for tag in tags),
@@ -258,23 +258,29 @@ class Publisher:
             needs_filter=remembered or not is_infallible,
         )
 
-    def _template(self, tag: Tag) -> tuple[bytes, int]:
-        """Returns the text of a message, with placeholders, and the fixed part of its length."""
+    def _template(self, tag: Tag) -> _Template:
         message = _encode(Data(self._prefix, self._device, tag.id, None, tag.datatype, 0))
         # What follows the value has no `null`, whatever the ids have.
         before, _, rest = message.rpartition(b"null")
         after = rest.removesuffix(b"0}")
-        # `%` in an id must survive the formatting of the template in `_part_messages`.
-        text = before.replace(b"%", b"%%") + b"%b" + after + b"%b}"
         subject = self._dialect.data_subject(self._prefix, self._device, tag.id).encode()
-        size, header = len(before) + len(after) + 1, self._header
-        escaped = subject.replace(b"%", b"%%")
-        # The size of the payload is only known with the value: it stays a placeholder (`%d`).
-        head_line = b"PUB %b %%d\r\n" % escaped
+        header = self._header
+        head = b"PUB %b " % subject
         if header:
-            head_line = b"HPUB %b %d %%d\r\n%b" % (escaped, len(header), header)
-        return head_line + text + b"\r\n", size + len(header)
+            head = b"HPUB %b %d " % (subject, len(header))
+        length = len(header) + len(before) + len(after) + len(b"}")
+        return head, length, b"\r\n" + header + before, after
 
+
+class _Sizes(dict[int, bytes]):
+    """The sizes of payloads as text."""
+
+    def __missing__(self, size: int) -> bytes:
+        text = self[size] = b"%d" % size
+        return text
+
+
+_SIZES = _Sizes()
 
 _INFALLIBLE_TYPES = {
     "bool",
@@ -291,10 +297,7 @@ class _BlockPart(NamedTuple):
     decoder: Decoder
     tags: Sequence[Tag]
     ids: Sequence[str]
-    templates: Sequence[bytes]
-    """The messages, with placeholders for length, value and time."""
-    lengths: Sequence[int]
-    """The lengths of the payloads without values and times."""
+    templates: Sequence[_Template]
     deadbands: Sequence[float]
     is_plain_json: bool
     """Whether all values can be encoded as one JSON array and split at the commas."""

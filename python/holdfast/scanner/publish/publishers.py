@@ -66,12 +66,11 @@ class Publishers:
         """Publishes the results of a poll that are due."""
         id = device.id
         messages = self._publishers[id].messages(due, blocks)
-        self._outbox.put([((id, tag), text) for tag, text in messages])
+        self._outbox.put(messages, of=id)
         if len(device.subjects) > 1:
             one, other = (f"{self._prefix}.data.{name}" for name in device.subjects)
-            self._outbox.put(
-                [((id, tag, other), batch.readdressed(text, one, other)) for tag, text in messages]
-            )
+            again = [((tag, other), batch.readdressed(text, one, other)) for tag, text in messages]
+            self._outbox.put(again, of=id)
 
     def publish_state(self, device: ScannedDevice) -> None:
         """Publishes and stores the state of a device, if this scanner polls it."""
@@ -93,7 +92,7 @@ class Publishers:
             text = batch.text(subject, device.status)
             if (lease := self._placement.lease(device)) is not None:
                 text = batch.leased(text, lease)
-            self._outbox.put([((device.id, subject), text)])
+            self._outbox.put([(subject, text)], of=device.id)
 
     def _begin(self, device: ScannedDevice) -> Publisher:
         lease = self._placement.lease(device)
