@@ -12,8 +12,10 @@ import pytest
 
 import holdfast
 from holdfast.appliance import Appliance
+from holdfast.appliance.parts import tag_values
 from holdfast.appliance.parts.tag_values import TagValues
 from holdfast.config import load
+from holdfast.events import log_lines
 from holdfast.outputs.buffer_file import Stored
 from support import wire
 from support.polled import Fake, data, exception
@@ -208,6 +210,7 @@ class Polls:
         self.waiting: queue.Queue[Any] = queue.Queue()
         self.empty = 0
         """How often there was none."""
+        self.dropped = 0
 
     def take(self, _: float) -> Any:
         try:
@@ -249,6 +252,42 @@ def test_a_poll_of_a_device_that_was_replaced_is_not_of_the_new_one(tmp_path: Pa
     finally:
         polls.waiting.put(None)
         found.join(wire.DEADLINE)
+
+
+def test_a_backlog_is_handled_in_turns_and_losses_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tag_values, "_TURN_S", 0.0)
+    polls: Any = Polls()
+    found = TagValues(polls, time.monotonic())
+    turns: list[int] = []
+    offer = found._offer
+
+    def counted(polls: Any) -> None:
+        turns.append(len(polls))
+        offer(polls)
+
+    monkeypatch.setattr(found, "_offer", counted)
+    events: list[tuple[str, Any]] = []
+
+    def observer(event: str, fields: Any, _by: object, _times: int) -> None:
+        events.append((event, fields["count"]))
+
+    found.adopt(load(saved(tmp_path, settings(502))))
+    log_lines.observe(observer)
+    found.start()
+    try:
+        registers = [("holding_registers", 0, 6, bytes(12), 0, 0.0)]
+        polls.dropped = 7
+        polls.waiting.put(([("m", float(at), registers) for at in range(5)], []))
+        wire.until(lambda: len(turns) >= 5 and bool(events), "all are handled")
+    finally:
+        polls.waiting.put(None)
+        found.join(wire.DEADLINE)
+        log_lines.forget(observer)
+    assert turns == [1] * 5
+    assert events == [("tag_polls_dropped", 7)]
+    assert found.dropped == 7
 
 
 def test_values_are_metrics(tmp_path: Path, device: int, memory: holdfast.Memory) -> None:

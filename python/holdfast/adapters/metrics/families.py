@@ -79,6 +79,7 @@ def all_metrics(diagnostics: DiagnosticsSource) -> Iterator[Metric]:
         stats,
         events_lost="Listener events that were not logged.",
         log_dropped="Log lines that were dropped because nobody read them.",
+        tag_polls_dropped="Polls whose values no output got, because too many came.",
     )
     if stats["memory_files"]:
         files = {

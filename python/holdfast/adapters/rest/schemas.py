@@ -218,6 +218,7 @@ _DIAGNOSTICS: dict[str, Schema] = {
             ),
             "events_lost": COUNT,
             "log_dropped": COUNT,
+            "tag_polls_dropped": COUNT,
             "memory_files": map_of(_MEMORY_FILE, "By path: the files that keep memories"),
             "logs": map_of(_LOG, "By name: the logs that memories are replicated through"),
             "audit": _AUDIT,

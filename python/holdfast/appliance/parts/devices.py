@@ -150,7 +150,8 @@ class Devices(Part):
         for name in found.keys() & aging.keys():
             found[name]["mirrors"] = aging[name]
         links = {name: link.counters() for name, link in self._links.items()}
-        return {"devices": found, "links": links}
+        dropped = 0 if self.values is None else self.values.dropped
+        return {"devices": found, "links": links, "tag_polls_dropped": dropped}
 
     def health(self) -> dict[str, str]:
         """The health of each polled device when `log_changes` looked last. Thread-safe."""

@@ -1,12 +1,19 @@
-"""The values of tags: from the native poller to the outputs, on a thread of its own."""
+"""The values of tags: from the native poller to the outputs, on a thread of its own.
+
+It handles polls in short turns, so that nobody waits long for its lock. If it can't keep up, it
+rests between turns, because outputs need the processor too; polls stay in the poller, which drops
+the oldest.
+"""
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
+from collections import deque
 from dataclasses import dataclass
 from math import inf
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from holdfast.client.url import NetworkTarget
 from holdfast.config.models.devices import DeviceIdentityConfig
@@ -18,7 +25,7 @@ from holdfast.polling.readings import Reader
 from holdfast.runtime.heartbeat import Heartbeat
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable
+    from collections.abc import Callable, Collection, Iterator, Sequence
 
     from holdfast._core import Results
     from holdfast.config import Config
@@ -28,13 +35,20 @@ if TYPE_CHECKING:
     from holdfast.outputs.buffer_file import Stored
     from holdfast.polling import DevicePoll
     from holdfast.tags import Tag
-    from holdfast.types import ThreadHeartbeat
+    from holdfast.types import PolledBlock, ThreadHeartbeat
 
 _WAIT_S = 1.0
 """How long one wait for polls takes."""
 
 _GATHER_S = 0.005
 """How long a batch waits for more polls, so that batches have a useful size."""
+
+
+_TURN_S = 0.01
+"""Time of polls that are handled while others wait for the lock."""
+
+Poll: TypeAlias = "tuple[str, float, list[PolledBlock]]"
+"""The device, the scheduled time in seconds, and the blocks."""
 
 
 def _info(device: DeviceConfig) -> DeviceInfo:
@@ -83,6 +97,8 @@ class TagValues:
         """Changes when a device stops to answer, or answers again."""
         self._heartbeat = Heartbeat()
         self._ending = threading.Event()
+        self._told = 0
+        """Dropped polls that were logged."""
         self._thread = threading.Thread(target=self._run, name="holdfast-tags", daemon=True)
 
     def start(self) -> None:
@@ -91,7 +107,8 @@ class TagValues:
             self._thread.start()
 
     def join(self, timeout: float) -> None:
-        """Waits for the thread, which ends with the poller."""
+        """Waits for the thread, which ends with the poller and does not rest any more."""
+        self._ending.set()
         if self._thread.ident is not None:
             self._thread.join(timeout)
 
@@ -187,28 +204,48 @@ class TagValues:
             return None
         return self._thread.name, self._heartbeat.age, self._thread.native_id
 
+    @property
+    def dropped(self) -> int:
+        """Polls that were lost because this thread did not keep up."""
+        return self.results.dropped
+
     def _run(self) -> None:
         while (taken := self.results.take(_WAIT_S)) is not None:
             self._heartbeat.beat()
-            found = taken[0]
-            if not found:
+            if not taken[0]:
                 continue
             self._ending.wait(_GATHER_S)
+            found = deque(taken[0])
             more = self.results.take(0.0)
             if more is not None:
                 found += more[0]
+            self._handle(found)
+            if (lost := self.dropped - self._told) > 0:
+                self._told += lost
+                log_lines.limited(logging.WARNING, "tag_polls_dropped", kind="", count=lost)
+
+    def _handle(self, found: deque[Poll]) -> None:
+        while found:
+            self._heartbeat.beat()
+            began = time.monotonic()
             try:
                 with self._lock:
-                    polls = [
-                        self._readers[name].poll(blocks)
-                        for name, start, blocks in found
-                        if name in self._readers and start >= self._since.get(name, 0.0)
-                    ]
-                    self._offer(polls)
+                    self._offer(list(self._turn(found, began + _TURN_S)))
             except Exception:  # A fault in one poll must not end all outputs.
                 log_lines.problem("tag_values_failed")
+            if found:
+                self._ending.wait(time.monotonic() - began)
 
-    def _offer(self, polls: Iterable[DevicePoll]) -> None:
+    def _turn(self, found: deque[Poll], until: float) -> Iterator[DevicePoll]:
+        """Takes and converts polls until a time, at least one."""
+        while found:
+            name, start, blocks = found.popleft()
+            if name in self._readers and start >= self._since.get(name, 0.0):
+                yield self._readers[name].poll(blocks)
+            if time.monotonic() >= until:
+                return
+
+    def _offer(self, polls: Sequence[DevicePoll]) -> None:
         for poll in polls:
             self._latest[poll.device] = poll.readings
             answers = poll.has_answered
