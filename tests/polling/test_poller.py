@@ -11,6 +11,7 @@ import pytest
 import holdfast
 from holdfast import Tag, TagList
 from holdfast.polling import Poller, Reading, WriteFailed
+from holdfast.polling import poller as poller_module
 from holdfast.polling.faults import NO_CONNECTION
 from holdfast.tags.scale import RegisterScale
 from support import wire
@@ -199,6 +200,18 @@ def test_queued_polls_of_a_removed_device_are_not_those_of_the_next(
     assert list(poller.counters()) == ["oven"]
     with pytest.raises(ValueError, match="device oven: the name is already in use"):
         poller.add(url(device), tags, name="oven")
+
+
+def test_a_backlog_comes_in_several_batches(
+    device: holdfast.Server, poller: Poller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(poller_module, "MAX_CONVERTING_S", 0.0)
+    poller.add(url(device), {"t": ("holding_registers", 0)}, name="oven", interval=0.01)
+    wire.until(lambda: poller.counters()["oven"]["polls"] >= 3, "polls are queued")
+    poller.close()
+    batches = list(poller)
+    assert len(batches) >= 3
+    assert {len(batch) for batch in batches} == {1}
 
 
 def test_a_tag_has_the_name_of_its_key(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 SIGNAL_CHECK_S = 0.1
 """Seconds of one wait, between which signal handlers run."""
 
+MAX_CONVERTING_S = 0.05
+"""Seconds in which polls become values for one batch. The next batch has those that are left."""
 
 ABANDON_CHECK_S = 1.0
 """Seconds that a thread waits for a batch, for a task that may not want it any more."""
@@ -70,6 +73,7 @@ class Poller:
         self._generations = itertools.count(1)
         self._pending: asyncio.Future[Batch | None] | None = None
         self._has_ended = False
+        self._queued: deque[tuple[str, float, list[Any]]] = deque()
 
     def add(
         self,
@@ -182,26 +186,36 @@ class Poller:
         end = None if timeout is None else time.monotonic() + timeout
         while True:
             left = SIGNAL_CHECK_S if end is None else min(SIGNAL_CHECK_S, end - time.monotonic())
-            results = self._results.take(max(0.0, left))
-            if results is None:
-                self._has_ended = True
-                return None
-            polls = self._polls(results[0])
+            if not self._queued:
+                results = self._results.take(max(0.0, left))
+                if results is None:
+                    self._has_ended = True
+                    return None
+                self._queue(results[0])
+            polls = self._converted()
             if polls:
                 return Batch(polls)
             if end is not None and time.monotonic() >= end:
                 return None
 
-    def _polls(self, found: list[tuple[str, float, list[Any]]]) -> list[DevicePoll]:
+    def _queue(self, found: list[tuple[str, float, list[Any]]]) -> None:
+        self._queued += found
         if found and self._gather:
             time.sleep(self._gather)
             more = self._results.take(0.0)
-            found = found + (more[0] if more is not None else [])
-        polls = []
-        for name, _, blocks in found:
+            self._queued += more[0] if more is not None else []
+
+    def _converted(self) -> list[DevicePoll]:
+        """The values of queued polls, as many as fit into the time of a batch."""
+        polls: list[DevicePoll] = []
+        until = time.monotonic() + MAX_CONVERTING_S
+        while self._queued:
+            name, _, blocks = self._queued.popleft()
             reader = self._readers.get(name)
             if reader is not None:
                 polls.append(reader.poll(blocks))
+            if time.monotonic() >= until:
+                break
         return polls
 
     def __iter__(self) -> Iterator[Batch]:
