@@ -140,6 +140,7 @@ class StandIn:
             **{key: {} for key in (*of_no_part, "revocation_lists")},
             "listeners": self.listeners,
             "events_lost": self.events_lost,
+            "tag_polls_dropped": 0,
             "audit": self.audit,
             "logs": self.logs,
         }
