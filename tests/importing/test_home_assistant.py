@@ -315,6 +315,42 @@ def test_secrets_are_read_from_the_file_beside_it(
     assert device["url"] == "tcp://10.0.0.9:1502"
 
 
+def test_all_sections_are_read(imported: Callable[..., Imported]) -> None:
+    rest = "type: tcp, host: 10.0.0.1, port: 502, sensors: [{name: a, address: 1}]"
+    packages = [f"{name}:\n  modbus: [{{name: {name}, {rest}}}]\n" for name in "xy"]
+    found = imported("", "".join(packages))
+    assert list(found.data["devices"]) == ["x", "y"]
+
+
+def test_a_problem_of_an_anchor_elsewhere_is_one_of_its_alias(
+    imported: Callable[..., Imported],
+) -> None:
+    hub = HUB.replace("default_config:", "base: &base {data_type: !secret kind, scale: 0.1}")
+    with pytest.raises(NotImportable) as raised:
+        imported("sensors: [{<<: *base, name: a, address: 1}]", hub)
+    missing = "which is not in secrets.yaml beside this file, allowed: its value"
+    assert refusals(raised.value) == [
+        f"8: modbus[0].sensors[0].'<<': found the secret kind, {missing}"
+    ]
+
+
+def test_secrets_are_not_shown_and_are_single_values(
+    imported: Callable[..., Imported], tmp_path: Path
+) -> None:
+    (tmp_path / "secrets.yaml").write_text("word: hunter2\nmany: {a: 1}\n")
+    entities = (
+        "sensors: [{name: a, address: !secret word}, {<<: !secret many, name: b, address: 2}]"
+    )
+    with pytest.raises(NotImportable) as raised:
+        imported(entities, HUB.replace("192.168.1.50", "!secret word"))
+    found = refusals(raised.value)
+    assert len(found) == 2
+    assert not [message for message in found if "hunter2" in message]
+    (tmp_path / "secrets.yaml").write_text("word: [\n")
+    with pytest.raises(NotImportable, match="is not YAML that can be read"):
+        imported("sensors: [{name: a, address: !secret word}]")
+
+
 def test_merged_keys_are_those_of_the_entity_unless_it_has_its_own(
     imported: Callable[..., Imported],
 ) -> None:

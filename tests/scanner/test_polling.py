@@ -118,3 +118,29 @@ def test_a_poll_that_can_t_be_handled_costs_no_other() -> None:
     assert came == ["b"]
     assert [type(problem["exception"]) for problem in problems] == [LookupError]
     assert not [thread for thread in threading.enumerate() if thread.name == "holdfast-scan"]
+
+
+def test_polls_that_wait_are_not_handled_after_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "TURN_S", 0.0)
+
+    async def run() -> list[float]:
+        results = Results([poll("a", at, 0.0) for at in range(100)])
+        core = SimpleNamespace(receiver=lambda: results, remove=lambda _: None)
+        polling, began = Polling(cast("_core.Poller", core)), asyncio.Event()
+        came: list[float] = []
+
+        def on_poll(_device: Any, due: float, _blocks: Any) -> None:
+            came.append(due)
+            began.set()
+
+        polling._devices.update({"a": cast("Any", "a")})
+        polling.start(on_poll)
+        await asyncio.wait_for(began.wait(), 30)
+        await polling.stop()
+        handled = list(came)
+        for _ in range(10):
+            await asyncio.sleep(0)
+        assert came == handled
+        return came
+
+    assert len(asyncio.run(run())) < 100

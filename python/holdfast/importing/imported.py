@@ -65,7 +65,7 @@ class Source:
     def __init__(self, path: Path | str, resolve: Resolve | None = None) -> None:
         """Raises `ConfigError` for a file that can't be read.
 
-        With `resolve`, for the tags of the source, it also accepted merge keys.
+        `resolve` gives tags of the source a value; such a source also accepted merge keys.
         """
         self.file = str(path)
         text = yaml_document.read_text(Path(path), self.file)
@@ -79,12 +79,15 @@ class Source:
         self._lines = text.splitlines()
         self._look_at((), document.data)
 
-    def narrow(self, path: KeyPath) -> None:
-        """Reads nothing but the value at a path: problems elsewhere do not matter."""
-        key = self.desk.document.spell(path)
-        self.problems = [each for each in self.problems if _is_in(key, each.key)]
+    def narrow(self, paths: Sequence[KeyPath]) -> None:
+        """Reads nothing but the values at these paths: problems elsewhere do not matter."""
+        keys = [self.desk.document.spell(path) for path in paths]
+        self.problems = [
+            each for each in self.problems if any(_is_in(key, each.key) for key in keys)
+        ]
         self.desk.report.found.clear()
-        self._look_at(path, self.desk.report.raw(path))
+        for path in paths:
+            self._look_at(path, self.desk.report.raw(path))
 
     def _look_at(self, path: KeyPath, value: object) -> None:
         self.desk.broken = {each.key for each in self.problems}

@@ -23,6 +23,12 @@ _TRUE = ("yes", "Yes", "YES", "on", "On", "ON")
 _FALSE = ("no", "No", "NO", "off", "Off", "OFF")
 
 
+class Secret(str):
+    """A text that no message shows."""
+
+    __slots__ = ()
+
+
 @dataclass
 class Section:
     """The mapping at `path`. An empty value counts as absent, as in the source."""
@@ -168,7 +174,8 @@ class Section:
 
     def _wrong(self, key: str | int, value: object, allowed: str) -> None:
         if value is not None:
-            self.desk.problem(self.at(key), f"found {show(value)}, allowed: {allowed}")
+            found = "a secret" if isinstance(value, Secret) else show(value)
+            self.desk.problem(self.at(key), f"found {found}, allowed: {allowed}")
 
 
 def section(desk: Desk, path: KeyPath, value: object) -> Section | None:

@@ -5,7 +5,7 @@ Messages show found values, but never a secret.
 
 from __future__ import annotations
 
-from collections import Counter
+import re
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -47,7 +47,7 @@ class Desk:
     quoted_numbers: bool = False
     """Whether the source accepted numbers in quotes."""
     folds: bool = False
-    """Whether notes with the same message become one, which counts them."""
+    """Whether equal notes on keys of the same name become one, with their number."""
     broken: set[str] = field(default_factory=set)
     """The keys whose values could not be read, which is a problem of its own."""
 
@@ -60,13 +60,13 @@ class Desk:
         notes = sorted(self.noted, key=lambda note: (note.line, note.column))
         if not self.folds:
             return tuple(notes)
-        count = Counter((note.kind, note.message) for note in notes)
-        first = {(note.kind, note.message): note for note in reversed(notes)}
+        alike: dict[tuple[str, str, str], list[Note]] = {}
+        for note in notes:
+            last = re.sub(r"\[\d+\]", "", note.key.rpartition(".")[2])
+            alike.setdefault((note.kind, last, note.message), []).append(note)
         return tuple(
-            replace(note, message=f"{note.message} (and {count[same] - 1} more)")
-            if count[same] > 1
-            else note
-            for same, note in reversed(first.items())
+            replace(first, message=f"{first.message} (and {len(more)} more)") if more else first
+            for first, *more in alike.values()
         )
 
     def note(self, kind: Kind, path: KeyPath, message: str) -> None:

@@ -47,8 +47,19 @@ _GATHER_S = 0.005
 _TURN_S = 0.01
 """Time of polls that are handled while others wait for the lock."""
 
+_YIELD_S = 0.001
+"""Time between two turns, in which others get the lock."""
+
+_LATE_S = 1.0
+"""Age of a poll from which on the thread rests between turns as long as they take."""
+
 Poll: TypeAlias = "tuple[str, float, list[PolledBlock]]"
 """The device, the scheduled time in seconds, and the blocks."""
+
+
+def _is_late(poll: Poll) -> bool:
+    _, _, blocks = poll
+    return bool(blocks) and time.time() - blocks[-1][5] > _LATE_S
 
 
 def _info(device: DeviceConfig) -> DeviceInfo:
@@ -227,14 +238,13 @@ class TagValues:
     def _handle(self, found: deque[Poll]) -> None:
         while found:
             self._heartbeat.beat()
-            began = time.monotonic()
             try:
                 with self._lock:
-                    self._offer(list(self._turn(found, began + _TURN_S)))
+                    self._offer(list(self._turn(found, time.monotonic() + _TURN_S)))
             except Exception:  # A fault in one poll must not end all outputs.
                 log_lines.problem("tag_values_failed")
             if found:
-                self._ending.wait(time.monotonic() - began)
+                self._ending.wait(_TURN_S if _is_late(found[0]) else _YIELD_S)
 
     def _turn(self, found: deque[Poll], until: float) -> Iterator[DevicePoll]:
         """Takes and converts polls until a time, at least one."""

@@ -181,8 +181,8 @@ def parse(
 ) -> tuple[Document, list[Problem]]:
     """Returns the document and its problems. Raises `ConfigError` if the YAML is not valid.
 
-    For files of other programs: `resolve` gives scalars with a tag of their own a value, and with
-    `merges` the key `<<` adds the keys of other mappings.
+    For files of other programs: `resolve` gives scalars with a tag of their own a value, which must
+    be a scalar. With `merges`, the key `<<` adds the keys of other mappings that are not there.
     """
     if found := _NOT_ALLOWED.search(text):
         line = text[: found.start()].count("\n") + 1
@@ -224,6 +224,9 @@ class _Reader:
     ) -> None:
         self._resolve = resolve
         self._merges = merges
+        self._mistakes_of: dict[int | str, list[str]] = {}
+        """The mistakes inside an anchor, which are also those of its aliases: only a part of a file
+        of another program may be read."""
         self.mistakes: list[tuple[Place, KeyPath, str]] = []
         self._events = iter(events)
         self._left = MAX_WRITTEN
@@ -245,12 +248,17 @@ class _Reader:
         if anchor is None:
             return self._new_value(event, path)
         self._anchors[anchor] = None
+        known = len(self.mistakes)
         value = self._anchors[anchor] = self._new_value(event, path)
+        if self._resolve is not None:
+            self._mistakes_of[anchor] = [message for _, _, message in self.mistakes[known:]]
         return value
 
     def _aliased(self, event: YamlEvent, anchor: int | str, path: KeyPath) -> tuple[Any, _Spot]:
         value = self._anchors[anchor]
         if value is not None:
+            for message in self._mistakes_of.get(anchor, ()):
+                self._add(event, path, message)
             return value
         return self._refused(event, path, "an alias inside its own anchor is not allowed")
 
@@ -289,11 +297,11 @@ class _Reader:
     def _mapping(self, start: YamlEvent, path: KeyPath) -> tuple[Any, _Spot]:
         spot = _Spot(_place(start))
         data: dict[Key, Any] = {}
-        merged: list[tuple[Any, _Spot]] = []
+        merged: list[tuple[YamlEvent, Any, _Spot]] = []
         for event in self._until_end():
             key = self._key(event, path)
             if key == "<<" and self._merges:
-                merged.append(self._value(next(self._events), (*path, key)))
+                merged.append((event, *self._value(next(self._events), (*path, key))))
                 continue
             if key in data:
                 first = spot.children[key][0].line
@@ -308,8 +316,11 @@ class _Reader:
             data[key] = value
             spot.children[key] = (_place(event), child)
             spot.values += child.values
-        for value, child in merged:
-            self._merge(data, spot, value, child)
+        for event, value, child in merged:
+            if isinstance(value, dict | list):
+                self._merge(data, spot, value, child)
+            elif value is not None:
+                self._add(event, (*path, "<<"), f"found {show(value)}, allowed: a mapping")
         return data, spot
 
     def _merge(self, data: dict[Key, Any], spot: _Spot, value: Any, child: _Spot) -> None:

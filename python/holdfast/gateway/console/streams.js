@@ -2,7 +2,10 @@
 
 import { answer, JSON_TYPE, Problem, send } from "./api.js";
 
-/** Streams of this browser, with the one that is wanted. A browser has six connections to a host. */
+/**
+ * The most streams of this browser, by what they are for. It has six connections to a host: a watch leaves two for
+ * everything else, a map one.
+ */
 export const MAX_STREAMS = { watch: 4, map: 5 };
 
 /** Calls `onEvent(name, data)` for each event of a stream, until the stream ends. */

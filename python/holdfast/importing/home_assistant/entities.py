@@ -54,9 +54,11 @@ _UTF_8 = {"encoding": "utf-8"}
 
 _LARGEST = {"float16": 65504.0, "float32": (2 - 2.0**-23) * 2.0**127, "float64": float_info.max}
 
-_STRUCTURE = re.compile(r"([@=<>!]?)(\d*)([hHiIlLqQefds])")
+_STRUCTURE = re.compile(r"([@=<>!]?)(\d{0,3})([hHiIlLqQefds])")
 _CODES = dict(zip("hHiIqQefd", _TYPES, strict=True)) | {"l": "int32", "L": "uint32"}
 """The types of one value of a structure, by its code."""
+_SIZES = dict(zip("hHiIlLqQefd", (2, 2, 4, 4, 4, 4, 8, 8, 2, 4, 8), strict=True))
+"""Their bytes."""
 
 _PREFIX = re.compile(r"^(swing_mode_)?(state_|action_)(fan_(?!only))?")
 """What the name of a mode begins with."""
@@ -182,6 +184,12 @@ def _structure(
         message = f"{_name(entity)} has the structure {show(structure)}, which is no type here"
         entity.desk.left_out(entity.path, f"{message}: add a tag for each value")
         return None
+    size = number if found[3] == "s" else number * _SIZES[found[3]]
+    if found[3] in "lL" and found[1] in ("", "@"):  # Of a processor of 32 or 64 bits.
+        size = 2 * count if count in (2 * number, 4 * number) else size
+    if count is not None and size != 2 * count:
+        message = f"found {count}, but the structure has {size} bytes, allowed: half as many"
+        entity.desk.problem(entity.at("count"), message)
     if number > 1 and swap in ("word", "word_byte") and found[3] != "s":
         message = f"found {swap} with several values, whose order it changes, allowed: none or byte"
         entity.desk.problem(entity.at("swap"), message)
@@ -210,7 +218,9 @@ def _null(entity: Section, kind: str) -> list[int | float]:
     if kind not in _TYPES:
         entity.desk.left_out(entity.at("nan_value"), f"values of type {kind} have none")
         return []
-    candidates = [each for each in sorted({number, -number}) if each]
+    candidates = sorted({number, -number})
+    if number == 0:
+        entity.desk.check(entity.at("nan_value"), "0 is no value, as in newer versions")
     if kind.startswith("float"):
         return [float(each) for each in candidates if abs(each) <= _LARGEST[kind]]
     bits = 16 * register_count(kind)
@@ -351,6 +361,10 @@ def _climate(places: Places, entity: Section) -> None:
         _mode(places, entity, key, writable=True)
     _mode(places, entity, "hvac_action_register", writable=False)
     _power(places, entity)
+    if settings is not None and settings["type"] not in _TYPES:
+        message = f"values of type {settings['type']} are no temperatures: add a tag"
+        entity.desk.left_out(entity.path, message)
+        return
     if address is None or settings is None or not target:
         return
     entity.desk.changed(entity.path, "a sensor, a number and selects instead of a thermostat")

@@ -16,12 +16,14 @@ from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError
 from holdfast.importing.home_assistant.entities import PLATFORMS, Entities, Places
 from holdfast.importing.imported import Imported, Source
-from holdfast.importing.key_reader import Section, section
+from holdfast.importing.key_reader import Secret, Section, section
 from holdfast.importing.names import free_name, unique_names
 from holdfast.net.addresses import joined
 from holdfast.protocol import MAX_UNIT
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from holdfast.config.text.yaml_document import KeyPath
     from holdfast.importing.notes import Desk
 
@@ -66,32 +68,36 @@ def read_home_assistant(path: Path | str) -> Imported:
     source = Source(path, _Tags(Path(path).parent).resolve)
     desk = source.desk
     desk.quoted_numbers = desk.folds = True
-    root = _modbus((), desk.document.data)
-    if root is not None:
-        source.narrow(root)
-    hubs = desk.report.raw(root or ())
-    entries = [(root or (), hubs)] if isinstance(hubs, dict) else []
-    if isinstance(hubs, list):
-        entries = [((*(root or ()), index), hub) for index, hub in enumerate(hubs)]
-    elif not entries and not source.problems:
-        found = "nothing" if hubs is None else show(hubs)
-        desk.problem(root or (), f"found {found}, allowed: the hubs of modbus")
+    roots = list(_sections((), desk.document.data))
+    if roots:
+        source.narrow(roots)
+    entries: list[tuple[KeyPath, Any]] = []
+    for root in roots or [()]:
+        hubs = desk.report.raw(root)
+        if isinstance(hubs, list):
+            entries += [((*root, index), hub) for index, hub in enumerate(hubs)]
+        elif isinstance(hubs, dict):
+            entries.append((root, hubs))
+        elif not source.problems:
+            found = "nothing" if hubs is None else show(hubs)
+            desk.problem(root, f"found {found}, allowed: the hubs of modbus")
     found_hubs = [section(desk, path, hub) for path, hub in entries]
     devices = _devices(desk, [hub for hub in found_hubs if hub is not None])
     if not devices and not desk.report.problems and not source.problems:
-        desk.problem(root or (), "no hub has an entity that can be converted")
+        desk.problem((roots or [()])[0], "no hub has an entity that can be converted")
     source.finish()
     return Imported(source.file, "home-assistant", "Home Assistant", _config(devices), desk.notes)
 
 
-def _modbus(path: KeyPath, data: Any) -> KeyPath | None:
-    """The path of the first section `modbus`."""
+def _sections(path: KeyPath, data: Any) -> Iterator[KeyPath]:
+    """The paths of all sections `modbus`: the source joins those of packages."""
     if not isinstance(data, dict) or len(path) > _MAX_DEPTH:
-        return None
-    if "modbus" in data:
-        return (*path, "modbus")
-    found = (_modbus((*path, key), value) for key, value in data.items())
-    return next((each for each in found if each is not None), None)
+        return
+    for key, value in data.items():
+        if key == "modbus":
+            yield (*path, key)
+        else:
+            yield from _sections((*path, key), value)
 
 
 class _Tags:
@@ -106,17 +112,20 @@ class _Tags:
             raise ValueError(f"found {kind} {text}, allowed: what is in that file")
         if self._secrets is None:
             self._secrets = self._read()
-        if text not in self._secrets:
+        found = self._secrets.get(text)
+        if found is None or isinstance(found, dict | list):
             missing = f"which is not in {self._file.name} beside this file"
             raise ValueError(f"found the secret {text}, {missing}, allowed: its value")
-        return self._secrets[text]
+        return Secret(found) if isinstance(found, str) else found
 
     def _read(self) -> dict[Any, Any]:
-        try:
-            text = yaml_document.read_text(self._file, str(self._file))
-            data = yaml_document.parse(text, str(self._file))[0].data
-        except ConfigError:
+        if not self._file.exists():
             return {}
+        name = str(self._file)
+        try:
+            data = yaml_document.parse(yaml_document.read_text(self._file, name), name)[0].data
+        except ConfigError:
+            raise ValueError(f"found a secret, but {name} is not YAML that can be read") from None
         return data if isinstance(data, dict) else {}
 
 
@@ -263,7 +272,9 @@ class _Hub:
         try:
             parse(url)
         except ValueError as error:
-            self.desk.problem(self.hub.at(key), str(error))
+            hidden = isinstance(self.hub.data.get(key), Secret)
+            message = "found a secret, allowed: the address of a device" if hidden else str(error)
+            self.desk.problem(self.hub.at(key), message)
 
     def _query(self, options: dict[str, Any], usual_wait_ms: int) -> str:
         """Options of the line, and pauses that the source made."""

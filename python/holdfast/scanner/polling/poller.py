@@ -278,6 +278,8 @@ class Polling:
 
     def _handle(self, polls: deque[Poll]) -> None:
         until = self._loop.time() + TURN_S
+        if self._stopping.is_set():
+            polls.clear()
         try:
             while polls:
                 name, due, blocks = polls.popleft()
