@@ -24,9 +24,12 @@ _FALSE = ("no", "No", "NO", "off", "Off", "OFF")
 
 
 class Secret(str):
-    """A text that no message shows."""
+    """A text that no message shows: `show` has it as `a secret`."""
 
     __slots__ = ()
+
+    def __repr__(self) -> str:
+        return "a secret"
 
 
 @dataclass
@@ -174,8 +177,7 @@ class Section:
 
     def _wrong(self, key: str | int, value: object, allowed: str) -> None:
         if value is not None:
-            found = "a secret" if isinstance(value, Secret) else show(value)
-            self.desk.problem(self.at(key), f"found {found}, allowed: {allowed}")
+            self.desk.problem(self.at(key), f"found {show(value)}, allowed: {allowed}")
 
 
 def section(desk: Desk, path: KeyPath, value: object) -> Section | None:

@@ -6,13 +6,13 @@ import re
 import unicodedata
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from sys import float_info
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.config.text.messages import show
 from holdfast.importing.names import MAX_LENGTH, free_name
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
-from holdfast.values import register_count
+from holdfast.values import encode, register_count
+from holdfast.values.errors import DoesNotFit
 
 if TYPE_CHECKING:
     from holdfast.config.text.yaml_document import KeyPath
@@ -32,18 +32,8 @@ _REGISTERS = ("holding", "input")
 _BITS = ("coils", "discrete_inputs")
 
 _TYPES = ("int16", "uint16", "int32", "uint32", "int64", "uint64", "float16", "float32", "float64")
-_BY_COUNT = {
-    ("int", 1): "int16",
-    ("int", 2): "int32",
-    ("int", 4): "int64",
-    ("uint", 1): "uint16",
-    ("uint", 2): "uint32",
-    ("uint", 4): "uint64",
-    ("float", 1): "float16",
-    ("float", 2): "float32",
-    ("float", 4): "float64",
-}
-"""Types of former versions, by the number of registers."""
+_FORMER_TYPES = ("int", "uint", "float")
+"""Types of former versions, whose `count` is their size in registers."""
 
 _ORDERS = {"none": None, "word": "CDAB", "byte": "BADC", "word_byte": "DCBA"}
 _LITTLE_ORDERS = {"none": "DCBA", "word": "BADC", "byte": "CDAB", "word_byte": None}
@@ -52,13 +42,9 @@ _LITTLE_ORDERS = {"none": "DCBA", "word": "BADC", "byte": "CDAB", "word_byte": N
 _UTF_8 = {"encoding": "utf-8"}
 """The source decoded every text as UTF-8."""
 
-_LARGEST = {"float16": 65504.0, "float32": (2 - 2.0**-23) * 2.0**127, "float64": float_info.max}
-
 _STRUCTURE = re.compile(r"([@=<>!]?)(\d{0,3})([hHiIlLqQefds])")
 _CODES = dict(zip("hHiIqQefd", _TYPES, strict=True)) | {"l": "int32", "L": "uint32"}
 """The types of one value of a structure, by its code."""
-_SIZES = dict(zip("hHiIlLqQefd", (2, 2, 4, 4, 4, 4, 8, 8, 2, 4, 8), strict=True))
-"""Their bytes."""
 
 _PREFIX = re.compile(r"^(swing_mode_)?(state_|action_)(fan_(?!only))?")
 """What the name of a mode begins with."""
@@ -100,6 +86,12 @@ def _address(entity: Section, key: str = "address", *, required: bool = True) ->
     return entity.integer(key, 0, LAST_ADDRESS, required=required, what="an address")
 
 
+def _register(entity: Section, key: str, usual: int) -> int:
+    """What a register holds."""
+    found = entity.integer(key, 0, 65535)
+    return usual if found is None else found
+
+
 def _area(entity: Section, key: str, default: str, allowed: tuple[str, ...]) -> Area:
     return _AREAS[entity.word(key, allowed) or default]
 
@@ -138,17 +130,18 @@ def _scaled(entity: Section, prefix: str = "") -> dict[str, Any]:
     """Scale and offset, those of this value or those of the entity."""
     found: dict[str, Any] = {}
     for key, plain in (("scale", 1), ("offset", 0)):
-        value = entity.number(f"{prefix}{key}") if prefix else None
-        value = entity.number(key) if value is None else value
+        own = entity.number(f"{prefix}{key}") if prefix else None
+        value = entity.number(key) if own is None else own
         found[key] = None if value == plain else value
-    if found["scale"] == 0:
-        entity.desk.problem(entity.at("scale"), "found 0, allowed: any other number")
+        if key == "scale" and value == 0:
+            at = entity.at(key if own is None else f"{prefix}{key}")
+            entity.desk.problem(at, "found 0, allowed: any other number")
     return found
 
 
 def _typed(entity: Section) -> dict[str, Any] | None:
     """Type, byte order and encoding; `None` if there is no such type here."""
-    kinds = (*_TYPES, "int", "uint", "float", "string", "custom")
+    kinds = (*_TYPES, *_FORMER_TYPES, "string", "custom")
     count = entity.integer("count", 1, 125)
     kind = entity.word("data_type", kinds) or ("int16" if count is None else "int")
     structure = entity.text("structure")
@@ -163,7 +156,8 @@ def _typed(entity: Section) -> dict[str, Any] | None:
             entity.desk.problem_of_key(entity.at("count"), message)
             return None
         return {"type": f"string:{2 * count}", "order": _ORDERS[swap], **_UTF_8}
-    kind = _BY_COUNT.get((kind, count or 1), kind)
+    if kind in _FORMER_TYPES and f"{kind}{16 * (count or 1)}" in _TYPES:
+        kind = f"{kind}{16 * (count or 1)}"
     if kind not in _TYPES:
         message = f"found {count} with data_type {kind}, allowed: 1, 2 or 4"
         entity.desk.problem(entity.at("count"), message)
@@ -184,23 +178,29 @@ def _structure(
         message = f"{_name(entity)} has the structure {show(structure)}, which is no type here"
         entity.desk.left_out(entity.path, f"{message}: add a tag for each value")
         return None
-    size = number if found[3] == "s" else number * _SIZES[found[3]]
-    if found[3] in "lL" and found[1] in ("", "@"):  # Of a processor of 32 or 64 bits.
-        size = 2 * count if count in (2 * number, 4 * number) else size
-    if count is not None and size != 2 * count:
-        message = f"found {count}, but the structure has {size} bytes, allowed: half as many"
+    kind = _kind(found, number, count)
+    if count not in (None, register_count(kind)):
+        message = f"found {count} with this structure, allowed: {register_count(kind)}"
         entity.desk.problem(entity.at("count"), message)
     if number > 1 and swap in ("word", "word_byte") and found[3] != "s":
         message = f"found {swap} with several values, whose order it changes, allowed: none or byte"
         entity.desk.problem(entity.at("swap"), message)
+    if found[3] == "s":
+        return {"type": kind, "order": _ORDERS[swap], **_UTF_8}
     # Without a sign, the source used the order of its processor, which is the little one.
     orders = _ORDERS if found[1] in (">", "!") else _LITTLE_ORDERS
+    return {"type": kind, "order": orders[swap]}
+
+
+def _kind(found: re.Match[str], number: int, count: int | None) -> str:
+    """The type of so many values of a structure."""
     if found[3] == "s":
-        return {"type": f"string:{number}", "order": _ORDERS[swap], **_UTF_8}
+        return f"string:{number}"
     kind = _CODES[found[3]]
-    if found[3] in "lL" and count == 4 * number:  # A long of a processor of 64 bits.
+    # Without a sign, a long is that of the processor: the count tells whether it has 64 bits.
+    if found[3] in "lL" and found[1] in ("", "@") and count == 4 * number:
         kind = kind.replace("32", "64")
-    return {"type": kind if number == 1 else f"{kind}[{number}]", "order": orders[swap]}
+    return kind if number == 1 else f"{kind}[{number}]"
 
 
 def _null(entity: Section, kind: str) -> list[int | float]:
@@ -221,11 +221,15 @@ def _null(entity: Section, kind: str) -> list[int | float]:
     candidates = sorted({number, -number})
     if number == 0:
         entity.desk.check(entity.at("nan_value"), "0 is no value, as in newer versions")
-    if kind.startswith("float"):
-        return [float(each) for each in candidates if abs(each) <= _LARGEST[kind]]
-    bits = 16 * register_count(kind)
-    least, most = (0, 2**bits) if kind.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1))
-    return [each for each in candidates if least <= each < most]
+    return [each for each in candidates if _fits(each, kind)]
+
+
+def _fits(number: int, kind: str) -> bool:
+    try:
+        encode(number, kind)
+    except DoesNotFit:
+        return False
+    return True
 
 
 def _hexadecimal(text: str) -> int | None:
@@ -253,9 +257,7 @@ def _switch(places: Places, entity: Section) -> None:
     kinds = ("holding", "holdings", "coil", "coils")
     area = _area(entity, "write_type", "holding", kinds)
     address = _address(entity)
-    on = entity.integer("command_on", 0, 65535)
-    off = entity.integer("command_off", 0, 65535)
-    on, off = 1 if on is None else on, 0 if off is None else off
+    on, off = _register(entity, "command_on", 1), _register(entity, "command_off", 0)
     verify = entity.mapping("verify")
     if address is None:
         return
@@ -330,9 +332,9 @@ def _cover(places: Places, entity: Section) -> None:
     area = _area(entity, "input_type", "holding", ("holding", "coil"))
     address = _address(entity)
     defaults = {"closed": 0, "open": 1, "opening": 2, "closing": 3}
-    given = {name: entity.integer(f"state_{name}", 0, 65535) for name in defaults}
-    numbers = {name: defaults[name] if each is None else each for name, each in given.items()}
-    states = _states((number, name) for name, number in numbers.items())
+    states = _states(
+        (_register(entity, f"state_{name}", usual), name) for name, usual in defaults.items()
+    )
     status = _address(entity, "status_register", required=False)
     status_area = _area(entity, "status_register_type", "holding", _REGISTERS)
     if address is None:
@@ -404,8 +406,7 @@ def _power(places: Places, entity: Section) -> None:
     """A register or a coil that turns a thermostat on."""
     coil = _address(entity, "hvac_onoff_coil", required=False)
     register = _address(entity, "hvac_onoff_register", required=False)
-    on, off = entity.integer("hvac_on_value", 0, 65535), entity.integer("hvac_off_value", 0, 65535)
-    on, off = 1 if on is None else on, 0 if off is None else off
+    on, off = _register(entity, "hvac_on_value", 1), _register(entity, "hvac_off_value", 0)
     name = f"{_name(entity)} power"
     if coil is not None:
         places.add(name, "coils", coil, writable=True)

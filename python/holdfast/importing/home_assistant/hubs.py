@@ -17,7 +17,7 @@ from holdfast.config.text.problems import ConfigError
 from holdfast.importing.home_assistant.entities import PLATFORMS, Entities, Places
 from holdfast.importing.imported import Imported, Source
 from holdfast.importing.key_reader import Secret, Section, section
-from holdfast.importing.names import free_name, unique_names
+from holdfast.importing.names import MAX_LENGTH, free_name, unique_names
 from holdfast.net.addresses import joined
 from holdfast.protocol import MAX_UNIT
 
@@ -151,7 +151,9 @@ def _devices(desk: Desk, hubs: list[Section]) -> dict[str, dict[str, Any]]:
         read.read()
         units = {number: unit for number, unit in read.units.items() if unit.places.tags}
         for number, unit in units.items():
-            its_name = name if len(units) == 1 else free_name(f"{name}-{number}"[-64:], taken)
+            its_name = (
+                name if len(units) == 1 else free_name(f"{name}-{number}"[-MAX_LENGTH:], taken)
+            )
             taken.add(its_name)
             devices[its_name] = {"url": read.url, **unit.device(number, read.timeout)}
     if devices:
