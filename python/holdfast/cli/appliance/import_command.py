@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from functools import partial
 from pathlib import Path
@@ -192,7 +193,7 @@ def _summary(imported: Imported, output: Path | None) -> str:
     if imported.generation is not None:
         of = f" is of the {ORDINALS[imported.generation]} generation"
     notes = counted(len(imported.notes), "note")
-    check = f"; next: holdfast check {output}" if output is not None else ""
+    check = f"; next: holdfast check {shlex.quote(str(output))}" if output is not None else ""
     return f"{imported.file}{of}: {notes}{check}"
 
 
