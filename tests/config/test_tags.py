@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.config import ConfigError, load
-from holdfast.config.checks import listeners
+from holdfast.config.checks import rule_order
 from holdfast.config.tag_files.read import load_tags
 from holdfast.net.addresses import covers
 from holdfast.tags import Tag
@@ -409,7 +409,7 @@ def test_the_rules_of_many_units_are_compared_once_for_equal_ones(
         asked.append(network)
         return covers(networks, network)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(listeners, "covers", counted)
+    monkeypatch.setattr(rule_order, "covers", counted)
     rules = ", ".join(
         f"{{sources: [10.0.0.{number}], access: read-only, units: {{0-255: m}}}}"
         for number in range(20)

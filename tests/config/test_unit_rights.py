@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.config.checks.rights import together
 from holdfast.config.models.devices import RangeConfig
 from holdfast.config.models.listeners import ModbusTcpListener, RouteConfig, UnitMemoryConfig
+from holdfast.config.unit_rights import together
 from support.config_folder import Folder
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from holdfast.config.checks.rights import UnitRights
+    from holdfast.config.unit_rights import UnitRights
 
 HEAD = """\
 memories:

@@ -9,6 +9,7 @@ import click
 
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.terminal_text import print_json
+from holdfast.client.base import MAX_TIMEOUT_S
 from holdfast.errors import (
     ConnectionLost,
     InvalidResponse,
@@ -64,6 +65,13 @@ def differs(wrong: Sequence[str]) -> dict[str, object]:
     return {"reason": "differs", "detail": "; ".join(wrong)} if wrong else {}
 
 
+TIMEOUTS_S = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, MAX_TIMEOUT_S)
+"""Timeouts to suggest."""
+
+MEASURED_TIMEOUTS = 4
+"""A late reply is measured up to this many times the timeout, as long as it may raise that."""
+
+
 HINTS = {
     ILLEGAL_ADDRESS: "'holdfast describe map {}' finds the addresses that exist",
     TARGET_SILENT: "'holdfast find {}' finds the unit ids that answer",
@@ -80,6 +88,24 @@ def hint(error: object, url: str) -> None:
     if code not in told:
         told.add(code)
         click.echo(f"hint: {HINTS[code].format(url)}", err=True)
+
+
+def hint_at_late_replies(longest: float, timeout: float) -> None:
+    """Suggests a longer timeout; the slowest late reply took `longest` seconds, 0 without one."""
+    if not longest:
+        return
+    # The timeout includes connecting: a reply that missed it may be sooner after its request.
+    longest = max(longest, timeout)
+    least = next(each for each in TIMEOUTS_S if each >= longest * 1.5 or each == TIMEOUTS_S[-1])
+    found = (
+        f"up to {longest:.2g} s"
+        if longest < MEASURED_TIMEOUTS * timeout
+        else f"{longest:.2g} s or more"
+    )
+    click.echo(
+        f"hint: replies take {found}, longer than --timeout {timeout:g} s: use --timeout {least:g}",
+        err=True,
+    )
 
 
 def fail(

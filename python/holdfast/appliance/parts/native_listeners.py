@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal, assert_never, cast
 
 from holdfast import _core
-from holdfast.config.checks.rights import items, together, unit_rights
 from holdfast.config.models.listeners import (
     ModbusAsciiListener,
     ModbusAsciiOverTcpListener,
@@ -18,6 +17,7 @@ from holdfast.config.models.listeners import (
     RawIngestListener,
     SecureRawRuleConfig,
 )
+from holdfast.config.unit_rights import items, together, unit_rights
 from holdfast.server import Identity
 from holdfast.server.options import RAW_INGEST_DEFAULTS, STREAM_DEFAULTS
 
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from holdfast._core import Memory
     from holdfast.appliance.parts.native_devices import Links
     from holdfast.config import Config
-    from holdfast.config.checks.rights import UnitRights
     from holdfast.config.models.listeners import (
         Listener,
         RawCompatConfig,
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
     )
     from holdfast.config.models.root import IdentityConfig
     from holdfast.config.models.server_tls import ServerTlsConfig
+    from holdfast.config.unit_rights import UnitRights
     from holdfast.server.options import (
         DatagramOptions,
         RawIngestOptions,

@@ -7,7 +7,6 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from holdfast.cli.terminal_text import number_ranges, ranges_shown, styled, table, words
-from holdfast.config.checks.rights import matching, together
 from holdfast.config.models.listeners import (
     DATAGRAM_TYPES,
     ModbusAsciiListener,
@@ -17,14 +16,15 @@ from holdfast.config.models.listeners import (
     RawIngestListener,
     tls_of,
 )
+from holdfast.config.unit_rights import matching, together
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from holdfast.config import Config
-    from holdfast.config.checks.rights import UnitRights
     from holdfast.config.models.devices import RangeConfig
     from holdfast.config.models.listeners import Listener, RawRuleConfig
+    from holdfast.config.unit_rights import UnitRights
     from holdfast.net.addresses import Address
 
 HEAD = ("unit", "to", "access", "functions", "reads", "writes")

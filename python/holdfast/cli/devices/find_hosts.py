@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.cli import terminal_text
+from holdfast.cli.device_errors import hint_at_late_replies
 from holdfast.cli.devices.search_report import INTERRUPTED, NOTHING, Report, ended_to_json
 from holdfast.cli.exit_codes import ExitCode
-from holdfast.cli.options import device
 from holdfast.discovery import device_search
 from holdfast.discovery.device_search import Host
 
@@ -101,7 +101,7 @@ def find_hosts(
     )
     if interrupted and not as_json:
         click.echo("holdfast: interrupted", err=True)
-    device.hint_at_late_replies(max((host.longest_late for host in found), default=0.0), timeout)
+    hint_at_late_replies(max((host.longest_late for host in found), default=0.0), timeout)
     if interrupted or not counts["modbus"]:
         sys.exit(ExitCode.FAILED)
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.cli import terminal_text
+from holdfast.cli.device_errors import hint_at_late_replies
 from holdfast.cli.devices.find_units import unit_to_json
 from holdfast.cli.devices.search_report import NOTHING, Report, ended_to_json
 from holdfast.cli.exit_codes import ExitCode
-from holdfast.cli.options import device
 from holdfast.cli.options.units import refuse_broadcast
 from holdfast.cli.signals import interruptions
 from holdfast.cli.terminal_text import number_ranges
@@ -63,7 +63,7 @@ def find_line(
         report.end(_line_to_json(attempts, found, total, why))
     if why is not None and not as_json:
         click.echo(f"holdfast: {path}: {why}", err=True)
-    device.hint_at_late_replies(max((each.longest_late for each in attempts), default=0.0), timeout)
+    hint_at_late_replies(max((each.longest_late for each in attempts), default=0.0), timeout)
     if why is not None or not found:
         sys.exit(ExitCode.FAILED)
 

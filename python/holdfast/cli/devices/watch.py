@@ -175,14 +175,10 @@ def _appliance(
     from holdfast.cli.live import appliance_sources
 
     config = load_or_exit(file)
-    token = os.environ.get(TOKEN)
     if memory is not None:
         require_known(memory, config.memories, f"{file} has no memory", "memories")
     try:
-        if config.rest is not None:
-            blocks = appliance_sources.by_rest(config, token)
-        else:
-            name, bind, blocks = appliance_sources.by_modbus(config)
+        blocks, opened = appliance_sources.readable(config, os.environ.get(TOKEN))
     except Unwatchable as error:
         fail(f"{file}: {error}", ExitCode.WRONG, reason="configuration", prefix="")
     if memory is not None:
@@ -193,12 +189,7 @@ def _appliance(
     if not blocks:
         why = "none of the requested addresses can be read"
         fail(f"{file}: {why}", ExitCode.WRONG, reason="configuration", prefix="")
-    if config.rest is not None:
-        needed = None if config.rest.tokens == "none" else token
-        return appliance_sources.Rest(config.rest, blocks, needed, timeout)
-    url = appliance_sources.url_of(bind)
-    client = device.connect(url, blocks[0].unit, timeout)
-    return sources.DeviceSource(f"listener {name} at {url}", url, client, blocks)
+    return opened(blocks, timeout)
 
 
 def _lines(

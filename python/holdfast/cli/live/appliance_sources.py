@@ -9,20 +9,22 @@ import ssl
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
-from holdfast.cli.live.sources import Unreadable, Unwatchable, WatchedRange, within
-from holdfast.config.checks.rights import items, matching, together
+from holdfast.cli.live.sources import DeviceSource, Unreadable, Unwatchable, WatchedRange, within
+from holdfast.cli.options import device
 from holdfast.config.models.listeners import ModbusTcpListener
+from holdfast.config.unit_rights import items, matching, together
 from holdfast.net.addresses import joined, parse_address, reachable
 from holdfast.net.certificates.own import own_der
 from holdfast.protocol import READ_FUNCTIONS
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
+    from holdfast.cli.live.sources import Source
     from holdfast.config import Config
-    from holdfast.config.checks.rights import UnitRights
     from holdfast.config.models.services import RestConfig
+    from holdfast.config.unit_rights import UnitRights
     from holdfast.config.values.ip_addresses import Bind
 
 
@@ -101,6 +103,26 @@ class Rest:
         self._connection.close()
 
 
+def readable(
+    config: Config, token: str | None
+) -> tuple[list[WatchedRange], Callable[[list[WatchedRange], float], Source]]:
+    """What can be read of an appliance, and how with a timeout: over REST if its file has that,
+    otherwise from its first Modbus TCP listener. Raises `Unwatchable`.
+    """
+    rest = config.rest
+    if rest is not None:
+        needed = None if rest.tokens == "none" else token
+        return by_rest(config, token), lambda blocks, timeout: Rest(rest, blocks, needed, timeout)
+    name, bind, found = by_modbus(config)
+    url = f"tcp://{_shown(bind)}"
+
+    def over_modbus(blocks: list[WatchedRange], timeout: float) -> Source:
+        client = device.connect(url, blocks[0].unit, timeout)
+        return DeviceSource(f"listener {name} at {url}", url, client, blocks)
+
+    return found, over_modbus
+
+
 def by_rest(config: Config, token: str | None) -> list[WatchedRange]:
     """The memories that the token may read. Raises `Unwatchable`."""
     rest = config.rest
@@ -151,11 +173,6 @@ def by_modbus(config: Config) -> tuple[str, Bind, list[WatchedRange]]:
             seen.add(rights.memory)
             blocks += readable
     return name, listener.bind, blocks
-
-
-def url_of(bind: Bind) -> str:
-    """The URL of a listener, for a client on this machine."""
-    return f"tcp://{_shown(bind)}"
 
 
 def _shown(bind: Bind) -> str:

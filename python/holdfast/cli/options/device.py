@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from holdfast.cli.device_errors import hint_at_late_replies
 from holdfast.cli.options.duration import timeout_option
 from holdfast.cli.options.option import Command, number_option, option_group
 from holdfast.client import SyncClient
-from holdfast.client.base import MAX_TIMEOUT_S
 from holdfast.errors import (
     ModbusError,
     ModbusException,
@@ -25,12 +25,6 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 UNIT = f"Unit id, 0 to {MAX_UNIT}."
-
-TIMEOUTS_S = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, MAX_TIMEOUT_S)
-"""Timeouts to suggest."""
-
-MEASURED_TIMEOUTS = 4
-"""A late reply is measured up to this many times the timeout, as long as it may raise that."""
 
 
 def unit_option(default: int | None = 1, help: str = UNIT) -> Callable[[Command], Command]:
@@ -49,24 +43,6 @@ def connect(url: str, unit: int, timeout: float) -> SyncClient:
     context = click.get_current_context()
     context.call_on_close(lambda: hint_at_late_replies(client.longest_late, timeout))
     return client
-
-
-def hint_at_late_replies(longest: float, timeout: float) -> None:
-    """Suggests a longer timeout; the slowest late reply took `longest` seconds, 0 without one."""
-    if not longest:
-        return
-    # The timeout includes connecting: a reply that missed it may be sooner after its request.
-    longest = max(longest, timeout)
-    least = next(each for each in TIMEOUTS_S if each >= longest * 1.5 or each == TIMEOUTS_S[-1])
-    found = (
-        f"up to {longest:.2g} s"
-        if longest < MEASURED_TIMEOUTS * timeout
-        else f"{longest:.2g} s or more"
-    )
-    click.echo(
-        f"hint: replies take {found}, longer than --timeout {timeout:g} s: use --timeout {least:g}",
-        err=True,
-    )
 
 
 def await_late_reply(client: SyncClient, area: Area, address: int) -> None:

@@ -29,10 +29,10 @@ from holdfast.cli.options.plc_addresses import MODICON_AREAS
 from holdfast.cli.services.reloader import Reloader
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Interrupted, Signals
 from holdfast.cli.terminal_text import ranges_shown
-from holdfast.config.checks.rights import unit_rights
 from holdfast.config.fingerprint import files_of
 from holdfast.config.models.listeners import ModbusTcpListener, RouteConfig, UnitMemoryConfig
 from holdfast.config.models.services import GatewayConfig
+from holdfast.config.unit_rights import unit_rights
 from holdfast.config.values.scanner_settings import written_pollable
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined, reachable
@@ -48,11 +48,11 @@ if TYPE_CHECKING:
     from holdfast.appliance.parts.listeners import ListenAddress
     from holdfast.appliance.windows_service.control import ServiceControl
     from holdfast.config import Config
-    from holdfast.config.checks.rights import UnitRights
     from holdfast.config.models.devices import DeviceConfig
     from holdfast.config.models.listeners import RawRuleConfig, RuleConfig, SerialRuleConfig
     from holdfast.config.models.outputs import Output
     from holdfast.config.models.services import NatsConfig
+    from holdfast.config.unit_rights import UnitRights
     from holdfast.types import Area
 
 # A signal is noticed within this time.

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, TypeAlias
 from holdfast.client.url import SerialTarget
 from holdfast.config.checks.common import given, items, refuse_repeats, until_invalid
 from holdfast.config.checks.memories import area_of, check_memory
-from holdfast.config.checks.rights import narrowed
 from holdfast.config.models.base import INVALID
 from holdfast.config.models.listeners import (
     RouteConfig,
@@ -17,6 +16,7 @@ from holdfast.config.models.listeners import (
     UnitMemoryConfig,
 )
 from holdfast.config.text.messages import show
+from holdfast.config.unit_rights import narrowed
 from holdfast.config.values.unit_keys import parse_unit_key, unit_ids
 from holdfast.protocol import (
     CODES,

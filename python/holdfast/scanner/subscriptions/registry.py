@@ -6,16 +6,21 @@ checked on its own; the registry checks it against all others.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from holdfast.client.url import STRICT, SerialTarget
 from holdfast.scanner.dialects import TENTACLE, Dialect
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.subject_parts import subject_id
+from holdfast.scanner.subscriptions.conflicts import (
+    check_settings,
+    check_tags,
+    connection_of,
+    merged,
+    replaces,
+)
 from holdfast.scanner.subscriptions.device import ScannedDevice, Source, Subscriber
 from holdfast.scanner.subscriptions.health import Health
-from holdfast.scanner.subscriptions.subscription import SETTINGS
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -26,9 +31,6 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.request_rules import ScannerLimits
     from holdfast.scanner.subscriptions.subscription import Subscription
     from holdfast.scanner.subscriptions.tag import Tag
-
-LINE_SETTINGS = ("mode", "baud", "parity", "stop_bits", "data_bits", "silence")
-"""Settings that must be equal for all devices on one serial line."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ class Registry:
         Raises `Refused` if it would replace a device that others use.
         """
         device = self.devices.get(subscription.device)
-        if device is None or not _replaces(device, subscription):
+        if device is None or not replaces(device, subscription):
             return device
         return None
 
@@ -136,12 +138,12 @@ class Registry:
             self._check_shared(subscription)
             self._dialect.check_tag_ids((), subscription.tags)
             return subscription.source, None
-        source, former = _merged(device.source, subscription), None
-        if _replaces(device, subscription):
+        source, former = merged(device.source, subscription), None
+        if replaces(device, subscription):
             # The new address may be on a line or connection that other devices share.
             former = device
             self._check_shared(subscription)
-        _check_tags(device, subscription)
+        check_tags(device, subscription)
         self._dialect.check_tag_ids(device.tags, subscription.tags)
         # All tags together, not only the new ones: their blocks are planned together.
         source.plan.check(list((device.tags | dict(subscription.tags)).values()))
@@ -171,7 +173,7 @@ class Registry:
             device.subscribers, device.tags = dict(former.subscribers), dict(former.tags)
             self._release_connection(former)
         self.devices[device.id] = device
-        self._devices_by_connection.setdefault(_connection(source.target), []).append(device.id)
+        self._devices_by_connection.setdefault(connection_of(source.target), []).append(device.id)
         self._subjects |= dict.fromkeys(_subjects(device), device.id)
         return device
 
@@ -251,26 +253,15 @@ class Registry:
     def _check_shared(self, subscription: Subscription) -> None:
         """Checks that a device has the settings of others on its connection. Raises `Refused`."""
         target = subscription.source.target
-        place = _connection(target)
-        sharing = (
-            id for id in self._devices_by_connection.get(place, ()) if id != subscription.device
-        )
-        id = next(sharing, None)
-        if id is None:
-            return
-        settings = _settings(target)
+        sharing = self._devices_by_connection.get(connection_of(target), ())
         # One is enough: each was compared with the others when it was added.
-        for key, known in _settings(self.devices[id].source.target).items():
-            if known != settings[key]:
-                at = "on one serial line" if isinstance(target, SerialTarget) else "at one address"
-                raise Refused(
-                    f"{key} of {place} is already {_setting_text(known)} for {id}, "
-                    f"not {_setting_text(settings[key])}; devices {at} have the same settings"
-                )
+        other = next((id for id in sharing if id != subscription.device), None)
+        if other is not None:
+            check_settings(target, self.devices[other])
 
     def _release_connection(self, device: ScannedDevice) -> None:
         """Notes that a device does not use its connection any more."""
-        place = _connection(device.source.target)
+        place = connection_of(device.source.target)
         self._devices_by_connection[place].remove(device.id)
         if not self._devices_by_connection[place]:
             del self._devices_by_connection[place]
@@ -307,94 +298,6 @@ def _new_to_subscriber(device: ScannedDevice | None, subscription: Subscription)
     }
 
 
-def _replaces(device: ScannedDevice, subscription: Subscription) -> bool:
-    """Returns whether a request changes the address or a setting of a device.
-
-    Raises `Refused` if other subscribers use the device.
-    """
-    known, requested = device.source, subscription.source
-    conflict = ""
-    if (known.target, known.unit) != (requested.target, requested.unit):
-        conflict = f"{device.id} is known as {_described(known)}, not as {_described(requested)}"
-    else:
-        for key in SETTINGS:
-            known_value, requested_value = getattr(known, key), getattr(requested, key)
-            if key in subscription.given_settings and known_value != requested_value:
-                conflict = (
-                    f"{key} of {device.id} is already different: "
-                    f"{known_value}, not {requested_value}"
-                )
-                break
-    if not conflict:
-        return False
-    _check_unused(
-        conflict, [name for name in device.subscribers if name != subscription.subscriber]
-    )
-    return True
-
-
-def _merged(known: Source, subscription: Subscription) -> Source:
-    """Returns the source of a request, with the known settings in place of those left out."""
-    known_settings = {
-        key: getattr(known, key) for key in SETTINGS if key not in subscription.given_settings
-    }
-    return replace(subscription.source, **known_settings)
-
-
-def _check_tags(device: ScannedDevice, subscription: Subscription) -> None:
-    """Checks that no other subscriber uses another definition of a tag. Raises `Refused`."""
-    for id, definition in subscription.tags.items():
-        known = device.tags.get(id)
-        if known is not None and known != definition:
-            difference = f"{known}, not {definition}"
-            # The text of a tag has neither its encoding nor its null values.
-            if str(known) == str(definition):
-                difference = "another encoding or other null values"
-            conflict = f"tag {id!r} of {device.id} already has another definition: {difference}"
-            users = [name for name in device.users(id) if name != subscription.subscriber]
-            _check_unused(conflict, users)
-
-
 def _subjects(device: ScannedDevice) -> set[str]:
     """Returns the names of a device in subjects and in stored entries."""
     return {subject_id(device.id), *device.subjects}
-
-
-def _check_unused(conflict: str, users: list[str]) -> None:
-    """Raises `Refused` if there are other users of something that a request would replace."""
-    if users:
-        more = f" and {len(users) - 1} more" if len(users) > 1 else ""
-        raise Refused(f"{conflict}; {users[0]}{more} must unsubscribe first")
-
-
-def _connection(target: Target) -> str:
-    """Returns the serial line, or the address, that identifies a connection."""
-    return target.device if isinstance(target, SerialTarget) else str(target)
-
-
-def _settings(target: Target) -> dict[str, object]:
-    """Returns the settings that must be equal for all devices of one connection."""
-    line = LINE_SETTINGS if isinstance(target, SerialTarget) else ()
-    return {key: getattr(target, key) for key in line} | asdict(target.tolerance)
-
-
-def _described(source: Source) -> str:
-    """Formats the address of a device with everything that identifies it."""
-    target = source.target
-    usual: dict[str, object] = asdict(STRICT)
-    more = ""
-    if isinstance(target, SerialTarget):
-        usual["mode"] = target.mode
-    elif target.tls.name is not None:
-        more = f" with the name {target.tls.name}"
-    settings = [
-        f"{key} {_setting_text(value)}"
-        for key, value in _settings(target).items()
-        if key not in usual or value != usual[key]
-    ]
-    more += f" ({', '.join(settings)})" if settings else ""
-    return f"{target}{more} unit {source.unit}"
-
-
-def _setting_text(setting: object) -> object:
-    return "the default" if setting is None else setting

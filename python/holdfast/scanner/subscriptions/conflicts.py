@@ -1,0 +1,123 @@
+"""What a request may not change, because other subscribers or devices use it.
+
+A device has one address and one set of settings, a tag has one definition, and devices on one line
+or at one address share their settings. Who is the only one to use something may change it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING
+
+from holdfast.client.url import STRICT, SerialTarget
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.subscriptions.subscription import SETTINGS
+
+if TYPE_CHECKING:
+    from holdfast.client.url import Target
+    from holdfast.scanner.subscriptions.device import ScannedDevice, Source
+    from holdfast.scanner.subscriptions.subscription import Subscription
+
+LINE_SETTINGS = ("mode", "baud", "parity", "stop_bits", "data_bits", "silence")
+"""Settings that must be equal for all devices on one serial line."""
+
+
+def replaces(device: ScannedDevice, subscription: Subscription) -> bool:
+    """Returns whether a request changes the address or a setting of a device.
+
+    Raises `Refused` if other subscribers use the device.
+    """
+    known, requested = device.source, subscription.source
+    conflict = ""
+    if (known.target, known.unit) != (requested.target, requested.unit):
+        conflict = f"{device.id} is known as {_described(known)}, not as {_described(requested)}"
+    else:
+        for key in SETTINGS:
+            known_value, requested_value = getattr(known, key), getattr(requested, key)
+            if key in subscription.given_settings and known_value != requested_value:
+                conflict = (
+                    f"{key} of {device.id} is already different: "
+                    f"{known_value}, not {requested_value}"
+                )
+                break
+    if not conflict:
+        return False
+    _check_unused(
+        conflict, [name for name in device.subscribers if name != subscription.subscriber]
+    )
+    return True
+
+
+def merged(known: Source, subscription: Subscription) -> Source:
+    """Returns the source of a request, with the known settings in place of those left out."""
+    known_settings = {
+        key: getattr(known, key) for key in SETTINGS if key not in subscription.given_settings
+    }
+    return replace(subscription.source, **known_settings)
+
+
+def check_tags(device: ScannedDevice, subscription: Subscription) -> None:
+    """Checks that no other subscriber uses another definition of a tag. Raises `Refused`."""
+    for id, definition in subscription.tags.items():
+        known = device.tags.get(id)
+        if known is not None and known != definition:
+            difference = f"{known}, not {definition}"
+            # The text of a tag has neither its encoding nor its null values.
+            if str(known) == str(definition):
+                difference = "another encoding or other null values"
+            conflict = f"tag {id!r} of {device.id} already has another definition: {difference}"
+            users = [name for name in device.users(id) if name != subscription.subscriber]
+            _check_unused(conflict, users)
+
+
+def check_settings(target: Target, other: ScannedDevice) -> None:
+    """Raises `Refused` if a target has not the settings of a device on the same connection."""
+    settings = _settings(target)
+    for key, known in _settings(other.source.target).items():
+        if known != settings[key]:
+            at = "on one serial line" if isinstance(target, SerialTarget) else "at one address"
+            raise Refused(
+                f"{key} of {connection_of(target)} is already {_setting_text(known)} for "
+                f"{other.id}, not {_setting_text(settings[key])}; devices {at} have the same "
+                "settings"
+            )
+
+
+def _check_unused(conflict: str, users: list[str]) -> None:
+    """Raises `Refused` if there are other users of something that a request would replace."""
+    if users:
+        more = f" and {len(users) - 1} more" if len(users) > 1 else ""
+        raise Refused(f"{conflict}; {users[0]}{more} must unsubscribe first")
+
+
+def connection_of(target: Target) -> str:
+    """Returns the serial line, or the address, that identifies a connection."""
+    return target.device if isinstance(target, SerialTarget) else str(target)
+
+
+def _settings(target: Target) -> dict[str, object]:
+    """Returns the settings that must be equal for all devices of one connection."""
+    line = LINE_SETTINGS if isinstance(target, SerialTarget) else ()
+    return {key: getattr(target, key) for key in line} | asdict(target.tolerance)
+
+
+def _described(source: Source) -> str:
+    """Formats the address of a device with everything that identifies it."""
+    target = source.target
+    usual: dict[str, object] = asdict(STRICT)
+    more = ""
+    if isinstance(target, SerialTarget):
+        usual["mode"] = target.mode
+    elif target.tls.name is not None:
+        more = f" with the name {target.tls.name}"
+    settings = [
+        f"{key} {_setting_text(value)}"
+        for key, value in _settings(target).items()
+        if key not in usual or value != usual[key]
+    ]
+    more += f" ({', '.join(settings)})" if settings else ""
+    return f"{target}{more} unit {source.unit}"
+
+
+def _setting_text(setting: object) -> object:
+    return "the default" if setting is None else setting
