@@ -68,6 +68,8 @@ def test_an_unknown_token_is_a_failed_authentication_and_other_refusals_are_not(
         ("done", "success"),
         ("sent", "success"),
         ("exception 02", "failure"),
+        ("exception 05", "unknown"),
+        ("exception 0B", "unknown"),
         ("refused", "failure"),
         ("not sent", "failure"),
         ("failed", "unknown"),

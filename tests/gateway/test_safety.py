@@ -25,7 +25,7 @@ from holdfast.client.url import NetworkTarget
 from holdfast.config.values.allow_entries import parse_allowed
 from holdfast.gateway import Settings, token_file
 from support import cli, gateways, web, wire
-from support.fake_device import FakeDevice, registers
+from support.fake_device import FakeDevice, exception, registers
 from support.gateways import PLC, Dialed, Names
 
 if TYPE_CHECKING:
@@ -290,13 +290,27 @@ def test_a_write_that_was_not_sent_is_told_apart(server: holdfast.Server, log: w
         gateways.running(allow=["127.0.0.0/8:1024-65535"], resolve=Names()) as running,
     ):
         body = {"host": "127.0.0.1", "address": 0, "value": 1}
+        answers = []
         for each in (port, 502, mute.port, server.address[1]):
             short = {"timeout": 500} if each == mute.port else {}
-            running.ask("/write/register", {**body, "port": each, **short})
-        running.ask("/write/register", {**body, "host": "no-such-name.invalid"})
+            answers.append(running.ask("/write/register", {**body, "port": each, **short}))
+        answers.append(running.ask("/write/register", {**body, "host": "no-such-name.invalid"}))
         assert running.gateway.status()["writes"] == 2
     outcomes = [each["outcome"] for each in log.of("gateway_write")]
     assert outcomes == ["not sent", "refused", "failed", "done", "not sent"]
+    told = [each.headers.get("holdfast-maybe-written") for each in answers]
+    assert told == ["false", "false", "true", None, "false"]
+
+
+@pytest.mark.parametrize(("code", "maybe"), [(2, "false"), (5, "true"), (6, "false"), (11, "true")])
+def test_an_exception_says_whether_the_write_may_be_carried_out(code: int, maybe: str) -> None:
+    with FakeDevice(lambda pdu: exception(pdu, code)) as device, gateways.running() as running:
+        where = {"host": "127.0.0.1", "port": device.port, "address": 0}
+        written = running.ask("/write/register", {**where, "value": 1}).headers
+        read = running.ask("/read", {**where, "functionCode": 3, "quantity": 1}).headers
+    assert written["holdfast-exception"] == read["holdfast-exception"] == str(code)
+    assert written["holdfast-maybe-written"] == maybe
+    assert "holdfast-maybe-written" not in read
 
 
 # Tokens.
@@ -564,6 +578,8 @@ def test_a_request_under_way_is_answered_when_the_gateway_ends(path: str, ending
         answer = waiting.result(wire.DEADLINE)
     assert (answer.status, answer.headers["holdfast-reason"]) == (503, "stopping")
     assert "may have been carried out" in answer.json["error"]
+    told = answer.headers.get("holdfast-maybe-written")
+    assert told == (None if path == "/read" else "true")
 
 
 def test_a_request_that_can_still_be_done_when_the_gateway_ends_is_done() -> None:

@@ -134,7 +134,7 @@ def test_a_part_that_fails_for_a_while_comes_back(gateway: Running) -> None:
         stream = view(gateway, device.port, ranged(0))
         assert stream.next("view")["parts"][0]["values"] == [5]
         error = "Modbus exception: Server Device Busy (code 0x6)"
-        assert changed(stream) == [{"part": 0, "error": error, "reason": "exception"}]
+        assert changed(stream) == [{"part": 0, "error": error, "reason": "exception", "code": 6}]
         assert changed(stream) == [{"part": 0, "error": None}]
 
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
+from holdfast.errors import UNCERTAIN
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -131,8 +133,9 @@ OUTCOMES: Mapping[tuple[str, str], Outcome] = {
     ("gateway_write", "failed"): "unknown",
     ("gateway_write", "not sent"): "failure",
     ("gateway_write", "refused"): "failure",
+    **{("gateway_write", f"exception {code:02X}"): "unknown" for code in UNCERTAIN},
 }
-"""Outcomes by the field `outcome` of an event. Modbus exceptions are failures."""
+"""Outcomes by the field `outcome` of an event. Other Modbus exceptions are failures."""
 
 
 def meaning(event: str, fields: Mapping[str, object]) -> Meaning | None:

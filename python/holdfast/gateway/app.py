@@ -25,6 +25,7 @@ from holdfast.gateway.pool import Pool
 from holdfast.gateway.refusals import EXCEPTION_STATUS, FAILURE, REFUSALS
 from holdfast.gateway.shared_devices import Shared
 from holdfast.gateway.streams import views, watch
+from holdfast.gateway.write_outcome import outcome
 from holdfast.net.allow_list import AllowList
 from holdfast.net.http import health as probes
 from holdfast.net.http.application import Application, json_response
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from holdfast.gateway.endpoint import Answer, Endpoint, Given
     from holdfast.gateway.pool import Dial
     from holdfast.gateway.settings import Settings
+    from holdfast.gateway.write_outcome import WriteOutcome
     from holdfast.net.http.health import HealthSource
     from holdfast.net.http.operations import Later, Operation
     from holdfast.net.resolver import Resolve
@@ -58,6 +60,7 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 REASON = b"holdfast-reason"
+EXCEPTION = b"holdfast-exception"
 FORM = b"application/x-www-form-urlencoded"
 """The default Content-Type of `curl -d`. The gateway treats it as JSON."""
 
@@ -163,7 +166,7 @@ class App(Application):
             return self._refused_by(request, error)
         if isinstance(error, Failed):
             self._failed += 1
-            return rejection(FAILURE.status, error.reason, error.detail)
+            return rejection(FAILURE.status, error.reason, error.detail, *error.headers)
         log_lines.problem("request_failed", listener="gateway", peer=request.peer)
         return rejection(FAILURE.status, "internal_error", "internal error, see the log")
 
@@ -179,7 +182,8 @@ class App(Application):
             # The detail may contain values to be written, which are never logged.
             detail="-" if error.reason == "malformed" else error.detail,
         )
-        answer = rejection(REFUSALS.status(error.reason), error.reason, error.detail)
+        status = REFUSALS.status(error.reason)
+        answer = rejection(status, error.reason, error.detail, *error.headers)
         if isinstance(error, port_of_call.Rejected):
             answer.body, answer.status = error.body, error.status
         return answer
@@ -249,9 +253,13 @@ class App(Application):
                 try:
                     return await self._until_disconnect(request, work, grace=self._limits.ending)
                 except ClientDisconnected:
-                    if self._ending.is_set():  # The client is there, and gets an answer.
-                        raise BadRequest("stopping", STOPPING) from None
-                    raise
+                    if not self._ending.is_set():
+                        raise
+                    # The client is there, and gets an answer.
+                    stopping = BadRequest("stopping", STOPPING)
+                    if is_write:
+                        stopping.headers = (outcome(device, stopping).header,)
+                    raise stopping from None
 
     async def _reply(
         self,
@@ -262,37 +270,39 @@ class App(Application):
         is_write: bool,
     ) -> Response:
         """Returns what the device replies."""
-        outcome = "failed"
         try:
             reply = await endpoint.carry_out(given, device)
-            # An answer that names the device itself has the order of Port of Call.
-            named = {} if "host" in reply else device.target_fields
-            answer = {"success": True, **named, **reply}
-            if endpoint.has_rtt:
-                answer["rtt"] = device.rtt
-            outcome = "sent" if device.is_broadcast else "done"
-            if device.is_broadcast:
-                answer["note"] = NOTE
-        except ModbusException as error:
-            outcome = f"exception {error.code:02X}"
-            return json_response(
-                endpoint.on_exception(given, device, error), status=EXCEPTION_STATUS
-            )
-        except BadRequest:
-            outcome = "refused"
-            raise
-        finally:
+        except BaseException as error:
+            ended = outcome(device, error)
             if is_write:
-                self._log_write(request, given, device, outcome)
+                self._log_write(request, given, device, ended)
+            more = (ended.header,) if is_write else ()
+            if isinstance(error, ModbusException):
+                return json_response(
+                    endpoint.on_exception(given, device, error),
+                    (EXCEPTION, b"%d" % error.code),
+                    *more,
+                    status=EXCEPTION_STATUS,
+                )
+            if isinstance(error, BadRequest | Failed):
+                error.headers = more
+            raise
+        if is_write:
+            self._log_write(request, given, device, outcome(device, None))
+        # An answer that names the device itself has the order of Port of Call.
+        named = {} if "host" in reply else device.target_fields
+        answer = {"success": True, **named, **reply}
+        if endpoint.has_rtt:
+            answer["rtt"] = device.rtt
+        if device.is_broadcast:
+            answer["note"] = NOTE
         return json_response(answer)
 
     def _log_write(
-        self, request: Request, given: Given, device: RequestedDevice, outcome: str
+        self, request: Request, given: Given, device: RequestedDevice, ended: WriteOutcome
     ) -> None:
         """Counts a write that may have been sent, and logs it without the values."""
-        if outcome != "refused":
-            self._writes += device.maybe_sent
-            outcome = outcome if device.maybe_sent else "not sent"
+        self._writes += device.maybe_sent
         log_lines.write(
             logging.INFO,
             "gateway_write",
@@ -302,7 +312,7 @@ class App(Application):
             target=f"{device.host}:{device.port}",
             unit=device.unit,
             address=given.get("address", given.get("writeAddress", "-")),
-            outcome=outcome,
+            outcome=ended.word,
         )
 
     # Streams.
@@ -420,7 +430,7 @@ def host_of(peer: str) -> str:
     return peer.rpartition(":")[0]
 
 
-def rejection(status: int, reason: str, detail: str) -> Response:
+def rejection(status: int, reason: str, detail: str, *more: tuple[bytes, bytes]) -> Response:
     """Returns the response to a refused or failed request."""
     said = {"success": False, "error": detail}
-    return json_response(said, (REASON, reason.encode()), status=status)
+    return json_response(said, (REASON, reason.encode()), *more, status=status)

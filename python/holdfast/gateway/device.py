@@ -53,6 +53,8 @@ class Failed(Exception):
     def __init__(self, reason: str, detail: str) -> None:
         self.reason = reason
         self.detail = detail
+        self.headers: tuple[tuple[bytes, bytes], ...] = ()
+        """More headers of the response."""
         super().__init__(f"{reason}: {detail}")
 
 
@@ -171,3 +173,10 @@ def exception_name(error: ModbusException) -> str:
 def exception_text(error: ModbusException) -> str:
     """Returns the message for a Modbus exception."""
     return f"Modbus exception: {exception_name(error)} (code 0x{error.code:x})"
+
+
+def problem(error: ModbusException | Failed | BadRequest) -> dict[str, Any]:
+    """Returns the fields for an error in events of a stream."""
+    if isinstance(error, ModbusException):
+        return {"reason": "exception", "error": exception_text(error), "code": error.code}
+    return {"reason": error.reason, "error": error.detail}

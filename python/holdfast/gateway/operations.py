@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from holdfast.gateway import assets, port_of_call
+from holdfast.gateway import assets, port_of_call, write_outcome
 from holdfast.gateway.app import App
 from holdfast.gateway.endpoint import EXAMPLE, TARGET, never
 from holdfast.gateway.endpoints import (
@@ -26,7 +26,7 @@ from holdfast.net.http import health, openapi
 from holdfast.net.http.application import DOCUMENTS
 from holdfast.net.http.openapi import Api, html_answer, json_answer, stream_answer
 from holdfast.net.http.operations import Operation, body_of
-from holdfast.net.http.schemas import COUNT, object_of, ref
+from holdfast.net.http.schemas import BOOLEAN, COUNT, object_of, ref
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
@@ -170,7 +170,9 @@ def document(version: str, settings: Settings) -> dict[str, Any]:
         "Access to Modbus devices over HTTP.",
         "Every response of a device has status 200; a Modbus exception has `success` false. A "
         "failed connection or a timeout has status 500. The header `Holdfast-Reason` has the "
-        "reason of an error as a word. Addresses count from 0. `timeout` covers connecting, "
+        "reason of an error as a word, and `Holdfast-Exception` the code of a Modbus exception. "
+        f"`{write_outcome.HEADER}` says of a write that failed whether the device may have carried "
+        "it out. Addresses count from 0. `timeout` covers connecting, "
         f"sending and receiving. A body has at most {settings.limits.body} bytes.",
         SCHEMAS,
         REFUSALS,
@@ -186,4 +188,5 @@ def _refused(row: Refusal) -> dict[str, Any]:
     """The response to a refused or failed request."""
     said = json_answer(row.means, ref("Error"), {"success": False, "error": row.example})
     reason = {"schema": {"enum": list(row.reasons)}, "description": "The reason as a word"}
-    return {**said, "headers": {"Holdfast-Reason": reason}}
+    written = {"schema": BOOLEAN, "description": "Of a write that a device was to carry out"}
+    return {**said, "headers": {"Holdfast-Reason": reason, write_outcome.HEADER: written}}

@@ -40,6 +40,7 @@ _RANGES: Schema = {
     "description": "The first and the last address of each range",
 }
 _NOW: dict[str, Schema] = {"time": count("Milliseconds since 1970"), "rtt": COUNT}
+CODE: Schema = {**integer(0, 255), "description": "The code of a Modbus exception"}
 _ASKED = {"functionCode": FUNCTION_SCHEMA, "address": ADDRESS_SCHEMA, "quantity": _QUANTITY}
 
 _ERRORS: dict[str, Schema] = {
@@ -75,13 +76,14 @@ _WATCHES: dict[str, Schema] = {
         },
         optional=("typed",),
     ),
-    "Problem": object_of({**_NOW, "error": TEXT, "reason": TEXT}),
+    "Problem": object_of({**_NOW, "error": TEXT, "reason": TEXT, "code": CODE}, optional=("code",)),
 }
 
 _PAIR: Schema = {"type": "array", "minItems": 2, "maxItems": 2, "prefixItems": [COUNT, {}]}
 _PROBLEM: dict[str, Schema] = {
     "error": {"type": ["string", "null"], "description": "Why the last poll failed"},
     "reason": TEXT,
+    "code": CODE,
 }
 _STATES: dict[str, Schema] = {
     "values": {"type": "array", "description": "Registers or bits; the values of tags"},

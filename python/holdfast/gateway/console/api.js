@@ -7,16 +7,19 @@ export const JSON_TYPE = { "Content-Type": "application/json" };
 /** How long the gateway may need beyond the timeouts of the device, in milliseconds. */
 const GRACE = 10_000;
 
-/** An error: a reason as a word, and the gateway's message. */
+/** An error: a reason as a word, the gateway's message, and the code of a Modbus exception. */
 export class Problem extends Error {
-  constructor(reason, said) {
+  constructor(reason, said, code = null) {
     super(said);
     this.reason = reason;
+    this.code = code;
+    /** Whether a write may have been carried out; `null` if the gateway has not said it. */
+    this.maybeWritten = null;
   }
 }
 
-/** Returns an error with a reason, as the gateway tells it. */
-export const failure = (reason, said) => new Problem(reason, said);
+/** Returns an error with a reason, as the gateway tells it; `code` is that of a Modbus exception. */
+export const failure = (reason, said, code = null) => new Problem(reason, said, code);
 
 export const hasToken = () => sessionStorage.getItem(KEY) !== null;
 export const forgetToken = () => sessionStorage.removeItem(KEY);
@@ -67,7 +70,12 @@ export async function answer(reply) {
     throw new Problem("internal_error", `status ${reply.status}, the body is not JSON`);
   }
   if (reply.status === 200 && body.success !== false) return body;
-  throw new Problem(reply.headers.get("Holdfast-Reason") ?? "exception", body.error ?? `status ${reply.status}`);
+  const said = reply.headers;
+  const code = said.has("Holdfast-Exception") ? Number(said.get("Holdfast-Exception")) : null;
+  const reason = said.get("Holdfast-Reason") ?? (code === null ? "internal_error" : "exception");
+  const problem = new Problem(reason, body.error ?? `status ${reply.status}`, code);
+  if (said.has("Holdfast-Maybe-Written")) problem.maybeWritten = said.get("Holdfast-Maybe-Written") === "true";
+  throw problem;
 }
 
 let asking = null;
@@ -162,25 +170,24 @@ const WORDS = {
 };
 
 const EXCEPTIONS = {
-  "0x1": ["The device does not support this function.", ["It may not have this area: try another."]],
-  "0x2": ["The device does not have this address.", [
+  1: ["The device does not support this function.", ["It may not have this area: try another."]],
+  2: ["The device does not have this address.", [
     "The manual may count from 1, or use numbers such as 40001: this page counts from 0.",
     "A range must not contain a missing address: read fewer addresses, or use the map.",
   ]],
-  "0x3": ["The device does not accept this value or quantity.", ["Read fewer addresses at once.", "Is the value in the range that the device allows?"]],
-  "0x4": ["The device failed to carry out the request.", ["Its current state may not allow it: check the device."]],
-  "0x5": ["The device accepted the request and is still processing it.", ["Try again later."]],
-  "0x6": ["The device is busy.", ["Try again in a moment."]],
-  "0xa": ["The Modbus gateway has no path to the device.", ["Is the unit id right?", "Is the serial line of that gateway configured?"]],
-  "0xb": ["The device behind the Modbus gateway does not respond.", ["Is the unit id right?", "Is the device powered, and the serial line wired?"]],
+  3: ["The device does not accept this value or quantity.", ["Read fewer addresses at once.", "Is the value in the range that the device allows?"]],
+  4: ["The device failed to carry out the request.", ["Its current state may not allow it: check the device."]],
+  5: ["The device accepted the request and is still processing it.", ["Try again later."]],
+  6: ["The device is busy.", ["Try again in a moment."]],
+  10: ["The Modbus gateway has no path to the device.", ["Is the unit id right?", "Is the serial line of that gateway configured?"]],
+  11: ["The device behind the Modbus gateway does not respond.", ["Is the unit id right?", "Is the device powered, and the serial line wired?"]],
 };
 
 /** Returns what an error means, in one sentence. */
 export const meaning = (error) => explained(error)[0];
 
 function explained(error) {
-  const code = /\(code (0x[0-9a-f]+)\)/.exec(error.message);
-  if (code && EXCEPTIONS[code[1]]) return EXCEPTIONS[code[1]];
+  if (EXCEPTIONS[error.code]) return EXCEPTIONS[error.code];
   if (error.reason === "malformed") return ["The request is malformed.", [mark(error) ? "Check the marked value." : "Check the values."]];
   return WORDS[error.reason] ?? ["The request failed.", []];
 }

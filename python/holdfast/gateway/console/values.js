@@ -230,7 +230,7 @@ export class Values {
       if (this.reading !== reading) return;
       const took = `read in ${Math.round(performance.now() - began)} ms.`;
       const [first] = data.parts;
-      if (data.parts.length === 1 && first.error) throw failure(first.reason, first.error);
+      if (data.parts.length === 1 && first.error) throw failure(first.reason, first.error, first.code);
       this.show(wanted, data);
       this.take(data, false);
       const failed = data.parts.filter((each) => each.error).length;
@@ -289,7 +289,7 @@ export class Values {
       if (!this.fits(data)) this.show(this.wholes, data);
       this.take(data, true);
       const own = data.parts[this.wholes.indexOf(panel.whole)];
-      if (own.error) throw failure(own.reason, own.error);
+      if (own.error) throw failure(own.reason, own.error, own.code);
       const changed = `${told} and read back. Changes are marked.`;
       say($("outcome"), outcome === "written" ? changed : `${told}. The table shows the values read back.`);
     } catch (error) {
@@ -399,7 +399,7 @@ export class Values {
     const changed = [];
     for (const each of changes) {
       const panel = this.panels[each.part];
-      if ("error" in each || isView) errors[each.part] = each.error ? failure(each.reason, each.error) : null;
+      if ("error" in each || isView) errors[each.part] = each.error ? failure(each.reason, each.error, each.code) : null;
       if (isView && !each.values) continue;
       const cells = isView ? panel.set(each, mark && panel.values.length > 0) : panel.change(each, mark);
       changed.push(...cells.map((cell) => [panel, cell]));

@@ -69,7 +69,7 @@ class Change {
     await stream("/api/modbus/watch/view", { method: "POST", body, extraTime }, (_, data) => (found = data.parts));
     if (found === null) throw failure("gateway_gone", "the gateway sent no value");
     const [own, words] = found;
-    if (words.error) throw failure(words.reason, words.error);
+    if (words.error) throw failure(words.reason, words.error, words.code);
     return { words: words.values, texts: [own.error ?? own.errors[0] ?? own.texts[0]] };
   }
 }

@@ -30,12 +30,8 @@ const CHANGED = "The current values have changed. Check the review again before 
 
 /** Reasons of errors after which the same request is refused again. */
 const FINAL = ["no_such_name", "refused_target", "writes_off", "malformed", "unauthorized", "foreign_page", "too_large", "not_json"];
-/** Reasons of errors that occur before anything is sent to the device. */
-const UNSENT = new Set([...FINAL, "no_connection", "busy"]);
-/** Exceptions after which a write may still be carried out: Acknowledge, and a gateway's timeout. */
-const OPEN = /\(code 0x[5b]\)/;
-/** The gateway's message for a timeout of a request that it has not sent. */
-const KEPT = /was not sent/;
+/** Reasons of errors that occur before the gateway turns to the device. */
+const UNSENT = new Set([...FINAL, "busy"]);
 
 /** The write dialog. */
 export class Writer {
@@ -227,9 +223,7 @@ export class Writer {
       asked.outcome = "written";
       if (this.isAbout(asked)) this.dialog.close();
     } catch (error) {
-      const refused = error.reason === "exception"
-        ? !OPEN.test(error.message)
-        : UNSENT.has(error.reason) || KEPT.test(error.message);
+      const refused = error.maybeWritten === false || (error.maybeWritten === null && UNSENT.has(error.reason));
       if (refused) asked.outcome = doubt;
       const told = refused ? "Not written." : "Unknown whether it was written.";
       const back = await change.read().catch(() => null);

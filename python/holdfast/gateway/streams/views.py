@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.client.tag_reading import TagReader, packed
 from holdfast.errors import ModbusError, ModbusException
-from holdfast.gateway.device import Failed, exception_text
+from holdfast.gateway.device import Failed, exception_text, problem
 from holdfast.gateway.endpoint import TARGET
 from holdfast.gateway.endpoints.read import FUNCTION, QUANTITY, Range
 from holdfast.gateway.endpoints.request_tags import LIST, MAX_TAGS, described, tags_of
@@ -180,8 +180,8 @@ class _Watched:
 
     part: _Part
     state: _State | None = None
-    problem: tuple[str, str] | None = None
-    """The reason and the message of the error of the last poll."""
+    problem: dict[str, Any] = field(default_factory=dict)
+    """The fields of the error of the last poll."""
     silent: int = 0
     """The number of the poll that it did not answer last; 0 if it did."""
 
@@ -200,7 +200,7 @@ class View:
         await self._poll()
         parts = []
         for each in self._parts:
-            about = {**each.part.about(), **_error_fields(each.problem)}
+            about = {**each.part.about(), **each.problem}
             if describe and each.part.tags:
                 about["tags"] = [described(tag) for tag in each.part.tags]
             state = each.state
@@ -219,10 +219,10 @@ class View:
         with contextlib.suppress(Failed, BadRequest):  # Each part has the error.
             await self._poll()
         parts = []
-        for at, (each, (state, problem)) in enumerate(zip(self._parts, before, strict=True)):
+        for at, (each, (state, known)) in enumerate(zip(self._parts, before, strict=True)):
             changed = _changes(state, each.state)
-            if each.problem != problem:
-                changed |= _error_fields(each.problem) or {"error": None}
+            if each.problem != known:
+                changed |= each.problem or {"error": None}
             if changed:
                 parts.append({"part": at, **changed})
         return {**self._now(), "parts": parts}
@@ -239,25 +239,21 @@ class View:
         for each in sorted(self._parts, key=lambda each: each.silent):
             if ended is None:
                 try:
-                    each.state, each.problem = await each.part.read(self._device), None
+                    each.state, each.problem = await each.part.read(self._device), {}
                     answered, each.silent = True, 0
                 except ModbusException as error:
-                    each.problem = "exception", exception_text(error)
+                    each.problem = problem(error)
                     answered, each.silent = True, 0
                 except (Failed, BadRequest) as error:
                     ended, each.silent = error, self._number
             if ended is not None:
-                each.problem = ended.reason, ended.detail
+                each.problem = problem(ended)
         self._took = round(1000 * (time.monotonic() - began))
         if ended is not None and not answered:
             raise ended
 
     def _now(self) -> dict[str, Any]:
         return {"time": round(1000 * time.time()), "rtt": self._took}
-
-
-def _error_fields(problem: tuple[str, str] | None) -> dict[str, Any]:
-    return {} if problem is None else {"reason": problem[0], "error": problem[1]}
 
 
 def _changes(before: _State | None, now: _State | None) -> dict[str, Any]:

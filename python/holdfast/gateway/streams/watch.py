@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from holdfast.errors import ModbusException
-from holdfast.gateway.device import Failed, exception_text
+from holdfast.gateway.device import Failed, problem
 from holdfast.gateway.endpoint import TARGET
 from holdfast.gateway.endpoints.read import FUNCTION, QUANTITY, Range
 from holdfast.gateway.fields import ADDRESS, BYTE_ORDER, DATATYPE, timeout
@@ -88,11 +88,11 @@ class _View:
         self.wanted = wanted
         self._device = device
         self._values: list[Any] | None = None
-        self._problem = ""
+        self._problem: dict[str, Any] = {}
 
     def all(self, found: list[Any]) -> Event:
         """Returns an event with all values."""
-        self._values, self._problem = found, ""
+        self._values, self._problem = found, {}
         return "values", {**self._now(), **self.wanted.with_values(found)}
 
     def changed(self, found: list[Any]) -> Event | None:
@@ -109,14 +109,11 @@ class _View:
 
     def problem(self, error: ModbusException | Failed | BadRequest) -> Event | None:
         """Returns an event with the error; `None` if the client knows it already."""
-        if isinstance(error, ModbusException):
-            reason, text = "exception", exception_text(error)
-        else:
-            reason, text = error.reason, error.detail
-        if text == self._problem:
+        found = problem(error)
+        if found == self._problem:
             return None
-        self._problem = text
-        return "problem", {**self._now(), "error": text, "reason": reason}
+        self._problem = found
+        return "problem", {**self._now(), **found}
 
     def _typed(self, found: list[Any], places: Sequence[int]) -> dict[str, Any]:
         """Returns the typed values that contain changed registers."""

@@ -46,6 +46,8 @@ class BadRequest(Exception):
     def __init__(self, reason: str, detail: str) -> None:
         self.reason = reason
         self.detail = detail
+        self.headers: tuple[tuple[bytes, bytes], ...] = ()
+        """More headers of the response."""
         super().__init__(f"{reason}: {detail}")
 
 
