@@ -5,7 +5,7 @@ import { isPlain, ofTag, ofType, ofWords } from "./write_change.js";
 import { $, h, once, pause } from "./dom.js";
 import { extent, modicon, REGISTER_FORMS } from "./numbers.js";
 import { placed, same } from "./parts.js";
-import * as reviews from "./review.js";
+import * as reviews from "./review_tables.js";
 
 const BITS_HELP = "0, 1, on or off. Separate values for consecutive coils with semicolons.";
 const SEVERAL = "Separate values for consecutive registers with semicolons.";
