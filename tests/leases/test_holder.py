@@ -15,7 +15,6 @@ from nats.js.errors import ServiceUnavailableError
 from holdfast.replication.leases import leases as module
 from holdfast.replication.leases.bucket import (
     SETTLED,
-    BucketIdentity,
     Entry,
     Holding,
     LeaseBucket,
@@ -47,8 +46,8 @@ class MemoryBucket:
         self.may_answer.set()
         self.deleted: list[tuple[str, bool]] = []
 
-    async def open(self, *_: int) -> BucketIdentity:
-        return BucketIdentity(None, 1)
+    async def open(self, *_: int) -> tuple[None, int]:
+        return None, 1
 
     async def unfollow(self) -> None:
         pass

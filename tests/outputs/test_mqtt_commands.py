@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.appliance import Appliance
-from holdfast.appliance.services.outputs import OutputSite
+from holdfast.appliance.services.outputs import _Site
 from holdfast.outputs import sending
 from holdfast.runtime.standstill import STANDSTILL_S
 from support import wire
@@ -217,15 +217,15 @@ def test_commands_that_waited_while_the_output_stood_still_are_not_written(
     """The version of MQTT for each of them, which has a broker of its own."""
     written: dict[str, list[str]] = {device: [] for device in devices}
     goes_on = threading.Event()
-    write = OutputSite.write
+    write = _Site.write
 
-    def wait_and_write(site: OutputSite, device: str, tag: str, text: str, *more: Any) -> None:
+    def wait_and_write(site: _Site, device: str, tag: str, text: str, *more: Any) -> None:
         written[device].append(text)
         if text == "1":
             goes_on.wait(3 * wire.DEADLINE)
         write(site, device, tag, text, *more)
 
-    monkeypatch.setattr(OutputSite, "write", wait_and_write)
+    monkeypatch.setattr(_Site, "write", wait_and_write)
     with ExitStack() as opened:
         plants: dict[str, Plant] = {}
         probes: dict[str, Client] = {}

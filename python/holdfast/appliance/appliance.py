@@ -14,7 +14,7 @@ from holdfast import _core
 from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.health import Health
 from holdfast.appliance.liveness import Liveness
-from holdfast.appliance.parts.audit import audit_of
+from holdfast.appliance.parts.audit import AuditLog
 from holdfast.appliance.parts.certificate_expiry import CertificateExpiry
 from holdfast.appliance.parts.device_leases import DeviceLeases
 from holdfast.appliance.parts.devices import Devices
@@ -189,7 +189,7 @@ class _Running:
             lambda: [each for part in self._parts for each in part.heartbeats()]
         )
         self.memories = Memories(config, memories)
-        self.audit = audit = audit_of(config)
+        self.audit = audit = AuditLog(config)
         logs = SharedLogs(config, self.memories)
         self.leases = DeviceLeases(config, logs, lease_times)
         mirrors = Mirrors(config)

@@ -20,8 +20,7 @@ from holdfast.protocol import (
     READ_REGISTERS,
     WRITE_LIMITS,
 )
-from holdfast.values.numeric import INTEGERS
-from holdfast.values.numeric import MAX as MAX_OF_FLOATS
+from holdfast.values.numeric import limits
 from holdfast.values.types import FIXED
 
 if TYPE_CHECKING:
@@ -83,7 +82,7 @@ def _placeholders() -> dict[str, Any]:
         }
         for area, function in READ_FUNCTIONS.items()
     }
-    types = {name: {"width": size // 2, "ends": _ends(name, size)} for name, size in FIXED.items()}
+    types = {name: {"width": size // 2, "ends": _ends(name)} for name, size in FIXED.items()}
     return {
         "STANDARD": {
             "AREAS": areas,
@@ -99,13 +98,9 @@ def _placeholders() -> dict[str, Any]:
     }
 
 
-def _ends(name: str, size: int) -> tuple[float | str, ...]:
+def _ends(name: str) -> tuple[float | str, ...]:
     """The least and the greatest number. Integers are text: JavaScript rounds large ones."""
-    if name in MAX_OF_FLOATS:
-        return -MAX_OF_FLOATS[name], MAX_OF_FLOATS[name]
-    if name.startswith("bcd"):
-        return "0", str(10 ** (2 * size) - 1)
-    if name not in INTEGERS:
+    if name == "bool":
         return ()
-    least = 0 if name.startswith("u") else -(1 << 8 * size - 1)
-    return str(least), str(least + (1 << 8 * size) - 1)
+    least, most = limits(name)
+    return (least, most) if isinstance(least, float) else (str(least), str(most))

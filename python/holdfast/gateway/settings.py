@@ -52,11 +52,6 @@ class GatewayLimits:
     ending: float = 0.7
     """The time for pending requests when the gateway stops; then they get status 503."""
 
-    @property
-    def open_connections(self) -> int:
-        """The most open connections, of clients and to devices."""
-        return self.connections + self.devices
-
 
 @dataclass(frozen=True)
 class Settings:

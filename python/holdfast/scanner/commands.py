@@ -28,13 +28,11 @@ if TYPE_CHECKING:
 
     from nats.aio.msg import Msg
 
-    from holdfast import tags
     from holdfast.scanner.dialects import Dialect
     from holdfast.scanner.placement import Placement
     from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.responder import Responder
     from holdfast.scanner.settings import Settings
-    from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.tag import Tag
 
@@ -42,24 +40,14 @@ MOVED = f"not written: {fault_text(STANDBY)}"
 
 
 def value(text: str, tag: Tag) -> Any:
-    """Parses a text to a value of a tag's type. Raises `Refused`."""
+    """What the registers have to hold for a value, given as text. Raises `Refused`."""
     try:
-        made = from_text(text, parsed(tag.type), tag.requested_type)
+        if tag.meaning is None:
+            made = from_text(text, parsed(tag.type), tag.requested_type)
+        else:
+            made = tag.meaning.raw(value_from(tag.meaning, text))
     except ValueError as error:
         raise Refused(str(error)) from None
-    return _checked(made, tag)
-
-
-def _of_profile(text: str, tag: Tag, meaning: tags.Tag) -> Any:
-    """What the registers have to hold for a value of a profile's tag, given as text."""
-    try:
-        return _checked(meaning.raw(value_from(meaning, text)), tag)
-    except ValueError as error:
-        raise Refused(str(error)) from None
-
-
-def _checked(made: Any, tag: Tag) -> Any:
-    """Returns the value if it fits the type of the tag. Raises `Refused`."""
     try:
         encode(made, tag.type, tag.order, encoding=tag.encoding)
     except ConversionError as error:
@@ -103,39 +91,33 @@ class Commands:
     async def write(
         self, device_id: str, tag_id: str, text: str, remaining_s: Callable[[], float]
     ) -> None:
-        """Writes to a device. Raises `Refused`; `Moved` if this scanner does not poll it."""
+        """Writes a value, given as text. Returns when the device has confirmed it.
+
+        `remaining_s` is called at the last moment: it refuses what is too late, and returns how
+        many seconds the write may wait for the device. Raises `Refused`, and `Moved` if another
+        node has the device.
+        """
         # Looked up again: the device may have been replaced while the command waited.
         device = self._registry.devices.get(device_id)
         if device is None or tag_id not in device.tags:
             raise Refused(f"no tag {tag_id!r} of {device_id}")
         if not self._placement.takes_writes(device):
             raise Moved(MOVED)
-        await write_tag(self._polling, device, device.tags[tag_id], text, remaining_s)
-
-
-async def write_tag(
-    polling: Polling, device: ScannedDevice, tag: Tag, text: str, remaining_s: Callable[[], float]
-) -> None:
-    """Writes a value, given as text. Returns when the device has confirmed it.
-
-    `remaining_s` is called at the last moment: it refuses what is too late, and returns how many
-    seconds the write may wait for the device. Raises `Refused`, and `Moved` if another node has
-    the device.
-    """
-    if (flaw := unwritable(device, tag)) is not None:
-        raise Refused(f"tag {tag.id!r} of {device.id} is not writable: {flaw}")
-    made = value(text, tag) if tag.meaning is None else _of_profile(text, tag, tag.meaning)
-    try:
-        [request] = write_typed(
-            tag.area, tag.address, made, tag.type, tag.order, tag.encoding, split=False
-        )
-    except ValueError as error:
-        raise Refused(f"not written: {error}") from None
-    fault = await polling.write(device, request, within=remaining_s())
-    if fault == STANDBY:  # Its fence is closed, so nothing was sent.
-        raise Moved(MOVED)
-    if fault:
-        outcome = "not written" if fault in NOT_WRITTEN_FAULTS else "not confirmed"
-        again = f"; {SEND_AGAIN}" if fault == EXPIRED else ""
-        raise Refused(f"{outcome}: {fault_text(fault)}{again}")
-    log_lines.write(logging.INFO, "tag_written", device=device.id, tag=tag.id)
+        tag = device.tags[tag_id]
+        if (flaw := unwritable(device, tag)) is not None:
+            raise Refused(f"tag {tag.id!r} of {device.id} is not writable: {flaw}")
+        made = value(text, tag)
+        try:
+            [request] = write_typed(
+                tag.area, tag.address, made, tag.type, tag.order, tag.encoding, split=False
+            )
+        except ValueError as error:
+            raise Refused(f"not written: {error}") from None
+        fault = await self._polling.write(device, request, within=remaining_s())
+        if fault == STANDBY:  # Its fence is closed, so nothing was sent.
+            raise Moved(MOVED)
+        if fault:
+            outcome = "not written" if fault in NOT_WRITTEN_FAULTS else "not confirmed"
+            again = f"; {SEND_AGAIN}" if fault == EXPIRED else ""
+            raise Refused(f"{outcome}: {fault_text(fault)}{again}")
+        log_lines.write(logging.INFO, "tag_written", device=device.id, tag=tag.id)

@@ -10,12 +10,10 @@ from holdfast.tags.text import text_of
 from holdfast.values import DoesNotFit, codec_for
 from holdfast.values.digits import shortest
 from holdfast.values.errors import shown
-from holdfast.values.numeric import MAX
+from holdfast.values.numeric import limits
 
 if TYPE_CHECKING:
     from holdfast.tags import Tag
-
-MAX_BCD = {"bcd16": 9999, "bcd32": 99_999_999}
 
 
 def nearest(tag: Tag, value: Any) -> Any:
@@ -128,16 +126,9 @@ def _linear(tag: Tag) -> Linear:
 
 def _limits(tag: Tag) -> tuple[float, float]:
     """The least and the largest number that the registers can hold and that is a value."""
-    base = tag.of_type.base
-    if base in MAX:
-        return -MAX[base], MAX[base]
-    if base in MAX_BCD:
-        least, most = 0, MAX_BCD[base]
-    else:
-        bits = int(base.lstrip("uint"))
-        least, most = (
-            (0, 2**bits - 1) if base.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
-        )
+    least, most = limits(tag.of_type.base)
+    if tag.is_float:
+        return least, most
     while least in tag.null:
         least += 1
     while most in tag.null:

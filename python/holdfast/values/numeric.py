@@ -12,6 +12,7 @@ from holdfast.values.errors import DoesNotFit, Undecodable, shown
 from holdfast.values.integers import as_integer
 from holdfast.values.kinds import Bytewise, Kind
 from holdfast.values.orders import move
+from holdfast.values.types import FIXED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,6 +28,17 @@ MAX = {
 }
 
 
+def limits(base: str) -> tuple[float, float]:
+    """The least and the greatest number of a type. Of integers and BCD, both are integers."""
+    if base in MAX:
+        return -MAX[base], MAX[base]
+    size = FIXED[base]
+    if base.startswith("bcd"):
+        return 0, 10 ** (2 * size) - 1
+    least = -(1 << 8 * size - 1) if base.startswith("i") else 0
+    return least, least + (1 << 8 * size) - 1
+
+
 class Number(Kind):
     """Elements with a format of `struct`."""
 
@@ -35,6 +47,7 @@ class Number(Kind):
 
     def __init__(self, type: Type, order: Order, code: str) -> None:
         super().__init__(type, order)
+        self._least, self._most = limits(type.base)
         self.item = code
         if order.places:
             self.item = f"{self.width}s"
@@ -75,9 +88,9 @@ class Number(Kind):
     def _number(self, value: Any) -> Any:
         """Converts a value of another type for `struct`. Raises `DoesNotFit`."""
 
-    @abstractmethod
     def _too_large(self, value: Any) -> DoesNotFit:
-        """The error for a number outside the range of the type."""
+        allowed = f"{self._least} to {self._most} of {self.name}"
+        return DoesNotFit(f"{shown(value)} is outside {allowed}")
 
     def _moved(self, data: bytes) -> bytes:
         """Applies an order of eight letters. `struct` handles reversed orders."""
@@ -91,16 +104,9 @@ class Integer(Number):
 
     def __init__(self, type: Type, order: Order) -> None:
         super().__init__(type, order, INTEGERS[type.base])
-        bits, signed = 8 * type.width, type.base.startswith("i")
-        self._least = -(1 << bits - 1) if signed else 0
-        self._most = self._least + (1 << bits) - 1
 
     def _number(self, value: Any) -> int:
         return _required_integer(value, self.name)
-
-    def _too_large(self, value: Any) -> DoesNotFit:
-        allowed = f"{self._least} to {self._most} of {self.name}"
-        return DoesNotFit(f"{shown(value)} is outside {allowed}")
 
 
 class Float(Number):
@@ -110,16 +116,11 @@ class Float(Number):
 
     def __init__(self, type: Type, order: Order) -> None:
         super().__init__(type, order, FLOATS[type.base])
-        self._most = MAX[type.base]
 
     def _number(self, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, Real):
             raise DoesNotFit(f"{shown(value)} is not a number, which {self.name} requires")
         return float(value)
-
-    def _too_large(self, value: Any) -> DoesNotFit:
-        allowed = f"{-self._most} to {self._most} of {self.name}"
-        return DoesNotFit(f"{shown(value)} is outside {allowed}")
 
 
 class Bcd(Bytewise):
@@ -137,9 +138,9 @@ class Bcd(Bytewise):
     def pack_one(self, value: Any) -> bytes:
         """The digits of an integer. Raises `DoesNotFit`."""
         number = _required_integer(value, self.name)
-        most = 10 ** (2 * self.width) - 1
-        if not 0 <= number <= most:
-            raise DoesNotFit(f"{shown(value)} is outside 0 to {most} of {self.name}")
+        least, most = limits(self.name)
+        if not least <= number <= most:
+            raise DoesNotFit(f"{shown(value)} is outside {least} to {most} of {self.name}")
         return self.arrange(bytes.fromhex(f"{number:0{2 * self.width}d}"))
 
 

@@ -35,42 +35,26 @@ TIMEOUT_S = PERIOD_S
 RETRY_S = 1.0
 
 
-class NoAudit(Part):
-    """An appliance without an audit log. Steps of the wall clock are still logged."""
+class AuditLog(Part):
+    """The audit log, if there is one: opened before anything listens, closed after the last write.
 
-    log: Audit | None = None
-
-    def __init__(self, config: Config) -> None:
-        super().__init__(config)
-        self._clock = WallClock()
-
-    def log_changes(self) -> None:
-        """Logs and records a step of the wall clock."""
-        step = self._clock.look()
-        if step is not None:
-            self._note("clock_stepped", step=step)
-
-    def record_writes_of(self, engine: Engine) -> None:
-        """Records writes of clients, and refusals, from now on."""
-
-    def _note(self, event: str, **fields: object) -> None:
-        """Records an event. Does not wait."""
-
-    def stats(self) -> Mapping[str, Any]:
-        """The counters of the log."""
-        return {"audit": None if self.log is None else self.log.counts()}
-
-
-class AuditLog(NoAudit):
-    """The audit log: opened before anything listens, closed after the last write."""
+    Steps of the wall clock are logged also without one.
+    """
 
     # A hanging service may wait for a shared log, and writes its record when the log is closed.
     closing_rank = 1
 
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self.log: Audit | None = None
+        self._recorder: WriteRecorder | None = None
+        self._clock = WallClock()
+
     def open(self, plan: Plan) -> None:
         """Opens the file, and records the start."""
         settings = plan.config.audit
-        assert settings is not None, "there is an audit log"
+        if settings is None:
+            return
         self.log = log = Audit(
             settings.file,
             max_bytes=settings.max_bytes,
@@ -78,43 +62,43 @@ class AuditLog(NoAudit):
             closed=settings.fail == "closed",
             copies=_copies(settings),
         )
-        self._record("start")
+        self._record(log, "start")
         self.closing.callback(log.close)
-        self.closing.callback(self._record, "stop")
+        self.closing.callback(self._record, log, "stop")
 
     def record_writes_of(self, engine: Engine) -> None:
-        """Starts the thread that records. It ends when everything is recorded."""
-        assert self.log is not None, "opened before the listeners"
-        self._recorder = WriteRecorder(self.log, engine)
-        self._recorder.start()
-        self.closing.callback(self._recorder.finish)
+        """Starts the thread that records writes of clients, and refusals, until all is recorded."""
+        if self.log is not None:
+            self._recorder = WriteRecorder(self.log, engine)
+            self._recorder.start()
+            self.closing.callback(self._recorder.finish)
 
     def prepare(self, plan: Plan) -> Callable[[], None]:  # noqa: ARG002
         """Reopens the file after a rename."""
         return self._reopen
 
-    def _note(self, event: str, **fields: object) -> None:
-        self._recorder.note(event, **fields)
+    def log_changes(self) -> None:
+        """Logs and records a step of the wall clock."""
+        step = self._clock.look()
+        if step is not None and self._recorder is not None:
+            self._recorder.note("clock_stepped", step=step)
 
     def heartbeats(self) -> Sequence[ThreadHeartbeat]:
         """The heartbeat of the thread."""
-        return [self._recorder.heartbeat()]
+        return () if self._recorder is None else [self._recorder.heartbeat()]
+
+    def stats(self) -> Mapping[str, Any]:
+        """The counters of the log."""
+        return {"audit": None if self.log is None else self.log.counts()}
 
     def _reopen(self) -> None:
-        assert self.log is not None, "it is open while the appliance runs"
-        self.log.reopen()
-        self._record("reload")
+        if self.log is not None:
+            self.log.reopen()
+            self._record(self.log, "reload")
 
-    def _record(self, event: str) -> None:
+    def _record(self, log: Audit, event: str) -> None:
         """Records an event of the appliance, with the digest of its configuration."""
-        assert self.log is not None, "it is open while the appliance runs"
-        sha256 = self.config.sha256
-        self.log.write(event=event, version=__version__, config_sha256=sha256)
-
-
-def audit_of(config: Config) -> NoAudit:
-    """The part for a configuration."""
-    return NoAudit(config) if config.audit is None else AuditLog(config)
+        log.write(event=event, version=__version__, config_sha256=self.config.sha256)
 
 
 class WriteRecorder:

@@ -18,7 +18,7 @@ from holdfast.events import log_lines
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from holdfast.appliance.parts.audit import NoAudit
+    from holdfast.appliance.parts.audit import AuditLog
     from holdfast.appliance.parts.device_leases import DeviceLeases
     from holdfast.appliance.parts.mirrors import Mirrors
     from holdfast.appliance.parts.part import Plan
@@ -34,7 +34,7 @@ class Devices(Part):
     """Everything that uses the native poller, which is created when needed."""
 
     def __init__(
-        self, config: Config, audit: NoAudit, leases: DeviceLeases, mirrors: Mirrors
+        self, config: Config, audit: AuditLog, leases: DeviceLeases, mirrors: Mirrors
     ) -> None:
         super().__init__(config)
         self._audit, self._leases, self._mirrors = audit, leases, mirrors

@@ -18,7 +18,7 @@ from holdfast.server.fork import close_in_children
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from holdfast.appliance.parts.audit import NoAudit
+    from holdfast.appliance.parts.audit import AuditLog
     from holdfast.appliance.parts.part import Plan
     from holdfast.config import Config
     from holdfast.config.models.listeners import Listener
@@ -61,7 +61,7 @@ class Listeners(Part):
 
     engine: _core.Engine
 
-    def __init__(self, config: Config, audit: NoAudit) -> None:
+    def __init__(self, config: Config, audit: AuditLog) -> None:
         super().__init__(config)
         self._audit = audit
         self._lost_events = 0

@@ -43,12 +43,12 @@ class Outputs(Service):
         if values is None or writes is None:
             return
         for name, settings in config.outputs.items():
-            site = OutputSite(name, settings.devices, values, writes)
+            site = _Site(name, settings.devices, values, writes)
             factory = partial(values.sending, name, partial(receiver, name, settings, site))
             yield Supervisor(f"{PREFIX}{name}", factory, settings)
 
 
-class OutputSite:
+class _Site:
     """The devices of the appliance, as one output may see them: a `Site`."""
 
     def __init__(
@@ -59,36 +59,29 @@ class OutputSite:
 
     @property
     def revision(self) -> int:
-        """Changes with the tags of any device, and with `devices`."""
         return self._values.revision
 
     @property
     def answers(self) -> int:
-        """Changes when a device stops to answer, or answers again."""
         return self._values.answers
 
     def tags(self) -> dict[str, tuple[Tag, ...]]:
-        """The tags of each device."""
         return {name: tags for name, tags in self._values.tags().items() if self._has(name)}
 
     def devices(self) -> Mapping[str, DeviceInfo]:
-        """What is known of each device."""
         return self._values.devices
 
     def answering(self) -> dict[str, bool]:
-        """Whether each device answers, as far as it is known."""
         answers = self._values.answering()
         return {name: answer for name, answer in answers.items() if self._has(name)}
 
     def latest(self) -> list[Reading]:
-        """The last reading of each tag."""
         return [reading for reading in self._values.latest() if self._has(reading.device)]
 
     def _has(self, device: str) -> bool:
         return self._only is None or device in self._only
 
     def refresh(self) -> None:
-        """Has the next value of each tag published, also if it is unchanged."""
         self._values.refresh(self._output)
 
     def write(
@@ -99,7 +92,6 @@ class OutputSite:
         peer: str,
         done: Callable[[NotWritten | None], None],
     ) -> None:
-        """Writes a value, as text. Raises `NotWritten` if nothing was sent."""
         if not self._has(device):
             raise NotWritten("unknown_tag", "no such tag")
         self._writes.write(device, tag, text, f"output/{self._output}", peer, done)

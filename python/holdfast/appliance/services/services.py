@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from holdfast._core import Memory
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.sessions import SessionControl
-    from holdfast.appliance.parts.audit import NoAudit
+    from holdfast.appliance.parts.audit import AuditLog
     from holdfast.appliance.parts.devices import Devices
     from holdfast.appliance.parts.part import Plan
     from holdfast.appliance.services.supervision import Supervisor
@@ -35,7 +35,7 @@ class ServiceContext:
     """What services use of their appliance."""
 
     memories: Mapping[str, Memory]
-    audit: NoAudit
+    audit: AuditLog
     devices: Devices
     diagnostics: DiagnosticsSource
     health: HealthSource

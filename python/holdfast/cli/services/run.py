@@ -176,9 +176,10 @@ def _connections(config: Config) -> int:
     most += sum(1 + len(device.forward) for device in config.devices.values())
     most += len(config.links)
     if config.nats is not None:
-        most += scanner_settings(config.nats).limits.connections
+        most += scanner_settings(config.nats).limits.devices
     if config.gateway is not None:
-        most += gateway_settings(config.gateway).limits.open_connections
+        limits = gateway_settings(config.gateway).limits
+        most += limits.connections + limits.devices
     return most
 
 

@@ -156,7 +156,7 @@ def scan(
         raise click.UsageError("--store requires --embedded.")
     log_lines.configure(options["log_level"], options["log_format"])
     limits = ScannerLimits(devices=options["max_devices"], tags=options["max_tags"])
-    raise_open_file_limit(limits.connections)
+    raise_open_file_limit(limits.devices)
     with ExitStack() as stack:
         check: Callable[[], None] | None = None
         try:

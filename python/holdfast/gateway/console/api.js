@@ -18,9 +18,6 @@ export class Problem extends Error {
   }
 }
 
-/** Returns an error with a reason, as the gateway tells it; `code` is that of a Modbus exception. */
-export const failure = (reason, said, code = null) => new Problem(reason, said, code);
-
 export const hasToken = () => sessionStorage.getItem(KEY) !== null;
 export const forgetToken = () => sessionStorage.removeItem(KEY);
 

@@ -1,6 +1,6 @@
 // The map of a device: a picture of each area, and a list of its ranges.
 
-import { notice } from "./api.js";
+import { notice, Problem } from "./api.js";
 import { $, colour, h, onTheme, say } from "./dom.js";
 import { AREAS } from "./standard.js";
 import { MAX_STREAMS, stream } from "./streams.js";
@@ -88,7 +88,7 @@ export class Discovery {
     }
     this.pictures.forEach((each) => each.list());
     if (data.success) say($("survey-state"), `Done in ${data.seconds.toFixed(1)} s: ${counted}.`, data.exact ? null : this.sampled(data.areas));
-    else say($("survey-state"), notice(Object.assign(new Error(data.error), { reason: data.reason ?? "timeout" })), `Until then: ${counted}.`, this.unsearched());
+    else say($("survey-state"), notice(new Problem(data.reason ?? "timeout", data.error)), `Until then: ${counted}.`, this.unsearched());
   }
 
   /** Where a map that ended early did not look; `null` after a complete one. */

@@ -15,6 +15,14 @@ export function h(tag, properties = {}, ...children) {
   return element;
 }
 
+/** Creates a table. The first cell of a row is its heading. */
+export const table = (kind, caption, head, rows) =>
+  h("table", { class: kind },
+    caption,
+    h("thead", {}, h("tr", {}, head.map((text) => h("th", { scope: "col" }, text)))),
+    h("tbody", {}, rows.map(([name, ...cells]) =>
+      h("tr", {}, h("th", { scope: "row" }, name), cells.map((cell) => h("td", {}, cell))))));
+
 /** Puts a message into a live region. Screen readers announce it even if it is unchanged. */
 export function say(region, ...content) {
   const shown = content.filter((each) => each !== null);

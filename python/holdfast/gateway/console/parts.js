@@ -2,7 +2,7 @@
 
 import { packed, unpacked } from "./page_url.js";
 import { modicon, typeOf } from "./numbers.js";
-import { areaOf, LAST_ADDRESS } from "./standard.js";
+import { AREAS, areaOf, LAST_ADDRESS } from "./standard.js";
 
 /** Returns a range. `type` is one of `typeOf`. */
 export function range(area, address, quantity, type, order) {
@@ -61,10 +61,8 @@ export async function read(text) {
   return range(area, address, quantity, type, rest[3] ?? "ABCD");
 }
 
-const SHORT = { coils: 1, discrete_inputs: 2, holding_registers: 3, input_registers: 4 };
-
 /** Returns the read function of the area of a tag. */
-export const functionOf = (tag) => SHORT[tag.area];
+export const functionOf = (tag) => AREAS[tag.area].code;
 
 /** Describes a scale: a number, or the register that contains it. */
 function scaled(scale) {

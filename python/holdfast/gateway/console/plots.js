@@ -29,10 +29,10 @@ export class Plots {
       h("button", { type: "button", onclick: () => this.download() }, "Download plots as CSV"), this.told));
     this.place.hidden = false;
     this.timer = setInterval(() => this.draw(), TICK);
-    this.resized = new ResizeObserver(() => this.fit());
+    this.resized = new ResizeObserver(() => this.shown.forEach((plot) => plot.fit()));
     this.resized.observe(this.place);
     this.ended = new AbortController();
-    onTheme(() => this.restyle(), this.ended.signal);
+    onTheme(() => this.shown.forEach((plot) => plot.show()), this.ended.signal);
   }
 
   /** Returns what chooses a value: an address of the only range, or one of all values. */
@@ -140,14 +140,6 @@ export class Plots {
   draw() {
     if (document.hidden) return;
     for (const plot of this.shown.values()) plot.draw();
-  }
-
-  fit() {
-    for (const plot of this.shown.values()) plot.fit();
-  }
-
-  restyle() {
-    for (const plot of this.shown.values()) plot.show();
   }
 
   /** Stops updating. */

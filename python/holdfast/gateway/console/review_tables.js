@@ -1,7 +1,7 @@
 // The review of a write: each register or coil that it changes, before and after.
 
 import { notice } from "./api.js";
-import { $, clock, h } from "./dom.js";
+import { $, clock, h, table } from "./dom.js";
 import { binary, hex } from "./numbers.js";
 
 const UNREAD = "not read";
@@ -56,7 +56,7 @@ const ofMask = ([and]) => `bit ${Math.log2(and ^ 0xffff)}`;
 function ofValues({ tag, values, typed }, texts) {
   const caption = tag ? tag.type : `${typed.datatype}, byte order ${typed.byteOrder}`;
   const rows = values.map(({ name, text }, at) => [name, texts[at] ?? UNREAD, text]);
-  return table("by-column", h("caption", {}, caption), [tag ? "Tag" : "Address", "Now", "New"], rows);
+  return table("review by-column", h("caption", {}, caption), [tag ? "Tag" : "Address", "Now", "New"], rows);
 }
 
 function ofWords({ ofBits, address, mask }, before, after) {
@@ -67,7 +67,7 @@ function ofWords({ ofBits, address, mask }, before, after) {
     return [String(address + at), now, differs ? h("mark", {}, own) : own];
   });
   const [one, many] = ofBits ? ["Coil", "Coils"] : ["Register", "Registers"];
-  return table("by-column", named(many), [one, "Now", "New"], rows);
+  return table("review by-column", named(many), [one, "Now", "New"], rows);
 }
 
 /** Shows one register in every form. Changed bits are marked. */
@@ -75,16 +75,8 @@ function ofBits(before, after) {
   const [was, will] = [binary(before), binary(after)];
   const marked = [...will].map((bit, at) => (bit === was[at] ? bit : h("mark", {}, bit)));
   const head = [h("span", { class: "unseen" }, "When"), "Decimal", "Hex", "Binary"];
-  return table("by-row", named("Bits"), head, [["Now", String(before), hex(before), was], ["New", String(after), hex(after), marked]]);
+  return table("review by-row", named("Bits"), head, [["Now", String(before), hex(before), was], ["New", String(after), hex(after), marked]]);
 }
 
 /** Names a table for screen readers. */
 const named = (text) => h("caption", { class: "unseen" }, text);
-
-function table(kind, caption, head, rows) {
-  return h("table", { class: `review ${kind}` },
-    caption,
-    h("thead", {}, h("tr", {}, head.map((text) => h("th", { scope: "col" }, text)))),
-    h("tbody", {}, rows.map(([name, ...cells]) =>
-      h("tr", {}, h("th", { scope: "row" }, name), cells.map((cell) => h("td", {}, cell))))));
-}

@@ -1,7 +1,7 @@
 // The table of registers, or the grid of bits, with marks for changes.
 
 import { notice, post } from "./api.js";
-import { $, h } from "./dom.js";
+import { $, h, table } from "./dom.js";
 import { binary, hex, modicon } from "./numbers.js";
 import { Panel } from "./panel.js";
 import { AREAS, areaOf } from "./standard.js";
@@ -176,7 +176,4 @@ export class Table extends Panel {
 }
 
 /** Shows the texts of registers by type and byte order. */
-const tableOf = ({ orders, rows }) => h("table", { class: "review" },
-  h("thead", {}, h("tr", {}, ["Type", ...orders].map((each) => h("th", { scope: "col" }, each)))),
-  h("tbody", {}, rows.map(({ type, texts }) =>
-    h("tr", {}, h("th", { scope: "row" }, type), texts.map((text) => h("td", {}, text))))));
+const tableOf = ({ orders, rows }) => table("review", null, ["Type", ...orders], rows.map(({ type, texts }) => [type, ...texts]));

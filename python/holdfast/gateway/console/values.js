@@ -1,6 +1,6 @@
 // The values view: reads or watches ranges and tag lists, and offers plots and writes.
 
-import { failure, notice } from "./api.js";
+import { notice, Problem } from "./api.js";
 import { save, stamp } from "./csv.js";
 import { $, h, pause, say, show } from "./dom.js";
 import { Lists } from "./lists.js";
@@ -214,7 +214,7 @@ export class Values {
   async once(wanted, signal) {
     let data = null;
     await stream(PATH, this.sent(wanted, { once: true }, signal), (_, found) => (data = found));
-    if (data === null) throw failure("gateway_gone", "the connection to the gateway ended");
+    if (data === null) throw new Problem("gateway_gone", "the connection to the gateway ended");
     return data;
   }
 
@@ -230,7 +230,7 @@ export class Values {
       if (this.reading !== reading) return;
       const took = `read in ${Math.round(performance.now() - began)} ms.`;
       const [first] = data.parts;
-      if (data.parts.length === 1 && first.error) throw failure(first.reason, first.error, first.code);
+      if (data.parts.length === 1 && first.error) throw new Problem(first.reason, first.error, first.code);
       this.show(wanted, data);
       this.take(data, false);
       const failed = data.parts.filter((each) => each.error).length;
@@ -289,7 +289,7 @@ export class Values {
       if (!this.fits(data)) this.show(this.wholes, data);
       this.take(data, true);
       const own = data.parts[this.wholes.indexOf(panel.whole)];
-      if (own.error) throw failure(own.reason, own.error, own.code);
+      if (own.error) throw new Problem(own.reason, own.error, own.code);
       const changed = `${told} and read back. Changes are marked.`;
       say($("outcome"), outcome === "written" ? changed : `${told}. The table shows the values read back.`);
     } catch (error) {
@@ -399,7 +399,7 @@ export class Values {
     const changed = [];
     for (const each of changes) {
       const panel = this.panels[each.part];
-      if ("error" in each || isView) errors[each.part] = each.error ? failure(each.reason, each.error, each.code) : null;
+      if ("error" in each || isView) errors[each.part] = each.error ? new Problem(each.reason, each.error, each.code) : null;
       if (isView && !each.values) continue;
       const cells = isView ? panel.set(each, mark && panel.values.length > 0) : panel.change(each, mark);
       changed.push(...cells.map((cell) => [panel, cell]));

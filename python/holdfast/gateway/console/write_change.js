@@ -1,6 +1,6 @@
 // A write: the values that are typed, the request that sends them, and the registers or coils that it changes.
 
-import { failure, post } from "./api.js";
+import { post, Problem } from "./api.js";
 import { bit, literal, register, separated, swapsBytes } from "./numbers.js";
 import { same } from "./parts.js";
 import { areaOf, MAX_WORD } from "./standard.js";
@@ -67,9 +67,9 @@ class Change {
     let found = null;
     const extraTime = parts.length * this.device.timeout;
     await stream("/api/modbus/watch/view", { method: "POST", body, extraTime }, (_, data) => (found = data.parts));
-    if (found === null) throw failure("gateway_gone", "the gateway sent no value");
+    if (found === null) throw new Problem("gateway_gone", "the gateway sent no value");
     const [own, words] = found;
-    if (words.error) throw failure(words.reason, words.error, words.code);
+    if (words.error) throw new Problem(words.reason, words.error, words.code);
     return { words: words.values, texts: [own.error ?? own.errors[0] ?? own.texts[0]] };
   }
 }

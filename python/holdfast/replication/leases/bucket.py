@@ -114,14 +114,6 @@ class Outdated(Exception):
     """A key has another revision than expected."""
 
 
-@dataclass(frozen=True)
-class BucketIdentity:
-    """Which bucket it is: one of the same name may have been lost, or deleted."""
-
-    created: datetime | None
-    last_revision: int
-
-
 class _Ack(msgspec.Struct):
     """The answer of JetStream to a message."""
 
@@ -304,10 +296,11 @@ class LeaseBucket(KeyBucket):
         super().__init__(client, name, ANSWER_TIMEOUT_S, times.answer_timeout_s)
         self._times = times
 
-    async def open(self, replicas: int = 1, after: int = 0) -> BucketIdentity:
+    async def open(self, replicas: int = 1, after: int = 0) -> tuple[datetime | None, int]:
         """Makes the bucket, if there is none, with revisions after that one.
 
-        Raises `NotALeaseBucket` and the errors of nats-py.
+        Returns when it was made, and its last revision. One of the same name may have been lost,
+        or deleted. Raises `NotALeaseBucket` and the errors of nats-py.
         """
         info = await self.make(
             replicas,
@@ -324,7 +317,7 @@ class LeaseBucket(KeyBucket):
                 f"the bucket {self.name} exists without TTLs of keys or with a history: delete it, "
                 "so that it is made again"
             )
-        return BucketIdentity(info.created, info.state.last_seq)
+        return info.created, info.state.last_seq
 
     async def settle(self) -> Entry:
         """Marks the bucket as one that is older than all leases of a former one.

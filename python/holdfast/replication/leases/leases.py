@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 
     from nats.aio.client import Client
 
-    from holdfast.replication.leases.bucket import BucketIdentity
-
 TICK_S = 0.1
 """The longest time between two looks at what others hold."""
 
@@ -279,9 +277,9 @@ class Leases:
     async def _open(self, client: Client) -> None:
         bucket = self._bucket or LeaseBucket(client, self.bucket, self.times)
         try:
-            identity = await bucket.open(self._replicas, self._latest)
+            created, last_revision = await bucket.open(self._replicas, self._latest)
             await bucket.unfollow()
-            self._identify(identity)
+            self._identify(created, last_revision)
             await bucket.follow(self._saw, self._note_read)
         except (Error, OSError, NotALeaseBucket) as error:
             self.works(nats_reason(error))
@@ -301,10 +299,10 @@ class Leases:
             self.works(None)
         self._news.set()
 
-    def _identify(self, identity: BucketIdentity) -> None:
+    def _identify(self, created: datetime | None, last_revision: int) -> None:
         """Forgets what is known of a bucket that is lost, or was set back: revisions begin anew."""
-        if identity.created != self._made_at or identity.last_revision < self._latest:
-            self._made_at = identity.created
+        if created != self._made_at or last_revision < self._latest:
+            self._made_at = created
             self.seen.clear()
             self.is_read = self._is_refused = False
             self._may_settle_at = time.monotonic() + self.times.settle_s

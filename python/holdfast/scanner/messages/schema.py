@@ -6,34 +6,12 @@ from typing import Any
 
 import msgspec
 
-from holdfast.scanner.messages.types import (
-    Announcement,
-    Answer,
-    BrowseAnswer,
-    BrowseRequest,
-    Data,
-    Heartbeat,
-    LogEntry,
-    Status,
-    SubscribeRequest,
-    UnsubscribeRequest,
-    Variable,
-    VariablesRequest,
-)
+from holdfast.scanner.messages import types
 
-MESSAGES = (
-    SubscribeRequest,
-    UnsubscribeRequest,
-    BrowseRequest,
-    Answer,
-    BrowseAnswer,
-    Data,
-    Status,
-    Heartbeat,
-    VariablesRequest,
-    Variable,
-    LogEntry,
-    Announcement,
+MESSAGES = tuple(
+    each
+    for each in vars(types).values()
+    if isinstance(each, type) and issubclass(each, msgspec.Struct) and each.__struct_fields__
 )
 
 

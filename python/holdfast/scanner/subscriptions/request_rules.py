@@ -51,11 +51,6 @@ class ScannerLimits:
     pending: int = 10_000
     """Pending requests."""
 
-    @property
-    def connections(self) -> int:
-        """The maximum number of connections to devices: one each."""
-        return self.devices
-
 
 @dataclass(frozen=True)
 class Defaults:
