@@ -150,10 +150,10 @@ def test_a_retained_message_is_not_delivered_again_to_an_adapter_that_replaces_a
 
     both = [subscription(), subscription("plant/more")]
     after = rig.run(settings(broker.url, *both, version=version))
-    after.wait_until_received(1)
+    after.wait_until_received(2)
     after.wait_until_connected()
     rig.probe(broker).publish("plant/ingest", text(command([44], 2)))
-    after.wait_until_received(2)
+    after.wait_until_received(3)
 
     assert rig.registers(0, 3) == [43, 52, 44]
 

@@ -13,7 +13,7 @@ import pytest
 
 from holdfast.adapters.mqtt import adapter, answers, connection, inbox
 from holdfast.ingest import MemoryAccess
-from holdfast.net.mqtt import connect
+from holdfast.net.mqtt import client, connect
 from holdfast.net.mqtt.stream import BrokerSocket
 from support import mqtt_peer as mqtt
 from support import wire
@@ -623,7 +623,7 @@ def test_nothing_piles_up_while_the_broker_does_not_read(
         most["packets"] = max(most["packets"], self.connection.unsent)
         most["answers"] = max(most["answers"], len(self._on_the_way) + len(self._waiting))
 
-    monkeypatch.setattr(adapter, "dial", dial_one_that_jams)
+    monkeypatch.setattr(client, "dial", dial_one_that_jams)
     monkeypatch.setattr(connection.BrokerConnection, "read_more", spy)
     monkeypatch.setattr(Jammed, "jam", threading.Event())
     running = run(rig, fake5)

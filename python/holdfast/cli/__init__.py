@@ -30,59 +30,53 @@ COMPLETION_VARIABLE = "_HOLDFAST_COMPLETE"
 
 GROUPS = {
     "Devices": {
-        "read": ("devices.read:read", "Read values of a device, once or repeatedly."),
-        "write": ("devices.write:write", "Write values to a device."),
-        "watch": ("devices.watch:watch", "Show values of a device or an appliance live."),
-        "find": (
-            "devices.find:find",
-            "Find devices: in a network, behind a gateway, on a serial line.",
-        ),
-        "describe": (
-            "devices.describe:describe",
-            "Describe an undocumented device; map, guess, identify.",
-        ),
-        "simulate": ("devices.simulate:simulate", "Run a simulated device from a tag list."),
+        "read": "Read values of a device, once or repeatedly.",
+        "write": "Write values to a device.",
+        "watch": "Show values of a device or an appliance live.",
+        "find": "Find devices: in a network, behind a gateway, on a serial line.",
+        "describe": "Describe an undocumented device; map, guess, identify.",
+        "simulate": "Run a simulated device from a tag list.",
     },
     "Services": {
-        "run": ("services.run:run", "Run an appliance: the services of a configuration file."),
-        "scan": (
-            "services.scan:scan",
-            "Run the NATS service, which polls devices for subscribers.",
-        ),
-        "gateway": ("services.gateway:gateway", "Run the HTTP service, with the web console."),
-        "proxy": ("services.proxy:proxy", "Serve one device to many Modbus clients."),
+        "run": "Run an appliance: the services of a configuration file.",
+        "scan": "Run the NATS service, which polls devices for subscribers.",
+        "gateway": "Run the HTTP service, with the web console.",
+        "proxy": "Serve one device to many Modbus clients.",
     },
     "Appliance": {
-        "check": ("appliance.check:check", "Check a configuration file."),
-        "health": ("appliance.health:health", "Ask a running appliance whether it is ready."),
-        "reload": ("appliance.reload:reload", "Have a running appliance reread its configuration."),
-        "service": (
-            "appliance.windows_service:service",
-            "Run an appliance as a service of Windows.",
-        ),
-        "sessions": ("appliance.sessions:sessions", "List the connections of a running appliance."),
-        "fleet": ("appliance.fleet:fleet", "Show and drain scanners that share devices."),
-        "log": ("appliance.log:log", "Show, replay, back up and replicate logs."),
-        "memory": (
-            "appliance.memory:memory",
-            "Verify, export and import files that keep memories.",
-        ),
-        "audit": ("appliance.audit:audit", "Verify audit logs."),
-        "import": (
-            "appliance.import_command:import_",
-            "Convert the configuration of another program.",
-        ),
-        "cert": ("appliance.cert:cert", "Make, revoke and show TLS certificates."),
-        "token": ("appliance.token:token", "Create a secret for a client of REST."),
+        "check": "Check a configuration file.",
+        "health": "Ask a running appliance whether it is ready.",
+        "reload": "Have a running appliance reread its configuration.",
+        "service": "Run an appliance as a service of Windows.",
+        "sessions": "List the connections of a running appliance.",
+        "fleet": "Show and drain scanners that share devices.",
+        "log": "Show, replay, back up and replicate logs.",
+        "memory": "Verify, export and import files that keep memories.",
+        "audit": "Verify audit logs.",
+        "import": "Convert the configuration of another program.",
+        "cert": "Make, revoke and show TLS certificates.",
+        "token": "Create a secret for a client of REST.",
     },
     "More": {
-        "raw-send": ("more.raw_send:raw_send", "Write values with one Raw Ingest packet."),
-        "bench": ("more.bench:bench", "Load test of a Modbus server."),
+        "raw-send": "Write values with one Raw Ingest packet.",
+        "bench": "Load test of a Modbus server.",
     },
 }
-"""The commands, in the order of the help: the module here and function of each, and a summary."""
+"""The commands, in the order of the help, each with a summary. `read` is the function `read` in
+`devices.read` here, and so on, but for those in `_ELSEWHERE`."""
 
-COMMANDS = {name: place for group in GROUPS.values() for name, (place, _) in group.items()}
+_ELSEWHERE = {
+    "service": "appliance.windows_service:service",
+    "import": "appliance.import_command:import_",
+    "raw-send": "more.raw_send:raw_send",
+}
+
+COMMANDS = {
+    name: _ELSEWHERE.get(name, f"{group.lower()}.{name}:{name}")
+    for group, summaries in GROUPS.items()
+    for name in summaries
+}
+"""The module here and function of each command."""
 
 
 def _imported(place: str) -> click.Command:
@@ -254,7 +248,7 @@ class Program(SuggestingGroup):
         found = [
             CompletionItem(name, help=summary)
             for group in GROUPS.values()
-            for name, (_, summary) in group.items()
+            for name, summary in group.items()
             if name.startswith(incomplete)
         ]
         old = [name for name in OLD_NAMES if incomplete and name.startswith(incomplete)]
@@ -268,7 +262,7 @@ class Program(SuggestingGroup):
         for title, group in GROUPS.items():
             with formatter.section(title):
                 formatter.write_dl(
-                    [(f"{name:{width}}", summary) for name, (_, summary) in group.items()]
+                    [(f"{name:{width}}", summary) for name, summary in group.items()]
                 )
 
 

@@ -109,36 +109,26 @@ def hint_at_late_replies(longest: float, timeout: float) -> None:
 
 
 def fail(
-    error: ModbusError,
+    error: object,
     url: str,
     answer: Mapping[str, object] | None,
     first: str | None = None,
     *,
+    where: str | None = None,
     is_in_area: bool = True,
 ) -> NoReturn:
-    """Prints an error as `print_error` does, and exits with 1."""
-    print_error(error, url, answer, first, is_in_area=is_in_area)
-    sys.exit(ExitCode.FAILED)
+    """Prints an error and hints, `first` before others, and exits with 1.
 
-
-def print_error(
-    error: ModbusError,
-    url: str,
-    answer: Mapping[str, object] | None,
-    first: str | None = None,
-    *,
-    is_in_area: bool = True,
-) -> None:
-    """Prints an error and hints, `first` before others; with `answer`, as JSON on standard output.
-
-    `is_in_area`: whether it concerns an area, not records of a file or a queue.
+    With `answer`, prints JSON on standard output. `where`: what to name in place of the URL.
+    `is_in_area`: whether the error concerns an area, not records of a file or a queue.
     """
     if answer is not None:
         print_json({"ok": False, **answer, **problem(error)})
-        return
-    click.echo(f"holdfast: {url}: {error}", err=True)
+        sys.exit(ExitCode.FAILED)
+    click.echo(f"holdfast: {where or url}: {error}", err=True)
     if first is not None:
         click.echo(f"hint: {first}", err=True)
     is_absent = isinstance(error, ModbusException) and error.code == ILLEGAL_ADDRESS
     if is_in_area or not is_absent:  # A search of addresses finds no files and queues.
         hint(error, url)
+    sys.exit(ExitCode.FAILED)

@@ -23,105 +23,57 @@ class Meaning(NamedTuple):
     outcome: Outcome
 
 
-_OPENED = Meaning(("network",), ("connection", "start"), "success")
-_CLOSED = Meaning(("network",), ("connection", "end"), "success")
-_BROKEN = Meaning(("network",), ("connection", "end"), "failure")
-_UNUSABLE = Meaning(("network",), ("connection", "info"), "failure")
-_NOT_ADMITTED = Meaning(("network",), ("connection", "denied"), "failure")
-_REQUEST_DENIED = Meaning(("network",), ("protocol", "denied"), "failure")
-_COMMAND_DENIED = Meaning(("api",), ("denied",), "failure")
-_NOT_AUTHENTICATED = Meaning(("authentication", "api"), ("start", "denied"), "failure")
-_SESSION_ENDED = Meaning(("session",), ("end",), "success")
-_WRITTEN = Meaning(("api",), ("change",), "success")
-_CHANGED = Meaning(("configuration",), ("change",), "success")
-_NOT_CHANGED = Meaning(("configuration",), ("change",), "failure")
-_STORED = Meaning(("file",), ("change",), "success")
-_NOT_STORED = Meaning(("file",), ("change",), "failure")
-_HEALTHY = Meaning(("process",), ("info",), "success")
-_UNHEALTHY = Meaning(("process",), ("info",), "failure")
+_MEANINGS: Mapping[tuple[str, str, Outcome], str] = {
+    # Connections, also those to brokers
+    ("network", "start", "success"): "listening",
+    ("network", "connection start", "success"): "opened line_back mqtt_connected nats_connected",
+    ("network", "connection end", "success"): """
+        closed idle ended evicted mqtt_disconnected nats_disconnected""",
+    ("network", "connection end", "failure"): "request_timeout slow_reader broken_frame line_lost",
+    ("network", "connection denied", "failure"): "refused_source refused_full",
+    ("network", "connection info", "failure"): """
+        unrequested_data accept_error listener_fault mqtt_connect_failed nats_connect_failed""",
+    ("network", "denied", "failure"): "mqtt_subscription_refused",
+    # Authentication and sessions
+    ("authentication network", "start allowed", "success"): "secured",
+    ("authentication network", "start denied", "failure"): "tls_failed",
+    ("session", "start", "failure"): "refused_role",
+    ("session", "end", "success"): "rights_revoked session_ended",
+    # Requests
+    ("network", "protocol denied", "failure"): """
+        refused_function refused_unit refused_address refused_sealed refused_listen_only
+        packet_refused surplus_bytes bytes_dropped broken_request message_malformed""",
+    ("api", "denied", "failure"): "ingest_refused gateway_refused request_refused",
+    ("api", "change", "success"): "gateway_write tag_written",
+    # Configuration
+    ("configuration", "change", "success"): "reloaded seal scanner_enabled scanner_disabled",
+    ("configuration", "change", "failure"): "reload_refused reload_incomplete",
+    ("file", "info", "unknown"): "certificate_expires",
+    ("file", "info", "failure"): "certificate_expired",
+    ("file", "access", "failure"): "tls_unusable",
+    # Start, stop and health, also of the logs
+    ("process", "start", "success"): "started",
+    ("process", "end", "success"): "stopped shutdown_asked",
+    ("process", "info", "success"): "thread_back",
+    ("process", "info", "failure"): """
+        thread_stalled log_contents_dropped log_failed log_digests_differ log_dropped
+        events_lost""",
+    ("process", "info", "unknown"): "held_back",
+    ("file", "change", "success"): "memory_file_back audit_back audit_copies_back",
+    ("file", "change", "failure"): """
+        memory_file_failing audit_failed audit_lost audit_not_rotated audit_copy_failed
+        audit_copies_lost""",
+    ("host", "change", "unknown"): "clock_stepped",
+}
+"""The events by category, type and outcome."""
 
 EVENTS: Mapping[str, Meaning] = {
-    # Connections
-    "listening": Meaning(("network",), ("start",), "success"),
-    "opened": _OPENED,
-    "closed": _CLOSED,
-    "idle": _CLOSED,
-    "ended": _CLOSED,
-    "refused_source": _NOT_ADMITTED,
-    "refused_full": _NOT_ADMITTED,
-    "evicted": _CLOSED,
-    "request_timeout": _BROKEN,
-    "slow_reader": _BROKEN,
-    "broken_frame": _BROKEN,
-    "unrequested_data": _UNUSABLE,
-    "accept_error": _UNUSABLE,
-    "listener_fault": _UNUSABLE,
-    "line_lost": _BROKEN,
-    "line_back": _OPENED,
-    # Authentication and sessions
-    "secured": Meaning(("authentication", "network"), ("start", "allowed"), "success"),
-    "tls_failed": Meaning(("authentication", "network"), ("start", "denied"), "failure"),
-    "refused_role": Meaning(("session",), ("start",), "failure"),
-    "rights_revoked": _SESSION_ENDED,
-    "session_ended": _SESSION_ENDED,
-    # Requests
-    "refused_function": _REQUEST_DENIED,
-    "refused_unit": _REQUEST_DENIED,
-    "refused_address": _REQUEST_DENIED,
-    "refused_sealed": _REQUEST_DENIED,
-    "refused_listen_only": _REQUEST_DENIED,
-    "packet_refused": _REQUEST_DENIED,
-    "surplus_bytes": _REQUEST_DENIED,
-    "bytes_dropped": _REQUEST_DENIED,
-    "broken_request": _REQUEST_DENIED,
-    "message_malformed": _REQUEST_DENIED,
-    "ingest_refused": _COMMAND_DENIED,
-    "gateway_refused": _COMMAND_DENIED,
-    "request_refused": _COMMAND_DENIED,
-    "gateway_write": _WRITTEN,
-    "tag_written": _WRITTEN,
-    # Brokers
-    "mqtt_connected": _OPENED,
-    "mqtt_disconnected": _CLOSED,
-    "mqtt_connect_failed": _UNUSABLE,
-    "mqtt_subscription_refused": Meaning(("network",), ("denied",), "failure"),
-    "nats_connected": _OPENED,
-    "nats_disconnected": _CLOSED,
-    "nats_connect_failed": _UNUSABLE,
-    # Configuration
-    "reloaded": _CHANGED,
-    "reload_refused": _NOT_CHANGED,
-    "reload_incomplete": _NOT_CHANGED,
-    "seal": _CHANGED,
-    "scanner_enabled": _CHANGED,
-    "scanner_disabled": _CHANGED,
-    "certificate_expires": Meaning(("file",), ("info",), "unknown"),
-    "certificate_expired": Meaning(("file",), ("info",), "failure"),
-    "tls_unusable": Meaning(("file",), ("access",), "failure"),
-    # Start, stop and health
-    "started": Meaning(("process",), ("start",), "success"),
-    "stopped": Meaning(("process",), ("end",), "success"),
-    "shutdown_asked": Meaning(("process",), ("end",), "success"),
-    "memory_file_failing": _NOT_STORED,
-    "memory_file_back": _STORED,
-    "log_contents_dropped": _UNHEALTHY,
-    "log_failed": _UNHEALTHY,
-    "log_digests_differ": _UNHEALTHY,
-    "thread_stalled": _UNHEALTHY,
-    "thread_back": _HEALTHY,
-    "clock_stepped": Meaning(("host",), ("change",), "unknown"),
-    # The logs themselves
-    "audit_failed": _NOT_STORED,
-    "audit_back": _STORED,
-    "audit_lost": _NOT_STORED,
-    "audit_not_rotated": _NOT_STORED,
-    "audit_copy_failed": _NOT_STORED,
-    "audit_copies_back": _STORED,
-    "audit_copies_lost": _NOT_STORED,
-    "events_lost": _UNHEALTHY,
-    "log_dropped": _UNHEALTHY,
-    "held_back": Meaning(("process",), ("info",), "unknown"),
+    event: Meaning(tuple(category.split()), tuple(kind.split()), outcome)
+    for (category, kind, outcome), events in _MEANINGS.items()
+    for event in events.split()
 }
+
+_NOT_AUTHENTICATED = Meaning(("authentication", "api"), ("start", "denied"), "failure")
 
 BY_REASON: Mapping[tuple[str, str], Meaning] = {
     ("ingest_refused", "unauthorized"): _NOT_AUTHENTICATED,

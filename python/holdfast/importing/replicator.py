@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -16,7 +16,7 @@ from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT
 from holdfast.types import AREAS, Area
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
     from pathlib import Path
 
     from holdfast.config.text.yaml_document import KeyPath
@@ -39,24 +39,6 @@ _TOP_REASONS = {
 }
 
 _READ_REASONS = {"interval_ms": "each unit has one interval here, that of its poll"}
-
-
-@dataclass
-class _Read:
-    area: Area
-    address: int
-    count: int
-
-    def plain(self) -> dict[str, Any]:
-        return {"area": self.area, "address": self.address, "count": self.count}
-
-
-@dataclass
-class _Unit:
-    """One unit of the source, as far as it is valid."""
-
-    endpoint: str | None = None
-    device: dict[str, Any] = field(default_factory=dict)
 
 
 def read_replicator(path: Path | str) -> Imported:
@@ -90,23 +72,20 @@ class _Units:
         replicator.close(_TOP_REASONS)
         if replicator.get("units") == []:
             self.desk.problem(replicator.at("units"), "no unit, allowed: at least one")
-        wanted = [(each.at("id"), self._id(each)) for each in sections]
-        units = [self._unit(each) for each in sections]
-        self._retry(units)
+        wanted = [(each.at("id"), each.name("id", required=True) or "unit") for each in sections]
+        devices = [self._device(each) for each in sections]
         names = unique_names(self.desk, wanted)
-        kept = [(name, unit) for name, unit in zip(names, units, strict=True) if unit.device]
+        kept = {name: each for name, each in zip(names, devices, strict=True) if each}
         if sections and not kept and not self.desk.report.problems:
             self.desk.problem(replicator.at("units"), "no unit has a target that is written")
         if kept:
             partly = "if a read of a device fails, the others are written; the source wrote none"
             self.desk.check(replicator.at("units"), partly)
-        return {name: unit.device for name, unit in kept}
+        self._retry(kept.values())
+        return kept
 
-    def _id(self, unit: Section) -> str:
-        return unit.name("id", required=True) or "unit"
-
-    def _unit(self, one: Section) -> _Unit:
-        unit = _Unit()
+    def _device(self, one: Section) -> dict[str, Any]:
+        """The device of a unit; empty if it is not polled or not valid."""
         source = one.mapping("source", required=True)
         poll = one.mapping("poll", required=True)
         reads = list(self._reads(one))
@@ -114,8 +93,8 @@ class _Units:
         interval = None if poll is None else self._interval(poll)
         one.close()
         if source is None:
-            return unit
-        unit.endpoint = self._endpoint(source)
+            return {}
+        endpoint = self._endpoint(source)
         timeout = self._timeout(source)
         block = self._block(source, has_targets=bool(targets))
         number = source.integer("unit_id", 0, MAX_UNIT, what="a unit id")
@@ -129,16 +108,17 @@ class _Units:
         ]
         if not forward:
             self.desk.left_out(one.path, "no target is written, so it is not polled")
-        elif unit.endpoint is not None and interval is not None:
-            unit.device = {
-                "url": f"tcp://{unit.endpoint}",
-                "unit": number or 0,
-                "interval": interval,
-                "timeout": timeout or DEVICE_TIMEOUT_S,
-                "reads": [read.plain() for read in reads],
-                "forward": forward,
-            }
-        return unit
+            return {}
+        if endpoint is None or interval is None:
+            return {}
+        return {
+            "url": f"tcp://{endpoint}",
+            "unit": number or 0,
+            "interval": interval,
+            "timeout": timeout or DEVICE_TIMEOUT_S,
+            "reads": reads,
+            "forward": forward,
+        }
 
     def _interval(self, poll: Section) -> float | None:
         """Seconds between polls."""
@@ -190,7 +170,7 @@ class _Units:
         shown = "".join(each if " " <= each <= "~" else "?" for each in name[:16])
         return {"area": "holding_registers", "slot": slot, "name": shown}
 
-    def _reads(self, one: Section) -> Iterator[_Read]:
+    def _reads(self, one: Section) -> Iterator[dict[str, Any]]:
         if one.get("reads") == []:
             self.desk.problem(one.at("reads"), "no read, allowed: at least one")
         for read in one.sections("reads", required=True):
@@ -209,12 +189,12 @@ class _Units:
                 allowed = f"allowed: up to {ADDRESSES - address} from address {address}"
                 self.desk.problem(read.at("quantity"), f"found {count}, {allowed}")
                 continue
-            yield _Read(_AREAS[function], address, count)
+            yield {"area": _AREAS[function], "address": address, "count": count}
 
     def _forwards(
         self,
         target: Section,
-        reads: list[_Read],
+        reads: list[dict[str, Any]],
         block: dict[str, Any] | None,
         timeout: float | None,
     ) -> Iterator[dict[str, Any]]:
@@ -261,7 +241,9 @@ class _Units:
         lost = "" if block is None else ". It received the status block, which requires values here"
         self.desk.left_out(target.path, f"{reason}{lost}")
 
-    def _offsets(self, path: KeyPath, value: object, reads: list[_Read]) -> dict[Area, int]:
+    def _offsets(
+        self, path: KeyPath, value: object, reads: list[dict[str, Any]]
+    ) -> dict[Area, int]:
         """What is added to addresses, by area; the source has it by function."""
         memory = section(self.desk, path, value)
         if memory is None:
@@ -282,21 +264,20 @@ class _Units:
                 continue
             area = _AREAS[function]
             most = ADDRESSES - max(
-                (read.address + read.count for read in reads if read.area == area), default=1
+                (read["address"] + read["count"] for read in reads if read["area"] == area),
+                default=1,
             )
             offset = given.integer(function, 0, most, what="an offset")
             if offset:
                 found[area] = offset
         return found
 
-    def _retry(self, units: list[_Unit]) -> None:
-        """Retries each address at the shortest interval of its units, as the source does."""
+    def _retry(self, devices: Collection[dict[str, Any]]) -> None:
+        """Retries each address at the shortest interval of its devices, as the source does."""
         soonest: dict[str, float] = {}
-        for unit in units:
-            if unit.device and unit.endpoint is not None:
-                interval = unit.device["interval"]
-                soonest[unit.endpoint] = min(interval, soonest.get(unit.endpoint, interval))
-        for unit in units:
-            if unit.device and unit.endpoint is not None:
-                pause = soonest[unit.endpoint]
-                unit.device["retry"] = {"first": pause, "most": pause}
+        for device in devices:
+            url, interval = device["url"], device["interval"]
+            soonest[url] = min(interval, soonest.get(url, interval))
+        for device in devices:
+            pause = soonest[device["url"]]
+            device["retry"] = {"first": pause, "most": pause}

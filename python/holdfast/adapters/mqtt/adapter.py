@@ -6,24 +6,24 @@ import contextlib
 import logging
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 from holdfast.adapters.mqtt.answers import Answers
 from holdfast.adapters.mqtt.connection import BrokerConnection
-from holdfast.adapters.mqtt.inbox import Filters, Inbox, Values
+from holdfast.adapters.mqtt.inbox import Filters, Inbox, Value
 from holdfast.adapters.mqtt.subscriptions import Subscriptions
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
-from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S, dial
+from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S
 from holdfast.net.mqtt.selector import Ended, Waiter
-from holdfast.net.secret_file import read_password
 from holdfast.net.secure_channel import failure_text
 from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags
+    from paho.mqtt.client import Client, DisconnectFlags
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from holdfast.config.models.root import MappedTag
     from holdfast.config.models.services import MqttConfig
     from holdfast.ingest import MemoryAccess
-    from holdfast.net.mqtt.stream import BrokerSocket
     from holdfast.runtime.stop import Stop
 
 LOG_INTERVAL_S = 600.0
@@ -81,7 +80,7 @@ class Mqtt:
         self._pauses = first_pause, max_pause
         self._broker = joined(settings.host, settings.port)
         filters = Filters(settings.subscriptions)
-        values = Values(mapped or {})
+        values = {topic: Value(topic, each) for topic, each in (mapped or {}).items()}
         self._inbox = Inbox(memory_access, filters, values, self._broker)
         self._answers = Answers(filters, values)
         session = _SESSIONS.setdefault((self._broker, settings.client_id), _Session())
@@ -140,16 +139,10 @@ class Mqtt:
         return held
 
     def _link(self, waiter: Waiter) -> BrokerConnection:
-        settings = self._settings
-
-        def open_socket() -> BrokerSocket:
-            return dial(settings.host, settings.port, settings.tls_files, waiter)
-
-        password = read_password(settings.password_file)
         link = BrokerConnection(
-            settings, password, open_socket, self._unreleased, self._inbox, self._answers.send
+            self._settings, waiter, self._unreleased, self._inbox, self._answers.send
         )
-        link.on_connect = self._on_connect
+        link.on_accepted = partial(self._accepted, link)
         link.on_subscribe = self._on_subscribe
         link.on_disconnect = self._on_disconnect
         return link
@@ -190,21 +183,8 @@ class Mqtt:
             self._failures.tell(reason)
         return 0.0
 
-    def _on_connect(
-        self,
-        link: Client,
-        _data: object,
-        flags: ConnectFlags,
-        reason: ReasonCode,
-        properties: Properties | None,
-    ) -> None:
-        assert isinstance(link, BrokerConnection)
-        if reason.is_failure:
-            self._ending = f"the broker refused the connection: {reason}"
-            return
-        link.accepted(properties)
+    def _accepted(self, link: BrokerConnection, is_resumed: bool) -> None:
         self._failures.forget()
-        is_resumed = flags.session_present
         if not is_resumed:
             self._unreleased.clear()
         log_lines.write(

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast.adapters.mqtt.connection import BrokerConnection
-    from holdfast.adapters.mqtt.inbox import Filters, Values
+    from holdfast.adapters.mqtt.inbox import Filters, Value
     from holdfast.net.mqtt.packets import Publish
 
 
@@ -28,7 +28,7 @@ MAX_WAITING_ANSWERS = 100
 class Answers:
     """Sends and counts answers."""
 
-    def __init__(self, filters: Filters, values: Values) -> None:
+    def __init__(self, filters: Filters, values: Mapping[str, Value]) -> None:
         self._filters, self._values = filters, values
         self.sent = 0
         self.dropped = 0

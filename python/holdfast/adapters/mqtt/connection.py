@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from holdfast.adapters.mqtt.inbox import Inbox
     from holdfast.config.models.services import MqttConfig
     from holdfast.net.mqtt.packets import Publish
-    from holdfast.net.mqtt.stream import BrokerSocket
+    from holdfast.net.mqtt.selector import Waiter
 
 SESSION_EXPIRY_S = 3600
 """Seconds that the broker keeps the session while this client is disconnected. MQTT 5 only."""
@@ -64,8 +64,7 @@ class BrokerConnection(BrokerClient):
     def __init__(
         self,
         settings: MqttConfig,
-        password: bytes | None,
-        dial: Callable[[], BrokerSocket],
+        waiter: Waiter,
         unreleased: set[int],
         inbox: Inbox,
         answer: Callable[[BrokerConnection, Publish, Mapping[str, object]], None],
@@ -74,9 +73,7 @@ class BrokerConnection(BrokerClient):
 
         `answer` is called for each message, after its acknowledgement.
         """
-        super().__init__(
-            settings, settings.client_id, password, dial, session_expiry=SESSION_EXPIRY_S
-        )
+        super().__init__(settings, settings.client_id, waiter, session_expiry=SESSION_EXPIRY_S)
         self._unreleased = unreleased
         self._inbox = inbox
         self._answer = answer
@@ -106,7 +103,6 @@ class BrokerConnection(BrokerClient):
 
     def accepted(self, properties: Properties | None) -> None:
         """Applies the limits from the broker's CONNACK."""
-        self.on_log = None
         most: int = getattr(properties, "ReceiveMaximum", _MAX_UNACKNOWLEDGED)
         self._most_on_the_way = min(most, _MAX_UNACKNOWLEDGED)
         self._largest_sent = getattr(properties, "MaximumPacketSize", None)

@@ -47,8 +47,9 @@ class BadValue(Exception):
 class Value:
     """What the messages of one topic write."""
 
-    def __init__(self, topic: str, memory: str, mapped: MappedTag) -> None:
-        tag = self._tag = mapped.tag
+    def __init__(self, topic: str, mapped: MappedTag) -> None:
+        memory, tag = mapped
+        self._tag = tag
         self._where = {"memory": memory, "area": tag.area, "address": tag.address}
         self._codec = codec_for(tag.area, tag.type, tag.order, tag.encoding)
         self.grant = Grant(topic, frozenset({memory}), frozenset({tag.area}))
@@ -76,23 +77,6 @@ class Value:
         return BadValue(f"{self._tag.name}: {cause}", where)
 
 
-class Values:
-    """What is written by the messages of each topic with plain values."""
-
-    def __init__(self, mapped: Mapping[str, MappedTag]) -> None:
-        self._values = {topic: Value(topic, each.memory, each) for topic, each in mapped.items()}
-
-    def __contains__(self, topic: str) -> bool:
-        return topic in self._values
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def get(self, topic: str) -> Value | None:
-        """What the messages of a topic write; `None` if it has no plain values."""
-        return self._values.get(topic)
-
-
 MAX_PAYLOAD_BYTES = 8 * 2**20
 """The largest accepted payload, in bytes."""
 
@@ -109,8 +93,13 @@ class Inbox:
     """Handles messages one by one. An error in one does not affect the next."""
 
     def __init__(
-        self, memory_access: MemoryAccess, filters: Filters, values: Values, broker: str
+        self,
+        memory_access: MemoryAccess,
+        filters: Filters,
+        values: Mapping[str, Value],
+        broker: str,
     ) -> None:
+        """`values`: what the topics with plain values write."""
         self._memory_access = memory_access
         self._filters, self._values = filters, values
         self._broker = broker

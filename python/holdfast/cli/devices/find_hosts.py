@@ -63,8 +63,9 @@ def find_hosts(
             err=True,
         )
     report = Report({"target": target, "port": port} if as_json else None)
-    hosts = HostReport(report, max(map(len, urls)))
+    row = f"{{:{max(map(len, urls))}}}  {{:>4}}  {{:7}}  {{}}"
     found: list[Host] = []
+    listed: list[Host] = []
 
     async def look() -> None:
         seen = device_search.hosts(
@@ -78,7 +79,9 @@ def find_hosts(
         with report.progress("Finding", total, lambda: f"{_answering(found)} found"):
             async for host in seen:
                 found.append(host)
-                hosts.add(host)
+                if host.state in LISTED_STATES:
+                    listed.append(host)
+                    _print(host, report, row, is_first=len(listed) == 1)
                 report.advance(len(found))
 
     interrupted = False
@@ -87,7 +90,7 @@ def find_hosts(
     except KeyboardInterrupt:
         interrupted = True
     counts = Counter(host.state for host in found)
-    report.text(*([""] if hosts.printed else []), _counted(counts, total, total - len(found)))
+    report.text(*([""] if listed else []), _counted(counts, total, total - len(found)))
     report.end(
         {
             **ended_to_json(INTERRUPTED if interrupted else None if counts["modbus"] else NOTHING),
@@ -106,27 +109,14 @@ def find_hosts(
         sys.exit(ExitCode.FAILED)
 
 
-class HostReport:
-    """The table of the hosts that are found, as they come."""
-
-    def __init__(self, report: Report, width: int) -> None:
-        self.printed = 0
-        self._report = report
-        self._row = f"{{:{width}}}  {{:>4}}  {{:7}}  {{}}"
-
-    def add(self, host: Host) -> None:
-        """Prints a host, if it answers or has the port open."""
-        if host.state not in LISTED_STATES:
-            return
-        if self.printed == 0:
-            head = self._row.format("url", "unit", "answer", "identification")
-            self._report.text(terminal_text.styled(head, bold=True))
-        self.printed += 1
-        unit = "" if host.unit is None else str(host.unit)
-        answer = host.detail if host.state == "modbus" else f"no Modbus: {host.detail}"
-        identity = terminal_text.plain(str(host.identity))
-        self._report.text(self._row.format(host.url, unit, answer, identity).rstrip())
-        self._report.entry(_host(host))
+def _print(host: Host, report: Report, row: str, *, is_first: bool) -> None:
+    unit = "" if host.unit is None else str(host.unit)
+    answer = host.detail if host.state == "modbus" else f"no Modbus: {host.detail}"
+    identity = terminal_text.plain(str(host.identity))
+    head = terminal_text.styled(row.format("url", "unit", "answer", "identification"), bold=True)
+    line = row.format(host.url, unit, answer, identity).rstrip()
+    report.text(*([head] if is_first else []), line)
+    report.entry(_host(host))
 
 
 def _answering(found: Iterable[Host]) -> int:

@@ -135,11 +135,11 @@ def read(
             place = query.place if isinstance(query, _Query) else None
             of_modicon = modicon_hint(place) if place and _is_absent(error) else None
             shown = fields if as_json else None
-            is_in_area = place is not None
-            device_errors.print_error(error, url, shown, of_modicon, is_in_area=is_in_area)
-            if place and isinstance(error, RequestTimeout):
-                device.await_late_reply(client, place.area, place.address)
-            sys.exit(ExitCode.FAILED)
+            try:
+                device_errors.fail(error, url, shown, of_modicon, is_in_area=place is not None)
+            finally:  # Its hint follows the others.
+                if place and isinstance(error, RequestTimeout):
+                    device.await_late_reply(client, place.area, place.address)
     if as_json:
         print_json({"ok": not query.undecodable(raw), **fields, **query.found(raw)})
     else:

@@ -119,7 +119,8 @@ def watch(
         try:
             first = source.read()
         except (ModbusError, Unreadable, OSError) as error:
-            sources.fail_first(source.where, source.url, error, as_json=as_json)
+            answer = {"target": source.url} if as_json else None
+            device_errors.fail(error, source.url, answer, where=source.where)
         if sys.stdout.isatty() and not as_json:
             from holdfast.cli.live.registers_view import View
 
@@ -154,7 +155,7 @@ def _device(
             )
     except ModbusError as error:
         client.close()
-        sources.fail_first(url, url, error, as_json=as_json)
+        device_errors.fail(error, url, {"target": url} if as_json else None)
     blocks = [
         WatchedRange(None, unit, found.area, each.start, len(each))
         for found in survey.areas
@@ -162,7 +163,8 @@ def _device(
     ]
     if not blocks:
         client.close()
-        sources.fail_first(url, url, "no address was found", as_json=as_json)
+        answer = {"target": url} if as_json else None
+        device_errors.fail("no address was found", url, answer)
     return sources.DeviceSource(where, url, client, blocks)
 
 

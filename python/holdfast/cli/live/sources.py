@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NoReturn, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import click
 
 from holdfast.cli import terminal_text
 from holdfast.cli.device_errors import hint, problem
-from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options.device import read_raw
 from holdfast.cli.terminal_text import print_json
 
@@ -107,16 +105,6 @@ def cut(
         left -= count
     total = sum(block.count for block in blocks)
     return kept, total - sum(block.count for block in kept)
-
-
-def fail_first(where: str, url: str, error: object, *, as_json: bool) -> NoReturn:
-    """Prints why the first reading failed, and exits."""
-    if as_json:
-        print_json({"ok": False, "target": url, **problem(error)})
-    else:
-        click.echo(f"holdfast: {where}: {error}", err=True)
-        hint(error, url)
-    sys.exit(ExitCode.FAILED)
 
 
 def print_error(error: object, url: str, *, as_json: bool) -> None:

@@ -48,32 +48,24 @@ def tls_options(prefix: str, into: str, *texts: str) -> Callable[[Command], Comm
 
 
 _HTTPS = {
-    "cert": "Serve HTTPS with this certificate, followed by its intermediate certificates.",
-    "key": "Its key.",
-    "passphrase-file": "File that contains the passphrase of the key.",
-    "client-ca": "Require client certificates of these authorities.",
+    "cert cert_file": (
+        "Serve HTTPS with this certificate, followed by its intermediate certificates."
+    ),
+    "key key_file": "Its key.",
+    "passphrase-file key_passphrase_file": "File that contains the passphrase of the key.",
+    "client-ca client_ca_file": "Require client certificates of these authorities.",
 }
+"""The options `--https-…` and their keys in a configuration."""
 
 
-def _https_config(
-    https_cert: Path | None,
-    https_key: Path | None,
-    https_passphrase_file: Path | None,
-    https_client_ca: Path | None,
-) -> dict[str, Path] | None:
+def _https_config(**given: Path | None) -> dict[str, Path] | None:
     """The files of the options, as in a configuration; `None` for HTTP.
 
     Raises `click.UsageError`.
     """
-    _require_both("https", https_cert, https_key)
-    named = {
-        "cert_file": https_cert,
-        "key_file": https_key,
-        "key_passphrase_file": https_passphrase_file,
-        "client_ca_file": https_client_ca,
-    }
-    files = {key: file for key, file in named.items() if file is not None}
-    if files and https_cert is None:
+    _require_both("https", given["cert_file"], given["key_file"])
+    files = {key: file for key, file in given.items() if file is not None}
+    if files and "cert_file" not in files:
         raise click.UsageError(
             "--https-passphrase-file and --https-client-ca require --https-cert."
         )

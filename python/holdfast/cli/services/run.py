@@ -178,8 +178,8 @@ def _connections(config: Config) -> int:
     if config.nats is not None:
         most += scanner_settings(config.nats).limits.devices
     if config.gateway is not None:
-        limits = gateway_settings(config.gateway).limits
-        most += limits.connections + limits.devices
+        of_gateway = gateway_settings(config.gateway).limits
+        most += of_gateway.connections + of_gateway.devices
     return most
 
 

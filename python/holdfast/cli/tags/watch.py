@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from holdfast.cli import terminal_text
-from holdfast.cli.device_errors import hint
+from holdfast.cli.device_errors import fail, hint
 from holdfast.cli.live import schedule
-from holdfast.cli.live.sources import fail_first, print_error
+from holdfast.cli.live.sources import print_error
 from holdfast.cli.tags import recording
 from holdfast.cli.tags.changes import TagTracker, common_error
 from holdfast.cli.tags.read import problem, value_shown
@@ -33,7 +33,8 @@ def watch_tags(source: TagSource, form: Form, every: float, times: int | None) -
         moment, first = source.read()
         error = common_error(first)
         if error is not None:
-            fail_first(source.where, source.url, error, as_json=form == "json")
+            answer = {"target": source.url} if form == "json" else None
+            fail(error, source.url, answer, where=source.where)
         if form == "text" and sys.stdout.isatty():
             from holdfast.cli.tags.view import TagView
 

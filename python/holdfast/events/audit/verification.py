@@ -7,6 +7,7 @@ who has written the whole chain anew: against both, keep digests elsewhere (`anc
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import partial
@@ -186,13 +187,9 @@ def _lines(files: Iterable[Path]) -> Iterator[Line]:
 
 
 def _with_next(lines: Iterable[Line]) -> Iterator[tuple[Line, Line | None]]:
-    before: Line | None = None
-    for line in lines:
-        if before is not None:
-            yield before, line
-        before = line
-    if before is not None:
-        yield before, None
+    for line, after in itertools.pairwise(itertools.chain(lines, (None,))):
+        assert line is not None, "only the last one is"
+        yield line, after
 
 
 def _after(files: Sequence[Path], line: Line) -> Iterator[Line]:

@@ -13,12 +13,21 @@ from paho.mqtt.enums import CallbackAPIVersion, LogLevel, MQTTErrorCode, MQTTPro
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
+from holdfast.net.mqtt import MAX_TEXT
+from holdfast.net.mqtt.connect import dial
 from holdfast.net.mqtt.packets import head
+from holdfast.runtime.bounded_files import MAX_SECRETS_BYTES, read
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
+    from paho.mqtt.client import ConnectFlags
+    from paho.mqtt.reasoncodes import ReasonCode
+
+    from holdfast.net.mqtt.selector import Waiter
     from holdfast.net.mqtt.stream import BrokerSocket
+    from holdfast.net.tls import Tls
 
 
 class BrokerSettings(Protocol):
@@ -41,6 +50,14 @@ class BrokerSettings(Protocol):
         """The name that it knows this client by."""
 
     @property
+    def password_file(self) -> Path | None:
+        """The file of the password."""
+
+    @property
+    def tls_files(self) -> Tls | None:
+        """The files for TLS; `None` without TLS."""
+
+    @property
     def keep_alive(self) -> int:
         """The seconds after which it gives up a silent client."""
 
@@ -52,13 +69,14 @@ class BrokerClient(Client):
         self,
         settings: BrokerSettings,
         client_id: str,
-        password: bytes | None,
-        dial: Callable[[], BrokerSocket],
+        waiter: Waiter,
         *,
         session_expiry: int,
     ) -> None:
         """`session_expiry`: seconds that the broker keeps the session after the connection, as far
         as MQTT 3.1.1 can express it; 0 for a new session in each connection.
+
+        Raises `OSError` for an unusable file of the password.
         """
         self._settings = settings
         self._five = settings.version == "5"
@@ -70,11 +88,17 @@ class BrokerClient(Client):
             protocol=MQTTProtocolVersion.MQTTv5 if self._five else MQTTProtocolVersion.MQTTv311,
             reconnect_on_failure=False,
         )
-        self._dial = dial
+        self._waiter = waiter
         self._connection: BrokerSocket | None = None
         self.trouble: str | None = None
         """Why the connection ends, or the last error that paho logged."""
+        self.is_accepted = False
+        """Whether the broker has accepted the connection."""
+        self.on_accepted: Callable[[bool], None] | None = None
+        """Called then, with whether the broker resumes a session."""
+        self.on_connect = self._connected
         self.on_log = self._note
+        password = _password(settings.password_file)
         self.username_pw_set(settings.username, password)  # type: ignore[arg-type]
 
     def open(self, **limits: int) -> None:
@@ -106,6 +130,10 @@ class BrokerClient(Client):
         """Whether the connection has begun and has not ended."""
         return self._connection is not None and self._connection.is_open
 
+    def accepted(self, properties: Properties | None) -> None:
+        """Applies the limits from the broker's CONNACK."""
+        raise NotImplementedError
+
     def pass_on(self, first: int, body: bytes | bytearray) -> MQTTErrorCode:
         """Passes a packet to paho, which closes the connection after an error."""
         self.connection.for_paho += head(first, len(body)) + body
@@ -128,10 +156,45 @@ class BrokerClient(Client):
         if self._connection is not None:
             self._connection.close()
 
+    def _connected(
+        self,
+        _client: Client,
+        _data: object,
+        flags: ConnectFlags,
+        reason: ReasonCode,
+        properties: Properties | None,
+    ) -> None:
+        """Handles CONNACK."""
+        if reason.is_failure:
+            self.trouble = f"the broker refused the connection: {reason}"
+            return
+        self.on_log = None
+        self.accepted(properties)
+        self.is_accepted = True
+        if self.on_accepted is not None:
+            self.on_accepted(flags.session_present)
+
     def _note(self, _client: Client, _data: object, level: int, text: str) -> None:
         if level == LogLevel.MQTT_LOG_ERR or "malformed" in text:
             self.trouble = text
 
     def _create_socket(self) -> BrokerSocket:
-        self._connection = self._dial()
+        settings = self._settings
+        self._connection = dial(settings.host, settings.port, settings.tls_files, self._waiter)
         return self._connection
+
+
+def _password(file: Path | None) -> bytes | None:
+    """The password in a file, which may be any bytes.
+
+    Read at each attempt to connect, so that a new password needs no restart. Raises `OSError` for
+    an unusable file.
+    """
+    if file is None:
+        return None
+    content = read(file, MAX_SECRETS_BYTES)
+    newline = b"\r\n" if content.endswith(b"\r\n") else b"\n"
+    password = content.removesuffix(newline)
+    if len(password) > MAX_TEXT:
+        raise OSError(f"{file} holds more than {MAX_TEXT} bytes")
+    return password

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from holdfast.config.models.services import BrokerConfig
     from holdfast.net.mqtt.packets import Publish
-    from holdfast.net.mqtt.stream import BrokerSocket
+    from holdfast.net.mqtt.selector import Waiter
     from holdfast.outputs.mqtt.delivery import Delivery
 
 WINDOW = {"5": 1000, "3.1.1": 100}
@@ -66,8 +66,7 @@ class Connection(BrokerClient):
         self,
         settings: BrokerConfig,
         client_id: str,
-        password: bytes | None,
-        dial: Callable[[], BrokerSocket],
+        waiter: Waiter,
         on_command: Callable[[Publish, bool], None],
         *,
         qos: int,
@@ -76,7 +75,7 @@ class Connection(BrokerClient):
         """`proves`: with a quality of service of 0, messages count as confirmed when the broker
         has answered a ping that follows them; otherwise, when they are written.
         """
-        super().__init__(settings, client_id, password, dial, session_expiry=0)
+        super().__init__(settings, client_id, waiter, session_expiry=0)
         self._on_command = on_command
         self._qos, self._proves = qos, proves
         self._window = WINDOW[settings.version]
@@ -93,7 +92,6 @@ class Connection(BrokerClient):
 
     def accepted(self, properties: Properties | None) -> None:
         """Applies the limits from the broker's CONNACK."""
-        self.on_log = None
         self._window = min(getattr(properties, "ReceiveMaximum", self._window), self._window)
         self._largest = getattr(properties, "MaximumPacketSize", None)
         self._retains = bool(getattr(properties, "RetainAvailable", 1))

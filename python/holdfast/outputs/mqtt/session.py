@@ -12,9 +12,8 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 
 from holdfast.events import log_lines
-from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S, dial
+from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S
 from holdfast.net.mqtt.selector import Ended, Waiter
-from holdfast.net.secret_file import read_password
 from holdfast.net.secure_channel import failure_text
 from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES, Connection
 from holdfast.outputs.mqtt.delivery import Delivery, Message
@@ -24,12 +23,11 @@ from holdfast.runtime.stop import Stop
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags
+    from paho.mqtt.client import Client, DisconnectFlags
     from paho.mqtt.properties import Properties
 
     from holdfast.config.models.services import BrokerConfig
     from holdfast.net.mqtt.packets import Publish
-    from holdfast.net.mqtt.stream import BrokerSocket
 
 CONFIRM_TIMEOUT_S = 10.0
 """Seconds without any confirmation after which the connection is given up."""
@@ -81,7 +79,6 @@ class Session:
         self._news = threading.Condition(self._lock)
         self._new: list[Delivery] = []
         self._topics: list[tuple[Sequence[str], bool]] = []
-        self._is_accepted = False
         self._reason: str | None = None
         self._is_over = False
         self._waiter = Waiter(self._end)
@@ -153,23 +150,15 @@ class Session:
 
     def _opened(self, client_id: str, will: Message | None) -> Connection:
         """Connects, and waits for the broker's consent. A stop interrupts it."""
-        settings = self._settings
         with Waiter(self._stop) as waiter:
-
-            def open_socket() -> BrokerSocket:
-                return dial(settings.host, settings.port, settings.tls_files, waiter)
-
-            password = read_password(settings.password_file)
             connection = Connection(
-                settings,
+                self._settings,
                 client_id,
-                password,
-                open_socket,
+                waiter,
                 self._take,
                 qos=self._qos,
                 proves=self._proves,
             )
-            connection.on_connect = self._on_connect
             connection.on_disconnect = self._on_disconnect
             if will is not None:
                 connection.will_set(
@@ -178,13 +167,13 @@ class Session:
             try:
                 connection.open(MaximumPacketSize=MAX_PACKET_BYTES)
                 end = time.monotonic() + CONNACK_TIMEOUT_S
-                while not self._is_accepted and connection.is_open:
+                while not connection.is_accepted and connection.is_open:
                     if time.monotonic() > end:
                         raise TimeoutError(
                             f"the broker did not answer within {CONNACK_TIMEOUT_S:g} s"
                         )
                     self._step(connection, waiter)
-                if not self._is_accepted:
+                if not connection.is_accepted:
                     reason = self._reason or connection.trouble
                     raise ConnectionError(reason or "the broker closed the connection")
             except Ended:
@@ -267,21 +256,6 @@ class Session:
     def _notify(self) -> None:
         with self._news:
             self._news.notify_all()
-
-    def _on_connect(
-        self,
-        connection: Client,
-        _data: object,
-        _flags: ConnectFlags,
-        reason: ReasonCode,
-        properties: Properties | None,
-    ) -> None:
-        assert isinstance(connection, Connection)
-        if reason.is_failure:
-            self._reason = f"the broker refused the connection: {reason}"
-            return
-        connection.accepted(properties)
-        self._is_accepted = True
 
     def _on_disconnect(
         self,
