@@ -12,7 +12,7 @@ import { areaOf, LAST_ADDRESS } from "./standard.js";
 import { MAX_STREAMS, stream } from "./streams.js";
 import { Table } from "./table.js";
 import { TagTable } from "./tags.js";
-import { Writer } from "./writing.js";
+import { Writer } from "./write_dialog.js";
 
 /** Milliseconds that news may be late. */
 const SLACK = 2 * 1000;
