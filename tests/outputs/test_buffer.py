@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast.outputs import Buffer
-from holdfast.outputs.buffer_file import Stored
+from holdfast.outputs.buffer_file import MAX_ROW, Stored
 from support import wire
 from support.cases import examples
 from support.readings import numbered, numbers, reading, tag
@@ -92,7 +92,7 @@ def test_a_file_comes_before_memory_and_survives(opened: Opened, tmp_path: Path)
     buffer.stored = opened(tmp_path / "b.db")
     buffer.offer(numbered(5))
     assert numbers(buffer.take(2, 0)) == [0, 1]
-    buffer.keep(2)
+    buffer.keep(60, 2)
     buffer.offer(numbered(2, 5))
     assert len(buffer) == 7
     buffer.detach()
@@ -104,13 +104,49 @@ def test_a_file_comes_before_memory_and_survives(opened: Opened, tmp_path: Path)
     assert drained(buffer) == [5, 6]
 
 
+def test_readings_that_come_while_others_are_stored_do_not_hold_up_the_output(
+    opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    buffer = Buffer()
+    stored = buffer.stored = opened(tmp_path / "b.db")
+    add = stored.add
+
+    def slow_disk(readings: list[Reading]) -> int:
+        buffer.offer(numbered(2, 100))
+        return add(readings)
+
+    monkeypatch.setattr(stored, "add", slow_disk)
+    buffer.offer(numbered(5))
+    buffer.keep(60, 2)
+    assert (stored.count, len(buffer)) == (5, 11)
+
+
+def test_storing_ends_in_time_and_loses_nothing(opened: Opened, tmp_path: Path) -> None:
+    buffer = Buffer()
+    buffer.stored = opened(tmp_path / "b.db")
+    buffer.offer(numbered(5))
+    buffer.keep(0, 2)
+    assert (buffer.stored.count, drained(buffer)) == (0, list(range(5)))
+
+
+def test_a_large_step_is_stored_whole_and_sent_in_small_ones(
+    opened: Opened, tmp_path: Path
+) -> None:
+    buffer = Buffer()
+    buffer.stored = opened(tmp_path / "b.db")
+    buffer.offer(numbered(2 * MAX_ROW + 1))
+    buffer.keep(60)
+    assert numbers(buffer.take(9, 0)) == list(range(MAX_ROW))
+    assert drained(buffer) == list(range(2 * MAX_ROW + 1))
+
+
 def test_what_was_taken_from_the_file_is_taken_again_after_a_crash(
     opened: Opened, tmp_path: Path
 ) -> None:
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
     buffer.offer(numbered(3))
-    buffer.keep()
+    buffer.keep(60)
     assert numbers(buffer.take(9, 0)) == [0, 1, 2]
     buffer.detach()
     again = Buffer()
@@ -179,10 +215,10 @@ def test_what_a_full_disk_refuses_stays_in_memory(
     with monkeypatch.context() as patched:
         patched.setattr(buffer.stored, "add", full)
         with pytest.raises(OSError, match="disk is full"):
-            buffer.keep()
+            buffer.keep(60)
         assert numbers(buffer.take(2, 0)) == [0, 1]
         with pytest.raises(OSError, match="disk is full"):
-            buffer.keep()
+            buffer.keep(60)
     assert drained(buffer) == [0, 1, 2]
 
 
@@ -236,10 +272,10 @@ def test_a_batch_that_the_file_has_dropped_takes_no_other_with_it(
     buffer.stored = opened(tmp_path / "b.db", max_bytes=250)
     for start in range(0, 8, 4):
         buffer.offer(numbered(4, start))
-        buffer.keep()
+        buffer.keep(60)
     assert numbers(buffer.take(9, 0)) == [0, 1, 2, 3]
     buffer.offer(numbered(4, 8))
-    buffer.keep()
+    buffer.keep(60)
     assert buffer.dropped == 4
     assert drained(buffer) == list(range(12))
 
@@ -306,9 +342,9 @@ def test_nothing_is_lost_or_reordered(
             sent += numbers(buffer.take(2, 0))
             buffer.done()
         elif step == "keep":
-            buffer.keep(2)
+            buffer.keep(60, 2)
         else:
-            buffer.keep(2)
+            buffer.keep(60, 2)
             buffer.detach()
             buffer.stored = opened(file)
     sent += drained(buffer)

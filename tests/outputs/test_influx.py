@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import http.client
 import socket
@@ -215,6 +216,28 @@ def fake_server() -> Iterator[int]:
         thread.start()
         yield listener.getsockname()[1]
         thread.join()
+
+
+def test_a_receiver_that_answers_byte_by_byte_is_given_up_after_the_timeout() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        output = influx(url, bucket="b", timeout=0.2)
+        gone = threading.Event()
+
+        def drip() -> None:
+            connection, _ = listener.accept()
+            with connection, contextlib.suppress(OSError):
+                connection.recv(65536)
+                connection.sendall(b"HTTP/1.1 ")
+                while not gone.wait(0.05):
+                    connection.sendall(b" ")
+
+        thread = threading.Thread(target=drip)
+        thread.start()
+        with pytest.raises(OSError, match=r"no answer within 0\.2 s"):
+            output.send(numbered(1))
+        gone.set()
+        thread.join(wire.DEADLINE)
 
 
 def test_a_receiver_that_never_answers_does_not_hold_up_a_stop(

@@ -250,6 +250,31 @@ def test_what_can_not_be_sent_at_the_end_is_in_the_file(
     assert again.receiver.sent == list(range(1501))
 
 
+def test_what_a_slow_disk_can_not_store_at_the_end_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "CHECK_INTERVAL_S", 0)
+    monkeypatch.setattr(module, "STORE_TIMEOUT_S", 0)
+    output = Running(tmp_path / "b.db")
+    output.receiver.error = OSError("down")
+    output.buffer.offer(numbered(5))
+    wire.until(lambda: output.receiver.attempts > 0, "it was tried")
+    output.end()
+    [record] = [record for record in caplog.records if record.message == "output_unsent"]
+    assert vars(record)["fields"]["count"] == 5
+
+
+def test_what_there_is_no_room_for_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    output = Running()
+    output.receiver.error = OSError("down")
+    output.buffer.most = 2
+    output.buffer.offer(numbered(5))
+    wire.until(lambda: count(caplog, "output_dropped") > 0, "it is told")
+    output.end()
+    told = [record for record in caplog.records if record.message == "output_dropped"]
+    assert sum(vars(record)["fields"]["count"] for record in told) == output.buffer.dropped
+
+
 def test_what_is_lost_at_the_end_is_told(caplog: pytest.LogCaptureFixture) -> None:
     output = Running()
     output.receiver.error = OSError("down")

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from holdfast.client.url import NetworkTarget
 from holdfast.net.nats import outbox as outboxes
 from holdfast.net.nats.outbox import Outbox
+from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.scanner.commands import Commands
 from holdfast.scanner.dialects import TENTACLE
 from holdfast.scanner.errors import Moved
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast.config.values.scanner_settings import Publish
-    from holdfast.net.nats.tolerant_client import SafeClient
     from holdfast.types import PolledBlock
 
 TARGET = NetworkTarget("tcp", "127.0.0.1", 502)
@@ -373,6 +373,18 @@ async def _run(outbox: Outbox, seconds: float = 0.1) -> None:
     running = asyncio.create_task(outbox.run())
     await asyncio.wait([running], timeout=seconds)
     running.cancel()
+
+
+def test_a_server_whose_answer_waits_behind_messages_is_not_given_up() -> None:
+    async def outstanding() -> int:
+        client = SafeClient()
+        client._pings_outstanding = 3
+        client.transport._io_reader = asyncio.StreamReader()
+        client.transport._io_reader.feed_data(b"+OK\r\n")
+        await client.transport.read(100)
+        return client._pings_outstanding
+
+    assert asyncio.run(outstanding()) == 0
 
 
 def test_messages_flow_in_order_while_they_are_taken() -> None:

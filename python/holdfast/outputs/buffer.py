@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,10 @@ if TYPE_CHECKING:
 
     from holdfast.outputs.buffer_file import Stored
     from holdfast.polling import Reading
+
+
+MAX_STEP = 20_000
+"""Readings that are stored at once. Each step waits for the disk once."""
 
 
 class Buffer:
@@ -79,20 +84,26 @@ class Buffer:
             self._is_woken = True
             self._changed.notify_all()
 
-    def keep(self, step: int = 1000) -> None:
-        """Moves the readings in memory to the file, if there is one, `step` at a time.
+    def keep(self, seconds: float, step: int = MAX_STEP) -> None:
+        """Moves what waits in memory now to the file, if there is one, `step` at a time.
 
-        Raises `OSError` if the file fails. No reading is lost then.
+        Ends after some seconds, and does not wait for readings that come meanwhile: they may come
+        faster than a disk stores them. Raises `OSError` if the file fails. No reading is lost then.
         """
         if self.stored is None:
             return
-        while True:
+        until = time.monotonic() + seconds
+        with self._changed:
+            left = len(self._waiting)
+        while time.monotonic() < until:
             # The batch goes first: it is older than the readings that wait.
             if self._batch and not self._is_batch_stored:
                 moved = self._batch
             else:
                 with self._changed:
-                    moved = [self._waiting.popleft() for _ in range(min(step, len(self._waiting)))]
+                    count = min(step, left, len(self._waiting))
+                    moved = [self._waiting.popleft() for _ in range(count)]
+                left -= count
             if not moved:
                 return
             try:

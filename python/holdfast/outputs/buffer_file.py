@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 LOCK_TIMEOUT_S = 1.0
 """Seconds to wait for a file that is in use, by default."""
 
+MAX_ROW = 1000
+"""Readings in one row, which are sent together."""
+
 _CREATE = """
 CREATE TABLE IF NOT EXISTS readings (
     id INTEGER PRIMARY KEY AUTOINCREMENT, count INTEGER NOT NULL, data BLOB NOT NULL
@@ -61,21 +64,32 @@ class Stored:
             self._recount()
 
     def add(self, readings: Sequence[Reading]) -> int:
-        """Stores readings durably. Returns how many old readings were dropped for them."""
-        data = msgspec.msgpack.encode([_plain(reading) for reading in readings])
+        """Stores readings durably, all or none. Returns how many were dropped for want of room."""
         dropped = 0
-        # The rollback may undo removals that `_remove` has counted.
+        # Many readings have one tag.
+        tags = {id(reading.tag): reading.tag for reading in readings}
+        meanings = {of: meaning_of(tag) for of, tag in tags.items()}
+        # The rollback may undo what is counted here.
         with file_errors(self.file, self._recount), self._db:
             self._db.execute("BEGIN")
-            while self._bytes + len(data) > self._max_bytes and self.count:
-                dropped += self._remove("(SELECT min(id) FROM readings)")
-            if len(data) > self._max_bytes:
-                return dropped + len(readings)
-            self._db.execute(
-                "INSERT INTO readings (count, data) VALUES (?, ?)", (len(readings), data)
-            )
-        self.count += len(readings)
-        self._bytes += len(data)
+            for at in range(0, len(readings), MAX_ROW):
+                row = readings[at : at + MAX_ROW]
+                data = msgspec.msgpack.encode(
+                    [
+                        (device, tag.name, value, time, fault, undecoded, meanings[id(tag)])
+                        for device, tag, value, time, fault, undecoded in row
+                    ]
+                )
+                while self._bytes + len(data) > self._max_bytes and self.count:
+                    dropped += self._remove("(SELECT min(id) FROM readings)")
+                if len(data) > self._max_bytes:
+                    dropped += len(row)
+                    continue
+                self._db.execute(
+                    "INSERT INTO readings (count, data) VALUES (?, ?)", (len(row), data)
+                )
+                self.count += len(row)
+                self._bytes += len(data)
         return dropped
 
     def first(self) -> list[Reading]:
@@ -152,11 +166,6 @@ def file_errors(file: Path, undo: Callable[[], object] = lambda: None) -> Iterat
         with contextlib.suppress(sqlite3.Error):
             undo()
         raise OSError(f"{file}: {error}") from error
-
-
-def _plain(reading: Reading) -> tuple[Any, ...]:
-    device, tag, value, time, fault, undecoded = reading
-    return device, tag.name, value, time, fault, undecoded, meaning_of(tag)
 
 
 def _stand_in(name: str, value: Any) -> Tag:

@@ -7,6 +7,7 @@ import contextlib
 import gzip
 import http.client
 import socket
+import threading
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
@@ -42,7 +43,7 @@ class Influx(Receiver):
         self._settings = settings
         self._target = settings.target
         self._connection: http.client.HTTPConnection | None = None
-        self._has_ended = False
+        self._has_ended = self._is_late = False
         self._path = self._target.path
         if self._path in ("", "/"):
             query = {"org": settings.org, "bucket": settings.bucket, "precision": "ns"}
@@ -98,6 +99,11 @@ class Influx(Receiver):
     def _request(self, body: bytes, headers: dict[str, str]) -> tuple[int, bytes]:
         if self._connection is None:
             self._connection = self._opened()
+        # A receiver that sends a byte now and then does not exceed the timeout of the socket.
+        self._is_late = False
+        timer = threading.Timer(self._settings.timeout, self._time_out)
+        timer.daemon = True
+        timer.start()
         try:
             self._connection.request("POST", self._path, body, headers)
             answer = self._connection.getresponse()
@@ -105,19 +111,30 @@ class Influx(Receiver):
             # Without a socket, `http.client` would open one with the timeout for connecting.
             if not answer.isclosed() or self._connection.sock is None:
                 self.close()
-        except http.client.HTTPException as error:
+        except (http.client.HTTPException, OSError) as error:
             self.close()
-            if isinstance(error, ConnectionError):
+            if self._is_late or isinstance(error, TimeoutError):
+                late = f"{self._at}: no answer within {self._settings.timeout:g} s"
+                raise TimeoutError(late) from error
+            if isinstance(error, OSError):
                 raise
             raise OSError(f"{self._at}: not HTTP: {error or type(error).__name__}") from error
-        except OSError:
-            self.close()
-            raise
+        finally:
+            timer.cancel()
         return answer.status, text
 
+    def _time_out(self) -> None:
+        """Called by another thread, if a request takes too long."""
+        self._is_late = True
+        self._interrupt()
+
     def _end(self) -> None:
-        """Called by another thread: what waits for the socket gets an error."""
+        """Called by another thread, at the stop."""
         self._has_ended = True
+        self._interrupt()
+
+    def _interrupt(self) -> None:
+        """Called by another thread: what waits for the socket gets an error."""
         connection = self._connection
         if connection is not None and connection.sock is not None:
             with contextlib.suppress(OSError):

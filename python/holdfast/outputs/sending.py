@@ -6,6 +6,7 @@ import contextlib
 import logging
 import threading
 import time
+from math import inf
 from typing import TYPE_CHECKING, Protocol
 
 from holdfast.events import log_lines
@@ -29,8 +30,14 @@ MAX_READINGS = 1000
 CHECK_INTERVAL_S = 1.0
 """Interval of moving readings to the file during an outage."""
 
+DROPPED_INTERVAL_S = 60.0
+"""Interval of logging that readings were dropped."""
+
 STOP_TIMEOUT_S = 2.0
 """Time in which a stopped output sends the remaining readings."""
+
+STORE_TIMEOUT_S = 2.5
+"""Time in which it then stores those that are left. Both end before the output is given up."""
 
 
 class Refused(Exception):
@@ -92,6 +99,8 @@ class Sending:
         self._name, self._receiver, self._buffer = name, receiver, buffer
         self._open_file = open_file
         self._sent = self._refused = 0
+        self._told_dropped, self._told_at = buffer.dropped, -inf
+        self._stopped_at = inf
         self._backoff = Backoff(FIRST_PAUSE_S, MAX_PAUSE_S, jitter=True)
         self._pause = 0.0
         self._last_error: str | None = None
@@ -99,19 +108,26 @@ class Sending:
         self._file_error: str | None = None
 
     def run(self, stop: Stop) -> None:
-        """Sends until `stop` is set. Then sends the rest for `STOP_TIMEOUT_S`, or keeps it."""
-        stop.then(self._buffer.wake)
+        """Sends until `stop` is set. Then sends or stores the rest."""
+        stop.then(self._stopping)
         self._receiver.until(stop)
         try:
             while not stop.is_set():
                 self._use_file()
                 if not self._step(stop):
                     self._wait(stop)
+                self._tell_dropped()
             self._finish()
+        except Exception:
+            self._keep(STORE_TIMEOUT_S)
+            raise
         finally:
-            self._keep()  # Also what waits when an error ends the output.
             self._receiver.close()
             self._buffer.detach()
+
+    def _stopping(self) -> None:
+        self._stopped_at = time.monotonic()
+        self._buffer.wake()
 
     def status(self) -> dict[str, object]:
         """The counters of readings, and the last errors."""
@@ -188,12 +204,13 @@ class Sending:
         """Waits for the next attempt, and moves new readings to the file meanwhile."""
         end = time.monotonic() + self._pause
         while not stop.is_set() and (left := end - time.monotonic()) > 0:
-            self._keep()
+            self._keep(CHECK_INTERVAL_S)
+            self._tell_dropped()
             stop.wait(min(CHECK_INTERVAL_S, left))
 
     def _finish(self) -> None:
-        """Sends remaining readings for `STOP_TIMEOUT_S`, and moves the rest to the file."""
-        end = time.monotonic() + STOP_TIMEOUT_S
+        """Sends remaining readings for `STOP_TIMEOUT_S`, then moves the rest to the file."""
+        end = self._stopped_at + STOP_TIMEOUT_S
         if not self._is_failing:
             while len(self._buffer) and time.monotonic() < end:
                 try:
@@ -201,7 +218,8 @@ class Sending:
                     self._buffer.done()
                 except OSError:
                     break
-        self._keep()
+        self._keep(STORE_TIMEOUT_S)
+        self._tell_dropped(0.0)
         unsent = len(self._buffer) - (self._buffer.stored.count if self._buffer.stored else 0)
         if unsent > 0:
             log_lines.write(logging.WARNING, "output_unsent", output=self._name, count=unsent)
@@ -213,9 +231,16 @@ class Sending:
         with self._using_file():
             self._buffer.stored = self._open_file()
 
-    def _keep(self) -> None:
+    def _keep(self, seconds: float) -> None:
         with self._using_file():
-            self._buffer.keep()
+            self._buffer.keep(seconds)
+
+    def _tell_dropped(self, every: float = DROPPED_INTERVAL_S) -> None:
+        """Logs how many readings were lost because there was no room, once in some seconds."""
+        lost, now = self._buffer.dropped - self._told_dropped, time.monotonic()
+        if lost > 0 and now >= self._told_at + every:
+            self._told_dropped, self._told_at = self._told_dropped + lost, now
+            log_lines.write(logging.WARNING, "output_dropped", output=self._name, count=lost)
 
     @contextlib.contextmanager
     def _using_file(self) -> Iterator[None]:

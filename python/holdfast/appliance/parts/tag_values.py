@@ -236,7 +236,8 @@ class TagValues:
                 log_lines.limited(logging.WARNING, "tag_polls_dropped", kind="", count=lost)
 
     def _handle(self, found: deque[Poll]) -> None:
-        while found:
+        # At the stop, the outputs have ended before.
+        while found and not self._ending.is_set():
             self._heartbeat.beat()
             try:
                 with self._lock:

@@ -62,14 +62,18 @@ class MessageTransport(TcpTransport):
     def __init__(
         self,
         deliver: Callable[[int, bytes, bytes, bytes, bytes], Awaitable[None]],
+        heard: Callable[[], None],
         *,
         requires_tls: bool,
     ) -> None:
-        """`requires_tls`: refuse a server without TLS before anything is sent to it. nats-py would
+        """`heard` is called when the server has sent something.
+
+        `requires_tls`: refuse a server without TLS before anything is sent to it. nats-py would
         continue without encryption.
         """
         super().__init__()  # type: ignore[no-untyped-call]
         self._deliver = deliver
+        self._heard = heard
         self._requires_tls = requires_tls
         self._buffer = bytearray()
         self._head: _Head | None = None
@@ -215,7 +219,10 @@ class MessageTransport(TcpTransport):
 
         Raises `ProtocolError` for malformed lines.
         """
-        self._buffer += await self._received(buffer_size)
+        received = await self._received(buffer_size)
+        if received:
+            self._heard()
+        self._buffer += received
         others = b""
         while self._buffer:
             if self._head is not None:
@@ -332,7 +339,7 @@ class SafeClient(Client):
     def __init__(self, *, requires_tls: bool = False) -> None:
         """`requires_tls`: refuse a server without TLS."""
         super().__init__()
-        self.transport = MessageTransport(self._deliver, requires_tls=requires_tls)
+        self.transport = MessageTransport(self._deliver, self._heard, requires_tls=requires_tls)
         self._transport = self.transport
         self.msg_class = self._with_age  # type: ignore[assignment]
 
@@ -346,6 +353,10 @@ class SafeClient(Client):
         """Pings the server, unless that was done after `since`."""
         if self.is_connected and self.transport.pinged < since:
             self.transport.ping()
+
+    def _heard(self) -> None:
+        """A server that sends is there: its answer to a ping may be behind many messages."""
+        self._pings_outstanding = 0
 
     def _with_age(self, **parts: Any) -> Received:
         return Received(**parts, sent_after=self.transport.answered)
