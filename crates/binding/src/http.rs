@@ -15,10 +15,10 @@ use holdfast_engine::tls::server::Protocol;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use pyo3::intern;
 use pyo3::prelude::*;
-use pyo3::types::{PyBytes, PyDict, PyList, PyTuple};
+use pyo3::types::{IntoPyDict, PyBytes, PyDict, PyList, PyTuple};
 
 use crate::arguments::{address, network, os_error, os_text, time_to_wait};
-use crate::engine::{dict, event_fields};
+use crate::engine::event_fields;
 use crate::exchange::{Answers, Headers, HttpExchange, request, response_head};
 use crate::heartbeat;
 use crate::json_commands::{Commands, ParsedWrite, ParsedWrites};
@@ -102,9 +102,9 @@ impl HttpServer {
     ) -> PyResult<HttpServer> {
         let limits = limits(max_connections, max_connections_per_source, when_full)?;
         let max_handshakes = tls.as_ref().map(|_| limits.max_connections);
+        let socket = socket.with(TcpListener::try_clone)?;
         let settings = HttpSettings {
             name,
-            socket: socket.with(TcpListener::try_clone)?,
             sources: sources.iter().map(|text| network(text)).collect::<PyResult<_>>()?,
             limits: ConnectionLimits {
                 max_handshakes,
@@ -114,11 +114,11 @@ impl HttpServer {
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
             idle_timeout: time_to_wait("idle_timeout", idle_timeout)?,
             leaving,
-            tls: tls.map(|tls| tls.of(Protocol::Http)).transpose()?,
             refusals: bodies(&refusals)?,
         };
+        let tls = tls.map(|tls| tls.of(Protocol::Http)).transpose()?;
         Ok(HttpServer {
-            core: CoreServer::new(settings)?,
+            core: CoreServer::new(settings, socket, tls)?,
             heads: Heads::default(),
             answers: Arc::default(),
         })
@@ -199,7 +199,7 @@ impl HttpServer {
             ("tls_failed", counters.tls_failed.total()),
             ("open", self.core.open() as u64),
         ];
-        dict(py, counts)
+        counts.into_py_dict(py)
     }
 
     fn tls_failures(&self) -> BTreeMap<&'static str, u64> {

@@ -85,8 +85,6 @@ pub struct Conditions<'c> {
 }
 
 impl Conditions<'_> {
-    const NONE: Conditions<'static> = Conditions { to_begin: &|| Ok(()), to_go_on: None };
-
     fn may_go_on(&self) -> bool {
         self.to_go_on.is_none_or(|may_go_on| may_go_on())
     }
@@ -105,24 +103,9 @@ impl BlockingClient {
         }
     }
 
-    /// Sends a request when it is the caller's turn, and passes its response and the PDU of that to
-    /// `take`. `timeout` does not include the wait for the turn. On a serial line, unit id 0 is a broadcast: no unit
-    /// replies, and a write counts as done when it is sent.
-    ///
-    /// # Errors
-    /// [`ClientError`]: the request failed, or there is no connection.
-    pub fn call<T>(
-        &self,
-        unit_id: u8,
-        request: &EncodedRequest,
-        timeout: Duration,
-        take: impl FnOnce(Response<'_>, &[u8]) -> T,
-    ) -> Result<T, ClientError> {
-        self.call_under(&Conditions::NONE, unit_id, request, timeout, take)
-    }
-
-    /// The same, unless `interrupted` returns true. It is asked at most every 0.1 s. Returns `None`
-    /// then, and the connection is closed: a reply would still come. `to_begin` is as in [`Conditions`].
+    /// As [`BlockingClient::call`], unless `interrupted` returns true. It is asked at most every 0.1 s.
+    /// Returns `None` then, and the connection is closed: a reply would still come. `to_begin` is as in
+    /// [`Conditions`].
     pub fn interruptible_call<T>(
         &self,
         interrupted: &mut dyn FnMut() -> bool,
@@ -137,11 +120,14 @@ impl BlockingClient {
         self.call_unless(interrupt, (unit_id, request, &conditions), timeout, take)
     }
 
-    /// The same as [`BlockingClient::call`], under conditions.
+    /// Sends a request when it is the caller's turn, and passes its response and the PDU of that to
+    /// `take`. `timeout` does not include the wait for the turn. On a serial line, unit id 0 is a broadcast: no unit
+    /// replies, and a write counts as done when it is sent.
     ///
     /// # Errors
-    /// Also that of [`Conditions::to_begin`], if nothing was sent.
-    pub fn call_under<T>(
+    /// [`ClientError`]: the request failed, or there is no connection; or that of
+    /// [`Conditions::to_begin`], if nothing was sent.
+    pub fn call<T>(
         &self,
         conditions: &Conditions<'_>,
         unit_id: u8,
@@ -313,18 +299,10 @@ impl BlockingClient {
         })
     }
 
-    /// Closes the connection after the calls before this one. The next call opens a new one.
-    pub fn close(&self) {
-        self.close_unless(Interrupt::new(None));
-    }
-
-    /// The same, unless `interrupted` returns true while calls before this one take their time.
-    pub fn interruptible_close(&self, interrupted: &mut dyn FnMut() -> bool) {
-        self.close_unless(Interrupt::new(Some(interrupted)));
-    }
-
-    fn close_unless(&self, mut interrupt: Interrupt<'_>) {
-        let Some(_turn) = self.turns.take(&mut interrupt) else { return };
+    /// Closes the connection after the calls before this one, unless `interrupted` returns true while
+    /// they take their time. The next call opens a new one.
+    pub fn close(&self, interrupted: Option<&mut dyn FnMut() -> bool>) {
+        let Some(_turn) = self.turns.take(&mut Interrupt::new(interrupted)) else { return };
         self.state.lock().unwrap_or_else(PoisonError::into_inner).end();
     }
 
@@ -516,6 +494,8 @@ mod tests {
 
     use super::*;
 
+    const ANY_TIME: Conditions<'static> = Conditions { to_begin: &|| Ok(()), to_go_on: None };
+
     /// A stream whose second copy of a reply waits unread when the guard time is over, because the process had no
     /// processor.
     struct Stalled {
@@ -566,7 +546,8 @@ mod tests {
         for address in 1..4 {
             let range = Range::new(address, 1).unwrap();
             let request = EncodedRequest::new(&Request::ReadHoldingRegisters(range));
-            let pdu = client.call(1, &request, Duration::from_secs(60), |_, pdu| pdu.to_vec());
+            let timeout = Duration::from_secs(60);
+            let pdu = client.call(&ANY_TIME, 1, &request, timeout, |_, pdu| pdu.to_vec());
             assert_eq!(pdu.unwrap(), [3, 2, 0, address as u8]);
         }
     }
@@ -591,7 +572,7 @@ mod tests {
             used: Instant::now(),
             late: 0,
         });
-        let answer = client.call(1, &request, timeout, |_, _| ());
+        let answer = client.call(&ANY_TIME, 1, &request, timeout, |_, _| ());
         let expected = Lost::Closed(Closed::NoTransactionId);
         assert!(
             matches!(&answer, Err(ClientError::Lost(why)) if why.to_string() == expected.to_string())
@@ -612,7 +593,7 @@ mod tests {
         };
         let conditions = Conditions { to_begin: &to_begin, to_go_on: None };
         let write = EncodedRequest::new(&Request::WriteSingleRegister { address: 0, value: 1 });
-        let answer = client.call_under(&conditions, 1, &write, Duration::from_secs(60), |_, _| ());
+        let answer = client.call(&conditions, 1, &write, Duration::from_secs(60), |_, _| ());
         assert!(matches!(answer, Err(ClientError::Expired)), "{answer:?}");
         drop(client);
         let mut received = Vec::new();

@@ -65,7 +65,7 @@ pub(super) async fn serve(
     let Admitted { stream, peer, ticket, .. } = connection;
     set_options(&stream, KEEPALIVE);
     // One time for the handshake and the first request.
-    let due = Instant::now() + front.request_timeout;
+    let due = Instant::now() + front.settings.request_timeout;
     let begun = begin(&front, (stream, peer), &ticket, due, stop.clone()).await;
     let Some((stream, peer)) = begun else { return };
     let line = SharedLine::new(Arc::clone(&front), (ticket, peer), stream, due);
@@ -200,7 +200,7 @@ pub(super) async fn converse(
 impl super::line::Line {
     /// Whether the client is gone, although its connection is only half closed.
     fn is_left(&self) -> bool {
-        let leaves = |exchange: &Arc<Exchange>| self.front.leaving || exchange.leaves();
+        let leaves = |exchange: &Arc<Exchange>| self.front.settings.leaving || exchange.leaves();
         self.is_ended && self.is_busy() && self.exchange.as_ref().is_some_and(leaves)
     }
 

@@ -1,7 +1,7 @@
 //! What the connections of a server have in common: settings, certificates, counters, and where
 //! requests go.
 
-use std::net::{IpAddr, TcpListener};
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -21,8 +21,6 @@ use crate::tls::server::ServerTls;
 #[derive(Debug)]
 pub struct HttpSettings {
     pub name: String,
-    /// A socket that listens.
-    pub socket: TcpListener,
     /// The networks of the clients.
     pub sources: Vec<IpNet>,
     pub limits: ConnectionLimits,
@@ -32,7 +30,6 @@ pub struct HttpSettings {
     pub idle_timeout: Duration,
     /// Whether a client that sends no more is gone.
     pub leaving: bool,
-    pub tls: Option<Arc<ServerTls>>,
     /// In the order of [`Refusal::ALL`].
     pub refusals: [RefusalBody; Refusal::ALL.len()],
 }
@@ -41,41 +38,32 @@ pub struct HttpSettings {
 pub(super) struct Front {
     pub(super) context: Arc<ListenerContext>,
     pub(super) inbox: Arc<Inbox<Event>>,
-    sources: Vec<IpNet>,
-    pub(super) request_timeout: Duration,
-    pub(super) idle_timeout: Duration,
-    pub(super) leaving: bool,
+    pub(super) settings: HttpSettings,
     tls: Option<Reloadable<ServerTls>>,
-    refusals: [RefusalBody; Refusal::ALL.len()],
     next: AtomicU64,
 }
 
 impl Front {
-    /// Also returns the socket.
     pub(super) fn new(
         settings: HttpSettings,
+        tls: Option<Arc<ServerTls>>,
         inbox: Arc<Inbox<Event>>,
         reporter: Reporter,
-    ) -> (Front, TcpListener) {
+    ) -> Front {
         let context = ListenerContext::new(&settings.name, Some(settings.limits), reporter, None);
-        let front = Front {
+        Front {
             context: Arc::new(context),
             inbox,
-            sources: settings.sources,
-            request_timeout: settings.request_timeout,
-            idle_timeout: settings.idle_timeout,
-            leaving: settings.leaving,
-            tls: settings.tls.map(Reloadable::from),
-            refusals: settings.refusals,
+            settings,
+            tls: tls.map(Reloadable::from),
             next: AtomicU64::new(0),
-        };
-        (front, settings.socket)
+        }
     }
 
     /// Whether a client may connect.
     pub(super) fn admits(&self, peer: IpAddr) -> bool {
         let peer = peer.to_canonical();
-        self.sources.iter().any(|network| network.contains(&peer))
+        self.settings.sources.iter().any(|network| network.contains(&peer))
     }
 
     /// Uses these certificates for new connections. Returns those before.
@@ -88,7 +76,7 @@ impl Front {
     }
 
     pub(super) fn refusal(&self, refusal: Refusal) -> &RefusalBody {
-        &self.refusals[refusal as usize]
+        &self.settings.refusals[refusal as usize]
     }
 
     /// Counts and reports the end of a connection, or what is wrong with it.

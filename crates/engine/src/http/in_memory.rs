@@ -70,12 +70,6 @@ impl Stream for Pieces {
         Ok(())
     }
 
-    fn is_amid_record(&self) -> bool {
-        false
-    }
-
-    fn end(&mut self, _unsent: &mut Vec<u8>) {}
-
     fn socket(&self) -> &TcpStream {
         &self.socket
     }
@@ -97,7 +91,6 @@ pub(super) fn front() -> (Arc<Front>, Arc<Inbox<Event>>) {
     let refusal = RefusalBody { body: Bytes::from_static(b"refused"), ..RefusalBody::default() };
     let settings = HttpSettings {
         name: "test".into(),
-        socket: std::net::TcpListener::bind(("127.0.0.1", 0)).unwrap(),
         sources: vec!["127.0.0.0/8".parse().unwrap()],
         limits: ConnectionLimits {
             max_connections: 9,
@@ -109,11 +102,10 @@ pub(super) fn front() -> (Arc<Front>, Arc<Inbox<Event>>) {
         request_timeout: Duration::from_secs(60),
         idle_timeout: Duration::from_secs(60),
         leaving: false,
-        tls: None,
         refusals: [(); Refusal::ALL.len()].map(|()| refusal.clone()),
     };
     let (reporter, _) = event::channel(Verbosity::Nothing);
-    (Arc::new(Front::new(settings, Arc::clone(&inbox), reporter).0), inbox)
+    (Arc::new(Front::new(settings, None, Arc::clone(&inbox), reporter)), inbox)
 }
 
 /// What the handler got and did.
@@ -183,7 +175,7 @@ pub(super) async fn line(
     let written = Arc::new(Mutex::new(Vec::new()));
     let stream = Pieces { pieces, is_pausing, turns: 0, written: Arc::clone(&written), socket };
     let peer = SocketAddr::from(([127, 0, 0, 1], 50_000));
-    let due = Instant::now() + front.request_timeout;
+    let due = Instant::now() + front.settings.request_timeout;
     let (ticket, _) = front.context.admission.admit(peer).unwrap();
     let line =
         SharedLine::new(Arc::clone(front), (ticket, Peer::from(peer)), Box::new(stream), due);

@@ -215,10 +215,10 @@ impl Line {
         let now = Instant::now();
         self.since = now;
         if self.taken < self.held.len() {
-            self.request_due = Some(now + self.front.request_timeout);
+            self.request_due = Some(now + self.front.settings.request_timeout);
         } else {
             self.request_due = None;
-            self.idle_due = Some(now + self.front.idle_timeout);
+            self.idle_due = Some(now + self.front.settings.idle_timeout);
         }
         self.note_waiting();
     }
@@ -304,7 +304,7 @@ impl Line {
             self.idle_due = None;
             if self.request_due.is_none() {
                 self.since = Instant::now();
-                self.request_due = Some(self.since + self.front.request_timeout);
+                self.request_due = Some(self.since + self.front.settings.request_timeout);
             }
         }
         self.note_waiting();
@@ -353,7 +353,7 @@ impl Line {
             _ if self.is_late => Verdict::DropAgain,
             Some(_) if self.is_busy() && !self.is_asked => {
                 // The peer waits for the handler, not the handler for the peer.
-                self.request_due = Some(now + self.front.request_timeout);
+                self.request_due = Some(now + self.front.settings.request_timeout);
                 Verdict::Stay
             }
             Some(exchange) if self.is_busy() => {
@@ -373,7 +373,7 @@ impl Line {
             if self.stream.socket().poll_write_ready(context)?.is_pending() {
                 if self.reply_due.is_none() {
                     self.since = Instant::now();
-                    self.reply_due = Some(self.since + self.front.request_timeout);
+                    self.reply_due = Some(self.since + self.front.settings.request_timeout);
                     self.note_waiting();
                 }
                 return Poll::Pending;

@@ -69,16 +69,20 @@ impl HttpServer {
     pub const HTTP_10: hyper::Version = hyper::Version::HTTP_10;
     pub const CONTENT_LENGTH: hyper::header::HeaderName = hyper::header::CONTENT_LENGTH;
 
-    /// A server that accepts nothing yet.
+    /// A server on a socket that listens. It accepts nothing yet.
     ///
     /// # Errors
     /// The system has no sockets left.
-    pub fn new(settings: HttpSettings) -> io::Result<HttpServer> {
+    pub fn new(
+        settings: HttpSettings,
+        socket: TcpListener,
+        tls: Option<Arc<ServerTls>>,
+    ) -> io::Result<HttpServer> {
         let (inbox, wakes) = Inbox::new()?;
         let (reporter, events) = event::channel(Verbosity::Refusals);
-        settings.socket.set_nonblocking(true)?;
+        socket.set_nonblocking(true)?;
         let thread = format!("http-{}", settings.name);
-        let (front, socket) = Front::new(settings, Arc::new(inbox), reporter);
+        let front = Front::new(settings, tls, Arc::new(inbox), reporter);
         Ok(HttpServer {
             front: Arc::new(front),
             stop: watch::Sender::new(false),
@@ -107,9 +111,10 @@ impl HttpServer {
         let inbox = Arc::clone(&front.inbox);
         runtime.spawn(async move { inbox.deliver().await });
         let work = async move {
+            let Ok(socket) = tokio::net::TcpListener::from_std(socket) else { return };
             let context = Arc::clone(&front.context);
             let live = Arc::new(Reloadable::from(front));
-            accept(Arc::clone(&context), live, socket, vec![worker], stop).await;
+            accept(Arc::clone(&context), live, Arc::new(socket), vec![worker], stop).await;
             while context.admission.open() > 0 {
                 tokio::select! {
                     _ = abort.wait_for(|abort| *abort) => return,

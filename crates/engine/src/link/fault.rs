@@ -82,6 +82,15 @@ pub(crate) fn exception(request: &[u8], code: u8) -> Vec<u8> {
     vec![request.first().copied().unwrap_or_default() | 0x80, code]
 }
 
+/// The code of the exception that a reply is; `None` for any other reply.
+#[inline]
+pub(crate) fn exception_in(reply: &[u8]) -> Option<u8> {
+    match reply {
+        [code, exception, ..] if code & 0x80 != 0 => Some(*exception),
+        _ => None,
+    }
+}
+
 /// The PDU that confirms a write: it repeats the request, but not its values if it may have several
 /// (V1.1b3, 6.11 and 6.12).
 pub(crate) fn confirmation(request: &[u8]) -> &[u8] {

@@ -19,7 +19,7 @@ pub(crate) mod sockets;
 pub(crate) use access::Link;
 pub use caller::{Called, Caller};
 pub use fault::Fault;
-pub(crate) use fault::{confirmation, exception};
+pub(crate) use fault::{confirmation, exception, exception_in};
 pub(crate) use limits::lease_fence::Pass;
 pub use limits::lease_fence::{Fence, Stage};
 pub(crate) use limits::permit::Permit;

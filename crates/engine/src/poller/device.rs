@@ -23,7 +23,6 @@ use holdfast_runtime::Retry;
 use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
-use super::bisection;
 use super::cost::Samples;
 use super::destination::Destination;
 use super::forwarding::{Forward, ForwardSettings};
@@ -93,7 +92,7 @@ pub(super) struct Device {
     turn: Rc<Turn>,
     forwards: Vec<Rc<Forward>>,
     /// The parts of reads. Each fits into one request.
-    fields: Vec<Field>,
+    pub(super) fields: Vec<Field>,
     /// For each field, the index of its read, and its offset in it, in items.
     parts: Vec<(usize, u32)>,
     name: Arc<str>,
@@ -376,7 +375,7 @@ impl Device {
     }
 
     /// Plans the readable fields within the learned limits.
-    fn draw_plan(&self) {
+    pub(super) fn draw_plan(&self) {
         let learned = self.learned.borrow();
         let known: Vec<usize> =
             (0..self.fields.len()).filter(|at| !learned.is_refused(&self.fields[*at])).collect();
@@ -404,7 +403,7 @@ impl Device {
         *self.plan.borrow_mut() = plan;
     }
 
-    fn learned(&self) -> RefMut<'_, Learned> {
+    pub(super) fn learned(&self) -> RefMut<'_, Learned> {
         self.learned.borrow_mut()
     }
 
@@ -527,9 +526,9 @@ impl Device {
                 self.take(block, bytes, gathered);
                 Ok(())
             }
-            Err(fault) if bisection::is_illegal(fault) => {
+            Err(fault) if fault.is_illegal() => {
                 gathered.answered = true;
-                bisection::search(&mut Search { device: self, gathered }, block, fault).await
+                self.search(gathered, block, fault).await
             }
             Err(other) => {
                 gathered.note(block, Err(other));
@@ -539,12 +538,12 @@ impl Device {
     }
 
     /// Passes on the bytes of a block.
-    fn take(&self, block: &Block, bytes: Vec<u8>, gathered: &mut Gathered) {
+    pub(super) fn take(&self, block: &Block, bytes: Vec<u8>, gathered: &mut Gathered) {
         self.spread(block, &bytes, gathered);
         gathered.note(block, Ok(bytes));
     }
 
-    async fn ask(&self, block: &Block) -> Result<Vec<u8>, Fault> {
+    pub(super) async fn ask(&self, block: &Block) -> Result<Vec<u8>, Fault> {
         let (address, quantity) = (block.address, block.count);
         let request = match block.area {
             Area::Coils => Range::new(address, quantity).map(Request::ReadCoils),
@@ -673,7 +672,7 @@ fn data(mut pdu: Vec<u8>) -> Vec<u8> {
 /// The data of one poll: reads with several parts, with the number of missing items; all blocks,
 /// if they are reported; and whether the device has answered a request.
 #[derive(Default)]
-struct Gathered {
+pub(super) struct Gathered {
     answered: bool,
     parts: HashMap<usize, Partial>,
     blocks: Vec<BlockResult>,
@@ -690,7 +689,7 @@ struct Partial {
 }
 
 impl Gathered {
-    fn note(&mut self, block: &Block, outcome: Result<Vec<u8>, Fault>) {
+    pub(super) fn note(&mut self, block: &Block, outcome: Result<Vec<u8>, Fault>) {
         if self.report {
             let Block { area, address, count, .. } = *block;
             let time = SystemTime::now();
@@ -724,38 +723,6 @@ impl Gathered {
             return None;
         }
         self.parts.remove(&read).map(|partial| partial.bytes)
-    }
-}
-
-/// A device whose refused block is being searched.
-struct Search<'a> {
-    device: &'a Device,
-    gathered: &'a mut Gathered,
-}
-
-impl bisection::Searched for Search<'_> {
-    fn fields(&self) -> &[Field] {
-        &self.device.fields
-    }
-
-    fn learned(&self) -> RefMut<'_, Learned> {
-        self.device.learned()
-    }
-
-    fn draw_plan(&self) {
-        self.device.draw_plan();
-    }
-
-    async fn ask(&self, block: &Block) -> Result<Vec<u8>, Fault> {
-        self.device.ask(block).await
-    }
-
-    fn take(&mut self, block: &Block, bytes: Vec<u8>) {
-        self.device.take(block, bytes, self.gathered);
-    }
-
-    fn note(&mut self, block: &Block, fault: Fault) {
-        self.gathered.note(block, Err(fault));
     }
 }
 

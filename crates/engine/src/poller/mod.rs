@@ -18,7 +18,6 @@ mod panic_guard;
 pub mod plan;
 mod poll_pause;
 mod results;
-mod roster;
 mod schedule;
 mod standby;
 mod state;

@@ -22,7 +22,6 @@ use super::forwarding::{Forward, ForwardCounters, ForwardSettings};
 use super::panic_guard::spawn_guarded;
 use super::plan::{PlanError, PlanLimits};
 use super::results::{Receivers, Results, Written};
-use super::roster::Roster;
 use super::schedule;
 use super::state::DeviceState;
 use super::turn::Turn;
@@ -69,6 +68,8 @@ pub enum PollerError {
 #[derive(Clone)]
 pub struct Polled {
     pub name: String,
+    /// Grows in the order in which devices are added.
+    number: u64,
     pub state: Arc<DeviceState>,
     pub forwards: Vec<Arc<ForwardCounters>>,
     /// The queue that receives its polls.
@@ -79,12 +80,13 @@ pub struct Polled {
 }
 
 impl Polled {
-    fn new(device: &DeviceSettings, state: Arc<DeviceState>) -> Polled {
+    fn new(device: &DeviceSettings, number: u64, state: Arc<DeviceState>) -> Polled {
         state.set_stale_after(device.interval, device.timeout);
         let forwards = device.forward.iter().map(|_| Arc::default()).collect();
         let address = Arc::new(address(&device.endpoint));
         Polled {
             name: device.name.clone(),
+            number,
             state,
             forwards,
             report: device.report.clone(),
@@ -106,7 +108,9 @@ impl Polled {
 
 /// A running poller, until it is stopped or dropped. Devices can be added and removed.
 pub struct Poller {
-    polled: Mutex<Roster<Polled>>,
+    polled: Mutex<HashMap<String, Polled>>,
+    /// The number of the next device.
+    numbers: AtomicU64,
     commands: mpsc::UnboundedSender<Command>,
     receivers: Arc<Receivers>,
     tickets: AtomicU64,
@@ -173,6 +177,7 @@ impl Poller {
         threads.push(thread);
         let poller = Poller {
             polled: Mutex::default(),
+            numbers: AtomicU64::default(),
             commands,
             receivers,
             tickets: AtomicU64::default(),
@@ -203,12 +208,13 @@ impl Poller {
     fn begin(&self, device: Planned) -> Result<(), PollerError> {
         let mut all = self.polled();
         let settings = &device.settings;
-        if all.has(&settings.name) {
+        if all.contains_key(&settings.name) {
             return Err(PollerError::Taken { device: settings.name.clone() });
         }
-        let polled = Polled::new(settings, Arc::default());
+        let number = self.numbers.fetch_add(1, Ordering::Relaxed);
+        let polled = Polled::new(settings, number, Arc::default());
         self.send(Command::Add(Box::new(device), polled.clone()))?;
-        all.add(polled.name.clone(), polled);
+        all.insert(polled.name.clone(), polled);
         Ok(())
     }
 
@@ -232,18 +238,19 @@ impl Poller {
         let device = checked(device)?;
         let settings = &device.settings;
         let mut all = self.polled();
-        if settings.name != name && all.has(&settings.name) {
+        if settings.name != name && all.contains_key(&settings.name) {
             return Err(PollerError::Taken { device: settings.name.clone() });
         }
         let Some(before) = all.get(name) else {
             return Err(PollerError::Unknown { device: name.to_owned() });
         };
-        let mut polled = Polled::new(settings, Arc::clone(&before.state));
+        let mut polled = Polled::new(settings, before.number, Arc::clone(&before.state));
         polled.keep_forwards(before);
         let device = Box::new(device);
         let sent = polled.clone();
         self.send(Command::Replace { name: name.to_owned(), device, polled: sent, at_once })?;
-        all.replace(name, polled.name.clone(), polled);
+        all.remove(name);
+        all.insert(polled.name.clone(), polled);
         Ok(())
     }
 
@@ -277,7 +284,7 @@ impl Poller {
         settings: LinkSettings,
     ) -> Result<Option<Arc<SharedLink>>, PollerError> {
         let address = address(&settings.endpoint);
-        let is_known = self.polled().iter().any(|device| *device.address == address) || {
+        let is_known = self.polled().values().any(|device| *device.address == address) || {
             let all = self.shared.lock().unwrap_or_else(PoisonError::into_inner);
             all.iter().any(|(other, link)| *other == address && link.strong_count() > 0)
         };
@@ -319,7 +326,7 @@ impl Poller {
             let function = request.pdu()[0];
             return Err(PollerError::NoWrite { device: name.to_owned(), function });
         }
-        if !self.polled().has(name) {
+        if !self.polled().contains_key(name) {
             return Err(PollerError::Unknown { device: name.to_owned() });
         }
         let ticket = self.tickets.fetch_add(1, Ordering::Relaxed);
@@ -332,7 +339,7 @@ impl Poller {
     /// whether there was a device of that name.
     pub fn remove(&self, name: &str) -> bool {
         let mut all = self.polled();
-        let known = all.remove(name);
+        let known = all.remove(name).is_some();
         if known {
             // A stopped poller polls nothing.
             let _ = self.send(Command::Remove(name.to_owned()));
@@ -340,12 +347,14 @@ impl Poller {
         known
     }
 
-    /// The current devices.
+    /// The current devices, in the order in which they were added.
     pub fn devices(&self) -> Vec<Polled> {
-        self.polled().iter().cloned().collect()
+        let mut devices: Vec<_> = self.polled().values().cloned().collect();
+        devices.sort_unstable_by_key(|device| device.number);
+        devices
     }
 
-    fn polled(&self) -> MutexGuard<'_, Roster<Polled>> {
+    fn polled(&self) -> MutexGuard<'_, HashMap<String, Polled>> {
         self.polled.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -919,8 +928,8 @@ mod tests {
             let mut link =
                 || links.to(&settings().endpoint, (InFlight::Fixed(1), Retry::default()));
             let (first, second) = (with([1, 2]), with([2, 3]));
-            let before = Polled::new(&first.settings, Arc::default());
-            let mut polled = Polled::new(&second.settings, Arc::clone(&before.state));
+            let before = Polled::new(&first.settings, 0, Arc::default());
+            let mut polled = Polled::new(&second.settings, 0, Arc::clone(&before.state));
             polled.keep_forwards(&before);
             let hour = Duration::from_secs(3600);
             let mut running = Running::start(first, before, link(), hour);

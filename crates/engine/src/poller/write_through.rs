@@ -14,7 +14,8 @@ use tokio::sync::{mpsc, oneshot};
 
 use crate::items::{Items, touched};
 use crate::link::{
-    Fault, Link, PendingReply, Permit, Priority, ReplyTo, confirmation, exception, pending_reply,
+    Fault, Link, PendingReply, Permit, Priority, ReplyTo, confirmation, exception, exception_in,
+    pending_reply,
 };
 
 /// The most writes into one memory that wait for devices.
@@ -126,9 +127,8 @@ impl Passage {
     pub fn write(&self, request: &Request<'_>) -> Result<(), u8> {
         let encoded = EncodedRequest::new(request);
         let (_, pending) = self.pass(encoded.pdu()).map_err(ExceptionCode::code)?;
-        match pending.wait().as_ref().map(|reply| &reply.pdu[..]) {
-            Ok([function, code]) if function & 0x80 != 0 => Err(*code),
-            Ok(_) => Ok(()),
+        match pending.wait() {
+            Ok(reply) => exception_in(&reply.pdu).map_or(Ok(()), Err),
             Err(_) => Err(ExceptionCode::GatewayPathUnavailable.code()),
         }
     }

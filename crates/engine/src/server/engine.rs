@@ -20,9 +20,7 @@ use crate::heartbeat::Heartbeat;
 use crate::own_threads::OwnThreads;
 use crate::serial_line::SerialLine;
 use crate::server::connections::admission::{ConnectionLimits, OpenConnection};
-use crate::server::connections::listener::{
-    ListenerContext, Service, accept_shared, bind_tcp, bind_udp,
-};
+use crate::server::connections::listener::{ListenerContext, Service, accept, bind_tcp, bind_udp};
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::audit::{Auditor, Record, Records, Unrecordable, auditing};
 use crate::server::reports::counters::{ConnectionCounters, PacketCounters};
@@ -287,7 +285,7 @@ impl Engine {
                 let service = ModbusStream::new(&stream, Arc::clone(&unit_server), None);
                 let live = Arc::new(Reloadable::new(service));
                 let served = Served::Stream(Arc::clone(&live), unit_server);
-                let task = accept_shared(Arc::clone(&context), live, socket, workers, stopping);
+                let task = accept(Arc::clone(&context), live, socket, workers, stopping);
                 (context, Some((stream.bind, address, copy)), served, Box::pin(task))
             }
             ListenerKind::RawIngest(raw) => {
@@ -295,7 +293,7 @@ impl Engine {
                 let context = context(Some(raw.limits));
                 let live = Arc::new(Reloadable::new(RawIngest::new(&raw, Arc::default())));
                 let served = Served::Packets(Arc::clone(&live));
-                let task = accept_shared(Arc::clone(&context), live, socket, workers, stopping);
+                let task = accept(Arc::clone(&context), live, socket, workers, stopping);
                 (context, Some((raw.bind, address, copy)), served, Box::pin(task))
             }
             ListenerKind::ModbusUdp(udp) => {

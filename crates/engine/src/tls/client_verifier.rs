@@ -37,7 +37,7 @@ impl Clients {
             return may_lack_authorities(files).map(|()| None);
         };
         let listed = listed(ca_file)?;
-        let subjects = listed.iter().filter_map(Listed::subject).collect();
+        let subjects = listed.iter().filter_map(|each| each.parsed.subject()).collect();
         doubts.of_listed(ca_file, &listed);
         let lists = match &files.crl_file {
             Some(file) if !listed.iter().any(Listed::is_authority) => {
@@ -93,7 +93,7 @@ fn may_lack_authorities(files: &ServerFiles) -> Result<(), FileError> {
 /// Reads authorities and self-signed certificates. Any other certificate is a mistake.
 fn listed(file: &Path) -> Result<Arc<[Listed]>, FileError> {
     let listed = Listed::of_file(file)?;
-    let is_mistake = |listed: &Listed| !listed.is_authority() && !listed.is_self_signed();
+    let is_mistake = |listed: &Listed| !listed.is_authority() && !listed.parsed.is_self_signed();
     if let Some(index) = listed.iter().position(is_mistake) {
         let flaw =
             format!("certificate {}: neither an authority (CA:TRUE) nor self-signed", index + 1);

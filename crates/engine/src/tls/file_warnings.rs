@@ -38,7 +38,7 @@ impl<'f> Doubts<'f> {
 
     pub(super) fn of_listed(&mut self, file: &Path, listed: &[Listed]) {
         for (each, number) in listed.iter().zip(1..) {
-            let parsed = each.parsed();
+            let parsed = &each.parsed;
             let outcome = match each.is_authority() {
                 true => "its clients are refused",
                 false => "this client is refused",
@@ -72,7 +72,7 @@ impl<'f> Doubts<'f> {
         for list in lists {
             let name = format!("revocation list {} ({})", list.number, name_text(list.issuer()));
             let named = || {
-                let issued = |each: &&(&Listed, usize)| each.0.parsed().has_subject(list.issuer());
+                let issued = |each: &&(&Listed, usize)| each.0.parsed.has_subject(list.issuer());
                 authorities.iter().filter(issued)
             };
             if named().next().is_none() {
@@ -80,7 +80,7 @@ impl<'f> Doubts<'f> {
                     "{name} is not of an authority in {ca_key}: it applies only to clients that \
                      send its authority"
                 ));
-            } else if !named().any(|(each, _)| list.is_signed_by(each.parsed())) {
+            } else if !named().any(|(each, _)| list.is_signed_by(&each.parsed)) {
                 self.add(file, &format!(
                     "{name} is not signed by the authority of that name in {ca_key}: clients of \
                      that authority are refused"
@@ -97,8 +97,8 @@ impl<'f> Doubts<'f> {
             }
         }
         for (each, number) in authorities {
-            if !lists.iter().any(|list| each.parsed().has_subject(list.issuer())) {
-                let subject = each.parsed().subject_text();
+            if !lists.iter().any(|list| each.parsed.has_subject(list.issuer())) {
+                let subject = each.parsed.subject_text();
                 self.add(file, &format!(
                     "found no list of certificate {number} of {ca_key} ({subject}): its clients are \
                      refused"

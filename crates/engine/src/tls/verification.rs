@@ -14,7 +14,7 @@ use std::path;
 use std::sync::Arc;
 
 use rustls::pki_types::{CertificateDer, Der, TrustAnchor, UnixTime};
-use rustls::{CertificateError, DistinguishedName, Error, OtherError};
+use rustls::{CertificateError, Error, OtherError};
 use webpki::{EndEntityCert, ExtendedKeyUsageValidator, KeyPurposeIdIter, VerifiedPath};
 use x509_cert::der::asn1::ObjectIdentifier;
 use x509_cert::der::{Reader, SliceReader};
@@ -29,7 +29,7 @@ use super::revocation::Lists;
 #[derive(Debug)]
 pub(super) struct Listed {
     certificate: CertificateDer<'static>,
-    parsed: Parsed,
+    pub(super) parsed: Parsed,
     /// The name and key of an authority.
     anchor: Option<TrustAnchor<'static>>,
 }
@@ -64,18 +64,6 @@ impl Listed {
 
     pub(super) fn is_authority(&self) -> bool {
         self.anchor.is_some()
-    }
-
-    pub(super) fn is_self_signed(&self) -> bool {
-        self.parsed.is_self_signed()
-    }
-
-    pub(super) fn parsed(&self) -> &Parsed {
-        &self.parsed
-    }
-
-    pub(super) fn subject(&self) -> Option<DistinguishedName> {
-        self.parsed.subject()
     }
 }
 
@@ -158,7 +146,7 @@ impl Trust {
         let anchors: Vec<TrustAnchor<'_>> = anchors.map(borrow_anchor).collect();
         let check = |verified: &VerifiedPath<'_>| {
             let authority = is_allowed(verified, authorities)?;
-            self.lists.judge(verified, authority.parsed(), path.now)
+            self.lists.judge(verified, &authority.parsed, path.now)
         };
         path.end_entity.verify_for_usage(
             ALGORITHMS.all,

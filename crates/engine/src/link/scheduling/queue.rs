@@ -57,6 +57,9 @@ impl Priority {
     }
 }
 
+/// Sources that take turns. Every source has at least one item.
+type RoundRobin<T> = VecDeque<(u64, VecDeque<T>)>;
+
 pub(in crate::link) struct Queue<T> {
     ranks: [RoundRobin<T>; RANKS],
     passed_over: [u32; RANKS],
@@ -72,7 +75,11 @@ impl<T> Queue<T> {
     pub(in crate::link) fn push(&mut self, source: u64, priority: Priority, item: T) {
         // Writes go in the order of their arrival: as if all came from one source.
         let source = if priority == Priority::Urgent { 0 } else { source };
-        self.ranks[priority.rank()].push(source, item);
+        let sources = &mut self.ranks[priority.rank()];
+        match sources.iter_mut().find(|(other, _)| *other == source) {
+            Some((_, items)) => items.push_back(item),
+            None => sources.push_back((source, VecDeque::from([item]))),
+        }
     }
 
     pub(in crate::link) fn pop(&mut self) -> Option<T> {
@@ -83,39 +90,11 @@ impl<T> Queue<T> {
             self.passed_over[lower] += 1;
         }
         self.passed_over[next] = 0;
-        self.ranks[next].pop()
-    }
-}
-
-/// Sources that take turns.
-struct RoundRobin<T> {
-    /// Every source has at least one item.
-    sources: VecDeque<(u64, VecDeque<T>)>,
-}
-
-impl<T> Default for RoundRobin<T> {
-    fn default() -> RoundRobin<T> {
-        RoundRobin { sources: VecDeque::new() }
-    }
-}
-
-impl<T> RoundRobin<T> {
-    fn is_empty(&self) -> bool {
-        self.sources.is_empty()
-    }
-
-    fn push(&mut self, source: u64, item: T) {
-        match self.sources.iter_mut().find(|(other, _)| *other == source) {
-            Some((_, items)) => items.push_back(item),
-            None => self.sources.push_back((source, VecDeque::from([item]))),
-        }
-    }
-
-    fn pop(&mut self) -> Option<T> {
-        let (source, mut items) = self.sources.pop_front()?;
+        let sources = &mut self.ranks[next];
+        let (source, mut items) = sources.pop_front()?;
         let item = items.pop_front();
         if !items.is_empty() {
-            self.sources.push_back((source, items));
+            sources.push_back((source, items));
         }
         item
     }

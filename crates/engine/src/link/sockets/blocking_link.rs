@@ -64,13 +64,13 @@ impl BlockingLink {
                         let answer = carried_out(&client, &call, &pause);
                         let flooded = flood.as_ref().and_then(|flood| flood.until(Instant::now()));
                         if let Some(until) = flooded {
-                            client.close();
+                            client.close(None);
                             pause.flooded(until);
                         }
                         let _ = call.answer.send((answer, pause.until()));
                     }
                     Job::Release => {
-                        client.close();
+                        client.close(None);
                         pass = None;
                     }
                 }
@@ -125,7 +125,7 @@ fn carried_out(client: &BlockingClient, call: &Call, pause: &ConnectPause) -> Ex
         to_begin: &|| permit.check(),
         to_go_on: allows.as_ref().map(|allows| allows as &dyn Fn() -> bool),
     };
-    let answer = client.call_under(&conditions, unit_id, request, timeout, |_, pdu| pdu.to_vec());
+    let answer = client.call(&conditions, unit_id, request, timeout, |_, pdu| pdu.to_vec());
     let answer = answer.map_err(Arc::new);
     match &answer {
         Err(error) => match **error {

@@ -26,7 +26,7 @@ use crate::server::connections::peer::Peer;
 use crate::server::connections::reply_order::{Deferral, Deferred, MAX_WAITING};
 use crate::server::connections::worker_share::{Share, WORK_OF_READ};
 use crate::server::reports::event::Kind;
-use crate::server::reports::refused_request::{RefusedRequest, Reported};
+use crate::server::reports::refused_request::Reported;
 use crate::server::requests::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};
 use crate::server::rights::peer_rights::PeerRights;
 use crate::server::transports::framing::{Ascii, Framing, Mbap, Next, Rtu};
@@ -426,7 +426,11 @@ impl<F: Framing> Answering<F> {
                         let request = (tag, unit_id, pdu);
                         match deferred.defer(ours, place, self.peer.ip(), request) {
                             Deferral::Later(refused) => {
-                                self.note_refused(refused);
+                                self.context.note_refused(
+                                    refused,
+                                    &self.reported,
+                                    Some(&self.peer),
+                                );
                                 rest = &rest[len..];
                                 answered.requests += 1;
                                 continue;
@@ -550,20 +554,10 @@ impl<F: Framing> Answering<F> {
         };
         let ours = (&*self.unit_server, &*self.rights);
         let (len, refused) = self.context.answer(ours, Some(&self.peer), unit_id, request, buffer);
-        self.note_refused(refused);
+        self.context.note_refused(refused, &self.reported, Some(&self.peer));
         let answered = &buffer[..len.unwrap_or_default()];
         self.delimiter = changed_delimiter(request, answered).unwrap_or(self.delimiter);
         len.map_or(0, |len| F::complete(output, tag, unit_id, len))
-    }
-
-    /// Reports the first refusal for each reason.
-    #[inline]
-    fn note_refused(&self, refused: Option<RefusedRequest>) {
-        if let Some(refused) = refused
-            && self.reported.is_first(&refused)
-        {
-            self.context.refuse_request(refused, Some(self.peer.clone()));
-        }
     }
 
     /// Sends `unsent`, then reads, answers and sends until no input is left, without waiting.

@@ -21,7 +21,7 @@ use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::audit::{Auditor, Permit};
 use crate::server::reports::counters::ConnectionCounters;
 use crate::server::reports::event::{Kind, Reporter};
-use crate::server::reports::refused_request::RefusedRequest;
+use crate::server::reports::refused_request::{RefusedRequest, Reported};
 use crate::server::requests::unit_server::UnitServer;
 use crate::server::rights::peer_rights::PeerRights;
 
@@ -200,9 +200,19 @@ impl ListenerContext {
         (len, refused.filter(|_| !is_for_listen_only))
     }
 
-    /// Reports a refused request. The exceptions are counted elsewhere.
-    pub(crate) fn refuse_request(&self, refused: RefusedRequest, peer: Option<Peer>) {
-        self.report(Kind::RefusedRequest(refused), peer);
+    /// Reports the first refusal for each reason. The exceptions are counted elsewhere.
+    #[inline]
+    pub(crate) fn note_refused(
+        &self,
+        refused: Option<RefusedRequest>,
+        reported: &Reported,
+        peer: Option<&Peer>,
+    ) {
+        if let Some(refused) = refused
+            && reported.is_first(&refused)
+        {
+            self.report(Kind::RefusedRequest(refused), peer.cloned());
+        }
     }
 
     pub(crate) fn refuse_role(&self, peer: Peer) {
@@ -255,22 +265,9 @@ pub(crate) trait Service: Send + Sync + Sized + 'static {
     ) -> Serving;
 }
 
-/// Accepts connections until `stop`, and distributes them to the workers in turn.
+/// Accepts connections until `stop`, and distributes them to the workers in turn. A reload can hand the
+/// socket to another listener.
 pub(crate) async fn accept<S: Service>(
-    context: Arc<ListenerContext>,
-    service: Arc<Reloadable<S>>,
-    socket: std::net::TcpListener,
-    workers: Vec<Handle>,
-    stop: watch::Receiver<bool>,
-) {
-    let Ok(socket) = TcpListener::from_std(socket) else {
-        return;
-    };
-    accept_shared(context, service, Arc::new(socket), workers, stop).await;
-}
-
-/// The same, from a socket that a reload can hand to another listener.
-pub(crate) async fn accept_shared<S: Service>(
     context: Arc<ListenerContext>,
     service: Arc<Reloadable<S>>,
     socket: Arc<TcpListener>,

@@ -276,8 +276,11 @@ fn a_listener_that_was_removed_admits_no_connection() {
     let socket = bind_tcp(any_port()).unwrap();
     let mut late = connect(socket.local_addr().unwrap());
     let handles = engine.handles.clone();
-    let task =
-        engine.handles[0].spawn(accept(context, live, socket, handles, engine.stop.subscribe()));
+    let stop = engine.stop.subscribe();
+    let task = engine.handles[0].spawn(async move {
+        let socket = Arc::new(tokio::net::TcpListener::from_std(socket).unwrap());
+        accept(context, live, socket, handles, stop).await;
+    });
     assert_eq!((ask(&mut late, &packet(V1)), register(&memory)), (NO_REPLY.to_vec(), 0));
     let counted = &listener.context.connections;
     assert_eq!((counted.accepted.get(), counted.refused_full.get()), (1, 0));

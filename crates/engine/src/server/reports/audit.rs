@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use holdfast_protocol::raw_ingest;
 
+use crate::link::exception_in;
 use crate::server::connections::peer::Peer;
 use crate::server::rights::functions::{is_write, only_reads};
 
@@ -209,10 +210,7 @@ fn record(
     forwarded: Forwarded<'_>,
 ) -> Record {
     let Forwarded { route, request, reply, log_sequence } = forwarded;
-    let refused = match reply {
-        [code, exception, ..] if code & 0x80 != 0 => Some(*exception),
-        _ => None,
-    };
+    let refused = exception_in(reply);
     let write = Written::Modbus { unit_id, pdu: request.to_vec(), refused, route: route.cloned() };
     Record { listener: Arc::clone(listener), peer: peer.cloned(), write, log_sequence }
 }

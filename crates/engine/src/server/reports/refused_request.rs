@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 use holdfast_memory::Memory;
 use holdfast_protocol::pdu::ExceptionCode;
 
+use crate::link::exception_in;
 use crate::server::rights::functions::is_write;
 use crate::server::rights::peer_rights::PeerRights;
 use crate::server::rights::rule::Elsewhere;
@@ -52,11 +53,7 @@ impl RefusedRequest {
         request: &[u8],
         reply: &[u8],
     ) -> Option<RefusedRequest> {
-        let &[code, exception, ..] = reply else { return None };
-        if code & 0x80 == 0 {
-            return None;
-        }
-        let code = ExceptionCode::from_code(exception)?;
+        let code = ExceptionCode::from_code(exception_in(reply)?)?;
         let why = match code {
             ExceptionCode::ServerDeviceBusy if is_write(request) => Why::Sealed,
             // With a memory, it is the device whose values the memory has that does not answer.

@@ -17,7 +17,7 @@ use holdfast_protocol::pdu::{
 
 use crate::counter::Counter;
 use crate::items::Items;
-use crate::link::{Asker, PendingReply};
+use crate::link::{Asker, PendingReply, exception_in};
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::comm_events::{CommEvents, Received};
 use crate::server::reports::counters::{Bus, Counters, FrameCounters};
@@ -223,14 +223,12 @@ impl UnitServer {
 
     /// Counts what a device has answered, or what was answered in its place.
     pub(crate) fn forwarded(&self, request: &[u8], reply: &[u8]) {
-        let refused = match reply {
-            [code, exception, ..] if code & 0x80 != 0 => ExceptionCode::from_code(*exception),
-            _ => None,
-        };
+        let exception = exception_in(reply);
+        let refused = exception.and_then(ExceptionCode::from_code);
         self.comm_events.send(refused, false);
         match reply {
             [] => self.counters.unanswered.add(),
-            [code, ..] if code & 0x80 != 0 => {
+            _ if exception.is_some() => {
                 if let Some(code) = refused {
                     self.counters.exception(code);
                 }
@@ -279,11 +277,9 @@ impl UnitServer {
                     (reply[..len].to_vec(), None)
                 }
             };
-            match reply[..] {
-                [code, exception, ..] if code & 0x80 != 0 => {
-                    refused = refused.or(ExceptionCode::from_code(exception));
-                }
-                _ => carried_out = true,
+            match exception_in(&reply) {
+                Some(code) => refused = refused.or(ExceptionCode::from_code(code)),
+                None => carried_out = true,
             }
             note(&reply, log_sequence, permit);
         }

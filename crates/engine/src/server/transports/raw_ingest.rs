@@ -1006,12 +1006,6 @@ mod tests {
             Ok(())
         }
 
-        fn is_amid_record(&self) -> bool {
-            false
-        }
-
-        fn end(&mut self, _unsent: &mut Vec<u8>) {}
-
         fn socket(&self) -> &TcpStream {
             self.socket
         }

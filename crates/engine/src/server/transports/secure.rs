@@ -22,70 +22,62 @@ use crate::tls::server::ServerTls;
 pub(crate) async fn secured(
     tls: &ServerTls,
     context: &ListenerContext,
-    connection: (TcpStream, SocketAddr),
-    ticket: &Ticket,
-    time_limit: Duration,
-    stop: watch::Receiver<bool>,
-) -> Option<(ServerTlsStream, Peer)> {
-    Box::pin(handshake(tls, context, connection, ticket, time_limit, stop)).await
-}
-
-async fn handshake(
-    tls: &ServerTls,
-    context: &ListenerContext,
     (stream, peer): (TcpStream, SocketAddr),
     ticket: &Ticket,
     time_limit: Duration,
     mut stop: watch::Receiver<bool>,
 ) -> Option<(ServerTlsStream, Peer)> {
-    let ended = |end| {
-        context.ended(end, peer);
-        None
-    };
-    let mut stream = match ServerTlsStream::new(stream, tls) {
-        Ok(stream) => stream,
-        Err(end) => return ended(end),
-    };
-    let shaken = tokio::select! {
-        biased;
-        _ = stop.wait_for(|stop| *stop) => None,
-        shaken = timeout(time_limit, stream.handshake(time_limit)) => Some(shaken),
-    };
-    let Some(shaken) = shaken else {
-        if stream.has_begun() {
-            // The peer may have completed its side.
-            stream.announce_end();
+    Box::pin(async move {
+        let ended = |end| {
+            context.ended(end, peer);
+            None
+        };
+        let mut stream = match ServerTlsStream::new(stream, tls) {
+            Ok(stream) => stream,
+            Err(end) => return ended(end),
+        };
+        let shaken = tokio::select! {
+            biased;
+            _ = stop.wait_for(|stop| *stop) => None,
+            shaken = timeout(time_limit, stream.handshake(time_limit)) => Some(shaken),
+        };
+        let Some(shaken) = shaken else {
+            if stream.channel.has_begun() {
+                // The peer may have completed its side.
+                stream.announce_end();
+            }
+            return ended(Kind::Closed);
+        };
+        let certificate = match shaken {
+            Ok(Ok(())) => stream.peer_certificate(),
+            Ok(Err(Kind::Closed)) => {
+                return ended(Kind::TlsFailed(TlsFailure::ClosedDuringHandshake.reason()));
+            }
+            Ok(Err(end)) => Err(end),
+            Err(_) => return ended(Kind::TlsFailed("timeout")),
+        };
+        let certificate = match certificate {
+            Ok(certificate) => certificate.map(Arc::new),
+            Err(end) => {
+                context.ended_with(end, peer, stream.channel.presented_subject().as_deref());
+                drain(&mut stream.into_socket(), stop, |_| ()).await;
+                return None;
+            }
+        };
+        if let Some(certificate) = &certificate {
+            ticket.identify(Arc::clone(certificate));
         }
-        return ended(Kind::Closed);
-    };
-    let certificate = match shaken {
-        Ok(Ok(())) => stream.peer_certificate(),
-        Ok(Err(Kind::Closed)) => {
-            return ended(Kind::TlsFailed(TlsFailure::ClosedDuringHandshake.reason()));
+        let peer = Peer { address: peer, certificate };
+        match ticket.establish() {
+            Ok(evicted) => context.evicted(evicted),
+            Err(Full) => {
+                context.refuse_full(peer);
+                stream.refuse(stop).await;
+                return None;
+            }
         }
-        Ok(Err(end)) => Err(end),
-        Err(_) => return ended(Kind::TlsFailed("timeout")),
-    };
-    let certificate = match certificate {
-        Ok(certificate) => certificate.map(Arc::new),
-        Err(end) => {
-            context.ended_with(end, peer, stream.presented_subject().as_deref());
-            drain(&mut stream.into_socket(), stop, |_| ()).await;
-            return None;
-        }
-    };
-    if let Some(certificate) = &certificate {
-        ticket.identify(Arc::clone(certificate));
-    }
-    let peer = Peer { address: peer, certificate };
-    match ticket.establish() {
-        Ok(evicted) => context.evicted(evicted),
-        Err(Full) => {
-            context.refuse_full(peer);
-            stream.refuse(stop).await;
-            return None;
-        }
-    }
-    context.report(Kind::Secured, Some(peer.clone()));
-    Some((stream, peer))
+        context.report(Kind::Secured, Some(peer.clone()));
+        Some((stream, peer))
+    })
+    .await
 }

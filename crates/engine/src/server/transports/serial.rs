@@ -22,7 +22,7 @@ use crate::server::connections::reloadable::Reloadable;
 use crate::server::connections::reply_order::{Asked, Expected};
 use crate::server::reports::audit::Forwarded;
 use crate::server::reports::event::Kind;
-use crate::server::reports::refused_request::{RefusedRequest, Reported};
+use crate::server::reports::refused_request::Reported;
 use crate::server::requests::unit_server::{
     ASCII_DELIMITER, UnitServer, UnitSettings, changed_delimiter,
 };
@@ -270,7 +270,7 @@ impl ModbusSerial {
                 self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted)
             });
             let (asked, answered, refused) = asked;
-            self.note_refused(context, refused);
+            context.note_refused(refused, &self.reported, None);
             let answered = match answered {
                 Expected::Pending(pending) => {
                     let ours = (Arc::clone(&self.unit_server), Arc::clone(context));
@@ -291,21 +291,12 @@ impl ModbusSerial {
         }
         let ours = (&*self.unit_server, &*rights);
         let (len, refused) = context.answer(ours, None, unit_id, request, reply);
-        self.note_refused(context, refused);
+        context.note_refused(refused, &self.reported, None);
         let answered = &reply[..len.unwrap_or_default()];
         if let Some(delimiter) = changed_delimiter(request, answered) {
             self.delimiter.store(delimiter, Ordering::Relaxed);
         }
         len
-    }
-
-    /// Reports the first refusal for each reason.
-    fn note_refused(&self, context: &ListenerContext, refused: Option<RefusedRequest>) {
-        if let Some(refused) = refused
-            && self.reported.is_first(&refused)
-        {
-            context.refuse_request(refused, None);
-        }
     }
 
     /// Carries out a broadcast: every memory carries out the write, no unit replies.

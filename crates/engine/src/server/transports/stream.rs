@@ -51,10 +51,13 @@ pub(crate) trait Stream: Send {
     fn send(&mut self, output: &[u8], unsent: &mut Vec<u8>) -> Result<(), Kind>;
 
     /// Whether the peer has sent part of a TLS record.
-    fn is_amid_record(&self) -> bool;
+    #[inline]
+    fn is_amid_record(&self) -> bool {
+        false
+    }
 
     /// Appends the message that announces the end, if the stream has one.
-    fn end(&mut self, unsent: &mut Vec<u8>);
+    fn end(&mut self, _unsent: &mut Vec<u8>) {}
 
     fn socket(&self) -> &TcpStream;
 }
@@ -87,13 +90,6 @@ impl Stream for TcpStream {
     fn send(&mut self, output: &[u8], unsent: &mut Vec<u8>) -> Result<(), Kind> {
         send(self, output, unsent)
     }
-
-    #[inline]
-    fn is_amid_record(&self) -> bool {
-        false
-    }
-
-    fn end(&mut self, _unsent: &mut Vec<u8>) {}
 
     fn socket(&self) -> &TcpStream {
         self

@@ -45,7 +45,7 @@ thread_local! {
 
 pub(crate) struct ServerTlsStream {
     socket: TcpStream,
-    channel: ServerChannel,
+    pub(crate) channel: ServerChannel,
     records: Records,
     /// Plain text that did not fit into the input of the connection, and how much of it was read.
     plain: Vec<u8>,
@@ -82,16 +82,6 @@ impl ServerTlsStream {
     /// The certificate of the peer, after the handshake; `None` if clients need none.
     pub(crate) fn peer_certificate(&self) -> Result<Option<PeerCertificate>, Kind> {
         self.channel.peer_certificate().map_err(|failure| failed(&failure).into())
-    }
-
-    /// The subject of the certificate of a peer whose handshake has failed.
-    pub(crate) fn presented_subject(&self) -> Option<String> {
-        self.channel.presented_subject()
-    }
-
-    /// Whether the peer has begun the handshake.
-    pub(crate) fn has_begun(&self) -> bool {
-        self.channel.has_begun()
     }
 
     /// Announces the end without waiting.

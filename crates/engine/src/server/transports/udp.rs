@@ -20,7 +20,7 @@ use crate::link::{Asker, source};
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::connections::reply_order::{Asked, Expected};
-use crate::server::reports::refused_request::RefusedRequest;
+use crate::server::reports::refused_request::Reported;
 use crate::server::requests::unit_server::{UnitServer, UnitSettings};
 use crate::server::rights::policy::Policy;
 use crate::server::rights::rule::Rule;
@@ -203,7 +203,7 @@ impl ModbusUdp {
                 self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted)
             });
             let (asked, reply, refused) = asked;
-            note_refused(context, refused, peer);
+            context.note_refused(refused, &Reported::default(), Some(&peer.into()));
             return match reply {
                 Expected::Pending(pending) => {
                     let meta = *meta;
@@ -224,7 +224,7 @@ impl ModbusUdp {
         }
         let ours = (&*self.unit_server, &*rights);
         let (len, refused) = context.answer(ours, Some(&peer.into()), unit_id, request, buffer);
-        note_refused(context, refused, peer);
+        context.note_refused(refused, &Reported::default(), Some(&peer.into()));
         len.map_or(0, |len| D::complete(output, tag, unit_id, len))
     }
 }
@@ -300,12 +300,6 @@ fn complete<D: Datagram>(socket: &Datagrams, completed: Completed, later: &mut L
         frame[D::HEADER_LEN..][..pdu.len()].copy_from_slice(&pdu);
         let len = D::complete(&mut frame, tag, unit_id, pdu.len());
         socket.send(&frame[..len], &meta);
-    }
-}
-
-fn note_refused(context: &ListenerContext, refused: Option<RefusedRequest>, peer: SocketAddr) {
-    if let Some(refused) = refused {
-        context.refuse_request(refused, Some(peer.into()));
     }
 }
 
