@@ -555,7 +555,7 @@ class RawRule:
 
     def __new__(
         cls,
-        targets: Mapping[int, Memory],
+        targets: dict[int, Memory],
         *,
         sources: Sequence[str],
         areas: Sequence[Area],

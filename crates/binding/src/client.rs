@@ -11,6 +11,7 @@ use holdfast_engine::client::{
 use holdfast_engine::tls::FileError;
 use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
 use holdfast_engine::{LineDirection, LineMode, LineParity, SerialLine};
+use holdfast_memory::{Area, Span};
 use holdfast_protocol::client::{AcceptUnit, Closed, Echo, Tolerance};
 use holdfast_protocol::frame::rtu;
 use holdfast_protocol::pdu::identification::ReadCode;
@@ -22,7 +23,7 @@ use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyList};
 
-use crate::arguments::{byte, os_text, seconds, within, word};
+use crate::arguments::{byte, os_text, seconds, unknown, within, word};
 use crate::memory::{Integer, integer, numbers};
 
 pyo3::import_exception!(holdfast.errors, ModbusException);
@@ -35,9 +36,6 @@ pyo3::import_exception!(holdfast.errors, TlsFailed);
 /// What a call raises that `end_call` has ended.
 const CLOSED: &str = "connection lost: closed by this side";
 
-/// The number of addresses of an area.
-const ADDRESSES: i128 = 65_536;
-
 #[pyclass(frozen, module = "holdfast")]
 pub struct Request {
     pub(crate) encoded: EncodedRequest,
@@ -49,37 +47,31 @@ impl Request {
     fn read(area: &str, address: Integer, count: Integer) -> PyResult<Request> {
         let area = crate::memory::named(area)?;
         Ok(encoded(&match area {
-            holdfast_memory::Area::Coils => CoreRequest::ReadCoils(range(address, count)?),
-            holdfast_memory::Area::DiscreteInputs => {
-                CoreRequest::ReadDiscreteInputs(range(address, count)?)
-            }
-            holdfast_memory::Area::HoldingRegisters => {
-                CoreRequest::ReadHoldingRegisters(range(address, count)?)
-            }
-            holdfast_memory::Area::InputRegisters => {
-                CoreRequest::ReadInputRegisters(range(address, count)?)
-            }
-            holdfast_memory::Area::File(_) => unreachable!("it is one of the four areas"),
+            Area::Coils => CoreRequest::ReadCoils(range(address, count)?),
+            Area::DiscreteInputs => CoreRequest::ReadDiscreteInputs(range(address, count)?),
+            Area::HoldingRegisters => CoreRequest::ReadHoldingRegisters(range(address, count)?),
+            Area::InputRegisters => CoreRequest::ReadInputRegisters(range(address, count)?),
+            Area::File(_) => unreachable!("it is one of the four areas"),
         }))
     }
 
     #[staticmethod]
     fn write_coil(address: Integer, value: &Bound<'_, PyAny>) -> PyResult<Request> {
         let address = register("address", address)?;
-        let value = single(holdfast_memory::Area::Coils, value)? == 1;
+        let value = single(Area::Coils, value)? == 1;
         Ok(encoded(&CoreRequest::WriteSingleCoil { address, value }))
     }
 
     #[staticmethod]
     fn write_register(address: Integer, value: &Bound<'_, PyAny>) -> PyResult<Request> {
         let address = register("address", address)?;
-        let value = single(holdfast_memory::Area::HoldingRegisters, value)?;
+        let value = single(Area::HoldingRegisters, value)?;
         Ok(encoded(&CoreRequest::WriteSingleRegister { address, value }))
     }
 
     #[staticmethod]
     fn write_coils(address: Integer, values: &Bound<'_, PyAny>) -> PyResult<Request> {
-        let values = numbers(holdfast_memory::Area::Coils, values)?;
+        let values = numbers(Area::Coils, values)?;
         let range = range::<{ limit::WRITE_BITS }>(address, Integer(values.len() as i128))?;
         let values: Vec<bool> = values.iter().map(|bit| *bit == 1).collect();
         let mut room = [0; pdu::MAX_LEN];
@@ -89,7 +81,7 @@ impl Request {
 
     #[staticmethod]
     fn write_registers(address: Integer, values: &Bound<'_, PyAny>) -> PyResult<Request> {
-        let values = numbers(holdfast_memory::Area::HoldingRegisters, values)?;
+        let values = numbers(Area::HoldingRegisters, values)?;
         let range = range::<{ limit::WRITE_REGISTERS }>(address, Integer(values.len() as i128))?;
         let mut room = [0; pdu::MAX_LEN];
         let registers = Registers::pack(&values, &mut room).map_err(refused)?;
@@ -112,7 +104,7 @@ impl Request {
         write_address: Integer,
         values: &Bound<'_, PyAny>,
     ) -> PyResult<Request> {
-        let values = numbers(holdfast_memory::Area::HoldingRegisters, values)?;
+        let values = numbers(Area::HoldingRegisters, values)?;
         let read = range(read_address, count)?;
         let written = Integer(values.len() as i128);
         let write_address =
@@ -159,7 +151,7 @@ impl Request {
     #[staticmethod]
     fn write_files(ranges: Vec<(Integer, Integer, Bound<'_, PyAny>)>) -> PyResult<Request> {
         let ranges = ranges.into_iter().map(|(file, record, values)| {
-            let values = numbers(holdfast_memory::Area::HoldingRegisters, &values)?;
+            let values = numbers(Area::HoldingRegisters, &values)?;
             let count = Integer(values.len() as i128);
             let range = file_range(file, record, count, limit::WRITE_RECORDS)?;
             Ok((range.file(), range.record(), values))
@@ -237,8 +229,7 @@ impl Endpoint {
             "rtu+udp" => Place::RtuOverUdp { host, port },
             _ => {
                 let allowed = "tcp, rtu+tcp, ascii+tcp, udp, rtu+udp";
-                let message = format!("transport is {transport:?}, allowed: {allowed}");
-                return Err(PyValueError::new_err(message));
+                return Err(unknown("transport", transport, allowed));
             }
         };
         Ok(Endpoint { core: core.into() })
@@ -364,7 +355,7 @@ impl BlockingClient {
             self.core.interruptible_call(interrupted, &to_begin, unit, request, timeout, take)
         })?;
         let result = result.ok_or_else(|| ConnectionLost::new_err(CLOSED))?;
-        result.map_err(raised)?.into_python(py)
+        result.map_err(|error| raised(&error))?.into_python(py)
     }
 
     /// Ends the call that waits for its reply, and its connection.
@@ -373,7 +364,7 @@ impl BlockingClient {
     }
 
     fn close(&self, py: Python<'_>) -> PyResult<()> {
-        self.interruptible(py, |interrupted| self.core.interruptible_close(interrupted))
+        self.interruptible(py, |interrupted| self.core.close(Some(interrupted)))
     }
 
     #[getter]
@@ -519,11 +510,8 @@ impl Reply {
                 (busy, events, messages, PyBytes::new(py, &log)).into_pyobject(py)?.into_any()
             }
             Reply::Files(ranges) => {
-                let words = |records: &Vec<u8>| {
-                    let (pairs, _) = records.as_chunks::<2>();
-                    pairs.iter().map(|pair| u16::from_be_bytes(*pair)).collect::<Vec<_>>()
-                };
-                PyList::new(py, ranges.iter().map(words))?.into_any()
+                let ranges = ranges.iter().map(|records| words(py, records));
+                PyList::new(py, ranges.collect::<PyResult<Vec<_>>>()?)?.into_any()
             }
             Reply::Identification(conformity, next, objects) => {
                 let objects: Vec<(u8, Bound<'_, PyBytes>)> =
@@ -550,15 +538,11 @@ fn words<'py>(py: Python<'py>, registers: &[u8]) -> PyResult<Bound<'py, PyAny>> 
 
 /// The Python exception of an error, as an object.
 pub(crate) fn exception<'py>(py: Python<'py>, error: &ClientError) -> Bound<'py, PyAny> {
-    mapped(error).into_value(py).into_bound(py).into_any()
+    raised(error).into_value(py).into_bound(py).into_any()
 }
 
 /// Maps an error to its Python exception.
-pub(crate) fn raised(error: ClientError) -> PyErr {
-    mapped(&error)
-}
-
-fn mapped(error: &ClientError) -> PyErr {
+pub(crate) fn raised(error: &ClientError) -> PyErr {
     let text = error.to_string();
     match error {
         ClientError::Exception(code) => {
@@ -588,7 +572,7 @@ fn encoded(request: &CoreRequest<'_>) -> Request {
 fn range<const MAX: u16>(address: Integer, Integer(count): Integer) -> PyResult<Range<MAX>> {
     let address = register("address", address)?;
     let quantity = within("count", count, 1..=usize::from(MAX))? as u16;
-    if i128::from(address) + count > ADDRESSES {
+    if i128::from(address) + count > i128::from(Span::MAX_SIZE) {
         let message = format!("{count} from address {address}: the last address is 65535");
         return Err(PyValueError::new_err(message));
     }
@@ -616,7 +600,7 @@ fn register(what: &str, Integer(number): Integer) -> PyResult<u16> {
 }
 
 /// Extracts and checks the value of one bit or register.
-fn single(area: holdfast_memory::Area, value: &Bound<'_, PyAny>) -> PyResult<u16> {
+fn single(area: Area, value: &Bound<'_, PyAny>) -> PyResult<u16> {
     let values = PyList::new(value.py(), [value])?;
     Ok(numbers(area, values.as_any())?[0])
 }

@@ -104,7 +104,7 @@ impl Connection {
         let tls = match tls {
             None => None,
             Some(tls) => Some(Tls::new(tls).map_err(|failure| {
-                raised(ClientError::Tls { to: to.clone(), failure, maybe_sent: false })
+                raised(&ClientError::Tls { to: to.clone(), failure, maybe_sent: false })
             })?),
         };
         let time = event_loop.getattr("time")?;
@@ -175,7 +175,7 @@ impl Connection {
         let ticket =
             match state.core.send_again(unit, &request.encoded, within, attempt, clock(now)?) {
                 Ok(ticket) => ticket.0,
-                Err(why) => return Err(raised(self.error(&state.ending, why.failure(), within))),
+                Err(why) => return Err(raised(&self.error(&state.ending, why.failure(), within))),
             };
         let is_alone = state.waiting.is_empty();
         state.waiting.push_back((ticket, future.clone().unbind()));
@@ -414,7 +414,7 @@ impl Connection {
                 Ok(response) => value(py, response).map(Bound::unbind),
                 Err(failure) => match done.again {
                     Some(core) => Py::new(py, Attempt { core }).map(Py::into_any),
-                    None => Err(raised(self.error(ending, failure, done.timeout))),
+                    None => Err(raised(&self.error(ending, failure, done.timeout))),
                 },
             };
             completed.push((future, outcome));

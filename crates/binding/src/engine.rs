@@ -11,7 +11,7 @@ use holdfast_engine::server::{
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{IntoPyDict, PyDict};
 
 use crate::arguments::{byte, os_error, seconds, within, word};
 use crate::audit_fields;
@@ -188,9 +188,9 @@ fn counted_packets<'py>(
     py: Python<'py>,
     counters: &PacketCounters,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let packets = dict(py, counters.by_name())?;
+    let packets = counters.by_name().into_py_dict(py)?;
     let refused = counters.refused().map(|(refusal, count)| (refusal.name(), count));
-    packets.set_item("refused", dict(py, refused)?)?;
+    packets.set_item("refused", refused.into_py_dict(py)?)?;
     Ok(packets)
 }
 
@@ -199,10 +199,10 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
     match &listener.protocol {
         ProtocolCounters::Modbus(unit_server, packets) => {
             let counters = &unit_server.counters;
-            all.set_item("requests", dict(py, counters.requests())?)?;
-            all.set_item("exceptions", dict(py, counters.exceptions())?)?;
+            all.set_item("requests", counters.requests().into_py_dict(py)?)?;
+            all.set_item("exceptions", counters.exceptions().into_py_dict(py)?)?;
             all.set_item("unanswered", counters.unanswered.get())?;
-            all.set_item("frames", dict(py, counters.frames.by_name())?)?;
+            all.set_item("frames", counters.frames.by_name().into_py_dict(py)?)?;
             if let Some(packets) = packets {
                 all.set_item("packets", counted_packets(py, packets)?)?;
             }
@@ -212,7 +212,7 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
         }
     }
     let counters = listener.connections();
-    let connections = dict(py, counters.by_name())?;
+    let connections = counters.by_name().into_py_dict(py)?;
     connections.set_item("tls_failed", counters.tls_failed.total())?;
     connections.set_item("open", listener.open_connections)?;
     all.set_item("connections", connections)?;
@@ -243,18 +243,6 @@ pub(crate) fn event_fields<'py>(py: Python<'py>, event: &Event) -> PyResult<Boun
         fields.set_item("function", refused.function_code)?;
     }
     Ok(fields)
-}
-
-/// Counts as a dict.
-pub(crate) fn dict<'py, K: IntoPyObject<'py>>(
-    py: Python<'py>,
-    counts: impl IntoIterator<Item = (K, u64)>,
-) -> PyResult<Bound<'py, PyDict>> {
-    let all = PyDict::new(py);
-    for (key, count) in counts {
-        all.set_item(key, count)?;
-    }
-    Ok(all)
 }
 
 /// Maps a failed socket to an `OSError` with its `errno`, so that Python selects the subclass.

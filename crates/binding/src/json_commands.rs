@@ -13,14 +13,12 @@ use holdfast_memory::Area;
 use pyo3::prelude::*;
 use pyo3::pybacked::PyBackedBytes;
 use pyo3::types::{PyBytes, PyString, PyTuple};
+use serde::Deserialize;
 
 use crate::batch::{Batch, Checked};
 use crate::exchange::{HttpExchange, request};
 use crate::memory::{Memory, largest, named, put};
 use crate::peer;
-
-/// The digits of the largest register.
-const MAX_DIGITS: usize = 5;
 
 /// What a source may write: the areas of each memory, and the most bytes of a command.
 #[pyclass(frozen, module = "holdfast")]
@@ -57,10 +55,11 @@ impl Commands {
     /// The memory's name, its name in JSON, and the write. `None` if the command has another form or is not granted,
     /// or its memory does not take it at once.
     pub fn parsed(&self, py: Python<'_>, body: &[u8]) -> Option<(Py<PyString>, Bytes, Batch)> {
-        if body.len() > self.most {
+        // An array could have the same values in the order of the fields.
+        if body.len() > self.most || !body.trim_ascii_start().starts_with(b"{") {
             return None;
         }
-        let Command { memory, area, address, values } = Command::parse(body)?;
+        let Command { memory, area, address, values } = serde_json::from_slice(body).ok()?;
         let target = self.targets.get(memory)?;
         let area = target.areas.iter().copied().find(|known| known.name() == area)?;
         let (core, count) = (&target.memory.get().core, values.len());
@@ -175,89 +174,11 @@ impl ParsedWrites {
 }
 
 /// A command in its plain form.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
 struct Command<'a> {
     memory: &'a str,
     area: &'a str,
     address: u16,
     values: Vec<u16>,
-}
-
-impl<'a> Command<'a> {
-    fn parse(body: &'a [u8]) -> Option<Command<'a>> {
-        let (mut memory, mut area, mut address, mut values) = (None, None, None, None);
-        let mut text = Text(body);
-        text.takes(b'{')?;
-        loop {
-            let key = text.word()?;
-            text.takes(b':')?;
-            match key {
-                "memory" if memory.is_none() => memory = Some(text.word()?),
-                "area" if area.is_none() => area = Some(text.word()?),
-                "address" if address.is_none() => address = Some(text.number()?),
-                "values" if values.is_none() => values = Some(text.numbers()?),
-                _ => return None,
-            }
-            if text.takes(b',').is_none() {
-                break;
-            }
-        }
-        text.takes(b'}')?;
-        text.trim();
-        text.0.is_empty().then_some(())?;
-        Some(Command { memory: memory?, area: area?, address: address?, values: values? })
-    }
-}
-
-/// JSON that was not read yet.
-struct Text<'a>(&'a [u8]);
-
-impl<'a> Text<'a> {
-    fn trim(&mut self) {
-        while let [b' ' | b'\t' | b'\n' | b'\r', rest @ ..] = self.0 {
-            self.0 = rest;
-        }
-    }
-
-    fn takes(&mut self, byte: u8) -> Option<()> {
-        self.trim();
-        self.0 = self.0.strip_prefix(&[byte])?;
-        Some(())
-    }
-
-    /// A text of printable ASCII without escapes.
-    fn word(&mut self) -> Option<&'a str> {
-        self.takes(b'"')?;
-        let is_plain = |byte: &u8| matches!(byte, b' '..=b'~') && !matches!(byte, b'"' | b'\\');
-        let len = self.0.iter().take_while(|byte| is_plain(byte)).count();
-        let (word, rest) = self.0.split_at(len);
-        self.0 = rest.strip_prefix(b"\"")?;
-        str::from_utf8(word).ok()
-    }
-
-    /// An integer without a sign, a fraction or an exponent: what follows it is no part of a number.
-    fn number(&mut self) -> Option<u16> {
-        self.trim();
-        let digits = self.0.iter().take_while(|byte| byte.is_ascii_digit()).count();
-        let (number, rest) = self.0.split_at(digits);
-        if digits > MAX_DIGITS || (digits > 1 && number.starts_with(b"0")) {
-            return None;
-        }
-        if matches!(rest, [b'.' | b'e' | b'E', ..]) {
-            return None;
-        }
-        self.0 = rest;
-        str::from_utf8(number).ok()?.parse().ok()
-    }
-
-    fn numbers(&mut self) -> Option<Vec<u16>> {
-        self.takes(b'[')?;
-        let mut numbers = Vec::new();
-        loop {
-            numbers.push(self.number()?);
-            if self.takes(b',').is_none() {
-                self.takes(b']')?;
-                return Some(numbers);
-            }
-        }
-    }
 }

@@ -12,7 +12,7 @@ use holdfast_protocol::client::MAX_LATENESS;
 use holdfast_protocol::pdu::{self, ExceptionCode, Function, SubFunction, limit};
 use holdfast_runtime::Retry;
 use pyo3::prelude::*;
-use pyo3::types::{PyDict, PyTuple};
+use pyo3::types::{IntoPyDict, PyTuple};
 
 pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let py = module.py();
@@ -32,16 +32,10 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let sub_functions = (0..=u16::MAX).filter_map(SubFunction::from_code);
     let sub_functions = sub_functions.map(|each| (each.code(), each.name(), each.changes_state()));
     module.add("SUB_FUNCTIONS", PyTuple::new(py, sub_functions.collect::<Vec<_>>())?)?;
-    let exceptions = PyDict::new(py);
-    for code in (0..=u8::MAX).filter_map(ExceptionCode::from_code) {
-        exceptions.set_item(code.code(), code.name())?;
-    }
-    module.add("EXCEPTIONS", exceptions)?;
-    let faults = PyDict::new(py);
-    for (fault, word) in Fault::NAMED {
-        faults.set_item(word, fault.code())?;
-    }
-    module.add("FAULTS", faults)?;
+    let exceptions = ExceptionCode::ALL.iter().map(|code| (code.code(), code.name()));
+    module.add("EXCEPTIONS", exceptions.into_py_dict(py)?)?;
+    let faults = Fault::NAMED.iter().map(|(fault, word)| (word, fault.code()));
+    module.add("FAULTS", faults.into_py_dict(py)?)?;
     module.add("TLS_REASONS", PyTuple::new(py, TlsFailure::REASONS)?)?;
     module.add("MAX_LATENESS", MAX_LATENESS.as_secs_f64())?;
     let Retry { first, most, .. } = Retry::default();

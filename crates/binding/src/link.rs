@@ -15,7 +15,7 @@ use holdfast_protocol::pdu::{self, Bits, Registers, Request as CoreRequest, limi
 use holdfast_runtime::Retry;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{IntoPyDict, PyDict};
 
 use crate::arguments::{byte, seconds, within};
 use crate::client::{Endpoint, Reply, Request, exception};
@@ -101,10 +101,7 @@ impl Link {
     }
 
     fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let all = PyDict::new(py);
-        for (name, count) in self.core.counters.by_name() {
-            all.set_item(name, count)?;
-        }
+        let all = self.core.counters.by_name().into_py_dict(py)?;
         all.set_item("waiting", self.core.waiting())?;
         add_strays(&all, self.core.strays())?;
         Ok(all)

@@ -15,7 +15,7 @@ use holdfast_engine::server::{
     StreamSettings, UdpSettings, WhenFull,
 };
 use holdfast_engine::tls::server::Protocol;
-use holdfast_memory::{Area, Memory as CoreMemory};
+use holdfast_memory::Area;
 use ipnet::IpNet;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -148,13 +148,14 @@ impl RawRule {
     #[new]
     #[pyo3(signature = (targets, *, sources, areas, roles=None))]
     fn new(
-        targets: &Bound<'_, PyMapping>,
+        targets: BTreeMap<i128, PyRef<'_, Memory>>,
         sources: Vec<String>,
         areas: Vec<String>,
         roles: Option<Vec<String>>,
     ) -> PyResult<RawRule> {
-        let targets = self::targets(targets)?.into_iter().map(|(target, memory)| {
-            Ok((within("unit or memory id", target, 0..=65_535)? as u16, memory))
+        let targets = targets.into_iter().map(|(target, memory)| {
+            let target = within("unit or memory id", target, 0..=65_535)? as u16;
+            Ok((target, Arc::clone(&memory.core)))
         });
         let targets = targets.collect::<PyResult<_>>()?;
         let areas = areas.iter().map(|area| named(area)).collect::<PyResult<_>>()?;
@@ -380,16 +381,6 @@ fn cores(rules: &[PyRef<'_, Rule>]) -> Vec<CoreRule> {
 
 fn networks(sources: &[String]) -> PyResult<Vec<IpNet>> {
     sources.iter().map(|text| network(text)).collect()
-}
-
-/// Converts a mapping from ids to memories.
-fn targets(mapping: &Bound<'_, PyMapping>) -> PyResult<Vec<(i128, Arc<CoreMemory>)>> {
-    let mut targets = Vec::new();
-    for item in mapping.items()?.iter() {
-        let (id, memory): (i128, PyRef<'_, Memory>) = item.extract()?;
-        targets.push((id, Arc::clone(&memory.core)));
-    }
-    Ok(targets)
 }
 
 pub(crate) fn limits(

@@ -11,7 +11,7 @@ use holdfast_journal::log::{
 use holdfast_memory::{Access, Action, Memory as CoreMemory, Step, StepWrite};
 use pyo3::exceptions::{PyException, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyDict, PyList};
+use pyo3::types::{IntoPyDict, PyDict, PyList};
 
 use crate::arguments::{seconds, within, word};
 use crate::memory::Memory;
@@ -166,14 +166,8 @@ impl Log {
     ) -> PyResult<Vec<(&'static str, Bound<'py, PyDict>)>> {
         let timeout = seconds("timeout", timeout)?;
         let events = py.detach(|| self.core.take_events(timeout));
-        let shown = events.into_iter().map(|event| {
-            let fields = PyDict::new(py);
-            for (key, value) in event.fields {
-                fields.set_item(key, value)?;
-            }
-            Ok((event.name, fields))
-        });
-        shown.collect()
+        let events = events.into_iter();
+        events.map(|event| Ok((event.name, event.fields.into_py_dict(py)?))).collect()
     }
 }
 

@@ -74,11 +74,7 @@ impl MemoryFile {
     #[pyo3(signature = (log=None))]
     fn start(&self, py: Python<'_>, log: Option<PyRef<'_, Log>>) -> PyResult<()> {
         let log = log.map(|log| Arc::new(OfLog(Arc::clone(&log.core))) as Arc<dyn Source>);
-        py.detach(|| match log {
-            Some(log) => self.core.start_of_log(log),
-            None => self.core.start(),
-        })
-        .map_err(|error| raised(&self.path, error))
+        py.detach(|| self.core.start(log)).map_err(|error| raised(&self.path, error))
     }
 
     fn stop(&self, py: Python<'_>) -> PyResult<()> {

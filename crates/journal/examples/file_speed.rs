@@ -56,7 +56,7 @@ fn main() {
     let disk = Arc::new(FileOnDisk::new(&path));
     let options = Options::new(Duration::ZERO);
     let file = MemoryFile::open(disk, members, options).expect("the file can be opened");
-    file.start().expect("the file can be written");
+    file.start(None).expect("the file can be written");
 
     let mut bare = File::create(&bare_path).expect("the folder can be written");
     bare.write_all(&[0; 1 << 20]).and_then(|()| bare.sync_all()).expect("there is room");

@@ -5,6 +5,7 @@
 
 use std::sync::Arc;
 
+use bytes::{Buf, TryGetError};
 use holdfast_memory::{Access, Action, Area, Memory, Step, StepWrite};
 use thiserror::Error;
 
@@ -34,6 +35,12 @@ pub enum DecodeError {
     Range { member: u16, area: Area, address: u16, count: u32 },
     #[error("a mask applies to registers, not to {}", .0.name())]
     Mask(Area),
+}
+
+impl From<TryGetError> for DecodeError {
+    fn from(_: TryGetError) -> DecodeError {
+        DecodeError::Short
+    }
 }
 
 /// Appends a step that is valid for its memories.
@@ -93,12 +100,12 @@ fn encoded_count(count: usize) -> u32 {
 /// [`DecodeError`], for all other bytes.
 pub fn decode(bytes: &[u8], members: &[Arc<Memory>]) -> Result<Step, DecodeError> {
     let mut rest = Rest { bytes, members };
-    let version = rest.byte()?;
+    let version = rest.bytes.try_get_u8()?;
     if version != VERSION {
         return Err(DecodeError::Version(version));
     }
     let access = rest.one_of(&ACCESSES, "the access")?;
-    let action = match rest.byte()? {
+    let action = match rest.bytes.try_get_u8()? {
         0 => {
             let mut writes = Vec::new();
             while !rest.bytes.is_empty() {
@@ -112,11 +119,13 @@ pub fn decode(bytes: &[u8], members: &[Arc<Memory>]) -> Result<Step, DecodeError
                 return Err(DecodeError::Mask(area));
             }
             rest.holds((member, area, address), 1)?;
-            Action::Mask { member, area, address, and_mask: rest.u16()?, or_mask: rest.u16()? }
+            let and_mask = rest.bytes.try_get_u16_le()?;
+            let or_mask = rest.bytes.try_get_u16_le()?;
+            Action::Mask { member, area, address, and_mask, or_mask }
         }
         2 => {
             let place = rest.place()?;
-            let count = rest.u32()?;
+            let count = rest.bytes.try_get_u32_le()?;
             rest.holds(place, count)?;
             let write = rest.write()?;
             let (member, area, address) = place;
@@ -140,46 +149,22 @@ struct Rest<'a> {
 }
 
 impl<'a> Rest<'a> {
-    fn take(&mut self, len: usize) -> Result<&'a [u8], DecodeError> {
-        let (taken, rest) = self.bytes.split_at_checked(len).ok_or(DecodeError::Short)?;
-        self.bytes = rest;
-        Ok(taken)
-    }
-
-    fn array<const LEN: usize>(&mut self) -> Result<[u8; LEN], DecodeError> {
-        let (taken, rest) = self.bytes.split_first_chunk().ok_or(DecodeError::Short)?;
-        self.bytes = rest;
-        Ok(*taken)
-    }
-
-    fn byte(&mut self) -> Result<u8, DecodeError> {
-        self.array::<1>().map(|[byte]| byte)
-    }
-
     /// The value that a byte is the number of.
     fn one_of<T: Copy>(&mut self, all: &[T], what: &'static str) -> Result<T, DecodeError> {
-        let found = self.byte()?;
+        let found = self.bytes.try_get_u8()?;
         all.get(usize::from(found)).copied().ok_or(DecodeError::Unknown { what, found })
     }
 
-    fn u16(&mut self) -> Result<u16, DecodeError> {
-        self.array().map(u16::from_le_bytes)
-    }
-
-    fn u32(&mut self) -> Result<u32, DecodeError> {
-        self.array().map(u32::from_le_bytes)
-    }
-
     fn place(&mut self) -> Result<(u16, Area, u16), DecodeError> {
-        let member = self.u16()?;
-        let area = match self.byte()? {
-            FILE => Area::File(self.u16()?),
+        let member = self.bytes.try_get_u16_le()?;
+        let area = match self.bytes.try_get_u8()? {
+            FILE => Area::File(self.bytes.try_get_u16_le()?),
             found => {
                 let area = Area::ALL.get(usize::from(found)).copied();
                 area.ok_or(DecodeError::Unknown { what: "the area", found })?
             }
         };
-        Ok((member, area, self.u16()?))
+        Ok((member, area, self.bytes.try_get_u16_le()?))
     }
 
     fn holds(
@@ -196,11 +181,12 @@ impl<'a> Rest<'a> {
 
     fn write(&mut self) -> Result<StepWrite, DecodeError> {
         let place = self.place()?;
-        let count = self.u32()?;
+        let count = self.bytes.try_get_u32_le()?;
         self.holds(place, count)?;
         let (member, area, address) = place;
         let count = count as usize;
-        let bytes = self.take(area.byte_len(count))?.to_vec();
+        let bytes =
+            self.bytes.split_off(..area.byte_len(count)).ok_or(DecodeError::Short)?.to_vec();
         Ok(StepWrite { member, area, address, count, bytes })
     }
 }

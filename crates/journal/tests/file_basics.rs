@@ -144,7 +144,7 @@ fn what_is_written_before_the_start_is_stored_by_it() {
     let file = file.unwrap();
     set(&one, 3, 33).unwrap();
     assert_eq!(file.status().commits, 0);
-    file.start().unwrap();
+    file.start(None).unwrap();
     assert_eq!(file.status().commits, 1);
     let two = memory(layout(0, 10), None);
     let disk = Arc::new(SimDisk::with_file(disk.bytes()));

@@ -267,10 +267,10 @@ fn a_start_that_cannot_store_is_an_error_and_can_be_repeated() {
     let members = vec![member("one", &one)];
     let file = MemoryFile::open(Arc::clone(&disk) as _, members, at_once()).unwrap();
     disk.set_broken(true);
-    file.start().unwrap_err();
+    file.start(None).unwrap_err();
     disk.set_broken(false);
     set(&one, 0, 5).unwrap();
-    file.start().unwrap();
+    file.start(None).unwrap();
     assert_eq!(contents(&stored(&disk)), contents(&one));
 }
 

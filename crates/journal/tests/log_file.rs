@@ -69,7 +69,7 @@ impl KeptNode {
     #[track_caller]
     fn start(&self) {
         self.node.start();
-        self.file.start_of_log(Arc::new(OfNode(Arc::clone(&self.node)))).unwrap();
+        self.file.start(Some(Arc::new(OfNode(Arc::clone(&self.node))))).unwrap();
     }
 
     fn stop(&self) {
@@ -251,7 +251,7 @@ fn a_file_that_something_else_has_changed_is_refused() {
     let member = Member { name: "plant".to_owned(), memory: Arc::clone(&alone) };
     let disk = Arc::new(FileOnDisk::new(&path));
     let file = MemoryFile::open(disk, vec![member], Options::new(Duration::ZERO)).unwrap();
-    file.start().unwrap();
+    file.start(None).unwrap();
     file.stop().unwrap();
     let error = opened(&path, &memory()).unwrap_err();
     assert!(

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::error::Refused;
-use crate::memory::{Memory, carry_out_across};
+use crate::memory::{Memory, Ranges, carry_out_across};
 use crate::operation::{Read, Write};
 use crate::step::{Action, CarriedOut, Outcome, Step};
 
@@ -42,14 +42,14 @@ impl Step {
             }
             &Action::Mask { member, area, address, and_mask, or_mask } => members
                 [usize::from(member)]
-            .carry_out_mask(self.access, area, address, and_mask, or_mask)
+            .mask(self.access, (area, address), (and_mask, or_mask), Ranges::All)
             .map(|()| Vec::new())
             .map_err(alone)?,
             &Action::WriteThenRead { ref write, area, address, count } => {
                 let mut out = vec![0; area.byte_len(count)];
                 let read = Read { area, address, count, out: &mut out };
                 members[usize::from(write.member)]
-                    .carry_out_then_read((self.access, age), write.borrowed(), read)
+                    .change_then_read((self.access, age), write.borrowed(), read, Ranges::All)
                     .map_err(alone)?;
                 out
             }

@@ -18,7 +18,7 @@ use crate::write_queue::{Observers, WriteQueue};
 
 /// Which ranges may be used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Ranges {
+pub(crate) enum Ranges {
     /// Those that are not reserved for [`Access::Mirror`] and not stale, unless that is the access.
     Unreserved,
     /// All: where a step was checked before.
@@ -107,6 +107,12 @@ impl Memory {
                 observers: Observers::default(),
             }),
         })
+    }
+
+    /// Creates a memory of the same layout and gate, with all items 0.
+    pub fn blank(&self) -> Memory {
+        let blank = Memory::new(self.layout.clone(), self.gate);
+        blank.expect("this memory has the layout and the gate")
     }
 
     pub fn span(&self, area: Area) -> Span {
@@ -474,30 +480,18 @@ impl Memory {
             let operation = Operation::Mask { area, address, and_mask, or_mask };
             return self.wait(access, operation).map(drop);
         }
-        let valid = self.maskable(access, area, address, Ranges::Unreserved);
-        self.mask(access, valid, (area, address), (and_mask, or_mask))
+        self.mask(access, (area, address), (and_mask, or_mask), Ranges::Unreserved)
     }
 
-    /// As [`Memory::mask_write`], by a journal.
-    pub(crate) fn carry_out_mask(
+    /// As [`Memory::mask_write`], without a journal.
+    pub(crate) fn mask(
         &self,
         access: Access,
-        area: Area,
-        address: u16,
-        and_mask: u16,
-        or_mask: u16,
-    ) -> Result<(), Refusal> {
-        let valid = self.maskable(access, area, address, Ranges::All);
-        self.mask(access, valid, (area, address), (and_mask, or_mask))
-    }
-
-    fn mask(
-        &self,
-        access: Access,
-        offset: Result<usize, Refusal>,
         (area, address): (Area, u16),
         (and_mask, or_mask): (u16, u16),
+        ranges: Ranges,
     ) -> Result<(), Refusal> {
+        let offset = self.maskable(access, area, address, ranges);
         let mut content = self.exclusive();
         content.admit(access)?;
         let offset = offset? * 2;
@@ -529,17 +523,8 @@ impl Memory {
         self.change_then_read((access, NOW), write, read, Ranges::Unreserved)
     }
 
-    /// As [`Memory::write_then_read`], by a journal.
-    pub(crate) fn carry_out_then_read(
-        &self,
-        (access, age): (Access, Option<Duration>),
-        write: Write<'_>,
-        read: Read<'_>,
-    ) -> Result<(), Refusal> {
-        self.change_then_read((access, age), write, read, Ranges::All)
-    }
-
-    fn change_then_read(
+    /// As [`Memory::write_then_read`], without a journal.
+    pub(crate) fn change_then_read(
         &self,
         (access, age): (Access, Option<Duration>),
         write: Write<'_>,

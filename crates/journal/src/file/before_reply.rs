@@ -33,11 +33,7 @@ impl BeforeReply {
         queue: Arc<Queue>,
         retry: Duration,
     ) -> BeforeReply {
-        let shadow = |memory: &Arc<Memory>| {
-            let shadow = Memory::new(memory.layout().clone(), memory.gate());
-            Arc::new(shadow.expect("the memory has this layout and gate"))
-        };
-        let shadows = memories.iter().map(shadow).collect();
+        let shadows = memories.iter().map(|memory| Arc::new(memory.blank())).collect();
         BeforeReply { store, memories, shadows, ids, queue, retry }
     }
 

@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use bytes::Buf;
 use holdfast_memory::{Area, Contents, Layout, Span};
 
 use super::error::FileError;
@@ -61,8 +62,9 @@ impl Changes {
 /// All that a file contains.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Image {
-    memories: Vec<StoredMemory>,
-    note: Option<Vec<u8>>,
+    pub memories: Vec<StoredMemory>,
+    /// What the log has noted that the contents come from.
+    pub note: Option<Vec<u8>>,
 }
 
 impl StoredMemory {
@@ -106,23 +108,6 @@ impl StoredMemory {
 }
 
 impl Image {
-    pub fn new(memories: Vec<StoredMemory>, note: Option<Vec<u8>>) -> Image {
-        Image { memories, note }
-    }
-
-    /// What the log has noted that the contents come from.
-    pub fn note(&self) -> Option<&Vec<u8>> {
-        self.note.as_ref()
-    }
-
-    pub fn memories(&self) -> &[StoredMemory] {
-        &self.memories
-    }
-
-    pub fn into_memories(self) -> Vec<StoredMemory> {
-        self.memories
-    }
-
     pub fn named(&self, name: &str) -> Option<&StoredMemory> {
         self.memories.iter().find(|stored| stored.name == name)
     }
@@ -202,16 +187,15 @@ pub(super) fn encode(id: u16, layout: &Layout) -> Vec<u8> {
 /// [`FileError::Damaged`]
 pub(super) fn decode(name: &str, record: &[u8]) -> Result<StoredMemory, FileError> {
     let invalid = || FileError::damaged(format!("the layout of memory {name} is invalid"));
-    let (id, mut rest) = record.split_first_chunk().ok_or_else(invalid)?;
+    let mut rest = record;
+    let id = rest.try_get_u16().map_err(|_| invalid())?;
     let (mut layout, mut areas, mut last) = (Layout::default(), Area::ALL.into_iter(), 0);
     loop {
         let area = match areas.next() {
             Some(area) => area,
             None if rest.is_empty() => break,
             None => {
-                let (number, tail) = rest.split_first_chunk().ok_or_else(invalid)?;
-                rest = tail;
-                let number = u16::from_be_bytes(*number);
+                let number = rest.try_get_u16().map_err(|_| invalid())?;
                 if number <= last {
                     return Err(invalid());
                 }
@@ -219,13 +203,11 @@ pub(super) fn decode(name: &str, record: &[u8]) -> Result<StoredMemory, FileErro
                 Area::File(number)
             }
         };
-        let (start, tail) = rest.split_first_chunk().ok_or_else(invalid)?;
-        let (size, tail) = tail.split_first_chunk().ok_or_else(invalid)?;
-        let span = Span::new(u16::from_be_bytes(*start), u32::from_be_bytes(*size));
-        layout = layout.with(area, span.map_err(|_| invalid())?);
-        rest = tail;
+        let start = rest.try_get_u16().map_err(|_| invalid())?;
+        let size = rest.try_get_u32().map_err(|_| invalid())?;
+        layout = layout.with(area, Span::new(start, size).map_err(|_| invalid())?);
     }
-    Ok(StoredMemory::new(name, u16::from_be_bytes(*id), layout))
+    Ok(StoredMemory::new(name, id, layout))
 }
 
 fn zeros(layout: &Layout) -> Vec<Box<[u8]>> {

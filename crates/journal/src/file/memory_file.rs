@@ -135,7 +135,7 @@ impl MemoryFile {
             }
             loaded.push(name.clone());
         }
-        for stored in store.image().memories() {
+        for stored in &store.image().memories {
             let name = &stored.name;
             if stored.set_aside_of().is_none() && members.iter().all(|member| member.name != *name)
             {
@@ -182,23 +182,12 @@ impl MemoryFile {
         self.note.as_deref()
     }
 
-    /// Stores what the memories contain, and goes on storing. A second call does nothing.
+    /// Stores what the memories contain, or the contents of their log, and goes on storing. A second call
+    /// does nothing.
     ///
     /// # Errors
-    /// [`FileError`] if the contents can't be stored. They are then still not stored.
-    pub fn start(&self) -> Result<(), FileError> {
-        self.start_from(None)
-    }
-
-    /// As [`MemoryFile::start`], with the contents of a log.
-    ///
-    /// # Errors
-    /// As [`MemoryFile::start`]; also if the log has no contents.
-    pub fn start_of_log(&self, log: Arc<dyn Source>) -> Result<(), FileError> {
-        self.start_from(Some(log))
-    }
-
-    fn start_from(&self, log: Option<Arc<dyn Source>>) -> Result<(), FileError> {
+    /// [`FileError`] if the contents can't be stored, or the log has none. They are then still not stored.
+    pub fn start(&self, log: Option<Arc<dyn Source>>) -> Result<(), FileError> {
         let mut state = self.state();
         let State::Loaded(store) = &mut *state else { return Ok(()) };
         let memories: Vec<_> = self.members.iter().map(|m| Arc::clone(&m.memory)).collect();
@@ -216,7 +205,7 @@ impl MemoryFile {
             };
             let mut changes;
             (changes, ids) = first_changes(store.image(), &self.members, contents)?;
-            changes.note = (store.image().note() != note.as_ref()).then_some(note);
+            changes.note = (store.image().note != note).then_some(note);
             store.store(changes)
         })?;
         let State::Loaded(store) = mem::replace(&mut *state, State::Stopped) else {
@@ -320,11 +309,11 @@ fn check(members: &[Member]) -> Result<(), FileError> {
 /// The note of the log, if the file has the contents of its memories; `None` if it has none yet.
 fn note_of(image: &Image, members: &[Member]) -> Result<Option<Vec<u8>>, FileError> {
     let all = || members.iter().map(|member| (member, image.named(&member.name)));
-    if image.note().is_none() && all().all(|(_, stored)| stored.is_none()) {
+    if image.note.is_none() && all().all(|(_, stored)| stored.is_none()) {
         return Ok(None);
     }
     let advice = "move the file away to start with the contents of the log";
-    let Some(note) = image.note() else {
+    let Some(note) = &image.note else {
         let text = format!("the file has contents that are not of a log: {advice}");
         return Err(FileError::OfLog(text));
     };

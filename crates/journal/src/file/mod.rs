@@ -54,7 +54,7 @@ pub fn read(path: &Path) -> Result<Vec<StoredMemory>, FileError> {
 /// As [`read`].
 pub fn read_from(disk: &dyn Disk) -> Result<Vec<StoredMemory>, FileError> {
     match disk.size()? {
-        Some(len) => Ok(store::inspect(disk, len)?.into_memories()),
+        Some(len) => Ok(store::inspect(disk, len)?.memories),
         None => Err(FileError::Io(std::io::ErrorKind::NotFound.into())),
     }
 }

@@ -116,7 +116,7 @@ impl StoredMemory {
 impl Image {
     /// What was cut from a memory.
     pub fn set_aside_of(&self, name: &str) -> Option<&StoredMemory> {
-        self.memories().iter().find(|stored| stored.set_aside_of() == Some(name))
+        self.memories.iter().find(|stored| stored.set_aside_of() == Some(name))
     }
 }
 

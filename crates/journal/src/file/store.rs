@@ -168,8 +168,8 @@ fn create_beside(disk: &dyn Disk, image: &Image, replace: bool) -> Result<Databa
     let database = disk.create(&builder())?;
     let transaction = database.begin_write()?;
     transaction.open_table(ABOUT)?.insert(FORMAT, WITHOUT_FILES)?;
-    let memories = image.memories().to_vec();
-    let note = image.note().cloned().map(Some);
+    let memories = image.memories.clone();
+    let note = image.note.clone().map(Some);
     write(&transaction, &Changes { memories, note, ..Changes::default() })?;
     transaction.commit()?;
     disk.install(replace)?;
@@ -264,7 +264,7 @@ fn contents(database: &Database) -> Result<Image, FileError> {
     };
     match note {
         Some(None) => Err(FileError::damaged("wrong checksum of the note of the log")),
-        note => Ok(Image::new(memories, note.flatten())),
+        note => Ok(Image { memories, note: note.flatten() }),
     }
 }
 

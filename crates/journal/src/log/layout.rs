@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use holdfast_memory::{Gate, GateMode, LayoutError, Memory};
+use holdfast_memory::{Gate, GateMode, Memory};
 
 /// A line for each memory, in the order of their names: name, areas with first address and size,
 /// seal.
@@ -49,16 +49,6 @@ pub(super) fn difference(log: &str, here: &str) -> Option<String> {
     }
     let extra = here.iter().find(|(name, _)| !log.contains_key(*name));
     extra.map(|(name, of)| format!("this node has memory {name:?} ({of}), the log has not"))
-}
-
-/// Memories of the same layout, which are empty and not kept.
-///
-/// # Errors
-/// Never for the layout of a memory that exists.
-pub(super) fn copies(members: &[Arc<Memory>]) -> Result<Vec<Arc<Memory>>, LayoutError> {
-    let copy =
-        |memory: &Arc<Memory>| Memory::new(memory.layout().clone(), memory.gate()).map(Arc::new);
-    members.iter().map(copy).collect()
 }
 
 #[cfg(test)]

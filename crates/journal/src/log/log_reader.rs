@@ -94,7 +94,8 @@ impl LogReader {
                 return Err(LogError::Snapshot("the log has no snapshot".to_owned()).into());
             };
             let members = members.iter().map(|(_, memory)| Arc::clone(memory)).collect();
-            Ok((read(&store, &pointer, members, until).await?, last))
+            let known = [Some(&pointer.newest), pointer.previous.as_ref()];
+            Ok((read_from(&store, known, members, until).await?, last))
         };
         let timed = async { tokio::time::timeout(timeout, opening).await };
         let last = "the servers do not answer".to_owned();
@@ -126,23 +127,15 @@ impl LogReader {
         }
         let next = self.reading.next(self.until);
         let timed = async { tokio::time::timeout(timeout, next).await };
-        match self.runtime.block_on(timed) {
-            Err(_) => Ok(Next::Nothing),
-            Ok(Ok(Some(record))) => Ok(Next::Record(record)),
-            Ok(Ok(None)) => {
-                self.ended = true;
-                Ok(Next::End)
-            }
-            Ok(Err(End::Fatal(error))) => {
-                self.ended = true;
-                Err(error)
-            }
-            Ok(Err(End::Lost(last))) => {
-                self.ended = true;
-                Err(LogError::NoConnection { within: timeout, last })
-            }
-            Ok(Err(End::Stopped)) => Ok(Next::End),
-        }
+        let result = match self.runtime.block_on(timed) {
+            Err(_) => return Ok(Next::Nothing),
+            Ok(Ok(Some(record))) => return Ok(Next::Record(record)),
+            Ok(Ok(None) | Err(End::Stopped)) => Ok(Next::End),
+            Ok(Err(End::Fatal(error))) => Err(error),
+            Ok(Err(End::Lost(last))) => Err(LogError::NoConnection { within: timeout, last }),
+        };
+        self.ended = true;
+        result
     }
 
     /// Whether all is applied up to the end, or an error came.
@@ -200,16 +193,6 @@ impl Reading {
             return Ok(Some(Record { sequence, stored, origin, steps, fresh }));
         }
     }
-}
-
-async fn read(
-    store: &Store,
-    pointer: &Pointer,
-    members: Vec<Arc<Memory>>,
-    until: Until,
-) -> Result<Reading, End> {
-    let known = [Some(&pointer.newest), pointer.previous.as_ref()];
-    read_from(store, known, members, until).await
 }
 
 /// Reads from the first of these snapshots that is not behind the end.

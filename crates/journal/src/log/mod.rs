@@ -126,7 +126,7 @@ impl Log {
         let (settings, shared) = (Arc::clone(&self.settings), Arc::clone(&self.shared));
         let mut node = Running::new(settings, fingerprint, shared, members);
         if let Some(note) = self.note.lock().unwrap_or_else(PoisonError::into_inner).take() {
-            node.resume(note)?;
+            node.applier.resume(note)?;
         }
         let name = format!("log {}", self.settings.name);
         let started =

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use aws_lc_rs::digest::{SHA256, digest};
+use bytes::Buf;
 use holdfast_memory::{CarriedOut, Contents, Memory, Outcome, Step};
 use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
@@ -160,13 +161,12 @@ impl State {
     pub(super) fn load(&mut self, bytes: &[u8], expected: Place) -> Result<(), LogError> {
         let malformed = || LogError::Snapshot("the snapshot of the log is malformed".to_owned());
         let bytes = bytes.strip_prefix(&MARK).ok_or_else(malformed)?;
-        let (&found, bytes) = bytes.split_first().ok_or_else(malformed)?;
+        let (&found, mut rest) = bytes.split_first().ok_or_else(malformed)?;
         if found != VERSION {
             let what = "the snapshot of the log";
             return Err(LogError::Version { what, found, supported: VERSION });
         }
-        let mut rest = Rest(bytes);
-        let loaded = rest.state(&self.members).filter(|_| rest.0.is_empty());
+        let loaded = loaded(&mut rest, &self.members).filter(|_| rest.is_empty());
         let (place, steps, origins, contents) = loaded.ok_or_else(malformed)?;
         if place != expected {
             let sequence = expected.sequence;
@@ -189,56 +189,38 @@ pub(super) fn digest_of(encoded: &[u8]) -> String {
 
 type Loaded = (Place, u64, BTreeMap<String, (u64, u64)>, Vec<Contents>);
 
-struct Rest<'a>(&'a [u8]);
-
-impl<'a> Rest<'a> {
-    fn take(&mut self, len: usize) -> Option<&'a [u8]> {
-        let (taken, rest) = self.0.split_at_checked(len)?;
-        self.0 = rest;
-        Some(taken)
+/// Takes an encoded state for these memories.
+fn loaded(bytes: &mut &[u8], members: &[Arc<Memory>]) -> Option<Loaded> {
+    let sequence = bytes.try_get_u64_le().ok()?;
+    let place = Place { sequence, stored: bytes.try_get_i64_le().ok()? };
+    let steps = bytes.try_get_u64_le().ok()?;
+    let mut origins = BTreeMap::new();
+    for _ in 0..bytes.try_get_u32_le().ok()? {
+        let len = bytes.try_get_u8().ok()?;
+        let node = str::from_utf8(bytes.split_off(..usize::from(len))?).ok()?;
+        let node = is_word(node).then(|| node.to_owned())?;
+        origins.insert(node, (bytes.try_get_u64_le().ok()?, bytes.try_get_u64_le().ok()?));
     }
-
-    fn array<const LEN: usize>(&mut self) -> Option<[u8; LEN]> {
-        self.take(LEN)?.try_into().ok()
+    if bytes.try_get_u32_le().ok()? as usize != members.len() {
+        return None;
     }
+    let contents = members.iter().map(|memory| contents(bytes, memory)).collect::<Option<_>>()?;
+    Some((place, steps, origins, contents))
+}
 
-    fn u64(&mut self) -> Option<u64> {
-        self.array().map(u64::from_le_bytes)
-    }
-
-    fn u32(&mut self) -> Option<u32> {
-        self.array().map(u32::from_le_bytes)
-    }
-
-    fn state(&mut self, members: &[Arc<Memory>]) -> Option<Loaded> {
-        let place = Place { sequence: self.u64()?, stored: self.u64()? as i64 };
-        let steps = self.u64()?;
-        let mut origins = BTreeMap::new();
-        for _ in 0..self.u32()? {
-            let [len] = self.array()?;
-            let node = str::from_utf8(self.take(usize::from(len))?).ok()?;
-            origins.insert(is_word(node).then(|| node.to_owned())?, (self.u64()?, self.u64()?));
-        }
-        if self.u32()? as usize != members.len() {
-            return None;
-        }
-        let contents = members.iter().map(|memory| self.contents(memory)).collect::<Option<_>>()?;
-        Some((place, steps, origins, contents))
-    }
-
-    fn contents(&mut self, memory: &Memory) -> Option<Contents> {
-        let sealed = match self.array()? {
-            [0] => false,
-            [1] if memory.gate().is_some() => true,
-            _ => return None,
-        };
-        let area = |expected: usize| {
-            let fits = self.u32()? as usize == expected;
-            fits.then(|| self.take(expected)).flatten().map(Box::from)
-        };
-        let areas = memory.layout().byte_lens().into_iter().map(area).collect::<Option<_>>()?;
-        Some(Contents { areas, sealed })
-    }
+/// Takes the contents of a memory.
+fn contents(bytes: &mut &[u8], memory: &Memory) -> Option<Contents> {
+    let sealed = match bytes.try_get_u8().ok()? {
+        0 => false,
+        1 if memory.gate().is_some() => true,
+        _ => return None,
+    };
+    let area = |expected: usize| {
+        let fits = bytes.try_get_u32_le().ok()? as usize == expected;
+        fits.then(|| bytes.split_off(..expected)).flatten().map(Box::from)
+    };
+    let areas = memory.layout().byte_lens().into_iter().map(area).collect::<Option<_>>()?;
+    Some(Contents { areas, sealed })
 }
 
 #[cfg(test)]

@@ -69,7 +69,7 @@ pub fn keep(
 ) -> Result<MemoryFile, FileError> {
     let members = memories.iter().map(|(name, memory)| member(name, memory)).collect();
     let file = MemoryFile::open(Arc::clone(disk) as _, members, options)?;
-    file.start()?;
+    file.start(None)?;
     Ok(file)
 }
 

@@ -128,14 +128,16 @@ impl OneAtATime {
     ) -> Ticket {
         let Call { unit_id, request, timeout, attempt } = call;
         self.frame.clear();
-        match self.framing {
-            Framing::Rtu => encode(&mut self.frame, [0; rtu::MAX_LEN], |frame| {
-                rtu::encode(unit_id, request.pdu(), frame)
-            }),
-            Framing::Ascii => encode(&mut self.frame, [0; ascii::MAX_LEN], |frame| {
-                ascii::encode(unit_id, request.pdu(), frame)
-            }),
-        }
+        let mut room = [0; ascii::MAX_LEN];
+        let len = match self.framing {
+            Framing::Rtu => {
+                let frame = room.first_chunk_mut();
+                frame.and_then(|frame| rtu::encode(unit_id, request.pdu(), frame))
+            }
+            Framing::Ascii => ascii::encode(unit_id, request.pdu(), &mut room),
+        };
+        let len = len.expect("an encoded request has 1 to 253 bytes, which fit into every frame");
+        self.frame.extend_from_slice(&room[..len]);
         self.received.clear();
         self.stray = None;
         (self.timeout, self.start) = (timeout, start);
@@ -263,18 +265,15 @@ impl OneAtATime {
         if !may_be_surplus {
             flights.strays.bytes += bytes.len().saturating_sub(late) as u64;
         }
-        if late == 0 && self.is_reply() {
+        if late == 0 && is_frame(self.framing, &self.received) {
             self.received.clear();
             self.late_replies.stray(now.saturating_sub(self.late_replies.used));
         }
         self.late_replies.used = now;
-        let Some(silence) = self.silence else {
-            if is_idle && late == 0 && !may_be_surplus {
-                flights.close(Closed::Invalid(InvalidResponse::Unrequested), sink);
-            }
-            return self.wait_again(flights, Duration::ZERO, now);
-        };
-        self.wait_again(flights, silence, now);
+        if self.silence.is_none() && is_idle && late == 0 && !may_be_surplus {
+            flights.close(Closed::Invalid(InvalidResponse::Unrequested), sink);
+        }
+        self.wait_again(flights, self.silence.unwrap_or_default(), now);
     }
 
     /// Lets a request that waits for silence wait from now on.
@@ -340,11 +339,6 @@ impl OneAtATime {
                 ascii::decode(line, &mut body).is_ok_and(is_its).then_some(line.len())
             }
         }
-    }
-
-    /// Whether the received bytes are one frame.
-    fn is_reply(&self) -> bool {
-        is_frame(self.framing, &self.received)
     }
 
     /// Handles a reply that can answer the request: believes it, or waits whether another follows.
@@ -506,11 +500,11 @@ impl OneAtATime {
             }
             self.learn_echo(is_no_reply(flight));
         }
-        let unanswered = flights.first().map(|flight| (flight.unit_id, flight.request.clone()));
-        let sent = flights.first().map_or(now, |flight| flight.sent);
+        let unanswered =
+            flights.first().map(|flight| (flight.unit_id, flight.request.clone(), flight.sent));
         self.rest(now);
         let Some(invalid) = flights.answer(0, pdu, now, sink) else { return };
-        if let Some((unit_id, request)) = unanswered {
+        if let Some((unit_id, request, sent)) = unanswered {
             let times = (sent, self.timeout);
             self.late_replies.ended((unit_id, &request), times, Ended::Other, now);
         }
@@ -761,19 +755,5 @@ struct Reply {
 impl Reply {
     fn new((unit_id, pdu): (u8, &[u8]), stray: usize) -> Reply {
         Reply { unit_id, pdu: pdu.to_vec(), stray }
-    }
-}
-
-/// Appends the frame that `write` encodes.
-fn encode<const N: usize>(
-    frame: &mut Vec<u8>,
-    mut buffer: [u8; N],
-    write: impl FnOnce(&mut [u8; N]) -> Option<usize>,
-) {
-    match write(&mut buffer) {
-        Some(len) => frame.extend_from_slice(&buffer[..len]),
-        None => {
-            unreachable!("an encoded request has 1 to 253 bytes, which fit into every frame")
-        }
     }
 }

@@ -2,6 +2,7 @@
 
 use core::fmt;
 
+use super::response::body;
 use super::{Buffer, ExceptionCode, MAX_LEN, Request, Response, ResponseError};
 
 /// The PDU of a request, ready to be sent: a valid one, or one that is passed on as it came.
@@ -83,15 +84,7 @@ impl EncodedRequest {
             let response = request.response(pdu)?;
             return Ok(if self.is_opaque { Response::Opaque(&pdu[1..]) } else { response });
         }
-        let expected = self.pdu()[0];
-        match pdu {
-            [found, body @ ..] if *found == expected => Ok(Response::Opaque(body)),
-            [found, code] if *found & 0x7F == expected => Err(ResponseError::exception(*code)),
-            [found, ..] if *found & 0x7F != expected => {
-                Err(ResponseError::Function { expected, found: *found })
-            }
-            _ => Err(ResponseError::Length),
-        }
+        body(pdu, self.pdu()[0]).map(Response::Opaque)
     }
 }
 

@@ -139,19 +139,10 @@ impl<'a> Request<'a> {
                 let [address, value] = words(body)?;
                 Request::WriteSingleRegister { address, value }
             }
-            Function::ReadExceptionStatus => {
-                empty(body)?;
-                Request::ReadExceptionStatus
-            }
+            Function::ReadExceptionStatus => empty(body, Request::ReadExceptionStatus)?,
             Function::Diagnostics => Request::Diagnostics(Diagnostics::parse(body)?),
-            Function::GetCommEventCounter => {
-                empty(body)?;
-                Request::GetCommEventCounter
-            }
-            Function::GetCommEventLog => {
-                empty(body)?;
-                Request::GetCommEventLog
-            }
+            Function::GetCommEventCounter => empty(body, Request::GetCommEventCounter)?,
+            Function::GetCommEventLog => empty(body, Request::GetCommEventLog)?,
             Function::WriteMultipleCoils => {
                 let ([address, quantity], data) = counted(body)?;
                 let bits = Bits::new(quantity, data).or(Err(ExceptionCode::IllegalDataValue))?;
@@ -161,10 +152,7 @@ impl<'a> Request<'a> {
                 let ([address, quantity], data) = counted(body)?;
                 Request::WriteMultipleRegisters { address, registers: registers(quantity, data)? }
             }
-            Function::ReportServerId => {
-                empty(body)?;
-                Request::ReportServerId
-            }
+            Function::ReportServerId => empty(body, Request::ReportServerId)?,
             Function::ReadFileRecord => Request::ReadFileRecord(FileRanges::parse(body)?),
             Function::WriteFileRecord => Request::WriteFileRecord(FileRecords::parse(body)?),
             Function::MaskWriteRegister => {
@@ -334,8 +322,9 @@ fn registers<const MAX: u16>(
     }
 }
 
-fn empty(body: &[u8]) -> Result<(), ExceptionCode> {
-    if body.is_empty() { Ok(()) } else { Err(ExceptionCode::IllegalDataValue) }
+/// The request of a function whose body is empty.
+fn empty<'a>(body: &[u8], request: Request<'a>) -> Result<Request<'a>, ExceptionCode> {
+    if body.is_empty() { Ok(request) } else { Err(ExceptionCode::IllegalDataValue) }
 }
 
 /// Writes words after the function code. Returns the length of the PDU so far.

@@ -78,14 +78,6 @@ pub enum ResponseError {
     Echo,
 }
 
-impl ResponseError {
-    /// An exception with this code.
-    pub(super) fn exception(code: u8) -> ResponseError {
-        ExceptionCode::from_code(code)
-            .map_or(ResponseError::UnknownException(code), ResponseError::Exception)
-    }
-}
-
 impl Request<'_> {
     /// Parses the PDU that answers this request.
     ///
@@ -105,17 +97,7 @@ impl Request<'_> {
     /// # Errors
     /// [`ResponseError`]: an exception, or why the PDU cannot be the answer to this request.
     pub fn response<'p>(&self, pdu: &'p [u8]) -> Result<Response<'p>, ResponseError> {
-        let expected = self.function().code();
-        let body = match pdu {
-            [found, body @ ..] if *found == expected => body,
-            [found, code] if *found & 0x7F == expected => {
-                return Err(ResponseError::exception(*code));
-            }
-            [found, ..] if *found & 0x7F != expected => {
-                return Err(ResponseError::Function { expected, found: *found });
-            }
-            _ => return Err(ResponseError::Length),
-        };
+        let body = body(pdu, self.function().code())?;
         match *self {
             Request::ReadCoils(range) | Request::ReadDiscreteInputs(range) => {
                 let data = counted(body, range.byte_len())?;
@@ -181,19 +163,14 @@ impl Request<'_> {
                     Err(ResponseError::Length)
                 }
             }
-            Request::WriteFileRecord(records) => match body {
-                [count, data @ ..]
-                    if usize::from(*count) == data.len()
-                        && data.len() == records.as_bytes().len() =>
-                {
-                    if data == records.as_bytes() {
-                        Ok(Response::Written)
-                    } else {
-                        Err(ResponseError::Echo)
-                    }
+            Request::WriteFileRecord(records) => {
+                let data = counted(body, records.as_bytes().len())?;
+                if data == records.as_bytes() {
+                    Ok(Response::Written)
+                } else {
+                    Err(ResponseError::Echo)
                 }
-                _ => Err(ResponseError::Length),
-            },
+            }
             Request::ReadFifoQueue { .. } => queue(body),
             Request::ReportServerId => match body {
                 [count, data @ ..] if usize::from(*count) == data.len() => {
@@ -205,6 +182,19 @@ impl Request<'_> {
                 Answer::parse(code, body).map(Response::Identification).ok_or(ResponseError::Length)
             }
         }
+    }
+}
+
+/// Returns what follows the function code `expected`.
+pub(super) fn body(pdu: &[u8], expected: u8) -> Result<&[u8], ResponseError> {
+    match pdu {
+        [found, body @ ..] if *found == expected => Ok(body),
+        [found, code] if *found & 0x7F == expected => Err(ExceptionCode::from_code(*code)
+            .map_or(ResponseError::UnknownException(*code), ResponseError::Exception)),
+        [found, ..] if *found & 0x7F != expected => {
+            Err(ResponseError::Function { expected, found: *found })
+        }
+        _ => Err(ResponseError::Length),
     }
 }
 
@@ -238,11 +228,6 @@ fn echoed(body: &[u8], words: &[u16]) -> Result<Response<'static>, ResponseError
     if body.len() != words.len() * 2 {
         return Err(ResponseError::Length);
     }
-    let same = body
-        .as_chunks::<2>()
-        .0
-        .iter()
-        .map(|pair| u16::from_be_bytes(*pair))
-        .eq(words.iter().copied());
+    let same = words.iter().flat_map(|word| word.to_be_bytes()).eq(body.iter().copied());
     if same { Ok(Response::Written) } else { Err(ResponseError::Echo) }
 }

@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::log::digests::{Digests, Verdict};
 use crate::log::error::{End, LogError};
-use crate::log::layout::copies;
 use crate::log::log_reader::digest_at;
 use crate::log::parts::background::{Background, Report};
 use crate::log::settings::{Settings, is_word};
@@ -139,12 +138,9 @@ impl Comparer {
             return false;
         }
         // The memories themselves go on with the session.
-        let members = copies(members);
+        let members = members.iter().map(|memory| Arc::new(memory.blank())).collect();
         background.spawn(|store| async move {
-            let digest = match members {
-                Ok(members) => digest_at(&store, &pointer, members, sequence).await,
-                Err(error) => Err(error.to_string()),
-            };
+            let digest = digest_at(&store, &pointer, members, sequence).await;
             Report::Replayed { sequence, digest }
         });
         true

@@ -17,7 +17,6 @@ use std::time::{Duration, Instant};
 use holdfast_memory::Memory;
 
 use crate::log::error::{End, LogError};
-use crate::log::parts::applied_file::Note;
 use crate::log::parts::applier::Applier;
 use crate::log::parts::comparer::Comparer;
 use crate::log::parts::sender::Sender;
@@ -62,14 +61,6 @@ impl Node {
             settings,
             shared,
         }
-    }
-
-    /// Begins with the contents of the file.
-    ///
-    /// # Errors
-    /// [`LogError::Snapshot`] if they are not those of the note.
-    pub(in crate::log) fn resume(&mut self, note: Note) -> Result<(), LogError> {
-        self.applier.resume(note)
     }
 
     pub(in crate::log) fn begin_session(&mut self) {

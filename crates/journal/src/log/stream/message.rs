@@ -4,7 +4,7 @@
 
 use std::sync::Arc;
 
-use bytes::Bytes;
+use bytes::{Buf, Bytes};
 use holdfast_memory::{Memory, Step};
 use thiserror::Error;
 
@@ -88,41 +88,38 @@ pub(in crate::log) fn decode(
     bytes: &[u8],
     members: &[Arc<Memory>],
 ) -> Result<Message, MessageError> {
-    let bytes = bytes.strip_prefix(&MARK).ok_or(MessageError::Foreign)?;
-    let (&version, bytes) = bytes.split_first().ok_or(MessageError::Foreign)?;
+    let mut bytes = bytes.strip_prefix(&MARK).ok_or(MessageError::Foreign)?;
+    let version = bytes.try_get_u8().or(Err(MessageError::Foreign))?;
     if version != VERSION {
         return Err(MessageError::Version(version));
     }
-    let (compares, bytes) = match bytes.split_first() {
-        Some((&flag @ (0 | 1), bytes)) => (flag == 1, bytes),
+    let compares = match bytes.try_get_u8() {
+        Ok(flag @ (0 | 1)) => flag == 1,
         _ => return Err(MessageError::Malformed),
     };
-    let (origin, mut bytes) = origin(bytes).ok_or(MessageError::Malformed)?;
+    let origin = origin(&mut bytes).ok_or(MessageError::Malformed)?;
     let mut steps = Vec::new();
     while !bytes.is_empty() {
-        let (step, rest) = step(bytes).ok_or(MessageError::Malformed)?;
+        let step = step(&mut bytes).ok_or(MessageError::Malformed)?;
         let index = steps.len();
         let step =
             encoding::decode(step, members).map_err(|error| MessageError::Step { index, error })?;
         steps.push(step);
-        bytes = rest;
     }
     Ok(Message { origin, compares, steps })
 }
 
-fn origin(bytes: &[u8]) -> Option<(Origin, &[u8])> {
-    let (&len, bytes) = bytes.split_first()?;
-    let (node, bytes) = bytes.split_at_checked(usize::from(len))?;
-    let node = str::from_utf8(node).ok().filter(|node| is_word(node))?;
-    let (start, bytes) = bytes.split_first_chunk()?;
-    let (counter, bytes) = bytes.split_first_chunk()?;
-    let (start, counter) = (u64::from_le_bytes(*start), u64::from_le_bytes(*counter));
-    Some((Origin { node: node.to_owned(), start, counter }, bytes))
+fn origin(bytes: &mut &[u8]) -> Option<Origin> {
+    let len = bytes.try_get_u8().ok()?;
+    let node = str::from_utf8(bytes.split_off(..usize::from(len))?).ok()?;
+    let node = is_word(node).then(|| node.to_owned())?;
+    let (start, counter) = (bytes.try_get_u64_le().ok()?, bytes.try_get_u64_le().ok()?);
+    Some(Origin { node, start, counter })
 }
 
-fn step(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
-    let (len, bytes) = bytes.split_first_chunk()?;
-    bytes.split_at_checked(u32::from_le_bytes(*len) as usize)
+fn step<'a>(bytes: &mut &'a [u8]) -> Option<&'a [u8]> {
+    let len = bytes.try_get_u32_le().ok()?;
+    bytes.split_off(..len as usize)
 }
 
 #[cfg(test)]
