@@ -19,7 +19,7 @@ ifneq ($(OS),Windows_NT)
 export PATH := $(CURDIR)/.cache/toolchain/bin:$(PATH)
 endif
 
-.PHONY: build run test test-python test-rust test-again test-slow explore fuzz proof torture lint clippy audit no-std format bench docs site \
+.PHONY: build run test test-python test-rust test-again test-slow explore fuzz proof torture lint audit no-std format bench docs site \
   pictures dist dist-check lock clean deb container release-check
 .DELETE_ON_ERROR:
 
@@ -90,16 +90,7 @@ fuzz: $(TOOLCHAIN)
 	  target/fuzz/$$host/release/$(TARGET) .cache/fuzz/$(TARGET) fuzz/corpus/$(TARGET) -timeout=10 \
 	  -artifact_prefix=fuzz/artifacts/$(TARGET)/ -max_total_time=$(SECONDS)
 
-# With `-j 2`, the compiler checks the crates while it builds the core.
-lint: .venv/core.stamp clippy no-std .venv/dev.stamp
-	$(BIN)/ruff check
-	$(BIN)/ruff format --check
-	$(BIN)/mypy
-	@$(BIN)/lint-imports --no-logo --cache-dir .cache/imports > .cache/imports.log || { cat .cache/imports.log; exit 1; }
-	$(BIN)/python -m mypy.stubtest holdfast._core
-
-# What Rust code is checked for.
-clippy: $(TOOLCHAIN)
+lint: no-std .venv/core.stamp .venv/dev.stamp
 	cargo fmt --check
 	cargo fmt --check --manifest-path $(NO_STD)
 	cargo fmt --check --manifest-path $(PEERS)/rust/Cargo.toml
@@ -110,6 +101,11 @@ clippy: $(TOOLCHAIN)
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets --no-default-features -- -D warnings
 	RUSTDOCFLAGS='-D warnings' cargo doc --locked --quiet --no-deps $(PROTOCOL)
 	cargo publish --locked --quiet --dry-run --allow-dirty $(PROTOCOL)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	@$(BIN)/lint-imports --no-logo --cache-dir .cache/imports > .cache/imports.log || { cat .cache/imports.log; exit 1; }
+	$(BIN)/python -m mypy.stubtest holdfast._core
 
 # Licences, origins and known vulnerabilities of all dependencies.
 CARGO_DENY := 0.20.2
@@ -124,7 +120,7 @@ audit: .venv/core.stamp .venv/dev.stamp .venv/release.stamp .cache/tools/cargo-d
 # Links a program without the standard library with the protocol crate: for this machine, and for a
 # microcontroller if its target is installed (`rustup target add thumbv7em-none-eabi`).
 NO_STD_BUILD := cargo build --locked --quiet --manifest-path $(NO_STD) --target-dir target/no_std
-no-std: $(TOOLCHAIN)
+no-std:
 	$(NO_STD_BUILD)
 	$(NO_STD_BUILD) --features alloc
 	@if [ -d "$$(rustc --print target-libdir --target $(BARE_METAL))" ]; then set -x; \
