@@ -298,8 +298,8 @@ def test_a_write_that_was_not_sent_is_told_apart(server: holdfast.Server, log: w
         assert running.gateway.status()["writes"] == 2
     outcomes = [each["outcome"] for each in log.of("gateway_write")]
     assert outcomes == ["not sent", "refused", "failed", "done", "not sent"]
-    told = [each.headers.get("holdfast-maybe-written") for each in answers]
-    assert told == ["false", "false", "true", None, "false"]
+    maybe = [each.headers.get("holdfast-maybe-written") for each in answers]
+    assert maybe == ["false", "false", "true", None, "false"]
 
 
 @pytest.mark.parametrize(("code", "maybe"), [(2, "false"), (5, "true"), (6, "false"), (11, "true")])
@@ -578,8 +578,8 @@ def test_a_request_under_way_is_answered_when_the_gateway_ends(path: str, ending
         answer = waiting.result(wire.DEADLINE)
     assert (answer.status, answer.headers["holdfast-reason"]) == (503, "stopping")
     assert "may have been carried out" in answer.json["error"]
-    told = answer.headers.get("holdfast-maybe-written")
-    assert told == (None if path == "/read" else "true")
+    maybe = answer.headers.get("holdfast-maybe-written")
+    assert maybe == (None if path == "/read" else "true")
 
 
 def test_a_request_that_can_still_be_done_when_the_gateway_ends_is_done() -> None:

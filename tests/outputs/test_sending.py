@@ -250,7 +250,7 @@ def test_what_can_not_be_sent_at_the_end_is_in_the_file(
     assert again.receiver.sent == list(range(1501))
 
 
-def test_what_a_slow_disk_can_not_store_at_the_end_is_told(
+def test_what_a_slow_disk_can_not_store_at_the_end_is_logged(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "CHECK_INTERVAL_S", 0)
@@ -264,15 +264,15 @@ def test_what_a_slow_disk_can_not_store_at_the_end_is_told(
     assert vars(record)["fields"]["count"] == 5
 
 
-def test_what_there_is_no_room_for_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_what_there_is_no_room_for_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     output = Running()
     output.receiver.error = OSError("down")
     output.buffer.most = 2
     output.buffer.offer(numbered(5))
-    wire.until(lambda: count(caplog, "output_dropped") > 0, "it is told")
+    wire.until(lambda: count(caplog, "output_dropped") > 0, "it is logged")
     output.end()
-    told = [record for record in caplog.records if record.message == "output_dropped"]
-    assert sum(vars(record)["fields"]["count"] for record in told) == output.buffer.dropped
+    logged = [record for record in caplog.records if record.message == "output_dropped"]
+    assert sum(vars(record)["fields"]["count"] for record in logged) == output.buffer.dropped
 
 
 def test_what_is_lost_at_the_end_is_told(caplog: pytest.LogCaptureFixture) -> None:

@@ -60,7 +60,7 @@ def _load_whole(path: Path | str) -> Config:
         raise ConfigError(str(path), report.problems)
     for place, message in doubts:
         report.warn(place, message)
-    return config.with_facts(warnings=(*config.warnings, *report.warnings)) if doubts else config
+    return config.with_warnings([*config.warnings, *report.warnings]) if doubts else config
 
 
 def _checks(config: Config) -> Iterator[tuple[KeyPath, Callable[[], Iterable[str]]]]:

@@ -54,7 +54,7 @@ def loaded(path: Path | str) -> tuple[Config, yaml_document.Document]:
         content = yaml_document.read_bytes(Path(path), file)
         document, problems = yaml_document.parse(yaml_document.decoded(content, file), file)
         config = checked(document, problems, Path(path).absolute().parent)
-        return config.with_facts(sha256=hashlib.sha256(content).hexdigest()), document
+        return config.with_sha256(hashlib.sha256(content).hexdigest()), document
 
     try:
         return bounded_files.answered(work)
@@ -90,7 +90,8 @@ def checked(document: yaml_document.Document, problems: list[Problem], folder: P
         raise ConfigError(document.file, problems)
     _warn(scope)
     warnings = sorted(report.warnings, key=lambda warning: warning.line or 0)
-    return config.with_facts(warnings=tuple(warnings), profile_files=tuple(profiles.files))
+    config.with_profile_files(profiles.files)
+    return config.with_warnings(warnings)
 
 
 def _check(scope: Scope) -> None:

@@ -66,29 +66,26 @@ class Stored:
     def add(self, readings: Sequence[Reading]) -> int:
         """Stores readings durably, all or none. Returns how many were dropped for want of room."""
         dropped = 0
-        # Many readings have one tag.
+        # Once for each tag: most readings share theirs.
         tags = {id(reading.tag): reading.tag for reading in readings}
         meanings = {of: meaning_of(tag) for of, tag in tags.items()}
+        plain = [
+            (device, tag.name, value, time, fault, undecoded, meanings[id(tag)])
+            for device, tag, value, time, fault, undecoded in readings
+        ]
+        steps = [plain[at : at + MAX_ROW] for at in range(0, len(plain), MAX_ROW)]
+        rows = [(len(step), msgspec.msgpack.encode(step)) for step in steps]
         # The rollback may undo what is counted here.
         with file_errors(self.file, self._recount), self._db:
             self._db.execute("BEGIN")
-            for at in range(0, len(readings), MAX_ROW):
-                row = readings[at : at + MAX_ROW]
-                data = msgspec.msgpack.encode(
-                    [
-                        (device, tag.name, value, time, fault, undecoded, meanings[id(tag)])
-                        for device, tag, value, time, fault, undecoded in row
-                    ]
-                )
+            for count, data in rows:
                 while self._bytes + len(data) > self._max_bytes and self.count:
                     dropped += self._remove("(SELECT min(id) FROM readings)")
                 if len(data) > self._max_bytes:
-                    dropped += len(row)
+                    dropped += count
                     continue
-                self._db.execute(
-                    "INSERT INTO readings (count, data) VALUES (?, ?)", (len(row), data)
-                )
-                self.count += len(row)
+                self._db.execute("INSERT INTO readings (count, data) VALUES (?, ?)", (count, data))
+                self.count += count
                 self._bytes += len(data)
         return dropped
 

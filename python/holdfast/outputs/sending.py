@@ -99,7 +99,7 @@ class Sending:
         self._name, self._receiver, self._buffer = name, receiver, buffer
         self._open_file = open_file
         self._sent = self._refused = 0
-        self._told_dropped, self._told_at = buffer.dropped, -inf
+        self._logged_dropped, self._logged_at = buffer.dropped, -inf
         self._stopped_at = inf
         self._backoff = Backoff(FIRST_PAUSE_S, MAX_PAUSE_S, jitter=True)
         self._pause = 0.0
@@ -116,7 +116,7 @@ class Sending:
                 self._use_file()
                 if not self._step(stop):
                     self._wait(stop)
-                self._tell_dropped()
+                self._log_dropped()
             self._finish()
         except Exception:
             self._keep(STORE_TIMEOUT_S)
@@ -205,7 +205,7 @@ class Sending:
         end = time.monotonic() + self._pause
         while not stop.is_set() and (left := end - time.monotonic()) > 0:
             self._keep(CHECK_INTERVAL_S)
-            self._tell_dropped()
+            self._log_dropped()
             stop.wait(min(CHECK_INTERVAL_S, left))
 
     def _finish(self) -> None:
@@ -219,7 +219,7 @@ class Sending:
                 except OSError:
                     break
         self._keep(STORE_TIMEOUT_S)
-        self._tell_dropped(0.0)
+        self._log_dropped(0.0)
         unsent = len(self._buffer) - (self._buffer.stored.count if self._buffer.stored else 0)
         if unsent > 0:
             log_lines.write(logging.WARNING, "output_unsent", output=self._name, count=unsent)
@@ -235,11 +235,11 @@ class Sending:
         with self._using_file():
             self._buffer.keep(seconds)
 
-    def _tell_dropped(self, every: float = DROPPED_INTERVAL_S) -> None:
+    def _log_dropped(self, every: float = DROPPED_INTERVAL_S) -> None:
         """Logs how many readings were lost because there was no room, once in some seconds."""
-        lost, now = self._buffer.dropped - self._told_dropped, time.monotonic()
-        if lost > 0 and now >= self._told_at + every:
-            self._told_dropped, self._told_at = self._told_dropped + lost, now
+        lost, now = self._buffer.dropped - self._logged_dropped, time.monotonic()
+        if lost > 0 and now >= self._logged_at + every:
+            self._logged_dropped, self._logged_at = self._logged_dropped + lost, now
             log_lines.write(logging.WARNING, "output_dropped", output=self._name, count=lost)
 
     @contextlib.contextmanager

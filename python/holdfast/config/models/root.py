@@ -48,6 +48,7 @@ from holdfast.tags import Tag, TagList
 from holdfast.values.orders import DEFAULT_ORDER
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     from holdfast.config.text.problems import Problem
@@ -182,20 +183,29 @@ class Config(Model):
         """The files that profiles were read from."""
         return self._profile_files
 
+    def with_profile_files(self, files: Iterable[Path]) -> Self:
+        """This configuration, with profiles from these files."""
+        self._profile_files = tuple(files)
+        return self
+
     @property
     def warnings(self) -> tuple[Problem, ...]:
         """Valid settings without effect, such as a rule that never matches."""
         return self._warnings
+
+    def with_warnings(self, warnings: Iterable[Problem]) -> Self:
+        """This configuration, with these warnings."""
+        self._warnings = tuple(warnings)
+        return self
 
     @property
     def sha256(self) -> str | None:
         """The SHA-256 of the file that this configuration was loaded from, if it was."""
         return self._sha256
 
-    def with_facts(self, **facts: object) -> Self:
-        """This configuration, with `warnings`, `sha256` or `profile_files`."""
-        for name, fact in facts.items():
-            setattr(self, f"_{name}", fact)
+    def with_sha256(self, sha256: str) -> Self:
+        """This configuration, loaded from a file with that SHA-256."""
+        self._sha256 = sha256
         return self
 
     def __eq__(self, other: object) -> bool:
