@@ -1,7 +1,8 @@
 //! A stream of RTU frames: [lengths of the pieces] parts. A fuzzer does not find checksums: an even first byte
 //! makes a part the content of a frame.
 
-use holdfast_protocol::frame::rtu::{self, Next, Requests};
+use holdfast_protocol::frame::rtu;
+use holdfast_protocol::frame::rtu_stream::{Next, Requests};
 use holdfast_protocol::pdu::Request;
 
 /// The requests that are found in a stream do not depend on how it is cut, and those of a good stream are all

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
-from holdfast.scanner.fleet import member as members
+from holdfast.scanner.fleet import partition_leases
 from holdfast.scanner.settings import FleetSettings
 from support import wire
 from support.fleet_nodes import FLEET, prepare
@@ -95,7 +95,7 @@ def test_a_busy_event_loop_loses_no_device(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(members, "HANG_AFTER_S", math.inf)
+    monkeypatch.setattr(partition_leases, "HANG_AFTER_S", math.inf)
     times = LeaseTimes(ttl_s=2.0, hold_s=1.5, renewal_s=0.2)
     one, two = node("a", times), node("b", times)
     share(one, two)
@@ -128,11 +128,11 @@ def test_others_take_over_from_a_node_whose_event_loop_hangs(
     one, two = node("a", BRIEF), node("b", BRIEF)
     share(one, two)
     subscribe(own_nats, judges)
-    member = as_member(one)
-    heartbeat, member._heartbeat = member._heartbeat, Hangs()  # type: ignore[assignment]
+    leases = as_member(one).fleet
+    heartbeat, leases.heartbeat = leases.heartbeat, Hangs()  # type: ignore[assignment]
     share(two)
     polled(judges)
-    member._heartbeat = heartbeat
+    leases.heartbeat = heartbeat
     share(one, two)
     polled(judges)
 

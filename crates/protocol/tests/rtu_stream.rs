@@ -1,7 +1,8 @@
 //! Tests RTU requests in a stream, as in RTU over TCP.
 
 use holdfast_protocol::frame::FrameError;
-use holdfast_protocol::frame::rtu::{self, Next, Requests};
+use holdfast_protocol::frame::rtu;
+use holdfast_protocol::frame::rtu_stream::{Next, Requests};
 use proptest::prelude::*;
 
 fn frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {

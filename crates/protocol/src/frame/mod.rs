@@ -4,12 +4,13 @@
 //! | --- | --- | --- |
 //! | TCP, UDP | [`mbap::encode`] | [`mbap::next`] |
 //! | serial line, RTU mode | [`rtu::encode`] | [`rtu::decode`] |
-//! | RTU over TCP | [`rtu::encode`] | [`rtu::Requests`], [`rtu::response_len`] |
+//! | RTU over TCP | [`rtu::encode`] | [`rtu_stream::Requests`], [`rtu::response_len`] |
 //! | serial line, ASCII mode | [`ascii::encode`] | [`ascii::decode`] |
 
 pub mod ascii;
 pub mod mbap;
 pub mod rtu;
+pub mod rtu_stream;
 
 use crate::pdu;
 

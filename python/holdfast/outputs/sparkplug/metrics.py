@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import struct
-import time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from holdfast.outputs.sparkplug.datatypes import INT32, STRING, Datatype, datatype_of
+from holdfast.outputs.sparkplug.historical import Births
 from holdfast.outputs.tag_meaning import meaning_of
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class DeviceMetrics:
         self.by_name: dict[str, Entry] = {}
         """The metrics by name. This and `by_alias` are for all threads."""
         self.by_alias: dict[int, Entry] = {}
-        self._born: dict[str, float] = {}
+        self._births = Births()
         self._bad: set[str] = set()
 
     def birth(self, payload: Any, latest: Mapping[str, Reading], aliases: Iterator[int]) -> None:
@@ -60,8 +60,7 @@ class DeviceMetrics:
             reading = latest.get(name)
             if reading is not None and not self._is_of_same_meaning(reading):
                 reading = None
-            at = time.time() if reading is None else reading.time
-            self._born[name] = at
+            at = self._births.add(name, reading)
             for entry in entries:
                 metric = payload.metrics.add(
                     name=entry.name,
@@ -78,18 +77,17 @@ class DeviceMetrics:
 
     def is_known(self, reading: Reading) -> bool:
         """Whether the birth had this reading, or there is no metric for it any more."""
-        name = reading.tag.name
-        return name not in self._entries or reading.time == self._born.get(name)
+        return reading.tag.name not in self._entries or self._births.has(reading)
 
     def add(self, payload: Any, reading: Reading) -> bool:
-        """Adds the metrics of a reading. It is historical if the birth had a newer one.
+        """Adds the metrics of a reading.
 
         Returns whether the reading fits: it may have waited since before the tag was changed.
         """
         name = reading.tag.name
         if not self._is_of_same_meaning(reading):
             return False
-        is_historical = reading.time < self._born[name]
+        is_historical = self._births.is_historical(reading)
         entries, first = self._entries[name], len(payload.metrics)
         try:
             have_values = [_fill(payload.metrics.add(), entry, reading.value) for entry in entries]
@@ -103,7 +101,6 @@ class DeviceMetrics:
                 metric.datatype = entry.datatype.number
             if is_historical:
                 metric.is_historical = True
-            if is_historical:
                 if not has_value:
                     _property(metric, "Quality", INT32, BAD)
             elif has_value is (entry.name in self._bad):

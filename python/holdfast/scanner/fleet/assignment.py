@@ -18,7 +18,8 @@ def assigned(partitions: int, nodes: Collection[str], held: Mapping[int, str]) -
     """Who should hold each partition; `held` is who does now.
 
     All nodes have the same number of partitions, or one more. No other assignment of that kind
-    moves fewer of those that are held by live nodes.
+    moves fewer of those that are held by live nodes. (Rendezvous hashing alone does not spread few
+    partitions evenly, and with a limit for each node it moves far more than necessary.)
     """
     if not nodes:
         return {}

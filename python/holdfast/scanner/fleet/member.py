@@ -23,7 +23,6 @@ from holdfast.replication.leases.bucket import Outdated
 from holdfast.replication.leases.leases import FIRST_RETRY_S, MAX_RETRY_S
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
-from holdfast.runtime.heartbeat import Heartbeat
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.fleet.assignment import partition_of
 from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
@@ -58,9 +57,6 @@ CONNECTION_CHECK_S = 0.1
 LEAVE_TIMEOUT_S = 10.0
 """Time to hand devices over to other nodes."""
 
-HANG_AFTER_S = 5.0
-"""Time without a sign of life of the event loop after which leases are not renewed."""
-
 
 class FleetMember(Placement):
     """Joins the fleet, follows the desired state, and knows which devices are its own."""
@@ -82,10 +78,8 @@ class FleetMember(Placement):
             self._gained,
             self._lost,
             connect=connect,
-            withheld=self._withheld,
             start_thread=start_thread,
         )
-        self._heartbeat = Heartbeat()
         self._backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S, jitter=True)
         self.desired = DesiredState(settings.name, self._on_change, self._on_loss)
         self._check_interval_s = settings.check_interval_s
@@ -107,16 +101,7 @@ class FleetMember(Placement):
         """Sets the client; `None` while there is no connection."""
         self.client = client
         self._has_new_client.set()
-        if client is not None:
-            self.fleet.connected()
-
-    def _withheld(self) -> str | None:
-        """Why this node can't publish values; then others should have its devices."""
-        if self.client is None:
-            return "the other connection to NATS was lost"
-        if self._heartbeat.age > HANG_AFTER_S:
-            return f"the event loop hangs for {HANG_AFTER_S:g} s"
-        return None
+        self.fleet.connected(is_connected=client is not None)
 
     async def run(
         self, devices: DeviceHost, subscriptions: SubscriptionHost, ready: asyncio.Event, /
@@ -129,7 +114,7 @@ class FleetMember(Placement):
         running: list[asyncio.Task[None]] = []
         self.fleet.start()
         try:
-            async with tasks.beating(self._heartbeat):
+            async with tasks.beating(self.fleet.heartbeat):
                 await self._open(ready)
                 works = (self.fleet.run(), self._follow_again(), self._adopt_changes())
                 running += [asyncio.create_task(work) for work in works]

@@ -1,9 +1,7 @@
-"""One node of a fleet: its lease as a node, and the leases of its partitions.
+"""The leases of one node of a fleet: that of its name, and those of its partitions.
 
-`assigned` says which node should hold which partition, and says the same on every node. Rendezvous
-hashing alone does not spread few partitions evenly, and with a limit for each node it moves far
-more than necessary. So the holders of the moment count too: each node keeps what it has, up to its
-share.
+`assigned` says which node should hold which partition, and says the same on every node. A node that
+can't use its devices renews no lease, so that others take them.
 """
 
 from __future__ import annotations
@@ -17,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.events import log_lines
 from holdfast.replication.leases.leases import Leases
 from holdfast.replication.leases.thread import LeaseThread, Relay
+from holdfast.runtime.heartbeat import Heartbeat
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms, digest
 from holdfast.scanner.fleet.assignment import assigned
 from holdfast.scanner.fleet.handover import Handover
@@ -37,6 +36,9 @@ GATHER_S = 0.05
 
 CHECK_INTERVAL_S = 0.5
 """The longest time between two looks at which leases have ended."""
+
+HANG_AFTER_S = 5.0
+"""Time without a sign of life of the event loop after which leases are not renewed."""
 
 
 def leases_of(fleet: str) -> str:
@@ -59,15 +61,15 @@ class PartitionLeases:
         lost: Callable[[int], None],
         *,
         connect: Connect,
-        withheld: Callable[[], str | None],
         start_thread: StartThread,
     ) -> None:
         """`about` returns what others are shown of this node.
 
-        `connect` makes the connection of the leases. `withheld` returns why this node can't use its
-        devices, though it could renew their leases; it is called in their thread, which
-        `start_thread` starts.
+        `connect` makes the connection of the leases, `start_thread` starts their thread.
         """
+        self.heartbeat = Heartbeat()
+        """The heartbeat of the event loop of `start`."""
+        self._is_connected = False
         self.settings, self.node = settings, settings.node
         self.terms = terms
         self._terms_digest = digest(terms.encoded())
@@ -92,7 +94,7 @@ class PartitionLeases:
             times=settings.lease_times,
             replicas=3,
             about=self._about,
-            withheld=withheld,
+            withheld=self._withheld,
         )
         self._thread = LeaseThread(self.leases, connect, "holdfast-leases", start_thread)
         self._handover = Handover(self._thread, self._settle)
@@ -141,11 +143,23 @@ class PartitionLeases:
         """
         return self._epochs.get(partition, 0)
 
-    def connected(self) -> None:
-        """Gives messages greater numbers than those sent over the former connection.
+    def _withheld(self) -> str | None:
+        """Why this node can't publish values, though it could renew its leases."""
+        if not self._is_connected:
+            return "the other connection to NATS was lost"
+        if self.heartbeat.age > HANG_AFTER_S:
+            return f"the event loop hangs for {HANG_AFTER_S:g} s"
+        return None
 
-        A server that was frozen sends older messages when it continues.
+    def connected(self, *, is_connected: bool) -> None:
+        """The connection that publishes values was made or lost.
+
+        Gives messages greater numbers than those sent over the former connection: a server that was
+        frozen sends older messages when it continues.
         """
+        self._is_connected = is_connected
+        if not is_connected:
+            return
         for partition, epoch in self._epochs.items():
             self._epochs[partition] = max(self.revision(partition), epoch)
 

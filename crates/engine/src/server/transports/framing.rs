@@ -1,6 +1,6 @@
 //! The framings of streams and datagrams: an MBAP header, RTU frames, or ASCII frames.
 
-use holdfast_protocol::frame::{ascii, mbap, rtu};
+use holdfast_protocol::frame::{ascii, mbap, rtu, rtu_stream};
 use holdfast_protocol::pdu;
 
 use crate::server::transports::shared_port::Beginning;
@@ -143,26 +143,28 @@ impl Framing for Rtu {
     const SHORTEST: usize = 4;
     const MAX_LEN: usize = rtu::MAX_LEN;
 
-    type Before = rtu::Requests;
+    type Before = rtu_stream::Requests;
 
     type Decoded = ();
     const NOT_DECODED: () = ();
 
     fn next<'a>(
-        before: &mut rtu::Requests,
+        before: &mut rtu_stream::Requests,
         bytes: &'a [u8],
         _delimiter: impl FnOnce() -> u8,
         _decoded: &'a mut (),
     ) -> Next<'a> {
         match before.next(bytes) {
-            rtu::Next::Incomplete => Next::Incomplete,
-            rtu::Next::Frame { unit_id, pdu, len } => Next::Request { tag: 0, unit_id, pdu, len },
-            rtu::Next::Damaged { len } => Next::Damaged { len },
-            rtu::Next::Stray { len } => Next::Stray { len },
+            rtu_stream::Next::Incomplete => Next::Incomplete,
+            rtu_stream::Next::Frame { unit_id, pdu, len } => {
+                Next::Request { tag: 0, unit_id, pdu, len }
+            }
+            rtu_stream::Next::Damaged { len } => Next::Damaged { len },
+            rtu_stream::Next::Stray { len } => Next::Stray { len },
         }
     }
 
-    fn is_at_start(before: &rtu::Requests) -> bool {
+    fn is_at_start(before: &rtu_stream::Requests) -> bool {
         before.is_at_start()
     }
 
