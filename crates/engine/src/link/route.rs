@@ -1,7 +1,6 @@
 //! A link as listeners and event loops see it, from any thread.
 
 use std::net::IpAddr;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
@@ -12,6 +11,7 @@ use tokio::sync::mpsc;
 use super::caller::{Caller, Waiting};
 use crate::client::{ClientError, Endpoint, StrayCounters};
 use crate::counter::counters;
+use crate::link::limits::queue_share::{Place, QueueShare};
 use crate::link::scheduling::pace::InFlight;
 use crate::link::scheduling::pending_reply::{PendingReply, ReplyTo, pending_reply};
 use crate::link::scheduling::queue::Priority;
@@ -71,10 +71,7 @@ pub struct SharedLink {
     pub name: Arc<str>,
     pub counters: LinkCounters,
     calls: mpsc::UnboundedSender<Call>,
-    max_waiting: usize,
-    waiting: AtomicUsize,
-    /// Requests of event loops among those.
-    called: AtomicUsize,
+    queue: Arc<QueueShare>,
     strays: OnceLock<Arc<StrayCounters>>,
     preferred: Vec<IpAddr>,
 }
@@ -101,12 +98,6 @@ enum Receiver {
     /// With the timeout after the request was sent.
     Listener(ReplyTo, Duration),
     EventLoop(Waiting),
-}
-
-/// A place in the queue of a link.
-struct Place {
-    link: Arc<SharedLink>,
-    is_called: bool,
 }
 
 /// The source of a request.
@@ -137,9 +128,7 @@ impl SharedLink {
             name: settings.name.as_str().into(),
             counters: LinkCounters::default(),
             calls,
-            max_waiting: settings.queue,
-            waiting: AtomicUsize::new(0),
-            called: AtomicUsize::new(0),
+            queue: QueueShare::new(settings.queue),
             strays: OnceLock::new(),
             preferred: settings.preferred.clone(),
         }
@@ -157,14 +146,13 @@ impl SharedLink {
 
     /// Requests that wait or are in flight, without those of the poller.
     pub fn waiting(&self) -> usize {
-        self.waiting.load(Ordering::Relaxed)
+        self.queue.waiting()
     }
 
     /// Sends a request of an event loop on its way. `timeout` includes the wait for the turn. A
     /// broadcast ends without a reply. Returns the ticket of the call; `None` when the queue is full.
-    /// Event loops together may fill no more of the queue than they leave to others.
     pub fn call(
-        self: &Arc<SharedLink>,
+        &self,
         caller: &Arc<Caller>,
         unit_id: u8,
         request: &EncodedRequest,
@@ -172,8 +160,7 @@ impl SharedLink {
         is_broadcast: bool,
     ) -> Option<u64> {
         self.counters.requests.add();
-        let called = self.called.load(Ordering::Relaxed);
-        let place = self.place(called, true)?;
+        let place = self.admitted(self.queue.place_of_event_loop())?;
         let priority = Priority::of(request, None, &self.preferred);
         let (ticket, waiting) = caller.begin(request, timeout, is_broadcast);
         let (request, source) = (request.clone(), caller.source);
@@ -183,16 +170,12 @@ impl SharedLink {
         Some(ticket)
     }
 
-    /// A place in the queue, for a source with so many requests there.
-    fn place(self: &Arc<SharedLink>, own: usize, is_called: bool) -> Option<Place> {
-        let before = self.waiting.fetch_add(1, Ordering::Relaxed);
-        self.called.fetch_add(usize::from(is_called), Ordering::Relaxed);
-        let place = Place { link: Arc::clone(self), is_called };
-        if self.max_waiting.saturating_sub(before) <= own {
+    /// Notes whether a request has a place in the queue.
+    fn admitted(&self, place: Option<Place>) -> Option<Place> {
+        if place.is_none() {
             self.counters.refused_full.add();
-            return None;
         }
-        Some(place)
+        place
     }
 }
 
@@ -200,8 +183,7 @@ impl Route {
     /// Sends a request on its way, unchanged.
     ///
     /// # Errors
-    /// The exception to refuse it with: the queue is full, or the link has ended. A source may fill no
-    /// more of the queue than it leaves to others.
+    /// The exception to refuse it with: the queue is full, or the link has ended.
     pub(crate) fn ask(
         &self,
         asker: &Asker,
@@ -211,7 +193,8 @@ impl Route {
         let link = &self.link;
         link.counters.requests.add();
         let request = EncodedRequest::opaque(pdu).ok_or(ExceptionCode::IllegalFunction)?;
-        let place = link.place(asker.waiting, false).ok_or(ExceptionCode::ServerDeviceBusy)?;
+        let place = link.admitted(link.queue.place(asker.waiting));
+        let place = place.ok_or(ExceptionCode::ServerDeviceBusy)?;
         let priority = Priority::of(&request, asker.peer, &link.preferred);
         let (to, pending) = pending_reply();
         let call = Call {
@@ -272,12 +255,5 @@ impl Reply {
         if let Receiver::EventLoop(to) = &self.to {
             to.note_sent();
         }
-    }
-}
-
-impl Drop for Place {
-    fn drop(&mut self) {
-        self.link.waiting.fetch_sub(1, Ordering::Relaxed);
-        self.link.called.fetch_sub(usize::from(self.is_called), Ordering::Relaxed);
     }
 }

@@ -1,7 +1,9 @@
-//! When a link sends nothing: failed connects, units that are silent, floods, leases and deadlines.
+//! When a link takes or sends nothing: a full queue, failed connects, units that are silent, floods, leases and
+//! deadlines.
 
 pub(crate) mod circuit_breaker;
 pub(crate) mod connect_pause;
 pub(crate) mod flood;
 pub(crate) mod lease_fence;
 pub(crate) mod permit;
+pub(crate) mod queue_share;

@@ -5,7 +5,8 @@ use std::time::{Duration, Instant};
 
 use crate::log::error::{End, LogError};
 
-/// For so long, the servers may be cut off from the others. After that, they have lost messages.
+/// For so long, the servers may be cut off from the others. After that, they have lost messages. At least
+/// the time that a start may take (`JOIN_TIMEOUT_S` of `shared_logs.py`).
 pub(in crate::log) const MAX_CUT_OFF: Duration = Duration::from_secs(30);
 
 /// Since when the servers have known less than this node, without a session in which they did not.
