@@ -52,6 +52,7 @@ fn tolerances(bits: u8) -> Tolerance {
         pause: if has(5) { Duration::from_millis(10) } else { Duration::ZERO },
         close_after: if has(6) { 3 } else { 0 },
         retries: u8::from(has(7)),
+        write_multiple: has(4),
         ..Tolerance::default()
     }
 }

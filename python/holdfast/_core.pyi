@@ -987,6 +987,7 @@ class Endpoint:
         retry_busy: bool = False,
         close_after: int = 0,
         reconnect: float = 0.0,
+        write_multiple: bool = False,
     ) -> Endpoint:
         """The same device, treated as `holdfast.client.url.Tolerance` says."""
 

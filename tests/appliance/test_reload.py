@@ -677,6 +677,23 @@ def test_services_come_change_and_go(rig: Rig) -> None:
     assert rig.appliance.diagnostics.stats()["adapters"] == {}
 
 
+def test_a_profile_is_a_part_of_the_services_that_know_all(rig: Rig) -> None:
+    def with_scale(scale: float) -> Settings:
+        level = {"area": "holding_registers", "address": 5, "scale": scale}
+        gateway = {
+            "bind": "127.0.0.1:0",
+            "sources": ["127.0.0.1"],
+            "allow": ["127.0.0.1:*"],
+            "access": "read-only",
+            "tokens": "none",
+        }
+        return plant(gateway=gateway, profiles={"tank": {"tags": {"level": level}}})
+
+    rig.start(with_scale(0.1))
+    assert rig.reload(with_scale(0.01)) == ["gateway"]
+    assert rig.reload(with_scale(0.01)) == []
+
+
 @pytest.mark.parametrize("change", [{"name": "other", "secret": "new"}, {"areas": ("coils",)}])
 def test_a_token_has_its_new_rights_before_the_next_request(
     rig: Rig, change: dict[str, Any]

@@ -16,7 +16,8 @@ from calibration.blocks import build, constant, empty, near
 from calibration.cases import EMPTY, NOW, READS, Case, Truth
 from calibration.judge import Claim, Row, verdict
 from holdfast.discovery import description
-from holdfast.discovery.description import Described, Description
+from holdfast.discovery.described import Described
+from holdfast.discovery.description import Description
 from holdfast.discovery.type_guess import Guess
 from holdfast.values import encode
 

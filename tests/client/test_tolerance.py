@@ -582,12 +582,28 @@ def test_a_gateway_that_answers_one_after_the_other_has_the_whole_timeout_for_ea
     )
 
 
+# A device without functions 5 and 6
+
+
+@pytest.mark.parametrize("kind", ["tcp", "udp", "rtu+tcp", "ascii+tcp"])
+def test_single_writes_take_the_functions_for_several(kind: str, make: Make, dial: Dial) -> None:
+    device = make(kind)
+    client = dial(f"{device.url}?write_multiple=1")
+    client.write_register(7, 70)
+    client.write("holding_registers", 8, -1, "int16")
+    client.write_coil(3, True)
+    client.write_registers(9, [90, 100])
+    assert codes(device) == [16, 16, 15, 16]
+    assert client.read_holding_registers(7, 4) == [70, 0xFFFF, 90, 100]
+    assert client.read_coils(2, 3) == [False, True, False]
+
+
 # URLs
 
 
 ALL_OPTIONS = (
     "accept_unit=any&pad=1&pause=0.5&pause_after_connect=1&retries=2&retry_busy=1"
-    "&close_after=100&reconnect=60"
+    "&close_after=100&reconnect=60&write_multiple=1"
 )
 ALL = Tolerance(
     accept_unit="any",
@@ -598,6 +614,7 @@ ALL = Tolerance(
     retry_busy=True,
     close_after=100,
     reconnect=60.0,
+    write_multiple=True,
 )
 
 

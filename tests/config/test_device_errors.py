@@ -130,7 +130,8 @@ def test_a_right_device_is_right(folder: Folder) -> None:
          "8: tolerance.close_after: found 65536, allowed: an integer from 0 to 65535"),
         ("    reads", "    tolerance: {padding: true}\n    reads",
          "8: tolerance.padding: unknown key, allowed: accept_unit, pad, echo, pause, "
-         "pause_after_connect, retries, retry_busy, close_after, reconnect; did you mean 'pad'?"),
+         "pause_after_connect, retries, retry_busy, close_after, reconnect, write_multiple; "
+         "did you mean 'pad'?"),
         ("    reads", "    tolerance: {echo: true}\n    reads",
          "8: tolerance.echo: found true, allowed with RTU and ASCII frames only"),
         ("url: tcp://10.0.0.9\n", "url: tcp://10.0.0.9?pad=1\n    tolerance: {retries: 1}\n",

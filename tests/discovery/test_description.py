@@ -26,7 +26,7 @@ from support.fake_device import FakeDevice, exception, registers
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from holdfast.discovery.description import Described
+    from holdfast.discovery.described import Described
     from support.running import Serve
 
 

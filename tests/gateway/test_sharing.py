@@ -101,6 +101,23 @@ def test_all_writes_take_the_shared_connection(run: Run) -> None:
     assert counters(appliance)["requests"] == 6
 
 
+def test_single_writes_take_the_functions_for_several_where_the_device_needs_it(run: Run) -> None:
+    with Stream("tcp", in_turn=True) as device:
+        url = f"{device.url}?write_multiple=1"
+        appliance = run(with_gateway(url))
+        assert ask(appliance, "/write/register", device.port, address=1, value=51).json["success"]
+        assert ask(appliance, "/write/coil", device.port, address=4, value=True).json["success"]
+        assert read(appliance, device.port, 1).json["values"] == [51]
+    assert [asked.pdu[0] for asked in device.requests] == [16, 15, 3]
+
+
+def test_a_read_of_the_gateway_always_asks_the_device(run: Run) -> None:
+    with Stream("tcp", in_turn=True) as device:
+        appliance = run(with_gateway(device.url, link={"cache": 3600}))
+        assert [read(appliance, device.port, 5).json["values"] for _ in range(2)] == [[5], [5]]
+    assert len(device.requests) == 2
+
+
 MAX_TIMEOUT = 60_000
 """The longest timeout of a request in milliseconds, for what does not wait for it."""
 

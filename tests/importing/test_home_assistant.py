@@ -68,6 +68,7 @@ def test_a_sensor_becomes_a_tag(imported: Callable[..., Imported]) -> None:
             "unit": 3,
             "interval": 5,
             "timeout": 3,
+            "max_gap": 0,
             "tags": {
                 "grid_power": {
                     "area": "input_registers",
@@ -217,6 +218,43 @@ def test_switches_write_the_numbers_that_the_source_wrote(
     assert [note for note in notes(found) if blind in note] == [
         f"13: modbus[0].switches[4]: check: {blind}"
     ]
+
+
+@pytest.mark.parametrize(
+    "entities",
+    [
+        "switches: [{name: a, address: 1, write_type: holdings}, {name: b, address: 2}]",
+        "lights: [{name: a, address: 1, write_type: coils}, {name: b, address: 2}]",
+        "climates: [{name: a, address: 1, target_temp_register: 3, data_type: int16, "
+        "target_temp_write_registers: true}]\n    fans: [{name: b, address: 2}]",
+        "climates: [{name: a, address: 1, target_temp_register: 3, data_type: float32, "
+        "write_registers: true, hvac_onoff_register: 4}]\n    switches: [{name: b, address: 2}]",
+        "climates: [{name: a, address: 1, target_temp_register: 3, data_type: float32, "
+        "fan_mode_register: {address: 4, write_registers: true, values: {state_fan_on: 1}}}]"
+        "\n    covers: [{name: b, address: 2}]",
+    ],
+)
+def test_a_device_that_was_written_with_the_functions_for_several_still_is(
+    entities: str, imported: Callable[..., Imported]
+) -> None:
+    found = imported(entities)
+    assert found.data["devices"]["inverter"]["url"] == "tcp://192.168.1.50:502?write_multiple=1"
+    [note] = [each for each in notes(found) if "function" in each]
+    assert note.endswith("changed: written with function 15 or 16, as others of this hub")
+    single = imported("switches: [{name: a, address: 1, write_type: holding}]")
+    assert single.data["devices"]["inverter"]["url"] == "tcp://192.168.1.50:502"
+
+
+def test_hubs_at_one_address_have_the_same_options(imported: Callable[..., Imported]) -> None:
+    sensors = "sensors: {name: a, address: 1}"
+    hub = f"- {{name: NAME, type: tcp, host: 10.0.0.5, port: 502, MORE {sensors}}}\n"
+    first = hub.replace("NAME", "one").replace("MORE", "delay: 2,")
+    other = hub.replace("NAME", "two").replace("MORE", "message_wait_milliseconds: 50,")
+    found = imported("", first + other)
+    urls = {device["url"] for device in found.data["devices"].values()}
+    assert urls == {"tcp://10.0.0.5:502?pause_after_connect=2&pause=0.05"}
+    message = "hubs at one address share a connection: pauses and functions of another (and 1 more)"
+    assert f"1: [0]: changed: {message}" in notes(found)
 
 
 def test_covers_and_climates_become_their_registers(imported: Callable[..., Imported]) -> None:

@@ -102,6 +102,17 @@ WRITES: dict[str, tuple[Callable[[holdfast.SyncClient], object], bytes, list[int
 }
 
 
+def test_a_device_without_functions_5_and_6_gets_15_and_16(run: Run) -> None:
+    with plc() as source:
+        appliance = started(run, source, tolerance={"write_multiple": True}, emulate=True)
+        with client(appliance) as scada:
+            scada.write_register(11, 7)
+            scada.write_coil(101, True)
+            scada.mask_write(12, and_mask=0xFF00, or_mask=0x0011)
+            assert scada.read_holding_registers(10, 3) == [500, 7, 0x0111]
+        assert [pdu[0] for pdu in writes_of(source)] == [16, 15, 16]
+
+
 @pytest.mark.parametrize("listener", ["scada", "datagrams"])
 @pytest.mark.parametrize("name", WRITES)
 def test_a_write_reaches_the_device_and_then_memory(name: str, listener: str, run: Run) -> None:

@@ -276,7 +276,7 @@ impl Endpoint {
         Ok(Endpoint { core: Place::Serial(line).into() })
     }
 
-    #[pyo3(signature = (*, accept_unit=None, pad=false, echo=None, pause=0.0, pause_after_connect=0.0, retries=0, retry_busy=false, close_after=0, reconnect=0.0))]
+    #[pyo3(signature = (*, accept_unit=None, pad=false, echo=None, pause=0.0, pause_after_connect=0.0, retries=0, retry_busy=false, close_after=0, reconnect=0.0, write_multiple=false))]
     fn tolerating(
         &self,
         accept_unit: Option<&Bound<'_, PyAny>>,
@@ -288,6 +288,7 @@ impl Endpoint {
         retry_busy: bool,
         close_after: i128,
         reconnect: f64,
+        write_multiple: bool,
     ) -> PyResult<Endpoint> {
         let accept_unit = match accept_unit {
             None => AcceptUnit::Requested,
@@ -310,6 +311,7 @@ impl Endpoint {
             retry_busy,
             close_after: within("close_after", close_after, 0..=65_535)? as u32,
             reconnect: seconds("reconnect", reconnect)?,
+            write_multiple,
         };
         Ok(Endpoint { core: CoreEndpoint { place: self.core.place.clone(), tolerance } })
     }

@@ -32,6 +32,7 @@ const STRICT: Tolerance = Tolerance {
     retry_busy: false,
     close_after: 0,
     reconnect: Duration::ZERO,
+    write_multiple: false,
 };
 
 /// The result of a request: registers as bytes, empty for a write.
@@ -1068,6 +1069,27 @@ fn a_reply_to_a_request_that_was_not_sent_yet_ends_the_connection() {
 }
 
 #[test]
+fn a_device_without_functions_5_and_6_gets_15_and_16() {
+    let tolerance = Tolerance { write_multiple: true, ..STRICT };
+    let mut client = Client::tolerant(Transport::Tcp, tolerance);
+    let coil = Request::WriteSingleCoil { address: 4, value: true };
+    let tickets = [client.send(WRITE), client.send(coil)];
+    let register = mbap_frame(0, 7, &[16, 0, 3, 0, 1, 2, 0, 7]);
+    let coil = mbap_frame(1, 7, &[15, 0, 4, 0, 1, 1, 1]);
+    assert_eq!(client.outgoing(), [register, coil].concat());
+    client.receive(&mbap_frame(0, 7, &[16, 0, 3, 0, 1]));
+    client.receive(&mbap_frame(1, 7, &[15, 0, 4, 0, 1]));
+    assert_eq!(client.got(), tickets.map(|ticket| (ticket, Ok(Vec::new()))));
+}
+
+#[test]
+fn a_request_that_is_passed_on_keeps_its_function() {
+    let tolerance = Tolerance { write_multiple: true, ..STRICT };
+    let passed_on = EncodedRequest::opaque(&[6, 0, 3, 0, 7]).unwrap();
+    assert_eq!(tolerance.adapted(&passed_on), None);
+}
+
+#[test]
 fn a_connection_ends_after_as_many_requests_as_the_device_allows() {
     let mut client = Client::tolerant(Transport::Tcp, Tolerance { close_after: 2, ..STRICT });
     for id in 0..2 {
@@ -1164,9 +1186,16 @@ fn tolerances() -> impl Strategy<Value = Tolerance> {
         any::<u8>().prop_map(AcceptUnit::Also),
         Just(AcceptUnit::Any)
     ];
-    let flags = any::<[bool; 3]>();
+    let flags = any::<[bool; 4]>();
     (unit, flags, 0..3u32, 0..3u32, 0..3u8, 0..3u32).prop_map(
-        |(accept_unit, [pad, echo, retry_busy], pause, connect, retries, close_after)| Tolerance {
+        |(
+            accept_unit,
+            [pad, echo, retry_busy, write_multiple],
+            pause,
+            connect,
+            retries,
+            close_after,
+        )| Tolerance {
             accept_unit,
             pad,
             echo: if echo { Echo::Always } else { Echo::Auto },
@@ -1176,6 +1205,7 @@ fn tolerances() -> impl Strategy<Value = Tolerance> {
             retry_busy,
             close_after,
             reconnect: Duration::ZERO,
+            write_multiple,
         },
     )
 }

@@ -31,6 +31,8 @@ class ReloadIncomplete(Exception):
 
 
 SINGLE = ("identity", "rest", "mqtt", "nats", "gateway", "metrics", "log")
+OF_ALL_PROFILES = ("nats", "gateway")
+"""Services that know the tags of every profile."""
 SEVERAL = ("memories", "listeners", "devices", "links", "outputs", "adapters")
 
 
@@ -52,6 +54,9 @@ def _fingerprints(config: Config) -> dict[str, str]:
     for name, device in config.devices.items():
         if device.profile is not None:
             found[f"devices.{name}"] += profiles[device.profile]
+    for key in OF_ALL_PROFILES:
+        if getattr(config, key) is not None:
+            found[key] += fingerprint(config.profiles)
     return found
 
 

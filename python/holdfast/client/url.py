@@ -72,6 +72,10 @@ class Tolerance:
     """Requests after which the connection is closed, 0 for never; one is in flight then."""
     reconnect: float = 0.0
     """Seconds between the end of a connection and the next attempt to connect."""
+    write_multiple: bool = False
+    """Whether one coil is written with function 15 and one register with function 16, for a device
+    without functions 5 and 6.
+    """
 
     @property
     def is_one_at_a_time(self) -> bool:
@@ -275,6 +279,7 @@ OPTIONS: Mapping[str, _Option] = {
     "retry_busy": _flag(ALL),
     "close_after": _Option(f"0 to {MAX_CLOSE_AFTER}", _up_to(MAX_CLOSE_AFTER), ALL),
     "reconnect": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, ALL),
+    "write_multiple": _flag(ALL),
     **dict.fromkeys(
         ("ca", "cert", "key", "key_passphrase_file"), _Option("paths of files", _text, SECURE)
     ),

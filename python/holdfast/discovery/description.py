@@ -9,17 +9,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from holdfast.discovery import address_search, byte_order_habits, device_search, segments, sunspec
+from holdfast.discovery import (
+    address_search,
+    byte_order_habits,
+    device_search,
+    segments,
+    sunspec,
+    sunspec_tags,
+)
+from holdfast.discovery.described import Described
 from holdfast.discovery.device_search import Identity
 from holdfast.errors import ModbusException
 from holdfast.protocol import READ_LIMITS
 from holdfast.tags import Tag
-from holdfast.tags.scale import RegisterScale
 from holdfast.types import BIT_AREAS, SHORT_OF
-from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +34,7 @@ if TYPE_CHECKING:
     from holdfast.discovery.address_search import Survey
     from holdfast.discovery.byte_order_habits import Habit
     from holdfast.discovery.segments import Value
-    from holdfast.discovery.sunspec import Model, Point, SunSpec
+    from holdfast.discovery.sunspec import SunSpec
     from holdfast.types import Area
 
 SINGLE_BITS = 64
@@ -48,20 +54,6 @@ IMPROBABLE = 0.01
 
 MAX_ORDER_REGISTERS = 400
 """Registers from which the order of a device is inferred; more would cost time only."""
-
-
-@dataclass(frozen=True)
-class Described:
-    """A tag, and how sure it is."""
-
-    tag: Tag
-    confidence: float
-    """The probability of type and order; 1 if they are known."""
-    values: tuple[Any, ...]
-    """The numbers, bits or texts of each read, without scale."""
-    reasons: tuple[str, ...]
-    shown: Tag | None = None
-    """The tag with the scale that its register contained; `None` if no register does."""
 
 
 @dataclass
@@ -161,7 +153,7 @@ def conclude(found: Description, now: float | None = None) -> None:
     pieces = list(_pieces(found))
     habits = _habits(pieces, now)
     found.orders = byte_order_habits.order_shares(habits)
-    tags = list(_of_sunspec(found.sunspec)) if found.sunspec is not None else []
+    tags = list(sunspec_tags.tags_of(found.sunspec)) if found.sunspec is not None else []
     for (area, extent), contents in found.reads.items():
         if area in BIT_AREAS:
             tags += _bits(area, extent, contents)
@@ -290,65 +282,3 @@ def _tag(
 ) -> Tag:
     text = f"confidence {confidence:.2f}{': ' if reasons else ''}{', '.join(reasons)}"
     return Tag(f"{SHORT_OF[area]}_{address}", area, address, kind, order, description=text)
-
-
-def _of_sunspec(found: SunSpec) -> Iterator[Described]:
-    """The points of all models that have a value."""
-    names: set[str] = set()
-    for model in found.models:
-        for point in model.points:
-            if point.value is not None:
-                yield _of_point(model, point, names)
-
-
-def _of_point(model: Model, point: Point, names: set[str]) -> Described:
-    scale, flaw = _scale_of(point)
-    name = _unique(f"{model.name}_{point.name}{'_raw' if flaw else ''}", names)
-    text = f"SunSpec model {model.id}"
-    if point.label:
-        text += f", {point.label}"
-    if point.scaled_by is not None:
-        text += f"; {'no ' if flaw else ''}scale from {point.scaled_by}"
-    if flaw:
-        text += f", {flaw}"
-    if point.can_be_written:
-        text += "; can be written"
-    tag = Tag(
-        name,
-        "holding_registers",
-        point.address,
-        point.type,
-        scale=1 if flaw else point.scale,
-        unit="" if flaw else point.unit,
-        states=point.states,
-        null=frozenset(() if point.missing is None else (point.missing,)),
-        description=text,
-    )
-    if scale is None:
-        return Described(tag, 1.0, (point.value,), (text,))
-    return Described(replace(tag, scale=scale), 1.0, (point.value,), (text,), shown=tag)
-
-
-def _scale_of(point: Point) -> tuple[RegisterScale | None, str]:
-    """The register that contains the scale of a point, or why no tag can have it."""
-    if point.scaled_at is None:
-        return None, ""
-    size = parsed(point.type).registers
-    first, last = (
-        min(point.address, point.scaled_at),
-        max(point.address + size, point.scaled_at + 1),
-    )
-    if last - first > READ_LIMITS["holding_registers"]:
-        return None, f"which is at {point.scaled_at}, too far to be read with it"
-    source = Tag("", "holding_registers", point.scaled_at, "int16")
-    return RegisterScale("exponent", source=source), ""
-
-
-def _unique(name: str, names: set[str]) -> str:
-    """The name, with a number if another tag has it, of at most 64 characters."""
-    chosen, number = name[:64], 1
-    while chosen in names:
-        number += 1
-        chosen = f"{name[:60]}_{number}"
-    names.add(chosen)
-    return chosen

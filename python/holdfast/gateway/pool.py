@@ -6,18 +6,13 @@ A connection is opened when it is needed. It is closed when it is idle for some 
 last request on it had no response, because the state of the connection is then unknown. Where
 replies have no transaction ids, its client stays: it knows which ones may come on the next
 connection.
-
-Equal reads that wait for their turn are sent as one. A read never joins one that is sent already,
-nor one that waits before a later write: its value could be older than the read.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import copy
 import time
-from collections import deque
 from dataclasses import dataclass, field
 from math import inf
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
@@ -29,9 +24,9 @@ from holdfast.client.url import IN_FLIGHT, NetworkTarget
 from holdfast.errors import ConnectionLost, ModbusException
 from holdfast.gateway.broadcast import is_broadcast, send
 from holdfast.gateway.shared_devices import Turns
+from holdfast.gateway.shared_reads import WaitingRequests
 from holdfast.net.http.requests import BadRequest
 from holdfast.net.tls import NO_FILES
-from holdfast.protocol import READ_FUNCTIONS
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -51,39 +46,9 @@ first used. Raises `OSError` and `ValueError` for TLS files that can't be used."
 CHECK_INTERVAL_S = 0.5
 """Between checks for idle connections."""
 
-READS = frozenset(each.code for each in READ_FUNCTIONS.values())
-"""The functions of which equal requests can share a reply."""
-
 
 class Unusable(Exception):
     """The TLS files, which were valid at the start, can't be used any more."""
-
-
-@dataclass(eq=False)
-class _Waiting:
-    """A request that waits for its turn, or has it, and the callers that wait for its reply."""
-
-    request: Request
-    unit: int
-    timeout: float
-    """The longest timeout of its callers."""
-    callers: list[asyncio.Future[Any]] = field(default_factory=list)
-    worker: asyncio.Task[None] | None = None
-    """Sends it; `None` before its turn, and after its end."""
-    is_sent: bool = False
-
-    def end(self, outcome: Any) -> None:
-        """Gives all callers the result or the error."""
-        self.worker = None
-        for caller in self.callers:
-            if caller.done():
-                continue
-            # Each has an own one, because callers may change what they get.
-            own = outcome if caller is self.callers[0] else copy.copy(outcome)
-            if isinstance(own, Exception):
-                caller.set_exception(own)
-            else:
-                caller.set_result(own)
 
 
 @dataclass(eq=False)
@@ -96,9 +61,7 @@ class _Device:
     most: int
     """The most requests in flight."""
     in_flight: int = 0
-    waiting: deque[_Waiting] = field(default_factory=deque)
-    reads: dict[tuple[int, bytes], _Waiting] = field(default_factory=dict)
-    """Waiting reads that equal ones can join, by unit id and PDU."""
+    waiting: WaitingRequests = field(default_factory=WaitingRequests)
     workers: set[asyncio.Task[None]] = field(default_factory=set)
     users: int = 0
     """The number of calls that use the connection or wait for it."""
@@ -107,30 +70,6 @@ class _Device:
     """Whether the last request had no response."""
     needed: float = -inf
     """Until then, late replies may come that only this client knows."""
-
-    def join(self, request: Request, unit: int, timeout: float) -> _Waiting:
-        """Queues a request, or returns an equal read that waits."""
-        read = unit, request.pdu
-        is_read = request.pdu[0] in READS
-        if not is_read:
-            # Reads after it must see what it changes.
-            self.reads.clear()
-        elif read in self.reads:
-            equal = self.reads[read]
-            equal.timeout = max(equal.timeout, timeout)
-            return equal
-        new = _Waiting(request, unit, timeout)
-        self.waiting.append(new)
-        if is_read:
-            self.reads[read] = new
-        return new
-
-    def leave_queue(self, one: _Waiting) -> None:
-        """Removes a request, because it is sent now or has no callers any more."""
-        self.waiting.remove(one)
-        read = one.unit, one.request.pdu
-        if self.reads.get(read) is one:
-            del self.reads[read]
 
 
 def _is_needed(device: _Device) -> bool:
@@ -163,7 +102,7 @@ class _PoolTurns(Turns):
                 return await self._pool.send(device, request, unit, timeout)
             finally:
                 self._pool.pass_on(device)
-        waiting = device.join(request, unit, timeout)
+        waiting = device.waiting.join(request, unit, timeout)
         caller = asyncio.get_running_loop().create_future()
         waiting.callers.append(caller)
         try:
@@ -175,7 +114,7 @@ class _PoolTurns(Turns):
                 if waiting.worker is not None:
                     waiting.worker.cancel()
                 elif not waiting.is_sent:
-                    device.leave_queue(waiting)
+                    device.waiting.leave(waiting)
 
 
 class Pool:
@@ -300,11 +239,11 @@ class Pool:
                 except Exception:
                     device.doubtful = True  # The next request closes it, or gets the error.
             while device.waiting:
-                now = device.waiting[0]
+                now = device.waiting.first
                 if all(caller.done() for caller in now.callers):
                     await asyncio.sleep(0)  # They have given up, and leave the queue next.
                     continue
-                device.leave_queue(now)
+                device.waiting.leave(now)
                 now.is_sent, now.worker = True, worker
                 outcome: Any
                 try:

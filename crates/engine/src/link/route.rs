@@ -4,6 +4,7 @@ use std::net::IpAddr;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
+use holdfast_protocol::client::Tolerance;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
 use holdfast_runtime::Retry;
 use tokio::sync::mpsc;
@@ -74,6 +75,7 @@ pub struct SharedLink {
     queue: Arc<QueueShare>,
     strays: OnceLock<Arc<StrayCounters>>,
     preferred: Vec<IpAddr>,
+    tolerance: Tolerance,
 }
 
 /// A request of a listener or of an event loop.
@@ -131,6 +133,7 @@ impl SharedLink {
             queue: QueueShare::new(settings.queue),
             strays: OnceLock::new(),
             preferred: settings.preferred.clone(),
+            tolerance: settings.endpoint.tolerance,
         }
     }
 
@@ -161,6 +164,9 @@ impl SharedLink {
     ) -> Option<u64> {
         self.counters.requests.add();
         let place = self.admitted(self.queue.place_of_event_loop())?;
+        // Its reply is parsed as one to the request that is sent.
+        let adapted = self.tolerance.adapted(request);
+        let request = adapted.as_ref().unwrap_or(request);
         let priority = Priority::of(request, None, &self.preferred);
         let (ticket, waiting) = caller.begin(request, timeout, is_broadcast);
         let (request, source) = (request.clone(), caller.source);

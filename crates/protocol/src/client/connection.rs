@@ -192,6 +192,8 @@ impl Connection {
         assert!(self.has_room(), "one request at a time");
         self.sent += 1;
         let start = now.max(self.ready_at);
+        let adapted = self.flights.tolerance.adapted(request);
+        let request = adapted.as_ref().unwrap_or(request);
         let (flights, call) = (&mut self.flights, Call { unit_id, request, timeout, attempt });
         let ticket = match &mut self.wire {
             Wire::Stream(stream) => {

@@ -2,6 +2,8 @@
 
 use core::time::Duration;
 
+use crate::pdu::EncodedRequest;
+
 /// How to treat a device that deviates from the standard. The default follows the standard.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Tolerance {
@@ -25,12 +27,20 @@ pub struct Tolerance {
     pub close_after: u32,
     /// Time between the end of a connection and the next attempt to connect. The driver keeps it.
     pub reconnect: Duration,
+    /// Writes one coil with function 15 and one register with function 16, for a device without functions 5
+    /// and 6. A request that is passed on as it came stays as it is.
+    pub write_multiple: bool,
 }
 
 impl Tolerance {
     /// Whether a transport that can carry several requests at once carries one.
     pub const fn is_one_at_a_time(&self) -> bool {
         !self.pause.is_zero() || self.close_after > 0
+    }
+
+    /// The request to send instead of this one; `None` for this one.
+    pub fn adapted(&self, request: &EncodedRequest) -> Option<EncodedRequest> {
+        if self.write_multiple { request.as_multiple() } else { None }
     }
 }
 

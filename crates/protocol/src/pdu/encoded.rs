@@ -3,7 +3,7 @@
 use core::fmt;
 
 use super::response::body;
-use super::{Buffer, ExceptionCode, MAX_LEN, Request, Response, ResponseError};
+use super::{Bits, Buffer, ExceptionCode, MAX_LEN, Registers, Request, Response, ResponseError};
 
 /// The PDU of a request, ready to be sent: a valid one, or one that is passed on as it came.
 #[derive(Clone, PartialEq, Eq)]
@@ -67,6 +67,36 @@ impl EncodedRequest {
     #[inline]
     pub fn request(&self) -> Option<Request<'_>> {
         Request::parse(self.pdu()).ok()
+    }
+
+    /// The same write with function 15 or 16, if this is one of a single coil or register (V1.1b3, 6.11,
+    /// 6.12). `None` for any other request, and for one that is passed on as it came.
+    ///
+    /// ```
+    /// use holdfast_protocol::pdu::{EncodedRequest, Request};
+    ///
+    /// let single = EncodedRequest::new(&Request::WriteSingleRegister { address: 7, value: 0x1234 });
+    /// let multiple = single.as_multiple().unwrap();
+    /// assert_eq!(multiple.pdu(), [16, 0, 7, 0, 1, 2, 0x12, 0x34]);
+    /// assert!(multiple.as_multiple().is_none());
+    /// ```
+    pub fn as_multiple(&self) -> Option<EncodedRequest> {
+        if self.is_opaque {
+            return None;
+        }
+        let mut room = [0; MAX_LEN];
+        let multiple = match self.request()? {
+            Request::WriteSingleCoil { address, value } => {
+                let bits = Bits::pack(&[value], &mut room).ok()?;
+                Request::WriteMultipleCoils { address, bits }
+            }
+            Request::WriteSingleRegister { address, value } => {
+                let registers = Registers::pack(&[value], &mut room).ok()?;
+                Request::WriteMultipleRegisters { address, registers }
+            }
+            _ => return None,
+        };
+        Some(EncodedRequest::new(&multiple))
     }
 
     /// Whether the request is known to only read: repeating it changes nothing.

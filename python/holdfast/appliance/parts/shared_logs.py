@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 JOIN_TIMEOUT_S = 30.0
 """The time in which a node must have caught up with its log.
 
-At most `MAX_CUT_OFF` of `server_lag.rs`: servers that know less than this node may be cut off for that
-long, so a start that ends before can be tried again.
+At most `MAX_CUT_OFF` of `server_lag.rs`: servers that know less than this node may be cut off for
+that long, so a start that ends before can be tried again.
 """
 
 EVENTS = {

@@ -16,7 +16,8 @@ from holdfast.values.json import jsonable
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from holdfast.discovery.description import Described, Description
+    from holdfast.discovery.described import Described
+    from holdfast.discovery.description import Description
     from holdfast.discovery.device_search import Unit
     from holdfast.discovery.sunspec import SunSpec
 

@@ -225,6 +225,8 @@ class ToleranceConfig(Model):
     """Requests after which the connection is closed, 0 for never; one is in flight then."""
     reconnect: Pause = 0.0
     """Seconds between the end of a connection and the next attempt to connect."""
+    write_multiple: bool = False
+    """Whether one coil is written with function 15 and one register with function 16."""
 
 
 class RetryConfig(Model):

@@ -60,6 +60,8 @@ class Places:
     tags: dict[str, dict[str, Any]] = field(default_factory=dict)
     at: KeyPath = ()
     """The place of the entity that is being read."""
+    written: dict[bool, list[KeyPath]] = field(default_factory=lambda: {False: [], True: []})
+    """What writes one coil or register, with functions 5 and 6, or (`True`) with 15 and 16."""
 
     def add(self, name: str, area: Area, address: int, **settings: Any) -> None:
         """Adds a tag; its name is that of an entity id, and `name` its description."""
@@ -256,6 +258,7 @@ def _switch(places: Places, entity: Section) -> None:
     """A coil, or a register with a number for on and one for off; and where its state is read."""
     kinds = ("holding", "holdings", "coil", "coils")
     area = _area(entity, "write_type", "holding", kinds)
+    places.written[entity.get("write_type") in ("holdings", "coils")].append(entity.path)
     address = _address(entity)
     on, off = _register(entity, "command_on", 1), _register(entity, "command_off", 0)
     verify = entity.mapping("verify")
@@ -341,6 +344,7 @@ def _cover(places: Places, entity: Section) -> None:
         return
     kind = "switch" if area in _BITS else "select"
     entity.desk.changed(entity.path, f"a {kind} instead of a cover")
+    places.written[False].append(entity.path)
     settings = {} if area in _BITS else states
     places.add(_name(entity), area, address, **settings, writable=True)
     if status is not None:
@@ -374,6 +378,9 @@ def _climate(places: Places, entity: Section) -> None:
         message = "the first register is the setpoint; the source had one for each mode"
         entity.desk.changed(entity.at("target_temp_register"), message)
     places.add(_name(entity), area, address, **_given({**settings, **current, "unit": unit}))
+    if register_count(settings["type"]) == 1:
+        is_multiple = entity.flag("target_temp_write_registers") or False
+        places.written[is_multiple].append(entity.at("target_temp_register"))
     limits = {"min": 5 if least is None else least, "max": 35 if most is None else most}
     written = {**_given({**settings, **aim, "unit": unit}), "writable": True, **limits}
     places.add(f"{_name(entity)} setpoint", "holding_registers", target[0], **written)
@@ -387,7 +394,9 @@ def _mode(places: Places, entity: Section, key: str, *, writable: bool) -> None:
     given = _numbers(register, "address")
     values = register.mapping("values")
     area = _area(register, "input_type", "holding", _REGISTERS)
-    register.close({"write_registers": "one register is written with function 6"})
+    if writable:
+        places.written[register.flag("write_registers") or False].append(register.path)
+    register.close()
     if not given or values is None:
         message = "without address and values, allowed: with both"
         entity.desk.problem(entity.at(key), message)
@@ -407,10 +416,12 @@ def _power(places: Places, entity: Section) -> None:
     coil = _address(entity, "hvac_onoff_coil", required=False)
     register = _address(entity, "hvac_onoff_register", required=False)
     on, off = _register(entity, "hvac_on_value", 1), _register(entity, "hvac_off_value", 0)
-    name = f"{_name(entity)} power"
+    name, is_multiple = f"{_name(entity)} power", entity.flag("write_registers") or False
     if coil is not None:
+        places.written[False].append(entity.at("hvac_onoff_coil"))
         places.add(name, "coils", coil, writable=True)
     if register is not None:
+        places.written[is_multiple].append(entity.at("hvac_onoff_register"))
         settings = _two_states(entity, "holding_registers", [on], [off])
         places.add(name, "holding_registers", register, **settings, writable=True)
 

@@ -50,10 +50,8 @@ _ENTITY_REASONS = {
     "min_value": "values are not limited",
     "precision": "values are not rounded; Home Assistant can show fewer digits",
     "state_class": "numbers are measurements, and energies totals",
-    "target_temp_write_registers": "one register is written with function 6",
     "temp_step": "the step is the scale",
     "unique_id": "the new entities have ids of their own",
-    "write_registers": "one register is written with function 6",
     "zero_suppress": "small values are not replaced by 0",
 }
 _MAX_DEPTH = 3
@@ -146,9 +144,11 @@ def _devices(desk: Desk, hubs: list[Section]) -> dict[str, dict[str, Any]]:
     ]
     names = unique_names(desk, wanted)
     taken, devices = set(names), dict[str, dict[str, Any]]()
-    for name, hub in zip(names, hubs, strict=True):
-        read = _Hub(desk, hub)
+    found = [_Hub(desk, hub) for hub in hubs]
+    for read in found:
         read.read()
+    _share_connections(desk, found)
+    for name, read in zip(names, found, strict=True):
         units = {number: unit for number, unit in read.units.items() if unit.places.tags}
         for number, unit in units.items():
             its_name = (
@@ -159,6 +159,23 @@ def _devices(desk: Desk, hubs: list[Section]) -> dict[str, dict[str, Any]]:
     if devices:
         _to_check(desk, hubs[0].path)
     return devices
+
+
+def _share_connections(desk: Desk, hubs: list[_Hub]) -> None:
+    """Hubs at one address share a connection, so its options are the same."""
+    groups: dict[str, list[_Hub]] = {}
+    for hub in hubs:
+        groups.setdefault(hub.location, []).append(hub)
+    for group in groups.values():
+        shared: dict[str, float] = {}
+        for hub in group:
+            for key, value in hub.tolerance.items():
+                shared[key] = max(value, shared.get(key, 0))
+        for hub in group:
+            if hub.tolerance != shared:
+                message = "hubs at one address share a connection: pauses and functions of another"
+                desk.changed(hub.hub.path, message)
+                hub.tolerance = shared
 
 
 def _to_check(desk: Desk, path: KeyPath) -> None:
@@ -186,8 +203,9 @@ class _Unit:
             more = f", and {len(others) - 1} more" if len(others) > 1 else ""
             message = f"polled every {interval} s, as the whole device; it was {given} s{more}"
             self.places.desk.changed(path, message)
-        tags = self.places.tags
-        return {"unit": number, "interval": interval, "timeout": timeout, "tags": tags}
+        # The source read each entity alone: registers between them may not exist.
+        settings = {"unit": number, "interval": interval, "timeout": timeout, "max_gap": 0}
+        return {**settings, "tags": self.places.tags}
 
 
 @dataclass
@@ -196,7 +214,11 @@ class _Hub:
 
     desk: Desk
     hub: Section
-    url: str = ""
+    location: str = ""
+    """The URL without its options."""
+    line: dict[str, Any] = field(default_factory=dict)
+    """The options of the serial line."""
+    tolerance: dict[str, float] = field(default_factory=dict)
     timeout: float = TIMEOUT_S
     units: dict[int, _Unit] = field(default_factory=dict)
 
@@ -204,12 +226,28 @@ class _Hub:
         hub = self.hub
         kind = hub.word("type", tuple(_SCHEMES), required=True)
         if kind is not None:
-            self.url = self._serial_url() if kind == "serial" else self._network_url(kind)
+            self.location = self._serial() if kind == "serial" else self._network(kind)
         self.timeout = hub.number("timeout") or TIMEOUT_S
         for platform, convert in PLATFORMS.items():
             for entity in self._entities(platform):
                 self._entity(entity, convert)
+        self._choose_functions()
         hub.close(_HUB_REASONS)
+
+    @property
+    def url(self) -> str:
+        """The URL with the options of the line, and what the device needs."""
+        options = {**self.line, **self.tolerance}
+        return f"{self.location}?{urlencode(options)}" if options else self.location
+
+    def _choose_functions(self) -> None:
+        """Writes all values with functions 15 and 16 if one was: the device has no 5 or 6."""
+        written = [unit.places.written for unit in self.units.values()]
+        if not any(each[True] for each in written):
+            return
+        self.tolerance["write_multiple"] = 1
+        for path in (path for each in written for path in each[False]):
+            self.desk.changed(path, "written with function 15 or 16, as others of this hub")
 
     def _entities(self, platform: str) -> list[Section]:
         found = self.hub.get(platform)
@@ -234,15 +272,16 @@ class _Hub:
             convert(unit.places, entity)
         entity.close(_ENTITY_REASONS)
 
-    def _network_url(self, kind: str) -> str:
+    def _network(self, kind: str) -> str:
         host = self.hub.text("host", required=True) or ""
         port = self.hub.integer("port", 1, 65535, required=True, what="a port") or 0
         url = f"{_SCHEMES[kind]}://{joined(host, port)}"
         if host and port:
             self._check(url, "host")
-        return f"{url}{self._query({}, 0)}"
+        self._pauses(0)
+        return url
 
-    def _serial_url(self) -> str:
+    def _serial(self) -> str:
         hub = self.hub
         method = hub.word("method", ("rtu", "ascii"), required=True) or "rtu"
         port = hub.text("port", required=True) or ""
@@ -258,9 +297,9 @@ class _Hub:
         elif bits == 7:
             self.desk.problem(hub.at("bytesize"), "found 7 with method rtu, allowed: 8")
         scheme, mark, address = port.partition("://")
-        url, query = f"{method}://{quote(port)}", self._query(options, SERIAL_WAIT_MS)
+        url = f"{method}://{quote(port)}"
         if mark and scheme == "socket":
-            url, query = f"{method}+tcp://{address}", self._query({}, SERIAL_WAIT_MS)
+            url, options = f"{method}+tcp://{address}", {}
         elif mark:
             message = f"found {show(port)}, allowed: a serial port, or socket://host:port"
             self.desk.problem(hub.at("port"), message)
@@ -268,7 +307,9 @@ class _Hub:
             url = f"{method}:///{quote(port)}"
         if (port and not mark) or scheme == "socket":
             self._check(url, "port")
-        return f"{url}{query}"
+        self.line = {key: value for key, value in options.items() if value is not None}
+        self._pauses(SERIAL_WAIT_MS)
+        return url
 
     def _check(self, url: str, key: str) -> None:
         try:
@@ -278,11 +319,10 @@ class _Hub:
             message = "found a secret, allowed: the address of a device" if hidden else str(error)
             self.desk.problem(self.hub.at(key), message)
 
-    def _query(self, options: dict[str, Any], usual_wait_ms: int) -> str:
-        """Options of the line, and pauses that the source made."""
+    def _pauses(self, usual_wait_ms: int) -> None:
+        """The pauses that the source made."""
         wait = self.hub.integer("message_wait_milliseconds", 0, 60_000, what="milliseconds")
         wait = usual_wait_ms if wait is None else wait
         delay = self.hub.integer("delay", 0, 60, what="seconds")
-        pauses = {"pause": wait / 1000 if wait else None, "pause_after_connect": delay or None}
-        given = {key: value for key, value in {**options, **pauses}.items() if value is not None}
-        return f"?{urlencode(given)}" if given else ""
+        pauses = {"pause": wait / 1000, "pause_after_connect": delay}
+        self.tolerance = {key: value for key, value in pauses.items() if value}

@@ -1,0 +1,79 @@
+"""The tags of SunSpec points: their names, and the scales that registers contain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from holdfast.discovery.described import Described
+from holdfast.protocol import READ_LIMITS
+from holdfast.tags import Tag
+from holdfast.tags.scale import RegisterScale
+from holdfast.values.types import parsed
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from holdfast.discovery.sunspec import Model, Point, SunSpec
+
+
+def tags_of(found: SunSpec) -> Iterator[Described]:
+    """The points of all models that have a value."""
+    names: set[str] = set()
+    for model in found.models:
+        for point in model.points:
+            if point.value is not None:
+                yield _of_point(model, point, names)
+
+
+def _of_point(model: Model, point: Point, names: set[str]) -> Described:
+    scale, flaw = _scale_of(point)
+    name = _unique(f"{model.name}_{point.name}{'_raw' if flaw else ''}", names)
+    text = f"SunSpec model {model.id}"
+    if point.label:
+        text += f", {point.label}"
+    if point.scaled_by is not None:
+        text += f"; {'no ' if flaw else ''}scale from {point.scaled_by}"
+    if flaw:
+        text += f", {flaw}"
+    if point.can_be_written:
+        text += "; can be written"
+    tag = Tag(
+        name,
+        "holding_registers",
+        point.address,
+        point.type,
+        scale=1 if flaw else point.scale,
+        unit="" if flaw else point.unit,
+        states=point.states,
+        null=frozenset(() if point.missing is None else (point.missing,)),
+        description=text,
+    )
+    if scale is None:
+        return Described(tag, 1.0, (point.value,), (text,))
+    return Described(replace(tag, scale=scale), 1.0, (point.value,), (text,), shown=tag)
+
+
+def _scale_of(point: Point) -> tuple[RegisterScale | None, str]:
+    """The register that contains the scale of a point, or why no tag can have it."""
+    if point.scaled_at is None:
+        return None, ""
+    size = parsed(point.type).registers
+    first, last = (
+        min(point.address, point.scaled_at),
+        max(point.address + size, point.scaled_at + 1),
+    )
+    if last - first > READ_LIMITS["holding_registers"]:
+        return None, f"which is at {point.scaled_at}, too far to be read with it"
+    source = Tag("", "holding_registers", point.scaled_at, "int16")
+    return RegisterScale("exponent", source=source), ""
+
+
+def _unique(name: str, names: set[str]) -> str:
+    """The name, with a number if another tag has it, of at most 64 characters."""
+    chosen, number = name[:64], 1
+    while chosen in names:
+        number += 1
+        chosen = f"{name[:60]}_{number}"
+    names.add(chosen)
+    return chosen
