@@ -82,6 +82,7 @@ LINK: dict[str, int] = {
 LOG: dict[str, Any] = {
     "phase": "running",
     "connected": True,
+    "obstacle": None,
     "digest": (9, "abc", False),
     "contact_age": 0.5,
     "sequence": 9,
@@ -391,6 +392,14 @@ AUDIT = {
     "failing": True,
     "copies": {"syslog": {"sent": 3, "failed": 2, "dropped": 1, "waiting": 4}},
 }
+
+
+def test_a_connected_log_without_contact_is_not_up(
+    client: web.Client, diagnostics: Diagnostics
+) -> None:
+    late = LOG | {"contact_age": 68.9, "obstacle": "last contact 68.9 s ago, allowed 5 s"}
+    web.stand_in(diagnostics).logs = {"site": late}
+    assert samples(client.get("/metrics").body.decode())["holdfast_log_up", "site"] == 0
 
 
 @pytest.mark.parametrize("audit", [None, AUDIT])

@@ -163,6 +163,7 @@ def test_a_node_that_is_behind_its_log_is_live_and_not_ready(run: Run, nats: Nat
         wire.until(lambda: "logs" in failed(appliance), "it is behind")
         assert set(failed(appliance)) == {"logs"}
         assert failed(appliance)["logs"].startswith("site: ")
+        assert appliance.replicas()["site"]["obstacle"] is not None
         assert probe(appliance, "live")[0] == 200
     finally:
         nats.thaw()

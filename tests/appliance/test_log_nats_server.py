@@ -5,11 +5,13 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import resource
 import shutil
 import signal
 import socket
 import subprocess
 import sys
+import threading
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -20,6 +22,8 @@ import pytest
 import holdfast
 from holdfast.appliance import Appliance
 from holdfast.config import load
+from holdfast.net.nats_server.folder import Folder as NatsFolder
+from holdfast.net.nats_server.log import ServerLog
 from support import wire
 from support.brokers import free_port
 from support.cli import RunCommand, answer, done, invoke
@@ -116,6 +120,59 @@ def test_a_server_that_dies_is_started_again(
     told = [getattr(each, "fields", {}) for each in (first, second)]
     assert [each["error"] for each in told] == ["killed by signal 9"] * 2
     assert told[1]["pause"] == 2 * told[0]["pause"]
+
+
+def test_a_server_whose_disk_was_full_is_started_again_when_it_has_room(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = configuration(tmp_path, free_port(), more=", max_lag: 0.5")
+    has_room = threading.Event()
+    monkeypatch.setattr(NatsFolder, "has_room", lambda _: has_room.is_set())
+    with Appliance(load(file)) as appliance, wire.Connection(endpoint(appliance, "scada")) as peer:
+        resource.prlimit(server(tmp_path), resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
+        wire.until(lambda: len(failed_writes(caplog)) > 1, "writes fail")
+        assert is_server(appliance, {"running": True, "restarts": 0})
+        has_room.set()
+        again = {"running": True, "restarts": 1}
+        wire.until(lambda: is_server(appliance, again), "it is started again")
+        wire.until(lambda: peer.ask(WRITE) == WRITE, "writes are taken again")
+        assert is_server(appliance, again)
+
+
+@pytest.mark.parametrize(
+    ("text", "times"),
+    [
+        ("Filestore [s] Critical write error: no space left on device", 1),
+        ("JetStream stream '$G > s' critical write error: no space left on device", 1),
+        ("JetStream failed to store a msg on stream '$G > s': input/output error", 1),
+        ("JetStream file resource limits exceeded for server", 1),
+        ("127.0.0.1:5000 - cid:5 - authentication error", 0),
+    ],
+)
+def test_lines_that_say_that_the_server_refuses_writes_are_found(text: str, times: int) -> None:
+    found: list[str] = []
+    log = ServerLog(refuses=lambda: found.append(text))
+    for line in (f"[ERR] {text}", "[INF] Server is ready", f"[ERR] {text}"):
+        log.take(f"[9] 2026/11/27 14:05:11.538896 {line}")
+    assert len(found) == times
+
+
+def failed_writes(caplog: pytest.LogCaptureFixture) -> list[str]:
+    texts = [getattr(each, "fields", {}).get("text", "") for each in caplog.records]
+    return [text for text in texts if "failed to store a msg" in text]
+
+
+def test_a_folder_has_room_if_its_disk_takes_a_file(tmp_path: Path) -> None:
+    folder = NatsFolder(tmp_path / "log")
+    assert folder.has_room()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        assert not folder.has_room()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        folder.close()
+    assert not (folder.path / "room").exists()
 
 
 def test_it_serves_this_machine_and_who_knows_the_token(file: Path, tmp_path: Path) -> None:

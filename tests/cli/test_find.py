@@ -339,6 +339,21 @@ def test_invalid_bytes_on_a_line_are_told(tmp_path: Path) -> None:
     )
 
 
+def test_unit_ids_with_invalid_replies_are_told(tmp_path: Path) -> None:
+    def behave(asked: Asked) -> None:
+        if asked.unit == 2:
+            asked.send(lines.RTU.damaged(registers(asked.pdu), asked.unit))
+
+    def are_told(timeout: float) -> bool:
+        options = ("--units", "1-3", "--timeout", str(timeout))
+        text = cli.invoke("find", device.url, *options).stdout.splitlines()
+        found = json.loads(cli.invoke("find", device.url, *options, "--json").stdout)
+        return text[1:] == ["no device: 1, 3", "invalid replies: 2"] and found["garbled"] == [2]
+
+    with Serial(lines.RTU, tmp_path / "line", then=behave) as device:
+        wire.until_long_enough(are_told, "the reply of unit 2 is invalid")
+
+
 def test_a_line_that_is_not_there_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "missing"
     [told] = failure("find", f"rtu://{path}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from holdfast.cli.appliance import log_status
 from support import wire
 from support.brokers import NatsServer, free_port
 from support.cli import RunCommand, answer, invoke
@@ -44,6 +45,25 @@ def node(tmp_path: Path, server: NatsServer) -> Iterator[RunCommand]:
     command.process.communicate()
 
 
+def test_a_connected_log_without_contact_is_not_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    reason = "the log has confirmed nothing for 3.8 s"
+    late = "last contact 68.9 s ago, allowed 5 s"
+    counters = dict.fromkeys(("sequence", "lag", "steps", "unavailable", "not_confirmed"), 0)
+    nodes = [{"name": name, "sequence": 8, "time_ns": 0, "digest": None} for name in ("a", "b")]
+    status = {
+        **{"phase": "running", "failure": None, "connected": True, "server": "127.0.0.1:4222"},
+        **{"contact_age": 68.9, "obstacle": late, "last_error": reason, "embedded": None},
+        **{"node": "a", "nodes": nodes, "digest": [7, "0123456789abcdef", True], **counters},
+    }
+    monkeypatch.setattr(log_status, "ask", lambda *_: {"logs": {"site": status}})
+    result = invoke("log", "status", __file__)
+    assert result.exit_code == 3
+    lines = result.stdout.splitlines()
+    assert lines[3:5] == [f"  not caught up: {late}", f"  last error: {reason}"]
+    assert [line.split()[0::3] for line in lines[6:]] == [["a", "7"], ["b"]]
+    assert lines[6].split()[-1] == "0123456789ab"
+
+
 def test_a_signal_ends_a_start_that_waits_for_the_log(tmp_path: Path) -> None:
     file = tmp_path / "a plant.yaml"
     file.write_text(CONFIGURATION.format(url=f"nats://127.0.0.1:{free_port()}"))
@@ -64,6 +84,7 @@ def test_the_nodes_of_a_log_are_shown(node: RunCommand, server: NatsServer, tmp_
         connection.ask(bytes.fromhex("060003002a"))
         status = answer("log", "status", file)["logs"]["site"]
         assert (status["phase"], status["connected"], status["steps"]) == ("running", True, 1)
+        assert (status["node"], status["obstacle"]) == ("scada-a", None)
         lines = invoke("log", "status", file).stdout.splitlines()
         assert lines[0] == f"log site: running, connected to {server.url.removeprefix('nats://')}"
         assert lines[2] == "  writes of this node: 1 done, 0 not sent, 0 not confirmed"
@@ -75,7 +96,8 @@ def test_the_nodes_of_a_log_are_shown(node: RunCommand, server: NatsServer, tmp_
     lines = invoke("log", "status", file).stdout.splitlines()
     assert lines[0] == "log site: running, not connected"
     assert lines[2] == "  writes of this node: 1 done, 1 not sent, 0 not confirmed"
-    assert lines[3].startswith("  last error: ")
+    assert lines[3] == "  not caught up: not connected"
+    assert lines[4].startswith("  last error: ")
     assert node.end(signal.SIGTERM)[0] == 0
     result = invoke("log", "status", file)
     assert (result.exit_code, result.stdout) == (1, "")

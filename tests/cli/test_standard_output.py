@@ -37,6 +37,29 @@ def test_a_full_disk_is_one_line_of_error(words: Sequence[str]) -> None:
 
 
 @with_full
+def test_tags_that_a_full_disk_leaves_unwritten_are_named(tmp_path: Path) -> None:
+    tags = tmp_path / "tags.yaml"
+    place = "area: holding_registers, writable: true"
+    rows = [f"  {name}: {{{place}, address: {at}}}" for at, name in enumerate("abc")]
+    tags.write_text("\n".join(["tags:", *rows]))
+    memory = holdfast.Memory(holding_registers=3)
+    with (
+        FULL.open("wb") as full,
+        holdfast.Server({1: memory}, bind="127.0.0.1:0", access="read-write") as server,
+    ):
+        ended = subprocess.run(
+            [*HOLDFAST, "write", cli.url(server), "a=1", "b=2", "c=3", "--tags", str(tags)],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    told = "Not written: b, c\nholdfast: standard output: No space left on device\n"
+    assert (ended.returncode, ended.stderr) == (1, told)
+    assert memory.read("holding_registers", 0, 3) == [1, 0, 0]
+
+
+@with_full
 def test_a_service_runs_although_nobody_can_read_its_greeting() -> None:
     port = free_port()
     with FULL.open("wb") as full:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from typing import TYPE_CHECKING
 
 import pytest
 
-from support import cli
+from support import cli, wire
 from support.brokers import free_port
 from support.cli import answer, done, failure, usage_error
-from support.fake_device import FakeDevice, exception
+from support.fake_device import FakeDevice, Serial, exception, silent
+from support.lines import RTU
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import holdfast
     from holdfast.types import Area
 
@@ -123,6 +127,8 @@ def test_many_values_are_written_by_several_requests_if_that_is_wanted(
         (("co", "0", "2"), "'2' is not true, false, on, off, 1 or 0."),
         (("hr", "0", "x", "--type", "float32"), "'x' is not a number."),
         (("hr", "0", "1e99", "--type", "float32"), "of float32."),
+        (("hr", "0", "1e999", "--type", "float64"), "'1e999' is outside the range of float64."),
+        (("hr", "0", "-1e999", "--type", "float16"), "'-1e999' is outside the range of float16."),
         (("hr", "0", "xy", "--type", "bytes:1"), "'xy' is not hex, allowed: pairs of hex digits."),
         (("hr", "0", "ABC", "--type", "string:2"), "allowed in string:2: up to 2."),
         (("hr", "0", "1", "--type", "int16[2]"), "int16[2] takes 2 values, found 1."),
@@ -163,6 +169,42 @@ def forgetful(pdu: bytes) -> bytes | None:
     if pdu[0] == 3:
         return bytes([3, 2 * pdu[4]]) + struct.pack(">H", 8) * pdu[4]
     return pdu[:5]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "read URL hr 0",
+        "read URL hr:0 co:1",
+        "read URL fifo:0 --json",
+        "watch URL hr 0",
+        "describe map URL --json",
+        "describe identify URL",
+        "describe status URL",
+        "bench URL hr:0 --count 1",
+        "write URL hr 0 7 --verify",
+        "write URL file:4:0 7 --verify",
+        "write URL level=7 --tags TAGS --verify",
+    ],
+)
+def test_only_writes_go_to_all_units_of_a_line(tmp_path: Path, words: str) -> None:
+    tags = tmp_path / "tags.yaml"
+    tags.write_text("tags: {level: {area: holding_registers, address: 0, writable: true}}")
+    call = words.replace("TAGS", str(tags)).replace("URL", "rtu:///dev/missing").split()
+    told = "Unit id 0 is the broadcast on a serial line: nobody answers it."
+    if "--json" in call:
+        found = cli.invoke(*call, "--unit", "0")
+        assert (found.exit_code, json.loads(found.stdout)["detail"]) == (2, told)
+    else:
+        assert usage_error(*call, "--unit", "0") == f"Error: {told}"
+
+
+def test_a_write_to_all_units_of_a_line_is_sent(tmp_path: Path) -> None:
+    with Serial(RTU, tmp_path / "line", then=silent) as device:
+        written = done("write", device.url, "hr", "5", "7", "--unit", "0")
+        wire.until(lambda: device.requests, "the request is there")
+    assert written == ["Written: holding_registers 5, 1 request."]
+    assert [(asked.unit, asked.pdu.hex()) for asked in device.requests] == [(0, "0600050007")]
 
 
 def test_what_is_not_read_back_alike_is_told() -> None:

@@ -11,6 +11,7 @@ import pytest
 from playwright.sync_api import expect
 
 from holdfast.client.url import Tls
+from holdfast.tags import Tag, TagList
 from support import gateway_pages
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
 from support.gateway_pages import DESK, PHONE, Opened, Pages, View, floats, opening
@@ -467,6 +468,22 @@ def test_a_token_is_asked_for_and_kept_in_the_tab_only(opened: Opened) -> None:
     assert not view.page.evaluate(kept.format("sessionStorage", SECRET))
 
 
+def test_a_token_that_is_given_late_allows_writing(opened: Opened) -> None:
+    view = opened(tokens=(("edge", hashlib.sha256(SECRET.encode()).digest()),))
+    box = view.page.get_by_label("Token", exact=True)
+    expect(box).to_be_focused()
+    view.page.keyboard.press("Escape")
+    expect(box).to_be_hidden()
+    view.connect()
+    box.fill(SECRET)
+    view.page.keyboard.press("Enter")
+    view.says("The device responded")
+    view.says("reads and writes")
+    view.button("Read").click()
+    expect(view.button("Write 0")).to_be_visible()
+    expect(view.page.get_by_text("Writes are disabled")).to_be_hidden()
+
+
 def test_a_device_is_part_of_the_address_of_the_page(opened: Opened) -> None:
     view = opened()
     view.connect()
@@ -739,6 +756,30 @@ def test_a_write_that_is_left_alone_is_told_when_it_ends(opened: Opened) -> None
         view.says("Unknown whether it was written. The table shows")
 
 
+@pytest.mark.parametrize("answered", [True, False])
+def test_a_write_is_told_if_another_range_is_read_meanwhile(opened: Opened, answered: bool) -> None:
+    held: list[Route] = []
+
+    def hold(route: Route) -> None:
+        if held:
+            route.continue_()
+        else:
+            held.append(route)
+
+    with FakeDevice(Registers()) as device:
+        view = opened()
+        read_registers(view, device.port)
+        view.page.route("**/api/modbus/watch/view", hold)
+        with view.page.expect_request("**/api/modbus/watch/view"):
+            write_4711(view)
+        view.read_four(2)
+        if answered:
+            held[0].continue_()
+        else:
+            held[0].abort()
+        view.says(f"Written: 1 of 127.0.0.1:{device.port}.")
+
+
 def test_errors_before_a_write_are_told_in_plain_words(opened: Opened) -> None:
     device = Registers()
     with FakeDevice(device) as vanishing:
@@ -828,6 +869,36 @@ def test_an_old_review_is_refreshed_before_a_write(opened: Opened) -> None:
         view.button("Write it").click()
         view.says("Written. Reading back failed.")
         assert device.values[1] == 4711
+
+
+def level(scale: float) -> TagList:
+    return TagList([Tag("level", "holding_registers", 1, "uint16", scale=scale, writable=True)])
+
+
+@pytest.mark.parametrize("noticed", ["while it is open", "before the write", "without a read"])
+def test_a_review_ends_if_the_tag_has_another_definition(opened: Opened, noticed: str) -> None:
+    profiles = {"tank": level(0.1)}
+    device = Registers()
+    with FakeDevice(device) as tank:
+        view = opened(profiles=profiles)
+        view.page.evaluate(REFRESHED_AFTER, 20 if noticed == "while it is open" else NEVER)
+        view.connect(port=tank.port)
+        view.says("The device responded")
+        view.button("Add tag list…").click()
+        view.page.get_by_role("combobox", name="Profile of the configuration").select_option("tank")
+        view.button("Add").click()
+        view.button("Read").click()
+        view.says("tank: read in")
+        device.hides = noticed == "without a read"
+        dialog = review(view, "Write level", "50")
+        now = "not read" if device.hides else "123.4"
+        expect(dialog.get_by_role("row", name=f"level {now} 50.0")).to_be_visible()
+        profiles["tank"] = level(0.01)
+        if noticed != "while it is open":
+            view.button("Write it").click()
+        view.says("The gateway has another definition of level now.")
+        expect(view.button("Write it")).to_be_hidden()
+        assert device.writes == []
 
 
 def test_a_change_of_the_device_makes_what_is_shown_old(opened: Opened) -> None:
@@ -1153,6 +1224,26 @@ def test_a_plot_that_can_not_be_is_told(opened: Opened) -> None:
     view.button("Add plot").click()
     view.says("3 is already plotted.")
     expect(view.button("Remove the plot of 3")).to_be_visible()
+
+
+@pytest.mark.parametrize(
+    ("kind", "held", "text"),
+    [
+        ("uint64", [0x20, 0, 0, 1], "9007199254740993"),
+        ("float64", [0x413C, 0x9C45, 0x3333, 0x3333], "1875013.2"),
+    ],
+)
+def test_a_plot_has_the_digits_of_the_table(
+    opened: Opened, plant: holdfast.Memory, kind: str, held: list[int], text: str
+) -> None:
+    plant.write("holding_registers", 8, held)
+    view = opened()
+    view.connect()
+    view.choose(type=kind, address="8", quantity="4", interval="50")
+    view.button("Read").click()
+    expect(view.row(8).locator(".typed")).to_have_text(text)
+    view.button("Plot 8").click()
+    expect(view.page.get_by_role("article").get_by_role("status")).to_have_text(text)
 
 
 def test_a_watch_goes_on_when_the_gateway_is_back(opened: Opened) -> None:

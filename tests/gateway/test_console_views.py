@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -304,6 +305,28 @@ def test_a_dialog_that_waits_says_so(opened: Opened) -> None:
     view.says("Reading the current value…")
 
 
+def test_a_dialog_does_not_wait_for_the_one_before(opened: Opened) -> None:
+    view = opened()
+    view.page.get_by_role("spinbutton", name="Timeout").fill("60000")
+    view.connect()
+    view.button("Read").click()
+    view.says("read in")
+    view.page.route("**/api/modbus/read", lambda _: None)
+    view.button("Write 4").click()
+    view.page.get_by_role("textbox", name="New value").fill("5")
+    view.button("Review").click()
+    wait = view.page.get_by_text("Reading the current value…")
+    expect(wait).to_be_visible()
+    with view.page.expect_event("requestfailed"):
+        view.page.keyboard.press("Escape")
+    view.page.unroute("**/api/modbus/read")
+    view.button("Write 5").click()
+    expect(wait).to_be_hidden()
+    view.page.get_by_role("textbox", name="New value").fill("6")
+    view.button("Review").click()
+    expect(view.page.get_by_role("row", name="5 0 0x0000 6 0x0006")).to_be_visible()
+
+
 # Gaps and old values.
 
 
@@ -473,6 +496,22 @@ def test_a_damaged_link_is_told(opened: Opened) -> None:
     view.says("Holding registers 0 to 9: read in")
 
 
+def test_the_link_to_the_values_leaves_that_of_the_page(opened: Opened) -> None:
+    view = connected(opened)
+    link = view.page.url
+    view.page.get_by_role("link", name="Skip to values").press("Enter")
+    expect(view.page.locator("#work")).to_be_focused()
+    expect(view.page).to_have_url(link)
+
+
+def test_another_link_is_opened_in_the_same_tab(opened: Opened) -> None:
+    view = connected(opened)
+    device = f"host=127.0.0.1&port={view.port}"
+    view.page.goto(f"{view.gateway.url}/#{device}&area=4&address=1000&quantity=2&watch=1")
+    view.says("Watching input registers 1000 to 1001")
+    expect(view.page).to_have_url(re.compile("area=4&address=1000"))
+
+
 # Downloads.
 
 
@@ -496,6 +535,21 @@ def test_what_is_shown_is_downloaded(opened: Opened, plant: holdfast.Memory) -> 
     assert ("room", "4", "123.4", "°C", "current") in shown
     assert "Illegal Data Address" in rows[-1]["error"]
     assert all(re.fullmatch(r"\d{4}-\d\d-\d\dT[\d:.]+Z", row["time"]) for row in rows)
+
+
+def test_coils_that_were_never_read_have_no_value_in_a_download(opened: Opened) -> None:
+    view = connected(opened)
+    view.choose(area="1", address="1000", quantity="2")
+    view.button("Add range to view").click()
+    view.choose(area="3", address="0")
+    view.button("Add range to view").click()
+    view.button("Read").click()
+    view.says("1 of 2 parts: read in")
+    with view.page.expect_download() as found:
+        view.button("Download values as CSV").click()
+    coils = [row for row in saved(found.value) if row["area"] == "coils"]
+    assert [row["value"] for row in coils] == ["", ""]
+    assert "Illegal Data Address" in coils[0]["error"]
 
 
 # Narrow screens.
@@ -559,3 +613,37 @@ def test_a_map_tells_absent_from_not_asked_and_zooms(opened: Opened) -> None:
     for _ in range(2):
         view.button("Zoom out: holding registers").click()
     expect(picture.locator(".scale")).to_contain_text("65535")
+
+
+def test_a_map_whose_gateway_ends_says_so(opened: Opened) -> None:
+    area = {"area": "coils", "addresses": 8, "ranges": [[0, 7]], "notSearchedFrom": 64}
+    progress = {"at": 64, "total": 65536, "requests": 1, "areas": [area]}
+    body = f"event: progress\ndata: {json.dumps(progress)}\n\n"
+    view = connected(opened)
+    view.page.get_by_role("tab", name="Map").click()
+    for name in ("Discrete inputs", "Holding registers", "Input registers"):
+        view.page.get_by_role("checkbox", name=name).uncheck()
+    view.page.route(
+        "**/api/modbus/map",
+        lambda route: route.fulfill(content_type="text/event-stream", body=body),
+    )
+    view.button("Map device").click()
+    view.says("The gateway does not answer.")
+    view.says("Not searched: coils from 64.")
+    expect(view.button("Read coils 0–7")).to_be_visible()
+    expect(view.button("Map device")).to_be_visible()
+
+
+def test_the_last_address_of_a_map_is_not_below_the_first(opened: Opened) -> None:
+    view = connected(opened)
+    view.page.get_by_role("tab", name="Map").click()
+    view.page.get_by_role("spinbutton", name="First address").fill("2000")
+    last = view.page.get_by_role("spinbutton", name="Last address")
+    last.fill("100")
+    view.button("Map device").click()
+    expect(last).to_be_focused()
+    told = last.evaluate("(each) => each.validationMessage")
+    assert told == "The last address is below the first one, 2000."
+    last.fill("2100")
+    view.button("Map device").click()
+    view.says("Done in")

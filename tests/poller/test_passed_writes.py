@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import resource
+import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
@@ -12,6 +14,8 @@ import pytest
 import holdfast
 from support import web, wire
 from support.audits import writes
+from support.cli import RunCommand
+from support.config_folder import written
 from support.fake_device import Asked, Stream, exception, good
 from support.polled import configuration, counters, device, read, until_polled
 from support.running import endpoint, log_events
@@ -340,6 +344,33 @@ def test_rest_writes_through_too_and_tells_the_exception(run: Run) -> None:
             refused = rest.ingest(web.command("holding_registers", 10, [3], "mirror"))
         assert (refused.status, refused.json["reason"]) == (502, "device_refused")
         assert "meter did not take the write: exception 04" in refused.json["detail"]
+
+
+@pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="only Linux has prlimit")
+def test_a_write_that_memory_could_not_keep_is_not_confirmed(tmp_path: Path) -> None:
+    mirror = {"holding_registers": 100, "keep": {"file": "mirror", "sync": 0}}
+    reads = [read("holding_registers", 500, 3, ("holding_registers", 10))]
+    with plc() as source, contextlib.ExitStack() as stack:
+        settings = {
+            "memories": {"mirror": mirror},
+            "devices": {"meter": device(source.url, *reads, **RARELY)},
+            "listeners": {"scada": MORE["listeners"]["scada"]},
+        }
+        file = tmp_path / "plant.yaml"
+        file.write_text(written(settings))
+        command = RunCommand(file)
+        stack.callback(command.end, signal.SIGTERM)
+        host, port = command.wait_until_it_serves()
+        with holdfast.SyncClient(f"tcp://{host}:{port}", timeout=wire.DEADLINE) as scada:
+            wire.until(lambda: scada.read_holding_registers(11, 1) == [501], "it is read")
+            pid = command.process.pid
+            _, most = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, most))
+            with refused_with(0x0B):
+                scada.write_register(11, 7)
+            assert scada.read_holding_registers(11, 1) == [501]
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (most, most))
+        assert writes_of(source) == [b"\x06\x01\xf5\x00\x07"]
 
 
 @pytest.mark.parametrize(("fail", "status"), [("open", 200), ("closed", 503)])

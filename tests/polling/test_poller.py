@@ -115,6 +115,12 @@ def test_a_refused_address_costs_only_its_own_tag(device: holdfast.Server, polle
     wire.until(settled, "only the bad tag is refused")
 
 
+def test_nothing_is_polled_from_all_units_of_a_line(poller: Poller) -> None:
+    with pytest.raises(ValueError, match="unit 0 of a serial line is the broadcast"):
+        poller.add("rtu:///dev/x", {"a": ("coils", 0)}, unit=0)
+    assert poller.counters() == {}
+
+
 def test_a_device_that_can_not_be_reached_has_readings_too(poller: Poller) -> None:
     tags = {"a": ("coils", 0), "b": ("input_registers", 100)}
     poller.add(f"tcp://127.0.0.1:{free_port()}", tags)

@@ -120,6 +120,18 @@ def test_a_program_is_restarted_after_pauses_that_grow() -> None:
     ]
 
 
+def test_a_program_that_is_terminated_is_restarted() -> None:
+    output = Lines()
+    running = child(SERVE, output, restarts=Backoff(0.01, 60.0, jitter=False))
+    running.start(wire.DEADLINE)
+    before = output.process
+    running.terminate()
+    wire.until(lambda: running.is_ready and running.restarts == 1, "it is back")
+    assert is_over(before)
+    running.stop()
+    assert is_over(output.process)
+
+
 def test_a_stop_ends_the_pause_before_a_restart() -> None:
     output = Lines()
     paused = threading.Event()

@@ -6,6 +6,7 @@ and the reply to the next request is the first that comes.
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import re
 import struct
@@ -18,13 +19,16 @@ import pytest
 from pymodbus.client import AsyncModbusSerialClient, ModbusSerialClient
 from pymodbus.framer import FramerType
 
+import holdfast
 from holdfast.types import AREAS
 from support import lines, wire
 from support.audits import writes
 from support.config_folder import written
+from support.fake_device import Stream, good
 from support.lines import ASCII, RTU, UNIT, Cable, Line, Mode
 from support.machine import tool
 from support.pymodbus_peer import OPTIONS, Patient, connected, tour
+from support.routed import Held
 from support.running import content
 from support.transports import ALL
 from support.vectors import cases, overlay
@@ -33,7 +37,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    import holdfast
     from holdfast.appliance import Appliance
     from support.running import Run
 
@@ -305,6 +308,55 @@ def test_a_silence_that_is_configured_holds_in_place_of_that_of_the_baud_rate(
 
     assert time.monotonic() < deadline
     assert plant.serves()
+
+
+def test_a_reply_that_comes_back_is_no_request(plant: Plant) -> None:
+    """A two-wire adapter may receive what it sends."""
+    for pdu, reply in ((WRITE, WRITE), (READ, bytes.fromhex("03021234")), (WRITE, WRITE)):
+        plant.line.send(plant.line.mode.frame(pdu))
+        assert plant.line.receive() == (UNIT, reply)
+        plant.memory.write("holding_registers", 0, [0x1234])
+        plant.line.send(plant.line.mode.frame(reply))
+
+    assert plant.line.ask(READ) == bytes.fromhex("03021234")
+    assert plant.line.is_quiet()
+    assert sum(plant.counters["requests"].values()) == 4
+    plant.memory.write("holding_registers", 0, [0])
+    assert plant.serves()
+
+
+def test_a_write_may_be_repeated_at_once(plant: Plant) -> None:
+    assert plant.line.ask(READ) == ZERO
+    assert [plant.line.ask(WRITE) for _ in range(3)] == [WRITE] * 3
+
+
+def test_a_reply_that_a_master_no_longer_waits_for_is_not_sent(start: Start) -> None:
+    held = Held()
+    with Stream("tcp", then=good) as device:
+        device.script = [held]
+        plant = start(
+            units={UNIT: {"route": "meter"}},
+            devices={"meter": {"url": device.url, "unit": 1, "timeout": wire.DEADLINE}},
+        )
+        plant.line.send(plant.line.mode.frame(bytes.fromhex("0300050001")))
+        device.await_requests(1)
+        plant.line.send_pieces(plant.line.mode.frame(bytes.fromhex("0300060001")))
+        held.release()
+        assert plant.line.receive() == (UNIT, bytes.fromhex("03020006"))
+        assert plant.line.is_quiet()
+
+
+def test_a_line_that_another_program_has_locked_is_not_opened(line: Line) -> None:
+    client = holdfast.SyncClient(f"{line.mode.name}://{line.device}?parity=none", timeout=0.1)
+    with line.device.open("rb") as other:
+        fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with pytest.raises(holdfast.ConnectFailed, match="another program uses the line"):
+            client.read_coils(0, 1)
+    with pytest.raises(holdfast.RequestTimeout):
+        client.read_coils(0, 1)
+    with line.device.open("rb") as other, pytest.raises(BlockingIOError):
+        fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    client.close()
 
 
 @only_ascii

@@ -80,6 +80,7 @@ def test_a_serial_line(mode: str, tmp_path: Path, memory: holdfast.Memory) -> No
         ("rtu+udp://127.0.0.1:0", {"idle_timeout": 4}, "idle_timeout has no effect with rtu+udp"),
         ("tcp://127.0.0.1:0", {"frame_timeout": 1}, "frame_timeout has no effect with tcp"),
         ("rtu:///dev/x", {"listen_only": True}, "listen_only has no effect with rtu"),
+        ("ascii:///dev/x", {"sources": ["127.0.0.0/8"]}, "sources has no effect with ascii"),
         ("rtu:///dev/x?retries=1", {}, "which has options of clients"),
         ("rtu:///dev/x?speed=1", {}, "unknown option 'speed'"),
         ("rtu://", {}, "has no device"),
@@ -90,6 +91,14 @@ def test_what_a_transport_can_not_be_or_have_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(says)):
         holdfast.Server({1: memory}, bind=bind, access="read-only", **options)
+
+
+@pytest.mark.parametrize("unit", [0, 248, 255])
+def test_a_server_on_a_serial_line_has_no_other_unit_than_1_to_247(
+    memory: holdfast.Memory, unit: int
+) -> None:
+    with pytest.raises(ValueError, match=f"unit id {unit}, allowed on a serial line: 1 to 247"):
+        holdfast.Server({1: memory, unit: memory}, bind="rtu:///dev/x", access="read-only")
 
 
 def test_a_serial_line_has_one_rule(memory: holdfast.Memory) -> None:

@@ -1,8 +1,22 @@
 //! Settings of a serial line, for clients and listeners.
 
+#[cfg(unix)]
+use std::collections::BTreeMap;
 use std::io;
+#[cfg(unix)]
+use std::io::ErrorKind;
+#[cfg(unix)]
+use std::os::fd::OwnedFd;
+#[cfg(unix)]
+use std::path::PathBuf;
+#[cfg(unix)]
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
+#[cfg(unix)]
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
+#[cfg(unix)]
+use rustix::io::Errno;
 use serial2_tokio::rs4xx::Rs485Config;
 use serial2_tokio::{CharSize, FlowControl, Parity, SerialPort, Settings, StopBits};
 
@@ -49,20 +63,30 @@ pub struct SerialLine {
     pub direction: LineDirection,
 }
 
+/// An open line. Programs that ask for its lock, as this one does, can't open it meanwhile: two masters would
+/// take each other's replies.
+#[derive(Debug)]
+pub(crate) struct OpenLine<Port> {
+    pub(crate) port: Port,
+    _lock: Lock,
+}
+
 impl SerialLine {
     /// Opens the device. Must be called in the context of a runtime.
-    pub(crate) fn open(&self) -> io::Result<SerialPort> {
+    pub(crate) fn open(&self) -> io::Result<OpenLine<SerialPort>> {
+        let lock = lock(&self.device)?;
         let port = SerialPort::open(&self.device, |settings: Settings| self.set(settings))?;
         self.set_direction(|mode| set_mode_of_tokio(&port, mode))?;
-        Ok(port)
+        Ok(OpenLine { port, _lock: lock })
     }
 
     /// Opens the device for blocking calls.
-    pub(crate) fn open_blocking(&self) -> io::Result<serial2::SerialPort> {
+    pub(crate) fn open_blocking(&self) -> io::Result<OpenLine<serial2::SerialPort>> {
+        let lock = lock(&self.device)?;
         let set = |settings: Settings| self.set(settings);
         let port = serial2::SerialPort::open(&self.device, set)?;
         self.set_direction(|mode| set_mode(&port, mode))?;
-        Ok(port)
+        Ok(OpenLine { port, _lock: lock })
     }
 
     /// Lets the driver switch the direction of the line.
@@ -98,8 +122,13 @@ impl SerialLine {
 
     /// Linux refuses to set character size and parity of a pseudo terminal.
     fn is_pseudo_terminal(&self) -> bool {
-        let device = std::fs::canonicalize(&self.device);
-        device.is_ok_and(|device| device.starts_with("/dev/pts"))
+        self.path().starts_with("/dev/pts/")
+    }
+
+    /// The path of the device itself: a link, such as those of `/dev/serial`, is another name of it.
+    pub(crate) fn path(&self) -> String {
+        let path = std::fs::canonicalize(&self.device);
+        path.map_or_else(|_| self.device.clone(), |path| path.to_string_lossy().into_owned())
     }
 
     /// The silence that ends an RTU frame: 3.5 characters by default.
@@ -117,6 +146,40 @@ impl SerialLine {
         let bits = 1 + u32::from(self.data_bits) + parity + u32::from(self.stop_bits);
         Duration::from_secs_f64(f64::from(bits) / f64::from(self.baud))
     }
+}
+
+#[cfg(unix)]
+type Lock = Arc<OwnedFd>;
+
+/// Locks a line. Within this process it may be open twice: a reload opens it before it closes it.
+#[cfg(unix)]
+fn lock(device: &str) -> io::Result<Lock> {
+    static HELD: Mutex<BTreeMap<PathBuf, Weak<OwnedFd>>> = Mutex::new(BTreeMap::new());
+    let path = std::fs::canonicalize(device)?;
+    let mut held = HELD.lock().unwrap_or_else(PoisonError::into_inner);
+    held.retain(|_, lock| lock.strong_count() > 0);
+    if let Some(lock) = held.get(&path).and_then(Weak::upgrade) {
+        return Ok(lock);
+    }
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    let lock = Arc::new(open(&path, flags, Mode::empty())?);
+    flock(&lock, FlockOperation::NonBlockingLockExclusive).map_err(|error| match error {
+        Errno::WOULDBLOCK => {
+            io::Error::new(ErrorKind::ResourceBusy, "another program uses the line")
+        }
+        other => other.into(),
+    })?;
+    held.insert(path, Arc::downgrade(&lock));
+    Ok(lock)
+}
+
+/// Windows lets nobody open a line twice.
+#[cfg(not(unix))]
+type Lock = ();
+
+#[cfg(not(unix))]
+fn lock(_device: &str) -> io::Result<Lock> {
+    Ok(())
 }
 
 #[cfg(target_os = "linux")]

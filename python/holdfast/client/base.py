@@ -10,11 +10,14 @@ from holdfast.values.integers import as_integer
 
 if TYPE_CHECKING:
     from holdfast._core import Request
+    from holdfast.client.url import Target
 
 DEFAULT_TIMEOUT_S = 1.0
 """Seconds for a request and its reply, of clients and of devices that are polled."""
 
 MAX_TIMEOUT_S = 86_400.0
+
+BROADCAST = "unit 0 of a serial line is the broadcast"
 
 
 class BaseClient:
@@ -30,13 +33,16 @@ class BaseClient:
     def unit_for(self, request: Request, unit: int | None) -> int:
         """The unit id of a call. Raises `ValueError` for a function that can't be broadcast."""
         unit = self.unit if unit is None else _unit(unit)
-        if unit == 0 and isinstance(self.target, SerialTarget):
+        if is_broadcast(self.target, unit):
             code = request.pdu[0]
             if code not in BROADCAST_CODES:
-                raise ValueError(
-                    f"unit 0 of a serial line is the broadcast, not allowed for function {code}"
-                )
+                raise ValueError(f"{BROADCAST}, not allowed for function {code}")
         return unit
+
+
+def is_broadcast(target: Target, unit: int) -> bool:
+    """Whether a unit id is the broadcast of a serial line, which has no reply."""
+    return unit == 0 and isinstance(target, SerialTarget)
 
 
 def _unit(unit: int) -> int:

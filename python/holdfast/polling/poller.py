@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
 from holdfast import _core
-from holdfast.client.base import DEFAULT_TIMEOUT_S
+from holdfast.client.base import BROADCAST, DEFAULT_TIMEOUT_S, is_broadcast
 from holdfast.client.endpoint import endpoint
 from holdfast.client.requests import write_typed
 from holdfast.client.url import parse
@@ -99,6 +99,8 @@ class Poller:
         and `RuntimeError` after `close`.
         """
         target = parse(url)
+        if is_broadcast(target, unit):
+            raise ValueError(f"{BROADCAST}, which can't be polled")
         listed = tags if isinstance(tags, TagList) else TagList(_tags(tags))
         if not len(listed):
             raise ValueError("tags is empty, allowed: at least one tag")

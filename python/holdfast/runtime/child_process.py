@@ -106,12 +106,16 @@ class ChildProcess:
         if self.end is not None:
             raise ChildFailed(f"{self._name} ended: {self.end}")
 
-    def stop(self) -> None:
-        """Ends the program, and waits for that. Kills it if it takes too long."""
-        self._stop.set()
+    def terminate(self) -> None:
+        """Ends the program. With `restarts`, it is started again as if it had ended by itself."""
         with self._lock:
             if self._process is not None:
                 self._process.terminate()
+
+    def stop(self) -> None:
+        """Ends the program, and waits for that. Kills it if it takes too long."""
+        self._stop.set()
+        self.terminate()
         if self._thread.ident is None:
             return
         self._thread.join(STOP_TIMEOUT_S)

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 from holdfast import _core
 from holdfast.client.url import SERIAL, STRICT, SerialTarget, parse
 from holdfast.net.addresses import LOOPBACK
+from holdfast.protocol import MAX_SERIAL_UNIT
 from holdfast.server.fork import close_in_children
 from holdfast.server.identity import Identity
 from holdfast.server.options import DEFAULTS, STREAM_DEFAULTS
@@ -52,10 +53,10 @@ SOURCES = tuple(map(str, LOOPBACK))
 class Server:
     """Serves memories over Modbus, from `start` (or `with`) to `stop`.
 
-    `units` maps unit ids, 0 to 255, to memories. Peers from `sources` have `access` to them,
-    limited by `functions` or `deny`, lists of function codes. Alternatively, set `rules`: for each
-    unit id, the first rule that matches the peer and has the unit id applies. A peer without a rule
-    is disconnected at once.
+    `units` maps unit ids, 0 to 255 (1 to 247 on a serial line), to memories. Peers from `sources`
+    have `access` to them, limited by `functions` or `deny`, lists of function codes. Alternatively,
+    set `rules`: for each unit id, the first rule that matches the peer and has the unit id applies.
+    A peer without a rule is disconnected at once.
     `bind` is `address:port` for Modbus TCP, or a URL with the schemes of clients: `tcp`, `tls`,
     `udp`, `rtu+tcp`, `rtu+udp` and `ascii+tcp` with an IP address and a port, `rtu` and `ascii`
     with a serial line, as in `rtu:///dev/ttyUSB0?baud=19200&parity=even`. Port 0 lets the system
@@ -96,6 +97,9 @@ class Server:
                 deny=list(deny) if deny else None,
             )
             rules = [rule]
+            scheme, _ = _split(bind)
+            if scheme in SERIAL:
+                _check_line(scheme, units, sources)
         elif units is not None or access is not None:
             raise TypeError("a server requires units and access, or rules, not both")
         if not 1 <= index(workers) <= MAX_WORKERS:
@@ -189,6 +193,16 @@ def _check(scheme: str, options: ServerOptions) -> None:
             raise TypeError(f"found the option {name!r}, allowed: {', '.join(DEFAULTS)}")
         if name not in allowed and value != cast("dict[str, object]", DEFAULTS)[name]:
             raise ValueError(f"{name} has no effect with {scheme}: omit it")
+
+
+def _check_line(scheme: str, units: Collection[int], sources: Sequence[str]) -> None:
+    """Raises `ValueError` for sources and unit ids that a serial line does not have."""
+    if tuple(sources) != SOURCES:
+        raise ValueError(f"sources has no effect with {scheme}: omit it")
+    for unit in units:
+        if not 1 <= unit <= MAX_SERIAL_UNIT:
+            allowed = f"allowed on a serial line: 1 to {MAX_SERIAL_UNIT}"
+            raise ValueError(f"found the unit id {unit}, {allowed}")
 
 
 def _split(bind: str) -> tuple[str, str]:

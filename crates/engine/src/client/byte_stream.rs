@@ -5,6 +5,7 @@ use std::net::{SocketAddr, TcpStream, UdpSocket};
 use std::time::{Duration, Instant};
 
 use crate::name_lookup::{self, Unresolved};
+use crate::serial_line::OpenLine;
 use crate::tls::TlsFailure;
 
 /// The shortest timeout that all systems accept.
@@ -222,23 +223,23 @@ impl ByteStream for UdpSocket {
     }
 }
 
-impl ByteStream for serial2::SerialPort {
+impl ByteStream for OpenLine<serial2::SerialPort> {
     fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> Result<usize, StreamError> {
         read(|| {
             // A port rounds down to whole milliseconds.
-            self.set_read_timeout(millis(deadline)?)?;
-            Read::read(self, buffer)
+            self.port.set_read_timeout(millis(deadline)?)?;
+            Read::read(&mut self.port, buffer)
         })
     }
 
     fn receive_now(&mut self, buffer: &mut [u8]) -> Result<Option<usize>, StreamError> {
-        self.set_read_timeout(Duration::ZERO)?;
-        at_once(read(|| Read::read(self, buffer)))
+        self.port.set_read_timeout(Duration::ZERO)?;
+        at_once(read(|| Read::read(&mut self.port, buffer)))
     }
 
     fn send(&mut self, bytes: &[u8], deadline: Instant) -> Result<(), StreamError> {
-        self.set_write_timeout(millis(deadline)?)?;
-        Ok(Write::write_all(self, bytes)?)
+        self.port.set_write_timeout(millis(deadline)?)?;
+        Ok(Write::write_all(&mut self.port, bytes)?)
     }
 }
 

@@ -565,15 +565,20 @@ impl Device {
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
         let fence = self.settings.fence.as_ref();
         let permit = Permit { fence: fence.cloned(), until: None };
+        let len = block.area.byte_len(block.count.into());
         let answer =
             self.link.call(*unit_id, &request, *timeout, priority, &permit).await.map(data);
+        // A broadcast has no reply, and so no values.
+        let answer = answer.and_then(|bytes| match bytes.len() == len {
+            true => Ok(bytes),
+            false => Err(Fault::Invalid),
+        });
         // After a stop of the process, a reply may be old, and another node may have read a newer one.
         if fence.is_some_and(|fence| !fence.allows()) {
             return Err(Fault::Standby);
         }
         match &answer {
-            Ok(bytes) => {
-                debug_assert_eq!(bytes.len(), block.area.byte_len(block.count.into()));
+            Ok(_) => {
                 let took = began.elapsed();
                 self.state.answered(took);
                 let mut samples = self.samples.get();

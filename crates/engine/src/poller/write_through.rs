@@ -264,14 +264,19 @@ impl PassedWrite {
             let area = Area::HoldingRegisters;
             changes.push(Change { area, address, count, bytes: bytes.to_vec() });
         }
+        let mut is_stored = true;
         for change in &changes {
-            self.store(change).await;
+            is_stored &= self.store(change).await;
         }
         let reply = match Function::from_pdu(&self.pdu) {
-            Some(Function::ReadWriteMultipleRegisters) => answer,
-            _ => confirmation(&self.pdu),
+            // What memory can't show is not confirmed, although the device has carried it out.
+            _ if !is_stored => {
+                exception(&self.pdu, ExceptionCode::GatewayTargetFailedToRespond.code())
+            }
+            Some(Function::ReadWriteMultipleRegisters) => answer.to_vec(),
+            _ => confirmation(&self.pdu).to_vec(),
         };
-        self.reply.send(reply.to_vec());
+        self.reply.send(reply);
         changes
     }
 
@@ -295,8 +300,9 @@ impl PassedWrite {
         address - self.range.address + self.range.device_address
     }
 
-    /// Waits for the journal of the memory, if it has one, without holding up other devices.
-    async fn store(&self, change: &Change) {
+    /// Whether memory has taken a change. Waits for its journal, if it has one, without holding up other
+    /// devices.
+    async fn store(&self, change: &Change) -> bool {
         let address = change.address - self.range.device_address + self.range.address;
         let Change { area, count, ref bytes, .. } = *change;
         let write = Write { area, address, count: count as usize, bytes };
@@ -306,14 +312,14 @@ impl PassedWrite {
                 let _ = done.send(outcome);
             });
             let submitted = self.memory.submit(Access::Mirror, Operation::Write(&[write]), kept);
-            let _ = outcome.await;
-            submitted
+            let carried_out = outcome.await.is_ok_and(|outcome| outcome.is_ok());
+            submitted.map(|()| carried_out)
         } else {
-            self.memory.write(Access::Mirror, write)
+            self.memory.write(Access::Mirror, write).map(|()| true)
         };
-        // A journal may refuse what the device has confirmed. The next poll tells the memory again.
         let fits = !matches!(stored, Err(Refusal::OutOfRange | Refusal::WrongLength));
         debug_assert!(fits, "a mirrored range is inside its memory: {stored:?}");
+        stored.unwrap_or(false)
     }
 }
 

@@ -167,7 +167,7 @@ MEMORY_FILE_GAUGES = {
 }
 LOG_COUNTERS = {"ignored": ("log_messages_ignored", "Messages that no node has sent.")}
 LOG_GAUGES = {
-    "is_up": ("log_up", "1 if the node is connected to the log and follows it."),
+    "is_up": ("log_up", "1 if the node follows the log: its contents are at most max_lag old."),
     "lag": ("log_lag", "Messages of the log that are not applied yet."),
     "contact_age": ("log_contact_age_seconds", "Time since contents were surely current."),
     "sequence": ("log_sequence", "The sequence that was applied last."),
@@ -235,7 +235,7 @@ def _log_metrics(logs: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
     steps = _counter("log_steps", "Writes of this node, by outcome.", "log", "outcome")
     figures = {}
     for name, stats in logs.items():
-        is_up = stats["phase"] == "running" and stats["connected"]
+        is_up = stats["obstacle"] is None
         differs = stats["digest"] is not None and stats["digest"][2] is False
         figures[name] = {**stats, "is_up": is_up, "differs": differs}
         # A label has the name in docs/metrics.md, the key that of the core.

@@ -130,13 +130,16 @@ class SharedLogs(Part):
         log_servers.begin(name, settings)
 
     def status(self) -> dict[str, dict[str, Any]]:
-        """The state and the counters of each log."""
+        """The state and the counters of each log, and why it is not caught up."""
+        return {name: self._status(name, log.status()) for name, log in self._logs.items()}
+
+    def _status(self, name: str, status: LogStatus) -> dict[str, Any]:
+        settings = self.config.logs[name]
         return {
-            name: {
-                **log.status(),
-                "embedded": self._servers[name].status() if name in self._servers else None,
-            }
-            for name, log in self._logs.items()
+            **status,
+            "node": settings.node,
+            "obstacle": _obstacle(status, settings.max_lag),
+            "embedded": self._servers[name].status() if name in self._servers else None,
         }
 
     def obstacles(self) -> dict[str, str | None]:

@@ -27,7 +27,7 @@ def log_status(file: Path, as_json: bool) -> None:
     """Show the logs of the appliance that runs FILE on this machine, and the nodes in them.
 
     Exit codes: 0 all logs are well, 1 no appliance of this user runs FILE, 3 a log is not
-    connected, has failed, or nodes have different contents.
+    connected, has failed or had no contact within max_lag, or nodes have different contents.
     """
     try:
         found = ask(file, "replicas")["logs"]
@@ -46,7 +46,7 @@ def log_status(file: Path, as_json: bool) -> None:
 
 def _is_well(status: dict[str, Any]) -> bool:
     differs = status["digest"] is not None and status["digest"][2] is False
-    return status["phase"] == "running" and status["connected"] and not differs
+    return status["obstacle"] is None and not differs
 
 
 def _shown(name: str, status: dict[str, Any]) -> list[str]:
@@ -64,9 +64,12 @@ def _shown(name: str, status: dict[str, Any]) -> list[str]:
         lines.append(f"  embedded server: {state}, started again {server['restarts']} times")
     if status["failure"] is not None:
         lines.append(f"  failed: {status['failure'][1]}")
-    elif status["last_error"] is not None and not status["connected"]:
-        lines.append(f"  last error: {status['last_error']}")
-    lines += (f"  {line}" for line in table(_HEAD, map(_row, status["nodes"])))
+    elif status["obstacle"] is not None:
+        lines.append(f"  not caught up: {status['obstacle']}")
+        if status["last_error"] is not None:
+            lines.append(f"  last error: {status['last_error']}")
+    rows = (_row(node, status) for node in status["nodes"])
+    lines += (f"  {line}" for line in table(_HEAD, rows))
     devices = status.get("devices")
     if devices:
         lines += (f"  {line}" for line in table(_DEVICES, map(_polled, devices.items())))
@@ -78,7 +81,9 @@ def _polled(device: tuple[str, dict[str, Any]]) -> tuple[str, ...]:
     return name, "nobody" if found["node"] is None else found["node"]
 
 
-def _row(node: dict[str, Any]) -> tuple[str, ...]:
-    at, digest = node["digest"] or ("", "")
+def _row(node: dict[str, Any], status: dict[str, Any]) -> tuple[str, ...]:
+    # `nodes` has the digests of other nodes only.
+    own = node["name"] == status["node"]
+    at, digest, *_ = (status if own else node)["digest"] or ("", "")
     when = log_lines.timestamp(node["time_ns"] / 1e9)
     return node["name"], str(node["sequence"]), when, str(at), digest[:_DIGEST]

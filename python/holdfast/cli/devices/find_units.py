@@ -58,6 +58,7 @@ def find_units(url: str, asked: Sequence[int], timeout: float, delay: float, as_
             {
                 **ended_to_json(why or (None if _count(found) else NOTHING)),
                 "complete": why is None,
+                "garbled": _garbled(found),
                 "ignores_unit": ignores,
                 "asked": [each.unit for each in found],
                 "not_asked": list(left),
@@ -81,6 +82,11 @@ def _count(found: Iterable[Unit]) -> int:
     return sum(each.answers for each in found)
 
 
+def _garbled(found: Iterable[Unit]) -> list[int]:
+    """The unit ids whose replies are invalid."""
+    return [each.unit for each in found if each.is_garbled]
+
+
 def unit_to_json(found: Unit) -> dict[str, object]:
     """A unit id for JSON."""
     return {
@@ -93,11 +99,13 @@ def unit_to_json(found: Unit) -> dict[str, object]:
 def _units(url: str, found: Sequence[Unit], left: Sequence[int], ignores: bool) -> list[str]:
     """The summary at the end of the search."""
     count = _count(found)
-    silent = [each.unit for each in found if not each.answers]
+    silent = [each.unit for each in found if not each.answers and not each.is_garbled]
     lines = [""] if count else []
     lines.append(f"{url}: {terminal_text.counted(count, 'unit id')} of {len(found)} asked answer")
     if silent:
         lines.append(f"no device: {number_ranges(silent)}")
+    if garbled := _garbled(found):
+        lines.append(f"invalid replies: {number_ranges(garbled)}")
     if left:
         lines.append(f"not asked: {number_ranges(left)}")
     if ignores:

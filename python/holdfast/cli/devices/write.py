@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from dataclasses import dataclass
@@ -150,7 +151,7 @@ def _carry_out(
             click.echo("\n".join(pdus))
         return
     differing: dict[int, tuple[int, int]] = {}
-    with device.connect(url, unit, timeout) as client:
+    with device.connect(url, unit, timeout, only_writes=not verify) as client:
         try:
             job.write(client)
         except (ModbusError, KeyboardInterrupt) as found:
@@ -332,10 +333,13 @@ def _value(text: str, kind: str) -> Any:
             raise click.UsageError(f"{text!r} is not hex, allowed: pairs of hex digits.") from None
     if base == "float":
         try:
-            return float(text)
+            number = float(text)
         except ValueError:
             point = f"; did you mean {text.replace(',', '.')!r}?" if "," in text else ""
             raise click.UsageError(f"{text!r} is not a number{point}") from None
+        if math.isinf(number) and "inf" not in text.lower():
+            raise click.UsageError(f"{text!r} is outside the range of {kind}.")
+        return number
     match = WHOLE.fullmatch(text)
     if match is None:
         raise click.UsageError(

@@ -85,9 +85,8 @@ def bench(
 
     load = load_of(count or 1)
     try:
-        if count is None:
-            with device.connect(url, unit, timeout) as client:
-                count = device.existing(client, place, COUNT)
+        with device.connect(url, unit, timeout) as client:
+            count = count or device.existing(client, place, COUNT)
         load = load_of(count)
         fields["count"] = count
         with (

@@ -10,7 +10,9 @@ import click
 from holdfast.cli.device_errors import hint_at_late_replies
 from holdfast.cli.options.duration import timeout_option
 from holdfast.cli.options.option import Command, number_option, option_group
+from holdfast.cli.options.units import refuse_broadcast
 from holdfast.client import SyncClient
+from holdfast.client.base import is_broadcast
 from holdfast.errors import (
     ModbusError,
     ModbusException,
@@ -36,10 +38,15 @@ device_options = option_group(unit_option(), timeout_option())
 """Adds `--unit` and `--timeout`."""
 
 
-def connect(url: str, unit: int, timeout: float) -> SyncClient:
-    """A client. It connects on its first request. The command ends with a hint at late replies."""
+def connect(url: str, unit: int, timeout: float, *, only_writes: bool = False) -> SyncClient:
+    """A client. It connects on its first request. The command ends with a hint at late replies.
+
+    Raises `click.UsageError` for the broadcast of a serial line, unless the command `only_writes`.
+    """
     with usable():
         client = SyncClient(url, unit=unit, timeout=timeout)
+    if not only_writes and is_broadcast(client.target, unit):
+        refuse_broadcast([unit])
     context = click.get_current_context()
     context.call_on_close(lambda: hint_at_late_replies(client.longest_late, timeout))
     return client

@@ -37,7 +37,7 @@ def write_tags(
         else:
             click.echo("\n".join(pdus))
         return
-    with device.connect(of.url, of.unit, of.timeout) as client:
+    with device.connect(of.url, of.unit, of.timeout, only_writes=not verify) as client:
         try:
             writes = _prepared(of, texts, client)
         except ModbusError as error:
@@ -49,7 +49,11 @@ def write_tags(
             except (ModbusError, KeyboardInterrupt) as found:
                 _fail(of, writes, at, device_errors.of_write(found), as_json)
             if not as_json:
-                click.echo(f"Written: {_text(write)}")
+                try:
+                    click.echo(f"Written: {_text(write)}")
+                except OSError:
+                    _print_not_written(writes[at + 1 :])
+                    raise
         differing = _differing(of, client, writes, as_json) if verify else {}
     if as_json:
         verified = {"verified": not differing} if verify else {}
@@ -140,6 +144,11 @@ def _fail(
     if maybe:
         click.echo(f"hint: {names[at]} was possibly written", err=True)
     device_errors.hint(error, of.url)
-    if names[at + 1 :]:
-        click.echo(f"Not written: {', '.join(names[at + 1 :])}", err=True)
+    _print_not_written(writes[at + 1 :])
     sys.exit(ExitCode.FAILED)
+
+
+def _print_not_written(writes: Sequence[TagWrite]) -> None:
+    if writes:
+        names = ", ".join(write.tag.name for write in writes)
+        click.echo(f"Not written: {names}", err=True)

@@ -26,6 +26,7 @@ export class Discovery {
       if (this.running) this.stop();
       else this.start(new FormData($("survey")));
     });
+    $("survey").addEventListener("input", () => this.validate());
     onTheme(() => this.pictures.forEach((each) => each.draw()));
   }
 
@@ -41,6 +42,12 @@ export class Discovery {
   leave() {
     if (this.running) this.stop();
     this.device = null;
+  }
+
+  /** Validates the addresses of the form. */
+  validate() {
+    const { first, last } = $("survey").elements;
+    last.setCustomValidity(Number(first.value) > Number(last.value) ? `The last address is below the first one, ${first.value}.` : "");
   }
 
   async start(form) {
@@ -59,10 +66,11 @@ export class Discovery {
       await stream("/api/modbus/map", { method: "POST", body, signal: stopping.signal, extraTime: this.device.timeout * areas.length }, (name, data) => {
         if (this.running === stopping) this.happened(name, data);
       });
+      // A result ends the map.
+      if (this.running === stopping) throw new Problem("gateway_gone", "the connection to the gateway ended");
     } catch (error) {
-      if (this.running === stopping) say($("survey-state"), notice(error));
+      if (this.running === stopping) this.interrupt(notice(error));
     }
-    if (this.running === stopping) this.end();
   }
 
   prepare(areas, first, last) {
@@ -87,6 +95,7 @@ export class Discovery {
       return;
     }
     this.pictures.forEach((each) => each.list());
+    this.end();
     if (data.success) say($("survey-state"), `Done in ${data.seconds.toFixed(1)} s: ${counted}.`, data.exact ? null : this.sampled(data.areas));
     else say($("survey-state"), notice(new Problem(data.reason ?? "timeout", data.error)), `Until then: ${counted}.`, this.unsearched());
   }
@@ -108,13 +117,18 @@ export class Discovery {
   startExact() {
     $("survey").elements.exact.checked = true;
     $("survey-go").focus();
-    this.start(new FormData($("survey")));
+    $("survey").requestSubmit();
   }
 
   stop() {
     this.running.abort();
-    say($("survey-state"), "Stopped. The map is incomplete: what it does not show as valid is unknown.", this.unsearched());
-    this.pictures.forEach((each) => each.list());
+    this.interrupt("Stopped. The map is incomplete: what it does not show as valid is unknown.");
+  }
+
+  /** Ends a map without a result. Says why, and lists what was found. */
+  interrupt(why) {
+    say($("survey-state"), why, this.unsearched());
+    if (this.areas.length > 0) this.pictures.forEach((each) => each.list());
     this.end();
   }
 

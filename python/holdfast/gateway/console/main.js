@@ -6,7 +6,7 @@ import * as pageUrl from "./page_url.js";
 import { Discovery } from "./discovery.js";
 import { Values } from "./values.js";
 
-const may = { write: false };
+const may = { write: null };
 const fields = ["host", "port", "unit", "transport", "timeout", "server"];
 /** Errors of the probe after which other areas may still respond. */
 const UNPROVEN = new Set(["timeout", "connection_lost", "invalid_reply", "exception"]);
@@ -36,17 +36,22 @@ let device = null;
 let connecting = null;
 
 /** Gets the settings of the gateway. */
+async function inquire() {
+  const status = await get("/api/gateway");
+  may.write = status.writes;
+  const mode = $("mode");
+  mode.textContent = status.writes ? "reads and writes" : "reads only";
+  mode.classList.toggle("writes", status.writes);
+  mode.title = `May connect to ${status.allow.join(", ")}`;
+  mode.hidden = false;
+  $("timeout").max = status.limits.timeout;
+  $("interval").min = status.limits.interval;
+}
+
+/** Gets the settings of the gateway, and connects if the link watches. */
 async function begin() {
   try {
-    const status = await get("/api/gateway");
-    may.write = status.writes;
-    const mode = $("mode");
-    mode.textContent = status.writes ? "reads and writes" : "reads only";
-    mode.classList.toggle("writes", status.writes);
-    mode.title = `May connect to ${status.allow.join(", ")}`;
-    mode.hidden = false;
-    $("timeout").max = status.limits.timeout;
-    $("interval").min = status.limits.interval;
+    await inquire();
   } catch (error) {
     say($("connection"), notice(error));
   }
@@ -81,6 +86,7 @@ async function connect() {
   connecting = aborting;
   say($("connection"), "Connecting…");
   try {
+    if (may.write === null) await inquire();
     const began = performance.now();
     const found = await post("/api/modbus/connect", asked, aborting.signal);
     if (connecting !== aborting) return;
@@ -164,6 +170,13 @@ $("forget").addEventListener("click", () => {
   forgetToken();
   location.reload();
 });
+
+document.querySelector(".skip").addEventListener("click", (event) => {
+  event.preventDefault(); // The fragment of the page's URL is the link of the view.
+  $("work").focus();
+});
+// Another link was opened in this tab. The page's own changes of its URL cause no such event.
+addEventListener("hashchange", () => location.reload());
 
 recall();
 begin();

@@ -177,7 +177,7 @@ class Plot {
       return;
     }
     this.history.take(time, value);
-    this.output.textContent = this.panel.text(this.cell) ?? shortened(value);
+    this.output.textContent = this.panel.text(this.cell) ?? String(value);
     this.root.classList.remove("old");
     this.describe();
   }

@@ -61,19 +61,21 @@ export class Table extends Panel {
 
   /** Returns the number to plot for an address: the typed value if one starts there. */
   number(address) {
-    const at = address - this.part.address;
-    const { width, ofBits, type } = this.part;
-    if (ofBits) return Number(this.values[at]);
-    if (at % width !== 0 || type.kind === "string" || type.kind === "bytes") return this.values[at] ?? null;
-    const text = this.texts[at / width] ?? "";
-    if (type.kind === "bool" || type.kind === "bit") return Number(text === "true");
+    const value = this.values[address - this.part.address];
+    const text = this.text(address);
+    if (text === null) return value === undefined ? null : Number(value);
+    const { kind } = this.part.type;
+    if (kind === "bool" || kind === "bit") return Number(text === "true");
     const number = Number(text);
     return text === "" || !Number.isFinite(number) ? null : number;
   }
 
-  /** Registers and bits have no text beside their number. */
-  text() {
-    return null;
+  /** Returns the text of the typed value that `number` returns; `null` for a register or a bit. */
+  text(address) {
+    const at = address - this.part.address;
+    const { width, ofBits, type } = this.part;
+    if (ofBits || at % width !== 0 || type.kind === "string" || type.kind === "bytes") return null;
+    return this.texts[at / width] ?? "";
   }
 
   cells() {
@@ -95,7 +97,7 @@ export class Table extends Panel {
     const rows = [];
     for (let at = 0; at < quantity; at += width) {
       const index = at / width;
-      const value = ofBits ? Number(this.values[at]) : this.texts[index];
+      const value = ofBits ? this.number(address + at) : this.texts[index];
       rows.push(["", areas[area - 1], address + at, ofBits ? "bool" : type.name, ofBits ? "" : order, value ?? "", "", this.errors.get(index) ?? ""]);
     }
     return rows;

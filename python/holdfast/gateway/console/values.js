@@ -28,7 +28,7 @@ const CHECK = 1000;
 /** How long the first poll of a tag list may take, in milliseconds. */
 const LONG = 60_000;
 
-/** The values view. `may.write` is whether the gateway allows writes. */
+/** The values view. `may.write` is whether the gateway allows writes; `null` until it has said so. */
 export class Values {
   constructor(may) {
     this.may = may;
@@ -252,7 +252,7 @@ export class Values {
     $("table").replaceChildren(...this.panels.map((panel) => panel.place));
     if (wanted.length > 1) this.panels.forEach((panel) => (panel.heading.hidden = false));
     this.wholes = wanted;
-    $("only-reads").hidden = this.may.write;
+    $("only-reads").hidden = this.may.write !== false;
     $("save").hidden = false;
   }
 
@@ -275,17 +275,16 @@ export class Values {
     if (outcome === null) return;
     const told = WRITTEN[outcome];
     const { device } = panel.part;
-    if (!this.panels.includes(panel) || this.device !== device) {
-      say($("outcome"), `${told}: ${cell} of ${device.host}:${device.port}.`);
-      return;
-    }
+    const isShown = () => this.panels.includes(panel) && this.device === device;
+    const tellElsewhere = () => say($("outcome"), `${told}: ${cell} of ${device.host}:${device.port}.`);
+    if (!isShown()) return tellElsewhere();
     if (this.watching) {
       say($("outcome"), `${told}. The watch continues.`);
       return;
     }
     try {
       const data = await this.once(this.wholes);
-      if (!this.panels.includes(panel) || this.device !== device) return;
+      if (!isShown()) return tellElsewhere();
       if (!this.fits(data)) this.show(this.wholes, data);
       this.take(data, true);
       const own = data.parts[this.wholes.indexOf(panel.whole)];
@@ -293,7 +292,7 @@ export class Values {
       const changed = `${told} and read back. Changes are marked.`;
       say($("outcome"), outcome === "written" ? changed : `${told}. The table shows the values read back.`);
     } catch (error) {
-      if (!this.panels.includes(panel)) return;
+      if (!isShown()) return tellElsewhere();
       panel.stale("Reading back failed.");
       say($("outcome"), notice(error, `${told}. Reading back failed.`));
     }

@@ -46,8 +46,8 @@ class Change {
   }
 
   /** Reads what the device has now: the words, the texts of the typed values, and the time. */
-  async read() {
-    const found = await (this.tag ? this.readTag() : this.readRange());
+  async read(signal) {
+    const found = await (this.tag ? this.readTag(signal) : this.readRange(signal));
     return { ...found, time: Date.now() };
   }
 
@@ -55,20 +55,22 @@ class Change {
     return { functionCode: this.area, address: this.address, quantity: this.count };
   }
 
-  async readRange() {
-    const { values, typedText = [] } = await post("/api/modbus/read", { ...this.device, ...this.range(), ...this.typed });
+  async readRange(signal) {
+    const body = { ...this.device, ...this.range(), ...this.typed };
+    const { values, typedText = [] } = await post("/api/modbus/read", body, signal);
     return { words: values, texts: typedText };
   }
 
   /** Reads the value of a tag, which may be scaled by a register, and its words. */
-  async readTag() {
+  async readTag(signal) {
     const parts = [{ ...this.source, only: [this.tag.name] }, this.range()];
-    const body = JSON.stringify({ ...this.device, parts, once: true, describe: false });
+    const body = JSON.stringify({ ...this.device, parts, once: true });
     let found = null;
     const extraTime = parts.length * this.device.timeout;
-    await stream("/api/modbus/watch/view", { method: "POST", body, extraTime }, (_, data) => (found = data.parts));
+    await stream("/api/modbus/watch/view", { method: "POST", body, signal, extraTime }, (_, data) => (found = data.parts));
     if (found === null) throw new Problem("gateway_gone", "the gateway sent no value");
     const [own, words] = found;
+    checkDefinition(this.tag, own.tags[0]);
     if (words.error) throw new Problem(words.reason, words.error, words.code);
     return { words: words.values, texts: [own.error ?? own.errors[0] ?? own.texts[0]] };
   }
@@ -83,11 +85,16 @@ async function checked(path, body) {
   }
 }
 
+/** Throws an error if the gateway has another definition of a tag than the one that is shown. */
+function checkDefinition(shown, found) {
+  if (!same(found, shown)) throw new Error(`The gateway has another definition of ${shown.name} now. Close this dialog and read the values again.`);
+}
+
 /** Returns the change that writes the value of a tag, which the gateway scales. */
 export async function ofTag(target, text) {
   const { part, tag } = target;
   const found = await checked("/api/gateway/tags/value", { ...part.source, name: tag.name, value: text });
-  if (!same(found.tag, tag)) throw new Error(`The gateway has another definition of ${tag.name} now. Close this dialog and read the values again.`);
+  checkDefinition(tag, found.tag);
   const values = [{ name: tag.name, text: found.text }];
   return new Change(target, found.form === "mask" ? { mask: found.values, values } : { words: found.values, values });
 }

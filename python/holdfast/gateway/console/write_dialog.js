@@ -2,7 +2,7 @@
 
 import { notice, post, Problem } from "./api.js";
 import { isPlain, ofTag, ofType, ofWords } from "./write_change.js";
-import { $, h, once, pause } from "./dom.js";
+import { $, h, pause } from "./dom.js";
 import { extent, modicon, REGISTER_FORMS } from "./numbers.js";
 import { placed, same } from "./parts.js";
 import * as reviews from "./review_tables.js";
@@ -61,7 +61,7 @@ export class Writer {
    */
   ask(target) {
     const { part, tag, area, address, ofBits } = target;
-    const asked = { ...target, change: null, before: null, looks: 0, sending: null, outcome: null };
+    const asked = { ...target, change: null, before: null, looks: 0, isBusy: false, sending: null, outcome: null, closing: new AbortController() };
     this.asked = asked;
     const { host, port, unitId } = part.device;
     const what = ofBits ? "coil" : "holding register";
@@ -74,12 +74,15 @@ export class Writer {
     else $("write-value").removeAttribute("list");
     $("write-value").value = "";
     $("write-error").replaceChildren();
+    this.tell("");
+    this.lock(false);
     this.back();
     this.help();
     this.dialog.showModal();
     $("write-value").focus();
     return new Promise((resolve) => {
       this.dialog.addEventListener("close", async () => {
+        asked.closing.abort();
         await asked.sending;
         resolve(asked.outcome);
       }, { once: true });
@@ -133,20 +136,35 @@ export class Writer {
     $("write-error").scrollIntoView({ block: "nearest" });
   }
 
-  step(asked) {
-    return once($("write-go"), async () => {
-      $("write-error").replaceChildren();
-      let told = "";
-      try {
-        if (asked.change) told = await this.confirm(asked);
-        else await this.review(asked);
-      } catch (error) {
-        if (this.isAbout(asked)) this.fail(error instanceof Problem ? notice(error) : error.message);
-      } finally {
-        asked.sending = null;
-        if (this.asked === asked) this.tell(told);
-      }
-    });
+  /** Shows whether the dialog is busy with a step. The button keeps the focus, unlike with `disabled`. */
+  lock(is) {
+    $("write-go").setAttribute("aria-disabled", is);
+  }
+
+  /** Returns to the first step because of an error: what was reviewed can't be written. */
+  reject(error) {
+    this.back();
+    this.fail(error instanceof Problem ? notice(error) : error.message);
+  }
+
+  /** Runs one step of a write at a time. The next dialog does not wait for a step of this one. */
+  async step(asked) {
+    if (asked.isBusy) return;
+    asked.isBusy = true;
+    this.lock(true);
+    $("write-error").replaceChildren();
+    let told = "";
+    try {
+      if (asked.change) told = await this.confirm(asked);
+      else await this.review(asked);
+    } catch (error) {
+      if (this.isAbout(asked)) this.reject(error);
+    }
+    asked.isBusy = false;
+    asked.sending = null;
+    if (this.asked !== asked) return;
+    this.tell(told);
+    this.lock(false);
   }
 
   /** Checks what was typed, reads the current values, and shows them beside the new ones. */
@@ -155,7 +173,7 @@ export class Writer {
     const text = $("write-value").value;
     const isTyped = $("write-as").value === "typed" && !isPlain(asked.part);
     const change = await (asked.tag ? ofTag : isTyped ? ofType : ofWords)(asked, text);
-    const before = await read(change);
+    const before = await read(change, asked);
     if (!this.isAbout(asked)) return;
     asked.change = change;
     asked.before = before;
@@ -178,13 +196,18 @@ export class Writer {
     while (this.isAbout(asked) && asked.change === change && !asked.before.error) {
       await pause(REFRESH_MS);
       // Nobody sees a hidden page. Before a write, it reads again.
-      if (!document.hidden && this.isReviewed(asked, change) && (await this.refresh(asked, change))) this.tell(CHANGED);
+      if (document.hidden || !this.isReviewed(asked, change)) continue;
+      try {
+        if (await this.refresh(asked, change)) this.tell(CHANGED);
+      } catch (error) {
+        if (this.isReviewed(asked, change)) this.reject(error);
+      }
     }
   }
 
   /** Reads again, and shows the result. Returns whether it differs from what was shown. */
   async refresh(asked, change) {
-    const now = await change.read().catch((error) => ({ error }));
+    const now = await read(change, asked);
     const shown = asked.before;
     // A read that a write has overtaken may have seen the new values. One read may fail.
     if (!this.isReviewed(asked, change) || (now.error && isRecent(shown.time))) return false;
@@ -198,15 +221,16 @@ export class Writer {
   /** Writes what the review shows. If it has changed, shows that instead. Returns what to tell. */
   async confirm(asked) {
     const { change, before } = asked;
+    this.tell(READING);
+    // A tag that can't be read may have another definition too.
+    if (change.tag) await ofTag(asked, $("write-value").value);
     // Who has looked again may write, even if a value changes all the time.
-    if (!before.error && !isRecent(asked.looks)) {
-      this.tell(READING);
-      await this.refresh(asked, change);
-      if (!this.isReviewed(asked, change)) return "";
-      if (!equal(before, asked.before)) {
-        asked.looks = Date.now();
-        return CHANGED;
-      }
+    const isSeen = before.error || isRecent(asked.looks);
+    if (!isSeen) await this.refresh(asked, change);
+    if (!this.isReviewed(asked, change)) return "";
+    if (!isSeen && !equal(before, asked.before)) {
+      asked.looks = Date.now();
+      return CHANGED;
     }
     this.tell("Writing…");
     asked.sending = this.write(asked, change);
@@ -226,7 +250,7 @@ export class Writer {
       const refused = error.maybeWritten === false || (error.maybeWritten === null && UNSENT.has(error.reason));
       if (refused) asked.outcome = doubt;
       const told = refused ? "Not written." : "Unknown whether it was written.";
-      const back = await change.read().catch(() => null);
+      const back = await change.read(asked.closing.signal).catch(() => null);
       if (!this.isAbout(asked)) return;
       this.back();
       this.fail(notice(error, told), h("p", {}, compared(change, asked.before, back)));
@@ -235,9 +259,9 @@ export class Writer {
 }
 
 /** Reads what a change is about. An error of the device is a part of the result: some registers can only be written. */
-async function read(change) {
+async function read(change, { closing }) {
   try {
-    return await change.read();
+    return await change.read(closing.signal);
   } catch (error) {
     if (!(error instanceof Problem) || FINAL.includes(error.reason)) throw error;
     return { error };

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 LEFT_OVER_END_TIMEOUT_S = 10.0
 """Seconds that a server which has lost its appliance has to end."""
 
+ROOM_BYTES = 2**20
+"""What a disk takes that is not full: the largest message of nats-server."""
+
 
 class ServerUnusable(OSError):
     """The server can't be started. The message says why."""
@@ -85,6 +88,18 @@ class Folder:
             named = error.filename or file
             raise ServerUnusable(f"{named} can't be used: {error.strerror or error}") from error
         return file
+
+    def has_room(self) -> bool:
+        """Whether the disk takes writes."""
+        file = self.path / "room"
+        try:
+            try:
+                file.write_bytes(bytes(ROOM_BYTES))
+            finally:
+                file.unlink(missing_ok=True)
+        except OSError:
+            return False
+        return True
 
     def close(self) -> None:
         """Unlocks the folder."""

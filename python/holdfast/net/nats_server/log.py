@@ -13,14 +13,22 @@ _LINE = re.compile(r"\[\d+\] [\d/]+ [\d:.]+ \[(?P<level>[A-Z]{3})\] ?(?P<text>.*
 _LEVELS = {"INF": logging.DEBUG, "WRN": logging.WARNING, "ERR": logging.ERROR, "FTL": logging.ERROR}
 _LISTENING = "Listening for client connections on "
 _READY = "Server is ready"
+_REFUSES = re.compile("[Cc]ritical write error|failed to store a msg|resource limits exceeded")
 
 
 class ServerLog:
     """The log of one server: whether it is ready, where it listens, and its last error."""
 
-    def __init__(self, take: Callable[[int, str], None] | None = None) -> None:
-        """`take` gets the level and the text of each line."""
-        self._take = take
+    def __init__(
+        self,
+        take: Callable[[int, str], None] | None = None,
+        refuses: Callable[[], None] | None = None,
+    ) -> None:
+        """`take` gets the level and the text of each line.
+
+        `refuses` is called for each line that says that a server which is ready refuses writes.
+        """
+        self._take, self._refuses = take, refuses
         self.begin()
 
     def begin(self) -> None:
@@ -44,3 +52,5 @@ class ServerLog:
         self.is_ready = self.is_ready or text == _READY
         if self._take is not None:
             self._take(level, text)
+        if self._refuses is not None and self.is_ready and _REFUSES.search(text):
+            self._refuses()

@@ -1,4 +1,7 @@
-"""The NATS server of a log: runs as long as the appliance, and is started again if it ends."""
+"""The NATS server of a log: runs as long as the appliance.
+
+It is started again if it ends, and after its disk was full.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +59,7 @@ class NatsServer:
             self._child = ChildProcess(
                 f"holdfast-nats-{self._name}",
                 [program, "-c", str(self._folder.configured(self._access))],
-                ServerLog(self._pass_on),
+                ServerLog(self._pass_on, self._refuses),
                 restarts=Backoff(FIRST_PAUSE_S, MAX_PAUSE_S, jitter=False, proven_s=PROVEN_S),
                 ended=self._ended,
                 inherited=self._folder.inherited,
@@ -87,6 +90,17 @@ class NatsServer:
         log_lines.write(
             logging.ERROR, "log_server_ended", log=self._name, error=reason, pause=pause
         )
+
+    def _refuses(self) -> None:
+        """Restarts the server if its disk has room again.
+
+        After a write error, and when it has stored 3/4 of what was free at its start, nats-server
+        refuses writes until it is restarted. It logs that again and again while nodes write.
+        """
+        assert self._folder is not None
+        assert self._child is not None
+        if self._folder.has_room():
+            self._child.terminate()
 
     def _pass_on(self, level: int, text: str) -> None:
         """Logs a line of the server's log."""

@@ -6,6 +6,7 @@ or at one address share their settings. Who is the only one to use something may
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
@@ -92,7 +93,7 @@ def _check_unused(conflict: str, users: list[str]) -> None:
 
 def connection_of(target: Target) -> str:
     """Returns the serial line, or the address, that identifies a connection."""
-    return target.device if isinstance(target, SerialTarget) else str(target)
+    return os.path.realpath(target.device) if isinstance(target, SerialTarget) else str(target)
 
 
 def _settings(target: Target) -> dict[str, object]:

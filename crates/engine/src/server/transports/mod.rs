@@ -3,8 +3,10 @@
 #[cfg(test)]
 pub(crate) mod cut_tests;
 pub(crate) mod framing;
+mod line_echo;
 pub(crate) mod raw_ingest;
 pub(crate) mod raw_ingest_input;
+mod rtu_line;
 pub(crate) mod secure;
 pub(crate) mod serial;
 pub(crate) mod shared_port;

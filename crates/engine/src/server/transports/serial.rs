@@ -4,6 +4,7 @@
 //! ones. Unit id 0 is the broadcast: every memory carries out the write, no unit replies. A lost
 //! device is opened again when it returns.
 
+use std::collections::VecDeque;
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
@@ -13,10 +14,10 @@ use holdfast_protocol::frame::{ascii, rtu};
 use holdfast_protocol::pdu::{self, Function};
 use serial2_tokio::SerialPort;
 use tokio::sync::watch;
-use tokio::time::{Instant, sleep, sleep_until, timeout};
+use tokio::time::{sleep, sleep_until, timeout};
 
 use crate::link::{Asker, source};
-use crate::serial_line::{LineMode, SerialLine};
+use crate::serial_line::{LineMode, OpenLine, SerialLine};
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::connections::reply_order::{Asked, Expected};
@@ -29,9 +30,14 @@ use crate::server::requests::unit_server::{
 use crate::server::rights::peer_rights::PeerRights;
 use crate::server::rights::rule::Rule;
 use crate::server::transports::framing::{Framing, Rtu};
+use crate::server::transports::line_echo::LineEcho;
+use crate::server::transports::rtu_line::RtuLine;
 
 /// The unit id that addresses all units (Modbus over Serial Line V1.02, 2.2).
 const BROADCAST: u8 = 0;
+
+/// The most characters of an ASCII line that wait while a request is carried out: two frames.
+const MAX_AHEAD: usize = 2 * ascii::MAX_LEN;
 
 /// The longest pause between two characters of an ASCII frame (2.5.2.1).
 const CHARACTER_TIMEOUT: Duration = Duration::from_secs(1);
@@ -69,6 +75,21 @@ struct Serving {
     running: watch::Receiver<bool>,
 }
 
+/// What is received while a request is carried out.
+enum Input<'i> {
+    Rtu(&'i mut RtuLine),
+    Ascii(&'i mut VecDeque<u8>),
+}
+
+impl Input<'_> {
+    async fn receive(&mut self, port: &SerialPort) -> io::Result<()> {
+        match self {
+            Input::Rtu(line) => line.receive_newer(port).await,
+            Input::Ascii(characters) => receive(port, characters).await,
+        }
+    }
+}
+
 impl ModbusSerial {
     pub(crate) fn new(
         line: SerialLine,
@@ -89,7 +110,7 @@ impl ModbusSerial {
     pub(crate) async fn serve(
         self,
         context: Arc<ListenerContext>,
-        mut port: SerialPort,
+        mut line: OpenLine<SerialPort>,
         mut stop: watch::Receiver<bool>,
     ) {
         let serving = Serving { context, running: stop.clone() };
@@ -97,21 +118,21 @@ impl ModbusSerial {
         loop {
             let lost = async {
                 match self.line.mode {
-                    LineMode::Rtu { .. } => self.serve_rtu(&serving, &port).await,
-                    LineMode::Ascii => self.serve_ascii(&serving, &port).await,
+                    LineMode::Rtu { .. } => self.serve_rtu(&serving, &line.port).await,
+                    LineMode::Ascii => self.serve_ascii(&serving, &line.port).await,
                 }
             };
             tokio::select! {
                 _ = &mut stopping => return,
                 _ = lost => serving.context.report(Kind::LineLost, None),
             }
-            port = loop {
+            line = loop {
                 tokio::select! {
                     _ = &mut stopping => return,
                     () = sleep(REOPEN_INTERVAL) => {}
                 }
-                if let Ok(port) = self.line.open() {
-                    break port;
+                if let Ok(line) = self.line.open() {
+                    break line;
                 }
             };
             serving.context.report(Kind::LineBack, None);
@@ -120,32 +141,26 @@ impl ModbusSerial {
 
     /// Serves RTU frames until the device is lost.
     async fn serve_rtu(&self, serving: &Serving, port: &SerialPort) -> io::Error {
-        let silence = self.line.silence();
-        // One byte more than the longest frame, so that a longer one is detected.
-        let mut frame = [0; rtu::MAX_LEN + 1];
-        let mut len = 0;
-        let mut quiet = std::pin::pin!(sleep_until(Instant::now()));
+        let (mut line, mut echo) = (RtuLine::new(&self.line), LineEcho::default());
         loop {
-            let at = len.min(frame.len() - 1);
+            let (end, has_begun) = (line.end(), !line.bytes().is_empty());
             // Characters that are already available do not count as silence, even if they are read
             // late.
-            let read = tokio::select! {
+            let done = tokio::select! {
                 biased;
-                read = port.read(&mut frame[at..]) => read,
-                () = &mut quiet, if len > 0 => {
-                    if let Err(error) = self.answer_rtu(serving, port, &frame[..len]).await {
-                        return error;
+                received = line.receive(port) => received,
+                () = sleep_until(end), if has_begun => {
+                    if line.waits_for_rest(|unit_id| self.is_served(unit_id)) {
+                        continue;
                     }
-                    len = 0;
-                    continue;
+                    let (frame, len) = line.take();
+                    self.answer_rtu(serving, port, &frame[..len], &mut line, &mut echo).await
                 }
             };
-            match read {
-                Ok(0) => return io::ErrorKind::UnexpectedEof.into(),
-                Ok(more) => len = at + more,
-                Err(error) => return error,
+            if let Err(error) = done {
+                return error;
             }
-            quiet.as_mut().reset(Instant::now() + silence);
+            line.skip(echo.at_start_of(line.bytes()));
         }
     }
 
@@ -154,6 +169,8 @@ impl ModbusSerial {
         serving: &Serving,
         port: &SerialPort,
         frame: &[u8],
+        line: &mut RtuLine,
+        echo: &mut LineEcho,
     ) -> io::Result<()> {
         let Ok((unit_id, request)) = rtu::decode(frame) else {
             self.damaged();
@@ -163,25 +180,33 @@ impl ModbusSerial {
         let Some(buffer) = reply[Rtu::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return Ok(());
         };
-        match self.answer(serving, unit_id, request, buffer).await {
-            None => Ok(()),
-            Some(len) => {
-                let len = Rtu::complete(&mut reply, 0, unit_id, len);
-                send(port, &reply[..len]).await
-            }
-        }
+        let answer = self.answer(serving, unit_id, request, buffer);
+        let Some(len) = unless_newer(answer, Input::Rtu(line), port).await? else {
+            return Ok(());
+        };
+        let len = Rtu::complete(&mut reply, 0, unit_id, len);
+        echo.sent(frame, &reply[..len], self.line.character() * len as u32);
+        send(port, &reply[..len]).await
+    }
+
+    /// Whether frames for a unit id are requests to this listener.
+    fn is_served(&self, unit_id: u8) -> bool {
+        let rights = self.rights.get();
+        let is_known = rights.memory(unit_id).is_some() || rights.elsewhere(unit_id).is_some();
+        is_known || unit_id == BROADCAST
     }
 
     /// Serves ASCII frames until the device is lost.
     async fn serve_ascii(&self, serving: &Serving, port: &SerialPort) -> io::Error {
-        let mut input = [0; 256];
+        let mut echo = LineEcho::default();
+        let mut input = VecDeque::new();
         let mut frame: Vec<u8> = Vec::with_capacity(ascii::MAX_LEN);
         loop {
-            let read = if frame.is_empty() {
-                port.read(&mut input).await
+            let received = if frame.is_empty() {
+                receive(port, &mut input).await
             } else {
-                match timeout(CHARACTER_TIMEOUT, port.read(&mut input)).await {
-                    Ok(read) => read,
+                match timeout(CHARACTER_TIMEOUT, receive(port, &mut input)).await {
+                    Ok(received) => received,
                     Err(_) => {
                         self.damaged();
                         frame.clear();
@@ -189,12 +214,10 @@ impl ModbusSerial {
                     }
                 }
             };
-            let len = match read {
-                Ok(0) => return io::ErrorKind::UnexpectedEof.into(),
-                Ok(len) => len,
-                Err(error) => return error,
-            };
-            for &character in &input[..len] {
+            if let Err(error) = received {
+                return error;
+            }
+            while let Some(character) = input.pop_front() {
                 let delimiter = self.delimiter.load(Ordering::Relaxed);
                 let ends = character == delimiter && frame.last() == Some(&b'\r');
                 if character == b':' && !ends {
@@ -212,8 +235,12 @@ impl ModbusSerial {
                 }
                 frame.push(character);
                 if ends {
-                    if let Err(error) = self.answer_ascii(serving, port, &mut frame).await {
-                        return error;
+                    if echo.at_start_of(&frame) == 0 {
+                        let ahead = (&mut input, &mut echo);
+                        let answered = self.answer_ascii(serving, port, &mut frame, ahead).await;
+                        if let Err(error) = answered {
+                            return error;
+                        }
                     }
                     frame.clear();
                 }
@@ -226,6 +253,7 @@ impl ModbusSerial {
         serving: &Serving,
         port: &SerialPort,
         frame: &mut [u8],
+        (input, echo): (&mut VecDeque<u8>, &mut LineEcho),
     ) -> io::Result<()> {
         if let Some(delimiter) = frame.last_mut() {
             *delimiter = b'\n';
@@ -236,14 +264,14 @@ impl ModbusSerial {
             return Ok(());
         };
         let mut buffer = [0; pdu::MAX_LEN];
-        let Some(len) = self.answer(serving, unit_id, request, &mut buffer).await else {
+        let answer = self.answer(serving, unit_id, request, &mut buffer);
+        let Some(len) = unless_newer(answer, Input::Ascii(input), port).await? else {
             return Ok(());
         };
         let mut reply = [0; ascii::MAX_LEN];
-        match ascii::encode(unit_id, &buffer[..len], &mut reply) {
-            None => Ok(()),
-            Some(len) => send(port, &reply[..len]).await,
-        }
+        let Some(len) = ascii::encode(unit_id, &buffer[..len], &mut reply) else { return Ok(()) };
+        echo.sent(frame, &reply[..len], self.line.character() * len as u32);
+        send(port, &reply[..len]).await
     }
 
     fn damaged(&self) {
@@ -317,6 +345,40 @@ impl ModbusSerial {
             }
         };
         self.unit_server.broadcast(&self.rights.get(), request, permit, note).await;
+    }
+}
+
+/// Waits for a reply. Returns its length; `None` if there is none, or if something was received meanwhile: the
+/// master has given up, and would take it for the reply to its next request.
+async fn unless_newer(
+    answer: impl Future<Output = Option<usize>>,
+    mut input: Input<'_>,
+    port: &SerialPort,
+) -> io::Result<Option<usize>> {
+    let mut answer = std::pin::pin!(answer);
+    let (mut is_newer, mut lost) = (false, None);
+    loop {
+        tokio::select! {
+            biased;
+            len = &mut answer => return lost.map_or(Ok(len.filter(|_| !is_newer)), Err),
+            received = input.receive(port), if lost.is_none() => match received {
+                Ok(()) => is_newer = true,
+                Err(error) => lost = Some(error),
+            },
+        }
+    }
+}
+
+/// Receives characters. An error means that the line is lost.
+async fn receive(port: &SerialPort, input: &mut VecDeque<u8>) -> io::Result<()> {
+    let mut bytes = [0; 256];
+    match port.read(&mut bytes).await? {
+        0 => Err(io::ErrorKind::UnexpectedEof.into()),
+        len => {
+            input.extend(&bytes[..len]);
+            input.drain(..input.len().saturating_sub(MAX_AHEAD));
+            Ok(())
+        }
     }
 }
 

@@ -53,7 +53,8 @@ pub(in crate::log) struct Store {
     context: Context,
     pub(in crate::log) stream: Stream,
     pub(in crate::log) keys: kv::Store,
-    leases: kv::Store,
+    /// Of a node; `None` for a reader.
+    leases: Option<kv::Store>,
     objects: ObjectStore,
 }
 
@@ -130,7 +131,12 @@ impl Store {
         check(stream.cached_info(), fingerprint)?;
         let bucket = |suffix: &str| format!("{name}{suffix}");
         let pointers = keys(context, settings, bucket(""), Duration::ZERO, create).await?;
-        let leases = keys(context, settings, bucket("-leases"), LEASE_TTL, create).await?;
+        // Only nodes need it, so a backup does not have it.
+        let leases = if create {
+            Some(keys(context, settings, bucket("-leases"), LEASE_TTL, create).await?)
+        } else {
+            None
+        };
         let objects = match context.get_object_store(bucket("")).await {
             Ok(objects) => objects,
             Err(error) if !create => return Err(End::lost("the snapshots of the log", error)),
@@ -270,12 +276,15 @@ impl Store {
 
     /// Whether this node may take a snapshot now.
     pub(in crate::log) async fn lease(&self, node: &str) -> bool {
-        self.leases.create(SNAPSHOT_KEY, Bytes::copy_from_slice(node.as_bytes())).await.is_ok()
+        let Some(leases) = &self.leases else { return false };
+        leases.create(SNAPSHOT_KEY, Bytes::copy_from_slice(node.as_bytes())).await.is_ok()
     }
 
     pub(in crate::log) async fn release(&self) {
-        // Otherwise it expires.
-        let _ = self.leases.delete(SNAPSHOT_KEY).await;
+        if let Some(leases) = &self.leases {
+            // Otherwise it expires.
+            let _ = leases.delete(SNAPSHOT_KEY).await;
+        }
     }
 
     /// Stores a snapshot and names it the newest, if the newest is still the one of `seen`.

@@ -1,0 +1,186 @@
+//! The RTU frames that arrive on a serial line: a silence ends them (Modbus over Serial Line V1.02, 2.5.1.1).
+
+use std::io;
+use std::time::Duration;
+
+use holdfast_protocol::frame::rtu;
+use holdfast_protocol::frame::rtu_stream::{Next, Requests};
+use serial2_tokio::SerialPort;
+use tokio::time::Instant;
+
+use crate::serial_line::{LineMode, SerialLine};
+
+/// How long the rest of a request is waited for: adapters collect bytes for up to 16 ms, and deliver them
+/// together.
+const PACKET_PAUSE: Duration = Duration::from_millis(30);
+
+/// One byte more than the longest frame, so that a longer one is detected.
+const MAX_BYTES: usize = rtu::MAX_LEN + 1;
+
+/// What has been received since the last frame.
+pub(super) struct RtuLine {
+    bytes: [u8; MAX_BYTES],
+    len: usize,
+    silence: Duration,
+    /// Whether the silence is that of the standard, not one that was configured.
+    may_wait: bool,
+    last: Instant,
+    /// How many bytes there were when the silence began after which the rest was waited for.
+    cut: Option<usize>,
+    is_waiting: bool,
+}
+
+impl RtuLine {
+    pub(super) fn new(line: &SerialLine) -> RtuLine {
+        let silence = line.silence();
+        let is_configured = matches!(line.mode, LineMode::Rtu { silence: Some(_) });
+        RtuLine {
+            bytes: [0; MAX_BYTES],
+            len: 0,
+            silence,
+            may_wait: !is_configured && silence < PACKET_PAUSE,
+            last: Instant::now(),
+            cut: None,
+            is_waiting: false,
+        }
+    }
+
+    pub(super) fn bytes(&self) -> &[u8] {
+        &self.bytes[..self.len]
+    }
+
+    /// Receives some bytes. An error means that the line is lost.
+    pub(super) async fn receive(&mut self, port: &SerialPort) -> io::Result<()> {
+        let (bytes, len) = read(port).await?;
+        self.append(&bytes[..len]);
+        Ok(())
+    }
+
+    /// Does the same while a request is carried out: of several frames, the last one counts.
+    pub(super) async fn receive_newer(&mut self, port: &SerialPort) -> io::Result<()> {
+        let (bytes, len) = read(port).await?;
+        if self.last.elapsed() >= self.silence {
+            self.skip(self.len);
+        }
+        self.append(&bytes[..len]);
+        Ok(())
+    }
+
+    fn append(&mut self, bytes: &[u8]) {
+        let at = self.len.min(MAX_BYTES - 1);
+        self.len = MAX_BYTES.min(at + bytes.len());
+        self.bytes[at..self.len].copy_from_slice(&bytes[..self.len - at]);
+        (self.last, self.is_waiting) = (Instant::now(), false);
+    }
+
+    /// When the frame ends, if nothing else arrives.
+    pub(super) fn end(&self) -> Instant {
+        self.last + if self.is_waiting { PACKET_PAUSE } else { self.silence }
+    }
+
+    /// After a silence: whether the rest of a request is waited for. Frames of other units follow each other
+    /// too soon for that, and the replies of others are no requests.
+    pub(super) fn waits_for_rest(&mut self, is_served: impl Fn(u8) -> bool) -> bool {
+        let is_incomplete = || Requests::default().next(self.bytes()) == Next::Incomplete;
+        if !self.may_wait || self.is_waiting || !is_served(self.bytes[0]) || !is_incomplete() {
+            return false;
+        }
+        self.is_waiting = true;
+        self.cut = Some(self.len);
+        true
+    }
+
+    /// Takes the frame that has ended. If a new request came instead of the rest, it is that one.
+    pub(super) fn take(&mut self) -> ([u8; MAX_BYTES], usize) {
+        let (mut frame, mut len) = (self.bytes, self.len);
+        let is_valid = |frame: &[u8]| rtu::decode(frame).is_ok();
+        if let Some(cut) = self.cut.take()
+            && !is_valid(&frame[..len])
+            && is_valid(&frame[cut..len])
+        {
+            frame.copy_within(cut..len, 0);
+            len -= cut;
+        }
+        self.skip(self.len);
+        (frame, len)
+    }
+
+    /// Drops the first bytes.
+    pub(super) fn skip(&mut self, count: usize) {
+        self.bytes.copy_within(count..self.len, 0);
+        self.len -= count;
+        (self.cut, self.is_waiting) = (None, false);
+    }
+}
+
+async fn read(port: &SerialPort) -> io::Result<([u8; MAX_BYTES], usize)> {
+    let mut bytes = [0; MAX_BYTES];
+    match port.read(&mut bytes).await? {
+        0 => Err(io::ErrorKind::UnexpectedEof.into()),
+        len => Ok((bytes, len)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::serial_line::{LineDirection, LineParity};
+
+    const UNIT: u8 = 7;
+
+    fn line(silence: Option<Duration>) -> RtuLine {
+        RtuLine::new(&SerialLine {
+            device: String::new(),
+            baud: 9_600,
+            parity: LineParity::Even,
+            stop_bits: 1,
+            data_bits: 8,
+            mode: LineMode::Rtu { silence },
+            direction: LineDirection::Adapter,
+        })
+    }
+
+    fn frame(pdu: &[u8]) -> Vec<u8> {
+        let mut frame = [0; rtu::MAX_LEN];
+        let len = rtu::encode(UNIT, pdu, &mut frame).unwrap();
+        frame[..len].to_vec()
+    }
+
+    fn taken(line: &mut RtuLine) -> Vec<u8> {
+        let (frame, len) = line.take();
+        frame[..len].to_vec()
+    }
+
+    #[test]
+    fn the_rest_of_a_request_may_come_with_the_next_packet_of_an_adapter() {
+        let write = frame(&[16, 0, 0, 0, 2, 4, 1, 2, 3, 4]);
+        let mut line = line(None);
+        for piece in write.chunks(4) {
+            line.append(piece);
+            let ends = line.bytes().len() == write.len();
+            assert_eq!(line.waits_for_rest(|unit_id| unit_id == UNIT), !ends);
+            assert!(ends || !line.waits_for_rest(|_| true), "only once without new bytes");
+        }
+        assert_eq!(taken(&mut line), write);
+        assert!(line.bytes().is_empty());
+    }
+
+    #[test]
+    fn nothing_is_waited_for_of_other_units_and_with_a_silence_that_was_configured() {
+        for (mut line, unit_id) in [(line(None), 9), (line(Some(Duration::from_millis(2))), UNIT)] {
+            line.append(&[unit_id, 3, 2, 0, 1, 2, 3]);
+            assert!(!line.waits_for_rest(|unit_id| unit_id == UNIT));
+        }
+    }
+
+    #[test]
+    fn a_request_that_comes_instead_of_the_rest_is_taken() {
+        let (cut, read) = (&frame(&[6, 0, 0, 0, 9])[..5], frame(&[3, 0, 0, 0, 1]));
+        let mut line = line(None);
+        line.append(cut);
+        assert!(line.waits_for_rest(|_| true));
+        line.append(&read);
+        assert!(!line.waits_for_rest(|_| true));
+        assert_eq!(taken(&mut line), read);
+    }
+}
