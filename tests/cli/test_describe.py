@@ -112,6 +112,15 @@ def test_a_device_that_ignores_unit_ids_is_described_once() -> None:
     assert [each["unit"] for each in found["units"]] == [1]
 
 
+def test_invalid_replies_are_told_apart_from_silence() -> None:
+    with Stream("tcp", then=lambda asked: asked.answer(unit=9)) as device:
+        options = ("--units", "1-2", "--timeout", "0.2")
+        found = answer("describe", device.url, *options, code=1)
+        told = cli.invoke("describe", device.url, *options).stdout
+    assert (found["silent"], found["garbled"]) == ([], [1, 2])
+    assert "invalid replies: 1-2; not asked" in told
+
+
 def test_a_silent_device_is_a_failure() -> None:
     with Stream("tcp", then=silent) as device:
         options = ("--units", "1-2", "--timeout", "0.05")

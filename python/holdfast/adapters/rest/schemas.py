@@ -127,6 +127,7 @@ _LOG = object_of(
     {
         "phase": {"enum": ["starting", "running", "returning", "failed", "stopped"]},
         "connected": {"type": "boolean"},
+        "obstacle": TEXT_OR_NULL | {"description": "Why it is not caught up"},
         "contact_age": NUMBER_OR_NULL
         | {"description": "Seconds since the contents were current for sure"},
         "sequence": count("Of the last message applied"),
@@ -138,7 +139,7 @@ _LOG = object_of(
         "ignored": count("Messages that no node has sent"),
         "nodes": {"type": "array"},
     },
-    optional=("contact_age", "unavailable", "not_confirmed", "refused", "ignored"),
+    optional=("obstacle", "contact_age", "unavailable", "not_confirmed", "refused", "ignored"),
     is_open=True,
 )
 _COPIES = object_of(

@@ -31,15 +31,23 @@ def units_lines(
 ) -> Iterator[str]:
     """Which unit ids answer, as text."""
     answering = [each.unit for each in seen if each.answers]
-    silent = [each.unit for each in seen if not each.answers]
-    unasked = set(asked) - set(answering) - set(silent)
+    silent, garbled = _without_answer(seen)
+    unasked = set(asked) - {each.unit for each in seen}
     yield (
         f"{url}: unit ids that answer: {number_ranges(answering)}"
         + (f"; no device: {number_ranges(silent)}" if silent else "")
+        + (f"; invalid replies: {number_ranges(garbled)}" if garbled else "")
         + f"; not asked: {number_ranges(unasked) + ' and ' if unasked else ''}all others"
     )
     if ignores:
         yield "It answers every unit id: it probably ignores them. One is described."
+
+
+def _without_answer(seen: Sequence[Unit]) -> tuple[list[int], list[int]]:
+    """The unit ids without any reply, and those whose replies are invalid."""
+    others = [each for each in seen if not each.answers]
+    silent = [each.unit for each in others if not each.is_garbled]
+    return silent, [each.unit for each in others if each.is_garbled]
 
 
 def head_lines(found: Description) -> list[str]:
@@ -161,9 +169,11 @@ def _shown(each: Described, raw: object) -> str:
 def units_to_json(asked: Sequence[int], seen: Sequence[Unit], ignores: bool) -> dict[str, object]:
     """Which unit ids answer, for JSON."""
     done = [each.unit for each in seen]
+    silent, garbled = _without_answer(seen)
     return {
         "answering": [each.unit for each in seen if each.answers],
-        "silent": [each.unit for each in seen if not each.answers],
+        "silent": silent,
+        "garbled": garbled,
         "not_asked": [unit for unit in asked if unit not in done],
         "ignores_unit": ignores,
     }
