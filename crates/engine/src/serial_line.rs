@@ -14,7 +14,7 @@ use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
 #[cfg(unix)]
-use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, open, stat};
 #[cfg(unix)]
 use rustix::io::Errno;
 use serial2_tokio::rs4xx::Rs485Config;
@@ -149,26 +149,52 @@ impl SerialLine {
 }
 
 #[cfg(unix)]
-type Lock = Arc<OwnedFd>;
+type Lock = Arc<HeldLock>;
+
+/// Ends with the process that took it, not with a child that has inherited the file.
+#[cfg(unix)]
+#[derive(Debug)]
+struct HeldLock {
+    file: OwnedFd,
+    of_process: u32,
+}
+
+#[cfg(unix)]
+impl Drop for HeldLock {
+    fn drop(&mut self) {
+        if self.of_process == std::process::id() {
+            let _ = flock(&self.file, FlockOperation::Unlock);
+        }
+    }
+}
 
 /// Locks a line. Within this process it may be open twice: a reload opens it before it closes it.
 #[cfg(unix)]
 fn lock(device: &str) -> io::Result<Lock> {
-    static HELD: Mutex<BTreeMap<PathBuf, Weak<OwnedFd>>> = Mutex::new(BTreeMap::new());
+    static HELD: Mutex<BTreeMap<PathBuf, Weak<HeldLock>>> = Mutex::new(BTreeMap::new());
     let path = std::fs::canonicalize(device)?;
     let mut held = HELD.lock().unwrap_or_else(PoisonError::into_inner);
     held.retain(|_, lock| lock.strong_count() > 0);
-    if let Some(lock) = held.get(&path).and_then(Weak::upgrade) {
+    let found = stat(&path)?;
+    // A device that is plugged in again is another one.
+    let is_same = |lock: &Lock| {
+        fstat(&lock.file).is_ok_and(|of| {
+            lock.of_process == std::process::id()
+                && (of.st_dev, of.st_ino, of.st_rdev) == (found.st_dev, found.st_ino, found.st_rdev)
+        })
+    };
+    if let Some(lock) = held.get(&path).and_then(Weak::upgrade).filter(is_same) {
         return Ok(lock);
     }
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
-    let lock = Arc::new(open(&path, flags, Mode::empty())?);
-    flock(&lock, FlockOperation::NonBlockingLockExclusive).map_err(|error| match error {
+    let file = open(&path, flags, Mode::empty())?;
+    flock(&file, FlockOperation::NonBlockingLockExclusive).map_err(|error| match error {
         Errno::WOULDBLOCK => {
             io::Error::new(ErrorKind::ResourceBusy, "another program uses the line")
         }
         other => other.into(),
     })?;
+    let lock = Arc::new(HeldLock { file, of_process: std::process::id() });
     held.insert(path, Arc::downgrade(&lock));
     Ok(lock)
 }

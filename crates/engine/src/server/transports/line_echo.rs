@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// Added to the time that a reply takes on the line: adapters and systems hold bytes back.
-const DELAY: Duration = Duration::from_millis(50);
+/// Added to the time that a reply takes on the line: adapters hold bytes back for up to 16 ms.
+const DELAY: Duration = Duration::from_millis(25);
 
-/// The last reply, until something else has come, and whether the line has an echo.
+/// The last reply, until a request has come, and whether the line has an echo.
 #[derive(Debug, Default)]
 pub(super) struct LineEcho {
     sent: Vec<u8>,
@@ -28,21 +28,32 @@ impl LineEcho {
         self.until = Some(Instant::now() + takes + DELAY);
     }
 
-    /// The number of bytes at the start of what has been received since that are the echo.
+    /// The number of bytes at the start of what has been received that are the echo.
     pub(super) fn at_start_of(&mut self, received: &[u8]) -> usize {
-        let len = self.sent.len();
-        if received.len() < len && self.sent.starts_with(received) {
+        if self.sent.is_empty() || !received.starts_with(&self.sent) {
             return 0;
         }
-        let is_same = received.starts_with(&self.sent);
         let is_soon = self.until.is_some_and(|until| Instant::now() <= until);
-        let is_echo = is_same && (self.is_certain || self.has_echo.unwrap_or(is_soon));
-        if self.is_certain && len > 0 {
-            self.has_echo = Some(is_same);
+        let is_echo = self.is_certain || self.has_echo.unwrap_or(is_soon);
+        if self.is_certain {
+            self.has_echo = Some(true);
+        }
+        let len = self.sent.len();
+        self.sent.clear();
+        if is_echo { len } else { 0 }
+    }
+
+    /// Whether these bytes are the start of an echo whose rest may come with the next packet.
+    pub(super) fn begins_with(&self, received: &[u8]) -> bool {
+        received.len() < self.sent.len() && self.sent.starts_with(received)
+    }
+
+    /// A request has come, which is no echo. A line that had an echo keeps it: one echo may be damaged.
+    pub(super) fn request(&mut self) {
+        if self.is_certain && !self.sent.is_empty() && self.has_echo.is_none() {
+            self.has_echo = Some(false);
         }
         self.sent.clear();
-        self.is_certain = false;
-        if is_echo { len } else { 0 }
     }
 }
 
@@ -56,7 +67,11 @@ mod tests {
 
     fn after(echo: &mut LineEcho, request: &[u8], reply: &[u8], received: &[u8]) -> usize {
         echo.sent(request, reply, Duration::from_secs(3600));
-        echo.at_start_of(received)
+        let len = echo.at_start_of(received);
+        if len == 0 && !echo.begins_with(received) {
+            echo.request();
+        }
+        len
     }
 
     #[test]
@@ -71,7 +86,19 @@ mod tests {
     fn an_echo_may_come_in_parts() {
         let mut echo = LineEcho::default();
         assert_eq!(after(&mut echo, READ, VALUE, &VALUE[..3]), 0);
+        assert!(echo.begins_with(&VALUE[..3]) && !echo.begins_with(VALUE));
         assert_eq!(echo.at_start_of(VALUE), VALUE.len());
+    }
+
+    #[test]
+    fn a_damaged_echo_does_not_show_that_there_is_none() {
+        let mut echo = LineEcho::default();
+        echo.sent(READ, VALUE, Duration::ZERO);
+        assert_eq!(echo.at_start_of(&[0xFF, 7, 3]), 0);
+        assert_eq!(after(&mut echo, WRITE, WRITE, WRITE), WRITE.len());
+        assert_eq!(after(&mut echo, READ, VALUE, VALUE), VALUE.len());
+        assert_eq!(after(&mut echo, READ, VALUE, WRITE), 0);
+        assert_eq!(after(&mut echo, WRITE, WRITE, WRITE), WRITE.len(), "it still has one");
     }
 
     #[test]

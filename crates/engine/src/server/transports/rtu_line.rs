@@ -25,8 +25,8 @@ pub(super) struct RtuLine {
     /// Whether the silence is that of the standard, not one that was configured.
     may_wait: bool,
     last: Instant,
-    /// How many bytes there were when the silence began after which the rest was waited for.
-    cut: Option<usize>,
+    /// How many bytes there were at each silence after which the rest was waited for.
+    cuts: Vec<usize>,
     is_waiting: bool,
 }
 
@@ -40,7 +40,7 @@ impl RtuLine {
             silence,
             may_wait: !is_configured && silence < PACKET_PAUSE,
             last: Instant::now(),
-            cut: None,
+            cuts: Vec::new(),
             is_waiting: false,
         }
     }
@@ -59,11 +59,25 @@ impl RtuLine {
     /// Does the same while a request is carried out: of several frames, the last one counts.
     pub(super) async fn receive_newer(&mut self, port: &SerialPort) -> io::Result<()> {
         let (bytes, len) = read(port).await?;
-        if self.last.elapsed() >= self.silence {
+        let pause = self.last.elapsed();
+        if pause >= PACKET_PAUSE || (pause >= self.silence && !self.is_incomplete()) {
             self.skip(self.len);
         }
         self.append(&bytes[..len]);
         Ok(())
+    }
+
+    /// Whether these are the bytes of a request, or of its start: not of noise.
+    pub(super) fn has_request(&self) -> bool {
+        match Requests::default().next(self.bytes()) {
+            Next::Frame { .. } => true,
+            Next::Incomplete => self.len > 1 && self.bytes[0] != 0,
+            Next::Damaged { .. } | Next::Stray { .. } => false,
+        }
+    }
+
+    fn is_incomplete(&self) -> bool {
+        Requests::default().next(self.bytes()) == Next::Incomplete
     }
 
     fn append(&mut self, bytes: &[u8]) {
@@ -78,38 +92,45 @@ impl RtuLine {
         self.last + if self.is_waiting { PACKET_PAUSE } else { self.silence }
     }
 
-    /// After a silence: whether the rest of a request is waited for. Frames of other units follow each other
-    /// too soon for that, and the replies of others are no requests.
-    pub(super) fn waits_for_rest(&mut self, is_served: impl Fn(u8) -> bool) -> bool {
-        let is_incomplete = || Requests::default().next(self.bytes()) == Next::Incomplete;
-        if !self.may_wait || self.is_waiting || !is_served(self.bytes[0]) || !is_incomplete() {
+    /// After a silence: whether the rest is waited for, of an echo that has begun or of a request. Requests to
+    /// other units follow each other too soon for that, and the replies of others are no requests.
+    pub(super) fn waits_for_rest(&mut self, is_echo: bool, is_served: impl Fn(u8) -> bool) -> bool {
+        let may_wait = is_echo
+            || self.may_wait
+                && is_served(self.bytes[0])
+                && self.is_incomplete()
+                && self.start().is_none();
+        if self.is_waiting || !may_wait {
             return false;
         }
         self.is_waiting = true;
-        self.cut = Some(self.len);
+        self.cuts.push(self.len);
         true
     }
 
-    /// Takes the frame that has ended. If a new request came instead of the rest, it is that one.
+    /// Where a valid frame starts that ends here: at the first byte, or at one that came after a silence,
+    /// where a new request has come instead of the rest.
+    fn start(&self) -> Option<usize> {
+        let mut starts = [0].into_iter().chain(self.cuts.iter().copied());
+        starts.find(|start| rtu::decode(&self.bytes[*start..self.len]).is_ok())
+    }
+
+    /// Takes the frame that has ended.
     pub(super) fn take(&mut self) -> ([u8; MAX_BYTES], usize) {
-        let (mut frame, mut len) = (self.bytes, self.len);
-        let is_valid = |frame: &[u8]| rtu::decode(frame).is_ok();
-        if let Some(cut) = self.cut.take()
-            && !is_valid(&frame[..len])
-            && is_valid(&frame[cut..len])
-        {
-            frame.copy_within(cut..len, 0);
-            len -= cut;
-        }
-        self.skip(self.len);
+        self.skip(self.start().unwrap_or_default());
+        let (frame, len) = (self.bytes, self.len);
+        self.skip(len);
         (frame, len)
     }
 
     /// Drops the first bytes.
     pub(super) fn skip(&mut self, count: usize) {
-        self.bytes.copy_within(count..self.len, 0);
-        self.len -= count;
-        (self.cut, self.is_waiting) = (None, false);
+        if count > 0 {
+            self.bytes.copy_within(count..self.len, 0);
+            self.len -= count;
+            self.cuts.clear();
+            self.is_waiting = false;
+        }
     }
 }
 
@@ -158,8 +179,8 @@ mod tests {
         for piece in write.chunks(4) {
             line.append(piece);
             let ends = line.bytes().len() == write.len();
-            assert_eq!(line.waits_for_rest(|unit_id| unit_id == UNIT), !ends);
-            assert!(ends || !line.waits_for_rest(|_| true), "only once without new bytes");
+            assert_eq!(line.waits_for_rest(false, |unit_id| unit_id == UNIT), !ends);
+            assert!(ends || !line.waits_for_rest(false, |_| true), "only once without new bytes");
         }
         assert_eq!(taken(&mut line), write);
         assert!(line.bytes().is_empty());
@@ -169,18 +190,46 @@ mod tests {
     fn nothing_is_waited_for_of_other_units_and_with_a_silence_that_was_configured() {
         for (mut line, unit_id) in [(line(None), 9), (line(Some(Duration::from_millis(2))), UNIT)] {
             line.append(&[unit_id, 3, 2, 0, 1, 2, 3]);
-            assert!(!line.waits_for_rest(|unit_id| unit_id == UNIT));
+            assert!(!line.waits_for_rest(false, |unit_id| unit_id == UNIT));
         }
     }
 
     #[test]
     fn a_request_that_comes_instead_of_the_rest_is_taken() {
-        let (cut, read) = (&frame(&[6, 0, 0, 0, 9])[..5], frame(&[3, 0, 0, 0, 1]));
-        let mut line = line(None);
-        line.append(cut);
-        assert!(line.waits_for_rest(|_| true));
-        line.append(&read);
-        assert!(!line.waits_for_rest(|_| true));
-        assert_eq!(taken(&mut line), read);
+        let read = frame(&[3, 0, 0, 0, 1]);
+        for before in [&frame(&[6, 0, 0, 0, 9])[..5], &[0], &[0, 0], &[UNIT, 3], &[UNIT]] {
+            let mut line = line(None);
+            line.append(before);
+            assert!(line.waits_for_rest(false, |_| true));
+            line.append(&read);
+            line.skip(0);
+            while line.waits_for_rest(false, |_| true) {
+                line.is_waiting = false;
+            }
+            assert_eq!(taken(&mut line), read, "after {before:?}");
+        }
+    }
+
+    #[test]
+    fn the_rest_of_an_echo_is_waited_for_too() {
+        let mut line = line(Some(Duration::from_millis(2)));
+        line.append(&[9, 3, 2]);
+        assert!(line.waits_for_rest(true, |_| false));
+        assert!(!line.waits_for_rest(true, |_| false), "only once without new bytes");
+    }
+
+    #[test]
+    fn noise_is_no_request() {
+        for (bytes, is_one) in [
+            (&[0][..], false),
+            (&[0, 0, 0], false),
+            (&[UNIT], false),
+            (&[UNIT, 3, 0], true),
+            (&frame(&[3, 0, 0, 0, 1]), true),
+        ] {
+            let mut line = line(None);
+            line.append(bytes);
+            assert_eq!(line.has_request(), is_one, "{bytes:?}");
+        }
     }
 }

@@ -88,6 +88,14 @@ impl Input<'_> {
             Input::Ascii(characters) => receive(port, characters).await,
         }
     }
+
+    /// Whether a request has come, or begun: noise is none.
+    fn has_request(&self) -> bool {
+        match self {
+            Input::Rtu(line) => line.has_request(),
+            Input::Ascii(characters) => characters.contains(&b':'),
+        }
+    }
 }
 
 impl ModbusSerial {
@@ -126,6 +134,8 @@ impl ModbusSerial {
                 _ = &mut stopping => return,
                 _ = lost => serving.context.report(Kind::LineLost, None),
             }
+            // The system gives its name to the next device only when nobody has the lost one.
+            drop(line);
             line = loop {
                 tokio::select! {
                     _ = &mut stopping => return,
@@ -150,7 +160,8 @@ impl ModbusSerial {
                 biased;
                 received = line.receive(port) => received,
                 () = sleep_until(end), if has_begun => {
-                    if line.waits_for_rest(|unit_id| self.is_served(unit_id)) {
+                    let is_echo = echo.begins_with(line.bytes());
+                    if line.waits_for_rest(is_echo, |unit_id| self.is_served(unit_id)) {
                         continue;
                     }
                     let (frame, len) = line.take();
@@ -176,6 +187,7 @@ impl ModbusSerial {
             self.damaged();
             return Ok(());
         };
+        echo.request();
         let mut reply = [0; rtu::MAX_LEN];
         let Some(buffer) = reply[Rtu::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return Ok(());
@@ -263,6 +275,7 @@ impl ModbusSerial {
             self.damaged();
             return Ok(());
         };
+        echo.request();
         let mut buffer = [0; pdu::MAX_LEN];
         let answer = self.answer(serving, unit_id, request, &mut buffer);
         let Some(len) = unless_newer(answer, Input::Ascii(input), port).await? else {
@@ -348,8 +361,8 @@ impl ModbusSerial {
     }
 }
 
-/// Waits for a reply. Returns its length; `None` if there is none, or if something was received meanwhile: the
-/// master has given up, and would take it for the reply to its next request.
+/// Waits for a reply. Returns its length; `None` if there is none, or if another request has come meanwhile: the
+/// master has given up, and would take it for the reply to that one.
 async fn unless_newer(
     answer: impl Future<Output = Option<usize>>,
     mut input: Input<'_>,
@@ -362,7 +375,7 @@ async fn unless_newer(
             biased;
             len = &mut answer => return lost.map_or(Ok(len.filter(|_| !is_newer)), Err),
             received = input.receive(port), if lost.is_none() => match received {
-                Ok(()) => is_newer = true,
+                Ok(()) => is_newer = input.has_request(),
                 Err(error) => lost = Some(error),
             },
         }
