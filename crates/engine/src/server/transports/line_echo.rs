@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// Added to the time that a reply takes on the line: adapters hold bytes back for up to 16 ms.
-const DELAY: Duration = Duration::from_millis(25);
+/// Added to the time that a reply takes on the line: adapters hold bytes back for up to 16 ms, in both directions.
+const DELAY: Duration = Duration::from_millis(40);
 
 /// The last reply, until a request has come, and whether the line has an echo.
 #[derive(Debug, Default)]
