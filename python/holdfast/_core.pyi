@@ -930,6 +930,9 @@ class Request:
     def pdu(self) -> bytes:
         """The encoded request, without transport framing."""
 
+    def as_multiple(self) -> Request | None:
+        """The same write with function 15 or 16, if this is one of a single coil or register."""
+
     def rtu_frame(self, unit: int) -> bytes:
         """The RTU frame to one unit id (Modbus over Serial Line V1.02, 2.5.1)."""
 

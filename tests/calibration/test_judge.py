@@ -16,7 +16,7 @@ from calibration.blocks import build, constant, empty, near
 from calibration.cases import EMPTY, NOW, READS, Case, Truth
 from calibration.judge import Claim, Row, verdict
 from holdfast.discovery import description
-from holdfast.discovery.described import Described
+from holdfast.discovery.described_tag import DescribedTag
 from holdfast.discovery.description import Description
 from holdfast.discovery.type_guess import Guess
 from holdfast.values import encode
@@ -186,7 +186,7 @@ def test_a_planted_false_description_is_counted_as_wrong(monkeypatch: pytest.Mon
     assert "float32 CDAB" in str(judge.wrong(after)[0])
 
 
-def _with_order(described: Described, order: str) -> Described:
+def _with_order(described: DescribedTag, order: str) -> DescribedTag:
     return replace(described, tag=replace(described.tag, order=order))
 
 

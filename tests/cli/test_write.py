@@ -77,6 +77,12 @@ def test_one_bit_of_a_register_is_written_and_the_others_are_kept(
     assert memory.read("holding_registers", 4, 1) == [0x8F0E]
 
 
+def test_a_dry_run_prints_the_functions_that_the_device_gets() -> None:
+    url = f"{NOWHERE}?write_multiple=1"
+    assert done("write", url, "hr", "5", "7", "--dry-run") == ["100005000102" + "0007"]
+    assert done("write", url, "co", "5", "on", "--dry-run") == ["0f000500010101"]
+
+
 @pytest.mark.parametrize(
     ("words", "pdus"),
     [

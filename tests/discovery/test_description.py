@@ -26,7 +26,7 @@ from support.fake_device import FakeDevice, exception, registers
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from holdfast.discovery.described import Described
+    from holdfast.discovery.described_tag import DescribedTag
     from support.running import Serve
 
 
@@ -142,7 +142,7 @@ def test_a_scale_factor_that_is_too_far_leaves_the_raw_number() -> None:
     assert "no scale from X_SF, which is at 40" in second.description
 
 
-def overlaps(tags: list[Described]) -> bool:
+def overlaps(tags: list[DescribedTag]) -> bool:
     ends: dict[str, int] = {}
     for each in tags:
         if each.tag.address < ends.get(each.tag.area, 0):

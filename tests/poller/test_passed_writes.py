@@ -346,7 +346,6 @@ def test_rest_writes_through_too_and_tells_the_exception(run: Run) -> None:
         assert "meter did not take the write: exception 04" in refused.json["detail"]
 
 
-@pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="only Linux has prlimit")
 def test_a_write_that_memory_could_not_keep_is_not_confirmed(tmp_path: Path) -> None:
     mirror = {"holding_registers": 100, "keep": {"file": "mirror", "sync": 0}}
     reads = [read("holding_registers", 500, 3, ("holding_registers", 10))]

@@ -202,6 +202,10 @@ impl Request {
         PyBytes::new(py, self.encoded.pdu())
     }
 
+    fn as_multiple(&self) -> Option<Request> {
+        self.encoded.as_multiple().map(|encoded| Request { encoded })
+    }
+
     fn rtu_frame<'py>(&self, py: Python<'py>, unit: Integer) -> PyResult<Bound<'py, PyBytes>> {
         let unit = byte("unit id", unit.0)?;
         let mut frame = [0; rtu::MAX_LEN];

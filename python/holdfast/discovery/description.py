@@ -20,7 +20,7 @@ from holdfast.discovery import (
     sunspec,
     sunspec_tags,
 )
-from holdfast.discovery.described import Described
+from holdfast.discovery.described_tag import DescribedTag
 from holdfast.discovery.device_search import Identity
 from holdfast.errors import ModbusException
 from holdfast.protocol import READ_LIMITS
@@ -72,7 +72,7 @@ class Description:
     """The contents that the survey read."""
     orders: Mapping[str, float] = field(default_factory=dict)
     """The probability of each order of the device; empty if no register says anything."""
-    tags: list[Described] = field(default_factory=list)
+    tags: list[DescribedTag] = field(default_factory=list)
 
 
 def describe(
@@ -223,7 +223,9 @@ def _habits(pieces: Sequence[_Piece], now: float | None) -> dict[Habit, float]:
     return {habit: share for habit, share in shares.items() if share > IMPROBABLE}
 
 
-def _values(piece: _Piece, habits: Mapping[Habit, float], now: float | None) -> Iterator[Described]:
+def _values(
+    piece: _Piece, habits: Mapping[Habit, float], now: float | None
+) -> Iterator[DescribedTag]:
     if piece.is_empty:
         yield from _filled(piece)
         return
@@ -235,7 +237,7 @@ def _values(piece: _Piece, habits: Mapping[Habit, float], now: float | None) -> 
         yield _described(piece, value, min(sure, MAX_CONFIDENCE))
 
 
-def _filled(piece: _Piece) -> Iterator[Described]:
+def _filled(piece: _Piece) -> Iterator[DescribedTag]:
     """Registers that contain nothing, in tags of limited size."""
     content = piece.reads[0][0]
     size = len(piece.reads[0])
@@ -244,10 +246,10 @@ def _filled(piece: _Piece) -> Iterator[Described]:
         reasons = (segments.FILL_REASONS[content],)
         kind = "uint16" if count == 1 else f"uint16[{count}]"
         tag = _tag(piece.area, piece.address + first, kind, "ABCD", segments.NOTHING_KNOWN, reasons)
-        yield Described(tag, segments.NOTHING_KNOWN, (content,) * len(piece.reads), reasons)
+        yield DescribedTag(tag, segments.NOTHING_KNOWN, (content,) * len(piece.reads), reasons)
 
 
-def _described(piece: _Piece, value: Value, confidence: float) -> Described:
+def _described(piece: _Piece, value: Value, confidence: float) -> DescribedTag:
     kind = value.type
     if kind == segments.PART:
         kind = "uint16"
@@ -259,10 +261,10 @@ def _described(piece: _Piece, value: Value, confidence: float) -> Described:
     if size < value.registers:
         kind = f"{kind}[{value.registers // size}]"
     tag = _tag(piece.area, piece.address + value.offset, kind, value.order, confidence, reasons)
-    return Described(tag, confidence, value.found, reasons)
+    return DescribedTag(tag, confidence, value.found, reasons)
 
 
-def _bits(area: Area, extent: range, contents: Sequence[Sequence[int]]) -> Iterator[Described]:
+def _bits(area: Area, extent: range, contents: Sequence[Sequence[int]]) -> Iterator[DescribedTag]:
     size = 1 if len(extent) <= SINGLE_BITS else MAX_BITS_PER_TAG
     for first in range(0, len(extent), size):
         count = min(size, len(extent) - first)
@@ -274,7 +276,7 @@ def _bits(area: Area, extent: range, contents: Sequence[Sequence[int]]) -> Itera
         reasons = ("changes",) if any(each != found[0] for each in found) else ()
         address = extent.start + first
         tag = Tag(f"{SHORT_OF[area]}_{address}", area, address, kind)
-        yield Described(tag, 1.0, found, reasons)
+        yield DescribedTag(tag, 1.0, found, reasons)
 
 
 def _tag(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from holdfast.discovery.described import Described
+from holdfast.discovery.described_tag import DescribedTag
 from holdfast.protocol import READ_LIMITS
 from holdfast.tags import Tag
 from holdfast.tags.scale import RegisterScale
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from holdfast.discovery.sunspec import Model, Point, SunSpec
 
 
-def tags_of(found: SunSpec) -> Iterator[Described]:
+def tags_of(found: SunSpec) -> Iterator[DescribedTag]:
     """The points of all models that have a value."""
     names: set[str] = set()
     for model in found.models:
@@ -26,7 +26,7 @@ def tags_of(found: SunSpec) -> Iterator[Described]:
                 yield _of_point(model, point, names)
 
 
-def _of_point(model: Model, point: Point, names: set[str]) -> Described:
+def _of_point(model: Model, point: Point, names: set[str]) -> DescribedTag:
     scale, flaw = _scale_of(point)
     name = _unique(f"{model.name}_{point.name}{'_raw' if flaw else ''}", names)
     text = f"SunSpec model {model.id}"
@@ -50,8 +50,8 @@ def _of_point(model: Model, point: Point, names: set[str]) -> Described:
         description=text,
     )
     if scale is None:
-        return Described(tag, 1.0, (point.value,), (text,))
-    return Described(replace(tag, scale=scale), 1.0, (point.value,), (text,), shown=tag)
+        return DescribedTag(tag, 1.0, (point.value,), (text,))
+    return DescribedTag(replace(tag, scale=scale), 1.0, (point.value,), (text,), shown=tag)
 
 
 def _scale_of(point: Point) -> tuple[RegisterScale | None, str]:

@@ -569,10 +569,8 @@ impl Device {
         let answer =
             self.link.call(*unit_id, &request, *timeout, priority, &permit).await.map(data);
         // A broadcast has no reply, and so no values.
-        let answer = answer.and_then(|bytes| match bytes.len() == len {
-            true => Ok(bytes),
-            false => Err(Fault::Invalid),
-        });
+        let answer = answer
+            .and_then(|bytes| if bytes.len() == len { Ok(bytes) } else { Err(Fault::Invalid) });
         // After a stop of the process, a reply may be old, and another node may have read a newer one.
         if fence.is_some_and(|fence| !fence.allows()) {
             return Err(Fault::Standby);

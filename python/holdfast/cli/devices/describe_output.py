@@ -16,7 +16,7 @@ from holdfast.values.json import jsonable
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from holdfast.discovery.described import Described
+    from holdfast.discovery.described_tag import DescribedTag
     from holdfast.discovery.description import Description
     from holdfast.discovery.device_search import Unit
     from holdfast.discovery.sunspec import SunSpec
@@ -81,7 +81,7 @@ def described_lines(found: Description, most: int | None) -> list[str]:
     return [line for part in parts if part for line in ("", *part)]
 
 
-def _rows(tags: Sequence[Described]) -> Iterator[tuple[str, ...]]:
+def _rows(tags: Sequence[DescribedTag]) -> Iterator[tuple[str, ...]]:
     """A row for each tag. Neighbouring bits share one, and neighbours that contain nothing."""
     for kind, group in itertools.groupby(_runs(tags), key=lambda each: each[0]):
         own = [tag for _, tag in group]
@@ -105,7 +105,7 @@ def _rows(tags: Sequence[Described]) -> Iterator[tuple[str, ...]]:
         )
 
 
-def _runs(tags: Sequence[Described]) -> Iterator[tuple[tuple[int, str | None], Described]]:
+def _runs(tags: Sequence[DescribedTag]) -> Iterator[tuple[tuple[int, str | None], DescribedTag]]:
     """Tags, each with the number and kind of its run; the kind is `None` for a run of one."""
     number, before, kind_before = 0, None, None
     for each in tags:
@@ -120,7 +120,7 @@ def _runs(tags: Sequence[Described]) -> Iterator[tuple[tuple[int, str | None], D
         before, kind_before = each.tag, kind
 
 
-def _kind(each: Described) -> str | None:
+def _kind(each: DescribedTag) -> str | None:
     """The kind of a tag: neighbours of one kind share a row; `None`: a row for the tag alone."""
     if each.tag.type == "bool":
         return "bits"
@@ -133,7 +133,7 @@ def _bits(bits: Sequence[bool]) -> str:
     )
 
 
-def _row(each: Described) -> tuple[str, ...]:
+def _row(each: DescribedTag) -> tuple[str, ...]:
     tag = each.tag
     return (
         tag.name,
@@ -148,13 +148,13 @@ def _row(each: Described) -> tuple[str, ...]:
     )
 
 
-def _value(each: Described) -> str:
+def _value(each: DescribedTag) -> str:
     """The value of the last read, after that of the first read if it changed."""
     first, last = (_shown(each, each.values[at]) for at in (0, -1))
     return last if first == last else f"{first} … {last}"
 
 
-def _shown(each: Described, raw: object) -> str:
+def _shown(each: DescribedTag, raw: object) -> str:
     tag = each.tag
     if tag.of_type.count is not None and not isinstance(raw, list):
         return terminal_text.shown(raw, tag.of_type.base)
@@ -213,7 +213,7 @@ def unit_to_json(found: Description) -> dict[str, object]:
     }
 
 
-def _tag(each: Described) -> dict[str, object]:
+def _tag(each: DescribedTag) -> dict[str, object]:
     tag = each.tag
     return {
         "name": tag.name,

@@ -144,7 +144,7 @@ def _carry_out(
     """Writes, or prints the requests of a dry run."""
     fields: dict[str, object] = {"target": url, "unit": unit, **job.to_json()}
     if dry_run:
-        pdus = [request.pdu.hex() for request in job.requests]
+        pdus = device.sent_pdus(url, job.requests)
         if as_json:
             print_json({"ok": True, **fields, "pdus": pdus})
         else:

@@ -13,6 +13,7 @@ from holdfast.cli.options.option import Command, number_option, option_group
 from holdfast.cli.options.units import refuse_broadcast
 from holdfast.client import SyncClient
 from holdfast.client.base import is_broadcast
+from holdfast.client.url import parse
 from holdfast.errors import (
     ModbusError,
     ModbusException,
@@ -21,8 +22,9 @@ from holdfast.protocol import ILLEGAL_ADDRESS, LAST_ADDRESS, MAX_UNIT
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
+    from holdfast._core import Request
     from holdfast.cli.options.plc_addresses import Place
     from holdfast.types import Area
 
@@ -36,6 +38,15 @@ def unit_option(default: int | None = 1, help: str = UNIT) -> Callable[[Command]
 
 device_options = option_group(unit_option(), timeout_option())
 """Adds `--unit` and `--timeout`."""
+
+
+def sent_pdus(url: str, requests: Sequence[Request]) -> list[str]:
+    """The requests as a device at this URL gets them, in hex."""
+    with usable():
+        is_multiple = parse(url).tolerance.write_multiple
+    multiples = [each.as_multiple() if is_multiple else None for each in requests]
+    sent = zip(requests, multiples, strict=True)
+    return [(each if multiple is None else multiple).pdu.hex() for each, multiple in sent]
 
 
 def connect(url: str, unit: int, timeout: float, *, only_writes: bool = False) -> SyncClient:

@@ -31,7 +31,7 @@ def write_tags(
     texts = _texts(words)
     if dry_run:
         writes = _prepared(of, texts, None)
-        pdus = [write.request.pdu.hex() for write in writes]
+        pdus = device.sent_pdus(of.url, [write.request for write in writes])
         if as_json:
             print_json({"ok": True, "target": of.url, "unit": of.unit, "pdus": pdus})
         else:

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Described:
+class DescribedTag:
     """A tag, and how sure it is."""
 
     tag: Tag
