@@ -1338,7 +1338,9 @@ class Fence:
     stopped sends nothing when it goes on too late.
     """
 
-    def __new__(cls) -> Fence: ...
+    def __new__(cls, lease: int) -> Fence:
+        """The fence of the lease with this number, which is the same on all nodes."""
+
     def open(self, until: float, *, settle: float = 0.0) -> None:
         """Opens it. Writes wait for `settle` seconds and the timeout of the device."""
 

@@ -252,6 +252,7 @@ class LogStep(TypedDict, total=False):
 
     `writes`: memory, area, address and values. `place` and `masks` are of a mask write: memory,
     area and address; the AND mask and the OR mask. `read` follows the write of `write_then_read`.
+    `refused`: why nothing was written.
     """
 
     access: Literal["client", "ingest", "mirror", "restore"]
@@ -260,6 +261,7 @@ class LogStep(TypedDict, total=False):
     place: tuple[str, Area, int]
     masks: tuple[int, int]
     read: tuple[str, Area, int, int]
+    refused: str
 
 
 class LogRecord(TypedDict):

@@ -5,13 +5,14 @@ The device is the judge: it knows which connection every request came over.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -27,6 +28,7 @@ from support.config_folder import written
 from support.fake_device import Stream, silent
 from support.leases import BRIEF, ENDLESS, make_settled
 from support.running import endpoint
+from support.tcp_proxy import Proxy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -192,6 +194,32 @@ def test_a_node_that_was_stopped_sends_not_one_poll_when_it_goes_on(
     wire.until(lambda: len(device.peers) > stopped_at + 20, "the other node goes on")
     assert set(device.peers[stopped_at:]) == {second}
     assert device.connections == 2
+
+
+def test_values_of_a_node_that_was_cut_off_are_refused_when_they_arrive_late(
+    node: Callable[..., Appliance],
+    settings: Callable[..., Path],
+    server: NatsServer,
+    device: Device,
+) -> None:
+    counted = itertools.count(1)
+    device.then = lambda asked: asked.answer(bytes((3, 4, 0, 0)) + next(counted).to_bytes(2))
+    with closing(Proxy(server.port, "nats")) as proxy:
+        file = settings("a", interval=0.01)
+        file.write_text(file.read_text().replace(server.url, proxy.url))
+        with Appliance(load(file), lease_times=BRIEF) as one:
+            wire.until(lambda: health(one) == "ok", "the first node polls it")
+            # It polls once, when it takes over.
+            two = node("b", BRIEF, interval=3600)
+            wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
+            proxy.hold()
+            wire.until(lambda: health(two) == "ok", "the other node has taken over")
+            newest = ask(two, "03000b0001")
+            proxy.go_on()
+            # What the first node has sent before comes before this.
+            wire.until(lambda: ask(one, "0600000001") == "0600000001", "it is connected again")
+            wire.until(lambda: ask(two, "0300000001") == "03020001", "the other node has followed")
+            assert [ask(each, "03000b0001") for each in (one, two)] == [newest, newest]
 
 
 def test_a_node_that_dies_is_replaced_and_the_first_write_waits(

@@ -43,7 +43,7 @@ def is_disconnected(fake: Stream) -> bool:
 
 
 def test_a_device_is_polled_while_its_fence_is_open(poller: ReportingPoller, fake: Fake) -> None:
-    fence = Fence()
+    fence = Fence(1)
     poller.add(device(fake, interval=0.01, fence=fence))
     wire.until(lambda: health(poller) == "standby", "it stands by")
     assert fake.connections == 0
@@ -66,7 +66,7 @@ def test_a_device_is_polled_while_its_fence_is_open(poller: ReportingPoller, fak
 def test_an_end_that_is_not_moved_ends_polls_and_closes_the_connection(
     poller: ReportingPoller, fake: Fake
 ) -> None:
-    fence = Fence()
+    fence = Fence(1)
     # The device is polled once an hour: nothing else would close its connection.
     fence.open(time.monotonic() + 0.3)
     poller.add(device(fake, interval=3600.0, fence=fence))
@@ -86,7 +86,7 @@ def test_an_end_that_is_not_moved_ends_polls_and_closes_the_connection(
 
 
 def test_a_lease_that_was_taken_too_late_to_be_used_can_be_renewed() -> None:
-    fence = Fence()
+    fence = Fence(1)
     fence.open(time.monotonic() - 1)
     assert not fence.allows
     fence.renew(time.monotonic() + FAR)
@@ -96,7 +96,7 @@ def test_a_lease_that_was_taken_too_late_to_be_used_can_be_renewed() -> None:
 def test_a_poll_that_has_begun_ends_before_a_lease_is_given_back(poller: ReportingPoller) -> None:
     waiting: list[Asked] = []
     with Stream("tcp", then=waiting.append) as slow:
-        fence = Fence()
+        fence = Fence(1)
         fence.open(time.monotonic() + FAR)
         endpoint = Endpoint.network("tcp", "127.0.0.1", slow.port)
         reads = [("holding_registers", 0, 1, None), ("holding_registers", 500, 1, None)]
@@ -121,7 +121,7 @@ def test_a_poll_that_has_begun_ends_before_a_lease_is_given_back(poller: Reporti
 def test_a_reply_after_the_end_is_not_passed_on(poller: ReportingPoller) -> None:
     waiting: list[Asked] = []
     with Stream("tcp", then=waiting.append) as slow:
-        fence = Fence()
+        fence = Fence(1)
         fence.open(time.monotonic() + FAR)
         poller.add(device(slow, interval=0.0, fence=fence))
         wire.until(lambda: len(waiting) == 1, "it is asked")
@@ -133,7 +133,7 @@ def test_a_reply_after_the_end_is_not_passed_on(poller: ReportingPoller) -> None
 
 
 def test_a_write_without_the_lease_is_not_sent(poller: ReportingPoller, fake: Fake) -> None:
-    fence = Fence()
+    fence = Fence(1)
     poller.add(device(fake, fence=fence))
     write = Request.write_register(3, 7)
     assert written(poller, poller.write("a", write)) == STANDBY
@@ -146,7 +146,7 @@ def test_writes_wait_for_what_a_former_holder_has_sent_and_keep_their_order(
     poller: ReportingPoller, fake: Fake
 ) -> None:
     def are_written(timeout: float) -> bool:
-        fence = Fence()
+        fence = Fence(1)
         before = len(fake.requests)
         poller.add(device(fake, interval=0.01, timeout=timeout, fence=fence))
         opened = time.monotonic()
@@ -171,7 +171,7 @@ def test_writes_wait_for_what_a_former_holder_has_sent_and_keep_their_order(
 def test_a_write_that_waits_is_refused_when_the_lease_is_lost(
     poller: ReportingPoller, fake: Fake
 ) -> None:
-    fence = Fence()
+    fence = Fence(1)
     poller.add(device(fake, fence=fence))
     fence.open(time.monotonic() + FAR, settle=3600.0)
     ticket = poller.write("a", Request.write_register(3, 7))
@@ -184,7 +184,7 @@ def test_a_write_that_waits_is_refused_when_the_lease_is_lost(
 def test_a_device_with_one_connection_is_connected_to_when_that_of_a_former_holder_has_ended(
     poller: ReportingPoller, fake: Fake
 ) -> None:
-    fence = Fence()
+    fence = Fence(1)
     poller.add(device(fake, timeout=0.2, release=True, fence=fence))
     opened = time.monotonic()
     fence.open(opened + FAR, settle=0.5)
@@ -195,7 +195,7 @@ def test_a_device_with_one_connection_is_connected_to_when_that_of_a_former_hold
 @pytest.mark.parametrize("kind", ["rtu+tcp", "ascii+tcp"])
 def test_other_transports_obey_too(poller: ReportingPoller, kind: str) -> None:
     with Stream(kind) as slow:
-        fence = Fence()
+        fence = Fence(1)
         endpoint = Endpoint.network(kind, "127.0.0.1", slow.port)  # type: ignore[arg-type]
         reads = [("holding_registers", 0, 1, None)]
         settings: dict[str, Any] = {"unit": 1, "interval": 0.01, "timeout": 10.0, "reads": reads}
@@ -214,7 +214,7 @@ def test_other_transports_obey_too(poller: ReportingPoller, kind: str) -> None:
 def test_a_device_that_is_replaced_while_it_stands_by_stands_by(
     poller: ReportingPoller, fake: Fake
 ) -> None:
-    fence = Fence()
+    fence = Fence(1)
     poller.add(device(fake, interval=0.01, fence=fence))
     poller.replace("a", device(fake, "b", interval=0.01, fence=fence))
     wire.until(lambda: health(poller, "b") == "standby", "the new one stands by")
@@ -226,7 +226,7 @@ def test_a_device_that_is_replaced_while_it_stands_by_stands_by(
 def test_a_device_that_loses_its_fence_while_it_stands_by_is_polled(
     poller: ReportingPoller, fake: Fake
 ) -> None:
-    poller.add(device(fake, fence=Fence()))
+    poller.add(device(fake, fence=Fence(1)))
     wire.until(lambda: health(poller) == "standby", "it stands by")
     poller.replace("a", device(fake))
     taken(poller, lambda polls, _: polls)

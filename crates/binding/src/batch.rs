@@ -236,7 +236,7 @@ fn refusal(py: Python<'_>, command: usize, index: Option<usize>, reason: &'stati
     noted.err().unwrap_or(error)
 }
 
-const fn reason(refusal: Refusal) -> &'static str {
+pub(crate) const fn reason(refusal: Refusal) -> &'static str {
     match refusal {
         Refusal::Sealed => "sealed",
         Refusal::Unsealed => "unsealed",
@@ -245,6 +245,7 @@ const fn reason(refusal: Refusal) -> &'static str {
         Refusal::WrongLength => "wrong_length",
         Refusal::Mirrored => "mirrored",
         Refusal::Stale => "stale",
+        Refusal::Overtaken => "overtaken",
         Refusal::NotRegisters => "not_registers",
         // What is wrong with the log is in its status.
         Refusal::Unavailable | Refusal::Behind | Refusal::Differs => "log_unavailable",

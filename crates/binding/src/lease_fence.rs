@@ -11,7 +11,6 @@ use pyo3::sync::PyOnceLock;
 use crate::arguments::seconds;
 
 #[pyclass(frozen, module = "holdfast")]
-#[derive(Default)]
 pub struct Fence {
     pub(crate) core: Arc<Core>,
 }
@@ -19,8 +18,8 @@ pub struct Fence {
 #[pymethods]
 impl Fence {
     #[new]
-    fn new() -> Fence {
-        Fence::default()
+    fn new(lease: u64) -> Fence {
+        Fence { core: Arc::new(Core::new(lease)) }
     }
 
     #[pyo3(signature = (until, *, settle=0.0))]

@@ -14,6 +14,7 @@ use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict, PyDict, PyList};
 
 use crate::arguments::{seconds, within, word};
+use crate::batch::reason;
 use crate::memory::Memory;
 use crate::python_values::listed;
 
@@ -267,8 +268,12 @@ impl LogReader {
         shown.set_item("node", record.origin.as_ref().map(|origin| &origin.node))?;
         shown.set_item("fresh", record.fresh)?;
         let steps = PyList::empty(py);
-        for step in &record.steps {
-            steps.append(self.step(py, step)?)?;
+        for (index, step) in record.steps.iter().enumerate() {
+            let shown = self.step(py, step)?;
+            if let Some(refusal) = record.refusals.get(index).copied().flatten() {
+                shown.set_item("refused", reason(refusal))?;
+            }
+            steps.append(shown)?;
         }
         shown.set_item("steps", steps)?;
         Ok(shown)

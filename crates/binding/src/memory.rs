@@ -342,6 +342,7 @@ impl Range {
             journal @ (Refusal::Unavailable
             | Refusal::NotStored
             | Refusal::NotConfirmed
+            | Refusal::Overtaken
             | Refusal::Behind
             | Refusal::Differs) => PyOSError::new_err(journal.to_string()),
             other => PyValueError::new_err(other.to_string()),

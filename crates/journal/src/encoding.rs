@@ -6,7 +6,7 @@
 use std::sync::Arc;
 
 use bytes::{Buf, TryGetError};
-use holdfast_memory::{Access, Action, Area, Memory, Step, StepWrite};
+use holdfast_memory::{Access, Action, Area, Memory, Step, StepWrite, Tenure};
 use thiserror::Error;
 
 /// The version that [`encode`] writes. Others are not decoded.
@@ -14,6 +14,9 @@ pub const VERSION: u8 = 1;
 
 /// The number of a file as an area.
 const FILE: u8 = Area::File(0).index() as u8;
+
+/// Set in the number of an access that a lease and whether the step claims it follow.
+const UNDER_LEASE: u8 = 0x80;
 
 /// In the order of their numbers.
 const ACCESSES: [Access; 4] = [Access::Client, Access::Ingest, Access::Mirror, Access::Restore];
@@ -50,7 +53,15 @@ impl From<TryGetError> for DecodeError {
 pub fn encode(step: &Step, out: &mut Vec<u8>) {
     out.push(VERSION);
     let access = ACCESSES.iter().position(|access| *access == step.access);
-    out.push(access.expect("each access has a number") as u8);
+    let access = access.expect("each access has a number") as u8;
+    match step.tenure {
+        None => out.push(access),
+        Some(Tenure { lease, claims }) => {
+            out.push(access | UNDER_LEASE);
+            out.extend_from_slice(&lease.to_le_bytes());
+            out.push(u8::from(claims));
+        }
+    }
     match &step.action {
         Action::Write(writes) => {
             out.push(0);
@@ -94,6 +105,11 @@ fn encoded_count(count: usize) -> u32 {
     u32::try_from(count).expect("a range is inside an area")
 }
 
+/// Whether an encoded step is under a lease.
+pub(crate) fn is_under_lease(step: &[u8]) -> bool {
+    step.get(1).is_some_and(|access| access & UNDER_LEASE != 0)
+}
+
 /// Decodes a step for these memories: all of its members exist, and hold its ranges.
 ///
 /// # Errors
@@ -104,7 +120,7 @@ pub fn decode(bytes: &[u8], members: &[Arc<Memory>]) -> Result<Step, DecodeError
     if version != VERSION {
         return Err(DecodeError::Version(version));
     }
-    let access = rest.one_of(&ACCESSES, "the access")?;
+    let (access, tenure) = rest.writer()?;
     let action = match rest.bytes.try_get_u8()? {
         0 => {
             let mut writes = Vec::new();
@@ -137,7 +153,7 @@ pub fn decode(bytes: &[u8], members: &[Arc<Memory>]) -> Result<Step, DecodeError
         found => return Err(DecodeError::Unknown { what: "the action", found }),
     };
     match rest.bytes.len() {
-        0 => Ok(Step { access, action }),
+        0 => Ok(Step { access, tenure, action }),
         extra => Err(DecodeError::Long(extra)),
     }
 }
@@ -150,9 +166,19 @@ struct Rest<'a> {
 
 impl<'a> Rest<'a> {
     /// The value that a byte is the number of.
-    fn one_of<T: Copy>(&mut self, all: &[T], what: &'static str) -> Result<T, DecodeError> {
+    fn writer(&mut self) -> Result<(Access, Option<Tenure>), DecodeError> {
         let found = self.bytes.try_get_u8()?;
-        all.get(usize::from(found)).copied().ok_or(DecodeError::Unknown { what, found })
+        let access = ACCESSES.get(usize::from(found & !UNDER_LEASE)).copied();
+        let access = access.ok_or(DecodeError::Unknown { what: "the access", found })?;
+        if found & UNDER_LEASE == 0 {
+            return Ok((access, None));
+        }
+        let lease = self.bytes.try_get_u64_le()?;
+        let claims = match self.bytes.try_get_u8()? {
+            flag @ (0 | 1) => flag == 1,
+            found => return Err(DecodeError::Unknown { what: "the claim", found }),
+        };
+        Ok((access, Some(Tenure { lease, claims })))
     }
 
     fn place(&mut self) -> Result<(u16, Area, u16), DecodeError> {

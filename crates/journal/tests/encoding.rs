@@ -4,9 +4,10 @@ use std::sync::Arc;
 
 use holdfast_journal::encoding::{DecodeError, VERSION, decode, encode};
 use holdfast_memory::{
-    Access, Action, Area, Layout, Memory, Refusal, Refused, Span, Step, StepWrite,
+    Access, Action, Area, Layout, Memory, Refusal, Refused, Span, Step, StepWrite, Tenure,
 };
 use proptest::collection::vec;
+use proptest::option;
 use proptest::prelude::*;
 use proptest::sample::select;
 
@@ -104,7 +105,17 @@ fn action() -> impl Strategy<Value = Action> {
 }
 
 fn step() -> impl Strategy<Value = Step> {
-    (access(), action()).prop_map(|(access, action)| Step { access, action })
+    let tenure = option::of((any::<u64>(), any::<bool>()))
+        .prop_map(|tenure| tenure.map(|(lease, claims)| Tenure { lease, claims }));
+    (access(), tenure, action()).prop_map(|(access, tenure, action)| Step {
+        access,
+        tenure,
+        action,
+    })
+}
+
+fn written(access: Access, action: Action) -> Step {
+    Step { access, tenure: None, action }
 }
 
 fn encoded(step: &Step) -> Vec<u8> {
@@ -165,7 +176,7 @@ fn register(member: u16, address: u16) -> StepWrite {
 
 #[test]
 fn members_and_ranges_are_checked_against_the_memories() {
-    let of = |action| decode(&encoded(&Step { access: Access::Client, action }), &members());
+    let of = |action| decode(&encoded(&written(Access::Client, action)), &members());
     let area = Area::HoldingRegisters;
     let outside = |address| DecodeError::Range { member: 0, area, address, count: 1 };
     assert_eq!(of(Action::Write(vec![register(2, 100)])), Err(DecodeError::Member(2)));
@@ -182,8 +193,7 @@ fn members_and_ranges_are_checked_against_the_memories() {
 #[test]
 fn errors_name_what_is_wrong() {
     let members = members();
-    let good =
-        encoded(&Step { access: Access::Ingest, action: Action::Write(vec![register(0, 100)]) });
+    let good = encoded(&written(Access::Ingest, Action::Write(vec![register(0, 100)])));
     let with = |at: usize, byte| {
         let mut bytes = good.clone();
         bytes[at] = byte;
@@ -196,7 +206,7 @@ fn errors_name_what_is_wrong() {
     assert_eq!(decode(&good[..good.len() - 1], &members), Err(DecodeError::Short));
     let mask =
         Action::Mask { member: 0, area: Area::InputRegisters, address: 0, and_mask: 1, or_mask: 2 };
-    let mut long = encoded(&Step { access: Access::Client, action: mask });
+    let mut long = encoded(&written(Access::Client, mask));
     long.push(0);
     assert_eq!(decode(&long, &members), Err(DecodeError::Long(1)));
     assert_eq!(decode(&[], &members), Err(DecodeError::Short));

@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use futures_util::StreamExt;
 use holdfast_journal::log::{LogError, LogReader, Next, Phase, Settings, Until};
 use holdfast_memory::{
-    Access, Action, Area, Freshness, Memory, Mirrored, Operation, Read, Refusal, Refused, Span,
-    Step, StepWrite, Write, write_across,
+    Access, Action, Area, Freshness, Memory, Mirrored, Operation, Outcome, Read, Refusal, Refused,
+    Span, Step, StepWrite, Tenure, Write, write_across,
 };
 use nodes::process::{Answer, Process};
 use nodes::{Node, REGISTERS, Server, cluster, memory_of, until};
@@ -24,7 +24,7 @@ fn step(address: u16, value: u16) -> Step {
         count: 1,
         bytes: value.to_be_bytes().to_vec(),
     };
-    Step { access: Access::Ingest, action: Action::Write(vec![write]) }
+    Step { access: Access::Ingest, tenure: None, action: Action::Write(vec![write]) }
 }
 
 #[test]
@@ -530,6 +530,57 @@ fn mirror(node: &Node, value: u16) {
     node.memory.write(Access::Mirror, write).unwrap();
 }
 
+/// Mirrors a value under a lease.
+fn mirror_under(lease: u64, claims: bool, node: &Node, value: u16) -> Result<(), Refusal> {
+    let bytes = value.to_be_bytes();
+    let write = Write { area: REGISTERS, address: 3, count: 1, bytes: &bytes };
+    let (sender, receiver) = std::sync::mpsc::channel();
+    let done = Box::new(move |outcome: Outcome| drop(sender.send(outcome)));
+    let tenure = Some(Tenure { lease, claims });
+    node.memory.submit_under(tenure, Access::Mirror, Operation::Write(&[write]), done)?;
+    receiver.recv().unwrap().map(|_| ()).map_err(|refused| refused.refusal)
+}
+
+#[test]
+fn what_a_former_holder_of_a_lease_writes_late_is_refused() {
+    const LEASE: u64 = 7;
+    let server = Server::new();
+    let soon = |settings: &mut Settings| settings.snapshot_steps = 20;
+    let [a, b] = ["a", "b"].map(|name| Node::new(&[&server], name, soon));
+    a.start();
+    b.start();
+    let late = || mirror_under(LEASE, false, &a, 4);
+    assert_eq!(mirror_under(LEASE, false, &b, 1), Ok(()), "nobody has claimed the lease");
+    assert_eq!(mirror_under(LEASE, true, &a, 2), Ok(()));
+    assert_eq!(mirror_under(LEASE, false, &a, 2), Ok(()));
+    assert_eq!(mirror_under(LEASE, true, &b, 3), Ok(()));
+    assert_eq!(late(), Err(Refusal::Overtaken));
+    assert_eq!(mirror_under(LEASE, false, &b, 5), Ok(()));
+    assert_eq!(mirror_under(LEASE + 1, false, &a, 5), Ok(()), "that is another lease");
+    let memory = memory_of(100);
+    let settings = Settings::new("site", "replay", vec![server.url()]);
+    let members = vec![("plant".to_owned(), memory)];
+    let mut reader = LogReader::open(&settings, members, Until::Now, nodes::DEADLINE).unwrap();
+    let mut refusals = Vec::new();
+    while let Next::Record(record) = reader.next(nodes::DEADLINE).unwrap() {
+        refusals.extend(record.refusals.into_iter().flatten());
+    }
+    assert_eq!(refusals, [Refusal::Overtaken]);
+    // Whoever begins with a snapshot knows the holder too.
+    until("a snapshot is taken", || {
+        b.write(0, 1).unwrap();
+        first_sequence(&server) > 1
+    });
+    let c = Node::started(&[&server], "c");
+    assert_eq!(late(), Err(Refusal::Overtaken));
+    c.until_applied(a.status().last_sequence);
+    assert_eq!((c.read(3), a.read(3), b.read(3)), (Ok(5), Ok(5), Ok(5)));
+    assert_eq!(mirror_under(LEASE, true, &a, 6), Ok(()), "it has the lease again");
+    assert_eq!(mirror_under(LEASE, false, &b, 5), Err(Refusal::Overtaken));
+    c.until_applied(a.status().last_sequence);
+    assert_eq!(c.read(3), Ok(6));
+}
+
 #[test]
 fn values_of_a_device_that_a_node_replays_have_no_age_and_later_ones_that_of_the_contact() {
     let server = Server::new();
@@ -894,7 +945,7 @@ fn a_message_of_a_newer_version_stops_a_node() {
     until("the node stops", || node.failure().is_some());
     let error = node.failure().unwrap();
     assert_eq!(error.kind(), "version");
-    let expected = "a message of the log has version 9, supported is 1: update this node";
+    let expected = "a message of the log has version 9, supported is 2: update this node";
     assert_eq!(error.to_string(), expected);
     assert_eq!(node.read(0), Err(Refusal::Differs));
 }

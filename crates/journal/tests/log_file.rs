@@ -288,8 +288,8 @@ fn a_note_that_does_not_fit_is_refused() {
     );
     let error = fresh("site").log.resume(b"{").unwrap_err();
     assert_eq!(error.kind(), "snapshot");
-    let error = fresh("site").log.resume(br#"{"version": 2}"#).unwrap_err();
-    assert!(matches!(error, LogError::Version { found: 2, .. }), "{error}");
+    let error = fresh("site").log.resume(br#"{"version": 3}"#).unwrap_err();
+    assert!(matches!(error, LogError::Version { found: 3, .. }), "{error}");
     let other = fresh("site");
     other.log.resume(&note).unwrap();
     let error = other.log.start().unwrap_err();

@@ -40,6 +40,8 @@ pub enum Refusal {
     NotStored,
     #[error("the write was sent, but not confirmed: it may still be carried out")]
     NotConfirmed,
+    #[error("another node has written what the device holds since, and nothing was written")]
+    Overtaken,
     #[error("the memory has had no contact with its log for too long")]
     Behind,
     #[error("the contents are not those that the log leads to")]

@@ -41,5 +41,5 @@ pub use memory::{Contents, Memory, check_across, write_across};
 pub use mirrored::{Freshness, Mirrored};
 pub use operation::{Access, Read, Write};
 pub use seal::{Gate, GateMode};
-pub use step::{Action, CarriedOut, Done, Journal, Operation, Outcome, Step, StepWrite};
+pub use step::{Action, CarriedOut, Done, Journal, Operation, Outcome, Step, StepWrite, Tenure};
 pub use write_queue::{WriteQueue, Written};

@@ -13,7 +13,7 @@ use crate::error::{LayoutError, Refusal, Refused};
 use crate::mirrored::{Mirrored, MirroredRanges};
 use crate::operation::{Access, Read, Write};
 use crate::seal::{self, Gate};
-use crate::step::{Action, Done, Journal, Operation, Step, StepWrite, wait};
+use crate::step::{Action, Done, Journal, Operation, Step, StepWrite, Tenure, wait};
 use crate::write_queue::{Observers, WriteQueue};
 
 /// Which ranges may be used.
@@ -257,6 +257,23 @@ impl Memory {
         operation: Operation<'_>,
         done: Done,
     ) -> Result<(), Refusal> {
+        self.submit_under(None, access, operation, done)
+    }
+
+    /// As [`Memory::submit`], for a write under a lease.
+    ///
+    /// # Errors
+    /// As [`Memory::submit`].
+    ///
+    /// # Panics
+    /// As [`Memory::submit`].
+    pub fn submit_under(
+        &self,
+        tenure: Option<Tenure>,
+        access: Access,
+        operation: Operation<'_>,
+        done: Done,
+    ) -> Result<(), Refusal> {
         let content = self.shared();
         self.admit(&content, access)?;
         let Some((journal, member)) = self.journal.get() else { panic!("there is no journal") };
@@ -284,7 +301,7 @@ impl Memory {
             }
         };
         drop(content);
-        journal.submit(Step { access, action }, done);
+        journal.submit(Step { access, tenure, action }, done);
         Ok(())
     }
 
@@ -757,7 +774,7 @@ fn submit_across(
         memory.admit(&memory.shared(), access).map_err(refused)?;
         step.push(StepWrite::new(*member, write));
     }
-    journal.submit(Step { access, action: Action::Write(step) }, done);
+    journal.submit(Step { access, tenure: None, action: Action::Write(step) }, done);
     Ok(())
 }
 
@@ -1040,7 +1057,7 @@ mod tests {
         assert_eq!(accesses(&memory, Access::Client, 5, 3), [Err(Refusal::Stale); 6]);
         let write = StepWrite::new(0, &writing(REGISTERS, 6, &[3, 4]));
         let action = Action::WriteThenRead { write, area: REGISTERS, address: 6, count: 1 };
-        let step = Step { access: Access::Client, action };
+        let step = Step { access: Access::Client, tenure: None, action };
         // Another node may know newer values.
         assert_eq!(step.carry_out(&[Arc::clone(&memory)]).unwrap().read, [3, 4]);
         memory.write(Access::Mirror, writing(REGISTERS, 5, &[1; 6])).unwrap();
@@ -1057,7 +1074,7 @@ mod tests {
         let then = write.clone();
         let then = Action::WriteThenRead { write: then, area: REGISTERS, address: 5, count: 1 };
         for action in [Action::Write(vec![write]), then] {
-            let step = Step { access: Access::Mirror, action };
+            let step = Step { access: Access::Mirror, tenure: None, action };
             let ages = [Some(Duration::ZERO), Some(Duration::from_secs(1)), None];
             let found = ages.map(|age| {
                 let (memory, aged) = stale();
@@ -1126,7 +1143,8 @@ mod tests {
                 assert_eq!(across, expected);
             }
             let step = StepWrite::new(0, &writing(REGISTERS, 0, &[3, 4]));
-            let step = Step { access: Access::Client, action: Action::Write(vec![step]) };
+            let action = Action::Write(vec![step]);
+            let step = Step { access: Access::Client, tenure: None, action };
             if guards {
                 *guard.refusal.lock().unwrap() = None;
                 assert_eq!(follower.changes(), Ok(all), "after a refusal, all is new");

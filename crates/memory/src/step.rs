@@ -13,7 +13,19 @@ use crate::operation::{Access, Write};
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Step {
     pub access: Access,
+    /// Under which lease it was written, if that matters to the journal.
+    pub tenure: Option<Tenure>,
     pub action: Action,
+}
+
+/// A lease under which a node writes what it reads from a device, while others may hold it before and after.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Tenure {
+    /// The number of the lease, the same on all nodes.
+    pub lease: u64,
+    /// Whether the step ends the tenure of the node that wrote under this lease before. Without it, a step of
+    /// another node than the last that has claimed the lease is refused with [`Refusal::Overtaken`].
+    pub claims: bool,
 }
 
 /// What a step does. A member is the number of a memory in its journal.
@@ -59,7 +71,7 @@ pub trait Journal: fmt::Debug + Send + Sync {
     /// also before this returns.
     ///
     /// Besides the refusals of a memory, the outcome may be [`Refusal::Unavailable`],
-    /// [`Refusal::NotStored`] or [`Refusal::NotConfirmed`].
+    /// [`Refusal::NotStored`], [`Refusal::NotConfirmed`] or [`Refusal::Overtaken`].
     fn submit(&self, step: Step, done: Done);
 
     /// Whether [`Journal::admit`] is asked before each access: several nodes share the contents. It stays

@@ -476,6 +476,7 @@ fn reserved_ranges_are_settled_when_a_step_is_given_to_the_journal() {
     memory.mirror(vec![Mirrored::reserved(Area::Coils, 3, 40)]).unwrap();
     let step = Kept {
         access: Access::Client,
+        tenure: None,
         action: holdfast_memory::Action::Write(vec![holdfast_memory::StepWrite {
             member: 0,
             area: Area::Coils,

@@ -17,7 +17,7 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use holdfast_memory::{Access, Area, Memory, Operation, Outcome, Refusal, Write};
+use holdfast_memory::{Access, Area, Memory, Outcome, Refusal, Write};
 use holdfast_protocol::pdu::{EncodedRequest, Range, Request};
 use holdfast_runtime::Retry;
 use tokio::sync::Notify;
@@ -32,6 +32,7 @@ use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
 use super::poll_pause::PollPause;
 use super::results::{BlockResult, Poll, Results};
 use super::schedule::Schedule;
+use super::standby::submit_under;
 use super::state::DeviceState;
 use super::status::StatusSettings;
 use super::turn::Turn;
@@ -646,7 +647,7 @@ impl Device {
                 state.count_unstored();
             }
         });
-        memory.submit(access, Operation::Write(&[write]), done)
+        submit_under(self.settings.fence.as_ref(), memory, access, write, done)
     }
 
     fn publish_status(&self) {

@@ -8,15 +8,16 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use holdfast_memory::{Access, Area, Memory, Operation, Outcome, Refusal, Write};
+use holdfast_memory::{Access, Area, Memory, Outcome, Refusal, Write};
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, Function, Range, Request};
 use tokio::sync::{mpsc, oneshot};
 
 use crate::items::{Items, touched};
 use crate::link::{
-    Fault, Link, PendingReply, Permit, Priority, ReplyTo, confirmation, exception, exception_in,
-    pending_reply,
+    Fault, Fence, Link, PendingReply, Permit, Priority, ReplyTo, confirmation, exception,
+    exception_in, pending_reply,
 };
+use crate::poller::standby::submit_under;
 
 /// The most writes into one memory that wait for devices.
 const MAX_WAITING: usize = 256;
@@ -246,7 +247,7 @@ impl PassedWrite {
             None => call(&self.request).await,
         };
         let pdu = match answered {
-            Ok(answer) => return self.confirm(&answer, value).await,
+            Ok(answer) => return self.confirm(&answer, value, permit).await,
             Err(fault) => exception(&self.pdu, fault.exception(link.retry_at().is_some())),
         };
         self.reply.send(pdu);
@@ -255,7 +256,7 @@ impl PassedWrite {
 
     /// Takes what the device has confirmed into memory, then replies. `value` is what the device holds
     /// after function 22.
-    async fn confirm(self, answer: &[u8], value: Option<u16>) -> Vec<Change> {
+    async fn confirm(self, answer: &[u8], value: Option<u16>, permit: &Permit) -> Vec<Change> {
         let mut changes: Vec<Change> = self.change(value).into_iter().collect();
         if let Ok(Request::ReadWriteMultipleRegisters { read, .. }) = Request::parse(&self.pdu)
             && let Some(bytes) = answer.get(2..)
@@ -266,7 +267,7 @@ impl PassedWrite {
         }
         let mut is_stored = true;
         for change in &changes {
-            is_stored &= self.store(change).await;
+            is_stored &= self.store(change, permit.fence.as_ref()).await;
         }
         let reply = match Function::from_pdu(&self.pdu) {
             // What memory can't show is not confirmed, although the device has carried it out.
@@ -302,7 +303,7 @@ impl PassedWrite {
 
     /// Whether memory has taken a change. Waits for its journal, if it has one, without holding up other
     /// devices.
-    async fn store(&self, change: &Change) -> bool {
+    async fn store(&self, change: &Change, fence: Option<&Arc<Fence>>) -> bool {
         let address = change.address - self.range.device_address + self.range.address;
         let Change { area, count, ref bytes, .. } = *change;
         let write = Write { area, address, count: count as usize, bytes };
@@ -311,7 +312,7 @@ impl PassedWrite {
             let kept = Box::new(|outcome: Outcome| {
                 let _ = done.send(outcome);
             });
-            let submitted = self.memory.submit(Access::Mirror, Operation::Write(&[write]), kept);
+            let submitted = submit_under(fence, &self.memory, Access::Mirror, write, kept);
             let carried_out = outcome.await.is_ok_and(|outcome| outcome.is_ok());
             submitted.map(|()| carried_out)
         } else {

@@ -5,12 +5,12 @@ use std::time::Duration;
 
 use async_nats::jetstream;
 use futures_util::StreamExt;
-use holdfast_memory::{Memory, Step};
+use holdfast_memory::{Memory, Outcome, Refusal, Step};
 
 use super::error::{End, LogError};
 use super::layout::fingerprint;
 use super::settings::Settings;
-use super::state::{Place, State, digest_of};
+use super::state::{Applied, Place, State, digest_of};
 use crate::log::stream::connection::connect;
 use crate::log::stream::message::{self, Origin};
 use crate::log::stream::messages::{Fetched, fetched};
@@ -38,6 +38,8 @@ pub struct Record {
     /// `None` if it is not of a node. Then it has no steps.
     pub origin: Option<Origin>,
     pub steps: Vec<Step>,
+    /// Why steps were refused, by their index.
+    pub refusals: Vec<Option<Refusal>>,
     /// Whether it changed anything: a message that was sent twice does so once.
     pub fresh: bool,
 }
@@ -186,11 +188,16 @@ impl Reading {
             // Also a message that was applied before is shown, with its steps.
             let decoded = message::decode(&payload, &self.state.members).ok();
             let applied = self.state.apply(place, &payload, |_| None)?;
-            let fresh = matches!(applied, super::state::Applied::Fresh { .. });
+            let (fresh, outcomes) = match applied {
+                Applied::Fresh { outcomes, .. } => (true, outcomes),
+                Applied::Stale(_) | Applied::Ignored(_) => (false, Vec::new()),
+            };
+            let refusal = |outcome: Outcome| outcome.err().map(|refused| refused.refusal);
+            let refusals = outcomes.into_iter().map(refusal).collect();
             let (origin, steps) =
                 decoded.map(|message| (Some(message.origin), message.steps)).unwrap_or_default();
             let Place { sequence, stored } = place;
-            return Ok(Some(Record { sequence, stored, origin, steps, fresh }));
+            return Ok(Some(Record { sequence, stored, origin, steps, refusals, fresh }));
         }
     }
 }

@@ -8,13 +8,18 @@ use std::time::Duration;
 
 use aws_lc_rs::digest::{SHA256, digest};
 use bytes::Buf;
-use holdfast_memory::{CarriedOut, Contents, Memory, Outcome, Step};
+use holdfast_memory::{CarriedOut, Contents, Memory, Outcome, Refusal, Refused, Step, Tenure};
 use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
 
 use super::error::LogError;
 use super::settings::is_word;
-use crate::log::stream::message::{self, MAX_NODES, Message, MessageError, Origin, VERSION};
+use crate::log::stream::message::{
+    self, MAX_NODES, Message, MessageError, Origin, VERSION, WITHOUT_LEASES,
+};
+
+/// The most leases whose holders are known. Of another one, the steps of all nodes are carried out.
+const MAX_HOLDERS: usize = 65_536;
 
 /// An encoded state begins with it.
 const MARK: [u8; 3] = *b"HFS";
@@ -27,6 +32,8 @@ pub(super) struct State {
     pub(super) steps: u64,
     /// The start and the last counter that were applied of each node.
     pub(super) origins: BTreeMap<String, (u64, u64)>,
+    /// The node that has claimed a lease last, and its start.
+    pub(super) holders: BTreeMap<u64, (String, u64)>,
 }
 
 /// A message of the stream.
@@ -64,7 +71,13 @@ pub(super) enum Applied {
 impl State {
     /// The state before the first message, with the contents that the memories have.
     pub(super) fn new(members: Vec<Arc<Memory>>) -> State {
-        State { members, place: Place::default(), steps: 0, origins: BTreeMap::new() }
+        State {
+            members,
+            place: Place::default(),
+            steps: 0,
+            origins: BTreeMap::new(),
+            holders: BTreeMap::new(),
+        }
     }
 
     /// Whether a message of this node was applied.
@@ -121,27 +134,61 @@ impl State {
         self.steps += steps.len() as u64;
         let at = |done| CarriedOut { sequence: Some(place.sequence), ..done };
         let age = age(&origin);
-        let carried_out = |step: &Step| step.carry_out_late(&self.members, age).map(at);
+        let carried_out = |step: &Step| {
+            self.admit(step.tenure, &origin)?;
+            step.carry_out_late(&self.members, age).map(at)
+        };
         let outcomes = steps.iter().map(carried_out).collect();
         Ok(Applied::Fresh { origin, compares, outcomes })
+    }
+
+    /// Refuses what a former holder of a lease has written, if the present one came before it in the log: a
+    /// cut network delivers it late.
+    fn admit(&mut self, tenure: Option<Tenure>, origin: &Origin) -> Result<(), Refused> {
+        let Some(Tenure { lease, claims }) = tenure else { return Ok(()) };
+        let is_holder =
+            |(node, start): &(String, u64)| *node == origin.node && *start == origin.start;
+        match self.holders.get(&lease) {
+            Some(holder) if is_holder(holder) => {}
+            Some(_) if !claims => return Err(Refused { index: 0, refusal: Refusal::Overtaken }),
+            _ if claims => {
+                // All nodes forget the same one.
+                if self.holders.len() == MAX_HOLDERS && !self.holders.contains_key(&lease) {
+                    self.holders.pop_first();
+                }
+                self.holders.insert(lease, (origin.node.clone(), origin.start));
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Of its encoding.
+    pub(super) fn version(&self) -> u8 {
+        if self.holders.is_empty() { WITHOUT_LEASES } else { VERSION }
     }
 
     pub(super) fn encode(&self) -> Vec<u8> {
         let contents = Memory::contents(&self.members);
         let len: usize =
             contents.iter().flat_map(|contents| &contents.areas).map(|area| area.len() + 8).sum();
-        let mut out = Vec::with_capacity(len + 64 + self.origins.len() * 96);
+        let mut out = Vec::with_capacity(len + 64 + (self.origins.len() + self.holders.len()) * 96);
         out.extend_from_slice(&MARK);
-        out.push(VERSION);
+        out.push(self.version());
         out.extend_from_slice(&self.place.sequence.to_le_bytes());
         out.extend_from_slice(&self.place.stored.to_le_bytes());
         out.extend_from_slice(&self.steps.to_le_bytes());
         out.extend_from_slice(&(self.origins.len() as u32).to_le_bytes());
         for (node, (start, counter)) in &self.origins {
-            out.push(node.len() as u8);
-            out.extend_from_slice(node.as_bytes());
-            out.extend_from_slice(&start.to_le_bytes());
+            encode_node(node, *start, &mut out);
             out.extend_from_slice(&counter.to_le_bytes());
+        }
+        if self.version() == VERSION {
+            out.extend_from_slice(&(self.holders.len() as u32).to_le_bytes());
+            for (lease, (node, start)) in &self.holders {
+                out.extend_from_slice(&lease.to_le_bytes());
+                encode_node(node, *start, &mut out);
+            }
         }
         out.extend_from_slice(&(contents.len() as u32).to_le_bytes());
         for Contents { areas, sealed } in &contents {
@@ -162,12 +209,12 @@ impl State {
         let malformed = || LogError::Snapshot("the snapshot of the log is malformed".to_owned());
         let bytes = bytes.strip_prefix(&MARK).ok_or_else(malformed)?;
         let (&found, mut rest) = bytes.split_first().ok_or_else(malformed)?;
-        if found != VERSION {
+        if !(WITHOUT_LEASES..=VERSION).contains(&found) {
             let what = "the snapshot of the log";
             return Err(LogError::Version { what, found, supported: VERSION });
         }
-        let loaded = loaded(&mut rest, &self.members).filter(|_| rest.is_empty());
-        let (place, steps, origins, contents) = loaded.ok_or_else(malformed)?;
+        let loaded = loaded(&mut rest, found, &self.members).filter(|_| rest.is_empty());
+        let Loaded { place, steps, origins, holders, contents } = loaded.ok_or_else(malformed)?;
         if place != expected {
             let sequence = expected.sequence;
             let text = format!("the snapshot at sequence {sequence}: it has another sequence");
@@ -176,7 +223,8 @@ impl State {
         for (memory, contents) in self.members.iter().zip(&contents) {
             memory.restore(contents);
         }
-        (self.place, self.steps, self.origins) = (place, steps, origins);
+        (self.place, self.steps) = (place, steps);
+        (self.origins, self.holders) = (origins, holders);
         Ok(())
     }
 }
@@ -187,25 +235,48 @@ pub(super) fn digest_of(encoded: &[u8]) -> String {
     digest.as_ref().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-type Loaded = (Place, u64, BTreeMap<String, (u64, u64)>, Vec<Contents>);
+struct Loaded {
+    place: Place,
+    steps: u64,
+    origins: BTreeMap<String, (u64, u64)>,
+    holders: BTreeMap<u64, (String, u64)>,
+    contents: Vec<Contents>,
+}
+
+fn encode_node(node: &str, start: u64, out: &mut Vec<u8>) {
+    out.push(node.len() as u8);
+    out.extend_from_slice(node.as_bytes());
+    out.extend_from_slice(&start.to_le_bytes());
+}
+
+/// Takes the name of a node, and a start.
+fn node(bytes: &mut &[u8]) -> Option<(String, u64)> {
+    let len = bytes.try_get_u8().ok()?;
+    let node = str::from_utf8(bytes.split_off(..usize::from(len))?).ok()?;
+    let node = is_word(node).then(|| node.to_owned())?;
+    Some((node, bytes.try_get_u64_le().ok()?))
+}
 
 /// Takes an encoded state for these memories.
-fn loaded(bytes: &mut &[u8], members: &[Arc<Memory>]) -> Option<Loaded> {
+fn loaded(bytes: &mut &[u8], version: u8, members: &[Arc<Memory>]) -> Option<Loaded> {
     let sequence = bytes.try_get_u64_le().ok()?;
     let place = Place { sequence, stored: bytes.try_get_i64_le().ok()? };
     let steps = bytes.try_get_u64_le().ok()?;
     let mut origins = BTreeMap::new();
     for _ in 0..bytes.try_get_u32_le().ok()? {
-        let len = bytes.try_get_u8().ok()?;
-        let node = str::from_utf8(bytes.split_off(..usize::from(len))?).ok()?;
-        let node = is_word(node).then(|| node.to_owned())?;
-        origins.insert(node, (bytes.try_get_u64_le().ok()?, bytes.try_get_u64_le().ok()?));
+        let (node, start) = node(bytes)?;
+        origins.insert(node, (start, bytes.try_get_u64_le().ok()?));
+    }
+    let mut holders = BTreeMap::new();
+    let count = if version == VERSION { bytes.try_get_u32_le().ok()? } else { 0 };
+    for _ in 0..count {
+        holders.insert(bytes.try_get_u64_le().ok()?, node(bytes)?);
     }
     if bytes.try_get_u32_le().ok()? as usize != members.len() {
         return None;
     }
     let contents = members.iter().map(|memory| contents(bytes, memory)).collect::<Option<_>>()?;
-    Some((place, steps, origins, contents))
+    Some(Loaded { place, steps, origins, holders, contents })
 }
 
 /// Takes the contents of a memory.
@@ -249,6 +320,36 @@ mod tests {
         assert_eq!(state.encode(), before);
         state.load(&saved, place).unwrap();
         assert_eq!(state.encode(), saved);
+    }
+
+    #[test]
+    fn a_state_without_leases_is_read_by_older_nodes() {
+        let mut state = State::new(vec![member()]);
+        assert_eq!(state.encode()[3], WITHOUT_LEASES);
+        let origin = Origin { node: "a".to_owned(), start: 5, counter: 1 };
+        let tenure = |claims| Some(Tenure { lease: 7, claims });
+        state.admit(tenure(false), &origin).unwrap();
+        assert_eq!(state.version(), WITHOUT_LEASES);
+        state.admit(tenure(true), &origin).unwrap();
+        let saved = state.encode();
+        assert_eq!(saved[3], VERSION);
+        let mut loaded = State::new(vec![member()]);
+        loaded.load(&saved, state.place).unwrap();
+        assert_eq!((loaded.encode(), &loaded.holders), (saved, &state.holders));
+        let restarted = Origin { start: 6, ..origin.clone() };
+        assert!(loaded.admit(tenure(false), &restarted).is_err());
+        assert!(loaded.admit(tenure(false), &origin).is_ok());
+    }
+
+    #[test]
+    fn the_holders_that_are_known_are_limited() {
+        let mut state = State::new(Vec::new());
+        let origin = Origin { node: "a".to_owned(), start: 1, counter: 1 };
+        for lease in 0..MAX_HOLDERS as u64 + 2 {
+            state.admit(Some(Tenure { lease, claims: true }), &origin).unwrap();
+        }
+        assert_eq!(state.holders.len(), MAX_HOLDERS);
+        assert!(!state.holders.contains_key(&1) && state.holders.contains_key(&2));
     }
 
     #[test]

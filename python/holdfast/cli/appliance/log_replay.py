@@ -197,7 +197,8 @@ def _step(step: Any) -> str:
         memory, area, address = step["place"]
         and_mask, or_mask = step["masks"]
         writes.append(f"{memory} {area} {address}: AND {and_mask:#06x} OR {or_mask:#06x}")
-    return "; ".join(writes)
+    refused = step.get("refused")
+    return "; ".join(writes) + (f" (refused: {refused})" if refused else "")
 
 
 def _serve(

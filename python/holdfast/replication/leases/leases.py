@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
 import secrets
 import time
 from dataclasses import dataclass, field
@@ -53,6 +54,11 @@ MAX_RETRY_S = 2.0
 
 USE_CHECK_S = 0.01
 """Between looks at a lease that is being given back."""
+
+
+def lease_number(key: str) -> int:
+    """The number of a lease in the steps of a log, the same on all nodes."""
+    return int.from_bytes(hashlib.sha256(key.encode()).digest()[:8])
 
 
 class Watcher(Protocol):
@@ -146,7 +152,7 @@ class Leases:
 
     def fence(self, key: str) -> _core.Fence:
         """The fence of what a lease protects. It stays the same while the lease comes and goes."""
-        return self._fences.setdefault(key, _core.Fence())
+        return self._fences.setdefault(key, _core.Fence(lease_number(key)))
 
     def want(self, keys: Iterable[str]) -> None:
         """Takes these leases as soon as they are free. Others are kept until `give_back`."""

@@ -9,6 +9,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
+use holdfast_memory::{Done, Outcome, Refusal, Refused, Tenure};
 use tokio::sync::watch;
 use tokio::time::sleep_until;
 
@@ -25,6 +26,10 @@ pub enum Stage {
 /// Until when devices may be used. It begins closed.
 #[derive(Debug)]
 pub struct Fence {
+    /// The number of the lease, the same on all nodes.
+    lease: u64,
+    /// Whether a log has what was read since it was opened, and refuses what former holders have read.
+    is_claimed: AtomicBool,
     /// The zero of all times.
     zero: Instant,
     /// In nanoseconds after `zero`; 0 if it was never opened, or is closed.
@@ -41,9 +46,12 @@ pub struct Fence {
 #[derive(Debug)]
 pub struct Pass(Arc<Fence>);
 
-impl Default for Fence {
-    fn default() -> Fence {
+impl Fence {
+    /// The fence of the lease with this number.
+    pub fn new(lease: u64) -> Fence {
         Fence {
+            lease,
+            is_claimed: AtomicBool::new(false),
             zero: Instant::now(),
             until: AtomicU64::new(0),
             settled: AtomicU64::new(0),
@@ -52,13 +60,12 @@ impl Default for Fence {
             stage: watch::Sender::new(Stage::Closed),
         }
     }
-}
 
-impl Fence {
     /// Opens it. What a former holder has sent may still arrive for `settle`, and the timeout of a device.
     pub fn open(&self, until: Instant, settle: Duration) {
         let settled = if settle.is_zero() { 0 } else { self.time(Instant::now() + settle) };
         self.settled.store(settled, Ordering::Release);
+        self.is_claimed.store(false, Ordering::Release);
         self.is_ending.store(false, Ordering::Release);
         self.until.store(self.time(until), Ordering::Release);
         self.announce();
@@ -99,6 +106,24 @@ impl Fence {
     /// Whether bytes may be sent now.
     pub fn allows(&self) -> bool {
         self.stage() != Stage::Closed
+    }
+
+    /// Under which lease to write what a device holds, and who receives the outcome in place of `done`.
+    pub(crate) fn tenure(self: &Arc<Fence>, done: Done) -> (Tenure, Done) {
+        let claims = !self.is_claimed.load(Ordering::Acquire);
+        let fence = Arc::clone(self);
+        let noted = move |outcome: Outcome| {
+            match outcome {
+                Ok(_) if claims => fence.is_claimed.store(true, Ordering::Release),
+                // If this node has the lease all the same, the next write claims it again.
+                Err(Refused { refusal: Refusal::Overtaken, .. }) => {
+                    fence.is_claimed.store(false, Ordering::Release);
+                }
+                _ => {}
+            }
+            done(outcome);
+        };
+        (Tenure { lease: self.lease, claims }, Box::new(noted))
     }
 
     /// The number of polls, writes and connections.

@@ -14,7 +14,7 @@ pub(in crate::server) fn exception_of(refusal: Refusal) -> ExceptionCode {
             ExceptionCode::IllegalDataAddress
         }
         Refusal::WrongLength | Refusal::NotRegisters => ExceptionCode::IllegalDataValue,
-        Refusal::Stale => ExceptionCode::GatewayTargetFailedToRespond,
+        Refusal::Stale | Refusal::Overtaken => ExceptionCode::GatewayTargetFailedToRespond,
         Refusal::Unavailable | Refusal::Behind => ExceptionCode::ServerDeviceBusy,
         Refusal::NotStored | Refusal::NotConfirmed | Refusal::Differs => {
             ExceptionCode::ServerDeviceFailure

@@ -812,6 +812,7 @@ fn refusal(refused: MemoryRefusal) -> Refusal {
         MemoryRefusal::Unavailable
         | MemoryRefusal::NotStored
         | MemoryRefusal::Stale
+        | MemoryRefusal::Overtaken
         | MemoryRefusal::Behind
         | MemoryRefusal::Differs => Refusal::NotStored,
         MemoryRefusal::NotConfirmed => Refusal::NotConfirmed,

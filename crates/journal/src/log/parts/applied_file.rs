@@ -8,8 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::log::error::LogError;
 use crate::log::shared::Checkpoint;
 use crate::log::state::{Place, State, digest_of};
-
-const VERSION: u8 = 1;
+use crate::log::stream::message::{VERSION, WITHOUT_LEASES};
 
 /// Which message of which log contents come from, and what a node has to know to go on from there.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -22,6 +21,8 @@ pub(in crate::log) struct Note {
     stored: i64,
     steps: u64,
     origins: BTreeMap<String, (u64, u64)>,
+    #[serde(default)]
+    holders: BTreeMap<u64, (String, u64)>,
     sealed: Vec<bool>,
     /// The digest of the contents and all of the above, as nodes compare it.
     digest: String,
@@ -37,7 +38,7 @@ impl Note {
         }
         let malformed = |_| LogError::Snapshot("the note of the log is malformed".to_owned());
         let Versioned { version: found } = serde_json::from_slice(bytes).map_err(malformed)?;
-        if found != VERSION {
+        if !(WITHOUT_LEASES..=VERSION).contains(&found) {
             let what = "the note of the log";
             return Err(LogError::Version { what, found, supported: VERSION });
         }
@@ -48,13 +49,14 @@ impl Note {
     pub(in crate::log) fn checkpoint(state: &State, log: &str, stream: &str) -> Option<Checkpoint> {
         let contents = Memory::contents(&state.members);
         let note = Note {
-            version: VERSION,
+            version: state.version(),
             log: log.to_owned(),
             stream: stream.to_owned(),
             sequence: state.place.sequence,
             stored: state.place.stored,
             steps: state.steps,
             origins: state.origins.clone(),
+            holders: state.holders.clone(),
             sealed: contents.iter().map(|contents| contents.sealed).collect(),
             digest: digest_of(&state.encode()),
         };
@@ -76,6 +78,7 @@ impl Note {
         state.place = Place { sequence: self.sequence, stored: self.stored };
         state.steps = self.steps;
         state.origins = self.origins.clone();
+        state.holders = self.holders.clone();
         let found = digest_of(&state.encode());
         if found == self.digest {
             return Ok(());

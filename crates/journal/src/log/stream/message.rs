@@ -13,8 +13,11 @@ use crate::log::settings::is_word;
 
 const MARK: [u8; 3] = *b"HFL";
 
-/// Of messages and snapshots, since both change together.
-pub(in crate::log) const VERSION: u8 = 1;
+/// The newest version of messages and snapshots: steps may be under leases.
+pub(in crate::log) const VERSION: u8 = 2;
+
+/// The version of messages and snapshots without leases: older nodes read it.
+pub(in crate::log) const WITHOUT_LEASES: u8 = 1;
 
 /// The node that sent a message, and the number of the message.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -71,7 +74,8 @@ pub(in crate::log) fn encode<'a>(
     let len: usize = steps.clone().map(|step| step.len() + 4).sum();
     let mut out = Vec::with_capacity(len + OVERHEAD_BYTES);
     out.extend_from_slice(&MARK);
-    out.push(VERSION);
+    let has_leases = steps.clone().any(encoding::is_under_lease);
+    out.push(if has_leases { VERSION } else { WITHOUT_LEASES });
     out.push(u8::from(compares));
     out.push(u8::try_from(origin.node.len()).expect("names of nodes are short"));
     out.extend_from_slice(origin.node.as_bytes());
@@ -90,7 +94,7 @@ pub(in crate::log) fn decode(
 ) -> Result<Message, MessageError> {
     let mut bytes = bytes.strip_prefix(&MARK).ok_or(MessageError::Foreign)?;
     let version = bytes.try_get_u8().or(Err(MessageError::Foreign))?;
-    if version != VERSION {
+    if !(WITHOUT_LEASES..=VERSION).contains(&version) {
         return Err(MessageError::Version(version));
     }
     let compares = match bytes.try_get_u8() {
@@ -138,7 +142,7 @@ mod tests {
     fn mask(address: u16) -> Step {
         let area = Area::HoldingRegisters;
         let action = Action::Mask { member: 0, area, address, and_mask: 3, or_mask: 4 };
-        Step { access: Access::Client, action }
+        Step { access: Access::Client, tenure: None, action }
     }
 
     fn encoded(origin: &Origin, compares: bool, steps: &[Step]) -> Bytes {
@@ -194,7 +198,7 @@ mod tests {
     fn bytes_of_others_are_distinguished_from_another_version() {
         let of = |bytes: &[u8]| decode(bytes, &members());
         assert_eq!(of(b"hello"), Err(MessageError::Foreign));
-        assert_eq!(of(b"HFL\x02whatever"), Err(MessageError::Version(2)));
+        assert_eq!(of(b"HFL\x03whatever"), Err(MessageError::Version(3)));
         assert_eq!(of(b"HFL\x01"), Err(MessageError::Malformed));
         let origin = Origin { node: "a".to_owned(), start: 1, counter: 2 };
         let error = of(&encoded(&origin, false, &[mask(1), mask(10)])).unwrap_err();

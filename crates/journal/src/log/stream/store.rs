@@ -21,7 +21,7 @@ use crate::log::error::{End, LogError};
 use crate::log::layout::difference;
 use crate::log::settings::Settings;
 use crate::log::state::{Place, State, digest_of};
-use crate::log::stream::message::{MAX_NODES, VERSION};
+use crate::log::stream::message::{MAX_NODES, VERSION, WITHOUT_LEASES};
 use crate::log::stream::raw_message::{Received, fetch};
 
 /// Within this time, the servers themselves notice a message that was sent twice.
@@ -346,8 +346,11 @@ pub(in crate::log) fn parsed(pointer: &[u8]) -> Result<Pointer, LogError> {
 
 fn config(settings: &Settings, fingerprint: &str) -> Config {
     let id = format!("{:032x}", unique());
-    let metadata =
-        [(META_VERSION, VERSION.to_string()), (META_LAYOUT, fingerprint.to_owned()), (META_ID, id)];
+    let metadata = [
+        (META_VERSION, WITHOUT_LEASES.to_string()),
+        (META_LAYOUT, fingerprint.to_owned()),
+        (META_ID, id),
+    ];
     Config {
         name: stream_name(&settings.name),
         description: Some("Writes to memories of Holdfast, in their order".to_owned()),
@@ -395,7 +398,7 @@ fn check(info: &Info, fingerprint: &str) -> Result<(), LogError> {
         return Err(LogError::Settings(text));
     };
     let found = version.parse().unwrap_or(u8::MAX);
-    if found != VERSION {
+    if !(WITHOUT_LEASES..=VERSION).contains(&found) {
         return Err(LogError::Version { what: "the log", found, supported: VERSION });
     }
     difference(layout, fingerprint).map_or(Ok(()), |difference| Err(LogError::Layout(difference)))

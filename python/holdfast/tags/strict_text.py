@@ -1,0 +1,80 @@
+"""Text as a value of a type, to write it."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+import re
+from decimal import Decimal
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.runtime.text import quote
+from holdfast.values.digits import FLOATS
+
+if TYPE_CHECKING:
+    from holdfast.values.types import Type
+
+BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
+
+_NUMBER = re.compile(r"[+-]?([0-9]{1,400}(\.[0-9]{0,400})?|\.[0-9]{1,400})([eE][+-]?[0-9]{1,3})?")
+
+
+def from_text(text: str, type: Type, named: str) -> Any:
+    """Parses a text to a value of a type, which may still be outside its range.
+
+    Raises `ValueError`. `named` is the type as messages call it.
+    """
+    if type.count is not None:
+        return _array(text, type, named)
+    if type.base == "string":
+        return text
+    if type.base == "bytes":
+        return _bytes(text, named)
+    if type.base in ("bool", "bit"):
+        return _boolean(text, named)
+    return _number(text.strip(), named, type.base in FLOATS)
+
+
+def _boolean(text: str, named: str) -> bool:
+    # Not `True`: programs take other words for false than for true, and a guess can start a motor.
+    found = BOOLEANS.get(text)
+    if found is None:
+        raise ValueError(f"{quote(text)} is not a valid {named}, allowed: true, false, 1 and 0")
+    return found
+
+
+def _number(text: str, named: str, is_float: bool) -> int | float:
+    if _NUMBER.fullmatch(text) is None:
+        raise ValueError(f"{quote(text)} is not a valid {named}, allowed: a JSON number")
+    if is_float:
+        number = float(text)
+        if math.isinf(number):
+            raise ValueError(f"{quote(text)} does not fit {named}")
+        return number
+    exact = Decimal(text)
+    if exact.adjusted() > 20 or exact != exact.to_integral_value():
+        raise ValueError(f"{quote(text)} is not a valid {named}")
+    return int(exact)
+
+
+def _bytes(text: str, named: str) -> bytes:
+    try:
+        return base64.b64decode(text.strip(), validate=True)
+    except (binascii.Error, ValueError):
+        raise ValueError(f"{quote(text)} is not a valid {named}, allowed: base64") from None
+
+
+def _array(text: str, type: Type, named: str) -> list[Any]:
+    try:
+        items = msgspec.json.decode(text)
+    except MALFORMED_JSON:
+        items = None
+    if not isinstance(items, list):
+        raise ValueError(f"{quote(text)} is not a valid {named}, allowed: a JSON array")
+    if type.base == "bytes":
+        return [_bytes(item, named) if isinstance(item, str) else item for item in items]
+    return items
