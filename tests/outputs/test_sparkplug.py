@@ -9,7 +9,7 @@ import pytest
 
 from holdfast.outputs import sending
 from holdfast.outputs.mqtt import session
-from holdfast.outputs.sparkplug import output
+from holdfast.outputs.sparkplug import primary_host
 from support import wire
 from support.mqtt_plant import TAGS, Plant
 from support.sparkplug_watch import SETTINGS, Said, Watch
@@ -26,7 +26,7 @@ REBIRTH: dict[str, Any] = {"name": "Node Control/Rebirth", "datatype": 11, "bool
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
         monkeypatch.setattr(sending, name, 0.05)
-    monkeypatch.setattr(output, "HOST_STATE_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(primary_host, "HOST_STATE_TIMEOUT_S", 0.05)
 
 
 @pytest.fixture

@@ -17,7 +17,8 @@ from holdfast.outputs import Refused
 from holdfast.outputs.sparkplug.datatypes import datatype_of, value_of
 from holdfast.outputs.sparkplug.definition import Metric, parsed
 from holdfast.outputs.sparkplug.node import EdgeNode, Names
-from holdfast.outputs.sparkplug.output import PrimaryHost, SparkplugOutput
+from holdfast.outputs.sparkplug.output import SparkplugOutput
+from holdfast.outputs.sparkplug.primary_host import PrimaryHost
 from holdfast.polling import Reading
 from holdfast.polling.faults import FAULTS
 from holdfast.tags import Tag

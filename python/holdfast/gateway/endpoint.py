@@ -6,7 +6,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.gateway.device import exception_text
-from holdfast.gateway.fields import HOST, PORT, REGISTER, SERVER_NAME, TRANSPORT, UNIT
+from holdfast.gateway.fields import (
+    HOST,
+    PORT,
+    REGISTER,
+    SERVER_NAME,
+    TIMEOUT_MS,
+    TRANSPORT,
+    UNIT,
+)
 from holdfast.net.http.fields import Field
 from holdfast.net.http.schemas import Schema, array_of
 
@@ -66,7 +74,7 @@ class Endpoint:
     """Whether the answer has the duration of the last call to the device, in milliseconds."""
     broadcast: bool = False
     """Whether the request may be a broadcast; the answer then has a `note`."""
-    timeout_ms: int = 10_000
+    timeout_ms: int = TIMEOUT_MS
     """The default timeout."""
     on_exception: Callable[[Given, RequestedDevice, ModbusException], Answer] = exception_answer
 

@@ -99,6 +99,13 @@ AREA_LIST = Field(
 )
 
 
+TIMEOUT_MS = 10_000
+WRITE_TIMEOUT_MS = 5_000
+POLL_TIMEOUT_MS = 5_000
+MAP_READ_TIMEOUT_MS = 2_000
+"""The timeouts of requests that name none."""
+
+
 def timeout(default: int, longest: int, text: str = "Timeout of the request in ms") -> Field:
     """The field for a timeout in milliseconds."""
     return Field("timeout", integer(1, longest), text, default)

@@ -1,4 +1,7 @@
-"""What became of a write: the word for it in the log, and whether the device may have written."""
+"""What became of a write: the word for it in the log, and whether the device may have written.
+
+The outcome in a security event: `holdfast.events.security`.
+"""
 
 from __future__ import annotations
 

@@ -18,8 +18,8 @@ from holdfast.scanner.late_commands import SEND_AGAIN, Lateness
 from holdfast.scanner.messages.types import Answer
 from holdfast.scanner.subscriptions.health import NOT_WRITTEN_FAULTS
 from holdfast.scanner.subscriptions.write_access import unwritable
+from holdfast.tags.strict_text import from_text
 from holdfast.tags.text import value_from
-from holdfast.tags.typed_text import from_text
 from holdfast.values import ConversionError, encode
 from holdfast.values.types import parsed
 

@@ -17,7 +17,7 @@ import msgspec
 
 from holdfast.runtime.text import quote
 from holdfast.tags.scale import RegisterScale, linear_of
-from holdfast.tags.typed_text import BOOLEANS, from_text
+from holdfast.tags.strict_text import BOOLEANS, from_text
 from holdfast.values import DoesNotFit
 from holdfast.values.digits import shortest
 

@@ -1,6 +1,6 @@
 """Typed values in JSON: bytes in hex, and `null` for NaN, infinity and what can't be decoded.
 
-Tags have a form of their own, with bytes in base64: `holdfast.tags.typed_text`.
+Tags have a form of their own, with bytes in base64: `holdfast.tags.strict_text`.
 """
 
 from __future__ import annotations

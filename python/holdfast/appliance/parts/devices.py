@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from holdfast import _core
-from holdfast.appliance.parts import native_devices
+from holdfast.appliance.parts import native_devices, native_links
 from holdfast.appliance.parts.device_events import DeviceEvents
 from holdfast.appliance.parts.part import Part
 from holdfast.appliance.parts.tag_values import TagValues
@@ -83,7 +83,7 @@ class Devices(Part):
                 values = TagValues(poller.receiver(), self._began)
                 writes = TagWrites(poller, self._audit.log, values.find)
             # The first use of an address decides the settings of its connection: links first.
-            plan.links = native_devices.links(config, plan.memories, poller)
+            plan.links = native_links.links(config, plan.memories, poller)
         results = None if values is None else values.results
         made = {
             name: native_devices.device(

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from holdfast._core import Memory
-    from holdfast.appliance.parts.native_devices import Links
+    from holdfast.appliance.parts.native_links import Links
     from holdfast.config import Config
     from holdfast.config.models.listeners import (
         Listener,

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from holdfast.appliance.parts.native_devices import Links
+from holdfast.appliance.parts.native_links import Links
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence

@@ -17,7 +17,7 @@ from holdfast.cli.options.item import range_of, words_argument
 from holdfast.cli.options.option import choice, json_option, number_option, option, require_known
 from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.url import checked_url, is_url
-from holdfast.cli.options.value import typed
+from holdfast.cli.options.value_type import typed
 from holdfast.cli.terminal_text import print_json
 from holdfast.config import read_plans
 from holdfast.config.read_plans import Preset

@@ -18,7 +18,7 @@ from holdfast.cli.options.duration import every_option
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import json_option, number_option
 from holdfast.cli.options.plc_addresses import modicon_hint, modicon_option
-from holdfast.cli.options.value import typed, typed_options
+from holdfast.cli.options.value_type import typed, typed_options
 from holdfast.cli.tags import options as tag_options
 from holdfast.cli.tags.options import TagFiles
 from holdfast.cli.terminal_text import print_json
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from holdfast.cli.devices.device_items import Records
     from holdfast.cli.options.plc_addresses import Place
-    from holdfast.cli.options.value import Typed
+    from holdfast.cli.options.value_type import Typed
     from holdfast.cli.tags.options import Selection, TagFiles
     from holdfast.client import SyncClient
 

@@ -19,7 +19,7 @@ from holdfast.cli.options import device, item
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import flag, json_option
 from holdfast.cli.options.plc_addresses import modicon_option
-from holdfast.cli.options.value import typed, typed_options
+from holdfast.cli.options.value_type import typed, typed_options
 from holdfast.cli.tags import options as tag_options
 from holdfast.cli.tags.options import TagFiles
 from holdfast.cli.terminal_text import print_json
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from holdfast.cli.options.plc_addresses import Place
-    from holdfast.cli.options.value import Typed
+    from holdfast.cli.options.value_type import Typed
     from holdfast.cli.tags.options import TagFiles
     from holdfast.client import SyncClient
 

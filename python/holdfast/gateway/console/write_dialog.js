@@ -1,7 +1,7 @@
 // The write dialog: asks for a value, reviews what it changes, then writes it.
 
 import { notice, post, Problem } from "./api.js";
-import { isPlain, ofTag, ofType, ofWords } from "./write_change.js";
+import { isPlain, ofTag, ofType, ofWords } from "./write_request.js";
 import { $, h, pause } from "./dom.js";
 import { extent, modicon, REGISTER_FORMS } from "./numbers.js";
 import { placed, same } from "./parts.js";

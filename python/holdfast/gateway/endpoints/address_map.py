@@ -11,7 +11,7 @@ from holdfast.discovery.address_search import Survey
 from holdfast.errors import ConnectionLost, ModbusError, ModbusException
 from holdfast.gateway.device import Failed
 from holdfast.gateway.endpoint import TARGET
-from holdfast.gateway.fields import ADDRESS_SCHEMA, AREA_LIST, timeout
+from holdfast.gateway.fields import ADDRESS_SCHEMA, AREA_LIST, MAP_READ_TIMEOUT_MS, timeout
 from holdfast.net.http.fields import Field, malformed
 from holdfast.net.http.requests import BadRequest
 from holdfast.net.http.schemas import integer
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 PATH = "/api/modbus/map"
-TIMEOUT_MS = 2_000
 
 PROGRESS_INTERVAL_S = 0.2
 """Between two progress events."""
@@ -56,7 +55,7 @@ def fields(limits: GatewayLimits) -> tuple[Field, ...]:
             "Refuse the map (`busy`) if the client's address has this many streams",
             None,
         ),
-        timeout(TIMEOUT_MS, round(1000 * limits.timeout), "Timeout of each read in ms"),
+        timeout(MAP_READ_TIMEOUT_MS, round(1000 * limits.timeout), "Timeout of each read in ms"),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.gateway.endpoint import EXAMPLE, REGISTERS, Endpoint, always
-from holdfast.gateway.fields import ADDRESS, ADDRESS_SCHEMA, REGISTER
+from holdfast.gateway.fields import ADDRESS, ADDRESS_SCHEMA, REGISTER, WRITE_TIMEOUT_MS
 from holdfast.net.http.fields import Field, malformed
 from holdfast.net.http.schemas import array, integer
 from holdfast.protocol import LAST_RECORD, MAX_WORD, READ_RECORDS, WRITE_RECORDS
@@ -77,7 +77,7 @@ ENDPOINTS = (
         answer={"file": 4, "record": 7, "quantity": 2},
         writes=always,
         broadcast=True,
-        timeout_ms=5_000,
+        timeout_ms=WRITE_TIMEOUT_MS,
     ),
     Endpoint(
         path="/api/modbus/read/fifo",

@@ -15,6 +15,7 @@ from holdfast.gateway.fields import (
     DATATYPE,
     REGISTER,
     TYPED_SCHEMA,
+    WRITE_TIMEOUT_MS,
 )
 from holdfast.net.http.fields import Field, malformed
 from holdfast.net.http.schemas import array, integer
@@ -113,7 +114,7 @@ REGISTER_VALUES = _values(REGISTER, WRITE_REGISTERS, "")
 
 _WRITTEN = {"startAddress": ADDRESS_SCHEMA, "quantity": integer(1, WRITE_BITS)}
 
-_write = partial(Endpoint, writes=always, broadcast=True, timeout_ms=5_000)
+_write = partial(Endpoint, writes=always, broadcast=True, timeout_ms=WRITE_TIMEOUT_MS)
 
 ENDPOINTS = (
     _write(

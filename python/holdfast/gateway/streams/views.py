@@ -14,8 +14,8 @@ from holdfast.gateway.device import Failed, exception_text, problem
 from holdfast.gateway.endpoint import TARGET
 from holdfast.gateway.endpoints.read import FUNCTION, QUANTITY, Range
 from holdfast.gateway.endpoints.request_tags import LIST, MAX_TAGS, described, tags_of
-from holdfast.gateway.fields import ADDRESS, BYTE_ORDER, DATATYPE, timeout
-from holdfast.gateway.streams.watch import TIMEOUT_MS, interval_field
+from holdfast.gateway.fields import ADDRESS, BYTE_ORDER, DATATYPE, POLL_TIMEOUT_MS, timeout
+from holdfast.gateway.streams.watch import interval_field
 from holdfast.net.http.fields import Field, filled, malformed, object_with
 from holdfast.net.http.requests import BadRequest, shown
 from holdfast.net.http.schemas import Schema, integer
@@ -74,7 +74,7 @@ def fields(limits: GatewayLimits) -> tuple[Field, ...]:
         Field("once", {"type": "boolean"}, "End after the first event", False),
         Field("describe", {"type": "boolean"}, "Whether `view` describes the tags", True),
         MAX_STREAMS,
-        timeout(TIMEOUT_MS, round(1000 * limits.timeout), "Timeout of each read in ms"),
+        timeout(POLL_TIMEOUT_MS, round(1000 * limits.timeout), "Timeout of each read in ms"),
     )
 
 

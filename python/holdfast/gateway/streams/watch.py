@@ -10,7 +10,7 @@ from holdfast.errors import ModbusException
 from holdfast.gateway.device import Failed, problem
 from holdfast.gateway.endpoint import TARGET
 from holdfast.gateway.endpoints.read import FUNCTION, QUANTITY, Range
-from holdfast.gateway.fields import ADDRESS, BYTE_ORDER, DATATYPE, timeout
+from holdfast.gateway.fields import ADDRESS, BYTE_ORDER, DATATYPE, POLL_TIMEOUT_MS, timeout
 from holdfast.net.http.fields import Field
 from holdfast.net.http.requests import BadRequest
 from holdfast.net.http.schemas import integer
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     Event: TypeAlias = tuple[str, Any]
 
 PATH = "/api/modbus/watch"
-TIMEOUT_MS = 5_000
 INTERVAL_MS = 1_000
 MAX_INTERVAL_MS = 3_600_000
 
@@ -53,7 +52,7 @@ def fields(limits: GatewayLimits) -> tuple[Field, ...]:
         DATATYPE,
         BYTE_ORDER,
         interval_field(limits),
-        timeout(TIMEOUT_MS, round(1000 * limits.timeout), "Timeout of each poll in ms"),
+        timeout(POLL_TIMEOUT_MS, round(1000 * limits.timeout), "Timeout of each poll in ms"),
     )
 
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-from typing import TYPE_CHECKING, Any
-
-import msgspec
+from typing import TYPE_CHECKING
 
 from holdfast.events import log_lines
 from holdfast.outputs.mqtt.receiver import BrokerReceiver
@@ -13,7 +10,7 @@ from holdfast.outputs.mqtt.session import Session
 from holdfast.outputs.sending import Refused
 from holdfast.outputs.sparkplug.commands import Commands
 from holdfast.outputs.sparkplug.node import EdgeNode, Names, state_topic
-from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.outputs.sparkplug.primary_host import PrimaryHost
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,42 +21,6 @@ if TYPE_CHECKING:
     from holdfast.outputs.mqtt.delivery import Message
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
-
-HOST_STATE_TIMEOUT_S = 2.0
-"""Seconds to wait for the state of the primary host after connecting."""
-
-
-class PrimaryHost:
-    """The state of a host. Thread-safe."""
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
-        self.is_online = False
-        self._since: int | None = None
-        self._is_known = False
-
-    def begin(self) -> None:
-        """Begins a connection, in which the state is unknown at first."""
-        with self._changed:
-            self.is_online = self._is_known = False
-
-    def take(self, payload: bytes) -> None:
-        """Takes a STATE message. Raises `ValueError` for one that is malformed.
-
-        A message that is older than the last one does not count: it is the will of a connection
-        that the host has replaced.
-        """
-        online, timestamp = _parsed(payload)
-        with self._changed:
-            if self._since is not None and timestamp < self._since:
-                return
-            self._since, self.is_online, self._is_known = timestamp, online, True
-            self._changed.notify_all()
-
-    def wait(self, seconds: float) -> None:
-        """Waits for the first message."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._is_known, seconds)
 
 
 class SparkplugOutput(BrokerReceiver):
@@ -156,7 +117,7 @@ class SparkplugOutput(BrokerReceiver):
         if self._primary is not None:
             assert self._settings.primary_host is not None, "there is one"
             session.subscribe([state_topic(self._settings.primary_host)], retained=True)
-            self._primary.wait(HOST_STATE_TIMEOUT_S)
+            self._primary.wait()
 
     def _adopt(self, session: Session) -> None:
         """Takes over the tags: of a new session, and after a reload."""
@@ -202,15 +163,3 @@ class SparkplugOutput(BrokerReceiver):
                     topic=message.topic,
                     reason=str(error),
                 )
-
-
-def _parsed(payload: bytes) -> tuple[bool, int]:
-    try:
-        found: Any = msgspec.json.decode(payload)
-    except MALFORMED_JSON:
-        found = None
-    if isinstance(found, dict):
-        online, timestamp = found.get("online"), found.get("timestamp")
-        if isinstance(online, bool) and type(timestamp) is int:
-            return online, timestamp
-    raise ValueError("not the JSON of a STATE message: online and timestamp")

@@ -12,6 +12,7 @@ from weakref import WeakValueDictionary
 from holdfast.events import log_lines
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.types import UnsubscribeRequest
+from holdfast.scanner.polling.poller import has_extra_scans
 from holdfast.scanner.subscriptions.health import Health
 from holdfast.scanner.subscriptions.ttl import SubscriptionTtls
 
@@ -27,9 +28,6 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.subscription import Subscription
     from holdfast.types import PolledBlock
-
-PROMPT_POLL_MAX_MS = 1000
-"""Scan interval up to which a new subscriber waits for the next regular scan."""
 
 
 @dataclass(eq=False)
@@ -86,9 +84,8 @@ class Devices:
         # A caller that subscribes to tags one by one knows the state already.
         if change.former is not None or not change.only_adds_tags:
             self._publishers.publish_state(device)
-        # At a short interval, the next regular scan comes soon enough for a new subscriber.
-        waits_long = bool(change.fresh) and device.rate > PROMPT_POLL_MAX_MS
-        if is_own and (change.polling or change.former or waits_long):
+        hurries = bool(change.fresh) and has_extra_scans(device)
+        if is_own and (change.polling or change.former or hurries):
             self._polling.renew(device)
         return change.new
 

@@ -1,0 +1,84 @@
+"""Creates the native links and routes of a configuration, and names the links.
+
+Nothing is started here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from holdfast.client.endpoint import endpoint, receiver_endpoint
+from holdfast.client.url import Receiver
+from holdfast.config.checks.units import routed
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from holdfast import _core
+    from holdfast._core import Memory
+    from holdfast.client.url import Target
+    from holdfast.config import Config
+    from holdfast.types import Area
+
+
+@dataclass(frozen=True)
+class Links:
+    """What listeners pass requests on to."""
+
+    links: dict[str, _core.Link] = field(default_factory=dict)
+    """By name; a link without a name of its own has that of the first device behind it."""
+    routes: dict[str, _core.Route] = field(default_factory=dict)
+    """By the name of the link or device."""
+    passages: dict[str, _core.Passage] = field(default_factory=dict)
+    """By the name of the memory."""
+
+
+def links(config: Config, memories: Mapping[str, Memory], poller: _core.Poller) -> Links:
+    """Creates all links, routes and passages. Raises `OSError` for unusable files.
+
+    The first use of an address decides the settings of its connection, so links come first, and
+    polled devices later.
+    """
+    made = Links()
+    for name, settings in config.links.items():
+        link = poller.link(
+            name,
+            endpoint_at(f"links.{name}.url", settings.target),
+            in_flight=None if settings.in_flight == "auto" else settings.in_flight,
+            queue=settings.queue,
+            coalesce=settings.coalesce,
+            cache=settings.cache,
+            preferred=list(settings.priority),
+            retry=settings.retry.pauses,
+        )
+        made.links[name] = link
+        made.routes[name] = link.route(name, timeout=settings.timeout)
+    for name in routed(config):
+        if name not in config.devices:
+            continue
+        device = config.devices[name]
+        link = poller.link(
+            name,
+            endpoint_at(f"devices.{name}.url", device.target),
+            in_flight=None if device.in_flight == "auto" else device.in_flight,
+            retry=device.retry.pauses,
+        )
+        made.links.setdefault(link.name, link)
+        made.routes[name] = link.route(name, unit=device.unit, timeout=device.timeout)
+    passed: dict[str, list[tuple[Area, int, int, str, int, bool]]] = {}
+    for name, device in config.devices.items():
+        for read, into in device.passed:
+            ranges = passed.setdefault(into.memory, [])
+            ranges.append((into.area, into.address, read.count, name, read.address, device.emulate))
+    for name, ranges in passed.items():
+        made.passages[name] = poller.passage(memories[name], ranges)
+    return made
+
+
+def endpoint_at(key: str, of: Target | Receiver) -> _core.Endpoint:
+    """The native endpoint of the URL at this key. Raises `OSError` for unusable files."""
+    try:
+        return receiver_endpoint(of) if isinstance(of, Receiver) else endpoint(of)
+    except (OSError, ValueError) as error:
+        raise OSError(f"{key}: {error}") from error
