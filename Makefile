@@ -19,7 +19,7 @@ ifneq ($(OS),Windows_NT)
 export PATH := $(CURDIR)/.cache/toolchain/bin:$(PATH)
 endif
 
-.PHONY: build run test test-python test-rust test-again test-slow explore fuzz proof torture lint audit no-std format bench docs site \
+.PHONY: build run test test-python test-rust test-again test-slow compiled explore fuzz proof torture lint audit no-std format bench docs site \
   pictures dist dist-check lock clean deb container release-check
 .DELETE_ON_ERROR:
 
@@ -111,6 +111,9 @@ lint: no-std .venv/core.stamp .venv/dev.stamp
 CARGO_DENY := 0.20.2
 audit: .venv/core.stamp .venv/dev.stamp .venv/release.stamp .cache/tools/cargo-deny-$(CARGO_DENY).stamp
 	PATH="$(CURDIR)/.cache/tools/bin:$$PATH" $(BIN)/python tools/dependencies.py
+
+# What takes longest to compile, side by side: the last step of a release build uses one core.
+compiled: .venv/core.stamp .cache/tools/cargo-deny-$(CARGO_DENY).stamp
 
 # A tool of Rust and its version: cargo-NAME-VERSION. Optimizing it would take longer than what it does.
 .cache/tools/cargo-%.stamp: $(TOOLCHAIN)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
 from holdfast.adapters import ENTRY_POINTS, Context, Grant
+from holdfast.runtime.interpreter import complete_hashlib
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,6 +24,8 @@ def entry_point(name: str, settings: AdapterConfig) -> EntryPoint:
 
     Raises `UnknownAdapter` when no installed package provides the type.
     """
+    from importlib.metadata import entry_points
+
     known = entry_points(group=ENTRY_POINTS)
     for entry in known:
         if entry.name == settings.type:
@@ -46,6 +48,7 @@ def factory(
     context = Context(name, memory_access, grant, settings.options)
 
     def make() -> Adapter:
+        complete_hashlib()
         adapter: Adapter = found.load()(context)
         return adapter
 

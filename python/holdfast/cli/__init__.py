@@ -17,6 +17,7 @@ from holdfast.cli import answers, standard_output
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.old_spellings import OLD_NAMES, hint, renewed
 from holdfast.runtime import extras
+from holdfast.runtime.interpreter import spare_memory
 from holdfast.runtime.text import either, sentence
 
 if TYPE_CHECKING:
@@ -181,8 +182,11 @@ class Program(SuggestingGroup):
         """The command with that name, or `None`."""
         if cmd_name not in COMMANDS:
             return None
+        # Of what runs for years, an appliance is the smallest.
+        sparing = spare_memory() if cmd_name == "run" else contextlib.nullcontext()
         try:
-            return _imported(COMMANDS[cmd_name])
+            with sparing:
+                return _imported(COMMANDS[cmd_name])
         except ModuleNotFoundError:
             # A shell that completes a line shows no errors.
             if ctx.resilient_parsing:

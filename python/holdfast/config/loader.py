@@ -122,14 +122,14 @@ def _warn(scope: Scope) -> None:
 
 def _foreign(data: object) -> str | None:
     """What a file is that is no configuration. Its content is not shown: it could be a secret."""
-    from difflib import get_close_matches  # Only a file of unknown keys is compared.
-
     if data is None:
         return "an empty file"
     if not isinstance(data, dict):
         return shape(data) if data else show(data)
     if not data or any(str(key) in Config.model_fields for key in data):
         return None
+    from difflib import get_close_matches  # Only a file of unknown keys is compared.
+
     known = known_keys((), None)
     if any(get_close_matches(str(key), known, cutoff=0.8) for key in data):
         return None
