@@ -52,6 +52,7 @@ __all__ = [
     "RETRY_PAUSES",
     "SUB_FUNCTIONS",
     "TLS_REASONS",
+    "TURNAROUND_S",
     "UNMEASURED_COST_MS",
     "WHEN_BEHIND",
     "WRITE_RECORDS",
@@ -110,6 +111,9 @@ ADDRESSES: Final[int]
 
 MAX_PDU: Final[int]
 """Maximum size of a request or reply in bytes, without the framing of a transport."""
+
+TURNAROUND_S: Final[float]
+"""The time for devices to carry out a broadcast."""
 
 AREAS: Final[tuple[Area, ...]]
 """The areas, in the order of their functions."""

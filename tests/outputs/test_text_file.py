@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.config.models.outputs import FileConfig
-from holdfast.outputs.text_file import Database, TextFile
+from holdfast.outputs.sqlite_file import Database
+from holdfast.outputs.text_file import TextFile
 from support.line_protocol import parsed
 from support.readings import reading, tag
 

@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING
 
 from holdfast.client.async_transports import explained
 from holdfast.errors import ConnectFailed, ConnectionLost, InvalidResponse
+from holdfast.protocol import TURNAROUND_S
 from holdfast.types import SERIAL_FRAMES
 
 if TYPE_CHECKING:
     from holdfast._core import Request
     from holdfast.client.url import NetworkTarget
     from holdfast.types import Transport
-
-TURNAROUND_S = 0.1
-"""The time for devices to carry out a broadcast (Modbus over Serial Line V1.02, section 2.4.1)."""
 
 NOTE = "the broadcast was sent; devices do not confirm broadcasts"
 

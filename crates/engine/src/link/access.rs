@@ -12,7 +12,7 @@ use tokio::time::Instant;
 use super::fault::{Answer, Exchanged, Fault, fault};
 use crate::client::{Endpoint, Place, StrayCounters};
 use crate::link::limits::permit::Permit;
-use crate::link::scheduling::pace::{Alone, InFlight, Pace, Place as Turn};
+use crate::link::scheduling::in_flight::{Alone, InFlight, Pace, Place as Turn};
 use crate::link::scheduling::queue::Priority;
 use crate::link::sockets::blocking_link::BlockingLink;
 use crate::link::sockets::tcp::TcpLink;

@@ -25,7 +25,7 @@ pub use limits::lease_fence::{Fence, Stage};
 pub(crate) use limits::permit::Permit;
 pub(crate) use route::{Asker, Call};
 pub use route::{LinkCounters, LinkSettings, Route, SharedLink};
-pub use scheduling::pace::InFlight;
+pub use scheduling::in_flight::InFlight;
 pub(crate) use scheduling::pending_reply::{PendingReply, Reply, ReplyTo, pending_reply};
 pub(crate) use scheduling::queue::{Priority, source};
 pub(crate) use scheduling::request_loop::serve;

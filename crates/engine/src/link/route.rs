@@ -13,7 +13,7 @@ use super::caller::{Caller, Waiting};
 use crate::client::{ClientError, Endpoint, StrayCounters};
 use crate::counter::counters;
 use crate::link::limits::queue_share::{Place, QueueShare};
-use crate::link::scheduling::pace::InFlight;
+use crate::link::scheduling::in_flight::InFlight;
 use crate::link::scheduling::pending_reply::{PendingReply, ReplyTo, pending_reply};
 use crate::link::scheduling::queue::Priority;
 use crate::link::scheduling::write_barrier::InOrder;

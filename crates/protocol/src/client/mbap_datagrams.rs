@@ -6,8 +6,14 @@ use core::time::Duration;
 use super::flights::{Call, Done, Flights, Ticket};
 use super::mbap_stream;
 use super::raised_timeouts::{Lateness, MAX_RAISED_FACTOR};
-use super::{Closed, Failure, InvalidResponse, MAX_STRAY_DATAGRAMS, Time, Tolerance, UDP_ATTEMPTS};
+use super::{Closed, Failure, InvalidResponse, Time, Tolerance};
 use crate::frame::mbap::{self, Next};
+
+/// How many times a read is sent over UDP within its timeout.
+pub const UDP_ATTEMPTS: u32 = 3;
+
+/// The number of datagrams that match no request, since the last reply, after which a connection ends.
+pub const MAX_STRAY_DATAGRAMS: u32 = 1000;
 
 /// The number of requests whose late replies are recognized.
 const MAX_RECENT_REQUESTS: usize = 16;

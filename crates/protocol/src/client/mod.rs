@@ -39,6 +39,8 @@ pub use attempts::{Attempt, BUSY_PAUSE};
 pub use connection::{Connection, Past};
 pub use flights::{Done, Strays, Ticket};
 pub use late_replies_without_ids::MAX_LATENESS;
+pub use mbap_datagrams::{MAX_STRAY_DATAGRAMS, UDP_ATTEMPTS};
+pub use rtu_and_ascii::TURNAROUND;
 pub use tolerance::{AcceptUnit, Echo, Tolerance};
 
 use core::time::Duration;
@@ -54,16 +56,6 @@ pub type Time = Duration;
 /// The number of consecutive timeouts, without a received byte, after which a connection ends.
 /// Requests in flight at the same time count as one.
 pub const MAX_CONSECUTIVE_TIMEOUTS: u32 = 3;
-
-/// How many times a read is sent over UDP within its timeout.
-pub const UDP_ATTEMPTS: u32 = 3;
-
-/// The number of datagrams that match no request, since the last reply, after which a connection ends.
-pub const MAX_STRAY_DATAGRAMS: u32 = 1000;
-
-/// The time that the units of a serial line have to carry out a broadcast (Modbus over Serial Line
-/// V1.02, 2.4.1).
-pub const TURNAROUND: Duration = Duration::from_millis(100);
 
 /// The time after a reply in which the same one may come again, on lines and streams without transaction
 /// ids. It passes before the next request until enough replies have come once.

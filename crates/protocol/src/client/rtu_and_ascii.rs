@@ -11,7 +11,7 @@ use super::attempts::Attempt;
 use super::flights::{Call, Done, Flight, Flights, Ticket};
 use super::late_replies_without_ids::{Ended, LateReplies};
 use super::tolerance::Echo;
-use super::{Closed, Failure, GUARD, InvalidResponse, TURNAROUND, Time};
+use super::{Closed, Failure, GUARD, InvalidResponse, Time};
 use crate::frame::{FrameError, ascii, rtu};
 use crate::pdu::{self, EncodedRequest, ExceptionCode, Response, ResponseError};
 
@@ -20,6 +20,10 @@ pub(super) enum Framing {
     Rtu,
     Ascii,
 }
+
+/// The time that the units of a serial line have to carry out a broadcast (Modbus over Serial Line
+/// V1.02, 2.4.1).
+pub const TURNAROUND: Duration = Duration::from_millis(100);
 
 /// Reads in a row whose echo came before their reply, after which an echo is expected of writes too.
 const MIN_ECHOES: u8 = 3;

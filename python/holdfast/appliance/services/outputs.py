@@ -117,7 +117,7 @@ def receiver(name: str, settings: Output, site: Site) -> Receiver:
 
             return SparkplugOutput(name, settings, site)
         case FileConfig(format="sqlite"):
-            from holdfast.outputs.text_file import Database
+            from holdfast.outputs.sqlite_file import Database
 
             return Database(settings)
         case FileConfig():

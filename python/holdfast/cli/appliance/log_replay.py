@@ -18,8 +18,8 @@ from holdfast.appliance.parts.memories import empty
 from holdfast.appliance.parts.shared_logs import credentials, servers
 from holdfast.cli.configuration import load_or_exit
 from holdfast.cli.exit_codes import fail
+from holdfast.cli.options.bind_and_source import bind_option, unbindable
 from holdfast.cli.options.logs import chosen_log, log_option
-from holdfast.cli.options.network import bind_option, unbindable
 from holdfast.cli.options.option import config_argument, flag, json_option, option
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.cli.terminal_text import print_json

@@ -98,7 +98,7 @@ def read(
     )
     if of is not None:
         from holdfast.cli.tags import read as tagged_read
-        from holdfast.cli.tags import reader as tag_source
+        from holdfast.cli.tags import source as tag_source
 
         form = tag_options.form_of(as_json, selection.csv)
         if count is not None:

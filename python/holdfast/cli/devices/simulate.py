@@ -17,9 +17,14 @@ import click
 from holdfast.cli import standard_output, terminal_text
 from holdfast.cli.exit_codes import fail
 from holdfast.cli.live import schedule
+from holdfast.cli.options.bind_and_source import (
+    bind_option,
+    require_source,
+    source_option,
+    unbindable,
+)
 from holdfast.cli.options.device import unit_option
 from holdfast.cli.options.duration import Duration, every_option
-from holdfast.cli.options.network import bind_option, require_source, source_option, unbindable
 from holdfast.cli.options.option import FILE, file_option, option, parsed_by
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.cli.tags.files import tags_of

@@ -89,7 +89,7 @@ def watch(
             files, target, words, selection.only, untyped, modicon, unit, timeout
         )
         if of is not None:
-            from holdfast.cli.tags import reader as tag_source
+            from holdfast.cli.tags import source as tag_source
             from holdfast.cli.tags import watch as tagged_watch
 
             of = replace(of, url=checked_url(of.url))

@@ -10,8 +10,8 @@ import click
 
 from holdfast.appliance.services.gateway import gateway_settings
 from holdfast.appliance.services.services import https as loaded_https
+from holdfast.cli.options.bind_and_source import bind_option, source_option
 from holdfast.cli.options.log_lines import log_format_option
-from holdfast.cli.options.network import bind_option, source_option
 from holdfast.cli.options.option import choice, number_option, option, parsed_by
 from holdfast.cli.options.tls import DEVICES, https_options, tls_options
 from holdfast.cli.services.run import serve

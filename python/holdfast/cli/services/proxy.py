@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from holdfast._core import MAX_IN_FLIGHT
+from holdfast.cli.options.bind_and_source import bind_option, require_source, source_option
 from holdfast.cli.options.device import unit_option, usable
 from holdfast.cli.options.duration import Duration, time_option, timeout_option
 from holdfast.cli.options.log_lines import log_format_option
-from holdfast.cli.options.network import bind_option, require_source, source_option
 from holdfast.cli.options.option import choice, option, parsed_by
 from holdfast.cli.options.url import checked_url
 from holdfast.cli.services.run import serve

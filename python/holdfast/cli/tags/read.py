@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from holdfast.cli.tags.options import Form
-    from holdfast.cli.tags.reader import TagSource
+    from holdfast.cli.tags.source import TagSource
     from holdfast.client.tag_reading import Error, Reading
     from holdfast.tags import Tag
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from holdfast.cli.tags.changes import Tracked
-    from holdfast.cli.tags.reader import TagSource
+    from holdfast.cli.tags.source import TagSource
     from holdfast.client.tag_reading import Error, Reading
 
 MIN_NAME_COLUMNS = 8

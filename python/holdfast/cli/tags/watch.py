@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from holdfast.cli.tags.changes import TagChange
     from holdfast.cli.tags.options import Form
-    from holdfast.cli.tags.reader import TagSource
+    from holdfast.cli.tags.source import TagSource
     from holdfast.client.tag_reading import Reading
 
 

@@ -1,6 +1,6 @@
 //! Which request is next, and which of them share a reply.
 
-pub(crate) mod pace;
+pub(crate) mod in_flight;
 pub(crate) mod pending_reply;
 pub(crate) mod queue;
 pub(crate) mod request_loop;

@@ -28,7 +28,7 @@ use crate::link::limits::connect_pause::ConnectPause;
 use crate::link::limits::flood::Flood;
 use crate::link::limits::lease_fence::Pass;
 use crate::link::limits::permit::Permit;
-use crate::link::scheduling::pace::Pace;
+use crate::link::scheduling::in_flight::Pace;
 use crate::link::sockets::connect::dial;
 use crate::link::sockets::handshake;
 use crate::name_lookup;

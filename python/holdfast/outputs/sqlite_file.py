@@ -1,0 +1,93 @@
+"""Writes values to an SQLite database, for small sites."""
+
+from __future__ import annotations
+
+import sqlite3
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from holdfast.outputs.buffer_file import file_errors
+from holdfast.outputs.sending import Receiver
+from holdfast.outputs.text_file import row
+
+if TYPE_CHECKING:
+    from holdfast.config.models.outputs import FileConfig
+    from holdfast.polling import Reading
+
+_CREATE = """
+CREATE TABLE IF NOT EXISTS readings (
+    time TEXT NOT NULL, device TEXT NOT NULL, tag TEXT NOT NULL, value, unit TEXT, error TEXT
+);
+CREATE INDEX IF NOT EXISTS readings_of_tag ON readings (device, tag, time);
+CREATE INDEX IF NOT EXISTS readings_by_time ON readings (time);
+"""
+
+MAX_ROWS_PER_REMOVAL = 1000
+"""Rows that are removed at once if the database is too large."""
+
+
+class Database(Receiver):
+    """The table `readings`. Others may read it meanwhile."""
+
+    def __init__(self, settings: FileConfig) -> None:
+        self._file, self._max_bytes = settings.file, settings.max_bytes
+        self._db: sqlite3.Connection | None = None
+
+    def send(self, readings: list[Reading]) -> None:
+        """Inserts rows. They survive a power cut when this returns."""
+        with file_errors(self._file, self.close):
+            db = self._opened()
+            with db:
+                db.executemany(
+                    "INSERT INTO readings VALUES (?, ?, ?, ?, ?, ?)",
+                    [_row(reading) for reading in readings],
+                )
+            self._shrink(db)
+
+    def close(self) -> None:
+        """Closes the database."""
+        if self._db is not None:
+            self._db.close()
+            self._db = None
+
+    def status(self) -> dict[str, object]:
+        """Where values go."""
+        return {"file": str(self._file)}
+
+    def _opened(self) -> sqlite3.Connection:
+        if self._db is None:
+            self._db = sqlite3.connect(self._file, timeout=5.0, check_same_thread=False)
+            self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
+            self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.executescript(_CREATE)
+        return self._db
+
+    def _shrink(self, db: sqlite3.Connection) -> None:
+        """Removes the oldest rows if there are too many."""
+        while self._size(db) > self._max_bytes:
+            with db:
+                gone = db.execute(
+                    "DELETE FROM readings WHERE rowid IN "
+                    f"(SELECT rowid FROM readings ORDER BY time LIMIT {MAX_ROWS_PER_REMOVAL})"
+                ).rowcount
+            db.executescript("PRAGMA incremental_vacuum")  # `execute` would free one page.
+            if gone < MAX_ROWS_PER_REMOVAL:
+                return
+
+    @staticmethod
+    def _size(db: sqlite3.Connection) -> int:
+        pages, free, size = (
+            db.execute(f"PRAGMA {name}").fetchone()[0]
+            for name in ("page_count", "freelist_count", "page_size")
+        )
+        return int((pages - free) * size)
+
+
+def _row(reading: Reading) -> tuple[Any, ...]:
+    time, device, tag, value, unit, error = row(reading)
+    if isinstance(value, list):
+        value = msgspec.json.encode(value).decode()
+    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+        value = float(value)
+    return time, device, tag, value, unit, error
