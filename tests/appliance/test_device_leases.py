@@ -20,6 +20,7 @@ import pytest
 from holdfast.appliance import Appliance
 from holdfast.client.url import connection_of, parse
 from holdfast.config import ConfigError, load
+from holdfast.replication.leases.leases import Leases
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from support import wire
 from support.brokers import NatsServer
@@ -27,6 +28,7 @@ from support.cli import RunCommand, invoke
 from support.config_folder import written
 from support.fake_device import Stream, silent
 from support.leases import BRIEF, ENDLESS, make_settled
+from support.nats_bus import logged
 from support.running import endpoint
 from support.tcp_proxy import Proxy
 
@@ -222,6 +224,69 @@ def test_values_of_a_node_that_was_cut_off_are_refused_when_they_arrive_late(
             assert [ask(each, "03000b0001") for each in (one, two)] == [newest, newest]
 
 
+def test_a_device_of_a_kept_memory_too_is_written_into_the_log_by_the_next_holder(
+    node: Callable[..., Appliance],
+    settings: Callable[..., Path],
+    tmp_path: Path,
+    device: Device,
+) -> None:
+    counted = itertools.count(1)
+    device.then = lambda asked: asked.answer(bytes((3, 4, 0, 0)) + next(counted).to_bytes(2))
+    one = node("a")
+    wire.until(lambda: health(one) == "ok", "the first node polls it")
+    one.stop()
+    file = settings("b")
+    keep = {"file": str(tmp_path / "b.redb"), "sync": 0}
+    own = {"own": {"holding_registers": 100, "keep": keep}}
+    read = {"area": "holding_registers", "address": 7, "count": 2}
+    into = {"memory": "own", "area": "holding_registers", "address": 10}
+    text = file.read_text().replace('"memories": {', f'"memories": {written(own)[:-1]}, ')
+    file.write_text(text.replace('"reads": [', f'"reads": [{written({**read, "into": into})}, '))
+    with Appliance(load(file), lease_times=LEASE_TIMES) as two:
+        wire.until(lambda: health(two) == "ok", "the other node has taken over")
+        before = ask(two, "03000b0001")
+        wire.until(lambda: ask(two, "03000b0001") > before, "the replicated memory moves on")
+        assert two.diagnostics.stats()["devices"]["meter"]["unstored"] == 0
+
+
+def test_a_log_with_later_terms_than_the_bucket_of_leases_takes_the_values_of_the_holder(
+    node: Callable[..., Appliance], device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted = itertools.count(1)
+    device.then = lambda asked: asked.answer(bytes((3, 4, 0, 0)) + next(counted).to_bytes(2))
+    one = node("a")
+    wire.until(lambda: health(one) == "ok", "the first node polls it")
+    one.stop()
+    before = next(counted)
+    # As if the bucket were one of long ago.
+    monkeypatch.setattr(
+        Leases, "_made_at", property(lambda _: None, lambda *_: None), raising=False
+    )
+    two = node("b")
+    wire.until(lambda: int(ask(two, "03000b0001")[-4:], 16) > before, "its values are there")
+    wire.until(lambda: health(two) == "ok", "it has recovered")
+
+
+def test_a_node_that_stands_by_writes_no_status_of_the_device(
+    settings: Callable[..., Path],
+) -> None:
+    status = {"memory": "plant", "area": "holding_registers", "slot": 2}
+
+    def started(name: str) -> Appliance:
+        config = load(settings(name, interval=3600, status=status))
+        return Appliance(config, lease_times=LEASE_TIMES)
+
+    with started("a") as one:
+        wire.until(lambda: health(one) == "ok", "the first node polls it")
+        wire.until(lambda: ask(one, "03003c0001") == "03020001", "its status is ok")
+        with started("b") as two:
+            wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
+            wire.until(lambda: health(two) == "standby", "it stands by")
+            assert ask(two, "0600000001") == "0600000001"
+            wire.until(lambda: ask(one, "0300000001") == "03020001", "the first has followed")
+            assert [ask(each, "03003c0001") for each in (one, two)] == ["03020001"] * 2
+
+
 def test_a_node_that_dies_is_replaced_and_the_first_write_waits(
     process: Callable[..., subprocess.Popen[bytes]],
     node: Callable[..., Appliance],
@@ -303,6 +368,24 @@ def test_without_its_log_a_node_stops_polling_and_comes_back(
     assert len(device.peers) == polls
     server.start()
     wire.until(lambda: health(one) == "ok", "it polls again")
+
+
+def test_a_log_whose_servers_have_lost_it_is_said_to_have_failed(
+    node: Callable[..., Appliance], server: NatsServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    one = node("a")
+    wire.until(lambda: health(one) == "ok", "it polls")
+    server.kill()
+    server.lose_store()
+    server.start()
+
+    def failed() -> bool:
+        one.log_events(0)
+        return bool(logged(caplog, "log_failed"))
+
+    wire.until(failed, "it is logged")
+    [fields] = logged(caplog, "log_failed")
+    assert (fields["log"], fields["kind"]) == ("site", "replaced")
 
 
 def test_values_that_a_node_replays_are_stale_until_the_device_is_read(

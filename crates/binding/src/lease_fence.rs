@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use holdfast_engine::link::{Fence as Core, Stage};
+use holdfast_memory::Term;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
@@ -22,10 +23,11 @@ impl Fence {
         Fence { core: Arc::new(Core::new(lease)) }
     }
 
-    #[pyo3(signature = (until, *, settle=0.0))]
-    fn open(&self, py: Python<'_>, until: f64, settle: f64) -> PyResult<()> {
+    #[pyo3(signature = (until, *, term=(0, 0), settle=0.0))]
+    fn open(&self, py: Python<'_>, until: f64, term: (u64, u64), settle: f64) -> PyResult<()> {
         let settle = seconds("settle", settle)?;
-        self.core.open(instant(py, until)?, settle);
+        let term = Term { epoch: term.0, since: term.1 };
+        self.core.open(instant(py, until)?, term, settle);
         Ok(())
     }
 
@@ -58,7 +60,11 @@ impl Fence {
     }
 }
 
-/// A time of Python's `time.monotonic`, limited to the next hour; now if it has passed.
+/// Times further ahead count as this one: `Duration::from_secs_f64` panics for large numbers.
+/// Leases are renewed far more often.
+const MAX_AHEAD_S: f64 = 3600.0;
+
+/// A time of Python's `time.monotonic`, at most `MAX_AHEAD_S` ahead; now if it has passed.
 ///
 /// Rust's clock is read first: if the process is stopped in between, the result is too early, never
 /// too late.
@@ -68,7 +74,7 @@ fn instant(py: Python<'_>, time: f64) -> PyResult<Instant> {
     let clock = CLOCK.import(py, "time", "monotonic")?;
     let left = time - clock.call0()?.extract::<f64>()?;
     if left.is_nan() {
-        return Err(PyValueError::new_err("the time is not a number"));
+        return Err(PyValueError::new_err("until is NaN, allowed: a time of time.monotonic"));
     }
-    Ok(now + Duration::from_secs_f64(left.clamp(0.0, 3600.0)))
+    Ok(now + Duration::from_secs_f64(left.clamp(0.0, MAX_AHEAD_S)))
 }

@@ -6,7 +6,7 @@
 use std::sync::Arc;
 
 use bytes::{Buf, TryGetError};
-use holdfast_memory::{Access, Action, Area, Memory, Step, StepWrite, Tenure};
+use holdfast_memory::{Access, Action, Area, Memory, Step, StepWrite, Tenure, Term};
 use thiserror::Error;
 
 /// The version that [`encode`] writes. Others are not decoded.
@@ -15,7 +15,7 @@ pub const VERSION: u8 = 1;
 /// The number of a file as an area.
 const FILE: u8 = Area::File(0).index() as u8;
 
-/// Set in the number of an access that a lease and whether the step claims it follow.
+/// Set in the number of an access that a lease and its term follow.
 const UNDER_LEASE: u8 = 0x80;
 
 /// In the order of their numbers.
@@ -56,10 +56,11 @@ pub fn encode(step: &Step, out: &mut Vec<u8>) {
     let access = access.expect("each access has a number") as u8;
     match step.tenure {
         None => out.push(access),
-        Some(Tenure { lease, claims }) => {
+        Some(Tenure { lease, term: Term { epoch, since } }) => {
             out.push(access | UNDER_LEASE);
-            out.extend_from_slice(&lease.to_le_bytes());
-            out.push(u8::from(claims));
+            for number in [lease, epoch, since] {
+                out.extend_from_slice(&number.to_le_bytes());
+            }
         }
     }
     match &step.action {
@@ -174,11 +175,9 @@ impl<'a> Rest<'a> {
             return Ok((access, None));
         }
         let lease = self.bytes.try_get_u64_le()?;
-        let claims = match self.bytes.try_get_u8()? {
-            flag @ (0 | 1) => flag == 1,
-            found => return Err(DecodeError::Unknown { what: "the claim", found }),
-        };
-        Ok((access, Some(Tenure { lease, claims })))
+        let epoch = self.bytes.try_get_u64_le()?;
+        let term = Term { epoch, since: self.bytes.try_get_u64_le()? };
+        Ok((access, Some(Tenure { lease, term })))
     }
 
     fn place(&mut self) -> Result<(u16, Area, u16), DecodeError> {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use holdfast_journal::encoding::{DecodeError, VERSION, decode, encode};
 use holdfast_memory::{
-    Access, Action, Area, Layout, Memory, Refusal, Refused, Span, Step, StepWrite, Tenure,
+    Access, Action, Area, Layout, Memory, Refusal, Refused, Span, Step, StepWrite, Tenure, Term,
 };
 use proptest::collection::vec;
 use proptest::option;
@@ -105,8 +105,9 @@ fn action() -> impl Strategy<Value = Action> {
 }
 
 fn step() -> impl Strategy<Value = Step> {
-    let tenure = option::of((any::<u64>(), any::<bool>()))
-        .prop_map(|tenure| tenure.map(|(lease, claims)| Tenure { lease, claims }));
+    let tenure = option::of(any::<[u64; 3]>()).prop_map(|tenure| {
+        tenure.map(|[lease, epoch, since]| Tenure { lease, term: Term { epoch, since } })
+    });
     (access(), tenure, action()).prop_map(|(access, tenure, action)| Step {
         access,
         tenure,

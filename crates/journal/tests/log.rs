@@ -11,7 +11,7 @@ use futures_util::StreamExt;
 use holdfast_journal::log::{LogError, LogReader, Next, Phase, Settings, Until};
 use holdfast_memory::{
     Access, Action, Area, Freshness, Memory, Mirrored, Operation, Outcome, Read, Refusal, Refused,
-    Span, Step, StepWrite, Tenure, Write, write_across,
+    Span, Step, StepWrite, Tenure, Term, Write, write_across,
 };
 use nodes::process::{Answer, Process};
 use nodes::{Node, REGISTERS, Server, cluster, memory_of, until};
@@ -530,13 +530,13 @@ fn mirror(node: &Node, value: u16) {
     node.memory.write(Access::Mirror, write).unwrap();
 }
 
-/// Mirrors a value under a lease.
-fn mirror_under(lease: u64, claims: bool, node: &Node, value: u16) -> Result<(), Refusal> {
+/// Mirrors a value under a lease that was taken at this revision.
+fn mirror_under(lease: u64, since: u64, node: &Node, value: u16) -> Result<(), Refusal> {
     let bytes = value.to_be_bytes();
     let write = Write { area: REGISTERS, address: 3, count: 1, bytes: &bytes };
     let (sender, receiver) = std::sync::mpsc::channel();
     let done = Box::new(move |outcome: Outcome| drop(sender.send(outcome)));
-    let tenure = Some(Tenure { lease, claims });
+    let tenure = Some(Tenure { lease, term: Term { epoch: 0, since } });
     node.memory.submit_under(tenure, Access::Mirror, Operation::Write(&[write]), done)?;
     receiver.recv().unwrap().map(|_| ()).map_err(|refused| refused.refusal)
 }
@@ -549,14 +549,13 @@ fn what_a_former_holder_of_a_lease_writes_late_is_refused() {
     let [a, b] = ["a", "b"].map(|name| Node::new(&[&server], name, soon));
     a.start();
     b.start();
-    let late = || mirror_under(LEASE, false, &a, 4);
-    assert_eq!(mirror_under(LEASE, false, &b, 1), Ok(()), "nobody has claimed the lease");
-    assert_eq!(mirror_under(LEASE, true, &a, 2), Ok(()));
-    assert_eq!(mirror_under(LEASE, false, &a, 2), Ok(()));
-    assert_eq!(mirror_under(LEASE, true, &b, 3), Ok(()));
+    let late = || mirror_under(LEASE, 10, &a, 4);
+    assert_eq!(mirror_under(LEASE, 10, &a, 1), Ok(()));
+    assert_eq!(mirror_under(LEASE, 10, &a, 2), Ok(()));
+    assert_eq!(mirror_under(LEASE, 11, &b, 3), Ok(()));
     assert_eq!(late(), Err(Refusal::Overtaken));
-    assert_eq!(mirror_under(LEASE, false, &b, 5), Ok(()));
-    assert_eq!(mirror_under(LEASE + 1, false, &a, 5), Ok(()), "that is another lease");
+    assert_eq!(mirror_under(LEASE, 11, &b, 5), Ok(()));
+    assert_eq!(mirror_under(LEASE + 1, 10, &a, 5), Ok(()), "that is another lease");
     let memory = memory_of(100);
     let settings = Settings::new("site", "replay", vec![server.url()]);
     let members = vec![("plant".to_owned(), memory)];
@@ -566,7 +565,7 @@ fn what_a_former_holder_of_a_lease_writes_late_is_refused() {
         refusals.extend(record.refusals.into_iter().flatten());
     }
     assert_eq!(refusals, [Refusal::Overtaken]);
-    // Whoever begins with a snapshot knows the holder too.
+    // Whoever begins with a snapshot knows the term too.
     until("a snapshot is taken", || {
         b.write(0, 1).unwrap();
         first_sequence(&server) > 1
@@ -575,8 +574,8 @@ fn what_a_former_holder_of_a_lease_writes_late_is_refused() {
     assert_eq!(late(), Err(Refusal::Overtaken));
     c.until_applied(a.status().last_sequence);
     assert_eq!((c.read(3), a.read(3), b.read(3)), (Ok(5), Ok(5), Ok(5)));
-    assert_eq!(mirror_under(LEASE, true, &a, 6), Ok(()), "it has the lease again");
-    assert_eq!(mirror_under(LEASE, false, &b, 5), Err(Refusal::Overtaken));
+    assert_eq!(mirror_under(LEASE, 12, &a, 6), Ok(()), "it has the lease again");
+    assert_eq!(mirror_under(LEASE, 11, &b, 5), Err(Refusal::Overtaken));
     c.until_applied(a.status().last_sequence);
     assert_eq!(c.read(3), Ok(6));
 }

@@ -41,5 +41,7 @@ pub use memory::{Contents, Memory, check_across, write_across};
 pub use mirrored::{Freshness, Mirrored};
 pub use operation::{Access, Read, Write};
 pub use seal::{Gate, GateMode};
-pub use step::{Action, CarriedOut, Done, Journal, Operation, Outcome, Step, StepWrite, Tenure};
+pub use step::{
+    Action, CarriedOut, Done, Journal, Operation, Outcome, Step, StepWrite, Tenure, Term,
+};
 pub use write_queue::{WriteQueue, Written};

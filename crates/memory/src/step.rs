@@ -19,13 +19,21 @@ pub struct Step {
 }
 
 /// A lease under which a node writes what it reads from a device, while others may hold it before and after.
+/// After a step of a later term, those of earlier ones are refused with [`Refusal::Overtaken`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Tenure {
     /// The number of the lease, the same on all nodes.
     pub lease: u64,
-    /// Whether the step ends the tenure of the node that wrote under this lease before. Without it, a step of
-    /// another node than the last that has claimed the lease is refused with [`Refusal::Overtaken`].
-    pub claims: bool,
+    pub term: Term,
+}
+
+/// The time for which one node holds a lease. A later one is greater.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Term {
+    /// Of what counts `since`. It may begin anew.
+    pub epoch: u64,
+    /// Grows with each holder.
+    pub since: u64,
 }
 
 /// What a step does. A member is the number of a memory in its journal.

@@ -650,10 +650,16 @@ impl Device {
         submit_under(self.settings.fence.as_ref(), memory, access, write, done)
     }
 
+    /// Whether another node writes what the device holds.
+    fn is_without_lease(&self) -> bool {
+        let fence = self.settings.fence.as_ref();
+        self.state.stands_by() || fence.is_some_and(|fence| !fence.allows())
+    }
+
     fn publish_status(&self) {
         let status = self.state.status();
         if let Some(to) = &self.settings.status
-            && !(self.state.stands_by() && to.memory.is_replicated())
+            && !(self.is_without_lease() && to.memory.is_replicated())
             && status.write_by(to, |write| self.store(&to.memory, Access::Ingest, write)).is_err()
         {
             self.state.count_unstored();

@@ -12,8 +12,8 @@ use tokio::time::sleep_until;
 use crate::link::{Fence, Stage};
 use crate::poller::device::DeviceSettings;
 
-/// Gives what a device holds to the journal of a memory. A log refuses it if another node has taken over the
-/// lease since.
+/// Gives what a device holds to the journal of a memory. The log of a replicated one refuses it if another node has
+/// taken over the lease since.
 pub(super) fn submit_under(
     fence: Option<&Arc<Fence>>,
     memory: &Memory,
@@ -21,7 +21,7 @@ pub(super) fn submit_under(
     write: Write<'_>,
     done: Done,
 ) -> Result<(), Refusal> {
-    let (tenure, done) = match fence {
+    let (tenure, done) = match fence.filter(|_| memory.is_replicated()) {
         None => (None, done),
         Some(fence) => {
             let (tenure, done) = fence.tenure(done);

@@ -8,7 +8,9 @@ use std::time::Duration;
 
 use aws_lc_rs::digest::{SHA256, digest};
 use bytes::Buf;
-use holdfast_memory::{CarriedOut, Contents, Memory, Outcome, Refusal, Refused, Step, Tenure};
+use holdfast_memory::{
+    CarriedOut, Contents, Memory, Outcome, Refusal, Refused, Step, Tenure, Term,
+};
 use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
 
@@ -18,8 +20,8 @@ use crate::log::stream::message::{
     self, MAX_NODES, Message, MessageError, Origin, VERSION, WITHOUT_LEASES,
 };
 
-/// The most leases whose holders are known. Of another one, the steps of all nodes are carried out.
-const MAX_HOLDERS: usize = 65_536;
+/// The most leases whose last term is known. Of another one, all steps are carried out.
+const MAX_LEASES: usize = 65_536;
 
 /// An encoded state begins with it.
 const MARK: [u8; 3] = *b"HFS";
@@ -32,8 +34,8 @@ pub(super) struct State {
     pub(super) steps: u64,
     /// The start and the last counter that were applied of each node.
     pub(super) origins: BTreeMap<String, (u64, u64)>,
-    /// The node that has claimed a lease last, and its start.
-    pub(super) holders: BTreeMap<u64, (String, u64)>,
+    /// The last term of each lease.
+    pub(super) terms: BTreeMap<u64, Term>,
 }
 
 /// A message of the stream.
@@ -76,7 +78,7 @@ impl State {
             place: Place::default(),
             steps: 0,
             origins: BTreeMap::new(),
-            holders: BTreeMap::new(),
+            terms: BTreeMap::new(),
         }
     }
 
@@ -135,7 +137,7 @@ impl State {
         let at = |done| CarriedOut { sequence: Some(place.sequence), ..done };
         let age = age(&origin);
         let carried_out = |step: &Step| {
-            self.admit(step.tenure, &origin)?;
+            self.admit(step.tenure)?;
             step.carry_out_late(&self.members, age).map(at)
         };
         let outcomes = steps.iter().map(carried_out).collect();
@@ -144,35 +146,30 @@ impl State {
 
     /// Refuses what a former holder of a lease has written, if the present one came before it in the log: a
     /// cut network delivers it late.
-    fn admit(&mut self, tenure: Option<Tenure>, origin: &Origin) -> Result<(), Refused> {
-        let Some(Tenure { lease, claims }) = tenure else { return Ok(()) };
-        let is_holder =
-            |(node, start): &(String, u64)| *node == origin.node && *start == origin.start;
-        match self.holders.get(&lease) {
-            Some(holder) if is_holder(holder) => {}
-            Some(_) if !claims => return Err(Refused { index: 0, refusal: Refusal::Overtaken }),
-            _ if claims => {
-                // All nodes forget the same one.
-                if self.holders.len() == MAX_HOLDERS && !self.holders.contains_key(&lease) {
-                    self.holders.pop_first();
-                }
-                self.holders.insert(lease, (origin.node.clone(), origin.start));
-            }
-            _ => {}
+    fn admit(&mut self, tenure: Option<Tenure>) -> Result<(), Refused> {
+        let Some(Tenure { lease, term }) = tenure else { return Ok(()) };
+        let last = self.terms.get(&lease);
+        if last.is_some_and(|last| term < *last) {
+            return Err(Refused { index: 0, refusal: Refusal::Overtaken });
         }
+        // All nodes forget the same one.
+        if last.is_none() && self.terms.len() == MAX_LEASES {
+            self.terms.pop_first();
+        }
+        self.terms.insert(lease, term);
         Ok(())
     }
 
     /// Of its encoding.
     pub(super) fn version(&self) -> u8 {
-        if self.holders.is_empty() { WITHOUT_LEASES } else { VERSION }
+        if self.terms.is_empty() { WITHOUT_LEASES } else { VERSION }
     }
 
     pub(super) fn encode(&self) -> Vec<u8> {
         let contents = Memory::contents(&self.members);
         let len: usize =
             contents.iter().flat_map(|contents| &contents.areas).map(|area| area.len() + 8).sum();
-        let mut out = Vec::with_capacity(len + 64 + (self.origins.len() + self.holders.len()) * 96);
+        let mut out = Vec::with_capacity(len + 64 + (self.origins.len() + self.terms.len()) * 96);
         out.extend_from_slice(&MARK);
         out.push(self.version());
         out.extend_from_slice(&self.place.sequence.to_le_bytes());
@@ -180,14 +177,17 @@ impl State {
         out.extend_from_slice(&self.steps.to_le_bytes());
         out.extend_from_slice(&(self.origins.len() as u32).to_le_bytes());
         for (node, (start, counter)) in &self.origins {
-            encode_node(node, *start, &mut out);
+            out.push(node.len() as u8);
+            out.extend_from_slice(node.as_bytes());
+            out.extend_from_slice(&start.to_le_bytes());
             out.extend_from_slice(&counter.to_le_bytes());
         }
         if self.version() == VERSION {
-            out.extend_from_slice(&(self.holders.len() as u32).to_le_bytes());
-            for (lease, (node, start)) in &self.holders {
-                out.extend_from_slice(&lease.to_le_bytes());
-                encode_node(node, *start, &mut out);
+            out.extend_from_slice(&(self.terms.len() as u32).to_le_bytes());
+            for (lease, Term { epoch, since }) in &self.terms {
+                for number in [lease, epoch, since] {
+                    out.extend_from_slice(&number.to_le_bytes());
+                }
             }
         }
         out.extend_from_slice(&(contents.len() as u32).to_le_bytes());
@@ -214,7 +214,7 @@ impl State {
             return Err(LogError::Version { what, found, supported: VERSION });
         }
         let loaded = loaded(&mut rest, found, &self.members).filter(|_| rest.is_empty());
-        let Loaded { place, steps, origins, holders, contents } = loaded.ok_or_else(malformed)?;
+        let Loaded { place, steps, origins, terms, contents } = loaded.ok_or_else(malformed)?;
         if place != expected {
             let sequence = expected.sequence;
             let text = format!("the snapshot at sequence {sequence}: it has another sequence");
@@ -224,7 +224,7 @@ impl State {
             memory.restore(contents);
         }
         (self.place, self.steps) = (place, steps);
-        (self.origins, self.holders) = (origins, holders);
+        (self.origins, self.terms) = (origins, terms);
         Ok(())
     }
 }
@@ -239,22 +239,8 @@ struct Loaded {
     place: Place,
     steps: u64,
     origins: BTreeMap<String, (u64, u64)>,
-    holders: BTreeMap<u64, (String, u64)>,
+    terms: BTreeMap<u64, Term>,
     contents: Vec<Contents>,
-}
-
-fn encode_node(node: &str, start: u64, out: &mut Vec<u8>) {
-    out.push(node.len() as u8);
-    out.extend_from_slice(node.as_bytes());
-    out.extend_from_slice(&start.to_le_bytes());
-}
-
-/// Takes the name of a node, and a start.
-fn node(bytes: &mut &[u8]) -> Option<(String, u64)> {
-    let len = bytes.try_get_u8().ok()?;
-    let node = str::from_utf8(bytes.split_off(..usize::from(len))?).ok()?;
-    let node = is_word(node).then(|| node.to_owned())?;
-    Some((node, bytes.try_get_u64_le().ok()?))
 }
 
 /// Takes an encoded state for these memories.
@@ -264,19 +250,23 @@ fn loaded(bytes: &mut &[u8], version: u8, members: &[Arc<Memory>]) -> Option<Loa
     let steps = bytes.try_get_u64_le().ok()?;
     let mut origins = BTreeMap::new();
     for _ in 0..bytes.try_get_u32_le().ok()? {
-        let (node, start) = node(bytes)?;
-        origins.insert(node, (start, bytes.try_get_u64_le().ok()?));
+        let len = bytes.try_get_u8().ok()?;
+        let node = str::from_utf8(bytes.split_off(..usize::from(len))?).ok()?;
+        let node = is_word(node).then(|| node.to_owned())?;
+        origins.insert(node, (bytes.try_get_u64_le().ok()?, bytes.try_get_u64_le().ok()?));
     }
-    let mut holders = BTreeMap::new();
+    let mut terms = BTreeMap::new();
     let count = if version == VERSION { bytes.try_get_u32_le().ok()? } else { 0 };
     for _ in 0..count {
-        holders.insert(bytes.try_get_u64_le().ok()?, node(bytes)?);
+        let lease = bytes.try_get_u64_le().ok()?;
+        let epoch = bytes.try_get_u64_le().ok()?;
+        terms.insert(lease, Term { epoch, since: bytes.try_get_u64_le().ok()? });
     }
     if bytes.try_get_u32_le().ok()? as usize != members.len() {
         return None;
     }
     let contents = members.iter().map(|memory| contents(bytes, memory)).collect::<Option<_>>()?;
-    Some(Loaded { place, steps, origins, holders, contents })
+    Some(Loaded { place, steps, origins, terms, contents })
 }
 
 /// Takes the contents of a memory.
@@ -326,30 +316,28 @@ mod tests {
     fn a_state_without_leases_is_read_by_older_nodes() {
         let mut state = State::new(vec![member()]);
         assert_eq!(state.encode()[3], WITHOUT_LEASES);
-        let origin = Origin { node: "a".to_owned(), start: 5, counter: 1 };
-        let tenure = |claims| Some(Tenure { lease: 7, claims });
-        state.admit(tenure(false), &origin).unwrap();
+        let tenure = |epoch, since| Some(Tenure { lease: 7, term: Term { epoch, since } });
+        state.admit(None).unwrap();
         assert_eq!(state.version(), WITHOUT_LEASES);
-        state.admit(tenure(true), &origin).unwrap();
+        state.admit(tenure(1, 5)).unwrap();
         let saved = state.encode();
         assert_eq!(saved[3], VERSION);
         let mut loaded = State::new(vec![member()]);
         loaded.load(&saved, state.place).unwrap();
-        assert_eq!((loaded.encode(), &loaded.holders), (saved, &state.holders));
-        let restarted = Origin { start: 6, ..origin.clone() };
-        assert!(loaded.admit(tenure(false), &restarted).is_err());
-        assert!(loaded.admit(tenure(false), &origin).is_ok());
+        assert_eq!((loaded.encode(), &loaded.terms), (saved, &state.terms));
+        assert!(loaded.admit(tenure(1, 4)).is_err() && loaded.admit(tenure(0, 9)).is_err());
+        assert!(loaded.admit(tenure(1, 5)).is_ok() && loaded.admit(tenure(2, 1)).is_ok());
+        assert!(loaded.admit(tenure(1, 9)).is_err());
     }
 
     #[test]
-    fn the_holders_that_are_known_are_limited() {
+    fn the_leases_that_are_known_are_limited() {
         let mut state = State::new(Vec::new());
-        let origin = Origin { node: "a".to_owned(), start: 1, counter: 1 };
-        for lease in 0..MAX_HOLDERS as u64 + 2 {
-            state.admit(Some(Tenure { lease, claims: true }), &origin).unwrap();
+        for lease in 0..MAX_LEASES as u64 + 2 {
+            state.admit(Some(Tenure { lease, term: Term::default() })).unwrap();
         }
-        assert_eq!(state.holders.len(), MAX_HOLDERS);
-        assert!(!state.holders.contains_key(&1) && state.holders.contains_key(&2));
+        assert_eq!(state.terms.len(), MAX_LEASES);
+        assert!(!state.terms.contains_key(&1) && state.terms.contains_key(&2));
     }
 
     #[test]

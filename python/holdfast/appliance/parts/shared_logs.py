@@ -149,12 +149,12 @@ class SharedLogs(Part):
             for name, log in self._logs.items()
         }
 
-    def log_changes(self) -> None:
+    def tick(self) -> None:
         """Logs what has happened since the last call."""
         for name, log in self._logs.items():
             for event, fields in log.events(0):
                 # Limited: any publisher can cause these events.
-                log_lines.limited(EVENTS[event], event, kind=name, log=name, **fields)
+                log_lines.count(EVENTS[event], event, {"log": name, **fields}, kind=name)
 
 
 def _obstacle(status: LogStatus, max_lag: float) -> str | None:

@@ -431,7 +431,10 @@ class Leases:
             return
         until = sent + self.times.hold_s
         self._held[key] = _Held(revision, holding, revision, until)
-        self.fence(key).open(until, settle=0.0 if clean else self.times.settle_s)
+        # Revisions begin anew with another bucket.
+        epoch = 0 if made_at is None else int(made_at.timestamp())
+        settle = 0.0 if clean else self.times.settle_s
+        self.fence(key).open(until, term=(max(epoch, 0), revision), settle=settle)
         self._watcher.taken(key)
 
     async def _read(self, bucket: LeaseBucket, key: str) -> None:

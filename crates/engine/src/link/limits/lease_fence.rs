@@ -6,10 +6,10 @@
 //! task closes the connection when the time is over: after a stop of the process, others may run first.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Weak};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
-use holdfast_memory::{Done, Outcome, Refusal, Refused, Tenure};
+use holdfast_memory::{Done, Outcome, Refusal, Refused, Tenure, Term};
 use tokio::sync::watch;
 use tokio::time::sleep_until;
 
@@ -28,8 +28,8 @@ pub enum Stage {
 pub struct Fence {
     /// The number of the lease, the same on all nodes.
     lease: u64,
-    /// Whether a log has what was read since it was opened, and refuses what former holders have read.
-    is_claimed: AtomicBool,
+    /// Since when this node has the lease, or had it last.
+    term: Mutex<Term>,
     /// The zero of all times.
     zero: Instant,
     /// In nanoseconds after `zero`; 0 if it was never opened, or is closed.
@@ -51,7 +51,7 @@ impl Fence {
     pub fn new(lease: u64) -> Fence {
         Fence {
             lease,
-            is_claimed: AtomicBool::new(false),
+            term: Mutex::default(),
             zero: Instant::now(),
             until: AtomicU64::new(0),
             settled: AtomicU64::new(0),
@@ -61,11 +61,12 @@ impl Fence {
         }
     }
 
-    /// Opens it. What a former holder has sent may still arrive for `settle`, and the timeout of a device.
-    pub fn open(&self, until: Instant, settle: Duration) {
+    /// Opens it for a term. What a former holder has sent may still arrive for `settle`, and the timeout of a
+    /// device.
+    pub fn open(&self, until: Instant, term: Term, settle: Duration) {
         let settled = if settle.is_zero() { 0 } else { self.time(Instant::now() + settle) };
         self.settled.store(settled, Ordering::Release);
-        self.is_claimed.store(false, Ordering::Release);
+        *self.term() = term;
         self.is_ending.store(false, Ordering::Release);
         self.until.store(self.time(until), Ordering::Release);
         self.announce();
@@ -108,22 +109,30 @@ impl Fence {
         self.stage() != Stage::Closed
     }
 
-    /// Under which lease to write what a device holds, and who receives the outcome in place of `done`.
+    fn term(&self) -> MutexGuard<'_, Term> {
+        self.term.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Under which term to write what a device holds into a log, and who receives the outcome in place of `done`.
     pub(crate) fn tenure(self: &Arc<Fence>, done: Done) -> (Tenure, Done) {
-        let claims = !self.is_claimed.load(Ordering::Acquire);
+        let tenure = Tenure { lease: self.lease, term: *self.term() };
         let fence = Arc::clone(self);
         let noted = move |outcome: Outcome| {
-            match outcome {
-                Ok(_) if claims => fence.is_claimed.store(true, Ordering::Release),
-                // If this node has the lease all the same, the next write claims it again.
-                Err(Refused { refusal: Refusal::Overtaken, .. }) => {
-                    fence.is_claimed.store(false, Ordering::Release);
-                }
-                _ => {}
+            if matches!(outcome, Err(Refused { refusal: Refusal::Overtaken, .. })) {
+                fence.overtaken(tenure.term);
             }
             done(outcome);
         };
-        (Tenure { lease: self.lease, claims }, Box::new(noted))
+        (tenure, Box::new(noted))
+    }
+
+    /// A log has a later term. If this node has the lease all the same, what counts terms has begun anew, or was
+    /// set back: a greater epoch is found after a few steps.
+    fn overtaken(&self, sent: Term) {
+        let mut term = self.term();
+        if *term == sent && self.allows() {
+            term.epoch = term.epoch.saturating_mul(2).saturating_add(1);
+        }
     }
 
     /// The number of polls, writes and connections.

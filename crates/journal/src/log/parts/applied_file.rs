@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use holdfast_memory::{Contents, Memory};
+use holdfast_memory::{Contents, Memory, Term};
 use serde::{Deserialize, Serialize};
 
 use crate::log::error::LogError;
@@ -22,7 +22,7 @@ pub(in crate::log) struct Note {
     steps: u64,
     origins: BTreeMap<String, (u64, u64)>,
     #[serde(default)]
-    holders: BTreeMap<u64, (String, u64)>,
+    terms: BTreeMap<u64, (u64, u64)>,
     sealed: Vec<bool>,
     /// The digest of the contents and all of the above, as nodes compare it.
     digest: String,
@@ -48,6 +48,8 @@ impl Note {
     /// The contents of this state, and the note about them. `None` if the note can't be encoded.
     pub(in crate::log) fn checkpoint(state: &State, log: &str, stream: &str) -> Option<Checkpoint> {
         let contents = Memory::contents(&state.members);
+        let terms = state.terms.iter();
+        let numbers = terms.map(|(lease, term)| (*lease, (term.epoch, term.since)));
         let note = Note {
             version: state.version(),
             log: log.to_owned(),
@@ -56,7 +58,7 @@ impl Note {
             stored: state.place.stored,
             steps: state.steps,
             origins: state.origins.clone(),
-            holders: state.holders.clone(),
+            terms: numbers.collect(),
             sealed: contents.iter().map(|contents| contents.sealed).collect(),
             digest: digest_of(&state.encode()),
         };
@@ -78,7 +80,9 @@ impl Note {
         state.place = Place { sequence: self.sequence, stored: self.stored };
         state.steps = self.steps;
         state.origins = self.origins.clone();
-        state.holders = self.holders.clone();
+        let terms = self.terms.iter();
+        state.terms =
+            terms.map(|(lease, &(epoch, since))| (*lease, Term { epoch, since })).collect();
         let found = digest_of(&state.encode());
         if found == self.digest {
             return Ok(());
