@@ -1296,3 +1296,19 @@ proptest! {
         prop_assert_eq!(client.got(), [(ticket, Ok(bytes))]);
     }
 }
+
+#[test]
+fn a_pause_lasts_beyond_the_end_of_a_connection() {
+    let tolerance = Tolerance { pause: SECOND * 2, close_after: 1, ..STRICT };
+    let read = EncodedRequest::new(&read());
+    let mut first = Connection::tolerant(Transport::Tcp, tolerance, SECOND);
+    first.send(1, &read, SECOND, SECOND).unwrap();
+    let past = first.take_past(SECOND * 2);
+    let mut next = Connection::tolerant(Transport::Tcp, tolerance, SECOND * 3);
+    next.follow(past);
+    next.send(1, &read, SECOND, SECOND * 3).unwrap();
+    next.advance(SECOND * 3, |_| {});
+    assert!(next.outgoing().is_empty(), "it waits for the pause");
+    next.advance(SECOND * 4, |_| {});
+    assert!(!next.outgoing().is_empty());
+}

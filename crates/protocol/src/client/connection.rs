@@ -50,7 +50,11 @@ pub struct Connection {
 
 /// What a connection leaves to the next one to the same address: see [`Connection::take_past`].
 #[derive(Debug, Default)]
-pub struct Past(Left);
+pub struct Past {
+    left: Left,
+    /// The end of the pause after the last request.
+    ready_at: Time,
+}
 
 #[derive(Debug, Default)]
 enum Left {
@@ -120,25 +124,30 @@ impl Connection {
         self
     }
 
-    /// Takes what the next connection to this address has to know: replies that may still come, and how
-    /// late they are. This connection is not used again.
+    /// Takes what the next connection to this address has to know: replies that may still come, how late
+    /// they are, and the pause. This connection is not used again.
     pub fn take_past(&mut self, now: Time) -> Past {
+        let pause = self.flights.tolerance.pause;
+        let was_asked = self.flights.len() > 0 && !pause.is_zero();
+        let ready_at = if was_asked { self.ready_at.max(now + pause) } else { self.ready_at };
         self.flights.close(Closed::BySelf, &mut |_| {});
-        match &mut self.wire {
+        let left = match &mut self.wire {
             Wire::Stream(stream) => {
                 let (next_id, given_up) = stream.take_ids(&self.flights);
-                Past(Left::Ids(next_id, given_up, take(&mut stream.lateness)))
+                Left::Ids(next_id, given_up, take(&mut stream.lateness))
             }
-            Wire::Datagrams(datagrams) => Past(Left::Lateness(take(&mut datagrams.lateness))),
-            Wire::OneAtATime(line) => {
-                Past(Left::LateReplies(line.take_late_replies(&self.flights, now)))
-            }
-        }
+            Wire::Datagrams(datagrams) => Left::Lateness(take(&mut datagrams.lateness)),
+            Wire::OneAtATime(line) => Left::LateReplies(line.take_late_replies(&self.flights, now)),
+        };
+        Past { left, ready_at }
     }
 
     /// Goes on where another connection to the same address ended, whose clock was the same.
     pub fn follow(&mut self, past: Past) {
-        match (&mut self.wire, past.0) {
+        if !self.flights.tolerance.pause.is_zero() {
+            self.ready_at = self.ready_at.max(past.ready_at);
+        }
+        match (&mut self.wire, past.left) {
             (Wire::Stream(stream), Left::Ids(next_id, given_up, lateness)) => {
                 stream.go_on(next_id, &given_up);
                 stream.lateness = lateness;
