@@ -103,10 +103,10 @@ class Rig:
     def __init__(self, folder: Path) -> None:
         self.log = folder / "audit.log"
         self.memories, self.compared = memories(), memories()
-        self.audit = Audit(self.log, max_bytes=10**7, keep=1, closed=True)
+        self.audit = Audit(self.log, max_bytes=10**7, keep=1, fail_closed=True)
         self.service = web.Service(self.memories, audit=self.audit, max_body=1024)
         self.other_log = folder / "other.log"
-        self.other_audit = Audit(self.other_log, max_bytes=10**7, keep=1, closed=True)
+        self.other_audit = Audit(self.other_log, max_bytes=10**7, keep=1, fail_closed=True)
         self.general = MemoryAccess("rest", self.compared, self.other_audit)
         self.parsed = 0
 

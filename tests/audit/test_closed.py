@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import socket
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from holdfast.ingest import Grant, MemoryAccess, Refused
 from support import routed, wire
 from support.audits import await_writes, full, lines, writes
 from support.fake_device import Stream
+from support.nats_bus import logged
 from support.running import endpoint
 
 if TYPE_CHECKING:
@@ -241,7 +243,7 @@ def test_a_batch_is_recorded_whole_or_not_at_all(
 ) -> None:
     """Also where it does not fit into the file, which is put aside first."""
     log = tmp_path / "audit.log"
-    audit = Audit(log, max_bytes=2000, keep=5, closed=True)
+    audit = Audit(log, max_bytes=2000, keep=5, fail_closed=True)
     for _ in range(4):
         audit.write_group(audit.queue([{"number": number} for number in range(8)]))
     assert len(list(tmp_path.iterdir())) == 4
@@ -294,3 +296,27 @@ def test_a_full_disk_at_the_stop_is_reported(
     appliance.stop()
     assert audit.counts()["failed"] == 2
     assert [line["event"] for line in lines(tmp_path / "audit.log")] == ["chain", "start"]
+
+
+def test_a_file_that_is_full_does_not_seem_to_work_before_it_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    log = tmp_path / "audit.log"
+    audit = Audit(log, max_bytes=10_000, keep=1, fail_closed=True)
+    make_room = full(monkeypatch)
+    with pytest.raises(Unrecorded):
+        audit.write_group(audit.queue([{"number": 1}]))
+    for _ in range(3):
+        audit.retry()
+        with pytest.raises(Unrecorded):
+            audit.require()
+    assert audit.failing
+    assert not logged(caplog, "audit_back")
+    make_room()
+    audit.require()
+    assert not audit.failing
+    audit.write_group(audit.queue([{"number": 2}]))
+    audit.close()
+    assert writes(log) == [{"lost": 0}, {"number": 2}]
+    assert verify([log]).lost == 0

@@ -8,6 +8,7 @@ import json
 import os
 import re
 import socket
+import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -133,6 +134,20 @@ def test_syslog_over_tcp_has_framed_messages_and_connects_again(
     log.write(number=3)
     with accepted(tcp) as second:
         assert record(framed(second))["number"] == 3
+
+
+def test_a_syslog_receiver_that_has_reset_the_connection_gets_the_next_line(
+    tcp: socket.socket, audit: Callable[..., Audit], caplog: pytest.LogCaptureFixture
+) -> None:
+    log = audit(Copies("syslog", Syslog("tcp", tcp.getsockname())))
+    log.write(number=1)
+    with accepted(tcp) as first:
+        assert record(framed(first))["number"] == 1
+        first.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    log.write(number=2)
+    with accepted(tcp) as second:
+        assert record(framed(second))["number"] == 2
+    assert "audit_copy_failed" not in caplog.messages
 
 
 def test_lines_wait_for_a_receiver_that_is_down(

@@ -102,8 +102,11 @@ impl HttpServer {
     pub fn start(&self) -> io::Result<()> {
         let mut unstarted = self.socket.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(socket) = &*unstarted else { return Ok(()) };
-        let socket = socket.try_clone()?;
         let runtime = Builder::new_current_thread().enable_io().enable_time().build()?;
+        let socket = {
+            let _context = runtime.enter();
+            tokio::net::TcpListener::from_std(socket.try_clone()?)?
+        };
         let name = self.heartbeat.thread().to_owned();
         let (front, heartbeat) = (Arc::clone(&self.front), Arc::clone(&self.heartbeat));
         let (stop, mut abort) = (self.stop.subscribe(), self.abort.subscribe());
@@ -111,7 +114,6 @@ impl HttpServer {
         let inbox = Arc::clone(&front.inbox);
         runtime.spawn(async move { inbox.deliver().await });
         let work = async move {
-            let Ok(socket) = tokio::net::TcpListener::from_std(socket) else { return };
             let context = Arc::clone(&front.context);
             let live = Arc::new(Reloadable::from(front));
             accept(Arc::clone(&context), live, Arc::new(socket), vec![worker], stop).await;

@@ -59,7 +59,7 @@ class AuditLog(Part):
             settings.file,
             max_bytes=settings.max_bytes,
             keep=settings.keep,
-            closed=settings.fail == "closed",
+            fail_closed=settings.fail == "closed",
             copies=_copies(settings),
         )
         self._record(log, "start")
@@ -77,7 +77,7 @@ class AuditLog(Part):
         """Reopens the file after a rename."""
         return self._reopen
 
-    def log_changes(self) -> None:
+    def tick(self) -> None:
         """Logs and records a step of the wall clock."""
         step = self._clock.look()
         if step is not None and self._recorder is not None:
@@ -140,7 +140,7 @@ class WriteRecorder:
         while True:
             self._heartbeat.beat()
             ended = self._stopped.is_set()
-            if self._audit.closed and self._audit.failing and not ended:
+            if self._audit.fail_closed and self._audit.failing and not ended:
                 # Writes wait in the queue of the engine, whose room is limited.
                 self._stopped.wait(RETRY_S)
                 self._audit.retry()

@@ -43,7 +43,7 @@ class Group:
 class Audit:
     """An audit log. Thread-safe. Raises `OSError` if the file can't be opened.
 
-    With `closed`, a write that can't be recorded must not be carried out: `write_group` and
+    With `fail_closed`, a write that can't be recorded must not be carried out: `write_group` and
     `require` raise `Unrecorded`. Without a file, `copies` are the only log.
     """
 
@@ -53,18 +53,18 @@ class Audit:
         *,
         max_bytes: int,
         keep: int,
-        closed: bool = False,
+        fail_closed: bool = False,
         copies: Sequence[Copies] = (),
     ) -> None:
-        self.closed = closed
+        self.fail_closed = fail_closed
         self._file = None if file is None else AuditFile(file, max_bytes=max_bytes, keep=keep)
         self._copies = copies
         self._lock = threading.Lock()
         self._end = End() if self._file is None else self._file.end
         self._lines = self._failed = self._missing = 0
-        self._kept: list[Record] = []
+        self._waiting: list[Record] = []
         self._group = Group()
-        self._failing = self._closed = False
+        self._failing = self._is_closed = False
         self._on_failing: Callable[[bool], object] = lambda _: None
         for each in copies:
             each.start()
@@ -77,24 +77,24 @@ class Audit:
         """Writes lines, all with the present time.
 
         After lines that could not be written, a line with their number comes first. But if the log
-        is `closed` and the lines are `done`, writes that were carried out, they wait in memory, and
-        are written as soon as that is possible.
+        is `fail_closed` and the lines are `done`, writes that were carried out, they wait in
+        memory, and are written as soon as that is possible.
         """
         records = self._records(lines)
         with self._lock:
             stored = self._store(records)
             if stored == len(records):
                 return
-            if self.closed and done:
-                self._kept += records[stored:]
+            if self.fail_closed and done:
+                self._waiting += records[stored:]
             else:
                 self._lose(records[stored:])
 
     def queue(self, lines: Iterable[Line]) -> Group:
         """Queues the lines of a write that is about to be carried out, for `write_group`.
 
-        Lines that are queued before that call are written together: a call of the system costs
-        several times as much as a line.
+        Lines that are queued before that call are written together: a system call
+        costs several times as much as encoding a line.
         """
         bodies = [encoded(fields) for fields in lines]
         with self._lock:
@@ -104,38 +104,39 @@ class Audit:
     def write_group(self, group: Group) -> None:
         """Writes the lines of a group, unless that was done already.
 
-        Raises `Unrecorded` if the log is `closed` and can't be written; no line is stored then.
+        Raises `Unrecorded` if the log is `fail_closed` and can't be written. Then no line is
+        stored.
         """
         with self._lock:
             if group is self._group:
                 self._group = Group()
                 now = log_lines.timestamp(time.time())
                 records = [(now, body) for body in group.bodies]
-                stored = self._store(records, together=self.closed)
+                stored = self._store(records, together=self.fail_closed)
                 if stored < len(records):
-                    group.is_refused = self.closed
-                    if not self.closed:
+                    group.is_refused = self.fail_closed
+                    if not self.fail_closed:
                         self._lose(records[stored:])
         if group.is_refused:
             raise Unrecorded
 
     def require(self) -> None:
-        """Raises `Unrecorded` if the log is `closed` and could not be written last time."""
-        if self.closed and self._failing:
+        """Raises `Unrecorded` if the log is `fail_closed` and could not be written last time."""
+        if self.fail_closed and self._failing:
             self.retry()
             if self._failing:
                 raise Unrecorded
 
     def retry(self) -> None:
-        """Writes lines that wait, and the number of lines that are missing."""
+        """Writes lines that wait, and the number of lines that are missing, 0 if none is."""
         with self._lock:
-            if self._kept or self._missing or self._failing:
+            if self._waiting or self._missing or self._failing:
                 self._store([])
 
     def rotate(self) -> None:
         """Puts the file aside as if it were full, and begins a new one. An empty file stays."""
         with self._lock:
-            if self._file is None or self._closed:
+            if self._file is None or self._is_closed:
                 return
             try:
                 self._file.check()
@@ -147,7 +148,7 @@ class Audit:
     def reopen(self) -> None:
         """Opens a new file if something else has renamed or deleted the present one."""
         with self._lock:
-            if self._file is None or self._closed:
+            if self._file is None or self._is_closed:
                 return
             try:
                 self._file.check()
@@ -171,17 +172,18 @@ class Audit:
             return {
                 "lines": self._lines,
                 "failed": self._failed,
-                "waiting": len(self._kept),
+                "waiting": len(self._waiting),
                 "failing": self._failing,
                 "copies": {each.name: each.counts() for each in self._copies},
             }
 
     def close(self) -> None:
         """Writes what waits, and closes file and copies. Later lines are lost."""
-        self.retry()
         with self._lock:
-            self._lose(self._kept)
-            self._kept, self._closed = [], True
+            if self._waiting or self._missing:
+                self._store([])
+            self._lose(self._waiting)
+            self._waiting, self._is_closed = [], True
             if self._file is not None:
                 self._file.close()
         for each in self._copies:
@@ -195,7 +197,7 @@ class Audit:
     def _store(self, records: list[Record], *, together: bool = False) -> int:
         """Stores records after all that wait. Returns how many of them were stored."""
         reports: list[Line] = []
-        if self._closed:
+        if self._is_closed:
             return 0
         if self._file is not None:
             try:
@@ -205,15 +207,17 @@ class Audit:
                 return 0
             if self._file.broken is not None:
                 reports.append({"event": BREAK, "reason": self._file.broken})
-        if self._missing:
+        # Without a line to write, nothing shows whether the file can be written again.
+        is_probe = self._failing and not records and not self._waiting
+        if self._missing or is_probe:
             reports.append({"lost": self._missing})
-        before = [*(self._records(reports) if reports else ()), *self._kept]
+        before = [*(self._records(reports) if reports else ()), *self._waiting]
         written = self._append([*before, *records] if before else records, together=together)
         if written >= len(reports):
             self._missing = 0
             if self._file is not None:
                 self._file.broken = None
-            self._kept = self._kept[written - len(reports) :]
+            self._waiting = self._waiting[written - len(reports) :]
         self._lines += max(0, written - len(reports))
         return max(0, written - len(before))
 
@@ -247,7 +251,7 @@ class Audit:
         self._send([unchained(record) for record in records])
 
     def _fail(self) -> None:
-        """Reports the present exception."""
+        """Logs the current exception."""
         assert self._file is not None
         log_lines.problem("audit_failed", file=str(self._file.file))
         self._set_failing(True)

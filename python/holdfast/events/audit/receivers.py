@@ -108,6 +108,8 @@ def _has_ended(connection: socket.socket) -> bool:
     except BlockingIOError:
         connection.settimeout(TIMEOUT_S)
         return False
+    except OSError:
+        return True
     return True
 
 
