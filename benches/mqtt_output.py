@@ -157,7 +157,7 @@ class Site:
     def refresh(self) -> None:
         pass
 
-    def write(self, *_: object) -> None:
+    def write(self, *_: object, **__: object) -> None:
         pass
 
 

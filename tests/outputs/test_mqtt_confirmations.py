@@ -96,7 +96,7 @@ class Site:
     def refresh(self) -> None:
         self.refreshed += 1
 
-    def write(self, *_: object) -> None:
+    def write(self, *_: object, **__: object) -> None:
         raise AssertionError("no test of this file writes")
 
 

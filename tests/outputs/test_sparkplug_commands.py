@@ -40,6 +40,15 @@ MORE: dict[str, Any] = {
     },
     "valves": {"area": "coils", "address": 10, "type": "bool[3]", "writable": True},
     "code": {"area": "holding_registers", "address": 30, "type": "bytes:4", "writable": True},
+    "level": {"area": "holding_registers", "address": 32, "type": "int16", "writable": True},
+    "rate": {"area": "holding_registers", "address": 34, "type": "float32", "writable": True},
+    "gear": {
+        "area": "holding_registers",
+        "address": 36,
+        "states": {0: "1", 1: "2", 2: "3"},
+        "writable": True,
+    },
+    "motor": {"area": "coils", "address": 20, "states": {0: "true", 1: "false"}, "writable": True},
 }
 
 
@@ -69,13 +78,18 @@ def outcomes(plant: Plant) -> int:
     [
         ("temperature", {"datatype": 10, "double_value": 21.5}, [215]),
         ("temperature", {"datatype": 9, "float_value": 21.3}, [213]),
-        ("temperature", {"datatype": 10, "int_value": 21}, [210]),
+        ("temperature", {"datatype": 3, "int_value": 21}, [210]),
         ("state", {"datatype": 6, "int_value": 1}, [1]),
         ("state", {"long_value": 1}, [1]),
         ("speeds", {"bytes_value": struct.pack("<2h", -5, 7)}, [0xFFFB, 7]),
         ("names", {"bytes_value": b"ab\0cd\0"}, [0x6162, 0x6364]),
         ("valves", {"bytes_value": b"\3\0\0\0\xa0"}, [1, 0, 1]),
         ("code", {"bytes_value": b"abcd"}, [0x6162, 0x6364]),
+        ("level", {"datatype": 2, "int_value": 0xFFFB}, [0xFFFB]),
+        ("level", {"datatype": 1, "int_value": 251}, [0xFFFB]),
+        ("rate", {"datatype": 2, "int_value": 0xFFFB}, [0xC0A0, 0]),
+        ("gear", {"int_value": 1}, [1]),
+        ("motor", {"boolean_value": True}, [1]),
     ],
 )
 @pytest.mark.parametrize("by", ["alias", "name"])
@@ -118,6 +132,10 @@ def test_a_value_is_written(
         {"name": "names", "bytes_value": b"\xff\0\xff\0"},
         {"name": "marked/0", "datatype": 2, "int_value": 5},
         {"name": "code", "bytes_value": b"abc"},
+        {"name": "rate", "int_value": 1},
+        {"name": "temperature", "datatype": 10, "int_value": 21},
+        {"name": "gear", "string_value": "2"},
+        {"name": "temperature", "is_historical": True, "double_value": 21.5},
     ],
     ids=str,
 )
@@ -132,6 +150,25 @@ def test_a_value_that_can_not_be_written_is_refused(plant: Plant, metric: dict[s
     assert plant.status()["commands_refused"] == 1
     assert device.memory.read("holding_registers", 0, 40) == [100] * 40
     assert not any(device.memory.read("coils", 0, 20))
+
+
+def test_a_command_of_the_past_is_refused_as_such(
+    plant: Plant, caplog: pytest.LogCaptureFixture
+) -> None:
+    device = plant.device()
+    watching = watch(plant)
+    plant.run(**SETTINGS, writes=True)
+    watching.until("DBIRTH", "pump")
+    watching.command("pump", name="temperature", is_historical=True, double_value=21.5)
+    watching.command("pump", name="temperature", is_historical=False, double_value=6.0)
+    wire.until(lambda: outcomes(plant) == 2, "both have outcomes")
+    assert device.memory.read("holding_registers", 0, 1) == [60]
+    reasons = [
+        entry.fields["reason"]  # type: ignore[attr-defined]
+        for entry in caplog.records
+        if "output_command_refused" in entry.getMessage()
+    ]
+    assert reasons == ["historical"]
 
 
 def test_an_alias_of_an_earlier_birth_writes_nothing(plant: Plant) -> None:

@@ -133,6 +133,98 @@ def test_any_metric_has_a_value_or_an_error(fields: dict[str, Any], tag: Tag) ->
         value_of(Metric(**fields), datatype_of(tag)[0])
 
 
+@pytest.mark.parametrize(
+    ("type", "fields", "value"),
+    [
+        # Tahu's client for Python sends the bits of the type, its others those of the field.
+        ("int16", {"datatype": 2, "int_value": 0xFFFB}, -5),
+        ("int16", {"datatype": 2, "int_value": 0xFFFFFFFB}, -5),
+        ("int16", {"datatype": 2, "long_value": 0xFFFB}, -5),
+        ("int16", {"datatype": 2, "long_value": 0xFFFFFFFFFFFFFFFB}, -5),
+        ("int16", {"datatype": 2, "int_value": 0x8000}, -0x8000),
+        ("int16", {"datatype": 2, "int_value": 0x7FFF}, 0x7FFF),
+        ("int16", {"datatype": 2, "int_value": 0x8000_0000}, None),
+        ("int16", {"datatype": 2, "int_value": 0xFFFF7FFF}, None),
+        ("int16", {"datatype": 2, "int_value": 0x10000}, None),
+        ("int16", {"datatype": 2, "long_value": 0xFFFFFFFB}, None),
+        ("int16", {"datatype": 1, "int_value": 251}, -5),
+        ("int16", {"datatype": 1, "int_value": 0xFFFFFFFB}, -5),
+        ("int16", {"datatype": 1, "int_value": 127}, 127),
+        ("int16", {"datatype": 1, "int_value": 256}, None),
+        ("int16", {"datatype": 1, "int_value": 0xFFFB}, None),
+        ("int32", {"datatype": 2, "int_value": 65531}, -5),
+        ("int32", {"datatype": 3, "int_value": 0xFFFFFFFB}, -5),
+        ("int32", {"datatype": 3, "long_value": 0xFFFFFFFB}, -5),
+        ("int32", {"datatype": 3, "long_value": 0xFFFFFFFFFFFFFFFB}, -5),
+        ("int32", {"datatype": 3, "int_value": 65531}, 65531),
+        ("int32", {"datatype": 3, "long_value": 2**32}, None),
+        ("int64", {"datatype": 4, "long_value": 0xFFFFFFFFFFFFFFFB}, -5),
+        ("int64", {"datatype": 4, "long_value": 0xFFFFFFFB}, 0xFFFFFFFB),
+        ("int64", {"datatype": 4, "int_value": 0x7FFFFFFF}, 0x7FFFFFFF),
+        # It may be negative, or not.
+        ("int64", {"datatype": 4, "int_value": 0xFFFFFFFB}, None),
+        ("uint16", {"datatype": 5, "int_value": 251}, 251),
+        ("uint16", {"datatype": 5, "int_value": 256}, None),
+        ("int32", {"datatype": 6, "int_value": 65531}, 65531),
+        ("int32", {"datatype": 6, "int_value": 0xFFFFFFFB}, None),
+        ("uint32", {"datatype": 7, "int_value": 0xFFFFFFFB}, 0xFFFFFFFB),
+        ("uint32", {"datatype": 7, "long_value": 2**32}, None),
+        ("uint64", {"datatype": 8, "long_value": 2**64 - 1}, 2**64 - 1),
+        # Without a type, that of the birth counts.
+        ("int16", {"int_value": 0xFFFB}, -5),
+        ("int16", {"int_value": 0xFFFFFFFB}, -5),
+        ("int64", {"long_value": 0xFFFFFFFFFFFFFFFB}, -5),
+        ("uint16", {"int_value": 0xFFFB}, 0xFFFB),
+        ("uint16", {"int_value": 0xFFFFFFFB}, None),
+        ("uint32", {"int_value": 0xFFFFFFFB}, 0xFFFFFFFB),
+        ("float32", {"datatype": 2, "int_value": 65531}, -5),
+        ("float64", {"datatype": 1, "int_value": 251}, -5),
+        ("float64", {"datatype": 7, "long_value": 0xFFFFFFFB}, 0xFFFFFFFB),
+        # No integer is a Float, and no other type is one of integers.
+        ("float32", {"int_value": 65531}, None),
+        ("float32", {"datatype": 9, "int_value": 1}, None),
+        ("float64", {"long_value": 1}, None),
+        ("float64", {"datatype": 10, "long_value": 1}, None),
+        ("uint16", {"datatype": 10, "int_value": 1}, None),
+        ("uint16", {"datatype": 11, "int_value": 1}, None),
+        ("uint64", {"datatype": 13, "long_value": 1}, None),
+    ],
+    ids=str,
+)
+def test_an_integer_has_the_sign_of_its_type(
+    type: str, fields: dict[str, int], value: int | None
+) -> None:
+    datatype, _ = datatype_of(Tag("x", "holding_registers", 0, type))
+    metric = Metric(**fields)
+    if value is None:
+        with pytest.raises(ValueError, match=r"is no U?Int|a type of integers"):
+            value_of(metric, datatype)
+    else:
+        assert value_of(metric, datatype) == value
+
+
+@pytest.mark.parametrize(
+    ("type", "number", "data"),
+    [
+        ("int16[4]", 24, "FBFFFFFF07000000"),
+        ("int16[2]", 27, "FBFF0700"),
+        ("bytes:4", 23, "61626364"),
+    ],
+)
+def test_an_array_of_another_type_is_an_error(type: str, number: int, data: str) -> None:
+    datatype, _ = datatype_of(Tag("x", "holding_registers", 0, type))
+    metric = Metric(datatype=number, bytes_value=bytes.fromhex(data))
+    with pytest.raises(ValueError, match=f"found the type {number}, allowed: {datatype.name}"):
+        value_of(metric, datatype)
+
+
+def test_an_array_has_no_more_numbers_than_a_tag() -> None:
+    datatype, _ = datatype_of(Tag("x", "holding_registers", 0, "float32[2]"))
+    assert len(value_of(Metric(bytes_value=bytes(4 * 2000)), datatype)) == 2000
+    with pytest.raises(ValueError, match="another length"):
+        value_of(Metric(bytes_value=bytes(4 * 2001)), datatype)
+
+
 def test_bits_begin_with_the_most_significant_one() -> None:
     values = [False, False, True, True, False, True, False, False, True, True, False, True]
     datatype, _ = datatype_of(Tag("x", "coils", 0, "bool[12]"))
@@ -394,7 +486,7 @@ class Pump:
     def refresh(self) -> None:
         raise AssertionError("not called")
 
-    def write(self, *_: object) -> None:
+    def write(self, *_: object, **__: object) -> None:
         raise AssertionError("not called")
 
 

@@ -71,8 +71,10 @@ class Site(Protocol):
         text: str,
         peer: str,
         done: Callable[[NotWritten | None], None],
+        *,
+        states: bool = True,
     ) -> None:
-        """Writes a value, as text or as the name of a state. Does not wait for the device.
+        """Writes a value, as text or, with `states`, as a name. Does not wait for the device.
 
         `done` is called with the outcome, by another thread. Raises `NotWritten` if nothing was
         sent. `peer` is where the command came from, for the audit log.

@@ -15,13 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast.runtime.text import quote
+from holdfast.runtime.text import either, quote
 from holdfast.tags.scale import RegisterScale, linear_of
 from holdfast.tags.strict_text import BOOLEANS, from_text
 from holdfast.values import DoesNotFit
 from holdfast.values.digits import shortest
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from holdfast.tags.tag import Tag
 
 SWITCHED = {"on": True, "off": False}
@@ -77,17 +79,20 @@ def text_of(tag: Tag, value: Any, *, states: bool = True) -> str:
     return str(value)
 
 
-def value_from(tag: Tag, text: str) -> Any:
-    """Parses a value of a tag, or the name of one; `Tag.raw` then checks whether it fits.
+def value_from(tag: Tag, text: str, *, states: bool = True) -> Any:
+    """Parses a value of a tag, or with `states` the name of one; `Tag.raw` then checks if it fits.
+
+    A text that is a name is that name, also if it looks like a number.
 
     Raises `ValueError`.
     """
     word = text.strip()
-    if word in tag.states.values():
+    names = tag.states.values() if states else ()
+    if word in names:
         return word
     if tag.of_type.count is not None or not tag.is_number:
         if tag.of_type.count is None and tag.of_type.base in ("bool", "bit"):
-            return _switched(tag, word)
+            return _switched(word, names)
         return from_text(text, tag.of_type, tag.type)
     if _INTEGER.fullmatch(word):
         return int(word)
@@ -106,16 +111,18 @@ def value_from(tag: Tag, text: str) -> Any:
     if _COMMA.fullmatch(word):
         point = word.replace(",", ".")
         raise DoesNotFit(f"{text!r} has a decimal comma, allowed: a decimal point, as in {point}")
-    if tag.states:
+    if names:
         return word
     raise DoesNotFit(f"{quote(text)} is not a number")
 
 
-def _switched(tag: Tag, word: str) -> bool:
-    found = (BOOLEANS | SWITCHED).get(word.lower())
+def _switched(word: str, names: Collection[str]) -> bool:
+    lowered = [name.lower() for name in names]
+    # A name in other letters: with `states: {0: on, 1: off}`, the word OFF would switch it on.
+    found = None if word.lower() in lowered else (BOOLEANS | SWITCHED).get(word.lower())
     if found is None:
-        names = "".join(f"{name}, " for name in tag.states.values())
-        raise DoesNotFit(f"{quote(word)} is not {names}true, false, on, off, 1 or 0")
+        allowed = either([*names, "true", "false", "on", "off", 1, 0])
+        raise DoesNotFit(f"{quote(word)} is not {allowed}")
     return found
 
 

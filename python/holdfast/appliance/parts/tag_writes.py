@@ -55,16 +55,19 @@ class TagWrites:
         by: str,
         peer: str,
         done: Callable[[NotWritten | None], None],
+        *,
+        states: bool = True,
     ) -> None:
-        """Writes a value, as text. Raises `NotWritten` if nothing was sent.
+        """Writes a value, as text or, with `states`, as a name.
 
-        `by` and `peer` are who has requested it, for the audit log.
+        Raises `NotWritten` if nothing was sent. `by` and `peer` are who has requested it, for the
+        audit log.
         """
         record: dict[str, Any] = {"listener": by, "peer": peer, "function": "write"}
         record |= {"device": device, "tag": name}
         try:
             tag = self._find(device, name)
-            request, values = _request(tag, text)
+            request, values = _request(tag, text, states=states)
             assert tag is not None, "there is no request for no tag"
             record |= {"area": tag.area, "address": tag.address, "values": values}
             self._send(device, request, _Write(record, done))
@@ -114,14 +117,14 @@ class TagWrites:
         write.done(NotWritten(outcome, fault_text(fault)) if fault else None)
 
 
-def _request(tag: Tag | None, text: str) -> tuple[Request, list[int]]:
+def _request(tag: Tag | None, text: str, *, states: bool) -> tuple[Request, list[int]]:
     """The request that writes a text, and what it writes. Raises `NotWritten`."""
     if tag is None:
         raise NotWritten("unknown_tag", "no such tag")
     if not tag.writable:
         raise NotWritten("not_writable", "the tag is not writable")
     try:
-        raw = tag.raw(value_from(tag, text))
+        raw = tag.raw(value_from(tag, text, states=states))
         encoded = codec_for(tag.area, tag.type, tag.order, tag.encoding).encode(raw)
         [request] = write_typed(
             tag.area, tag.address, raw, tag.type, tag.order, tag.encoding, split=False

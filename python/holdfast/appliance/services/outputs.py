@@ -91,10 +91,12 @@ class _Site:
         text: str,
         peer: str,
         done: Callable[[NotWritten | None], None],
+        *,
+        states: bool = True,
     ) -> None:
         if not self._has(device):
             raise NotWritten("unknown_tag", "no such tag")
-        self._writes.write(device, tag, text, f"output/{self._output}", peer, done)
+        self._writes.write(device, tag, text, f"output/{self._output}", peer, done, states=states)
 
 
 def receiver(name: str, settings: Output, site: Site) -> Receiver:

@@ -80,11 +80,15 @@ class Commands(CommandOutcomes):
                 raise NotWritten("unknown_tag", "no such metric")
             if entry.item is not None:
                 raise NotWritten("not_writable", "one item of an array")
+            if metric.is_historical:
+                raise NotWritten("historical", "it is a value of the past")
             try:
                 text = _text(value_of(metric, entry.datatype))
             except ValueError as error:
                 raise NotWritten("invalid_value", str(error)) from None
-            self._site.write(device, entry.tag.name, text, f"{self._broker} {topic}", done)
+            # A metric is a number where a tag has names for its values.
+            peer = f"{self._broker} {topic}"
+            self._site.write(device, entry.tag.name, text, peer, done, states=False)
         except NotWritten as refused:
             done(refused)
 

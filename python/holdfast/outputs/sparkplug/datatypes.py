@@ -6,6 +6,7 @@ import math
 import struct
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from holdfast.protocol import READ_LIMITS
 from holdfast.values.digits import shortest
 
 if TYPE_CHECKING:
@@ -14,7 +15,10 @@ if TYPE_CHECKING:
     from holdfast.tags import Tag
 
 INT32, INT64, FLOAT, DOUBLE, BOOLEAN, STRING = 3, 4, 9, 10, 11, 12
-FIRST_ARRAY, BOOLEAN_ARRAY, STRING_ARRAY = 22, 32, 33
+FLOAT_ARRAY, DOUBLE_ARRAY, BOOLEAN_ARRAY, STRING_ARRAY = 30, 31, 32, 33
+
+MAX_ITEMS = max(READ_LIMITS.values())
+"""The most numbers in an array: those of the longest tag."""
 
 
 class _Base(NamedTuple):
@@ -37,8 +41,8 @@ _BASES = {
     6: _Base("UInt16", "int_value", ("uint16", "bcd16"), 27, "H"),
     7: _Base("UInt32", "long_value", ("uint32", "bcd32"), 28, "I"),
     8: _Base("UInt64", "long_value", ("uint64",), 29, "Q"),
-    FLOAT: _Base("Float", "float_value", ("float16", "float32"), 30, "f"),
-    DOUBLE: _Base("Double", "double_value", ("float64",), 31, "d"),
+    FLOAT: _Base("Float", "float_value", ("float16", "float32"), FLOAT_ARRAY, "f"),
+    DOUBLE: _Base("Double", "double_value", ("float64",), DOUBLE_ARRAY, "d"),
     BOOLEAN: _Base("Boolean", "boolean_value", ("bool", "bit"), BOOLEAN_ARRAY),
     STRING: _Base("String", "string_value", ("string",), STRING_ARRAY),
     17: _Base("Bytes", "bytes_value", ("bytes",)),
@@ -48,6 +52,12 @@ _BASES = {
 _OF_TAG = {tag: number for number, base in _BASES.items() for tag in base.tags}
 _FORMATS = {base.array: base.item for base in _BASES.values() if base.item}
 _FIELDS = tuple(dict.fromkeys(base.field for base in _BASES.values()))
+_INTEGER_FIELDS = {"int_value": 32, "long_value": 64}
+"""The fields of integers, with their bits."""
+
+_SIGNED = {1: 8, 2: 16, INT32: 32, INT64: 64}
+_UNSIGNED = {5: 8, 6: 16, 7: 32, 8: 64}
+"""The types of integers by number, with their bits. A tag has none of 8 bits, a command may."""
 
 
 class Datatype(NamedTuple):
@@ -93,7 +103,7 @@ def _packer(array: int) -> Callable[[Any], bytes]:
     if array == STRING_ARRAY:
         return _texts
     item = _FORMATS[array]
-    if array in (30, 31):
+    if array in (FLOAT_ARRAY, DOUBLE_ARRAY):
         return lambda values: struct.pack(f"<{len(values)}{item}", *map(_double, values))
     return lambda values: struct.pack(f"<{len(values)}{item}", *values)
 
@@ -121,7 +131,8 @@ def _texts(values: list[str]) -> bytes:
 def value_of(metric: Any, datatype: Datatype) -> Any:
     """The value of a metric in a command. Raises `ValueError`.
 
-    Hosts differ in the field that they use for an integer, so each field is accepted.
+    Hosts differ in the type that they use for a number, and in the field for an integer: each is
+    accepted. A command without a type has that of the birth.
     """
     field = next((name for name in _FIELDS if metric.HasField(name)), None)
     if field is None or metric.is_null:
@@ -129,36 +140,60 @@ def value_of(metric: Any, datatype: Datatype) -> Any:
     found = getattr(metric, field)
     if field == "string_value" and not isinstance(found, str):
         raise ValueError("its text is not UTF-8")
-    if datatype.field in ("int_value", "long_value") and field in ("int_value", "long_value"):
-        return _signed(found, field, metric.datatype or datatype.number)
-    if datatype.number in (FLOAT, DOUBLE) and field == "float_value":
+    number = metric.datatype or datatype.number
+    is_float = datatype.number in (FLOAT, DOUBLE)
+    if field in _INTEGER_FIELDS and (is_float or datatype.field in _INTEGER_FIELDS):
+        return _integer(found, field, number)
+    if is_float and field == "float_value":
         return float(shortest(found, "float32"))
-    if datatype.number in (FLOAT, DOUBLE) and field == "double_value":
+    if is_float and field == "double_value":
         return found
-    if datatype.number in (FLOAT, DOUBLE) and field in ("int_value", "long_value"):
-        return _signed(found, field, metric.datatype)
     if field != datatype.field:
         raise ValueError(f"found a value in {field}, allowed: {datatype.name}")
-    return _unpacked(found, datatype) if datatype.number >= FIRST_ARRAY else found
+    if field == "bytes_value":
+        if number != datatype.number:
+            raise ValueError(f"found the type {number}, allowed: {datatype.name}")
+        return _unpacked(found, number)
+    return found
 
 
-def _signed(value: int, field: str, number: int) -> int:
-    """An integer, whose sign is in the highest bit of its field."""
-    if number not in (1, 2, 3, 4):
+def _integer(value: int, field: str, number: int) -> int:
+    """An integer of a type. Raises `ValueError`.
+
+    Hosts send a negative one in the bits of its type, as Tahu's client for Python does, or in
+    those of the field.
+    """
+    width = _INTEGER_FIELDS[field]
+    if number in _UNSIGNED:
+        if value >> _UNSIGNED[number]:
+            raise ValueError(f"{value} in {field} is no UInt{_UNSIGNED[number]}")
         return value
-    bits = 32 if field == "int_value" else 64
-    return value - (1 << bits) if value >> bits - 1 else value
+    bits = _SIGNED.get(number)
+    if bits is None:
+        raise ValueError(f"found the type {number} of {field}, allowed: a type of integers")
+    # In the field that is too narrow for its type, a value with the highest bit may be either.
+    if value < 1 << min(bits, width) - 1:
+        return value
+    for size in {bits, width}:
+        if bits <= size and -(1 << bits - 1) <= value - (1 << size) < 0:
+            return value - (1 << size)
+    raise ValueError(f"{value} in {field} is no Int{bits}")
 
 
-def _unpacked(data: bytes, datatype: Datatype) -> list[Any]:
-    if datatype.number == STRING_ARRAY:
+def _unpacked(data: bytes, number: int) -> Any:
+    if number == STRING_ARRAY:
         return [text.decode() for text in data.split(b"\0")[:-1]]
-    if datatype.number == BOOLEAN_ARRAY:
+    if number == BOOLEAN_ARRAY:
         if len(data) < 4 or len(data) != 4 + -(-(size := struct.unpack("<I", data[:4])[0]) // 8):
             raise ValueError("an array of another length")
         return [bool(data[4 + place // 8] >> 7 - place % 8 & 1) for place in range(size)]
-    item = _FORMATS[datatype.number]
+    item = _FORMATS.get(number)
+    if item is None:
+        return data
     count, rest = divmod(len(data), struct.calcsize(f"<{item}"))
-    if rest:
+    if rest or count > MAX_ITEMS:
         raise ValueError("an array of another length")
-    return list(struct.unpack(f"<{count}{item}", data))
+    values = struct.unpack(f"<{count}{item}", data)
+    if number == FLOAT_ARRAY:
+        return [float(shortest(value, "float32")) for value in values]
+    return list(values)
