@@ -14,12 +14,19 @@ Messages are for people. Programs should use classes and attributes.
 
 from __future__ import annotations
 
-from holdfast.protocol import ACKNOWLEDGE, TARGET_SILENT
+from holdfast.protocol import (
+    BUSY,
+    ILLEGAL_ADDRESS,
+    ILLEGAL_FUNCTION,
+    ILLEGAL_VALUE,
+    PATH_UNAVAILABLE,
+)
 
-UNCERTAIN = (ACKNOWLEDGE, TARGET_SILENT)
-"""Exceptions after which a device may execute the request, or have executed it.
+NOT_EXECUTED = (ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, BUSY, PATH_UNAVAILABLE)
+"""Exceptions of a device that has certainly not executed the request.
 
-With 0B, a gateway answers a request that it has sent and whose reply did not come in time.
+After another one it may have, or may still do it. 04 is an error while the device carried it out;
+with 0B, a gateway answers a request that it has sent and whose reply did not come in time.
 """
 
 
@@ -43,8 +50,8 @@ class ModbusException(ModbusError):
 
     @property
     def maybe_executed(self) -> bool:
-        """Whether the device may have executed the request: after 05 and 0B."""
-        return self.code in UNCERTAIN
+        """Whether the device may have executed the request: not after 01, 02, 03, 06 and 0A."""
+        return self.code not in NOT_EXECUTED
 
 
 class ConnectionLost(ModbusError, ConnectionError):

@@ -73,6 +73,21 @@ def test_an_array_is_a_value_for_each_element(server: holdfast.Server) -> None:
     }
 
 
+def test_a_request_reads_whole_elements_of_a_long_array(tmp_path: Path) -> None:
+    tags = tmp_path / "long.yaml"
+    tags.write_text(
+        "tags:\n"
+        "  curve: {area: input_registers, address: 7, type: 'float64[60]'}\n"
+        "  words: {area: input_registers, address: 7, type: 'uint32[120]'}\n"
+        "  text: {area: input_registers, address: 300, type: 'string:260'}\n"
+    )
+    with FakeDevice(registers) as device:
+        found = answer("read", device.url, "--tags", str(tags))["values"]
+        asked = [struct.unpack(">BHH", pdu) for pdu in device.asked]
+    assert (found["curve"], found["words"], found["text"]) == ([0] * 60, [0] * 120, "")
+    assert asked == [(4, 7, 124), (4, 131, 116), (4, 300, 125), (4, 425, 5)]
+
+
 def test_modicon_numbers_have_types_as_well(
     server: holdfast.Server, memory: holdfast.Memory
 ) -> None:

@@ -96,6 +96,15 @@ def test_a_dry_run_prints_the_functions_that_the_device_gets() -> None:
             ("hr", "0", *["7"] * 124, "--split"),
             ["100000007bf6" + "0007" * 123, "10007b0001020007"],
         ),
+        (
+            ("hr", "0", *["1.5"] * 31, "--type", "float64", "--split"),
+            ["1000000078f0" + "3ff8000000000000" * 30, "100078000408" + "3ff8000000000000"],
+        ),
+        (
+            ("hr", "0", "1.", "+.5", " 2E-1 ", "-Infinity", "--type", "float32"),
+            ["1000000008103f8000003f0000003e4ccccdff800000"],
+        ),
+        (("hr", "0", "nan", "--type", "float16"), ["0600007e00"]),
     ],
 )
 def test_a_dry_run_prints_the_requests_and_sends_nothing(
@@ -132,6 +141,14 @@ def test_many_values_are_written_by_several_requests_if_that_is_wanted(
         ),
         (("co", "0", "2"), "'2' is not true, false, on, off, 1 or 0."),
         (("hr", "0", "x", "--type", "float32"), "'x' is not a number."),
+        (("hr", "0", "1_0.5", "--type", "float32"), "'1_0.5' is not a number."),
+        (("hr", "0", "21_5", "--type", "float64"), "'21_5' is not a number."),
+        (("hr", "0", "２1.5", "--type", "float32"), "'２1.5' is not a number."),
+        (("hr", "0", "٣", "--type", "float16"), "'٣' is not a number."),
+        (("hr", "0", "1e1_0", "--type", "float32"), "'1e1_0' is not a number."),
+        (("hr", "0", ".", "--type", "float32"), "'.' is not a number."),
+        (("hr", "0", "ınf", "--type", "float32"), "'ınf' is not a number."),
+        (("hr", "0", "0x10", "--type", "float32"), "'0x10' is not a number."),
         (("hr", "0", "1e99", "--type", "float32"), "of float32."),
         (("hr", "0", "1e999", "--type", "float64"), "'1e999' is outside the range of float64."),
         (("hr", "0", "-1e999", "--type", "float16"), "'-1e999' is outside the range of float16."),

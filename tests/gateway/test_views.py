@@ -376,3 +376,30 @@ def test_typed_values_that_can_not_be_written_are_refused_before_a_write(
     answer = local(gateway, "/values", {"datatype": datatype, "values": given})
     assert answer.status == 400
     assert says in answer.json["error"], answer.json["error"]
+
+
+LAMPS = """\
+tags:
+  lamps: {area: coils, address: 1, type: "bool[3]", writable: true}
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "bits"),
+    [
+        ("[true,false,1]", [True, False, True]),
+        ('["false","false","false"]', None),
+        ("[false,false,false,true,true]", None),
+        ("[true]", None),
+        ("[]", None),
+        ("[0.4,0,0]", None),
+        ("[2,0,0]", None),
+        ("[null,0,0]", None),
+    ],
+)
+def test_bits_of_an_array_are_not_converted(
+    gateway: Running, text: str, bits: list[bool] | None
+) -> None:
+    answer = local(gateway, "/tags/value", {"tags": LAMPS, "name": "lamps", "value": text})
+    assert answer.status == (200 if bits else 400), answer.json
+    assert answer.json.get("values") == bits

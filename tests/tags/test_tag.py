@@ -129,6 +129,53 @@ def test_limits_hold_for_the_rounded_value() -> None:
         it.raw(20.3)
 
 
+@pytest.mark.parametrize(
+    ("value", "settings", "message"),
+    [
+        (1001.3, {"max": 1001.3}, r"^1001\.3 is 1001\.5 in float16, outside to 1001\.3$"),
+        (1000.7, {"min": 1000.7}, r"^1000\.7 is 1000\.5 in float16, outside 1000\.7 to$"),
+        (2049, {"min": 2049, "max": 3000}, "2049 is 2048.0 in float16, outside 2049 to 3000"),
+        (100.13, {"max": 100.13, "scale": 0.1}, "100.13 is 100.15 in float16, outside to 100.13"),
+        (5.3, {"max": 5.3, "offset": -1000}, "5.3 is 5.5 in float16, outside to 5.3"),
+        ([1, 1001.3], {"max": 1001.3, "type": "float16[2]"}, "1001.3 is 1001.5 in float16, "),
+    ],
+)
+def test_limits_hold_for_what_a_float16_makes_of_a_value(
+    value: Any, settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(DoesNotFit, match=message):
+        tag(**({"type": "float16"} | settings)).raw(value)
+
+
+@given(
+    st.sampled_from(["float16", "float32", "float64"]),
+    st.integers(-999, 999),
+    st.integers(0, 4),
+)
+def test_a_limit_in_decimal_may_be_written_itself(kind: str, digits: int, places: int) -> None:
+    limit = float(f"{digits}e-{places}")
+    assert tag(type=kind, min=limit, max=limit).raw(limit) == limit
+
+
+@pytest.mark.parametrize("limit", [math.pi, 16777219, 0.123456789, 1e-30, 1 / 3])
+@pytest.mark.parametrize(("scale", "offset"), [(1, 0), (1.8, 32), (0.6, 0), (1, -273.15)])
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+def test_a_limit_that_floats_do_not_have_may_be_written_itself(
+    limit: float, scale: float, offset: float, kind: str
+) -> None:
+    it = tag(type=kind, min=limit, max=limit, scale=scale, offset=offset)
+    held = decode(encode(it.raw(limit), kind), kind)
+    assert it.value(held) == pytest.approx(limit, rel=1e-7, abs=2**-24 * abs(offset))
+
+
+def test_a_float16_that_does_not_fit_is_left_to_its_codec() -> None:
+    it = tag(type="float16", min=0)
+    assert it.raw(65504) == 65504
+    assert it.raw(1e6) == 1e6
+    with pytest.raises(DoesNotFit, match=r"outside -65504\.0 to 65504\.0 of float16"):
+        encode(it.raw(1e6), "float16")
+
+
 def test_the_limits_themselves_may_be_written() -> None:
     it = tag(min=5, max=30)
     assert (it.raw(5), it.raw(30)) == (5, 30)

@@ -146,18 +146,22 @@ class EventLog:
     """One byte for each event, the latest first (V1.1b3, 6.10)."""
 
 
-def read_range(area: Area, address: int, count: int) -> Plan[list[Any]]:
-    """Reads `count` bits or registers, in several requests if necessary."""
+def read_range(area: Area, address: int, count: int, element: int = 1) -> Plan[list[Any]]:
+    """Reads `count` bits or registers, in several requests if necessary.
+
+    These end where an element ends, of `element` registers: a device may change values in between.
+    """
     limit = READ_LIMITS.get(area)
     if limit is None or (type(count) is int and count <= limit):
         return Request.read(area, address, count)
     address, count = index(address), index(count)
     if count <= limit:
         return Request.read(area, address, count)
+    size = _whole_elements(limit, element)
     return _in_turn(
         [
-            Request.read(area, start, min(limit, address + count - start))
-            for start in _starts(address, count, limit)
+            Request.read(area, start, min(size, address + count - start))
+            for start in _starts(address, count, size)
         ]
     )
 
@@ -203,8 +207,13 @@ class TooManyValues(ValueError):
         )
 
 
-def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) -> Steps[None]:
-    """Writes bits or registers in one request, or with `split` in several."""
+def write_range(
+    area: Area, address: int, items: Sequence[int], element: int = 1, *, split: bool
+) -> Steps[None]:
+    """Writes bits or registers in one request, or with `split` in several.
+
+    These end where an element ends, of `element` registers: a device may refuse any of them.
+    """
     limit = WRITE_LIMITS[area]
     address = index(address)
     make = Request.write_coils if area == "coils" else Request.write_registers
@@ -213,9 +222,10 @@ def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) 
             raise TooManyValues(len(items), limit)
         yield make(address, items)
         return
+    size = _whole_elements(limit, element)
     requests = [
-        make(start, items[start - address : start - address + limit])
-        for start in _starts(address, len(items), limit)
+        make(start, items[start - address : start - address + size])
+        for start in _starts(address, len(items), size)
     ]
     yield from requests
 
@@ -229,7 +239,7 @@ def read_typed(area: Area, address: int, kind: str, order: str, encoding: str | 
             f"{'bits' if area in BIT_AREAS else 'registers'}, use read_{area}({address}, {kind})"
         )
     codec = codec_for(area, kind, order, encoding)
-    plan = read_range(area, address, codec.type.registers)
+    plan = read_range(area, address, codec.type.registers, codec.type.width // 2)
     raw = (yield plan) if isinstance(plan, Request) else (yield from plan)
     return codec.unpack(codec.to_bytes(raw))
 
@@ -256,7 +266,7 @@ def write_typed(
         [mask] = raw
         yield Request.mask_write(address, *((MAX_WORD ^ mask, mask) if value else (mask, 0)))
     elif len(raw) > 1:
-        yield from write_range(area, address, raw, split=split)
+        yield from write_range(area, address, raw, codec.type.width // 2, split=split)
     elif area in BIT_AREAS:
         yield Request.write_coil(address, bool(raw[0]))
     else:
@@ -323,6 +333,11 @@ def diagnostics(sub_function: int, data: Sequence[int]) -> Steps[list[int]]:
         sent += number.to_bytes(2, "big")
     reply: bytes = yield Request.diagnostics(sub_function, sent)
     return [int.from_bytes(reply[at : at + 2], "big") for at in range(0, len(reply), 2)]
+
+
+def _whole_elements(limit: int, element: int) -> int:
+    """The most registers of a request with whole elements; `limit` if not even one fits."""
+    return limit // element * element or limit
 
 
 def _starts(address: int, count: int, limit: int) -> range:

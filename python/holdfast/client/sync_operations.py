@@ -127,7 +127,7 @@ class SyncOperations(BaseClient):
 
         Uses function 5 or 6 for one bit or register, 15 or 16 for several, and 22 for one bit of a
         register (`bit:3`). Values that exceed one request require `split`; the device then does not
-        write them in one step.
+        write them in one step, but no request cuts an element of an array.
         """
         steps = requests.write_typed(area, address, value, type, order, encoding, split=split)
         self._run(steps, unit)

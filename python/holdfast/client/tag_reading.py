@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
@@ -64,6 +65,8 @@ class _Block:
     count: int
     fields: list[_Field]
     decode: Decoder
+    width: int
+    """The bytes that one request has to read together: the block, or elements of an array."""
     requested_in: int = 0
     """The number of the last reading that requested it; 0 is none."""
     answered: bool = True
@@ -191,7 +194,11 @@ class TagReader:
         address = found[0].address
         count = max(each.address + each.count for each in found) - address
         tags = [self.tags[index] for each in found for index in each.tags]
-        return _Block(found[0].area, address, count, found, decoder(tags, address, count))
+        area, decode = found[0].area, decoder(tags, address, count)
+        # A block that exceeds one request is one range, with arrays of its whole length.
+        is_long = count > READ_LIMITS[area]
+        width = math.lcm(*(tag.of_type.width for tag in tags)) if is_long else 2 * count
+        return _Block(area, address, count, found, decode, width)
 
     def _request(self, block: _Block) -> Steps[tuple[list[_Block], ModbusError | None]]:
         """Reads a block. Returns the blocks that replace it, and the error of a silent device."""
@@ -241,8 +248,8 @@ def _fetch(client: SyncClient, block: _Block) -> bytes:
     """The bytes of a block, as in a Modbus reply."""
     area, address, count = block.area, block.address, block.count
     if area not in BIT_AREAS:
-        registers: bytes = client.read(area, address, f"bytes:{2 * count}")
-        return registers
+        kind = f"bytes:{block.width}[{2 * count // block.width}]"
+        return b"".join(client.read(area, address, kind))
     read_bits = client.read_coils if area == "coils" else client.read_discrete_inputs
     return packed(read_bits(address, count))
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
-from holdfast.errors import UNCERTAIN
+from holdfast.errors import NOT_EXECUTED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -85,9 +85,9 @@ OUTCOMES: Mapping[tuple[str, str], Outcome] = {
     ("gateway_write", "failed"): "unknown",
     ("gateway_write", "not sent"): "failure",
     ("gateway_write", "refused"): "failure",
-    **{("gateway_write", f"exception {code:02X}"): "unknown" for code in UNCERTAIN},
+    **{("gateway_write", f"exception {code:02X}"): "failure" for code in NOT_EXECUTED},
 }
-"""Outcomes by the field `outcome` of an event. Other Modbus exceptions are failures."""
+"""Outcomes by the field `outcome` of an event. After other Modbus exceptions, it is unknown."""
 
 
 def meaning(event: str, fields: Mapping[str, object]) -> Meaning | None:
@@ -96,5 +96,5 @@ def meaning(event: str, fields: Mapping[str, object]) -> Meaning | None:
     given = fields.get("outcome")
     if found is None or not isinstance(given, str):
         return found
-    usual: Outcome = "failure" if given.startswith("exception") else found.outcome
+    usual: Outcome = "unknown" if given.startswith("exception") else found.outcome
     return found._replace(outcome=OUTCOMES.get((event, given), usual))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from holdfast.protocol import WRITE_LIMITS
@@ -9,7 +11,7 @@ from holdfast.tags.base import BaseTag
 from holdfast.tags.scale import RegisterScale, is_finite
 from holdfast.types import BIT_AREAS
 from holdfast.values import DoesNotFit
-from holdfast.values.digits import FLOATS
+from holdfast.values.digits import FLOATS, shortest
 from holdfast.values.errors import shown
 
 if TYPE_CHECKING:
@@ -63,7 +65,8 @@ class WritableTag(BaseTag):
 
         Raises `DoesNotFit` for a value that they can't hold, and for one below `min` or above
         `max`. `default_round` is for a tag without `round`. A number that stands for a state is
-        never rounded. Floating-point registers take the nearest number.
+        never rounded. Floating-point registers take the nearest number; that of a `float16`, which
+        can be far off, is checked again.
         """
         if hasattr(value, "tolist"):
             value = value.tolist()
@@ -81,14 +84,12 @@ class WritableTag(BaseTag):
         if isinstance(self.scale, RegisterScale):
             raise DoesNotFit(self.unscaled)
         self._check_limits(value, f"{value} is")
-        if self.is_float and self._linear.is_identity:
-            return value
-        exact = self._linear.number(value)
         if self.is_float:
-            try:
-                return float(exact)
-            except OverflowError:
-                raise DoesNotFit(f"{value} does not fit {self.type}") from None
+            number = self._float(value)
+            if self.of_type.base == "float16":
+                self._check_half(value, number)
+            return number
+        exact = self._linear.number(value)
         if exact.denominator == 1:
             return exact.numerator
         steps = f"steps of {abs(self.scale)}"
@@ -98,6 +99,24 @@ class WritableTag(BaseTag):
         rounded = self._linear.value(nearest)
         self._check_limits(rounded, f"{value} is {rounded} in {steps},")
         return nearest
+
+    def _float(self, value: float) -> float:
+        if self._linear.is_identity:
+            return value
+        try:
+            return float(self._linear.number(value))
+        except OverflowError:
+            raise DoesNotFit(f"{value} does not fit {self.type}") from None
+
+    def _check_half(self, value: float, number: float) -> None:
+        """Checks the limits of what a `float16` makes of a number, in the digits that it has."""
+        form = FLOATS["float16"]
+        try:
+            [held] = struct.unpack(form, struct.pack(form, number))
+        except OverflowError:
+            return  # The codec refuses it, and says what the type allows.
+        rounded = self._linear.value(Fraction(shortest(held, "float16")))
+        self._check_limits(rounded, f"{value} is {rounded} in {self.of_type.element},")
 
     def _check_limits(self, value: float, found: str) -> None:
         least, most = self.min, self.max

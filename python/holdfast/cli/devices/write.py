@@ -38,6 +38,10 @@ if TYPE_CHECKING:
 
 TRUTHS = {"true": True, "on": True, "1": True, "false": False, "off": False, "0": False}
 WHOLE = re.compile(r"([+-]?)(0[xX][0-9a-fA-F]{1,20}|[0-9]{1,20})")
+NUMBER = re.compile(
+    r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|inf(inity)?|nan)", re.I | re.ASCII
+)
+"""A float. Python's own spelling has `21_5` for 215, and digits of other scripts."""
 NEGATIVE = re.compile(r"-(\.?[0-9]|inf|nan)", re.I)
 
 
@@ -332,11 +336,10 @@ def _value(text: str, kind: str) -> Any:
         except ValueError:
             raise click.UsageError(f"{text!r} is not hex, allowed: pairs of hex digits.") from None
     if base == "float":
-        try:
-            number = float(text)
-        except ValueError:
+        if NUMBER.fullmatch(text.strip()) is None:
             point = f"; did you mean {text.replace(',', '.')!r}?" if "," in text else ""
-            raise click.UsageError(f"{text!r} is not a number{point}") from None
+            raise click.UsageError(f"{text!r} is not a number{point}")
+        number = float(text)
         if math.isinf(number) and "inf" not in text.lower():
             raise click.UsageError(f"{text!r} is outside the range of {kind}.")
         return number

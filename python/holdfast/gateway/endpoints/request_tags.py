@@ -137,11 +137,15 @@ async def encode(given: Given, profiles: Mapping[str, TagList]) -> Answer:
 
 
 def _written(tag: Tag, raw: Any) -> Answer:
-    """Returns the registers, bits or masks that hold a value, and the value as it is then read."""
+    """Returns the registers, bits or masks that hold a value, and the value as it is then read.
+
+    Raises `ValueError` for what does not fit the type.
+    """
     of = tag.of_type
     if tag.area in BIT_AREAS:
-        bits = [bool(each) for each in (raw if isinstance(raw, list) else [raw])]
-        value = tag.value(bits if isinstance(raw, list) else bits[0])
+        codec = values.codec_for(tag.area, tag.type, tag.order, tag.encoding)
+        bits = [bool(each) for each in codec.encode(raw)]
+        value = tag.value(bits if of.count is not None else bits[0])
         return {"form": "coils", "values": bits, **_shown(tag, value)}
     if of.base == "bit":
         mask = 1 << _wire_bit(tag)

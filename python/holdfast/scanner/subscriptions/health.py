@@ -7,6 +7,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from holdfast.errors import NOT_EXECUTED
 from holdfast.polling.faults import (
     EXPIRED,
     NO_CONNECTION,
@@ -15,14 +16,7 @@ from holdfast.polling.faults import (
     fault_text,
     is_exception,
 )
-from holdfast.protocol import (
-    BUSY,
-    GATEWAY_FAILURES,
-    ILLEGAL_ADDRESS,
-    ILLEGAL_FUNCTION,
-    ILLEGAL_VALUE,
-    PATH_UNAVAILABLE,
-)
+from holdfast.protocol import GATEWAY_FAILURES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -37,11 +31,7 @@ TOLERATED_FAILURES = 1
 """Consecutive scans without a response before a device is offline."""
 
 NOT_WRITTEN_FAULTS = (
-    ILLEGAL_FUNCTION,
-    ILLEGAL_ADDRESS,
-    ILLEGAL_VALUE,
-    BUSY,
-    PATH_UNAVAILABLE,
+    *NOT_EXECUTED,
     NO_CONNECTION,
     UNREACHABLE,
     STANDBY,
