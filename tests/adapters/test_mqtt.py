@@ -627,7 +627,7 @@ from holdfast.config.models.services import MqttConfig
 from holdfast.ingest import MemoryAccess
 
 class Blocked(MemoryAccess):
-    def ingest(self, body, grant, peer):
+    def ingest(self, body, grant, peer, *, stale):
         print("in the write", flush=True)
         sys.stdin.read()
         raise AssertionError
@@ -737,10 +737,17 @@ def test_a_fault_in_the_write_does_not_stop_the_next_message(
     rig: Rig, caplog: pytest.LogCaptureFixture
 ) -> None:
     class Faulty(MemoryAccess):
-        def ingest(self, body: bytes | bytearray | memoryview, grant: Grant, peer: str) -> Written:
+        def ingest(
+            self,
+            body: bytes | bytearray | memoryview,
+            grant: Grant,
+            peer: str,
+            *,
+            stale: str | None = None,
+        ) -> Written:
             if b"fault" in bytes(body):
                 raise RuntimeError("a fault")
-            return super().ingest(body, grant, peer)
+            return super().ingest(body, grant, peer, stale=stale)
 
     memory_access = Faulty("mqtt", {"plant": rig.memory})
     broker = rig.broker()

@@ -75,10 +75,17 @@ class Gate(MemoryAccess):
         self.entered = threading.Event()
         self.open = threading.Event()
 
-    def ingest(self, body: bytes | bytearray | memoryview, grant: Grant, peer: str) -> Written:
+    def ingest(
+        self,
+        body: bytes | bytearray | memoryview,
+        grant: Grant,
+        peer: str,
+        *,
+        stale: str | None = None,
+    ) -> Written:
         self.entered.set()
         assert self.open.wait(wire.DEADLINE)
-        return super().ingest(body, grant, peer)
+        return super().ingest(body, grant, peer, stale=stale)
 
 
 @pytest.mark.parametrize("qos", [1, 2])

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -261,7 +262,9 @@ def test_the_price_of_a_request_decides() -> None:
         (("inputs", 0, 1), {}, "inputs"),
         (("coils", 0, 1), {"max_gap": -1}, "max_gap is -1"),
         (("coils", 0, 1), {"max_bits": 2001}, "max_bits is 2001"),
-        (("coils", 0, 1), {"cost": (-1.0, 0.0)}, "cost is below 0"),
+        (("coils", 0, 1), {"cost": (-1.0, 0.0)}, "cost is -1, 0, allowed: two numbers, 0 or more"),
+        (("coils", 0, 1), {"cost": (math.nan, 0.0)}, "cost is NaN, 0, allowed: two numbers"),
+        (("coils", 0, 1), {"cost": (1.0, 0.0), "max_gap": 0}, "max_gap and cost: give one"),
     ],
 )
 def test_what_can_not_be_read_is_an_error(field: Any, rules: Any, error: str) -> None:

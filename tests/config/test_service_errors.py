@@ -525,3 +525,70 @@ def test_with_tokens_names_of_rest_have_no_effect(folder: Folder) -> None:
     assert folder.warnings(MEMORIES + REST + "  hosts: [gw]\n") == [
         "p.yaml:13: rest.hosts: has no effect with tokens"
     ]
+
+
+PASSED = """\
+memories: {plant: {coils: 8, holding_registers: 100, input_registers: 10}}
+devices:
+  drive:
+    url: tcp://10.0.0.9
+    interval: 1
+    writes: pass
+    reads:
+      - area: holding_registers
+        address: 0
+        count: 10
+        into: {memory: plant, area: holding_registers, address: 20}
+      - area: input_registers
+        address: 0
+        count: 4
+        into: {memory: plant, area: input_registers, address: 0}
+mqtt:
+  url: mqtt://broker
+  client_id: plant
+"""
+LATE = (
+    "p.yaml:20: mqtt.subscriptions[0].qos: found 1: commands that the broker keeps while there is "
+    "no connection are sent to drive afterwards, however old; with qos 0, it keeps none"
+)
+
+
+@pytest.mark.parametrize(
+    ("qos", "area", "writes", "told"),
+    [
+        (1, "holding_registers", "pass", [LATE]),
+        (2, "holding_registers", "pass", [LATE.replace("found 1", "found 2")]),
+        (0, "holding_registers", "pass", []),
+        (1, "coils", "pass", []),
+        (1, "input_registers", "pass", []),
+        (1, "holding_registers", "local", []),
+    ],
+)
+def test_commands_for_a_device_that_a_broker_keeps_are_a_warning(
+    folder: Folder, qos: int, area: str, writes: str, told: list[str]
+) -> None:
+    entry = f"{{topic: in, qos: {qos}, memories: [plant], areas: [{area}]}}"
+    text = PASSED.replace("writes: pass", f"writes: {writes}")
+    assert folder.warnings(f"{text}  subscriptions:\n    - {entry}\n") == told
+
+
+@pytest.mark.parametrize(
+    ("address", "kind", "writes", "warned"),
+    [
+        (20, "uint16", "pass", True),
+        (29, "uint16", "pass", True),
+        (19, "float32", "pass", True),
+        (19, "uint16", "pass", False),
+        (30, "uint16", "pass", False),
+        (20, "uint16", "local", False),
+    ],
+)
+def test_plain_values_for_a_device_are_a_warning(
+    folder: Folder, address: int, kind: str, writes: str, warned: bool
+) -> None:
+    tag = f"{{area: holding_registers, address: {address}, type: {kind}}}"
+    text = PASSED.replace("writes: pass", f"writes: {writes}")
+    entry = f"  map:\n    - {{topic: a, memory: plant, tag: {tag}}}\n"
+    message = "its range mirrors drive, which is not sent plain values"
+    told = [f"p.yaml:20: mqtt.map[0]: has no effect: {message}"] if warned else []
+    assert folder.warnings(text + entry) == told

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import msgspec
 
 from holdfast import _core
-from holdfast.errors import UNCERTAIN
+from holdfast.errors import NOT_EXECUTED
 from holdfast.events import log_lines
 from holdfast.events.audit import Unrecorded
 from holdfast.events.audit.chain import encoded
@@ -87,6 +87,8 @@ class Begun:
     single: bool
     """Whether the batch is one command, sent alone."""
     grant: Grant
+    stale: str | None = None
+    """Why the commands may be old; `None` if nothing says so."""
     writes: _core.Batch | None = None
     device: str | None = None
     """The device that takes the write, in place of a memory."""
@@ -121,9 +123,19 @@ class MemoryAccess:
         """Whether a write can take as long as a device, a disk or a log needs to answer."""
         return bool(self._passages) or any(memory.waits for memory in self.memories.values())
 
-    def ingest(self, body: bytes | bytearray | memoryview, grant: Grant, peer: str) -> Written:
-        """Carries out JSON: one command, or an array of commands. Raises `Refused`."""
-        return self.begin(body, grant, peer)()
+    def ingest(
+        self,
+        body: bytes | bytearray | memoryview,
+        grant: Grant,
+        peer: str,
+        *,
+        stale: str | None = None,
+    ) -> Written:
+        """Carries out JSON: one command, or an array of commands. Raises `Refused`.
+
+        `stale` says why the commands may be old: memory takes them, but no device does.
+        """
+        return self._begin(partial(_decoded, body), grant, peer, stale)()
 
     def write(self, commands: Sequence[Mapping[str, object]], grant: Grant, peer: str) -> Written:
         """Carries out commands atomically, each with memory, area, address and values.
@@ -262,9 +274,11 @@ class MemoryAccess:
         with self._lock:
             return self._counts.snapshot()
 
-    def _begin(self, read: Callable[[], object], grant: Grant, peer: str) -> Callable[[], Written]:
+    def _begin(
+        self, read: Callable[[], object], grant: Grant, peer: str, stale: str | None = None
+    ) -> Callable[[], Written]:
         try:
-            begun = self._begun(read(), grant, peer)
+            begun = self._begun(read(), grant, peer, stale)
         except Refused as refused:
             self.refuse(refused, grant.name, peer)
             raise
@@ -293,12 +307,12 @@ class MemoryAccess:
             self.refuse(refused, begun.grant.name, peer)
             raise
 
-    def _begun(self, document: object, grant: Grant, peer: str) -> Begun:
+    def _begun(self, document: object, grant: Grant, peer: str, stale: str | None) -> Begun:
         single = not isinstance(document, list)
         batch: Any = [document] if single else document
         if not batch:
             raise Refused("malformed", "the batch is empty")
-        begun = Begun(batch, single, grant)
+        begun = Begun(batch, single, grant, stale)
         try:
             # Commands are checked one by one: native code stops at the first refused command.
             begun.writes = _core.Batch(
@@ -345,14 +359,21 @@ class MemoryAccess:
         return values
 
     def _device(self, begun: Begun, refused: _core.BatchRefused) -> str:
-        """The device that takes a write in place of a memory. Raises `Refused` if there is none."""
+        """The device that takes a write in place of a memory.
+
+        Raises `Refused` if there is none, and for a write that may be old: no stale command moves a
+        machine.
+        """
         command = begun.batch[refused.command]
         if begun.single and refused.reason == "mirrored" and command["area"] in begun.grant.areas:
             passage = self._passages.get(command["memory"])
             count = len(values_of(command))
             device = passage and passage.device_of(command["area"], command["address"], count)
             if device is not None:
-                return device
+                if begun.stale is None:
+                    return device
+                where = place_of(None, command["memory"], command["area"], command["address"])
+                raise Refused("stale_command", f"not sent to {device}: {begun.stale}", **where)
         index = None if begun.single else refused.command
         error = self._refused(command, refused, begun.grant, index)
         if refused.reason == "not_confirmed" and begun.recording is not None:
@@ -382,7 +403,7 @@ class MemoryAccess:
             return len(values)
         name = EXCEPTIONS.get(code, "unknown")
         detail = f"{begun.device} did not take the write: exception {code:02X} ({name})"
-        if code in UNCERTAIN:
+        if code not in NOT_EXECUTED:
             detail += "; it may still be carried out, or have been"
         raise Refused("device_refused", detail, **where)
 

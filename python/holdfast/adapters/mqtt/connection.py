@@ -47,6 +47,9 @@ _LARGEST = MAX_PAYLOAD_BYTES + _KEPT
 
 _READ_BYTES = 65_536
 
+_RETAIN, _DUP = 0x01, 0x08
+"""Flags of PUBLISH."""
+
 _PUBLISH, _PUBACK, _PUBREC, _PUBREL, _PUBCOMP, _PINGRESP = 0x30, 0x40, 0x50, 0x60, 0x70, 0xD0
 
 
@@ -185,7 +188,7 @@ class BrokerConnection(BrokerClient):
         if message.qos == 2 and message.identifier in self._unreleased:
             self._acknowledge(_PUBREC, message.identifier)
             return
-        result = self._inbox.take(message)
+        result = self._inbox.take(message, stale=_staleness(first))
         if message.qos and result.get("reason") in KEEPING:
             # Without an acknowledgement, the broker sends the message again after a reconnect.
             self.end(str(result["detail"]))
@@ -202,3 +205,15 @@ class BrokerConnection(BrokerClient):
 
     def _acknowledge(self, first: int, identifier: int) -> None:
         self.connection.put(acknowledgement(first, identifier))
+
+
+def _staleness(first: int) -> str | None:
+    """Why a message may be old, by the first byte of its packet.
+
+    `None` if nothing says so: what the broker has kept for a session looks like any new message.
+    """
+    if first & _RETAIN:
+        return "the message is retained, so its command may be old"
+    if first & _DUP:
+        return "the broker delivers the message again, and its command may be carried out already"
+    return None

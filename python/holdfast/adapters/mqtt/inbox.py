@@ -109,8 +109,11 @@ class Inbox:
         )
         self.received = 0
 
-    def take(self, message: Publish) -> dict[str, object]:
-        """Carries out a message. Returns the answer for its sender."""
+    def take(self, message: Publish, *, stale: str | None = None) -> dict[str, object]:
+        """Carries out a message. Returns the answer for its sender.
+
+        `stale` says why the message may be old: then it writes to memory, but not to a device.
+        """
         self.received += 1
         topic = message.topic
         shown = clip(topic, MAX_LOGGED_TOPIC_CHARS)
@@ -123,7 +126,8 @@ class Inbox:
                 command = value.command(message.payload)
                 return self._memory_access.write([command], grant, peer).answer()
             if refused is None:
-                return self._memory_access.ingest(message.payload, grant, peer).answer()
+                payload = message.payload
+                return self._memory_access.ingest(payload, grant, peer, stale=stale).answer()
             self._memory_access.refuse(refused, grant.name, peer)
         except BadValue as error:
             refused = Refused("invalid_value", str(error), **error.where)

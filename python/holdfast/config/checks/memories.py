@@ -246,6 +246,7 @@ def warn_of_grants(scope: Scope) -> None:
                 message = f"{area} has no effect: {_have(grant.memories)} no such area"
                 report.warn((*grant.path, "areas", index), message)
         _warn_of_while_sealed(config, grant, report)
+    _warn_of_passed(config, report)
     if config.rest is not None and config.rest.tokens == "none":
         return  # Every REST client may write everything, including the gate bits.
     for name, memory in config.memories.items():
@@ -270,6 +271,38 @@ def _warn_of_while_sealed(config: Config, grant: WriterGrant, report: Report) ->
         if not any(area in memory.areas() for memory in sealed):
             message = f"{area} has no effect: none of its memories with a seal has this area"
             report.warn((*grant.path, "while_sealed", index), message)
+
+
+def _warn_of_passed(config: Config, report: Report) -> None:
+    """Warns about messages of MQTT for ranges that are written through to devices: commands that
+    a broker keeps are late, and plain values are refused.
+    """
+    if config.mqtt is None:
+        return
+    passed = [
+        (name, into, range(into.address, into.address + read.count))
+        for name, device in config.devices.items()
+        for read, into in device.passed
+    ]
+    for index, topic in enumerate(config.mqtt.subscriptions):
+        names = dict.fromkeys(
+            name
+            for name, into, _ in passed
+            if topic.qos and into.memory in topic.memories and into.area in topic.areas
+        )
+        if names:
+            message = (
+                f"found {topic.qos}: commands that the broker keeps while there is no connection "
+                f"are sent to {listing(names)} afterwards, however old; with qos 0, it keeps none"
+            )
+            report.warn(("mqtt", "subscriptions", index, "qos"), message)
+    for index, (memory, tag) in enumerate(config.mapped().values()):
+        for name, into, addresses in passed:
+            is_there = (into.memory, into.area) == (memory, tag.area)
+            if is_there and tag.address < addresses.stop and addresses.start < tag.end:
+                message = f"has no effect: its range mirrors {name}, which is not sent plain values"
+                report.warn(("mqtt", "map", index), message)
+                break
 
 
 def _reads_into(config: Config, memory: str, gate: Seal) -> bool:
