@@ -45,18 +45,19 @@ __all__ = [
     "LAST_RECORD",
     "LINK_QUEUE",
     "MAX_IN_FLIGHT",
-    "MAX_LAG",
-    "MAX_LATENESS",
+    "MAX_LAG_S",
+    "MAX_LATENESS_S",
+    "MAX_LINK_QUEUE",
     "MAX_PDU",
     "READ_RECORDS",
-    "RETRY_PAUSES",
+    "RETRY_PAUSES_S",
     "SUB_FUNCTIONS",
     "TLS_REASONS",
     "TURNAROUND_S",
     "UNMEASURED_COST_MS",
     "WHEN_BEHIND",
     "WRITE_RECORDS",
-    "WRITE_TIMEOUT",
+    "WRITE_TIMEOUT_S",
     "Attempt",
     "Batch",
     "BatchRefused",
@@ -143,11 +144,11 @@ FAULTS: Final[dict[str, int]]
 TLS_REASONS: Final[tuple[str, ...]]
 """Why TLS failed, as a word."""
 
-MAX_LATENESS: Final[float]
-"""The seconds after its timeout in which a late reply may come, without transaction ids."""
+MAX_LATENESS_S: Final[float]
+"""How long after its timeout a late reply may come, without transaction ids."""
 
-RETRY_PAUSES: Final[tuple[float, float]]
-"""The first and the longest pause after failures, in seconds, where a device has no others."""
+RETRY_PAUSES_S: Final[tuple[float, float]]
+"""The first and the longest pause after failures, where a device has no others."""
 
 UNMEASURED_COST_MS: Final[tuple[float, float]]
 """The costs of a request and of a register until a device with `max_gap: auto` is measured."""
@@ -155,11 +156,14 @@ UNMEASURED_COST_MS: Final[tuple[float, float]]
 MAX_IN_FLIGHT: Final[int]
 """The most requests in flight on one connection."""
 
-LINK_QUEUE: Final[tuple[int, int]]
-"""How many requests may wait for a link that has no other number, and the most that can."""
+LINK_QUEUE: Final[int]
+"""How many requests may wait for a link that has no other number."""
 
-WRITE_TIMEOUT: Final[float]
-"""The seconds until a write that a log has not confirmed is answered, where it has no others."""
+MAX_LINK_QUEUE: Final[int]
+"""The largest such number that a link can have."""
+
+WRITE_TIMEOUT_S: Final[float]
+"""The time until a write that a log has not confirmed is answered, where it has no other."""
 
 CONTACTS_PER_LAG: Final[int]
 """How often a node of a log without writes has contact with it, in the time of `max_lag`."""
@@ -167,8 +171,8 @@ CONTACTS_PER_LAG: Final[int]
 WHEN_BEHIND: Final[Literal["serve", "refuse"]]
 """What happens to reads of a node that is behind, where the log says nothing else."""
 
-MAX_LAG: Final[float]
-"""The seconds without contact until a node of a log is behind, where the log has no others."""
+MAX_LAG_S: Final[float]
+"""The time without contact until a node of a log is behind, where the log has no other."""
 
 class OutOfRange(IndexError):
     """The range is not inside the area. Nothing was read or written."""
@@ -572,8 +576,8 @@ class ServerTls:
 
     `ca_file` has the authorities of client certificates, and self-signed certificates of clients;
     `crl_file` has the revocation lists of these authorities, and `expired_crl` is what happens to
-    their clients after `nextUpdate`. `key` is the content of `key_file` without its passphrase, if
-    it has one. Raises `ValueError` for a file that can't be used.
+    their clients after `nextUpdate`. `decrypted_key` is the content of `key_file` without its
+    passphrase, if it has one. Raises `ValueError` for a file that can't be used.
     """
 
     def __new__(
@@ -584,7 +588,7 @@ class ServerTls:
         ca_file: str | PathLike[str],
         crl_file: str | PathLike[str] | None = None,
         expired_crl: Literal["refuse", "accept"] = "refuse",
-        key: bytes | None = None,
+        decrypted_key: bytes | None = None,
     ) -> ServerTls: ...
     @property
     def warnings(self) -> list[str]:
@@ -726,7 +730,7 @@ def https_server_tls(
     crl_file: str | PathLike[str] | None = None,
     expired_crl: Literal["refuse", "accept"] = "refuse",
     roles: Sequence[str] | None = None,
-    key: bytes | None = None,
+    decrypted_key: bytes | None = None,
 ) -> ServerTls:
     """Settings of the TLS of an HTTPS server. Reads the PEM files at once.
 
@@ -958,13 +962,13 @@ class Endpoint:
         cert: str | PathLike[str] | None = None,
         key: str | PathLike[str] | None = None,
         name: str | None = None,
-        unlocked: bytes | None = None,
+        decrypted_key: bytes | None = None,
     ) -> Endpoint:
         """A device with Modbus TCP over TLS. Reads the PEM files at once.
 
         `ca` has the trusted certificates, of authorities or of the device itself. Default: the
         system's authorities. `name` is the name in the device's certificate, if it is not `host`.
-        `unlocked` is the content of `key` without its passphrase, if it has one.
+        `decrypted_key` is the content of `key` without its passphrase, if it has one.
         Raises `OSError` and `ValueError` for files that can't be used.
         """
 
@@ -1300,7 +1304,7 @@ class PolledDevice:
     (default: the interval). `report` takes the polls; `fields` are areas, addresses and counts that
     are read only for it, and not forwarded. `release` closes the
     connection after each poll. With `measured`, measurements replace `cost` after a while. `retry`
-    are the first and the longest pause after failures (default: `RETRY_PAUSES`). With `jitter`,
+    are the first and the longest pause after failures (default: `RETRY_PAUSES_S`). With `jitter`,
     they are up to a quarter shorter, and the device is retried at the next time of its schedule;
     without, when they end. With a `fence`, the device is polled and written to while that is open;
     devices of one link have the same. Times are in seconds; interval 0 polls without a pause.
@@ -1345,8 +1349,11 @@ class Fence:
     def __new__(cls, lease: int) -> Fence:
         """The fence of the lease with this number, which is the same on all nodes."""
 
-    def open(self, until: float, *, settle: float = 0.0) -> None:
-        """Opens it. Writes wait for `settle` seconds and the timeout of the device."""
+    def open(self, until: float, *, term: tuple[int, int] = (0, 0), settle: float = 0.0) -> None:
+        """Opens it for a term. Later ones are greater, and end the earlier ones in logs.
+
+        Writes wait for `settle` seconds and the timeout of the device.
+        """
 
     def renew(self, until: float) -> None:
         """Moves the end, never to an earlier time. Without effect if it was closed."""
@@ -1528,10 +1535,10 @@ class Poller:
 
         Devices at the same address share it. The first call for an address decides its settings:
         `queue` is the most requests of listeners that wait (default: `LINK_QUEUE`), with `coalesce`
-        one request answers equal reads that wait at the same time, for `cache` seconds a reply
-        answers equal reads, reads of the addresses in `preferred` go before those of others, and
-        `retry` are the first and the longest pause after failures (default: `RETRY_PAUSES`). Raises
-        `ValueError`, and `RuntimeError` after `stop`.
+        one request answers identical reads that wait at the same time, for `cache` seconds a reply
+        answers identical reads, reads of the addresses in `preferred` go before those of others,
+        and `retry` are the first and the longest pause after failures (default: `RETRY_PAUSES_S`).
+        Raises `ValueError`, and `RuntimeError` after `stop`.
         """
 
     def known_link(self, name: str, endpoint: Endpoint) -> Link | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -91,6 +92,11 @@ def test_a_lease_that_was_taken_too_late_to_be_used_can_be_renewed() -> None:
     assert not fence.allows
     fence.renew(time.monotonic() + FAR)
     assert fence.is_open
+
+
+def test_a_time_that_is_no_number_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"until is NaN, allowed: a time of time\.monotonic"):
+        Fence(1).open(math.nan)
 
 
 def test_a_poll_that_has_begun_ends_before_a_lease_is_given_back(poller: ReportingPoller) -> None:

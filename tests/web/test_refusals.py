@@ -86,7 +86,7 @@ def test_the_document_of_rest_has_what_a_route_refuses(
     document = rest_document("1.0", 1024, secured=secured)
     [route] = [route for route in OPERATIONS if route.name == name]
     operation = document["paths"][route.path][route.method.lower()]
-    asking = set() if route.is_open else {401, 403} if secured else {403}
+    asking = set() if route.is_public else {401, 403} if secured else {403}
     assert statuses(operation["responses"]) == expected | asking
 
 

@@ -17,7 +17,7 @@ use holdfast_protocol::frame::rtu;
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
     self, Bits, Diagnostics, EncodedRequest, ExceptionCode, FileRange, FileRanges, FileRecords,
-    Function, Range, Registers, Request as CoreRequest, RequestError, Response, SubFunction, limit,
+    Range, Registers, Request as CoreRequest, RequestError, Response, SubFunction, limit,
 };
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
@@ -33,7 +33,7 @@ pyo3::import_exception!(holdfast.errors, RequestTimeout);
 pyo3::import_exception!(holdfast.errors, InvalidResponse);
 pyo3::import_exception!(holdfast.errors, TlsFailed);
 
-/// What a call raises that `end_call` has ended.
+/// The message of the `ConnectionLost` that `end_call` causes.
 const CLOSED: &str = "connection lost: closed by this side";
 
 #[pyclass(frozen, module = "holdfast")]
@@ -116,14 +116,13 @@ impl Request {
 
     #[staticmethod]
     fn diagnostics(sub_function: Integer, data: &[u8]) -> PyResult<Request> {
-        let code = register("sub_function", sub_function)?;
-        let sub_function = SubFunction::from_code(code).ok_or_else(|| {
-            PyValueError::new_err(format!("sub_function {code} is not in the standard"))
+        let known = u16::try_from(sub_function.0).ok().and_then(SubFunction::from_code);
+        let sub_function = known.ok_or_else(|| {
+            let allowed = SubFunction::ALL.iter().map(|each| each.code().to_string());
+            let allowed = allowed.collect::<Vec<_>>().join(", ");
+            PyValueError::new_err(format!("sub_function is {}, allowed: {allowed}", sub_function.0))
         })?;
-        let asked = Diagnostics::new(sub_function, data).map_err(|_| {
-            let function = Function::Diagnostics.name();
-            PyValueError::new_err(format!("{function} does not allow these arguments"))
-        })?;
+        let asked = Diagnostics::new(sub_function, data).map_err(refused)?;
         Ok(encoded(&CoreRequest::Diagnostics(asked)))
     }
 
@@ -173,7 +172,7 @@ impl Request {
     #[staticmethod]
     fn of_function(code: Integer, data: &[u8]) -> PyResult<Request> {
         let code = within("function", code.0, 1..=0x7F)? as u8;
-        within("length of data", data.len() as i128, 0..=pdu::MAX_LEN - 1)?;
+        within("len(data)", data.len() as i128, 0..=pdu::MAX_LEN - 1)?;
         let pdu = [&[code], data].concat();
         let encoded = EncodedRequest::opaque(&pdu).expect("a PDU of this length and code");
         Ok(Request { encoded })
@@ -193,7 +192,7 @@ impl Request {
     fn identification(code: Integer, object_id: Integer) -> PyResult<Request> {
         let code = ReadCode::from_code(byte("code", code.0)?)
             .ok_or_else(|| PyValueError::new_err(format!("code is {}, allowed: 1 to 4", code.0)))?;
-        let object_id = byte("object id", object_id.0)?;
+        let object_id = byte("object_id", object_id.0)?;
         Ok(encoded(&CoreRequest::ReadDeviceIdentification { code, object_id }))
     }
 
@@ -207,7 +206,7 @@ impl Request {
     }
 
     fn rtu_frame<'py>(&self, py: Python<'py>, unit: Integer) -> PyResult<Bound<'py, PyBytes>> {
-        let unit = byte("unit id", unit.0)?;
+        let unit = byte("unit", unit.0)?;
         let mut frame = [0; rtu::MAX_LEN];
         let len = rtu::encode(unit, self.encoded.pdu(), &mut frame).expect("a request is a PDU");
         Ok(PyBytes::new(py, &frame[..len]))
@@ -240,7 +239,7 @@ impl Endpoint {
     }
 
     #[staticmethod]
-    #[pyo3(signature = (host, port, ca=None, cert=None, key=None, name=None, unlocked=None))]
+    #[pyo3(signature = (host, port, ca=None, cert=None, key=None, name=None, decrypted_key=None))]
     fn tls(
         py: Python<'_>,
         host: String,
@@ -249,7 +248,7 @@ impl Endpoint {
         cert: Option<PathBuf>,
         key: Option<PathBuf>,
         name: Option<&str>,
-        unlocked: Option<&[u8]>,
+        decrypted_key: Option<&[u8]>,
     ) -> PyResult<Endpoint> {
         let own = match (cert.as_deref(), key.as_deref()) {
             (Some(cert), Some(key)) => Some((cert, key)),
@@ -257,8 +256,8 @@ impl Endpoint {
             _ => return Err(PyValueError::new_err("cert and key: give both, or neither")),
         };
         let name = name.unwrap_or(&host);
-        let settings = ClientSettings { ca: ca.as_deref(), own, key: unlocked, name };
-        // A file that does not answer stops no other thread.
+        let settings = ClientSettings { ca: ca.as_deref(), own, decrypted_key, name };
+        // Reading may block: let other Python threads run.
         let tls = py.detach(|| ClientTls::new(settings));
         let tls = Some(Arc::new(tls.map_err(unusable)?));
         Ok(Endpoint { core: Place::Tcp { host, port, tls }.into() })
@@ -378,7 +377,7 @@ impl BlockingClient {
         self.core.late()
     }
 
-    /// The seconds that the longest of these replies took; 0 if there was none.
+    /// How many seconds the slowest late reply took; 0 if there were none.
     #[getter]
     fn longest_late(&self) -> f64 {
         self.core.longest_late().as_secs_f64()

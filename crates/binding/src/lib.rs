@@ -9,6 +9,7 @@ mod batch;
 mod channel;
 mod client;
 mod connection;
+mod constants;
 mod engine;
 mod exchange;
 mod follower;
@@ -16,7 +17,6 @@ mod heartbeat;
 mod http;
 mod json_commands;
 mod lease_fence;
-mod limits;
 mod link;
 mod listener;
 mod log;
@@ -36,7 +36,7 @@ use pyo3::prelude::*;
 
 #[pymodule(gil_used = false)]
 mod _core {
-    use super::{Bound, PyModule, PyModuleMethods, PyResult, limits};
+    use super::{Bound, PyModule, PyModuleMethods, PyResult, constants};
 
     #[pymodule_export]
     use super::batch::{Batch, BatchRefused};
@@ -83,7 +83,7 @@ mod _core {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
-        limits::add(module)?;
+        constants::add(module)?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }

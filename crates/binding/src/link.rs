@@ -51,13 +51,14 @@ pub(crate) fn settings(
         let invalid = || PyValueError::new_err(format!("preferred: {text} is not an IP address"));
         text.parse::<IpAddr>().map(|peer| peer.to_canonical()).map_err(|_| invalid())
     };
-    let (usual, most) = LinkSettings::QUEUE;
     Ok(LinkSettings {
         name,
         endpoint: endpoint.core.clone(),
         in_flight: in_flight(number)?,
         retry: retry(pauses)?,
-        queue: queue.map_or(Ok(usual), |queue| within("queue", queue, 1..=most))?,
+        queue: queue.map_or(Ok(LinkSettings::QUEUE), |queue| {
+            within("queue", queue, 1..=LinkSettings::MAX_QUEUE)
+        })?,
         coalesce,
         cache: seconds("cache", cache)?,
         preferred: preferred.into_iter().map(parsed).collect::<PyResult<_>>()?,

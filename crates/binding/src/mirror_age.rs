@@ -1,4 +1,4 @@
-//! `MirrorAge`: how old the values are that a device is read into.
+//! `MirrorAge`: the age of the values that were read from a device into a range of memory.
 
 use std::sync::Arc;
 

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
-use holdfast_engine::client::Place as HostPlace;
+use holdfast_engine::client::Place;
 use holdfast_engine::link::Fault;
 use holdfast_engine::poller::plan::{self, Field, PlanLimits, Strategy, Stretch};
 use holdfast_engine::poller::{
@@ -32,10 +32,10 @@ const MAX_BITS: i128 = limit::READ_BITS as i128;
 type Range = (String, u32, u32);
 
 /// A memory, an area and an address.
-type Place<'py> = (PyRef<'py, Memory>, String, u16);
+type MemoryAddress<'py> = (PyRef<'py, Memory>, String, u16);
 
 /// An area, an address, a count, and the destination of the bytes.
-type Read<'py> = (String, i128, i128, Option<Place<'py>>);
+type Read<'py> = (String, i128, i128, Option<MemoryAddress<'py>>);
 
 /// Area and slot of a status block, its name, and whether it keeps the last error.
 type StatusBlock = (String, u16, String, bool);
@@ -82,17 +82,17 @@ impl PolledDevice {
         jitter: bool,
         fence: Option<PyRef<'_, Fence>>,
     ) -> PyResult<PolledDevice> {
-        let place = |area: String, address, count| -> PyResult<_> {
+        let checked_range = |area: String, address, count| -> PyResult<_> {
             let address = within("address", address, 0..=65_535)? as u16;
             Ok((named(&area)?, address, within("count", count, 1..=65_536)? as u32))
         };
         let reads = reads.into_iter().map(|(area, address, count, into)| {
-            let (area, address, count) = place(area, address, count)?;
+            let (area, address, count) = checked_range(area, address, count)?;
             let into = into.map(destination).transpose()?;
             Ok(ReadSettings { area, address, count, into, forward: true })
         });
         let fields = fields.unwrap_or_default().into_iter().map(|(area, address, count)| {
-            let (area, address, count) = place(area, address.into(), count.into())?;
+            let (area, address, count) = checked_range(area, address.into(), count.into())?;
             Ok(ReadSettings { area, address, count, into: None, forward: false })
         });
         let forward = forward.unwrap_or_default().into_iter().map(forwarding);
@@ -308,7 +308,7 @@ pub fn plan_blocks(
         .collect())
 }
 
-fn destination((memory, area, address): Place<'_>) -> PyResult<Destination> {
+fn destination((memory, area, address): MemoryAddress<'_>) -> PyResult<Destination> {
     Ok(Destination { memory: Arc::clone(&memory.core), area: named(&area)?, address })
 }
 
@@ -320,7 +320,7 @@ pub fn write_disabled_status(
     block: StatusBlock,
 ) -> PyResult<()> {
     let status = status(&memory, block)?;
-    // What keeps the memory may be slow.
+    // The file or log of the memory may be slow.
     py.detach(|| status.write_disabled_status()).map_err(|refusal| match refusal {
         Refusal::OutOfRange => {
             PyValueError::new_err("the status block does not fit into its memory")
@@ -337,10 +337,11 @@ fn block((area, slot, name, keep_last_error): StatusBlock) -> PyResult<BlockSett
     Ok(BlockSettings { area: named(&area)?, slot, name, keep_last_error })
 }
 
-fn forwarding((receiver, forward): (PyRef<'_, Endpoint>, Forward)) -> PyResult<ForwardSettings> {
+fn forwarding((endpoint, forward): (PyRef<'_, Endpoint>, Forward)) -> PyResult<ForwardSettings> {
     let (format, crc, target, timeout, offsets, status) = forward;
-    let HostPlace::Tcp { host, port, tls } = receiver.core.place.clone() else {
-        return Err(PyValueError::new_err("the endpoint of a receiver must be TCP or TLS"));
+    let Place::Tcp { host, port, tls } = endpoint.core.place.clone() else {
+        let message = "forward: the transport of the endpoint is not supported, allowed: tcp, tls";
+        return Err(PyValueError::new_err(message));
     };
     let format = packet_format(&format, &crc)?;
     let timeout = seconds("timeout", timeout)?;
@@ -352,10 +353,14 @@ fn forwarding((receiver, forward): (PyRef<'_, Endpoint>, Forward)) -> PyResult<F
 
 fn strategy(max_gap: Option<i128>, cost: Option<(f64, f64)>) -> PyResult<Strategy> {
     match (max_gap, cost) {
-        (_, Some((request, item))) if request >= 0.0 && item >= 0.0 => {
+        (Some(_), Some(_)) => Err(PyValueError::new_err("max_gap and cost: give one, or neither")),
+        (None, Some((request, item))) if request >= 0.0 && item >= 0.0 => {
             Ok(Strategy::Cost { request, item })
         }
-        (_, Some(_)) => Err(PyValueError::new_err("cost is below 0, it must be 0 or more")),
+        (None, Some((request, item))) => {
+            let allowed = "two numbers, 0 or more";
+            Err(PyValueError::new_err(format!("cost is {request}, {item}, allowed: {allowed}")))
+        }
         (gap, None) => {
             let max_gap = within("max_gap", gap.unwrap_or_default(), 0..=65_535)? as u16;
             Ok(Strategy::Gap { max_gap })

@@ -15,8 +15,8 @@ use crate::arguments::word;
 ///
 /// `ca_file` has the authorities of client certificates, and self-signed certificates of clients;
 /// `crl_file` has the revocation lists of these authorities, and `expired_crl` is what happens to
-/// their clients after `nextUpdate`. `key` is the content of `key_file` without its passphrase, if
-/// it has one. Raises `ValueError` for a file that can't be used.
+/// their clients after `nextUpdate`. `decrypted_key` is the content of `key_file` without its
+/// passphrase, if it has one. Raises `ValueError` for a file that can't be used.
 #[pyclass(frozen, module = "holdfast")]
 pub struct ServerTls {
     pub(crate) core: Arc<CoreServerTls>,
@@ -25,7 +25,7 @@ pub struct ServerTls {
 #[pymethods]
 impl ServerTls {
     #[new]
-    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None, expired_crl="refuse", key=None))]
+    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None, expired_crl="refuse", decrypted_key=None))]
     fn new(
         py: Python<'_>,
         cert_file: PathBuf,
@@ -33,7 +33,7 @@ impl ServerTls {
         ca_file: PathBuf,
         crl_file: Option<PathBuf>,
         expired_crl: &str,
-        key: Option<&[u8]>,
+        decrypted_key: Option<&[u8]>,
     ) -> PyResult<ServerTls> {
         let files = ServerFiles {
             protocol: Protocol::Modbus,
@@ -44,7 +44,7 @@ impl ServerTls {
             expired_lists: expired_lists(expired_crl)?,
             roles: None,
         };
-        load(py, &files, key)
+        load(py, &files, decrypted_key)
     }
 
     /// What is doubtful about the files: dates, and revocation lists.
@@ -60,7 +60,7 @@ impl ServerTls {
 /// certificates: "" is a certificate without a role, `None` is any role. The rest is that of
 /// `ServerTls`, also what it raises.
 #[pyfunction]
-#[pyo3(signature = (*, cert_file, key_file, client_ca_file=None, crl_file=None, expired_crl="refuse", roles=None, key=None))]
+#[pyo3(signature = (*, cert_file, key_file, client_ca_file=None, crl_file=None, expired_crl="refuse", roles=None, decrypted_key=None))]
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 pub fn https_server_tls(
     py: Python<'_>,
@@ -70,7 +70,7 @@ pub fn https_server_tls(
     crl_file: Option<PathBuf>,
     expired_crl: &str,
     roles: Option<Vec<String>>,
-    key: Option<&[u8]>,
+    decrypted_key: Option<&[u8]>,
 ) -> PyResult<ServerTls> {
     let files = ServerFiles {
         protocol: Protocol::Http,
@@ -81,7 +81,7 @@ pub fn https_server_tls(
         expired_lists: expired_lists(expired_crl)?,
         roles,
     };
-    load(py, &files, key)
+    load(py, &files, decrypted_key)
 }
 
 impl ServerTls {
@@ -102,9 +102,9 @@ fn expired_lists(text: &str) -> PyResult<ExpiredLists> {
     word("expired_crl", text, &allowed)
 }
 
-fn load(py: Python<'_>, files: &ServerFiles, key: Option<&[u8]>) -> PyResult<ServerTls> {
-    // A file that does not answer stops no other thread.
-    let core = py.detach(|| CoreServerTls::load(files, key));
+fn load(py: Python<'_>, files: &ServerFiles, decrypted_key: Option<&[u8]>) -> PyResult<ServerTls> {
+    // Reading may block: let other Python threads run.
+    let core = py.detach(|| CoreServerTls::load(files, decrypted_key));
     let core = core.map_err(|error| PyValueError::new_err(error.to_string()))?;
     Ok(ServerTls { core: Arc::new(core) })
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-/// A counter that only increases, except where something is taken back.
+/// A count. It only goes up, except for `held_bytes`, which uses `subtract`.
 #[derive(Debug, Default)]
 pub struct Counter(AtomicU64);
 
@@ -32,8 +32,8 @@ impl Counter {
     }
 }
 
-/// Makes a struct of counters with a list of their names. Behind the semicolon are fields that the
-/// list leaves out.
+/// Makes a struct of counters with a list of their names. Fields after the semicolon are not in the
+/// list.
 macro_rules! counters {
     (
         $(#[$meta:meta])*
@@ -59,7 +59,7 @@ macro_rules! counters {
 }
 pub(crate) use counters;
 
-/// A counter for each reason. The reasons are words of the program, so there are few.
+/// A counter for each reason. Reasons are constants in the code, so the map stays small.
 #[derive(Debug, Default)]
 pub struct ReasonCounters(Mutex<BTreeMap<&'static str, u64>>);
 

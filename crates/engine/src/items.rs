@@ -12,7 +12,7 @@ pub struct Items {
 }
 
 impl Items {
-    /// The address behind the last one.
+    /// The address after the last item.
     pub(crate) fn end(self) -> u32 {
         u32::from(self.address) + self.count
     }

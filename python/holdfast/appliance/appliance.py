@@ -299,4 +299,4 @@ class _Running:
             log_lines.tell_held_back()
             self.liveness.check()
             for part in self._parts:
-                part.log_changes()
+                part.tick()

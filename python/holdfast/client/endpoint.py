@@ -43,13 +43,13 @@ def receiver_endpoint(receiver: Receiver) -> Endpoint:
 
 
 def _secure(host: str, port: int, of: Tls) -> Endpoint:
-    unlocked: bytes | None = None
+    decrypted_key: bytes | None = None
     if of.key is not None and of.key_passphrase_file is not None:
         from holdfast.net.certificates import own
 
-        unlocked = own.unlocked(of.key, of.key_passphrase_file)
+        decrypted_key = own.unlocked(of.key, of.key_passphrase_file)
     require_stored(of.ca, of.cert, of.key)
-    return Endpoint.tls(host, port, of.ca, of.cert, of.key, of.name, unlocked)
+    return Endpoint.tls(host, port, of.ca, of.cert, of.key, of.name, decrypted_key)
 
 
 def check_files(tls: Tls) -> None:

@@ -34,7 +34,7 @@ from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import shape, show
 from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.config.text.report import Report
-from holdfast.config.text.templates import expanded
+from holdfast.config.text.templates import expand_templates
 from holdfast.runtime import bounded_files
 
 
@@ -80,7 +80,7 @@ def checked(document: yaml_document.Document, problems: list[Problem], folder: P
     report = Report(document)
     profiles = ProfileFiles(folder, report)
     profiles.read()
-    expanded(report)
+    expand_templates(report)
     take_out_former_keys(report)
     config = build(report.document.data, folder, report)
     scope = Scope(config, folder, report)
@@ -90,8 +90,7 @@ def checked(document: yaml_document.Document, problems: list[Problem], folder: P
         raise ConfigError(document.file, problems)
     _warn(scope)
     warnings = sorted(report.warnings, key=lambda warning: warning.line or 0)
-    config.with_profile_files(profiles.files)
-    return config.with_warnings(warnings)
+    return config.with_profile_files(profiles.files).with_warnings(warnings)
 
 
 def _check(scope: Scope) -> None:
@@ -128,11 +127,11 @@ def _foreign(data: object) -> str | None:
         return shape(data) if data else show(data)
     if not data or any(str(key) in Config.model_fields for key in data):
         return None
-    from difflib import get_close_matches  # Only a file of unknown keys is compared.
+    # Imported here: only a file without any known key needs it.
+    from difflib import get_close_matches
 
     known = known_keys((), None)
     if any(get_close_matches(str(key), known, cutoff=0.8) for key in data):
         return None
-    return (
-        f"a mapping with {len(data)} other keys" if len(data) > 1 else "a mapping with another key"
-    )
+    unknown = "one unknown key" if len(data) == 1 else f"{len(data)} unknown keys"
+    return f"a mapping with {unknown}"

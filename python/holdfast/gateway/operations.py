@@ -52,7 +52,7 @@ def operations(settings: Settings) -> tuple[Operation[App], ...]:
         *tag_lists.OPERATIONS,
         *DOCUMENTS,
         *(_asset(path) for path in assets.FILES),
-        *(Operation("GET", path, "health", "", App.probe, is_open=True) for path in health.PATHS),
+        *(Operation("GET", path, "health", "", App.probe, is_public=True) for path in health.PATHS),
     )
 
 
@@ -160,7 +160,7 @@ _STATUS: Operation[App] = Operation(
 def _asset(path: str) -> Operation[App]:
     answer = html_answer() if path == "/" else None
     summary = "Open the console in a browser"
-    return Operation("GET", path, "console", summary, App.asset, answer, is_open=True)
+    return Operation("GET", path, "console", summary, App.asset, answer, is_public=True)
 
 
 def document(version: str, settings: Settings) -> dict[str, Any]:

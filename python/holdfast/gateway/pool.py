@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from holdfast._core import MAX_LATENESS
+from holdfast._core import MAX_LATENESS_S
 from holdfast.client.client import connection
 from holdfast.client.endpoint import check_files
 from holdfast.client.url import IN_FLIGHT, NetworkTarget
@@ -211,7 +211,7 @@ class Pool:
         finally:
             device.used = time.monotonic()
             if device.doubtful:
-                device.needed = device.used + device.timeout + MAX_LATENESS
+                device.needed = device.used + device.timeout + MAX_LATENESS_S
 
     def pass_on(self, device: _Device) -> None:
         """Gives the place of a request that has ended to those that wait."""

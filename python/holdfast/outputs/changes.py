@@ -28,14 +28,16 @@ class Changes:
         """The readings that are published."""
         if self._every:
             return list(readings)
-        return [reading for reading in readings if self._is_new(reading)]
+        return [reading for reading in readings if self._accept(reading)]
 
-    def _is_new(self, reading: Reading) -> bool:
+    def _accept(self, reading: Reading) -> bool:
+        """Whether a reading is published; if so, keeps it as the last one of its tag."""
         device, tag, value, time, _, _ = reading
         key = (device, tag.name)
         known = self._last.get(key)
         if known is not None:
             before, at = known
+            # 0 <=: also published after the clock was set back.
             silent = self._heartbeat is None or 0 <= time - at < self._heartbeat
             if silent and not differs(value, before, tag.deadband):
                 return False
@@ -43,6 +45,6 @@ class Changes:
         return True
 
     def forget(self, devices: Iterable[str]) -> None:
-        """Publishes the next readings of these devices in any case."""
-        gone = set(devices)
-        self._last = {key: last for key, last in self._last.items() if key[0] not in gone}
+        """Forgets the last values of these devices, so that their next readings are published."""
+        forgotten = set(devices)
+        self._last = {key: last for key, last in self._last.items() if key[0] not in forgotten}

@@ -94,5 +94,5 @@ def _flaw(name: str) -> str | None:
     if any(one // 2 != other // 2 for one, other in zip(places[::2], places[1::2], strict=True)):
         return "splits a register, allowed: AB, CD, EF and GH together"
     if any(places[source] != place for place, source in enumerate(places)):
-        return "is not its own inverse"
+        return "is not its own inverse, allowed: bytes that stay or swap places, as in CDABEFGH"
     return None

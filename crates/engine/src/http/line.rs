@@ -246,7 +246,7 @@ impl Line {
         let len = self.portion.len(received);
         // After the end, a part of a header is all that there is.
         let is_head = matches!(self.portion, Portion::Head(_));
-        let is_part = is_head && len == 0 && !self.portion.is_without_end();
+        let is_part = is_head && len == 0 && !self.portion.hyper_missed_end();
         if self.is_ended && is_part { received.len() } else { len }
     }
 
@@ -417,7 +417,7 @@ impl Read for Wire {
                 // The next request has to wait. The task is polled when the response is complete.
                 return Poll::Pending;
             }
-            if line.portion.is_without_end() {
+            if line.portion.hyper_missed_end() {
                 // hyper would take all that follows for the rest of the header.
                 line.front.ended(Kind::BrokenRequest, line.peer.clone());
                 return Poll::Ready(Err(io::ErrorKind::InvalidData.into()));

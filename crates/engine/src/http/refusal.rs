@@ -1,4 +1,4 @@
-//! Refusals of what no handler sees.
+//! Refusals of requests that reach no handler.
 
 use bytes::Bytes;
 use hyper::{HeaderMap, StatusCode};
@@ -44,13 +44,12 @@ impl RefusalBody {
     }
 }
 
-/// The end of a header.
-const BLANK_LINE: &[u8] = b"\r\n\r\n";
+const HEADER_END: &[u8] = b"\r\n\r\n";
 const NO_BODY: &[u8] = b"content-length: 0\r\n";
 
 /// Completes hyper's response to a request that it can't parse: hyper sends no body.
 pub(super) fn completed(response: &[u8], refusal: &RefusalBody) -> Vec<u8> {
-    let Some(header) = response.strip_suffix(BLANK_LINE) else {
+    let Some(header) = response.strip_suffix(HEADER_END) else {
         return response.to_vec();
     };
     let header = [header, b"\r\n"].concat();
@@ -61,8 +60,9 @@ pub(super) fn completed(response: &[u8], refusal: &RefusalBody) -> Vec<u8> {
     [&header, &refusal.lines()[..], b"\r\n", &refusal.body].concat()
 }
 
-/// The refusal of which hyper's response tells the status.
+/// Returns the refusal that the status of hyper's response stands for.
 pub(super) fn of_response(response: &[u8]) -> Refusal {
+    // After `HTTP/1.1 `.
     let status = response.get(9..12).and_then(|code| StatusCode::from_bytes(code).ok());
     match status {
         Some(StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE | StatusCode::URI_TOO_LONG) => {

@@ -16,7 +16,8 @@ pub(super) enum Portion {
 }
 
 impl Portion {
-    /// How many of these bytes belong to the request. `bytes` are those of the call before that were not
+    /// How many of these bytes hyper may read now: those of this request, but none of a header
+    /// until it is complete. `bytes` are those of the call before that were not
     /// [skipped](Portion::skip), and more.
     pub(super) fn len(&mut self, bytes: &[u8]) -> usize {
         match self {
@@ -38,8 +39,8 @@ impl Portion {
         }
     }
 
-    /// Whether hyper has all of a header, and still no request.
-    pub(super) fn is_without_end(&self) -> bool {
+    /// Whether hyper has read a whole header and still waits for its end.
+    pub(super) fn hyper_missed_end(&self) -> bool {
         matches!(self, Portion::Head(end) if end.search.found == Some(0))
     }
 
@@ -101,14 +102,15 @@ impl HeadEnd {
         }
         match self.search.found {
             Some(found) => found,
-            None if self.is_awaited(bytes) => 0,
+            None if self.is_held_back(bytes) => 0,
             None => bytes.len(),
         }
     }
 
-    /// Whether hyper gets nothing before the end has arrived. Once hyper has read a part of a header, it looks
-    /// for the end by other rules, and judges the rest later. What can't be a request is refused at once.
-    fn is_awaited(&self, bytes: &[u8]) -> bool {
+    /// Whether a header is held back until it is complete: of a part, hyper looks for the end by
+    /// other rules. Not if hyper has begun to read it; nor if it is too large, or its first byte
+    /// can't begin a request: hyper then refuses it at once.
+    fn is_held_back(&self, bytes: &[u8]) -> bool {
         let first = bytes.iter().find(|byte| !matches!(byte, b'\r' | b'\n'));
         !self.is_begun && bytes.len() <= MAX_HEADER_BYTES && first.is_none_or(u8::is_ascii_graphic)
     }

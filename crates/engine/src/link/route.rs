@@ -37,8 +37,10 @@ pub struct LinkSettings {
 }
 
 impl LinkSettings {
-    /// The most requests that wait, unless a link has another number, and the most it can have.
-    pub const QUEUE: (usize, usize) = (256, 65_535);
+    /// The most requests that wait, unless a link has another number.
+    pub const QUEUE: usize = 256;
+    /// The largest such number that a link can have.
+    pub const MAX_QUEUE: usize = 65_535;
 }
 
 counters! {

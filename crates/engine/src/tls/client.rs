@@ -33,7 +33,7 @@ pub struct ClientSettings<'s> {
     /// The certificate of the client, with its intermediates; and its key.
     pub own: Option<(&'s Path, &'s Path)>,
     /// The content of the key's file without its passphrase, if it has one.
-    pub key: Option<&'s [u8]>,
+    pub decrypted_key: Option<&'s [u8]>,
     /// The name or address that the certificate of the peer must have.
     pub name: &'s str,
 }
@@ -77,8 +77,10 @@ impl ClientTls {
             Some(file) => Listed::of_file(file)?,
             None => system_authorities()?,
         };
-        let own =
-            settings.own.map(|(file, key_file)| own(file, key_file, settings.key)).transpose()?;
+        let own = settings
+            .own
+            .map(|(file, key_file)| own(file, key_file, settings.decrypted_key))
+            .transpose()?;
         let own_chain = own.as_ref().map_or_else(Vec::new, |own| own.cert.clone());
         let verifier = Arc::new(ServerVerifier(Trust::new(Arc::clone(&trusted), Lists::default())));
         let builder = ClientConfig::builder_with_provider(provider())
@@ -238,7 +240,7 @@ mod tests {
         let ca = File::new(ca);
         let own = own.map(|own| (File::new(own.pem()), File::new(own.key.serialize_pem())));
         let own = own.as_ref().map(|(file, key)| (file.0.as_path(), key.0.as_path()));
-        ClientTls::new(ClientSettings { ca: Some(&ca.0), own, key: None, name }).unwrap()
+        ClientTls::new(ClientSettings { ca: Some(&ca.0), own, decrypted_key: None, name }).unwrap()
     }
 
     fn server(
@@ -458,7 +460,8 @@ mod tests {
         let outcome = |certificate: &str, key: &[u8]| {
             let (ca, file, key) = (File::new(plc.pem()), File::new(certificate), File::new(key));
             let own = Some((file.0.as_path(), key.0.as_path()));
-            let settings = ClientSettings { ca: Some(&ca.0), own, key: None, name: "plc" };
+            let settings =
+                ClientSettings { ca: Some(&ca.0), own, decrypted_key: None, name: "plc" };
             let error = ClientTls::new(settings).unwrap_err();
             let (file, key) = (file.0.display().to_string(), key.0.display().to_string());
             error.to_string().replace(&file, "CERT").replace(&key, "KEY")
@@ -493,16 +496,19 @@ mod tests {
             "CERT: certificate 1 can't be read, allowed: X.509 version 3"
         );
         let missing = Path::new("/nonexistent/ca.pem");
-        let settings = ClientSettings { ca: Some(missing), own: None, key: None, name: "plc" };
+        let settings =
+            ClientSettings { ca: Some(missing), own: None, decrypted_key: None, name: "plc" };
         let error = ClientTls::new(settings).unwrap_err().to_string();
         assert!(error.starts_with("/nonexistent/ca.pem: "), "{error}");
         let ca = File::new(vec![b'\n'; 5 << 20]);
-        let settings = ClientSettings { ca: Some(&ca.0), own: None, key: None, name: "plc" };
+        let settings =
+            ClientSettings { ca: Some(&ca.0), own: None, decrypted_key: None, name: "plc" };
         assert!(
             ClientTls::new(settings).unwrap_err().to_string().contains("more than 4194304 bytes")
         );
         let ca = File::new(&certificate);
-        let settings = ClientSettings { ca: Some(&ca.0), own: None, key: None, name: "a b" };
+        let settings =
+            ClientSettings { ca: Some(&ca.0), own: None, decrypted_key: None, name: "a b" };
         assert_eq!(
             ClientTls::new(settings).unwrap_err().to_string(),
             "found \"a b\" as the name in a certificate, allowed: a host name or an IP address"

@@ -12,18 +12,18 @@ use super::files::{FileError, certificates, key, key_of};
 use super::provider::{KEYS, provider};
 use super::rsa_pss::PssKey;
 
-/// Reads a certificate, with its intermediates, and its key. With `unlocked`, that is the content of
-/// the key's file.
+/// Reads a certificate, with its intermediates, and its key. With `decrypted_key`, that is the
+/// content of the key's file.
 ///
 /// # Errors
 /// [`FileError`] for an unusable file, or a key that does not belong to the certificate.
 pub(super) fn own(
     cert_file: &Path,
     key_file: &Path,
-    unlocked: Option<&[u8]>,
+    decrypted_key: Option<&[u8]>,
 ) -> Result<Arc<CertifiedKey>, FileError> {
     let chain = certificates(cert_file)?;
-    let key = match unlocked {
+    let key = match decrypted_key {
         Some(text) => key_of(key_file, text)?,
         None => key(key_file)?,
     };

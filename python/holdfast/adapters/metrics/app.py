@@ -96,7 +96,7 @@ class App(Application):
     def __init__(self, registry: CollectorRegistry, health: HealthSource, origins: Origins) -> None:
         metrics = Operation("GET", PATH, "metrics", "", App.export)
         live, ready = (
-            Operation("GET", path, "health", "", App.probe, is_open=True) for path in probes.PATHS
+            Operation("GET", path, "health", "", App.probe, is_public=True) for path in probes.PATHS
         )
         super().__init__((metrics, live, ready), origins)
         self._registry = registry

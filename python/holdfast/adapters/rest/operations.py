@@ -215,7 +215,7 @@ OPERATIONS: tuple[Operation[App], ...] = (
         "Check that the server is running",
         App.health,
         json_answer("The server is running", ref("Health"), {"status": "ok"}),
-        is_open=True,
+        is_public=True,
     ),
     Operation(
         "GET",

@@ -93,7 +93,7 @@ _LINK = object_of(
         "failures": count("No connection, a lost connection, or an invalid reply"),
         "refused_full": COUNT,
         "refused_down": COUNT,
-        "coalesced": count("Answered by an equal read"),
+        "coalesced": count("Answered by an identical read"),
         "cached": count("Answered by an earlier reply"),
         "withdrawn": count("Not sent: the client had gone"),
         "waiting": COUNT,

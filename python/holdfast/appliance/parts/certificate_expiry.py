@@ -71,7 +71,7 @@ class CertificateExpiry(Part):
 
         return adopt
 
-    def log_changes(self) -> None:
+    def tick(self) -> None:
         """Logs what is due."""
         self.log_due(self._expiries, time.time())
 

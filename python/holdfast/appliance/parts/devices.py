@@ -127,7 +127,7 @@ class Devices(Part):
             if thread is not None:
                 thread.join(_END_TIMEOUT_S)
 
-    def log_changes(self) -> None:
+    def tick(self) -> None:
         """Logs changes of devices and links."""
         for name, counted in self._counters().items():
             self._events.log_device(name, counted, self.config.devices[name].forward)
@@ -154,7 +154,7 @@ class Devices(Part):
         return {"devices": found, "links": links, "tag_polls_dropped": dropped}
 
     def health(self) -> dict[str, str]:
-        """The health of each polled device when `log_changes` looked last. Thread-safe."""
+        """The health of each polled device when `tick` looked last. Thread-safe."""
         return dict(self._events.health)
 
     def readings(self) -> list[Reading]:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.services import GatewayConfig, MetricsConfig, RestConfig
     from holdfast.types import ThreadHeartbeat
 
-# All other events of a listener are limited in number, and warnings except `secured`.
+# Events that are not rate-limited. All others are, as warnings; `secured` is info.
 LEVELS = {
     "opened": logging.DEBUG,
     "closed": logging.DEBUG,
@@ -98,8 +98,8 @@ class Listeners(Part):
             log_lines.write(logging.WARNING, "events_lost", count=lost - self._lost_events)
             self._lost_events = lost
 
-    def log_changes(self) -> None:
-        """Has the certificates of open connections judged again, when that is due."""
+    def tick(self) -> None:
+        """Reviews the certificates of open connections when that is due."""
         found = map(tls_of, self.config.listeners.values())
         interval_s = min((tls.review for tls in found if tls is not None and tls.review), default=0)
         now = time.monotonic()

@@ -115,7 +115,7 @@ class Memories(Part):
         files = self._files.items()
         return {"memory_files": {str(path): dict(file.status()) for path, file in files}}
 
-    def log_changes(self) -> None:
+    def tick(self) -> None:
         """Logs when a file can't be written any more, and when it can again."""
         for path, file in self._files.items():
             error = file.status()["failing"]

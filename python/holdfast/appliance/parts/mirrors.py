@@ -98,7 +98,7 @@ class Mirrors(Part):
             found.setdefault(mirror.device, []).append(entry)
         return found
 
-    def log_changes(self) -> None:
+    def tick(self) -> None:
         """Logs which ranges have become stale, or are read again, since the last call."""
         for device, place, age in ((each.device, each.place, each.age) for each in self._mirrors):
             was_stale = place in self._stale

@@ -97,7 +97,7 @@ def listener(
                 name, str(settings.bind), rules, cast("DatagramOptions", datagrams)
             )
         case ModbusRtuListener() | ModbusAsciiListener():
-            # A line with ASCII has no such setting: its frames have an end of their own.
+            # Defaults for what a mode lacks: ASCII has no silence, RTU always has 8 data bits.
             mode = "rtu" if isinstance(settings, ModbusRtuListener) else "ascii"
             line = {"silence": None, "data_bits": 8} | dict(settings) | dict(settings.serial)
             line |= {"mode": mode}
@@ -161,7 +161,7 @@ def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
         ca_file=settings.ca_file,
         crl_file=settings.crl_file,
         expired_crl=settings.expired_crl,
-        key=key_for_core(settings.key_file, settings.key_passphrase_file, *others),
+        decrypted_key=key_for_core(settings.key_file, settings.key_passphrase_file, *others),
     )
 
 
@@ -199,7 +199,7 @@ def _serial_rule(
     return _core.Rule(
         _targets(units, memories, links),
         sources=[],
-        access=rules[0].access,
+        access=rules[0].access,  # Not used: `narrowed` has all units.
         narrowed={unit: _narrowed(rights) for unit, rights in units.items()},
         exception_status=_exception_status(units),
         fifo=_fifo(config, units),

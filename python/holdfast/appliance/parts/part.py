@@ -78,8 +78,8 @@ class Part:
         """Waits for the end of what was started, and frees what was opened."""
         self.closing.close()
 
-    def log_changes(self) -> None:
-        """Logs what has changed since the last call. Called about once a second."""
+    def tick(self) -> None:
+        """Called about once a second: logs changes and does periodic work."""
 
     def heartbeats(self) -> Sequence[ThreadHeartbeat]:
         """The heartbeats of the threads of this part. Thread-safe."""

@@ -77,7 +77,7 @@ def parse_functions(text: str) -> list[int]:
 @unit_option(None, "Send all requests to unit N. Default: unit ids pass through.")
 @timeout_option(help="Time limit for a request to the device and its reply.", type=TIME)
 @option("--in-flight", "N", _IN_FLIGHT, parsed_by(parse_in_flight), "1")
-@time_option("--cache", "Time for which a reply answers equal reads.", "0", TIME_OR_NONE)
+@time_option("--cache", "Time for which a reply answers identical reads.", "0", TIME_OR_NONE)
 @log_format_option
 def proxy(
     url: str,
@@ -94,7 +94,7 @@ def proxy(
     """Serve the device at DEVICE-URL to many Modbus TCP clients.
 
     All clients share one connection or serial line to the device. Requests are sent one after
-    another, writes first; equal reads that wait are sent once. The device can be at any URL:
+    another, writes first; identical reads that wait are sent once. The device can be at any URL:
     tcp://host:502, rtu:///dev/ttyUSB0?baud=19200&parity=even, rtu+tcp://host:4001 and others.
 
     Unit ids pass through: 0 to 255 to a network address, 1 to 247 to a serial line, where requests

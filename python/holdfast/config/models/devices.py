@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationInfo, model_validator
 
-from holdfast._core import MAX_IN_FLIGHT, RETRY_PAUSES
+from holdfast._core import MAX_IN_FLIGHT, RETRY_PAUSES_S
 from holdfast.client.base import DEFAULT_TIMEOUT_S
 from holdfast.client.url import (
     MAX_CLOSE_AFTER,
@@ -232,9 +232,9 @@ class ToleranceConfig(Model):
 class RetryConfig(Model):
     """When an address that can't be reached, or a unit that does not answer, is tried again."""
 
-    first: Duration = RETRY_PAUSES[0]
+    first: Duration = RETRY_PAUSES_S[0]
     """Seconds after the first failure; doubled with each further one."""
-    most: Duration = RETRY_PAUSES[1]
+    most: Duration = RETRY_PAUSES_S[1]
     """The longest pause, in seconds."""
 
     @model_validator(mode="after")
@@ -304,7 +304,7 @@ class DeviceConfig(Model):
     in_flight: InFlight = 1
     """The most requests in flight at its address, over TCP; auto: more while replies stay fast."""
     tolerance: Annotated[ToleranceConfig | None, NotNull()] = None
-    """How to treat it if it deviates from the standard; in place of these options of the URL."""
+    """How to treat it if it deviates from the standard; replaces the same options in the URL."""
     retry: RetryConfig = RetryConfig()
     """When it is tried again if it can't be reached or does not answer."""
     reads: Annotated[tuple[ReadConfig, ...], Strict(False)] = Field(

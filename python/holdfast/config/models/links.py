@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from holdfast._core import LINK_QUEUE
+from holdfast._core import LINK_QUEUE, MAX_LINK_QUEUE
 from holdfast.client.base import DEFAULT_TIMEOUT_S
 from holdfast.client.url import Target, parse
 from holdfast.config.models.base import Model
@@ -31,17 +31,17 @@ class LinkConfig(Model):
     in_flight: InFlight = 1
     """The most requests in flight, over TCP; auto: more while replies stay fast."""
     tolerance: Annotated[ToleranceConfig | None, NotNull()] = None
-    """How to treat devices that deviate from the standard; in place of these options of the URL."""
+    """How to treat devices that deviate from the standard; replaces the same options in the URL."""
     retry: RetryConfig = RetryConfig()
     """When devices that can't be reached or do not answer are tried again."""
-    queue: Annotated[int, Field(ge=1, le=LINK_QUEUE[1])] = LINK_QUEUE[0]
+    queue: Annotated[int, Field(ge=1, le=MAX_LINK_QUEUE)] = LINK_QUEUE
     """The most requests that wait; more are answered with exception 06."""
     priority: dict[PeerAddress, Literal["high"]] = Field(default={}, json_schema_extra=PEER_KEYS)
     """Clients whose reads go before those of others, by IP address."""
     coalesce: bool = True
-    """Whether equal reads that wait at the same time are answered by one request."""
+    """Whether identical reads that wait at the same time are answered by one request."""
     cache: DurationOrZero = 0.0
-    """Seconds for which a reply answers equal reads; 0: none."""
+    """Seconds for which a reply answers identical reads; 0: none."""
 
     @property
     def target(self) -> Target:

@@ -29,7 +29,7 @@ _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _ALLOWED = "allowed: as in {n: 1-300} or {n: [1, 2, 5]}"
 
 
-def expanded(report: Report) -> None:
+def expand_templates(report: Report) -> None:
     """Replaces each device with `for` in the document of a report by its devices."""
     document = report.document
     devices = mapping(mapping(document.data).get("devices"))

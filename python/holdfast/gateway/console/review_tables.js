@@ -10,19 +10,19 @@ const UNREAD = "not read";
 export function show(change, before) {
   const words = before.words ?? null;
   const after = change.after(words);
-  date(change, before);
+  showHeading(change, before);
   $("write-unread").replaceChildren(before.error ? notice(before.error) : "");
   const detail = words !== null && !change.ofBits && change.count === 1 && change.values.length === 0;
   $("write-tables").replaceChildren(
-    ...(change.values.length > 0 ? [ofValues(change, before.texts ?? [])] : []),
-    ofWords(change, words, after),
-    ...(detail ? [ofBits(words[0], after[0])] : []),
+    ...(change.values.length > 0 ? [valueTable(change, before.texts ?? [])] : []),
+    wordTable(change, words, after),
+    ...(detail ? [bitTable(words[0], after[0])] : []),
   );
 }
 
 /** Says what is written, and how old the review is. */
-export function date(change, before) {
-  $("write-what").replaceChildren(h("strong", {}, written(change)), " ", h("span", { class: "dim" }, read(change, before)));
+export function showHeading(change, before) {
+  $("write-what").replaceChildren(h("strong", {}, writtenText(change)), " ", h("span", { class: "dim" }, readText(change, before)));
 }
 
 /** Clears the review. */
@@ -37,7 +37,7 @@ export function inWords(word) {
 }
 
 /** Says how many addresses are written, and which. */
-function written({ ofBits, mask, address, count }) {
+function writtenText({ ofBits, mask, address, count }) {
   const noun = `${ofBits ? "coil" : "register"}${count === 1 ? "" : "s"}`;
   const where = count === 1 ? address : `${address}-${address + count - 1}`;
   const only = mask ? ` Only ${ofMask(mask)} is written.` : "";
@@ -45,7 +45,7 @@ function written({ ofBits, mask, address, count }) {
 }
 
 /** Says when the current values were read, or that they can't be. */
-function read({ count }, { time, error }) {
+function readText({ count }, { time, error }) {
   const [current, were, they] = count === 1 ? ["The current value", "was", "It"] : ["The current values", "were", "They"];
   return error ? `${current} can't be read. ${they} can still be overwritten.` : `${current} ${were} read at ${clock(time)}.`;
 }
@@ -53,25 +53,25 @@ function read({ count }, { time, error }) {
 /** Names the bit of a mask. The console writes masks of one bit only. */
 const ofMask = ([and]) => `bit ${Math.log2(and ^ 0xffff)}`;
 
-function ofValues({ tag, values, typed }, texts) {
+function valueTable({ tag, values, typed }, texts) {
   const caption = tag ? tag.type : `${typed.datatype}, byte order ${typed.byteOrder}`;
   const rows = values.map(({ name, text }, at) => [name, texts[at] ?? UNREAD, text]);
   return table("review by-column", h("caption", {}, caption), [tag ? "Tag" : "Address", "Now", "New"], rows);
 }
 
-function ofWords({ ofBits, address, mask }, before, after) {
+function wordTable({ ofBits, address, mask }, before, after) {
   const rows = after.map((word, at) => {
     const now = before === null ? UNREAD : inWords(before[at]);
-    const own = word === null ? `${ofMask(mask)} ${mask[1] ? "on" : "off"}` : inWords(word);
+    const next = word === null ? `${ofMask(mask)} ${mask[1] ? "on" : "off"}` : inWords(word);
     const differs = before !== null && before[at] !== word;
-    return [String(address + at), now, differs ? h("mark", {}, own) : own];
+    return [String(address + at), now, differs ? h("mark", {}, next) : next];
   });
   const [one, many] = ofBits ? ["Coil", "Coils"] : ["Register", "Registers"];
   return table("review by-column", named(many), [one, "Now", "New"], rows);
 }
 
 /** Shows one register in every form. Changed bits are marked. */
-function ofBits(before, after) {
+function bitTable(before, after) {
   const [was, will] = [binary(before), binary(after)];
   const marked = [...will].map((bit, at) => (bit === was[at] ? bit : h("mark", {}, bit)));
   const head = [h("span", { class: "unseen" }, "When"), "Decimal", "Hex", "Binary"];

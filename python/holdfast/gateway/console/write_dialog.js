@@ -214,7 +214,7 @@ export class Writer {
     asked.before = now;
     const differs = !equal(now, shown);
     if (differs) reviews.show(change, now);
-    else reviews.date(change, now);
+    else reviews.showHeading(change, now);
     return differs;
   }
 

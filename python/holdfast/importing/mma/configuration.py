@@ -38,24 +38,24 @@ def read_mma(
 ) -> Imported:
     """Converts a configuration of either generation.
 
-    The source ignores some keys. By default, the result does what it did; with `as_meant`, these
-    keys have an effect. Tokens that its documentation publishes are left out, unless
-    `keep_published_tokens` is set. REST and MQTT may write the areas that they could write, and
-    those of `grant_rest` and `grant_mqtt`.
+    The appliance ignored some keys. By default, the result behaves as the appliance did; with
+    `as_meant`, these keys take effect as documented. Tokens that the documentation of the appliance
+    publishes are left out, unless `keep_published_tokens` is set. REST and MQTT may write the areas
+    that they could write, and those of `grant_rest` and `grant_mqtt`.
 
     Raises `ConfigError` with every problem that prevents the import.
     """
-    read = Source(path)
-    desk, draft = read.desk, Draft()
-    generation = _generation(desk) if read.is_mapping() else None
+    source = Source(path)
+    desk, draft = source.desk, Draft()
+    generation = _generation(desk) if source.is_mapping() else None
     if generation is not None:
         choices = Choices(as_meant, keep_published_tokens, grant_rest, grant_mqtt)
         _read(desk, draft, generation, choices)
         if not (draft.listeners or draft.rest or draft.mqtt or desk.report.problems):
             desk.problem((), "nothing to serve, allowed: at least one listener, REST or MQTT")
-    read.finish()
+    source.finish()
     program = "the Modbus Memory Appliance"
-    return Imported(read.file, "mma", program, draft.data(), desk.notes, generation)
+    return Imported(source.file, "mma", program, draft.data(), desk.notes, generation)
 
 
 def _generation(desk: Desk) -> Generation | None:
@@ -67,8 +67,11 @@ def _generation(desk: Desk) -> Generation | None:
     if "replicator" in data:
         desk.problem(("replicator",), "for the units in this file, use: holdfast import replicator")
         return None
-    allowed = "memory, routing and ports (first generation) or listeners (second)"
-    desk.problem((), f"found none of the keys of a generation, allowed: {allowed}")
+    message = (
+        "not a configuration of the Modbus Memory Appliance: found none of memory, routing and "
+        "ports (first generation), or listeners (second)"
+    )
+    desk.problem((), message)
     return None
 
 

@@ -48,20 +48,21 @@ def own_der(cert_file: File) -> bytes:
     if found is None:
         raise UnusableFile(cert_file, missing_block(text, "certificate"))
     try:
+        # Between the BEGIN and the END line.
         return base64.b64decode(b"".join(found.split(b"-----")[2].split()), validate=True)
     except binascii.Error as error:
         raise UnusableFile(cert_file, f"a certificate can't be read: {error}") from error
 
 
 def unlocked(file: File, passphrase_file: File | None) -> bytes | None:
-    """Returns an encrypted key in PEM, without encryption; `None` for a key without a passphrase.
+    """Returns an encrypted key in PEM, without encryption.
 
-    Raises `UnusableFile`.
+    `None` if the key is not encrypted and no passphrase file is given. Raises `UnusableFile`.
     """
     if passphrase_file is None:
         try:
             text = content(file)
-        except UnusableFile:  # Whoever uses the file says so.
+        except UnusableFile:  # The core reads the file next, and reports the error.
             return None
         if is_locked(text):
             raise UnusableFile(file, LOCKED)

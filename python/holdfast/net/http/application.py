@@ -134,7 +134,7 @@ class Application:
 
     def _judged(self, request: Request, operation: Operation[Any]) -> _Judged:
         """Judges all of a head but the length of the body. Raises `BadRequest`."""
-        if not operation.is_open:
+        if not operation.is_public:
             self.origins.check(request)
             request.who = owner(request, self._tokens) if self._tokens else self._anyone
         parameters: Given = {}
@@ -196,7 +196,7 @@ DOCUMENTS: tuple[Operation[Application], ...] = (
         "Get this document",
         Application.send_document,
         json_answer("The OpenAPI 3.1 document", {"type": "object"}),
-        is_open=True,
+        is_public=True,
     ),
     Operation(
         "GET",
@@ -205,7 +205,7 @@ DOCUMENTS: tuple[Operation[Application], ...] = (
         "Get this document as a web page",
         Application.send_page,
         html_answer(),
-        is_open=True,
+        is_public=True,
     ),
 )
 """The operations for the OpenAPI document."""

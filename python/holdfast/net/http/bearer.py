@@ -1,6 +1,6 @@
 """Whose request it is: the token in `Authorization: Bearer TOKEN` (RFC 6750).
 
-Which operations need none is in the table of each service: `Operation.is_open`.
+Which operations need none is in the table of each service: `Operation.is_public`.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ class Https:
 def _loaded(files: HttpsFiles) -> _core.ServerTls:
     """Loads the files. Raises `UnusableFile`."""
     others = (files.cert_file, files.client_ca_file, files.crl_file)
-    key = key_for_core(files.key_file, files.key_passphrase_file, *others)
+    decrypted_key = key_for_core(files.key_file, files.key_passphrase_file, *others)
     try:
         return _core.https_server_tls(
             cert_file=files.cert_file,
@@ -77,7 +77,7 @@ def _loaded(files: HttpsFiles) -> _core.ServerTls:
             crl_file=files.crl_file,
             expired_crl=files.expired_crl,
             roles=files.roles,
-            key=key,
+            decrypted_key=decrypted_key,
         )
     except ValueError as error:
         raise UnusableFile.of(error) from error

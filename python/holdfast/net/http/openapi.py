@@ -69,7 +69,7 @@ def document(
 def _rows(api: Api, operation: Operation[Any], *, secured: bool) -> list[Refusal]:
     """Returns the refusals and failures of an operation, sorted by status code."""
     reasons = [*operation.refusals, "method_not_allowed"]
-    if not operation.is_open:
+    if not operation.is_public:
         reasons += ["foreign_page", "unauthorized"] if secured else ["foreign_page"]
     if operation.body is not None:
         reasons += OF_BODY
@@ -83,7 +83,7 @@ def _operation(api: Api, operation: Operation[Any], *, secured: bool) -> dict[st
     made: dict[str, Any] = {"operationId": operation.name, "summary": operation.summary}
     if operation.description:
         made["description"] = operation.description
-    made["security"] = [{"token": []}] if secured and not operation.is_open else []
+    made["security"] = [{"token": []}] if secured and not operation.is_public else []
     if operation.body is not None:
         made["requestBody"] = _body(operation.body)
     if operation.parameters:

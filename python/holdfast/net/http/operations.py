@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from holdfast.net.http.schemas import Schema
 
 MAX_PARSED = 64
-"""Parsed bodies that are kept."""
+"""Parsed bodies kept for each operation."""
 
 MAX_PARSED_BYTES = 1024
 """The largest body that is kept in its parsed form."""
@@ -51,7 +51,8 @@ def body_of(fields: Sequence[Field], examples: Mapping[str, Any]) -> Body:
     def parse(body: bytes) -> Mapping[str, Any]:
         return from_json(body, fields)
 
-    # Those who poll send the same body again and again: parsing takes as long as the answer.
+    # Pollers repeat the same body, and parsing takes as long as the answer. Requests share the
+    # parsed body: a handler must not change it.
     known = lru_cache(MAX_PARSED)(parse)
     return Body(
         object_with(fields),
@@ -77,11 +78,11 @@ class Operation(Generic[App]):
     description: str = ""
     parameters: Sequence[Field] = ()
     body: Body | None = None
-    is_open: bool = False
-    """Whether it has no secret: it requires no token, and pages of other sites may link to it."""
+    is_public: bool = False
+    """Whether anyone may call it: no token is required, and pages of other sites may link to it."""
     has_head: bool = True
     failures: Sequence[Refusal] = ()
-    """Responses for failures that are no refusals."""
+    """Further error responses: the request was accepted, but could not be carried out."""
 
     @property
     def methods(self) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.subject_parts import second_id, subject_id
+from holdfast.values.orders import SWAPPED_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
 
 BYTE_ORDERS = {("float64", "CDAB"): "CDABGHEF"}
 """The four letters mislead: tentacle-modbus swaps the words of each half."""
-
-SWAPPED = ("BADC", "DCBA")
-"""The orders that swap the bytes of a single register."""
 
 
 class Tentacle:
@@ -79,7 +77,7 @@ class Tentacle:
                 f"write {used}, or the order that you mean, with eight letters"
             )
         is_written = area in WRITE_LIMITS and request.writable is not False
-        if datatype in ("int16", "uint16") and order in SWAPPED and is_written:
+        if datatype in ("int16", "uint16") and order in SWAPPED_BYTES and is_written:
             yield (
                 f"{order} swaps the bytes of the {datatype} in reads and in writes; "
                 "tentacle-modbus swaps them in reads only: a program that swaps the bytes of its "

@@ -13,7 +13,7 @@ import msgspec
 
 from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.messages.subject_parts import next_name
+from holdfast.scanner.messages.subject_parts import tentacle_next_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -95,29 +95,30 @@ class TentacleNext:
 
     def device_names(self, device: str) -> tuple[str, ...]:
         """Returns the only name."""
-        return (next_name(device),)
+        return (tentacle_next_name(device),)
 
     def tag_name(self, tag: str) -> str:
         """Returns the last part of the subjects of a tag."""
-        return next_name(tag)
+        return tentacle_next_name(tag)
 
     def data_subject(self, prefix: str, device: str, tag: str) -> str:
         """Returns the subject that a tag has alone."""
-        return f"{prefix}.data.{next_name(device)}.{next_name(tag)}"
+        return f"{prefix}.data.{tentacle_next_name(device)}.{tentacle_next_name(tag)}"
 
     def check_unsubscribe(self, request: UnsubscribeRequest) -> None:
         """Allows all: without tags, the whole subscription is meant."""
 
     def check_tag_ids(self, known: Iterable[str], new: Iterable[str]) -> None:
         """Checks that each tag of a device has a subject of its own. Raises `Refused`."""
-        names = {next_name(id): id for id in known}
+        names = {tentacle_next_name(id): id for id in known}
         for id in new:
             if not id.isprintable():
                 raise Refused(f"the tag id is {id!r}, allowed: printable characters and blanks")
-            other = names.setdefault(next_name(id), id)
+            name = tentacle_next_name(id)
+            other = names.setdefault(name, id)
             if other != id:
                 raise Refused(
-                    f"tag id {id!r} has the same name in subjects as {other!r}: {next_name(id)}; "
+                    f"tag id {id!r} has the same name in subjects as {other!r}: {name}; "
                     "give one of them another id"
                 )
 

@@ -1,7 +1,5 @@
-//! Constants of the module: areas, functions and their limits, names of exceptions, device faults,
-//! reasons of TLS failures, the latest replies, the usual pauses after failures, the cost of requests,
-//! what links and logs have if nothing else is configured.
-//! Python takes them from here and keeps no list of its own.
+//! Constants that Python takes from the core: areas, functions and their limits, names of exceptions
+//! and faults, and defaults.
 
 use holdfast_engine::link::{Fault, InFlight, LinkSettings};
 use holdfast_engine::poller::UNMEASURED_COST_MS;
@@ -38,16 +36,17 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let faults = Fault::NAMED.iter().map(|(fault, word)| (word, fault.code()));
     module.add("FAULTS", faults.into_py_dict(py)?)?;
     module.add("TLS_REASONS", PyTuple::new(py, TlsFailure::REASONS)?)?;
-    module.add("MAX_LATENESS", MAX_LATENESS.as_secs_f64())?;
+    module.add("MAX_LATENESS_S", MAX_LATENESS.as_secs_f64())?;
     let Retry { first, most, .. } = Retry::default();
-    module.add("RETRY_PAUSES", (first.as_secs_f64(), most.as_secs_f64()))?;
+    module.add("RETRY_PAUSES_S", (first.as_secs_f64(), most.as_secs_f64()))?;
     module.add("UNMEASURED_COST_MS", UNMEASURED_COST_MS)?;
     module.add("MAX_IN_FLIGHT", InFlight::MAX)?;
     module.add("LINK_QUEUE", LinkSettings::QUEUE)?;
-    module.add("WRITE_TIMEOUT", WRITE_TIMEOUT.as_secs_f64())?;
+    module.add("MAX_LINK_QUEUE", LinkSettings::MAX_QUEUE)?;
+    module.add("WRITE_TIMEOUT_S", WRITE_TIMEOUT.as_secs_f64())?;
     module.add("WHEN_BEHIND", WHEN_BEHIND.name())?;
     module.add("CONTACTS_PER_LAG", CONTACTS_PER_LAG)?;
-    module.add("MAX_LAG", MAX_LAG.as_secs_f64())
+    module.add("MAX_LAG_S", MAX_LAG.as_secs_f64())
 }
 
 /// The area that a function reads or writes, if any, and the most items per request: read, written.
