@@ -32,12 +32,11 @@ use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
 use super::poll_pause::PollPause;
 use super::results::{BlockResult, Poll, Results};
 use super::schedule::Schedule;
-use super::standby::submit_under;
 use super::state::DeviceState;
 use super::status::StatusSettings;
 use super::turn::Turn;
 use crate::client::Endpoint;
-use crate::link::{Fault, Fence, InFlight, Link, Permit, Priority};
+use crate::link::{Fault, Fence, InFlight, Link, Permit, Priority, submit_under};
 
 /// The longest interval between writes of the status block.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);

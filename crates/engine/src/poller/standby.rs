@@ -3,33 +3,12 @@
 //! What it sends without the lease is refused in `link/limits/lease_fence.rs`.
 
 use std::future::pending;
-use std::sync::Arc;
 use std::time::Instant;
 
-use holdfast_memory::{Access, Done, Memory, Operation, Refusal, Write};
 use tokio::time::sleep_until;
 
 use crate::link::{Fence, Stage};
 use crate::poller::device::DeviceSettings;
-
-/// Gives what a device holds to the journal of a memory. The log of a replicated one refuses it if another node has
-/// taken over the lease since.
-pub(super) fn submit_under(
-    fence: Option<&Arc<Fence>>,
-    memory: &Memory,
-    access: Access,
-    write: Write<'_>,
-    done: Done,
-) -> Result<(), Refusal> {
-    let (tenure, done) = match fence.filter(|_| memory.is_replicated()) {
-        None => (None, done),
-        Some(fence) => {
-            let (tenure, done) = fence.tenure(done);
-            (Some(tenure), done)
-        }
-    };
-    memory.submit_under(tenure, access, Operation::Write(&[write]), done)
-}
 
 impl DeviceSettings {
     /// Whether another node may poll the device now, or may still be connected to it.

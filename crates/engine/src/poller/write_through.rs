@@ -15,9 +15,8 @@ use tokio::sync::{mpsc, oneshot};
 use crate::items::{Items, touched};
 use crate::link::{
     Fault, Fence, Link, PendingReply, Permit, Priority, ReplyTo, confirmation, exception,
-    exception_in, pending_reply,
+    exception_in, pending_reply, submit_under,
 };
-use crate::poller::standby::submit_under;
 
 /// The most writes into one memory that wait for devices.
 const MAX_WAITING: usize = 256;

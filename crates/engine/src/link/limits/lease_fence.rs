@@ -9,7 +9,9 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
-use holdfast_memory::{Done, Outcome, Refusal, Refused, Tenure, Term};
+use holdfast_memory::{
+    Access, Done, Memory, Operation, Outcome, Refusal, Refused, Tenure, Term, Write,
+};
 use tokio::sync::watch;
 use tokio::time::sleep_until;
 
@@ -114,7 +116,7 @@ impl Fence {
     }
 
     /// Under which term to write what a device holds into a log, and who receives the outcome in place of `done`.
-    pub(crate) fn tenure(self: &Arc<Fence>, done: Done) -> (Tenure, Done) {
+    fn tenure(self: &Arc<Fence>, done: Done) -> (Tenure, Done) {
         let tenure = Tenure { lease: self.lease, term: *self.term() };
         let fence = Arc::clone(self);
         let noted = move |outcome: Outcome| {
@@ -223,6 +225,25 @@ impl Fence {
         let nanos = instant.saturating_duration_since(self.zero).as_nanos();
         u64::try_from(nanos).unwrap_or(u64::MAX)
     }
+}
+
+/// Gives what a device holds to the journal of a memory. The log of a replicated one refuses it if another node has
+/// taken over the lease since.
+pub(crate) fn submit_under(
+    fence: Option<&Arc<Fence>>,
+    memory: &Memory,
+    access: Access,
+    write: Write<'_>,
+    done: Done,
+) -> Result<(), Refusal> {
+    let (tenure, done) = match fence.filter(|_| memory.is_replicated()) {
+        None => (None, done),
+        Some(fence) => {
+            let (tenure, done) = fence.tenure(done);
+            (Some(tenure), done)
+        }
+    };
+    memory.submit_under(tenure, access, Operation::Write(&[write]), done)
 }
 
 impl Pass {
