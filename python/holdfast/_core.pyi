@@ -1349,7 +1349,7 @@ class Fence:
     def __new__(cls, lease: int) -> Fence:
         """The fence of the lease with this number, which is the same on all nodes."""
 
-    def open(self, until: float, *, term: tuple[int, int] = (0, 0), settle: float = 0.0) -> None:
+    def open(self, until: float, *, term: tuple[int, int] = ..., settle: float = 0.0) -> None:
         """Opens it for a term. Later ones are greater, and end the earlier ones in logs.
 
         Writes wait for `settle` seconds and the timeout of the device.

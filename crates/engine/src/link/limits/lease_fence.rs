@@ -15,6 +15,9 @@ use holdfast_memory::{
 use tokio::sync::watch;
 use tokio::time::sleep_until;
 
+/// Added to an epoch that a log takes for an earlier one. Epochs are seconds of Unix time, and much smaller.
+const FORCED_EPOCH: u64 = 1 << 40;
+
 /// What a fence allows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stage {
@@ -129,11 +132,11 @@ impl Fence {
     }
 
     /// A log has a later term. If this node has the lease all the same, what counts terms has begun anew, or was
-    /// set back: a greater epoch is found after a few steps.
+    /// set back: with a greater epoch, the next step is carried out, or one of the next.
     fn overtaken(&self, sent: Term) {
         let mut term = self.term();
         if *term == sent && self.allows() {
-            term.epoch = term.epoch.saturating_mul(2).saturating_add(1);
+            term.epoch = term.epoch.saturating_mul(2).max(term.epoch.saturating_add(FORCED_EPOCH));
         }
     }
 
