@@ -96,6 +96,7 @@ def test_a_retained_command_is_not_sent_to_a_device(
     appliance = started(run, broker.url, plc, version=version, audit={"file": str(audit)})
     until_handled(appliance, 1)
     assert state(appliance)["refused"] == {"stale_command": 1}
+    wire.until(lambda: bool(writes(audit)), "it is recorded")
     assert [line["outcome"] for line in writes(audit)] == ["stale_command"]
     if version == "5":
         assert json.loads(probe.get().payload) == {
