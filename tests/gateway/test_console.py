@@ -687,7 +687,7 @@ def test_a_write_that_is_refused_is_not_told_as_written(opened: Opened, leave: s
         view = opened()
         read_registers(view, refusing.port)
         alert = write_4711(view).get_by_role("alert")
-        expect(alert).to_contain_text("Not written.")
+        expect(alert).to_contain_text("Unknown whether it was written.")
         expect(alert).to_contain_text("The device failed to carry out the request.")
         expect(alert).to_contain_text("check the device")
         expect(alert).to_contain_text("Read back: unchanged.")
@@ -695,7 +695,7 @@ def test_a_write_that_is_refused_is_not_told_as_written(opened: Opened, leave: s
             view.page.keyboard.press("Escape")
         else:
             view.button("Cancel").click()
-        view.says("Not written. The table shows the values read back.")
+        view.says("Unknown whether it was written. The table shows")
         expect(view.page.get_by_text("Changes are marked")).to_be_hidden()
         expect(view.row(1).get_by_role("cell").first).to_have_text("1234")
         assert len(device.writes) == 1
