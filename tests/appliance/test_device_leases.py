@@ -5,7 +5,6 @@ The device is the judge: it knows which connection every request came over.
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import signal
@@ -63,6 +62,11 @@ class Device(Stream):
         if asked.pdu[0] > 4:
             self.writes.append((time.monotonic(), asked.pdu))
         asked.answer()
+
+    def count(self, asked: Asked) -> None:
+        """Answers with the number of the poll in the second register."""
+        self.peers.append(asked.peer)
+        asked.answer(bytes((3, 4, 0, 0)) + len(self.peers).to_bytes(2))
 
 
 @pytest.fixture
@@ -204,8 +208,7 @@ def test_values_of_a_node_that_was_cut_off_are_refused_when_they_arrive_late(
     server: NatsServer,
     device: Device,
 ) -> None:
-    counted = itertools.count(1)
-    device.then = lambda asked: asked.answer(bytes((3, 4, 0, 0)) + next(counted).to_bytes(2))
+    device.then = device.count
     with closing(Proxy(server.port, "nats")) as proxy:
         file = settings("a", interval=0.01)
         file.write_text(file.read_text().replace(server.url, proxy.url))
@@ -230,8 +233,7 @@ def test_a_device_of_a_kept_memory_too_is_written_into_the_log_by_the_next_holde
     tmp_path: Path,
     device: Device,
 ) -> None:
-    counted = itertools.count(1)
-    device.then = lambda asked: asked.answer(bytes((3, 4, 0, 0)) + next(counted).to_bytes(2))
+    device.then = device.count
     one = node("a")
     wire.until(lambda: health(one) == "ok", "the first node polls it")
     one.stop()
@@ -252,12 +254,11 @@ def test_a_device_of_a_kept_memory_too_is_written_into_the_log_by_the_next_holde
 def test_a_log_with_later_terms_than_the_bucket_of_leases_takes_the_values_of_the_holder(
     node: Callable[..., Appliance], device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    counted = itertools.count(1)
-    device.then = lambda asked: asked.answer(bytes((3, 4, 0, 0)) + next(counted).to_bytes(2))
+    device.then = device.count
     one = node("a")
     wire.until(lambda: health(one) == "ok", "the first node polls it")
     one.stop()
-    before = next(counted)
+    before = len(device.peers)
     # As if the bucket were one of long ago.
     monkeypatch.setattr(
         Leases, "_made_at", property(lambda _: None, lambda *_: None), raising=False

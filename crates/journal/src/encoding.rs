@@ -166,7 +166,7 @@ struct Rest<'a> {
 }
 
 impl<'a> Rest<'a> {
-    /// The value that a byte is the number of.
+    /// With which access a step was written, and under which lease.
     fn writer(&mut self) -> Result<(Access, Option<Tenure>), DecodeError> {
         let found = self.bytes.try_get_u8()?;
         let access = ACCESSES.get(usize::from(found & !UNDER_LEASE)).copied();

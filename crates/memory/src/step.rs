@@ -30,7 +30,7 @@ pub struct Tenure {
 /// The time for which one node holds a lease. A later one is greater.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Term {
-    /// Of what counts `since`. It may begin anew.
+    /// Greater each time the counter of `since` begins anew.
     pub epoch: u64,
     /// Grows with each holder.
     pub since: u64,

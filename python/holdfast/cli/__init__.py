@@ -182,7 +182,7 @@ class Program(SuggestingGroup):
         """The command with that name, or `None`."""
         if cmd_name not in COMMANDS:
             return None
-        # Of what runs for years, an appliance is the smallest.
+        # An appliance runs for years, and on small machines. Other commands end, or need OpenSSL.
         sparing = spare_memory() if cmd_name == "run" else contextlib.nullcontext()
         try:
             with sparing:

@@ -135,7 +135,7 @@ class MemoryAccess:
 
         `stale` says why the commands may be old: memory takes them, but no device does.
         """
-        return self._begin(partial(_decoded, body), grant, peer, stale)()
+        return self.begin(body, grant, peer, stale=stale)()
 
     def write(self, commands: Sequence[Mapping[str, object]], grant: Grant, peer: str) -> Written:
         """Carries out commands atomically, each with memory, area, address and values.
@@ -145,13 +145,18 @@ class MemoryAccess:
         return self._begin(lambda: list(commands), grant, peer)()
 
     def begin(
-        self, body: bytes | bytearray | memoryview, grant: Grant, peer: str
+        self,
+        body: bytes | bytearray | memoryview,
+        grant: Grant,
+        peer: str,
+        *,
+        stale: str | None = None,
     ) -> Callable[[], Written]:
-        """Checks JSON, and returns the function that carries it out. Both raise `Refused`.
+        """Checks JSON as `ingest`, and returns what carries it out. Both raise `Refused`.
 
         Writes that begin before others are carried out get into the audit log together.
         """
-        return self._begin(partial(_decoded, body), grant, peer)
+        return self._begin(partial(_decoded, body), grant, peer, stale)
 
     def commands(self, grant: Grant, most: int) -> _core.Commands:
         """Parses commands of at most `most` bytes, for `begin_parsed`.

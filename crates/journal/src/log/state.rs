@@ -20,7 +20,7 @@ use crate::log::stream::message::{
     self, MAX_NODES, Message, MessageError, Origin, VERSION, WITHOUT_LEASES,
 };
 
-/// The most leases whose last term is known. Of another one, all steps are carried out.
+/// The most leases whose last term is known. Without one, all steps are carried out.
 const MAX_LEASES: usize = 65_536;
 
 /// An encoded state begins with it.
@@ -160,7 +160,7 @@ impl State {
         Ok(())
     }
 
-    /// Of its encoding.
+    /// The version of the encoded state.
     pub(super) fn version(&self) -> u8 {
         if self.terms.is_empty() { WITHOUT_LEASES } else { VERSION }
     }
@@ -182,7 +182,7 @@ impl State {
             out.extend_from_slice(&start.to_le_bytes());
             out.extend_from_slice(&counter.to_le_bytes());
         }
-        if self.version() == VERSION {
+        if !self.terms.is_empty() {
             out.extend_from_slice(&(self.terms.len() as u32).to_le_bytes());
             for (lease, Term { epoch, since }) in &self.terms {
                 for number in [lease, epoch, since] {

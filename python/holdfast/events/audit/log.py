@@ -93,8 +93,8 @@ class Audit:
     def queue(self, lines: Iterable[Line]) -> Group:
         """Queues the lines of a write that is about to be carried out, for `write_group`.
 
-        Lines that are queued before that call are written together: a system call
-        costs several times as much as encoding a line.
+        Lines that are queued before that call are written together: a system call costs several
+        times as much as encoding a line.
         """
         bodies = [encoded(fields) for fields in lines]
         with self._lock:
