@@ -37,6 +37,14 @@ def test_registers_are_shown_in_three_ways(
     ]
 
 
+def test_a_request_reads_whole_numbers() -> None:
+    with FakeDevice(registers) as device:
+        found = answer("read", device.url, "hr:7", "60", "--type", "float64")
+        asked = [struct.unpack(">BHH", pdu) for pdu in device.asked]
+    assert found["values"] == [0.0] * 60
+    assert asked == [(3, 7, 124), (3, 131, 116)]
+
+
 def file_or_queue(pdu: bytes) -> bytes:
     """Records that have their own numbers, and a queue of three."""
     if pdu[0] == 24:

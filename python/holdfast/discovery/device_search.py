@@ -1,4 +1,4 @@
-"""Finds Modbus devices: hosts of networks, unit ids of a device, settings of a serial line.
+"""Finds Modbus devices: hosts of networks, and unit ids of a device.
 
 Everything is read; nothing is written. A device is found if it answers a request, with values or
 with an exception.
@@ -14,7 +14,7 @@ from time import monotonic
 from time import sleep as pause
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from holdfast.client import Client, SyncClient
+from holdfast.client import Client
 from holdfast.errors import (
     ConnectFailed,
     ConnectionLost,
@@ -29,8 +29,8 @@ from holdfast.protocol import GATEWAY_FAILURES, MAX_SERIAL_UNIT
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 
+    from holdfast.client import SyncClient
     from holdfast.client.requests import Identification, ServerId
-    from holdfast.client.url import Parity
     from holdfast.net.addresses import Address, Network
 
 UNUSUAL_UNIT = 231
@@ -41,12 +41,6 @@ HOST_UNITS = (1, 255, 0)
 
 GATEWAY_UNITS = tuple(range(1, MAX_SERIAL_UNIT + 1))
 """Unit ids to try behind a gateway, or on a line whose settings are known."""
-
-LINE_UNITS = tuple(range(1, 11))
-"""Unit ids to try on a serial line: each takes a timeout, with each of its settings."""
-
-BAUDS = (9600, 19200, 38400, 57600, 115200, 4800, 2400, 1200)
-PARITIES: tuple[Parity, ...] = ("none", "even", "odd")
 
 State: TypeAlias = Literal["modbus", "open", "refused", "silent", "error"]
 """What an address is: answers Modbus; only has the port open; refuses; does not respond."""
@@ -94,19 +88,6 @@ class Unit:
     identity: Identity = Identity()
     is_garbled: bool = False
     """Whether bytes came that are not a valid reply: the settings of a line may be wrong."""
-
-
-@dataclass(frozen=True)
-class LineSettings:
-    """Settings of a serial line."""
-
-    baud: int
-    parity: Parity
-
-    def url(self, mode: str, device: str) -> str:
-        """The URL of the line with these settings."""
-        stop = "&stop_bits=1" if self.parity == "none" else ""
-        return f"{mode}://{device}?baud={self.baud}&parity={self.parity}{stop}"
 
 
 @dataclass
@@ -283,58 +264,3 @@ def ignores_unit(client: SyncClient, asked: Sequence[Unit], *, is_line: bool) ->
         return True
     is_left = all(unit.unit != UNUSUAL_UNIT for unit in asked)
     return is_left and probe(client, UNUSUAL_UNIT).answers
-
-
-def line_settings(bauds: Sequence[int], parities: Sequence[Parity]) -> list[LineSettings]:
-    """The settings to try, the most common first."""
-    return [LineSettings(baud, parity) for baud in bauds for parity in parities]
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """An attempt to find a device on a line."""
-
-    settings: LineSettings
-    found: Unit
-    is_usable: bool = True
-    """Whether the line can be opened with these settings."""
-    longest_late: float = 0.0
-    """How many seconds the slowest late reply with these settings took so far."""
-
-
-def line(
-    mode: str,
-    device: str,
-    settings: Sequence[LineSettings],
-    unit_ids: Sequence[int],
-    timeout: float,
-) -> Iterator[Attempt]:
-    """Asks unit ids with each setting, and yields every attempt: the first unit id with all
-    settings, then the others. Ends after the unit ids of the first setting that has an answer.
-
-    Raises `ConnectFailed` if the line can't be opened with any setting.
-    """
-    failures: dict[LineSettings, ConnectFailed] = {}
-    for part in (unit_ids[:1], unit_ids[1:]):
-        for each in settings:
-            if each in failures:
-                continue
-            answered = False
-            with SyncClient(each.url(mode, device), timeout=timeout) as client:
-                for unit in part:
-                    try:
-                        found = probe(client, unit)
-                    except ConnectFailed as error:
-                        failures[each] = error
-                        refused = Unit(unit, answers=False, detail=error.detail)
-                        yield Attempt(each, refused, is_usable=False)
-                        break
-                    answered = answered or found.answers
-                    yield Attempt(each, found, longest_late=client.longest_late)
-                if answered:
-                    for unit in unit_ids[1:] if part == unit_ids[:1] else ():
-                        found = probe(client, unit)
-                        yield Attempt(each, found, longest_late=client.longest_late)
-                    return
-        if len(failures) == len(settings):
-            raise failures[settings[0]]

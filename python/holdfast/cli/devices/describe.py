@@ -35,6 +35,7 @@ from holdfast.config.tag_files.read import KINDS
 from holdfast.config.tag_files.write import tags_as_csv, tags_as_yaml
 from holdfast.discovery import description, device_search
 from holdfast.discovery.description import Description
+from holdfast.discovery.line_search import LINE_UNITS
 from holdfast.net.certificates import files
 
 if TYPE_CHECKING:
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from holdfast.client import SyncClient
     from holdfast.discovery.device_search import Unit
 
-LINE_UNITS = device_search.LINE_UNITS
 UNITS = (*LINE_UNITS, 255)
 _UNITS_HELP = (
     f"Unit ids to ask, as in 1-10,255.  [default: {number_ranges(UNITS)}; "

@@ -10,7 +10,8 @@ import click
 
 from holdfast._core import Request
 from holdfast.cli import terminal_text
-from holdfast.cli.options import device, item
+from holdfast.cli.options import device
+from holdfast.cli.options.option import whole_number
 from holdfast.client import requests
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def to_read(words: Sequence[str], count: int | None) -> Records:
     file, first, left = _parts(words)
     if len(left) > 1:
         raise click.UsageError(f"Got unexpected extra argument ({' '.join(left[1:])}).")
-    named = item.number(left[0]) if left else None
+    named = whole_number(left[0]) if left else None
     if left and named is None:
         raise click.UsageError(f"COUNT is {left[0]!r}, allowed: the number of records.")
     if named is not None and count is not None:
@@ -113,7 +114,7 @@ def to_write(words: Sequence[str]) -> tuple[int, int, list[str]]:
 
 def _parts(words: Sequence[str]) -> tuple[int | None, int, list[str]]:
     kind, *parts = words[0].split(":")
-    numbers = [item.number(part) for part in parts]
+    numbers = [whole_number(part) for part in parts]
     if len(numbers) != (2 if kind.lower() == "file" else 1) or None in numbers:
         raise click.UsageError(f"{words[0]!r} is not {FORM}.")
     *file, first = (number or 0 for number in numbers)

@@ -22,7 +22,7 @@ from holdfast.cli.options.url import SERIAL_DEVICE, checked_url
 from holdfast.client.url import SerialTarget, parse
 from holdfast.config.values.ip_addresses import parse_source
 from holdfast.discovery import device_search
-from holdfast.discovery.device_search import BAUDS, PARITIES
+from holdfast.discovery.line_search import BAUDS, PARITIES
 from holdfast.net.addresses import LAST_PORT
 from holdfast.protocol import MAX_SERIAL_UNIT, PORT
 

@@ -15,14 +15,14 @@ from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options.units import refuse_broadcast
 from holdfast.cli.signals import interruptions
 from holdfast.cli.terminal_text import number_ranges
-from holdfast.discovery import device_search
+from holdfast.discovery import line_search
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from holdfast.cli.devices.search_report import Ended
     from holdfast.client.url import Parity
-    from holdfast.discovery.device_search import Attempt
+    from holdfast.discovery.line_search import Attempt
 
 
 def find_line(
@@ -35,9 +35,9 @@ def find_line(
     as_json: bool,
 ) -> None:
     """Finds the settings of a line, prints them, and exits with 1 if there are none."""
-    units = asked or device_search.LINE_UNITS
+    units = asked or line_search.LINE_UNITS
     refuse_broadcast(units)
-    settings = device_search.line_settings(bauds, parities)
+    settings = line_search.line_settings(bauds, parities)
     total = len(settings) * len(units)
     if sys.stderr.isatty():
         click.echo(
@@ -51,7 +51,7 @@ def find_line(
 
         def search() -> None:
             with report.progress("Finding", total, lambda: _tried(attempts)):
-                for attempt in device_search.line(mode, path, settings, units, timeout):
+                for attempt in line_search.attempts(mode, path, settings, units, timeout):
                     with report.held():
                         attempts.append(attempt)
                         _print(mode, path, attempts, report)

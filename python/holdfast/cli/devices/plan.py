@@ -14,7 +14,14 @@ from holdfast.cli.old_spellings import hint
 from holdfast.cli.options import item
 from holdfast.cli.options.duration import Duration
 from holdfast.cli.options.item import range_of, words_argument
-from holdfast.cli.options.option import choice, json_option, number_option, option, require_known
+from holdfast.cli.options.option import (
+    choice,
+    json_option,
+    number_option,
+    option,
+    require_known,
+    whole_number,
+)
 from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.url import checked_url, is_url
 from holdfast.cli.options.value_type import typed
@@ -117,9 +124,9 @@ def _reads(words: Sequence[str], modicon: bool) -> list[Field]:
         if each.type is not None:
             of = typed(each.type, each.order, None, each.place.area, 1)
             size = of.registers if of else 0
-        elif each.count is None and rest and item.number(rest[0]) is not None:
+        elif each.count is None and rest and whole_number(rest[0]) is not None:
             item.are_several(left, modicon=modicon)
-            size = item.number(rest.pop(0)) or 0
+            size = whole_number(rest.pop(0)) or 0
         if not 1 <= size <= ADDRESSES - each.place.address:
             raise click.UsageError(
                 f"{each.text!r}: {size} addresses; the last address is {LAST_ADDRESS}."

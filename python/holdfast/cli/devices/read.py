@@ -192,7 +192,9 @@ class _Query:
         return "bit" if self.of_bits else "register"
 
     def read(self, client: SyncClient) -> list[int]:
-        return device.read_raw(client, self.place.area, self.place.address, self.size)
+        element = 1 if self.typed is None else self.typed.width
+        place = self.place
+        return device.read_raw(client, place.area, place.address, self.size, element=element)
 
     def to_json(self) -> dict[str, object]:
         """The query for JSON."""

@@ -11,9 +11,8 @@ import click
 from holdfast import raw_ingest
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.duration import timeout_option
-from holdfast.cli.options.item import number as number_of
 from holdfast.cli.options.item import take, words_argument
-from holdfast.cli.options.option import flag, json_option, option
+from holdfast.cli.options.option import flag, json_option, option, whole_number
 from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.url import Receiver, parse_receiver
@@ -25,7 +24,7 @@ SEPARATORS = re.compile(r"[\s,;]+")
 
 
 def _integer(text: str) -> int:
-    found = number_of(text)
+    found = whole_number(text)
     if found is None:
         raise click.UsageError(f"{text!r} is not an integer, decimal or 0x.")
     return found
@@ -50,7 +49,7 @@ def _receiver(text: str) -> Receiver:
         host = host[1:-1]
     elif ":" in host:
         raise click.BadParameter(f"{text!r}: an IPv6 address requires brackets, as in [::1]:9000.")
-    port = number_of(digits)
+    port = whole_number(digits)
     if not host or port is None:
         raise click.BadParameter(f"{text!r} is not HOST:PORT, as in 127.0.0.1:9000.")
     if not 1 <= port <= MAX_WORD:
@@ -173,7 +172,7 @@ def _values(file: IO[str]) -> list[int]:
             for text in SEPARATORS.split(words.strip()):
                 if not text:
                     continue
-                value = number_of(text)
+                value = whole_number(text)
                 if value is None:
                     found = f"{file.name}:{line}: {text[:40]!r} is not an integer"
                     raise ValueError(f"{found}, decimal or 0x")

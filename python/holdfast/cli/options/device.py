@@ -13,12 +13,13 @@ from holdfast.cli.options.option import Command, number_option, option_group
 from holdfast.cli.options.units import refuse_broadcast
 from holdfast.client import SyncClient
 from holdfast.client.base import is_broadcast
+from holdfast.client.requests import whole_elements
 from holdfast.client.url import parse
 from holdfast.errors import (
     ModbusError,
     ModbusException,
 )
-from holdfast.protocol import ILLEGAL_ADDRESS, LAST_ADDRESS, MAX_UNIT
+from holdfast.protocol import ILLEGAL_ADDRESS, LAST_ADDRESS, MAX_UNIT, READ_LIMITS
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
@@ -79,11 +80,21 @@ def usable() -> Iterator[None]:
 
 
 def read_raw(
-    client: SyncClient, area: Area, address: int, count: int, unit: int | None = None
+    client: SyncClient,
+    area: Area,
+    address: int,
+    count: int,
+    *,
+    element: int = 1,
+    unit: int | None = None,
 ) -> list[int]:
-    """Reads bits or registers, in several requests if necessary."""
+    """Reads bits or registers, in several requests if necessary, as `read_range` does."""
     kind = "bool" if area in BIT_AREAS else "uint16"
-    raw: list[int] = client.read(area, address, f"{kind}[{count}]", unit=unit)
+    size = whole_elements(READ_LIMITS[area], element)
+    raw: list[int] = []
+    for start in range(address, address + count, size):
+        most = min(size, address + count - start)
+        raw += client.read(area, start, f"{kind}[{most}]", unit=unit)
     return raw
 
 

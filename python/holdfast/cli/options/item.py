@@ -13,8 +13,13 @@ from typing import TYPE_CHECKING
 import click
 from click.shell_completion import CompletionItem
 
-from holdfast.cli.options.option import Command
-from holdfast.cli.options.plc_addresses import MODICON_NUMBER, Place, of_iec, of_modicon
+from holdfast.cli.options.option import Command, whole_number
+from holdfast.cli.options.plc_addresses import (
+    MODICON_NUMBER,
+    Place,
+    of_modicon,
+    of_number,
+)
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.runtime.text import listing, suggestion
 from holdfast.types import AREAS, SHORT_AREAS, SHORT_OF
@@ -44,17 +49,10 @@ class Item:
     order: str
 
 
-def number(text: str) -> int | None:
-    """Parses a non-negative integer, decimal or 0x. Returns `None` for other text."""
-    if re.fullmatch("0[xX][0-9a-fA-F]{1,20}", text):
-        return int(text, 16)
-    return int(text) if re.fullmatch("[0-9]{1,20}", text) else None
-
-
 def span(text: str, last: int = LAST_ADDRESS) -> range | None:
     """Parses FIRST-LAST or a single number, up to `last`. Returns `None` for other text."""
     first, dash, end = text.strip().partition("-")
-    numbers = number(first), number(end if dash else first)
+    numbers = whole_number(first), whole_number(end if dash else first)
     if numbers[0] is None or numbers[1] is None or not numbers[0] <= numbers[1] <= last:
         return None
     return range(numbers[0], numbers[1] + 1)
@@ -112,7 +110,7 @@ def take(words: Sequence[str], *, modicon: bool = False) -> tuple[Item, list[str
         raise click.UsageError("Missing argument 'AREA'.")
     text = left.pop(0)
     head, *parts = text.split(":")
-    place, count = _numbered(head, modicon=modicon), None
+    place, count = of_number(head, modicon=modicon), None
     if place is None:
         area = area_of(head)
         if not parts:
@@ -139,7 +137,7 @@ def take_range(words: Sequence[str], *, modicon: bool = False) -> tuple[Item, in
         raise click.UsageError(f"Got unexpected extra argument ({' '.join(left[1:])}).")
     count = item.count
     if left:
-        count = number(left[0])
+        count = whole_number(left[0])
         if count is None or not 1 <= count <= ADDRESSES:
             raise click.UsageError(f"COUNT is {left[0]!r}, allowed: 1 to {ADDRESSES}.")
     return item, count
@@ -172,7 +170,7 @@ def are_several(words: Sequence[str], *, modicon: bool) -> bool:
     item, left = take(words, modicon=modicon)
     if not left:
         return ":" in words[0] and item.count is None
-    if number(left[0]) is None:
+    if whole_number(left[0]) is None:
         # `hr 0 x` has a wrong COUNT, `hr 0 hr 4` and `hr 0 4x0003` have another item.
         return (
             ":" in words[0]
@@ -200,27 +198,6 @@ def words_argument(metavar: str, *, required: bool = False) -> Callable[[Command
     return click.argument(
         "words", nargs=-1, required=required, metavar=metavar, shell_complete=complete
     )
-
-
-def _numbered(text: str, *, modicon: bool) -> Place | None:
-    """The place of a number that names its area: Modicon's, or IEC's. `None` for other text."""
-    if text.startswith("%"):
-        return of_iec(text)
-    match = MODICON_NUMBER.fullmatch(text)
-    if match is not None and text[:2] in ("0x", "0X") and not modicon:
-        meant = of_modicon(text).address
-        raise click.UsageError(
-            f"{text!r} is not clear: type co:{meant} for the Modicon number, or name the area of "
-            f"the address {int(text, 16)}, as in hr:{text}."
-        )
-    if match is not None or (modicon and not text[:1].isalpha()):
-        return of_modicon(text)
-    if number(text) is not None:
-        raise click.UsageError(
-            f"{text!r} has no area: type hr:{text} for a holding register, counted from 0, or "
-            "co, di, ir instead of hr."
-        )
-    return None
 
 
 def _addressed(text: str, area: Area, *, modicon: bool) -> tuple[Place, int | None]:

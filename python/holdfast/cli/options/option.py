@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -167,3 +168,10 @@ def require_known(name: str, names: Collection[str], unknown: str, kind: str) ->
         known = listing(names) or f"none, there are no {kind}"
         near = suggestion(name, names)
         raise click.UsageError(f"{unknown} {name!r}, allowed: {known}{near}")
+
+
+def whole_number(text: str) -> int | None:
+    """Parses a non-negative integer, decimal or 0x. Returns `None` for other text."""
+    if re.fullmatch("0[xX][0-9a-fA-F]{1,20}", text):
+        return int(text, 16)
+    return int(text) if re.fullmatch("[0-9]{1,20}", text) else None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli.options.option import flag
+from holdfast.cli.options.option import flag, whole_number
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.types import AREAS
 
@@ -44,6 +44,27 @@ class Place:
 
     area: Area
     address: int
+
+
+def of_number(text: str, *, modicon: bool) -> Place | None:
+    """The place of a number that names its area: Modicon's, or IEC's. `None` for other text."""
+    if text.startswith("%"):
+        return of_iec(text)
+    match = MODICON_NUMBER.fullmatch(text)
+    if match is not None and text[:2] in ("0x", "0X") and not modicon:
+        meant = of_modicon(text).address
+        raise click.UsageError(
+            f"{text!r} is not clear: type co:{meant} for the Modicon number, or name the area of "
+            f"the address {int(text, 16)}, as in hr:{text}."
+        )
+    if match is not None or (modicon and not text[:1].isalpha()):
+        return of_modicon(text)
+    if whole_number(text) is not None:
+        raise click.UsageError(
+            f"{text!r} has no area: type hr:{text} for a holding register, counted from 0, or "
+            "co, di, ir instead of hr."
+        )
+    return None
 
 
 def of_modicon(text: str) -> Place:

@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING
 
 from holdfast.client.url import STRICT, SerialTarget
 from holdfast.scanner.errors import Refused
+from holdfast.scanner.messages.subject_parts import subject_id
 from holdfast.scanner.subscriptions.subscription import SETTINGS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from holdfast.client.url import Target
     from holdfast.scanner.subscriptions.device import ScannedDevice, Source
     from holdfast.scanner.subscriptions.subscription import Subscription
@@ -69,6 +72,19 @@ def check_tags(device: ScannedDevice, subscription: Subscription) -> None:
             conflict = f"tag {id!r} of {device.id} already has another definition: {difference}"
             users = [name for name in device.users(id) if name != subscription.subscriber]
             _check_unused(conflict, users)
+
+
+def check_subject(id: str, owners: Mapping[str, str]) -> None:
+    """Checks that no other device has the same name in subjects. Raises `Refused`.
+
+    `owners` are the ids of devices by their names in subjects.
+    """
+    name = subject_id(id)
+    if name in owners:
+        raise Refused(
+            f"deviceId {id!r} has the same name in subjects as {owners[name]!r}, which is known: "
+            f"{name}; give one of them another id"
+        )
 
 
 def check_settings(target: Target, other: ScannedDevice) -> None:

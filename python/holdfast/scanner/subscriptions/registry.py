@@ -14,6 +14,7 @@ from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.subject_parts import subject_id
 from holdfast.scanner.subscriptions.conflicts import (
     check_settings,
+    check_subject,
     check_tags,
     connection_of,
     merged,
@@ -134,7 +135,7 @@ class Registry:
         """
         self._check_limits(device, subscription, new_tags)
         if device is None:
-            self._check_subject(subscription.device)
+            check_subject(subscription.device, self._subjects)
             self._check_shared(subscription)
             self._dialect.check_tag_ids((), subscription.tags)
             return subscription.source, None
@@ -239,16 +240,6 @@ class Registry:
         ids.discard(id)
         if not ids:
             self._tags_by_name.pop(name, None)
-
-    def _check_subject(self, id: str) -> None:
-        """Checks that no other device has the same name in subjects. Raises `Refused`."""
-        name = subject_id(id)
-        owner = self._subjects.get(name)
-        if owner is not None:
-            raise Refused(
-                f"deviceId {id!r} has the same name in subjects as {owner!r}, which is known: "
-                f"{name}; give one of them another id"
-            )
 
     def _check_shared(self, subscription: Subscription) -> None:
         """Checks that a device has the settings of others on its connection. Raises `Refused`."""
