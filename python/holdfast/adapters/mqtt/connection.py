@@ -1,8 +1,6 @@
 """One connection to a broker: paho's client, but messages are received here.
 
-- A message is acknowledged after it was written, with every quality of service. With QoS 2 paho
-  sends PUBREC before it delivers the message, so a crash between the two would lose the message.
-- A message that a memory can't keep at the moment is not acknowledged, and the connection ends.
+- A message that a memory can't keep at the moment ends the connection.
 - The properties of a message are parsed here, in linear time.
 - A packet over the size limit is not kept in memory while it arrives.
 """
@@ -13,10 +11,10 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
+from holdfast.adapters.mqtt.deliveries import Deliveries, NotKept
 from holdfast.adapters.mqtt.inbox import MAX_PAYLOAD_BYTES
-from holdfast.ingest import KEEPING
 from holdfast.net.mqtt.client import BrokerClient
-from holdfast.net.mqtt.packets import MAX_PROPERTIES_BYTES, acknowledgement, parse_publish
+from holdfast.net.mqtt.packets import MAX_PROPERTIES_BYTES
 from holdfast.net.mqtt.stream import Packets
 
 if TYPE_CHECKING:
@@ -47,10 +45,7 @@ _LARGEST = MAX_PAYLOAD_BYTES + _KEPT
 
 _READ_BYTES = 65_536
 
-_RETAIN, _DUP = 0x01, 0x08
-"""Flags of PUBLISH."""
-
-_PUBLISH, _PUBACK, _PUBREC, _PUBREL, _PUBCOMP, _PINGRESP = 0x30, 0x40, 0x50, 0x60, 0x70, 0xD0
+_PUBLISH, _PUBREL, _PINGRESP = 0x30, 0x60, 0xD0
 
 
 class _Pending(NamedTuple):
@@ -77,8 +72,7 @@ class BrokerConnection(BrokerClient):
         `answer` is called for each message, after its acknowledgement.
         """
         super().__init__(settings, settings.client_id, waiter, session_expiry=SESSION_EXPIRY_S)
-        self._unreleased = unreleased
-        self._inbox = inbox
+        self._deliveries = Deliveries(inbox, unreleased, five=self._five)
         self._answer = answer
         self._largest_sent: int | None = None
         self.most_qos = 1
@@ -171,49 +165,17 @@ class BrokerConnection(BrokerClient):
         if first & 0xF0 == _PUBLISH:
             self._take(first, body, size)
         elif first & 0xF0 == _PUBREL:
-            if len(body) < 2:
-                raise ValueError("a PUBREL packet without identifier")
-            identifier = int.from_bytes(body[:2])
-            self._unreleased.discard(identifier)
-            self._acknowledge(_PUBCOMP, identifier)
+            self.connection.put(self._deliveries.release(body))
         else:
             self.pass_on(first, body)
 
     def _take(self, first: int, body: bytes | bytearray, size: int) -> None:
         try:
-            message = parse_publish(first, body, size, five=self._five)
-        except ValueError as error:
-            self.end(f"malformed message: {error}")
+            taken = self._deliveries.take(first, body, size)
+        except (ValueError, NotKept) as error:
+            self.end(str(error))
             return
-        if message.qos == 2 and message.identifier in self._unreleased:
-            self._acknowledge(_PUBREC, message.identifier)
-            return
-        result = self._inbox.take(message, stale=_staleness(first))
-        if message.qos and result.get("reason") in KEEPING:
-            # Without an acknowledgement, the broker sends the message again after a reconnect.
-            self.end(str(result["detail"]))
-            return
-        if message.qos == 1:
-            self._acknowledge(_PUBACK, message.identifier)
-        elif message.qos == 2:
-            self._unreleased.add(message.identifier)
-            self._acknowledge(_PUBREC, message.identifier)
-        # The answer follows the acknowledgement: if the broker closes the connection because of
-        # the answer, it does not deliver the message again.
-        if self.connection.failure is None:
-            self._answer(self, message, result)
-
-    def _acknowledge(self, first: int, identifier: int) -> None:
-        self.connection.put(acknowledgement(first, identifier))
-
-
-def _staleness(first: int) -> str | None:
-    """Why a message may be old, by the first byte of its packet.
-
-    `None` if nothing says so: what the broker has kept for a session looks like any new message.
-    """
-    if first & _RETAIN:
-        return "the message is retained, so its command may be old"
-    if first & _DUP:
-        return "the broker delivers the message again, and its command may be carried out already"
-    return None
+        if taken.acknowledgement:
+            self.connection.put(taken.acknowledgement)
+        if taken.result is not None and self.connection.failure is None:
+            self._answer(self, taken.message, taken.result)

@@ -25,7 +25,7 @@ from holdfast.net.addresses import joined
 from holdfast.net.mqtt.client import BrokerClient
 from holdfast.net.mqtt.packets import acknowledgement, parse_publish
 from holdfast.net.mqtt.stream import Packets
-from holdfast.outputs.mqtt.delivery import Message, packed, size_of
+from holdfast.outputs.mqtt.delivery import MAX_IN_FLIGHT, Message, packed, size_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -37,10 +37,6 @@ if TYPE_CHECKING:
     from holdfast.net.mqtt.packets import Publish
     from holdfast.net.mqtt.selector import Waiter
     from holdfast.outputs.mqtt.delivery import Delivery
-
-WINDOW = {"5": 1000, "3.1.1": 100}
-"""Messages that are sent and not confirmed, unless the broker allows fewer. MQTT 3.1.1 has no way
-to tell."""
 
 FIRST_IDENTIFIER, LAST_IDENTIFIER = 5000, 65535
 """Packet identifiers of messages. paho counts those of subscriptions from 1."""
@@ -78,7 +74,7 @@ class Connection(BrokerClient):
         super().__init__(settings, client_id, waiter, session_expiry=0)
         self._on_command = on_command
         self._qos, self._proves = qos, proves
-        self._window = WINDOW[settings.version]
+        self._max_in_flight = MAX_IN_FLIGHT[settings.version]
         self._largest: int | None = None
         self._retains = True
         self._packets = Packets(MAX_PACKET_BYTES)
@@ -92,7 +88,9 @@ class Connection(BrokerClient):
 
     def accepted(self, properties: Properties | None) -> None:
         """Applies the limits from the broker's CONNACK."""
-        self._window = min(getattr(properties, "ReceiveMaximum", self._window), self._window)
+        self._max_in_flight = min(
+            getattr(properties, "ReceiveMaximum", self._max_in_flight), self._max_in_flight
+        )
         self._largest = getattr(properties, "MaximumPacketSize", None)
         self._retains = bool(getattr(properties, "RetainAvailable", 1))
         self._qos = min(getattr(properties, "MaximumQoS", self._qos), self._qos)
@@ -145,9 +143,9 @@ class Connection(BrokerClient):
     def send_more(self) -> bool:
         """Sends waiting messages, as many as the broker may have. Returns whether some are done."""
         news = False
-        while self._waiting and len(self._in_flight) < self._window:
+        while self._waiting and len(self._in_flight) < self._max_in_flight:
             delivery = self._waiting[0]
-            news |= self._send(delivery, self._window - len(self._in_flight))
+            news |= self._send(delivery, self._max_in_flight - len(self._in_flight))
             if delivery.sent == len(delivery.messages):
                 self._waiting.popleft()
         if self._written and self._proves:

@@ -9,6 +9,10 @@ from holdfast.net.mqtt.packets import head
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+MAX_IN_FLIGHT = {"5": 1000, "3.1.1": 100}
+"""Messages that are sent and not confirmed, by the version of MQTT, unless the broker allows fewer.
+MQTT 3.1.1 has no way to tell."""
+
 NO_PROPERTIES = b"\0"
 """The properties of a message without any, in MQTT 5."""
 
