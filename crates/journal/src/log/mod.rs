@@ -21,6 +21,7 @@ mod defaults;
 mod digests;
 mod error;
 mod layout;
+mod lease_terms;
 mod log_reader;
 mod parts;
 #[cfg(feature = "fuzz")]

@@ -8,20 +8,16 @@ use std::time::Duration;
 
 use aws_lc_rs::digest::{SHA256, digest};
 use bytes::Buf;
-use holdfast_memory::{
-    CarriedOut, Contents, Memory, Outcome, Refusal, Refused, Step, Tenure, Term,
-};
+use holdfast_memory::{CarriedOut, Contents, Memory, Outcome, Step};
 use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
 
 use super::error::LogError;
+use super::lease_terms::LeaseTerms;
 use super::settings::is_word;
 use crate::log::stream::message::{
     self, MAX_NODES, Message, MessageError, Origin, VERSION, WITHOUT_LEASES,
 };
-
-/// The most leases whose last term is known. Without one, all steps are carried out.
-const MAX_LEASES: usize = 65_536;
 
 /// An encoded state begins with it.
 const MARK: [u8; 3] = *b"HFS";
@@ -34,8 +30,7 @@ pub(super) struct State {
     pub(super) steps: u64,
     /// The start and the last counter that were applied of each node.
     pub(super) origins: BTreeMap<String, (u64, u64)>,
-    /// The last term of each lease.
-    pub(super) terms: BTreeMap<u64, Term>,
+    pub(super) terms: LeaseTerms,
 }
 
 /// A message of the stream.
@@ -78,7 +73,7 @@ impl State {
             place: Place::default(),
             steps: 0,
             origins: BTreeMap::new(),
-            terms: BTreeMap::new(),
+            terms: LeaseTerms::default(),
         }
     }
 
@@ -137,27 +132,11 @@ impl State {
         let at = |done| CarriedOut { sequence: Some(place.sequence), ..done };
         let age = age(&origin);
         let carried_out = |step: &Step| {
-            self.admit(step.tenure)?;
+            self.terms.admit(step.tenure)?;
             step.carry_out_late(&self.members, age).map(at)
         };
         let outcomes = steps.iter().map(carried_out).collect();
         Ok(Applied::Fresh { origin, compares, outcomes })
-    }
-
-    /// Refuses what a former holder of a lease has written, if the present one came before it in the log: a
-    /// cut network delivers it late.
-    fn admit(&mut self, tenure: Option<Tenure>) -> Result<(), Refused> {
-        let Some(Tenure { lease, term }) = tenure else { return Ok(()) };
-        let last = self.terms.get(&lease);
-        if last.is_some_and(|last| term < *last) {
-            return Err(Refused { index: 0, refusal: Refusal::Overtaken });
-        }
-        // All nodes forget the same one.
-        if last.is_none() && self.terms.len() == MAX_LEASES {
-            self.terms.pop_first();
-        }
-        self.terms.insert(lease, term);
-        Ok(())
     }
 
     /// The version of the encoded state.
@@ -169,7 +148,7 @@ impl State {
         let contents = Memory::contents(&self.members);
         let len: usize =
             contents.iter().flat_map(|contents| &contents.areas).map(|area| area.len() + 8).sum();
-        let mut out = Vec::with_capacity(len + 64 + (self.origins.len() + self.terms.len()) * 96);
+        let mut out = Vec::with_capacity(len + 64 + self.origins.len() * 96);
         out.extend_from_slice(&MARK);
         out.push(self.version());
         out.extend_from_slice(&self.place.sequence.to_le_bytes());
@@ -183,12 +162,7 @@ impl State {
             out.extend_from_slice(&counter.to_le_bytes());
         }
         if !self.terms.is_empty() {
-            out.extend_from_slice(&(self.terms.len() as u32).to_le_bytes());
-            for (lease, Term { epoch, since }) in &self.terms {
-                for number in [lease, epoch, since] {
-                    out.extend_from_slice(&number.to_le_bytes());
-                }
-            }
+            self.terms.encode(&mut out);
         }
         out.extend_from_slice(&(contents.len() as u32).to_le_bytes());
         for Contents { areas, sealed } in &contents {
@@ -239,7 +213,7 @@ struct Loaded {
     place: Place,
     steps: u64,
     origins: BTreeMap<String, (u64, u64)>,
-    terms: BTreeMap<u64, Term>,
+    terms: LeaseTerms,
     contents: Vec<Contents>,
 }
 
@@ -255,13 +229,8 @@ fn loaded(bytes: &mut &[u8], version: u8, members: &[Arc<Memory>]) -> Option<Loa
         let node = is_word(node).then(|| node.to_owned())?;
         origins.insert(node, (bytes.try_get_u64_le().ok()?, bytes.try_get_u64_le().ok()?));
     }
-    let mut terms = BTreeMap::new();
-    let count = if version == VERSION { bytes.try_get_u32_le().ok()? } else { 0 };
-    for _ in 0..count {
-        let lease = bytes.try_get_u64_le().ok()?;
-        let epoch = bytes.try_get_u64_le().ok()?;
-        terms.insert(lease, Term { epoch, since: bytes.try_get_u64_le().ok()? });
-    }
+    let has_leases = version == VERSION;
+    let terms = if has_leases { LeaseTerms::decode(bytes)? } else { LeaseTerms::default() };
     if bytes.try_get_u32_le().ok()? as usize != members.len() {
         return None;
     }
@@ -286,7 +255,7 @@ fn contents(bytes: &mut &[u8], memory: &Memory) -> Option<Contents> {
 
 #[cfg(test)]
 mod tests {
-    use holdfast_memory::{Area, Layout, Span};
+    use holdfast_memory::{Area, Layout, Span, Tenure, Term};
 
     use super::*;
 
@@ -317,27 +286,21 @@ mod tests {
         let mut state = State::new(vec![member()]);
         assert_eq!(state.encode()[3], WITHOUT_LEASES);
         let tenure = |epoch, since| Some(Tenure { lease: 7, term: Term { epoch, since } });
-        state.admit(None).unwrap();
+        state.terms.admit(None).unwrap();
         assert_eq!(state.version(), WITHOUT_LEASES);
-        state.admit(tenure(1, 5)).unwrap();
+        state.terms.admit(tenure(1, 5)).unwrap();
         let saved = state.encode();
         assert_eq!(saved[3], VERSION);
         let mut loaded = State::new(vec![member()]);
         loaded.load(&saved, state.place).unwrap();
         assert_eq!((loaded.encode(), &loaded.terms), (saved, &state.terms));
-        assert!(loaded.admit(tenure(1, 4)).is_err() && loaded.admit(tenure(0, 9)).is_err());
-        assert!(loaded.admit(tenure(1, 5)).is_ok() && loaded.admit(tenure(2, 1)).is_ok());
-        assert!(loaded.admit(tenure(1, 9)).is_err());
-    }
-
-    #[test]
-    fn the_leases_that_are_known_are_limited() {
-        let mut state = State::new(Vec::new());
-        for lease in 0..MAX_LEASES as u64 + 2 {
-            state.admit(Some(Tenure { lease, term: Term::default() })).unwrap();
-        }
-        assert_eq!(state.terms.len(), MAX_LEASES);
-        assert!(!state.terms.contains_key(&1) && state.terms.contains_key(&2));
+        assert!(
+            loaded.terms.admit(tenure(1, 4)).is_err() && loaded.terms.admit(tenure(0, 9)).is_err()
+        );
+        assert!(
+            loaded.terms.admit(tenure(1, 5)).is_ok() && loaded.terms.admit(tenure(2, 1)).is_ok()
+        );
+        assert!(loaded.terms.admit(tenure(1, 9)).is_err());
     }
 
     #[test]

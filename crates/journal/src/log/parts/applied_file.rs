@@ -48,8 +48,7 @@ impl Note {
     /// The contents of this state, and the note about them. `None` if the note can't be encoded.
     pub(in crate::log) fn checkpoint(state: &State, log: &str, stream: &str) -> Option<Checkpoint> {
         let contents = Memory::contents(&state.members);
-        let terms = state.terms.iter();
-        let numbers = terms.map(|(lease, term)| (*lease, (term.epoch, term.since)));
+        let numbers = state.terms.iter().map(|(lease, term)| (lease, (term.epoch, term.since)));
         let note = Note {
             version: state.version(),
             log: log.to_owned(),
