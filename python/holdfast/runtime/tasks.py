@@ -1,4 +1,4 @@
-"""Tasks of asyncio: their end, and the heartbeat of their event loop."""
+"""Tasks of asyncio: their end, waiting with a limit, and the heartbeat of their event loop."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.runtime.heartbeat import PERIOD_S
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable
+    from collections.abc import AsyncIterator, Awaitable, Iterable
 
     from holdfast.runtime.heartbeat import Heartbeat
 
@@ -41,6 +41,13 @@ async def end(tasks: Iterable[asyncio.Task[Any]]) -> None:
         for task in done:
             if not task.cancelled():
                 task.exception()  # Marks it retrieved.
+
+
+async def within(seconds: float | None, step: Awaitable[object]) -> None:
+    """Waits until a step is done, or these seconds have passed; `None`: without a limit."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            await step
 
 
 @contextlib.asynccontextmanager

@@ -109,9 +109,7 @@ class Presence:
             if self._placement.writes_heartbeat:
                 await self.heartbeat.beat(self._client())
             tasks.check()  # nats-py may have swallowed a cancellation during the heartbeat.
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(HEARTBEAT_INTERVAL_S):
-                    await self._is_due.wait()
+            await tasks.within(HEARTBEAT_INTERVAL_S, self._is_due.wait())
 
     async def stop(self) -> None:
         """Deletes the heartbeat, unless other nodes of the fleet go on with it."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import threading
 from typing import TYPE_CHECKING
@@ -31,7 +30,7 @@ from holdfast.scanner.subscriptions.registry import Registry
 from holdfast.scanner.subscriptions.request_rules import Rules
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Sequence
+    from collections.abc import Sequence
 
     from nats.aio.msg import Msg
 
@@ -227,10 +226,10 @@ class Scanner:
         # First nothing new may begin; then other nodes take over while this one still polls.
         self._buckets.connected(None)
         await self._placement.leave()
-        await _within(self._polling.stop())
+        await tasks.within(STOP_STEP_TIMEOUT_S, self._polling.stop())
         self._responder.cancel()
-        await _within(self._publish_end())
-        await _within(tasks.end(running))
+        await tasks.within(STOP_STEP_TIMEOUT_S, self._publish_end())
+        await tasks.within(STOP_STEP_TIMEOUT_S, tasks.end(running))
 
     async def _publish_end(self) -> None:
         """Deletes heartbeat and states, and waits until all messages are sent."""
@@ -251,9 +250,3 @@ def _buckets(settings: Settings) -> Buckets:
     if settings.dialect == "tentacle-next":
         return TentacleNextBuckets(settings.prefix, settings.watch_times)
     return Buckets()
-
-
-async def _within(step: Awaitable[object]) -> None:
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(STOP_STEP_TIMEOUT_S):
-            await step

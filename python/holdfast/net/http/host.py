@@ -28,6 +28,7 @@ from holdfast.net.http.requests import (
     Response,
     rejection,
 )
+from holdfast.runtime import tasks
 from holdfast.runtime.heartbeat import PERIOD_S, Heartbeat
 
 if TYPE_CHECKING:
@@ -160,8 +161,7 @@ class Host:
                 self.heartbeat.beat()
                 self._review(server)
                 self._log_events(server)
-                with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(stopped.wait(), PERIOD_S)
+                await tasks.within(PERIOD_S, stopped.wait())
             await self._end(server)
             transport.close()
         finally:

@@ -25,6 +25,7 @@ from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.net.secret_file import read_secret
 from holdfast.net.secure_channel import SecureChannel, failure_text
 from holdfast.net.tls import NO_FILES, Tls
+from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
@@ -302,9 +303,7 @@ async def _given_up(client: SafeClient, ended: asyncio.Event) -> None:
     """Returns when nats-py has closed a client, or connects no more. It does not always call the
     callback."""
     while not (ended.is_set() or client.is_closed or client.is_left):
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(CHECK_INTERVAL_S):
-                await ended.wait()
+        await tasks.within(CHECK_INTERVAL_S, ended.wait())
     ended.set()
 
 

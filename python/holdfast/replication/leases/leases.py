@@ -34,6 +34,7 @@ from holdfast.replication.leases.bucket import (
     Outdated,
 )
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
+from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
@@ -202,9 +203,7 @@ class Leases:
                         if is_due or held.is_late:
                             self._begin(self._renew(key, held))
                     self._take_free(now)
-                with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(min(TICK_S, max(due - now, 0.0))):
-                        await self._news.wait()
+                await tasks.within(min(TICK_S, max(due - now, 0.0)), self._news.wait())
                 self._news.clear()
         except Exception:
             for key in self._held.copy():

@@ -161,9 +161,7 @@ class FleetMember(Placement):
         The server may have forgotten who follows it, or have lost the bucket.
         """
         while True:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(self._check_interval_s):
-                    await self._has_new_client.wait()
+            await tasks.within(self._check_interval_s, self._has_new_client.wait())
             client = self.client
             if client is None:
                 await asyncio.sleep(CONNECTION_CHECK_S)
@@ -184,10 +182,8 @@ class FleetMember(Placement):
     async def _adopt_changes(self) -> None:
         """Carries out what other nodes have stored."""
         while True:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(ADOPT_RETRY_S):
-                    await self._has_touched.wait()
-                    self._has_touched.clear()
+            await tasks.within(ADOPT_RETRY_S, self._has_touched.wait())
+            self._has_touched.clear()
             if not self._touched:
                 self._touched, self._failed = self._failed, set()
             touched, self._touched = self._touched, set()

@@ -7,7 +7,6 @@ can't use its devices renews no lease, so that others take them.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import time
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.events import log_lines
 from holdfast.replication.leases.leases import Leases
 from holdfast.replication.leases.thread import LeaseThread, Relay
+from holdfast.runtime import tasks
 from holdfast.runtime.heartbeat import Heartbeat
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms, digest
 from holdfast.scanner.fleet.assignment import assigned
@@ -239,9 +239,7 @@ class PartitionLeases:
         """
         known: list[str] = []
         while True:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(CHECK_INTERVAL_S):
-                    await self._has_changed.wait()
+            await tasks.within(CHECK_INTERVAL_S, self._has_changed.wait())
             await asyncio.sleep(GATHER_S)
             self._has_changed.clear()
             self._check_name()

@@ -109,9 +109,7 @@ class KeyWatch:
     async def read(self) -> None:
         """Waits until the bucket is read for the first time, but not for long."""
         if not self.tried.is_set():
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(MAX_FIRST_READ_WAIT_S):
-                    await self.tried.wait()
+            await tasks.within(MAX_FIRST_READ_WAIT_S, self.tried.wait())
 
     async def run(self) -> None:
         """Follows the bucket, until it is cancelled."""

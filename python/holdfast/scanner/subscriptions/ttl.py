@@ -6,10 +6,10 @@ The time runs only while NATS is connected: a subscriber can't repeat a request 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import time
 from typing import TYPE_CHECKING
 
+from holdfast.runtime import tasks
 from holdfast.scanner.subscriptions.key import SubscriptionKey
 
 if TYPE_CHECKING:
@@ -62,6 +62,4 @@ class SubscriptionTtls:
             left = None
             if self._is_running and self._ends:
                 left = max(min(self._ends.values()) - self._clock(), 0.0)
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(left):
-                    await self._changed.wait()
+            await tasks.within(left, self._changed.wait())
