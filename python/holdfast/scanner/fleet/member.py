@@ -81,7 +81,10 @@ class FleetMember(Placement):
             start_thread=start_thread,
         )
         self._backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S, jitter=True)
-        self.desired = DesiredState(settings.name, self._on_change, self._on_loss)
+        self._applied: dict[str, int] = {}
+        """The revision of each device that is carried out here. Only that one may be replaced: one
+        that is newer has what others have changed."""
+        self.desired = DesiredState(settings.name, self._on_change, self._applied.clear)
         self._check_interval_s = settings.check_interval_s
         self._registry = registry
         self.client: Client | None = None
@@ -91,9 +94,6 @@ class FleetMember(Placement):
         self._failed: set[str] = set()
         self._renewed: dict[str, dict[str, int]] = {}
         """When subscribers with a time to live have renewed it, by device and subscriber."""
-        self._applied: dict[str, int] = {}
-        """The revision of each device that is carried out here. Only that one may be replaced: one
-        that is newer has what others have changed."""
         self._devices: dict[int, dict[str, ScannedDevice]] = {}
         self.is_joined = False
 
@@ -189,9 +189,6 @@ class FleetMember(Placement):
             touched, self._touched = self._touched, set()
             for device in touched:
                 await self._adopt(device)
-
-    def _on_loss(self) -> None:
-        self._applied.clear()
 
     def _on_change(self, device: str) -> None:
         self._touched.add(device)

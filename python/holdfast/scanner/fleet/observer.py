@@ -79,20 +79,18 @@ class Seen:
 class FleetObserver:
     """A connection that reads the bucket of leases."""
 
-    def __init__(self, fleet: str, servers: Servers, within_s: float = ANSWERING) -> None:
-        """`within_s` is the time to connect, and to read all that there is."""
+    def __init__(self, fleet: str, servers: Servers) -> None:
         self._fleet = fleet
         self._servers = servers
-        self._within_s = within_s
         self._seen: dict[str, Entry] = {}
         self._ending = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
         async with AsyncExitStack() as ending:
-            connecting = connected_once(self._servers, "holdfast fleet", self._within_s)
+            connecting = connected_once(self._servers, "holdfast fleet")
             began = time.monotonic()
             self._client = await ending.enter_async_context(connecting)
-            left = began + self._within_s - time.monotonic()
+            left = began + ANSWERING - time.monotonic()
             bucket, is_read = LeaseBucket(self._client, leases_of(self._fleet)), asyncio.Event()
             try:
                 async with asyncio.timeout(max(left, 0.0)):
@@ -148,7 +146,7 @@ class FleetObserver:
         """Has a node leave. Raises `FleetUnavailable` if it does not."""
         where = subject(prefix, node, "drain")
         try:
-            answer = await self._client.request(where, b"", timeout=self._within_s)
+            answer = await self._client.request(where, b"", timeout=ANSWERING)
             if not msgspec.json.decode(answer.data, type=dict[str, Any]).get("success"):
                 raise FleetUnavailable(f"node {node} does not leave")
         except NoRespondersError:

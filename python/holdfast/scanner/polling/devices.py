@@ -12,7 +12,6 @@ from weakref import WeakValueDictionary
 from holdfast.events import log_lines
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.types import UnsubscribeRequest
-from holdfast.scanner.polling.poller import has_extra_scans
 from holdfast.scanner.subscriptions.health import Health
 from holdfast.scanner.subscriptions.ttl import SubscriptionTtls
 
@@ -28,6 +27,9 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.subscription import Subscription
     from holdfast.types import PolledBlock
+
+EXTRA_SCAN_ABOVE_MS = 1000
+"""At a scan interval of at most this, a new subscriber waits for the next regular scan."""
 
 
 @dataclass(eq=False)
@@ -84,7 +86,7 @@ class Devices:
         # A caller that subscribes to tags one by one knows the state already.
         if change.former is not None or not change.only_adds_tags:
             self._publishers.publish_state(device)
-        hurries = bool(change.fresh) and has_extra_scans(device)
+        hurries = bool(change.fresh) and device.rate > EXTRA_SCAN_ABOVE_MS
         if is_own and (change.polling or change.former or hurries):
             self._polling.renew(device)
         return change.new

@@ -57,15 +57,6 @@ MIN_CHANGE_INTERVAL_S = 0.1
 poll, and a caller may subscribe to a thousand tags one by one."""
 
 
-EXTRA_SCAN_ABOVE_MS = 1000
-"""At a scan interval of at most this, a new subscriber waits for the next regular scan."""
-
-
-def has_extra_scans(device: ScannedDevice) -> bool:
-    """Whether a new subscriber of tags gets a scan of its own."""
-    return device.rate > EXTRA_SCAN_ABOVE_MS
-
-
 class Polling:
     """Polls devices, from `start` on."""
 

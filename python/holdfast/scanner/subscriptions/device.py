@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from dataclasses import InitVar, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from holdfast.scanner.dialects import TENTACLE, Dialect
 from holdfast.scanner.subscriptions.latest_values import LatestBlocks
 
 if TYPE_CHECKING:
@@ -73,11 +72,10 @@ class ScannedDevice:
     address: Target
     """The target with the resolved address."""
     health: Health
+    subjects: tuple[str, ...]
+    """The names of the device in subjects; nearly always one."""
     writes: Writes = "tags"
     """Which of its tags may be written."""
-    dialect: InitVar[Dialect] = TENTACLE
-    subjects: tuple[str, ...] = ()
-    """The names of the device in subjects; nearly always one."""
     endpoint: Endpoint | None = None
     """The native form of `address`, for the poller."""
     subscribers: dict[str, Subscriber] = field(default_factory=dict)
@@ -93,9 +91,6 @@ class ScannedDevice:
     polled_as: str = ""
     """The device's name in the poller. Each change gives it a new one."""
     _looked_up: float = field(default_factory=time.monotonic)
-
-    def __post_init__(self, dialect: Dialect) -> None:
-        self.subjects = dialect.device_names(self.id)
 
     @property
     def rate(self) -> int:

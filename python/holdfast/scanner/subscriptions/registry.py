@@ -167,9 +167,9 @@ class Registry:
         former: ScannedDevice | None,
     ) -> ScannedDevice:
         """Adds a device; with the subscribers and the tags of the one that it replaces, if any."""
-        device = ScannedDevice(
-            subscription.device, source, address, Health(), self._writes, self._dialect
-        )
+        id = subscription.device
+        subjects = self._dialect.device_names(id)
+        device = ScannedDevice(id, source, address, Health(), subjects, self._writes)
         if former is not None:
             device.subscribers, device.tags = dict(former.subscribers), dict(former.tags)
             self._release_connection(former)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ScannerLimits:
-    """The limits of one scanner; times are in milliseconds.
+    """The limits of one scanner.
 
     Without limits, any caller could exhaust memory.
     """
@@ -40,10 +40,6 @@ class ScannerLimits:
     """Tags of one device."""
     subscribers: int = 100
     """Subscribers of one device."""
-    shortest_scan: int = MIN_SCAN_RATE
-    longest_scan: int = MAX_SCAN_RATE
-    shortest_timeout: int = MIN_TIMEOUT
-    longest_timeout: int = MAX_TIMEOUT
     request: int = 4 * 1024 * 1024
     """Size of a request in bytes."""
     command: int = 4096
@@ -80,20 +76,18 @@ class Rules:
 
         Unless the rules are strict, one that is too short is raised. Adds this to `adjustments`.
         """
-        limits = self.limits
         if requested is None:
             return self.defaults.scan_rate
-        if requested < limits.shortest_scan and not self.strict:
-            raised = f"{requested} to {limits.shortest_scan} ms"
+        if requested < MIN_SCAN_RATE and not self.strict:
+            raised = f"{requested} to {MIN_SCAN_RATE} ms"
             adjustments.changes.append(("scan_rate_raised", raised))
-            return limits.shortest_scan
-        return _within("scanRate", requested, limits.shortest_scan, limits.longest_scan)
+            return MIN_SCAN_RATE
+        return _within("scanRate", requested, MIN_SCAN_RATE, MAX_SCAN_RATE)
 
     def timeout(self, requested: int | None) -> int:
         """Returns the timeout of a request. Raises `Refused`."""
         timeout = self.defaults.timeout if requested is None else requested
-        limits = self.limits
-        return _within("timeout", timeout, limits.shortest_timeout, limits.longest_timeout)
+        return _within("timeout", timeout, MIN_TIMEOUT, MAX_TIMEOUT)
 
 
 def _within(key: str, value: int, least: int, most: int) -> int:
