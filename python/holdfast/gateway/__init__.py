@@ -75,15 +75,11 @@ class Gateway:
         stop.then(self._app.end)
         self._host.run(stop)
 
-    def counts(self) -> dict[str, int]:
-        """Returns the counts of connections. Thread-safe."""
-        return self._host.counts()
-
     def status(self) -> dict[str, object]:
         """Returns the address and the counts of connections and requests. Thread-safe."""
         return {
             "address": self.address,
-            "connections": self.counts(),
+            "connections": self._host.counts(),
             "tls_failures": self._host.tls_failures(),
             **self._app.counts(),
         }

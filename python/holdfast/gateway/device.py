@@ -21,7 +21,7 @@ from holdfast.gateway.broadcast import is_broadcast
 from holdfast.gateway.pool import Unusable
 from holdfast.gateway.shared_devices import QueueFull
 from holdfast.net.http.fields import malformed
-from holdfast.net.http.requests import BadRequest
+from holdfast.net.http.requests import BadRequest, RequestError
 from holdfast.net.resolver import NoSuchName
 from holdfast.protocol import BROADCAST_CODES, usual_port
 from holdfast.runtime.text import all_of
@@ -47,15 +47,8 @@ NO_BROADCAST = (
 UNIT_0 = "unit id 0 is the broadcast of serial lines, which has no response"
 
 
-class Failed(Exception):
-    """No connection, or no valid response: `reason` is a word, `detail` a sentence."""
-
-    def __init__(self, reason: str, detail: str) -> None:
-        self.reason = reason
-        self.detail = detail
-        self.headers: tuple[tuple[bytes, bytes], ...] = ()
-        """More headers of the response."""
-        super().__init__(f"{reason}: {detail}")
+class Failed(RequestError):
+    """No connection to the device, or no valid response from it."""
 
 
 class _RequestClient(Client):
@@ -106,8 +99,6 @@ class RequestedDevice:
         """
         try:
             return await self.attempt(call)
-        except ModbusException:
-            raise
         except (RequestTimeout, ConnectionLost, InvalidResponse) as error:
             raise self.failure(error) from None
 

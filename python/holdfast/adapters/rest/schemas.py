@@ -5,9 +5,12 @@ from __future__ import annotations
 from holdfast.adapters.diagnostics import HEALTH
 from holdfast.adapters.rest.refusals import REFUSALS
 from holdfast.net.http.schemas import (
+    BOOLEAN,
     COUNT,
     NUMBER,
+    NUMBER_OR_NULL,
     TEXT,
+    TEXT_OR_NULL,
     Schema,
     array_of,
     count,
@@ -20,8 +23,6 @@ from holdfast.protocol import LAST_ADDRESS, MAX_WORD
 from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS
 
 AT_LEAST_ONE: Schema = {"type": "integer", "minimum": 1}
-TEXT_OR_NULL: Schema = {"type": ["string", "null"]}
-NUMBER_OR_NULL: Schema = {"type": ["number", "null"]}
 REGISTER = integer(0, MAX_WORD)
 ADDRESS = integer(0, LAST_ADDRESS)
 
@@ -126,7 +127,7 @@ _MEMORY_FILE = object_of(
 _LOG = object_of(
     {
         "phase": {"enum": ["starting", "running", "returning", "failed", "stopped"]},
-        "connected": {"type": "boolean"},
+        "connected": BOOLEAN,
         "obstacle": TEXT_OR_NULL | {"description": "Why it is not caught up"},
         "contact_age": NUMBER_OR_NULL
         | {"description": "Seconds since the contents were current for sure"},
@@ -151,10 +152,7 @@ _AUDIT = object_of(
         "lines": count("Lines written"),
         "failed": count("Lines that are missing in the file"),
         "waiting": count("With fail: closed, lines that wait"),
-        "failing": {
-            "type": "boolean",
-            "description": "Whether the file could not be written last time",
-        },
+        "failing": BOOLEAN | {"description": "Whether the file could not be written last time"},
         "copies": map_of(_COPIES, "By name of the receiver: syslog, journald"),
     },
     is_open=True,
@@ -186,10 +184,7 @@ _DIAGNOSTICS: dict[str, Schema] = {
         {
             "areas": map_of(object_of({"start": COUNT, "size": AT_LEAST_ONE}))
             | {"propertyNames": ref("Area")},
-            "sealed": {
-                "type": "boolean",
-                "description": "Whether the memory refuses Modbus clients",
-            },
+            "sealed": BOOLEAN | {"description": "Whether the memory refuses Modbus clients"},
             "opened": count("How many times the seal opened"),
             "closed": count("How many times it closed again"),
         }
@@ -234,7 +229,7 @@ _DIAGNOSTICS: dict[str, Schema] = {
     ),
     "Mqtt": object_of(
         {
-            "connected": {"type": "boolean"},
+            "connected": BOOLEAN,
             "broker": TEXT_OR_NULL,
             "topics": {"type": "array"},
             "last_error": TEXT_OR_NULL,

@@ -40,9 +40,9 @@ export class Panel {
   /** Takes pairs of index and value. Returns the cells of the values that changed. */
   change({ values = [], texts = [], errors = [] }, mark = true) {
     const changed = new Set();
-    const take = (known, pairs) => {
+    const take = (known, pairs, placeOf = (index) => index) => {
       for (const [index, value] of pairs) {
-        if (known[index] !== value) changed.add(index);
+        if (known[index] !== value) changed.add(placeOf(index));
         known[index] = value;
       }
     };
@@ -53,14 +53,9 @@ export class Panel {
       else this.errors.set(index, error);
     }
     take(this.values, values);
-    const renamed = new Set();
-    for (const [index, text] of texts) {
-      if (this.texts[index] !== text) renamed.add(this.placeOf(index));
-      this.texts[index] = text;
-    }
-    const all = new Set([...changed, ...renamed]);
-    for (const index of all) this.render(index, mark);
-    return [...all].flatMap((index) => this.cellsOf(index));
+    take(this.texts, texts, (index) => this.placeOf(index));
+    for (const index of changed) this.render(index, mark);
+    return [...changed].flatMap((index) => this.cellsOf(index));
   }
 
   /** Returns the index in `values` of an index in `texts`. */

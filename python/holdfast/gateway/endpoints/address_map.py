@@ -14,19 +14,23 @@ from holdfast.gateway.endpoint import TARGET
 from holdfast.gateway.fields import ADDRESS_SCHEMA, AREA_LIST, MAP_READ_TIMEOUT_MS, timeout
 from holdfast.net.http.fields import Field, malformed
 from holdfast.net.http.requests import BadRequest
-from holdfast.net.http.schemas import integer
+from holdfast.net.http.schemas import BOOLEAN, integer
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_BITS
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Awaitable, Callable, Sequence
+    from typing import TypeAlias
 
+    from holdfast.client import Client
     from holdfast.discovery.address_search import AreaMap, Finding
     from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Given
     from holdfast.gateway.settings import GatewayLimits
     from holdfast.net.http.events import Stream
     from holdfast.types import Area
+
+    Call: TypeAlias = Callable[[Client], Awaitable[Any]]
 
 PATH = "/api/modbus/map"
 
@@ -44,7 +48,7 @@ def fields(limits: GatewayLimits) -> tuple[Field, ...]:
         AREA_LIST,
         Field("first", ADDRESS_SCHEMA, "The first address to map", 0),
         Field("last", ADDRESS_SCHEMA, "The last address to map", LAST_ADDRESS),
-        Field("exact", {"type": "boolean"}, "Read every address instead of samples", False),
+        Field("exact", BOOLEAN, "Read every address instead of samples", False),
         Field(
             "step", integer(1, ADDRESSES), "Largest distance of two samples", address_search.STEP
         ),
@@ -78,7 +82,7 @@ async def survey(given: Given, device: RequestedDevice, stream: Stream, longest:
     began = time.monotonic()
     await _require_reply(survey, device)
     await stream.begin()
-    running = asyncio.create_task(_run(survey, _Reader(device), longest))
+    running = asyncio.create_task(_run(survey, device, longest))
     sent = 0  # Findings that the client has.
     try:
         while not running.done():
@@ -104,7 +108,8 @@ async def _require_reply(survey: Survey, device: RequestedDevice) -> None:
     areas = survey.order
     for found in areas:
         try:
-            await _Reader(device).look(found.area, survey.span.start)
+            kind = "bool" if found.area in BIT_AREAS else "uint16"
+            await device.ask(_read(device, found.area, survey.span.start, kind))
         except ModbusException:  # An exception is a response: the device is reachable.
             pass
         except Failed as error:
@@ -114,11 +119,11 @@ async def _require_reply(survey: Survey, device: RequestedDevice) -> None:
         return
 
 
-async def _run(survey: Survey, reader: _Reader, longest: float) -> Failed | None:
+async def _run(survey: Survey, device: RequestedDevice, longest: float) -> Failed | None:
     """Carries out a survey. Returns why it ended early, or `None`."""
     try:
         async with asyncio.timeout(longest):
-            await address_search.run(survey, reader.read)
+            await address_search.run(survey, lambda *place: device.attempt(_read(device, *place)))
     except TimeoutError:
         return Failed("unfinished", f"not finished within {longest:g} s")
     except ModbusError as error:
@@ -131,24 +136,9 @@ async def _run(survey: Survey, reader: _Reader, longest: float) -> Failed | None
     return None
 
 
-class _Reader:
-    """The part of a client that a survey uses."""
-
-    def __init__(self, device: RequestedDevice) -> None:
-        self._device = device
-
-    async def look(self, area: Area, address: int) -> None:
-        """Makes the first read. Raises the exceptions of `RequestedDevice.ask`."""
-        kind = "bool" if area in BIT_AREAS else "uint16"
-        await self._device.ask(
-            lambda client: client.read(area, address, kind, unit=self._device.unit)
-        )
-
-    async def read(self, area: Area, address: int, kind: str) -> Any:
-        """Makes a read, with the request's timeout for each."""
-        return await self._device.attempt(
-            lambda client: client.read(area, address, kind, unit=self._device.unit)
-        )
+def _read(device: RequestedDevice, area: Area, address: int, kind: str) -> Call:
+    """Returns a read, for `ask` or `attempt`."""
+    return lambda client: client.read(area, address, kind, unit=device.unit)
 
 
 def _progress(survey: Survey, findings: Sequence[Finding]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.client.requests import OBJECT_NAMES
 from holdfast.gateway.endpoint import EXAMPLE, Endpoint
-from holdfast.net.http.schemas import integer
+from holdfast.net.http.schemas import TEXT_OR_NULL, integer
 
 if TYPE_CHECKING:
     from holdfast.gateway.device import RequestedDevice
@@ -16,7 +16,6 @@ _NAMES = {
     name: "".join(word if at == 0 else word.title() for at, word in enumerate(name.split("_")))
     for name in OBJECT_NAMES
 }
-_TEXT_OR_NULL = {"type": ["string", "null"]}
 _HEX = {"type": "string", "pattern": "^([0-9a-f]{2})*$"}
 
 
@@ -62,7 +61,7 @@ ENDPOINTS = (
         description="Function 43/14. It takes several requests if the device splits its objects.",
         carry_out=_identify,
         properties={
-            **dict.fromkeys(_NAMES.values(), _TEXT_OR_NULL),
+            **dict.fromkeys(_NAMES.values(), TEXT_OR_NULL),
             "conformityLevel": integer(0, 255),
             "objects": {
                 "type": "object",

@@ -59,6 +59,8 @@ QUANTITY = Field(
     allowed=f"an integer 1 to {READ_REGISTERS} for registers, 1 to {READ_BITS} for bits",
     example=10,
 )
+RANGE = (FUNCTION, ADDRESS, QUANTITY, DATATYPE, BYTE_ORDER)
+"""The fields of a `Range`."""
 
 
 class Range:
@@ -177,7 +179,7 @@ ENDPOINTS = (
         name="read",
         summary="Read coils, discrete inputs, holding or input registers",
         description=f"Functions 1 to 4. `values` are booleans, or register values 0 to {MAX_WORD}.",
-        fields=(FUNCTION, ADDRESS, QUANTITY, DATATYPE, BYTE_ORDER),
+        fields=RANGE,
         carry_out=_read,
         has_rtt=False,
         properties={

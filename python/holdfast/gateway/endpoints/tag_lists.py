@@ -17,6 +17,7 @@ from holdfast.net.http.schemas import (
     BOOLEAN,
     COUNT,
     NUMBER,
+    NUMBER_OR_NULL,
     TEXT,
     Schema,
     array,
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-_NUMBER_OR_NULL: Schema = {"type": ["number", "null"]}
 _SCALE = object_of(
     {"from": {"anyOf": [TEXT, {"type": "object"}]}, "as": {"enum": ["factor", "exponent"]}}
 ) | {"description": "The register that contains the scale: a tag, or its place"}
@@ -46,8 +46,8 @@ TAG = object_of(
         "scale": {"anyOf": [NUMBER, _SCALE]},
         "offset": NUMBER,
         "writable": BOOLEAN,
-        "min": _NUMBER_OR_NULL,
-        "max": _NUMBER_OR_NULL,
+        "min": NUMBER_OR_NULL,
+        "max": NUMBER_OR_NULL,
         "states": map_of(TEXT),
         "description": TEXT,
     },

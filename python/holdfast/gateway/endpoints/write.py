@@ -18,7 +18,7 @@ from holdfast.gateway.fields import (
     WRITE_TIMEOUT_MS,
 )
 from holdfast.net.http.fields import Field, malformed
-from holdfast.net.http.schemas import array, integer
+from holdfast.net.http.schemas import BOOLEAN, array, integer
 from holdfast.protocol import (
     ADDRESSES,
     LAST_ADDRESS,
@@ -127,7 +127,7 @@ ENDPOINTS = (
         properties={
             "address": ADDRESS_SCHEMA,
             "coilValue": {"enum": [0, ON]},
-            "written": {"type": "boolean", "description": "Whether the coil is now on"},
+            "written": BOOLEAN | {"description": "Whether the coil is now on"},
         },
         examples={"Coil 17 on": {**EXAMPLE, "address": 17, "value": True}},
         answer={"address": 17, "coilValue": ON, "written": True},

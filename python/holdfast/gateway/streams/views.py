@@ -12,13 +12,13 @@ from holdfast.client.tag_reading import TagReader, packed
 from holdfast.errors import ModbusError, ModbusException
 from holdfast.gateway.device import Failed, exception_text, problem
 from holdfast.gateway.endpoint import TARGET
-from holdfast.gateway.endpoints.read import FUNCTION, QUANTITY, Range
+from holdfast.gateway.endpoints.read import RANGE, Range
 from holdfast.gateway.endpoints.request_tags import LIST, MAX_TAGS, described, tags_of
-from holdfast.gateway.fields import ADDRESS, BYTE_ORDER, DATATYPE, POLL_TIMEOUT_MS, timeout
+from holdfast.gateway.fields import POLL_TIMEOUT_MS, timeout
 from holdfast.gateway.streams.watch import interval_field
 from holdfast.net.http.fields import Field, filled, malformed, object_with
 from holdfast.net.http.requests import BadRequest, shown
-from holdfast.net.http.schemas import Schema, integer
+from holdfast.net.http.schemas import BOOLEAN, Schema, integer
 from holdfast.tags.text import plain, text_of
 from holdfast.types import BIT_AREAS
 
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 PATH = "/api/modbus/watch/view"
 MAX_PARTS = 32
 
-RANGE = (FUNCTION, ADDRESS, QUANTITY, DATATYPE, BYTE_ORDER)
 ONLY = Field(
     "only",
     {
@@ -71,8 +70,8 @@ def fields(limits: GatewayLimits) -> tuple[Field, ...]:
         *TARGET,
         PARTS,
         interval_field(limits),
-        Field("once", {"type": "boolean"}, "End after the first event", False),
-        Field("describe", {"type": "boolean"}, "Whether `view` describes the tags", True),
+        Field("once", BOOLEAN, "End after the first event", False),
+        Field("describe", BOOLEAN, "Whether `view` describes the tags", True),
         MAX_STREAMS,
         timeout(POLL_TIMEOUT_MS, round(1000 * limits.timeout), "Timeout of each read in ms"),
     )

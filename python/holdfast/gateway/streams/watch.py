@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from holdfast.errors import ModbusException
 from holdfast.gateway.device import Failed, problem
 from holdfast.gateway.endpoint import TARGET
-from holdfast.gateway.endpoints.read import FUNCTION, QUANTITY, Range
-from holdfast.gateway.fields import ADDRESS, BYTE_ORDER, DATATYPE, POLL_TIMEOUT_MS, timeout
+from holdfast.gateway.endpoints.read import RANGE, Range
+from holdfast.gateway.fields import POLL_TIMEOUT_MS, timeout
 from holdfast.net.http.fields import Field
 from holdfast.net.http.requests import BadRequest
 from holdfast.net.http.schemas import integer
@@ -46,11 +46,7 @@ def fields(limits: GatewayLimits) -> tuple[Field, ...]:
     """Returns the fields of a request for a watch."""
     return (
         *TARGET,
-        FUNCTION,
-        ADDRESS,
-        QUANTITY,
-        DATATYPE,
-        BYTE_ORDER,
+        *RANGE,
         interval_field(limits),
         timeout(POLL_TIMEOUT_MS, round(1000 * limits.timeout), "Timeout of each poll in ms"),
     )

@@ -40,8 +40,8 @@ _JSON_WITH_PARAMETERS = re.compile(rb"application/json[ \t]*(;.*)?", re.I)
 _MAX_SHOWN = 40
 
 
-class BadRequest(Exception):
-    """A request is invalid or refused: `reason` is a word, `detail` a sentence."""
+class RequestError(Exception):
+    """An error that a request ends with: `reason` is a word, `detail` a sentence."""
 
     def __init__(self, reason: str, detail: str) -> None:
         self.reason = reason
@@ -49,6 +49,10 @@ class BadRequest(Exception):
         self.headers: tuple[tuple[bytes, bytes], ...] = ()
         """More headers of the response."""
         super().__init__(f"{reason}: {detail}")
+
+
+class BadRequest(RequestError):
+    """A request is invalid or refused."""
 
 
 class ClientDisconnected(Exception):
