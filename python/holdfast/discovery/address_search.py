@@ -591,16 +591,10 @@ def run_sync(
     carry_out(survey.steps(), answer)
 
 
-async def run(
-    survey: Survey,
-    read: Callable[[Area, int, str], Awaitable[object]],
-    progress: Callable[[Survey], object] | None = None,
-) -> None:
-    """Runs a survey; calls `progress` before every read. Raises `Unfinished`."""
+async def run(survey: Survey, read: Callable[[Area, int, str], Awaitable[object]]) -> None:
+    """Runs a survey. Raises `Unfinished`."""
 
     async def answer(probe: Probe) -> Outcome:
-        if progress is not None:
-            progress(survey)
         try:
             await read(probe.area, probe.address, _kind(probe))
         except ModbusError as error:

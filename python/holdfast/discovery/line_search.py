@@ -22,6 +22,7 @@ LINE_UNITS = tuple(range(1, 11))
 
 BAUDS = (9600, 19200, 38400, 57600, 115200, 4800, 2400, 1200)
 PARITIES: tuple[Parity, ...] = ("none", "even", "odd")
+"""The settings to try, the most common first."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,6 @@ class LineSettings:
         """The URL of the line with these settings."""
         stop = "&stop_bits=1" if self.parity == "none" else ""
         return f"{mode}://{device}?baud={self.baud}&parity={self.parity}{stop}"
-
-
-def line_settings(bauds: Sequence[int], parities: Sequence[Parity]) -> list[LineSettings]:
-    """The settings to try, the most common first."""
-    return [LineSettings(baud, parity) for baud in bauds for parity in parities]
 
 
 @dataclass(frozen=True)

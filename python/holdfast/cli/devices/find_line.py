@@ -16,6 +16,7 @@ from holdfast.cli.options.units import refuse_broadcast
 from holdfast.cli.signals import interruptions
 from holdfast.cli.terminal_text import number_ranges
 from holdfast.discovery import line_search
+from holdfast.discovery.line_search import LineSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -37,7 +38,7 @@ def find_line(
     """Finds the settings of a line, prints them, and exits with 1 if there are none."""
     units = asked or line_search.LINE_UNITS
     refuse_broadcast(units)
-    settings = line_search.line_settings(bauds, parities)
+    settings = [LineSettings(baud, parity) for baud in bauds for parity in parities]
     total = len(settings) * len(units)
     if sys.stderr.isatty():
         click.echo(
