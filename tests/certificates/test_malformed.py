@@ -23,7 +23,7 @@ OWNER = authority.new_key("p256")
 GOOD = {
     "CERTIFICATE": authority.pem(PLANT.issue_client("panel", "operator", OWNER, 9)),
     "X509 CRL": authority.list_pem(PLANT.revocation_list(None, [(7, authority.Reason.superseded)])),
-    "PRIVATE KEY": authority.key_pem(OWNER),
+    "PRIVATE KEY": parser.key_pem(OWNER),
 }
 
 

@@ -29,7 +29,7 @@ from holdfast.cli.terminal_text import print_json
 from holdfast.net.certificates import authority as making
 from holdfast.net.certificates import files as pem_files
 from holdfast.net.certificates import inspection
-from holdfast.net.certificates.parser import certificates
+from holdfast.net.certificates.parser import certificates, key_pem
 from holdfast.net.certificates.pem import UnusableFile, content, is_locked, passphrase
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ def ca(name: str, folder: Path, new: NewKey) -> None:
     """
     secret = new.secret()
     made = making.Authority.create(name, new.key_type, new.days)
-    _write(folder, "ca", making.pem(*made.chain), making.key_pem(made.key, secret))
+    _write(folder, "ca", making.pem(*made.chain), key_pem(made.key, secret))
 
 
 @cert.command(epilog="Example: holdfast cert server plc-1 --san 10.0.0.5 --san plc-1.plant.example")
@@ -274,7 +274,7 @@ def _issue(
     authority = of.load()
     secret, key = new.secret(), making.new_key(new.key_type)
     made = sign(authority, key)
-    _write(of.folder, name, making.pem(made, *authority.chain), making.key_pem(key, secret))
+    _write(of.folder, name, making.pem(made, *authority.chain), key_pem(key, secret))
 
 
 def _prompt(what: str, *, again: bool = False) -> bytes:

@@ -12,12 +12,7 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
-from cryptography.hazmat.primitives.serialization import (
-    BestAvailableEncryption,
-    Encoding,
-    NoEncryption,
-    PrivateFormat,
-)
+from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from holdfast.net.certificates.expiry import now
@@ -91,12 +86,6 @@ def new_key(kind: KeyKind) -> PrivateKey:
     if kind == "ed25519":
         return ed25519.Ed25519PrivateKey.generate()
     return rsa.generate_private_key(65537, int(kind.removeprefix("rsa")))
-
-
-def key_pem(of: PrivateKey, passphrase: bytes | None = None) -> bytes:
-    """Returns a key in PEM (PKCS#8), encrypted if there is a passphrase."""
-    encryption = NoEncryption() if passphrase is None else BestAvailableEncryption(passphrase)
-    return of.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, encryption)
 
 
 def pem(*chain: x509.Certificate) -> bytes:

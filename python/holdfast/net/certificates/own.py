@@ -72,4 +72,4 @@ def unlocked(file: File, passphrase_file: File | None) -> bytes | None:
         raise UnusableFile(file, f"a key with a passphrase {reason}")
     from holdfast.net.certificates import parser
 
-    return parser.decrypted(file, passphrase(passphrase_file))
+    return parser.key_pem(parser.key(file, passphrase(passphrase_file)))

@@ -1,4 +1,4 @@
-"""Parses certificates, keys and revocation lists, for which it requires the extra `certs`."""
+"""Parses certificates, keys and revocation lists, and encodes keys. Requires the extra `certs`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,14 @@ from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
-from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+)
 
 from holdfast.net.certificates.pem import (
     CERTIFICATE,
@@ -99,7 +105,7 @@ def key(file: File, secret: bytes | None = None) -> PrivateKey:
     if secret is not None and not is_locked(block):
         raise UnusableFile(file, "found a key without a passphrase, but a passphrase is given")
     try:
-        private_key = serialization.load_pem_private_key(block, secret)
+        private_key = load_pem_private_key(block, secret)
     except MALFORMED as error:
         wrong = "the passphrase is wrong, or the key can't be read"
         raise UnusableFile(file, wrong if secret else f"the key can't be read: {error}") from error
@@ -108,10 +114,7 @@ def key(file: File, secret: bytes | None = None) -> PrivateKey:
     return private_key
 
 
-def decrypted(file: File, secret: bytes) -> bytes:
-    """Returns the key of a file in PEM, without encryption. Raises `UnusableFile`."""
-    return key(file, secret).private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
-    )
+def key_pem(of: PrivateKey, passphrase: bytes | None = None) -> bytes:
+    """Returns a key in PEM (PKCS#8), encrypted if there is a passphrase."""
+    encryption = NoEncryption() if passphrase is None else BestAvailableEncryption(passphrase)
+    return of.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, encryption)
