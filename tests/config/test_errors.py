@@ -190,6 +190,12 @@ def test_names_are_plain_text(folder: Folder, name: str, spelled: str, problem: 
     assert folder.problems(memories + LISTENERS) == [f"p.yaml:3: memories.{spelled}: {problem}"]
 
 
+def test_a_memory_with_a_number_as_its_name_is_reported_only_there(folder: Folder) -> None:
+    listeners = LISTENERS.replace("1: plant", "1: '7'")
+    [problem] = folder.problems(f"{MEMORIES}  7: {{coils: 1}}\n{listeners}")
+    assert problem.startswith("p.yaml:3: memories.7: found 7, ")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [

@@ -116,8 +116,8 @@ def test_two_edge_nodes_need_two_names(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         load(file)
     [problem] = caught.value.problems
-    expected = "outputs.p.edge_node: found 'e', which outputs.o has in the same group"
-    assert str(problem).startswith(f"{file}:4: {expected}")
+    expected = "found 'e' in the group 'g', which is the edge node of outputs.o in line"
+    assert str(problem).startswith(f"{file}:4: outputs.p.edge_node: {expected}")
 
 
 def test_without_protobuf_sparkplug_says_what_to_install(

@@ -74,7 +74,7 @@ def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
     elif kind == "problem_at":
         context = error["ctx"]
         where = (*path, context["key"]) if context["key"] else path
-        report.add(where, context["message"], of_key=context["of_key"])
+        report.add(where, context["message"])
     elif kind == "value_error":
         report.add(path, str(error["ctx"]["error"]), of_key=of_key)
     else:

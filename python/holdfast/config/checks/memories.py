@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 from holdfast.config import initial_values
 from holdfast.config.checks.common import (
     Owners,
+    check_name,
     given,
     items,
     refuse_repeats,
@@ -19,7 +20,7 @@ from holdfast.config.models.listeners import RawRuleConfig
 from holdfast.config.models.services import AdapterConfig
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError
-from holdfast.runtime.text import extent, listing, suggestion
+from holdfast.runtime.text import extent, listing
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
@@ -189,10 +190,8 @@ def _check_while_sealed(scope: Scope, path: KeyPath, grant: SealedGrant) -> None
 
 def check_memory(scope: Scope, path: KeyPath, name: str) -> None:
     """Reports a memory that does not exist."""
-    names = list(scope.config.memories)
-    if names and name not in names:
-        allowed = f"allowed: {listing(names)}{suggestion(name, names)}"
-        scope.report.add(path, f"found {show(name)}, {allowed}")
+    if memories := scope.config.memories:
+        check_name(path, name, memories, "memories", scope.report)
 
 
 class WriterGrant(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.config.checks.common import check_name, given, items, until_invalid
+from holdfast.config.checks.common import Owners, check_name, given, items, until_invalid
 from holdfast.config.checks.nats import check_dialect_of, check_nats
 from holdfast.config.checks.services import check_broker
 from holdfast.config.checks.tls import check_client_tls, check_files
@@ -25,16 +25,17 @@ if TYPE_CHECKING:
 
 def check_outputs(scope: Scope) -> None:
     """Reports what is wrong."""
+    edge_nodes = Owners(scope.report, "edge node")
     with until_invalid():
         for path, output in items(("outputs",), scope.config.outputs):
             with until_invalid():
                 for where, name in items((*path, "devices"), output.devices or ()):
                     check_name(where, name, scope.names("devices"), "devices", scope.report)
             with until_invalid():
-                _check_output(scope, path, output)
+                _check_output(scope, path, output, edge_nodes)
 
 
-def _check_output(scope: Scope, path: KeyPath, output: Output) -> None:
+def _check_output(scope: Scope, path: KeyPath, output: Output, edge_nodes: Owners) -> None:
     if not output.type:
         return  # Never: the read ends the checks of an output whose type is invalid.
     if isinstance(output, InfluxConfig):
@@ -46,8 +47,11 @@ def _check_output(scope: Scope, path: KeyPath, output: Output) -> None:
         check_broker(path, output, scope.report)
         _check_topics(scope, path, output)
     elif isinstance(output, SparkplugConfig):
+        with until_invalid():
+            node, group = output.edge_node, output.group
+            shown = f"{show(node)} in the group {show(group)}"
+            edge_nodes.claim((*path, "edge_node"), (group, node), shown, path)
         check_broker(path, output, scope.report)
-        _check_sparkplug(scope, path, output)
 
 
 def _check_influx(scope: Scope, path: KeyPath, output: InfluxConfig) -> None:
@@ -69,19 +73,6 @@ def _check_influx(scope: Scope, path: KeyPath, output: InfluxConfig) -> None:
         report.add_key((*path, *user), f"found without {other}")
     check_files(path, output, ("token_file", "password_file"), report)
     check_client_tls((*path, "tls"), output.tls, report)
-
-
-def _check_sparkplug(scope: Scope, path: KeyPath, output: SparkplugConfig) -> None:
-    for other_path, other in items(("outputs",), scope.config.outputs):
-        if other is output:
-            break
-        if not isinstance(other, SparkplugConfig):
-            continue
-        with until_invalid():
-            if (other.group, other.edge_node) == (output.group, output.edge_node):
-                found = f"found {show(output.edge_node)}"
-                message = f"{found}, which outputs.{other_path[-1]} has in the same group"
-                scope.report.add((*path, "edge_node"), message)
 
 
 def _check_topics(scope: Scope, path: KeyPath, output: MqttOutputConfig) -> None:

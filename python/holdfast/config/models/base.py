@@ -22,10 +22,9 @@ class _Invalid:
         return "INVALID"
 
 
-def problem_at(key: str, message: str, *, of_key: bool = False) -> PydanticCustomError:
+def problem_at(key: str, message: str) -> PydanticCustomError:
     """The error of a validator of a whole model, with the key that it concerns."""
-    context = {"key": key, "message": message, "of_key": of_key}
-    return PydanticCustomError("problem_at", "{message}", context)
+    return PydanticCustomError("problem_at", "{message}", {"key": key, "message": message})
 
 
 INVALID: Final[Any] = _Invalid()

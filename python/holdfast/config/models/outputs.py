@@ -163,7 +163,6 @@ class SparkplugConfig(OutputConfig, BrokerConfig):
     primary_host: Annotated[SparkplugId | None, NotNull()] = None
     """The host without which nothing is published: values wait until it is online."""
     version: MqttVersion = "3.1.1"
-    """The version of MQTT."""
     client_id: Annotated[MqttText | None, NotNull()] = None
     """The client identifier. Default: holdfast, the name of the output, and that of the host."""
     datatypes: Literal["births", "always"] = "births"
