@@ -6,7 +6,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -308,16 +307,6 @@ def test_a_value_of_a_changed_tag_keeps_its_meaning(opened: Opened, tmp_path: Pa
         [found] = again.first()
         assert (found.value, found.tag.type) == (21.5, kind)
         again.close()
-
-
-def test_a_file_of_an_earlier_version_has_values_without_a_meaning(
-    opened: Opened, tmp_path: Path
-) -> None:
-    stored = opened(tmp_path / "b.db")
-    plain = msgspec.msgpack.encode([("pump", "t", 21.5, 1.0, 0, None)])
-    stored._db.execute("INSERT INTO readings (count, data) VALUES (1, ?)", (plain,))
-    stored.close()
-    assert opened(tmp_path / "b.db").first() == [reading(21.5, 1.0)]
 
 
 @settings(max_examples=examples(60), deadline=None)

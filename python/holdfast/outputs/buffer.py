@@ -109,22 +109,20 @@ class Buffer:
             try:
                 self.dropped += self.stored.add(moved)
             except OSError:
-                self._put_back(moved)
+                if moved is not self._batch:
+                    self._put_back(moved)
                 raise
             if moved is self._batch:
                 self._batch = []
 
     def _put_back(self, readings: list[Reading]) -> None:
-        if readings is self._batch:
-            return
         with self._changed:
             self._waiting.extendleft(reversed(readings))
 
     def detach(self) -> None:
         """Closes the file. A batch from memory waits again; one from the file stays there."""
         if not self._is_batch_stored:
-            with self._changed:
-                self._waiting.extendleft(reversed(self._batch))
+            self._put_back(self._batch)
         self._batch, self._is_batch_stored = [], False
         if self.stored is not None:
             self.stored.close()

@@ -145,11 +145,10 @@ class Stored:
         time: float,
         fault: int,
         undecoded: str | None,
-        meaning: int | None = None,
+        meaning: int,
     ) -> Reading:
-        """Files of earlier versions have no meaning."""
         tag = self._find(device, name)
-        if tag is None or meaning not in (None, meaning_of(tag)):
+        if tag is None or meaning != meaning_of(tag):
             tag = _stand_in(name, value)
         return Reading(device, tag, value, time, fault, undecoded)
 
