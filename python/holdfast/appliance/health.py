@@ -87,8 +87,9 @@ class Health:
         return Check(True, detail + (f", {standby} on standby" if standby else ""))
 
     def _caught_up(self) -> Check:
-        states = self._logs.obstacles()
-        behind = [f"{name}: {why}" for name, why in states.items() if why is not None]
+        states = self._logs.status()
+        whys = {name: each["obstacle"] for name, each in states.items()}
+        behind = [f"{name}: {why}" for name, why in whys.items() if why is not None]
         if behind:
             return Check(False, "; ".join(behind))
         return Check(True, f"{len(states)} caught up" if states else "none")

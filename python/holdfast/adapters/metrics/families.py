@@ -26,6 +26,12 @@ if TYPE_CHECKING:
 STATES = ("running", "failed", "stopped")
 OUTCOMES = ("valid", "exceptions", "timeouts", "transport_errors")
 """The outcomes of requests to a device."""
+TOTALS = {
+    "events_lost": "Listener events that were not logged.",
+    "log_dropped": "Log lines that were dropped because nobody read them.",
+    "tag_polls_dropped": "Polls whose values no output got, because too many came.",
+}
+"""The counters without labels: their key and description."""
 EXPIRIES = (
     (
         "certificates",
@@ -75,12 +81,8 @@ def all_metrics(diagnostics: DiagnosticsSource) -> Iterator[Metric]:
     audit = stats["audit"]
     yield InfoMetricFamily("holdfast_build", "The version of Holdfast.", {"version": __version__})
     yield GaugeMetricFamily("holdfast_uptime_seconds", "Time since start.", stats["uptime"])
-    yield from _single_counters(
-        stats,
-        events_lost="Listener events that were not logged.",
-        log_dropped="Log lines that were dropped because nobody read them.",
-        tag_polls_dropped="Polls whose values no output got, because too many came.",
-    )
+    for key, text in TOTALS.items():
+        yield CounterMetricFamily(f"holdfast_{key}", text, stats[key])
     if stats["memory_files"]:
         files = {
             name: file | {"is_failing": file["failing"] is not None}
@@ -224,11 +226,6 @@ LINK_COUNTERS = {
     **_stray_counters("link"),
 }
 LINK_GAUGES = {"waiting": ("link_waiting", "Requests that wait for a reply.")}
-
-
-def _single_counters(stats: Mapping[str, Any], **texts: str) -> Iterator[Metric]:
-    for key, text in texts.items():
-        yield CounterMetricFamily(f"holdfast_{key}", text, stats[key])
 
 
 def _log_metrics(logs: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:

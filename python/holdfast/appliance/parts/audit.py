@@ -12,7 +12,7 @@ from holdfast.appliance.parts.part import Part
 from holdfast.config.values.urls import parse_syslog
 from holdfast.events import log_lines
 from holdfast.events.audit import Audit, Copies, Journal, Syslog
-from holdfast.events.audit.refusal_summaries import INTERVAL_S, Refusals
+from holdfast.events.audit.refusal_summaries import Refusals
 from holdfast.runtime.heartbeat import PERIOD_S, Heartbeat
 from holdfast.runtime.standstill import WallClock
 
@@ -104,11 +104,10 @@ class AuditLog(Part):
 class WriteRecorder:
     """Moves writes and refusals to the audit log, in a thread, until the engine has stopped."""
 
-    def __init__(self, audit: Audit, engine: Engine, interval: float = INTERVAL_S) -> None:
-        """`interval` is that of `Refusals`."""
+    def __init__(self, audit: Audit, engine: Engine) -> None:
         self._audit = audit
         self._engine = engine
-        self._refusals = Refusals(interval)
+        self._refusals = Refusals()
         self._events: deque[dict[str, object]] = deque()
         self._lost = 0
         self._stopped = threading.Event()

@@ -142,13 +142,6 @@ class SharedLogs(Part):
             "embedded": self._servers[name].status() if name in self._servers else None,
         }
 
-    def obstacles(self) -> dict[str, str | None]:
-        """Why each log is not caught up; `None` if it is."""
-        return {
-            name: _obstacle(log.status(), self.config.logs[name].max_lag)
-            for name, log in self._logs.items()
-        }
-
     def tick(self) -> None:
         """Logs what has happened since the last call."""
         for name, log in self._logs.items():

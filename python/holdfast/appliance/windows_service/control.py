@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from holdfast.appliance.service_manager import ServiceManager
 
-
-class Reports(Protocol):
-    """Reports the state of the service to Windows."""
-
-    def running(self) -> None:
-        """Reports that the service runs."""
-
-    def stopping(self) -> None:
-        """Reports that the service is about to end."""
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 class ServiceControl(ServiceManager):
     """Requests to stop and to reload, and reports of what the appliance does."""
 
-    def __init__(self, reports: Reports) -> None:
+    def __init__(self, running: Callable[[], None], stopping: Callable[[], None]) -> None:
+        """`running` and `stopping` report these states of the service to Windows."""
         super().__init__({})
-        self._reports = reports
+        self._report_running, self._report_stopping = running, stopping
         self._reload = False
         self.received = False
         """Whether the service is to stop."""
@@ -47,8 +41,8 @@ class ServiceControl(ServiceManager):
 
     def ready(self) -> None:
         """Reports that the appliance serves."""
-        self._reports.running()
+        self._report_running()
 
     def stopping(self) -> None:
         """Reports that the appliance begins to stop."""
-        self._reports.stopping()
+        self._report_stopping()

@@ -35,7 +35,7 @@ class HostedService(ServiceFramework):
 
     def __init__(self, arguments: list[str]) -> None:
         super().__init__(arguments)
-        self.control = ServiceControl(self)
+        self.control = ServiceControl(self.running, self.stopping)
 
     def GetAcceptedControls(self) -> int:
         """The requests of Windows that are answered."""
@@ -56,9 +56,8 @@ class HostedService(ServiceFramework):
         self.stopping()
         self.control.request_stop()
 
-    def SvcShutdown(self) -> None:
-        """Windows shuts down."""
-        self.SvcStop()
+    SvcShutdown = SvcStop
+    """Windows shuts down."""
 
     def SvcInterrogate(self) -> None:
         """Nothing: Windows knows the state already. pywin32 would report that the service runs."""

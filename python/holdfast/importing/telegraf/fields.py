@@ -142,7 +142,7 @@ class Fields:
 
     def read(self) -> str:
         """Reads all fields. Returns the style."""
-        style = _word(self.source, "configuration_type", tuple(STYLES)) or "register"
+        style = word(self.source, "configuration_type", tuple(STYLES)) or "register"
         if style == "register":
             self._registers()
         elif style == "request":
@@ -253,8 +253,8 @@ class Fields:
     def _request(self, request: Section) -> None:
         """The style `request`: fields of one area."""
         unit = self._unit(request)
-        area = _AREAS[_word(request, "register", tuple(_AREAS)) or "holding"]
-        order = _ORDERS[_word(request, "byte_order", tuple(_ORDERS)) or "ABCD"]
+        area = _AREAS[word(request, "register", tuple(_AREAS)) or "holding"]
+        order = _ORDERS[word(request, "byte_order", tuple(_ORDERS)) or "ABCD"]
         omitted = []
         for entry in self._entries(request):
             if entry.flag("omit"):
@@ -271,9 +271,9 @@ class Fields:
         """The style `metric`: fields of any area."""
         unit = self._unit(metric)
         unit.max_gap = gap
-        order = _ORDERS[_word(metric, "byte_order", tuple(_ORDERS)) or "ABCD"]
+        order = _ORDERS[word(metric, "byte_order", tuple(_ORDERS)) or "ABCD"]
         for entry in self._entries(metric):
-            area = _AREAS[_word(entry, "register", tuple(_AREAS)) or "holding"]
+            area = _AREAS[word(entry, "register", tuple(_AREAS)) or "holding"]
             self._field(unit, entry, area, order, [metric])
         metric.text("measurement")
         self._leave_out_tags(metric)
@@ -292,7 +292,7 @@ class Fields:
     def _gap(self, section: Section, default: int | None) -> int:
         """The largest gap that the source read to join two fields."""
         allowed = ("none", "shrink", "rearrange", "aggressive", "max_insert")
-        kind = _word(section, "optimization", allowed)
+        kind = word(section, "optimization", allowed)
         fill = section.integer("optimization_max_register_fill", 0, 2000)
         if kind == "aggressive":
             message = f"gaps of up to {DEFAULT_MAX_GAP} are read; see max_gap of the device"
@@ -328,7 +328,7 @@ class Fields:
             entry.close(_BIT_REASONS)
             return
         kind = entry.word("type", _INPUT_TYPES, required=True)
-        output = _word(entry, "output", ("INT64", "UINT64", "FLOAT64", "STRING"))
+        output = word(entry, "output", ("INT64", "UINT64", "FLOAT64", "STRING"))
         length, size = self._length(entry, kind)
         if kind is not None and (output == "STRING") > (kind == "STRING"):
             self.desk.problem(entry.at("output"), "found STRING, allowed: only with type STRING")
@@ -358,7 +358,7 @@ class Fields:
         return None, register_count(_TYPES[kind]) if kind in _TYPES else 1
 
     def _bit_of_area(self, entry: Section, key: str) -> Typed:
-        output = _word(entry, key, ("UINT16", "BOOL"))
+        output = word(entry, key, ("UINT16", "BOOL"))
         return {}, output != "BOOL"
 
     def _bit(self, entry: Section, order: str) -> Typed | None:
@@ -439,7 +439,7 @@ def _order(order: str) -> dict[str, str]:
     return {} if order == "ABCD" else {"order": order}
 
 
-def _word(section: Section, key: str, allowed: tuple[str, ...]) -> str | None:
+def word(section: Section, key: str, allowed: tuple[str, ...]) -> str | None:
     """The word at a key. Empty text counts as absent in the source."""
     return None if section.get(key) == "" else section.word(key, allowed)
 

@@ -10,6 +10,7 @@ from holdfast.config.text.messages import shape
 from holdfast.config.values.scalars import MIN_TIME
 from holdfast.config.values.urls import parse_http
 from holdfast.importing.telegraf.durations import seconds
+from holdfast.importing.telegraf.fields import word
 from holdfast.importing.telegraf.reasons import FILTERS, NO_COUNTERPART
 from holdfast.net.addresses import joined
 
@@ -51,7 +52,7 @@ class Influx:
         has_token = out.secret("token") is not None
         if has_token:
             made["token_file"] = TOKEN_FILE
-        if _word_or(out, "content_encoding", ("gzip", "identity"), "gzip") == "identity":
+        if word(out, "content_encoding", ("gzip", "identity")) == "identity":
             made["gzip"] = False
         timeout = seconds(out, "timeout")
         if timeout is not None:
@@ -102,8 +103,3 @@ class Influx:
         whole = urlencode({**query, "precision": "ns"})
         before = f"{own}&" if own else ""
         return {"url": f"{base}{path.rstrip('/')}/api/v2/write?{before}{whole}"}
-
-
-def _word_or(section: Section, key: str, allowed: tuple[str, ...], default: str) -> str:
-    """The word at a key, the default if it is absent or empty."""
-    return (section.word(key, allowed) if section.get(key) else None) or default
