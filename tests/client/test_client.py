@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast._core import Request
-from holdfast.client.endpoint import blocking
+from holdfast._core import BlockingClient, Request
+from holdfast.client import endpoint as endpoints
 from holdfast.client.requests import TooManyValues
 from holdfast.client.url import NetworkTarget, SerialTarget, Tls, Tolerance, parse
 from holdfast.net import event_loop
@@ -1156,7 +1156,7 @@ def test_whoever_closes_a_client_may_be_cancelled() -> None:
 
 def test_a_call_that_is_cancelled_before_its_first_byte_is_not_sent() -> None:
     with Stream("rtu+tcp") as device:
-        client = blocking(parse(device.url))
+        client = BlockingClient(endpoints.endpoint(parse(device.url)))
         answers = iter([False, True])  # Before it connects, and before it sends.
         with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
             client.call(Request.write_register(0, 1), 1, wire.DEADLINE, lambda: next(answers))

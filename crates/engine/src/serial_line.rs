@@ -74,7 +74,7 @@ pub(crate) struct OpenLine<Port> {
 impl SerialLine {
     /// Opens the device. Must be called in the context of a runtime.
     pub(crate) fn open(&self) -> io::Result<OpenLine<SerialPort>> {
-        let lock = lock(&self.device)?;
+        let lock = lock(&self.device, User::Listener)?;
         let port = SerialPort::open(&self.device, |settings: Settings| self.set(settings))?;
         self.set_direction(|mode| set_mode_of_tokio(&port, mode))?;
         Ok(OpenLine { port, _lock: lock })
@@ -82,7 +82,7 @@ impl SerialLine {
 
     /// Opens the device for blocking calls.
     pub(crate) fn open_blocking(&self) -> io::Result<OpenLine<serial2::SerialPort>> {
-        let lock = lock(&self.device)?;
+        let lock = lock(&self.device, User::Client)?;
         let set = |settings: Settings| self.set(settings);
         let port = serial2::SerialPort::open(&self.device, set)?;
         self.set_direction(|mode| set_mode(&port, mode))?;
@@ -168,9 +168,16 @@ impl Drop for HeldLock {
     }
 }
 
-/// Locks a line. Within this process it may be open twice: a reload opens it before it closes it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum User {
+    /// A reload opens its line before it closes it.
+    Listener,
+    Client,
+}
+
+/// Locks a line. Within this process, only a listener may open it while it is open.
 #[cfg(unix)]
-fn lock(device: &str) -> io::Result<Lock> {
+fn lock(device: &str, user: User) -> io::Result<Lock> {
     static HELD: Mutex<BTreeMap<PathBuf, Weak<HeldLock>>> = Mutex::new(BTreeMap::new());
     let path = std::fs::canonicalize(device)?;
     let mut held = HELD.lock().unwrap_or_else(PoisonError::into_inner);
@@ -184,6 +191,10 @@ fn lock(device: &str) -> io::Result<Lock> {
         })
     };
     if let Some(lock) = held.get(&path).and_then(Weak::upgrade).filter(is_same) {
+        if user == User::Client {
+            let what = "another client or listener of this program uses the line";
+            return Err(io::Error::new(ErrorKind::ResourceBusy, what));
+        }
         return Ok(lock);
     }
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
@@ -204,7 +215,7 @@ fn lock(device: &str) -> io::Result<Lock> {
 type Lock = ();
 
 #[cfg(not(unix))]
-fn lock(_device: &str) -> io::Result<Lock> {
+fn lock(_device: &str, _user: User) -> io::Result<Lock> {
     Ok(())
 }
 

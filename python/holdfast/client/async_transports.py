@@ -19,8 +19,9 @@ from math import inf
 from threading import Event
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from holdfast._core import Attempt, Connection
-from holdfast.client.endpoint import blocking
+from holdfast._core import Attempt, BlockingClient, Connection
+from holdfast.client.endpoint import endpoint
+from holdfast.client.fork import renew_in_children
 from holdfast.client.tcp_connect import addresses, connected
 from holdfast.errors import ConnectFailed, ConnectionLost, ModbusError, RequestTimeout
 from holdfast.runtime.text import error_text
@@ -60,7 +61,12 @@ class ThreadedConnection:
     """A transport with one request at a time, in a thread of its own."""
 
     def __init__(self, target: Target) -> None:
-        self._core = blocking(target)
+        self._endpoint = endpoint(target)
+        self._connect_anew()
+        renew_in_children(self, ThreadedConnection._connect_anew)
+
+    def _connect_anew(self) -> None:
+        self._core = BlockingClient(self._endpoint)
         self._executor: ThreadPoolExecutor | None = None
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
@@ -113,6 +119,10 @@ class AsyncConnection:
         self._target = target
         self._endpoint = endpoint
         self._max_in_flight = 1 if target.tolerance.is_one_at_a_time else max_in_flight
+        self._connect_anew()
+        renew_in_children(self, AsyncConnection._connect_anew)
+
+    def _connect_anew(self) -> None:
         self._last: _LoopConnection | None = None
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:

@@ -5,18 +5,13 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from holdfast._core import BlockingClient, Endpoint
+from holdfast._core import Endpoint
 from holdfast.client.url import STRICT, NetworkTarget, SerialTarget
 from holdfast.protocol import TLS_PORT
 from holdfast.runtime.bounded_files import require_stored
 
 if TYPE_CHECKING:
     from holdfast.client.url import Receiver, Target, Tls
-
-
-def blocking(target: Target) -> BlockingClient:
-    """The native client of a target. It connects on its first call."""
-    return BlockingClient(endpoint(target))
 
 
 def endpoint(target: Target) -> Endpoint:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Self
 
+from holdfast._core import BlockingClient
 from holdfast.client.base import DEFAULT_TIMEOUT_S
-from holdfast.client.endpoint import blocking
+from holdfast.client.endpoint import endpoint
+from holdfast.client.fork import renew_in_children
 from holdfast.client.sync_operations import SyncOperations
 
 
@@ -35,7 +37,12 @@ class SyncClient(SyncOperations):
 
     def __init__(self, url: str, *, unit: int = 1, timeout: float = DEFAULT_TIMEOUT_S) -> None:
         super().__init__(url, unit, timeout)
-        self._transport = blocking(self.target)
+        self._endpoint = endpoint(self.target)
+        self._connect_anew()
+        renew_in_children(self, SyncClient._connect_anew)
+
+    def _connect_anew(self) -> None:
+        self._transport = BlockingClient(self._endpoint)
 
     def close(self) -> None:
         """Closes the connection after the calls before it. A later call reconnects."""

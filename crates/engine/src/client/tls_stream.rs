@@ -25,6 +25,7 @@ pub(super) struct TlsStream {
     heard: bool,
     /// The error after which nothing more can be received.
     broken: Option<TlsFailure>,
+    of_process: u32,
 }
 
 impl TlsStream {
@@ -36,7 +37,9 @@ impl TlsStream {
     ) -> Result<TlsStream, StreamError> {
         let channel = tls.channel().map_err(|error| StreamError::Tls((&error).into()))?;
         let (plain, out) = (Vec::new(), Vec::new());
-        let mut secure = TlsStream { stream, channel, plain, out, heard: false, broken: None };
+        let of_process = std::process::id();
+        let mut secure =
+            TlsStream { stream, channel, plain, out, heard: false, broken: None, of_process };
         secure.send(&[], deadline).and_then(|()| secure.shake_hands(deadline)).map_err(ended)?;
         Ok(secure)
     }
@@ -169,6 +172,10 @@ impl ByteStream for TlsStream {
 
 impl Drop for TlsStream {
     fn drop(&mut self) {
+        // A forked child ends its copy: the connection of its parent goes on.
+        if self.of_process != std::process::id() {
+            return;
+        }
         self.channel.end(&mut self.out);
         let _ = self.stream.at_once(|mut socket| socket.write(&self.out));
     }

@@ -72,6 +72,17 @@ pub struct DeviceSettings {
     pub fence: Option<Arc<Fence>>,
 }
 
+impl DeviceSettings {
+    /// What is read into memories, and where to.
+    fn mirrors(&self) -> impl Iterator<Item = impl PartialEq> + '_ {
+        self.reads.iter().filter_map(|read| {
+            let Destination { memory, area, address } = read.into.as_ref()?;
+            let into = (Arc::as_ptr(memory), *area, *address);
+            Some((read.area, read.address, read.count, into))
+        })
+    }
+}
+
 #[derive(Debug, Clone)]
 pub struct ReadSettings {
     pub area: Area,
@@ -136,6 +147,14 @@ impl Inbox {
     pub(super) fn wake(&self) {
         self.awake.set(true);
         self.arrived.notify_one();
+    }
+
+    /// Waits for a successor that stores its values elsewhere: those of this device would replace what
+    /// belongs to another one now.
+    async fn moved(&self, device: &Device) {
+        while !self.successor.borrow().as_ref().is_some_and(|next| device.is_moved(next)) {
+            self.arrived.notified().await;
+        }
     }
 
     async fn next(&self) -> Message {
@@ -280,16 +299,19 @@ impl Device {
             self.turn.polls(true);
             // In a box: a device takes the memory of a poll only while it polls.
             let poll = Box::pin(self.poll(due));
-            match &self.settings.fence {
-                None => poll.await,
-                Some(fence) => {
-                    let _pass = fence.pass();
-                    tokio::select! {
-                        biased;
-                        () = fence.closed() => {}
-                        () = poll => {}
-                    }
+            let fence = self.settings.fence.as_ref();
+            let _pass = fence.map(|fence| fence.pass());
+            let closed = async {
+                match fence {
+                    None => pending().await,
+                    Some(fence) => fence.closed().await,
                 }
+            };
+            tokio::select! {
+                biased;
+                () = closed => {}
+                () = inbox.moved(self) => {}
+                () = poll => {}
             }
             self.turn.polls(false);
             self.publish_status();
@@ -347,13 +369,26 @@ impl Device {
         self.schedule.want_soon();
     }
 
+    /// Whether its values have another source or place than those of its successor.
+    fn is_moved(&self, successor: &Device) -> bool {
+        self.has_other_source(successor) || self.settings.mirrors().ne(successor.settings.mirrors())
+    }
+
+    fn has_other_source(&self, other: &Device) -> bool {
+        !Rc::ptr_eq(&self.link, &other.link) || self.settings.unit_id != other.settings.unit_id
+    }
+
     /// Takes over the state of the device before it.
     fn follow(&mut self, before: Device) {
         let (old, new) = (&before.settings, &self.settings);
-        if !Rc::ptr_eq(&before.link, &self.link) || old.unit_id != new.unit_id {
+        if before.has_other_source(self) {
             return self.schedule.begin_now();
         }
-        self.schedule.follow(&before.schedule, before.poll_pause.is_delaying());
+        let is_delaying = before.poll_pause.is_delaying();
+        self.schedule.follow(&before.schedule, is_delaying);
+        if before.is_moved(self) && !is_delaying {
+            self.schedule.begin_now();
+        }
         self.poll_pause = before.poll_pause;
         if old.limits == new.limits {
             self.learned.replace(before.learned.take());
