@@ -25,6 +25,8 @@ from holdfast.config import load
 from support import web, wire
 from support.certificates import Certificates, Issued, named
 from support.config_folder import written
+from support.fake_device import Stream, registers, silent
+from support.routed import Held
 from support.running import endpoint, log_events
 from support.tls_peer import Peer, Refused, context
 
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from holdfast.config import Config
+    from support.fake_device import Behaviour
     from support.running import Connect, Serve
 
 READ = bytes.fromhex("0300070001")
@@ -597,6 +600,57 @@ def test_devices_come_change_and_go(rig: Rig, serve: Serve, connect: Connect) ->
     rig.reload(plant())
     assert rig.appliance.diagnostics.stats()["devices"] == {}
     assert client.ask(into_mirrored) == into_mirrored
+
+
+def values(number: int) -> Behaviour:
+    """Answers with registers that all have this value."""
+    return lambda asked: asked.answer(registers(asked.pdu, number))
+
+
+def mirrored(device: Stream, address: int, interval: float) -> Settings:
+    into = {"memory": "plant", "area": "holding_registers", "address": address}
+    read = {"area": "holding_registers", "address": 0, "count": 2, "into": into}
+    more = {"interval": interval, "timeout": wire.DEADLINE}
+    return {"url": device.url, "unit": 1, "reads": [read], **more}
+
+
+def test_devices_whose_places_change_are_polled_at_once(rig: Rig) -> None:
+    with Stream("tcp", then=values(1)) as one, Stream("tcp", then=values(2)) as two:
+
+        def places(first: int, second: int) -> Settings:
+            pump, fan = mirrored(one, first, 3600), mirrored(two, second, 3600)
+            return plant(devices={"pump": pump, "fan": fan})
+
+        rig.start(places(50, 60))
+        memory = rig.appliance.memories["plant"]
+
+        def show(first: int, second: int) -> bool:
+            read = memory.read("holding_registers", 50, 12)
+            return (read[:2], read[10:]) == ([first] * 2, [second] * 2)
+
+        wire.until(lambda: show(1, 2), "both are read")
+        rig.reload(places(60, 50))
+        wire.until(lambda: show(2, 1), "both are read again")
+
+
+def test_a_poll_that_a_reload_overtakes_stores_nothing_at_its_former_place(rig: Rig) -> None:
+    held = Held(7)
+    with (
+        Stream("tcp", values(1), held, then=values(8)) as one,
+        Stream("tcp", values(2), then=silent) as two,
+    ):
+
+        def places(first: int, second: int) -> Settings:
+            pump, fan = mirrored(one, first, 0.02), mirrored(two, second, 3600)
+            return plant(devices={"pump": pump, "fan": fan})
+
+        rig.start(places(50, 60))
+        one.await_requests(2)
+        rig.reload(places(60, 50))
+        held.release()
+        memory = rig.appliance.memories["plant"]
+        wire.until(lambda: memory.read("holding_registers", 60, 2) == [8, 8], "it is polled")
+        assert memory.read("holding_registers", 50, 2) == [1, 1]
 
 
 def test_a_memory_that_can_not_be_written_now_ends_no_reload(

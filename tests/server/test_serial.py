@@ -359,6 +359,19 @@ def test_a_line_that_another_program_has_locked_is_not_opened(line: Line) -> Non
     client.close()
 
 
+def test_a_line_that_another_client_of_this_program_uses_is_not_opened(line: Line) -> None:
+    url = f"{line.mode.name}://{line.device}?parity=none"
+    one, two = (holdfast.SyncClient(url, timeout=0.1) for _ in range(2))
+    with pytest.raises(holdfast.RequestTimeout):
+        one.read_coils(0, 1)
+    with pytest.raises(holdfast.ConnectFailed, match="another client or listener of this program"):
+        two.read_coils(0, 1)
+    one.close()
+    with pytest.raises(holdfast.RequestTimeout):
+        two.read_coils(0, 1)
+    two.close()
+
+
 @only_ascii
 def test_characters_may_come_one_by_one(plant: Plant) -> None:
     plant.line.send_pieces(*[bytes([character]) for character in lines.ascii_frame(READ)])

@@ -12,6 +12,7 @@ from holdfast.client.url import parse
 from holdfast.server.options import STREAM_DEFAULTS
 from support import wire
 from support.config_folder import written
+from support.fake_device import registers
 from support.lines import Cable
 from support.transports import TYPES
 
@@ -76,14 +77,15 @@ def await_count(appliance: Appliance, counter: str, number: int, link: str = "bu
 
 
 class Held:
-    """Behaves as a correct device that answers only after `release`."""
+    """Answers only after `release`: correctly, or with registers of one value."""
 
-    def __init__(self) -> None:
+    def __init__(self, value: int | None = None) -> None:
+        self._value = value
         self._released = threading.Event()
 
     def __call__(self, asked: Asked) -> None:
         self._released.wait(wire.DEADLINE)
-        asked.answer()
+        asked.answer(None if self._value is None else registers(asked.pdu, self._value))
 
     def release(self) -> None:
         self._released.set()
