@@ -1,10 +1,11 @@
 //! TLS over a connection whose socket belongs to the caller; `TlsChannel`: the same for Python.
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 
 use holdfast_engine::client::Place;
 use holdfast_engine::tls::client::ClientTls;
 use holdfast_engine::tls::{Channel, TlsFailure};
+use holdfast_runtime::lock;
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
@@ -101,23 +102,23 @@ impl TlsChannel {
     /// Whether the handshake is complete.
     #[getter]
     fn is_ready(&self) -> bool {
-        !self.tls().is_handshaking()
+        !lock(&self.tls).is_handshaking()
     }
 
     /// Whether the peer has announced the end.
     #[getter]
     fn has_ended(&self) -> bool {
-        self.tls().has_ended()
+        lock(&self.tls).has_ended()
     }
 
     /// Encrypts data. During the handshake, it is queued until the end of the handshake.
     fn send(&self, data: &[u8]) {
-        self.tls().send(data);
+        lock(&self.tls).send(data);
     }
 
     /// Takes the bytes to send now.
     fn outgoing<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
-        let mut tls = self.tls();
+        let mut tls = lock(&self.tls);
         let bytes = PyBytes::new(py, &tls.out);
         tls.out.clear();
         bytes
@@ -129,25 +130,19 @@ impl TlsChannel {
         py: Python<'py>,
         data: &[u8],
     ) -> (Bound<'py, PyBytes>, Option<FailureFields>) {
-        let mut tls = self.tls();
+        let mut tls = lock(&self.tls);
         let failure = tls.receive(data).err().map(fields_of);
         (PyBytes::new(py, &tls.plain), failure)
     }
 
     /// Announces the end.
     fn end(&self) {
-        self.tls().end();
+        lock(&self.tls).end();
     }
 
     /// Interprets the end of the connection; `None` if TLS has nothing to do with it.
     fn lost(&self, broken: bool) -> Option<FailureFields> {
-        self.tls().lost(broken).map(fields_of)
-    }
-}
-
-impl TlsChannel {
-    fn tls(&self) -> MutexGuard<'_, Tls> {
-        self.tls.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.tls).lost(broken).map(fields_of)
     }
 }
 

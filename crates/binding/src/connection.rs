@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 use std::hash::{BuildHasher, RandomState};
 use std::io;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 use std::time::Duration;
 
 use holdfast_engine::client::{ClientError, Lost, Place};
@@ -12,6 +12,7 @@ use holdfast_engine::tls::TlsFailure;
 use holdfast_protocol::client::{
     Attempt as CoreAttempt, Closed, Connection as Core, Done, Failure, Ticket, Transport,
 };
+use holdfast_runtime::lock;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyByteArray, PyBytes, PySlice};
@@ -113,7 +114,7 @@ impl Connection {
         // The keys of a hasher are random.
         let mut core = core.unpredictable(RandomState::new().hash_one(0));
         if let Some(last) = last {
-            core.follow(last.state().core.take_past(now));
+            core.follow(lock(&last.state).core.take_past(now));
         }
         let state = State {
             core,
@@ -138,19 +139,19 @@ impl Connection {
         wake_at: Py<PyAny>,
         changed: Py<PyAny>,
     ) {
-        self.state().owner = Some(Owner { write, flush_soon, wake_at, changed });
+        lock(&self.state).owner = Some(Owner { write, flush_soon, wake_at, changed });
     }
 
     /// Forgets them: the socket is closed.
     fn detach(&self) {
-        let owner = self.state().owner.take();
+        let owner = lock(&self.state).owner.take();
         drop(owner);
     }
 
     /// Whether requests can be sent: the connection is open, and any TLS handshake is complete.
     #[getter]
     fn is_ready(&self) -> bool {
-        let state = self.state();
+        let state = lock(&self.state);
         !state.is_handshaking() && state.core.closed().is_none()
     }
 
@@ -168,7 +169,7 @@ impl Connection {
         let (unit, within) = (byte("unit", unit.0)?, seconds("timeout", timeout)?);
         let attempt = attempt.map_or_else(Default::default, |attempt| attempt.core);
         let future = self.create_future.bind(py).call0()?;
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         if !state.core.has_room() {
             return Err(PyRuntimeError::new_err("the device takes one request at a time"));
         }
@@ -211,7 +212,7 @@ impl Connection {
 
     /// Writes what is to be sent now.
     fn flush(&self, py: Python<'_>) -> PyResult<()> {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         state.flushes = false;
         let write = state.owner.as_ref().map(|owner| owner.write.clone_ref(py));
         if let Some((write, outgoing)) = write.zip(state.outgoing(py)) {
@@ -238,7 +239,7 @@ impl Connection {
     #[pyo3(signature = (data, /))]
     fn data_received(&self, py: Python<'_>, data: &[u8]) -> PyResult<()> {
         let now = clock(self.time.bind(py).call0()?.extract()?)?;
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         let was_handshaking = state.is_handshaking();
         let completed = self.complete(py, &mut state, |core, tls, ending, add| {
             let Some(tls) = tls else {
@@ -263,14 +264,14 @@ impl Connection {
     /// Ends the requests whose timeout has expired. When to call it again; `None` for no request.
     fn advance(&self, py: Python<'_>) -> PyResult<Option<f64>> {
         let now = clock(self.time.bind(py).call0()?.extract()?)?;
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         let completed = self.complete(py, &mut state, |core, _, ending, add| {
             core.advance(now, |done| add(ending, done));
         });
         drop(state);
         settle(py, completed)?;
         // Requests that the caller of an ended one has sent meanwhile are among them.
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         let deadline = state.core.deadline().map(|deadline| deadline.as_secs_f64());
         state.wakes_at = deadline.unwrap_or(f64::INFINITY);
         Ok(deadline)
@@ -279,7 +280,7 @@ impl Connection {
     /// Drops a request whose caller no longer waits. A late reply to it is counted.
     fn cancel(&self, future: &Bound<'_, PyAny>, now: f64) -> PyResult<()> {
         let now = clock(now)?;
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         if let Some(at) = state.waiting.iter().position(|(_, other)| other.is(future))
             && let Some((ticket, _)) = state.waiting.remove(at)
         {
@@ -290,7 +291,7 @@ impl Connection {
 
     /// Ends the connection and all its requests. `flush` may still have bytes to write.
     fn close(&self, py: Python<'_>) -> PyResult<()> {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         let completed = self.complete(py, &mut state, |core, tls, ending, add| {
             core.close(Closed::BySelf, |done| add(ending, done));
             if let Some(tls) = tls {
@@ -304,7 +305,7 @@ impl Connection {
     /// Reports that the connection is lost. `error` is `None` when the peer closed it normally.
     #[pyo3(signature = (error=None))]
     fn lost(&self, py: Python<'_>, error: Option<String>) -> PyResult<()> {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         let completed = self.complete(py, &mut state, |core, tls, ending, add| {
             if core.closed().is_none() {
                 let of_tls = tls.as_ref().and_then(|tls| tls.lost(error.is_some()));
@@ -322,7 +323,7 @@ impl Connection {
     /// Why the connection has ended, as an exception; `None` while it is open.
     #[getter]
     fn closed<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyAny>> {
-        let state = self.state();
+        let state = lock(&self.state);
         let failure = state.core.closed()?.failure();
         Some(exception(py, &self.error(&state.ending, failure, Duration::ZERO)))
     }
@@ -330,13 +331,13 @@ impl Connection {
     /// The number of replies that came after their request had ended.
     #[getter]
     fn late(&self) -> u64 {
-        self.state().core.late()
+        lock(&self.state).core.late()
     }
 
     /// The seconds that the longest of these replies took; 0 if there was none.
     #[getter]
     fn longest_late(&self) -> f64 {
-        self.state().core.longest_late().as_secs_f64()
+        lock(&self.state).core.longest_late().as_secs_f64()
     }
 
     fn __traverse__(&self, visit: PyVisit<'_>) -> Result<(), PyTraverseError> {
@@ -356,7 +357,7 @@ impl Connection {
     }
 
     fn __clear__(&self) {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         let left = (std::mem::take(&mut state.waiting), state.owner.take());
         drop(state);
         drop(left);
@@ -388,10 +389,6 @@ impl State {
 }
 
 impl Connection {
-    fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     /// Collects what `work` completes.
     fn complete(
         &self,

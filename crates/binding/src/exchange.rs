@@ -1,10 +1,11 @@
 //! `HttpExchange`: an HTTP request and its response, for an event loop.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use bytes::Bytes;
 use holdfast_engine::http::{Exchange, RequestHead, ResponseHead, Sent};
 use holdfast_engine::server::Peer;
+use holdfast_runtime::lock;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::pybacked::PyBackedBytes;
@@ -102,7 +103,7 @@ impl Answers {
         let Ok(given) = headers.cast_exact::<PyTuple>() else {
             return response_head(status, &headers.extract::<Headers>()?);
         };
-        let mut last = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut last = lock(&self.0);
         if let Some((of, ResponseHead { status: known, headers })) = &*last
             && of.is(given)
             && *known == status

@@ -1,8 +1,9 @@
 //! `Follower`: what has changed in ranges of a memory.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use holdfast_memory::{Follower as CoreFollower, Refusal};
+use holdfast_runtime::lock;
 use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
@@ -36,8 +37,7 @@ impl Follower {
     }
 
     fn changes<'py>(&self, py: Python<'py>) -> PyResult<(u64, Vec<Change<'py>>)> {
-        let looked =
-            py.detach(|| self.core.lock().unwrap_or_else(PoisonError::into_inner).changes());
+        let looked = py.detach(|| lock(&self.core).changes());
         let (writes, changes) = looked.map_err(|refusal| match refusal {
             Refusal::Stale => Stale::new_err(refusal.to_string()),
             _ => PyOSError::new_err(refusal.to_string()),

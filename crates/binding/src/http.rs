@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::net::TcpListener;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -12,6 +12,7 @@ use holdfast_engine::http::{
 };
 use holdfast_engine::server::ConnectionLimits;
 use holdfast_engine::tls::server::Protocol;
+use holdfast_runtime::lock;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use pyo3::intern;
 use pyo3::prelude::*;
@@ -62,13 +63,13 @@ impl ListeningSocket {
 
     /// Stops listening, when the servers of the socket have ended too.
     fn close(&self) {
-        self.socket.lock().unwrap_or_else(PoisonError::into_inner).take();
+        lock(&self.socket).take();
     }
 }
 
 impl ListeningSocket {
     fn with<T>(&self, get: impl Fn(&TcpListener) -> std::io::Result<T>) -> PyResult<T> {
-        let socket = self.socket.lock().unwrap_or_else(PoisonError::into_inner);
+        let socket = lock(&self.socket);
         let socket = socket.as_ref();
         Ok(get(socket.ok_or_else(|| PyOSError::new_err("the socket is closed"))?)?)
     }

@@ -5,11 +5,12 @@
 //! request.
 
 use std::collections::HashMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 
 use bytes::Bytes;
 use holdfast_engine::http::RequestHead;
 use holdfast_memory::Area;
+use holdfast_runtime::lock;
 use pyo3::prelude::*;
 use pyo3::pybacked::PyBackedBytes;
 use pyo3::types::{PyBytes, PyString, PyTuple};
@@ -110,10 +111,6 @@ impl ParsedWrites {
     pub fn new(handler: Py<PyAny>, open: Vec<ParsedWrite>) -> ParsedWrites {
         ParsedWrites { handler, writes: Mutex::new(Writes { open, done: Vec::new() }) }
     }
-
-    fn writes(&self) -> MutexGuard<'_, Writes> {
-        self.writes.lock().unwrap_or_else(PoisonError::into_inner)
-    }
 }
 
 #[pymethods]
@@ -121,7 +118,7 @@ impl ParsedWrites {
     /// The lines of the audit log, without time and place in the chain. Each begins with `before`, the
     /// address of the peer, and `after`.
     fn lines<'py>(&self, py: Python<'py>, before: &[u8], after: &[u8]) -> Vec<Bound<'py, PyBytes>> {
-        let writes = self.writes();
+        let writes = lock(&self.writes);
         let lines = writes.open.iter().map(|write| {
             let peer = peer::text(write.head.peer.address);
             let origin = [before, b"\"", peer.as_bytes(), b"\"", after].concat();
@@ -134,7 +131,7 @@ impl ParsedWrites {
     /// Carries out the writes, one after the other. Returns the memory of each that was carried out, and
     /// the number of its values.
     fn write(&self, py: Python<'_>) -> Vec<(Py<PyString>, usize)> {
-        let mut writes = self.writes();
+        let mut writes = lock(&self.writes);
         let mut written = Vec::with_capacity(writes.open.len());
         for write in std::mem::take(&mut writes.open) {
             match write.batch.carry_out(py) {
@@ -155,7 +152,7 @@ impl ParsedWrites {
         headers: &Bound<'_, PyAny>,
         bodies: Vec<PyBackedBytes>,
     ) -> PyResult<()> {
-        let done = std::mem::take(&mut self.writes().done);
+        let done = std::mem::take(&mut lock(&self.writes).done);
         for (write, body) in done.iter().zip(bodies) {
             write.exchange.respond(status, headers, &body, false)?;
         }
@@ -164,7 +161,7 @@ impl ParsedWrites {
 
     /// Takes the requests whose writes were not carried out, as those of other commands.
     fn requests<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyTuple>>> {
-        let open = std::mem::take(&mut self.writes().open);
+        let open = std::mem::take(&mut lock(&self.writes).open);
         let requests =
             open.into_iter().map(|ParsedWrite { exchange, head, known, body, .. }| {
                 request(py, exchange, known.into_bound(py), &head, Some(body))

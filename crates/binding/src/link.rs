@@ -1,7 +1,7 @@
 //! `Link`, `Route`, `Passage` and `Caller`: devices that listeners and event loops ask.
 
 use std::net::IpAddr;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use holdfast_engine::Wakes;
 use holdfast_engine::client::{ClientError, StrayCounters};
@@ -12,7 +12,7 @@ use holdfast_engine::poller::{Passage as CorePassage, PassedRange};
 use holdfast_memory::Area;
 use holdfast_protocol::client::InvalidResponse;
 use holdfast_protocol::pdu::{self, Bits, Registers, Request as CoreRequest, limit};
-use holdfast_runtime::Retry;
+use holdfast_runtime::{Retry, lock};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict, PyDict};
@@ -137,7 +137,7 @@ impl Caller {
     }
 
     fn detach(&self) -> PyResult<i64> {
-        let wakes = self.wakes.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let wakes = lock(&self.wakes).take();
         let wakes = wakes.ok_or_else(|| PyRuntimeError::new_err("the socket has been detached"))?;
         Ok(handle(wakes))
     }

@@ -1,7 +1,7 @@
 //! `Log` and `LogReader`: memories that several nodes share.
 
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use holdfast_journal::log::{
@@ -9,6 +9,7 @@ use holdfast_journal::log::{
     Settings, Tls, Until, WhenBehind,
 };
 use holdfast_memory::{Access, Action, Memory as CoreMemory, Step, StepWrite};
+use holdfast_runtime::lock;
 use pyo3::exceptions::{PyException, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict, PyDict, PyList};
@@ -258,7 +259,7 @@ impl LogReader {
 
 impl LogReader {
     fn locked<T>(&self, work: impl FnOnce(&mut CoreReader) -> T) -> T {
-        work(&mut self.core.lock().unwrap_or_else(PoisonError::into_inner))
+        work(&mut lock(&self.core))
     }
 
     fn shown<'py>(&self, py: Python<'py>, record: &Record) -> PyResult<Bound<'py, PyDict>> {

@@ -2,9 +2,10 @@
 
 use std::collections::HashMap;
 use std::hash::{BuildHasher, RandomState};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 
 use holdfast_engine::http::{HttpServer, Parts};
+use holdfast_runtime::lock;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyList, PyTuple};
 
@@ -39,7 +40,7 @@ impl Heads {
     ) -> PyResult<(Bound<'py, PyTuple>, Bound<'py, PyDict>)> {
         let bytes = bytes_of(parts);
         let hash = self.hasher.hash_one(&bytes);
-        if let Some(head) = self.known().get(&hash)
+        if let Some(head) = lock(&self.known).get(&hash)
             && head.bytes == bytes
         {
             return Ok((head.parts.bind(py).clone(), head.kept.bind(py).clone()));
@@ -47,7 +48,7 @@ impl Heads {
         let kept = PyDict::new(py);
         let parts = made(py, parts, &kept)?;
         if bytes.len() <= MAX_HEAD_BYTES {
-            let mut known = self.known();
+            let mut known = lock(&self.known);
             if known.len() == MAX_HEADS {
                 // Those of which nothing is kept are refused requests: anybody can send them.
                 known.retain(|_, head| !head.kept.bind(py).is_empty());
@@ -59,10 +60,6 @@ impl Heads {
             known.insert(hash, Head { bytes, parts, kept });
         }
         Ok((parts, kept))
-    }
-
-    fn known(&self) -> MutexGuard<'_, HashMap<u64, Head>> {
-        self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

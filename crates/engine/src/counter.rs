@@ -1,36 +1,9 @@
 //! Counters.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 
-/// A count. It only goes up, except for `held_bytes`, which uses `subtract`.
-#[derive(Debug, Default)]
-pub struct Counter(AtomicU64);
-
-impl Counter {
-    pub const fn new() -> Counter {
-        Counter(AtomicU64::new(0))
-    }
-
-    #[inline]
-    pub fn add(&self) {
-        self.add_many(1);
-    }
-
-    #[inline]
-    pub fn add_many(&self, count: u64) {
-        self.0.fetch_add(count, Ordering::Relaxed);
-    }
-
-    pub fn subtract(&self, count: u64) {
-        self.0.fetch_sub(count, Ordering::Relaxed);
-    }
-
-    pub fn get(&self) -> u64 {
-        self.0.load(Ordering::Relaxed)
-    }
-}
+use holdfast_runtime::lock;
 
 /// Makes a struct of counters with a list of their names. Fields after the semicolon are not in the
 /// list.
@@ -45,7 +18,7 @@ macro_rules! counters {
         $(#[$meta])*
         #[derive(Debug, Default)]
         pub struct $name {
-            $($(#[$about])* pub $counter: $crate::counter::Counter,)*
+            $($(#[$about])* pub $counter: holdfast_runtime::Counter,)*
             $($($(#[$other_about])* $access $other: $type,)*)?
         }
 
@@ -65,12 +38,12 @@ pub struct ReasonCounters(Mutex<BTreeMap<&'static str, u64>>);
 
 impl ReasonCounters {
     pub fn add(&self, reason: &'static str) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner).entry(reason).or_default() += 1;
+        *lock(&self.0).entry(reason).or_default() += 1;
     }
 
     /// The counts by reason. Reasons that did not occur are left out.
     pub fn by_reason(&self) -> BTreeMap<&'static str, u64> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        lock(&self.0).clone()
     }
 
     pub fn total(&self) -> u64 {

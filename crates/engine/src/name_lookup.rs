@@ -7,10 +7,11 @@ use std::collections::{HashMap, VecDeque};
 use std::io;
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
 use std::sync::mpsc::{RecvTimeoutError, sync_channel};
-use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, LazyLock, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 use std::{mem, process, thread};
 
+use holdfast_runtime::lock;
 use tokio::sync::oneshot;
 
 /// Why a name has no addresses.
@@ -173,7 +174,7 @@ fn finish(host: &str, found: &Found) {
 }
 
 fn lookups() -> MutexGuard<'static, Lookups> {
-    LOOKUPS.lock().unwrap_or_else(PoisonError::into_inner)
+    lock(&LOOKUPS)
 }
 
 /// Begins a lookup that has no result before the sender is dropped.

@@ -1,8 +1,10 @@
 //! Threads that a value owns, which are joined at its end.
 
 use std::process;
-use std::sync::{Mutex, PoisonError, TryLockError};
+use std::sync::{Mutex, TryLockError};
 use std::thread::JoinHandle;
+
+use holdfast_runtime::lock;
 
 /// Threads of this process. In a child process that was forked, they do not exist.
 #[derive(Debug)]
@@ -19,7 +21,7 @@ impl Default for OwnThreads {
 
 impl OwnThreads {
     pub(crate) fn push(&self, thread: JoinHandle<()>) {
-        self.threads.lock().unwrap_or_else(PoisonError::into_inner).push(thread);
+        lock(&self.threads).push(thread);
     }
 
     /// Whether this is a forked child, which has no copies of the threads. It must not stop those of its
@@ -40,7 +42,7 @@ impl OwnThreads {
 
     /// Waits for the end of all threads. A second call waits for the first.
     pub(crate) fn join(&self) {
-        let mut threads = self.threads.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut threads = lock(&self.threads);
         for thread in threads.drain(..) {
             let ended = thread.join();
             debug_assert!(ended.is_ok() || std::thread::panicking(), "a thread panicked");

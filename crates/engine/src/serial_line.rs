@@ -10,7 +10,7 @@ use std::os::fd::OwnedFd;
 #[cfg(unix)]
 use std::path::PathBuf;
 #[cfg(unix)]
-use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
 #[cfg(unix)]
@@ -180,7 +180,7 @@ enum User {
 fn lock(device: &str, user: User) -> io::Result<Lock> {
     static HELD: Mutex<BTreeMap<PathBuf, Weak<HeldLock>>> = Mutex::new(BTreeMap::new());
     let path = std::fs::canonicalize(device)?;
-    let mut held = HELD.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut held = holdfast_runtime::lock(&HELD);
     held.retain(|_, lock| lock.strong_count() > 0);
     let found = stat(&path)?;
     // A device that is plugged in again is another one.

@@ -7,12 +7,13 @@ use std::hash::{BuildHasher, RandomState};
 use std::io::ErrorKind;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use holdfast_protocol::client::{Attempt, Closed, Connection, Done, Past, Transport};
 use holdfast_protocol::pdu::{EncodedRequest, Response};
+use holdfast_runtime::lock;
 
 use super::byte_stream::{ByteStream, StreamError};
 use super::connect::connect;
@@ -156,7 +157,7 @@ impl BlockingClient {
     ) -> Option<Result<T, ClientError>> {
         let interrupt = &mut interrupt;
         let _turn = self.turns.take(interrupt)?;
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut state = lock(&self.state);
         let mut take = Some(take);
         let mut call =
             Call { unit_id, request, attempt: Attempt::default(), conditions, refused: None };
@@ -303,7 +304,7 @@ impl BlockingClient {
     /// they take their time. The next call opens a new one.
     pub fn close(&self, interrupted: Option<&mut dyn FnMut() -> bool>) {
         let Some(_turn) = self.turns.take(&mut Interrupt::new(interrupted)) else { return };
-        self.state.lock().unwrap_or_else(PoisonError::into_inner).end();
+        lock(&self.state).end();
     }
 
     /// What came without a request, or late.

@@ -4,8 +4,10 @@
 //! waiting threads wake up.
 
 use std::collections::VecDeque;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 use std::thread::{self, Thread};
+
+use holdfast_runtime::lock;
 
 use super::interrupt::{Interrupt, SIGNAL_CHECK_INTERVAL};
 
@@ -31,7 +33,7 @@ pub(super) struct Turn<'t>(&'t Turns);
 impl Turns {
     /// Waits for a turn. `None` when the caller is interrupted before.
     pub(super) fn take(&self, interrupt: &mut Interrupt<'_>) -> Option<Turn<'_>> {
-        let mut tickets = self.tickets();
+        let mut tickets = lock(&self.tickets);
         let mine = tickets.next;
         tickets.next += 1;
         if tickets.current != mine {
@@ -45,7 +47,7 @@ impl Turns {
                 thread::park();
             }
             let is_hit = interrupt.is_hit();
-            tickets = self.tickets();
+            tickets = lock(&self.tickets);
             if is_hit && tickets.current != mine {
                 let me = thread::current().id();
                 tickets.waiting.retain(|thread| thread.id() != me);
@@ -56,15 +58,11 @@ impl Turns {
         drop(tickets);
         Some(Turn(self))
     }
-
-    fn tickets(&self) -> MutexGuard<'_, Tickets> {
-        self.tickets.lock().unwrap_or_else(PoisonError::into_inner)
-    }
 }
 
 impl Drop for Turn<'_> {
     fn drop(&mut self) {
-        let mut tickets = self.0.tickets();
+        let mut tickets = lock(&self.0.tickets);
         tickets.current += 1;
         while let Some(at) = tickets.left.iter().position(|number| *number == tickets.current) {
             tickets.left.swap_remove(at);
@@ -95,7 +93,7 @@ mod tests {
                     let _turn = turns.take(&mut Interrupt::new(None));
                     assert_eq!(served.fetch_add(1, Ordering::SeqCst) + 1, number);
                 });
-                while turns.tickets().next != number + 1 {
+                while lock(&turns.tickets).next != number + 1 {
                     thread::yield_now();
                 }
             }
@@ -111,10 +109,10 @@ mod tests {
         thread::scope(|threads| {
             let first = turns.take(&mut Interrupt::new(None));
             let leaves = threads.spawn(|| {
-                let mut check = || turns.tickets().next == 3;
+                let mut check = || lock(&turns.tickets).next == 3;
                 turns.take(&mut Interrupt::new(Some(&mut check))).is_none()
             });
-            while turns.tickets().next != 2 {
+            while lock(&turns.tickets).next != 2 {
                 thread::yield_now();
             }
             let stays = threads.spawn(|| turns.take(&mut Interrupt::new(None)).is_some());
@@ -123,6 +121,6 @@ mod tests {
             assert!(stays.join().unwrap());
         });
         assert!(turns.take(&mut Interrupt::new(None)).is_some());
-        assert!(turns.tickets().left.is_empty());
+        assert!(lock(&turns.tickets).left.is_empty());
     }
 }

@@ -1,8 +1,7 @@
 //! What devices send without a request, and late: counted for each connection, over all its lives.
 
 use holdfast_protocol::client::Connection;
-
-use crate::counter::Counter;
+use holdfast_runtime::Counter;
 
 #[derive(Debug, Default)]
 pub struct StrayCounters {

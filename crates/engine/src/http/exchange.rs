@@ -2,10 +2,11 @@
 
 use std::collections::VecDeque;
 use std::future::poll_fn;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::task::{Context, Poll, Waker};
 
 use bytes::Bytes;
+use holdfast_runtime::lock;
 use hyper::header::{CONTENT_LENGTH, HeaderName, HeaderValue};
 use hyper::http::request::Parts;
 use hyper::{HeaderMap, StatusCode};
@@ -131,7 +132,7 @@ impl Exchange {
         if has_body && !head.headers.contains_key(CONTENT_LENGTH) {
             head.headers.insert(CONTENT_LENGTH, HeaderValue::from(body.len()));
         }
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         state.orders.push_back(Order::Respond { head, body, closes });
         let waker = state.waker.take();
         drop(state);
@@ -143,13 +144,13 @@ impl Exchange {
     /// Answers the request with a stream. From now on, a client that sends no more counts as gone: a
     /// stream may have no other end.
     pub fn begin(&self, head: ResponseHead) {
-        self.state().leaves = true;
+        lock(&self.state).leaves = true;
         self.order(Order::Begin(head));
     }
 
     /// Sends data of a stream.
     pub fn send(&self, data: Bytes) -> Sent {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         if state.is_over {
             return Sent::Gone;
         }
@@ -164,7 +165,7 @@ impl Exchange {
 
     /// Ends a stream. One that is not complete is cut off, so that its client notices.
     pub fn end(&self, is_complete: bool) {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         state.end.get_or_insert(is_complete);
         wake(state);
     }
@@ -175,11 +176,11 @@ impl Exchange {
     }
 
     pub(super) fn leaves(&self) -> bool {
-        self.state().leaves
+        lock(&self.state).leaves
     }
 
     pub(super) fn order(&self, order: Order) {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         state.orders.push_back(order);
         wake(state);
     }
@@ -187,7 +188,7 @@ impl Exchange {
     /// The next order of the handler.
     pub(super) async fn next(&self) -> Order {
         poll_fn(|context| {
-            let mut state = self.state();
+            let mut state = lock(&self.state);
             match state.orders.pop_front() {
                 Some(order) => Poll::Ready(order),
                 None => {
@@ -205,7 +206,7 @@ impl Exchange {
 
     /// The socket has taken all that hyper has.
     pub(super) fn flushed(&self) {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         state.is_unsent = false;
         if state.is_awaited && state.data.is_none() {
             state.is_awaited = false;
@@ -216,7 +217,7 @@ impl Exchange {
 
     /// The connection is done with it. If the response is not complete, the client is gone.
     pub(super) fn finish(&self, is_complete: bool) {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         if !std::mem::replace(&mut state.is_over, true) && !is_complete {
             drop(state);
             self.notify(Event::Gone { number: self.number });
@@ -228,7 +229,7 @@ impl Exchange {
         &self,
         context: &Context<'_>,
     ) -> Poll<Option<Result<Bytes, Abandoned>>> {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         if let Some(data) = state.data.take() {
             state.is_unsent = true;
             return Poll::Ready(Some(Ok(data)));
@@ -243,10 +244,6 @@ impl Exchange {
         }
         state.waker = Some(context.waker().clone());
         Poll::Pending
-    }
-
-    fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

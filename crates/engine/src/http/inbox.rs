@@ -5,9 +5,10 @@
 
 use std::io::{self, Write};
 use std::mem;
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 use std::task::Waker;
 
+use holdfast_runtime::lock;
 use tokio::sync::Notify;
 use tokio::task::yield_now;
 
@@ -39,7 +40,7 @@ impl<Event> Inbox<Event> {
     }
 
     pub(super) fn push(&self, event: Event) {
-        let mut events = self.events.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut events = lock(&self.events);
         let was_empty = events.is_empty();
         events.push(event);
         drop(events);
@@ -55,7 +56,7 @@ impl<Event> Inbox<Event> {
 
     /// Wakes a task that has a response, after the next `flush`.
     pub(super) fn wake_later(&self, task: Waker) {
-        self.answered.lock().unwrap_or_else(PoisonError::into_inner).push(task);
+        lock(&self.answered).push(task);
     }
 
     pub(super) fn flush(&self) {
@@ -68,7 +69,7 @@ impl<Event> Inbox<Event> {
         loop {
             tokio::select! {
                 () = self.has_answered.notified() => {
-                    let mut answered = self.answered.lock().unwrap_or_else(PoisonError::into_inner);
+                    let mut answered = lock(&self.answered);
                     mem::take(&mut *answered).into_iter().for_each(Waker::wake);
                 }
                 () = self.has_events.notified() => {
@@ -82,6 +83,6 @@ impl<Event> Inbox<Event> {
 
     /// Takes all events.
     pub(super) fn take(&self) -> Vec<Event> {
-        mem::take(&mut *self.events.lock().unwrap_or_else(PoisonError::into_inner))
+        mem::take(&mut *lock(&self.events))
     }
 }

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, ready};
 use std::time::{Duration, Instant};
 
+use holdfast_runtime::lock;
 use hyper::rt::{Read, ReadBufCursor, Write};
 use socket2::SockRef;
 
@@ -121,7 +122,7 @@ impl SharedLine {
     }
 
     pub(super) fn lock(&self) -> MutexGuard<'_, Line> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 
     /// The line, when hyper and the response are done with it.

@@ -2,10 +2,11 @@
 
 use std::io;
 use std::net::{IpAddr, TcpListener};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
+use holdfast_runtime::lock;
 use tokio::runtime::Builder;
 use tokio::sync::watch;
 use tokio::time::sleep;
@@ -100,7 +101,7 @@ impl HttpServer {
     /// # Errors
     /// The system has no threads or file descriptors left.
     pub fn start(&self) -> io::Result<()> {
-        let mut unstarted = self.socket.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut unstarted = lock(&self.socket);
         let Some(socket) = &*unstarted else { return Ok(()) };
         let runtime = Builder::new_current_thread().enable_io().enable_time().build()?;
         let socket = {
@@ -147,7 +148,7 @@ impl HttpServer {
 
     /// The socket that becomes readable when there is something to take. Only the first call returns it.
     pub fn wakes(&self) -> Option<Wakes> {
-        self.wakes.lock().unwrap_or_else(PoisonError::into_inner).take()
+        lock(&self.wakes).take()
     }
 
     pub fn connections(&self) -> &ConnectionCounters {

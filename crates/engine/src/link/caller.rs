@@ -5,11 +5,12 @@
 
 use std::collections::HashMap;
 use std::io::{self, Write};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use holdfast_protocol::client::Closed;
 use holdfast_protocol::pdu::EncodedRequest;
+use holdfast_runtime::lock;
 
 use crate::client::{ClientError, Lost};
 use crate::link::scheduling::queue::source;
@@ -81,7 +82,7 @@ impl Caller {
         timeout: Duration,
         is_broadcast: bool,
     ) -> (u64, Waiting) {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         let ticket = state.next;
         state.next += 1;
         state.pending.insert(ticket, Pending { request: request.clone(), is_sent: false });
@@ -92,17 +93,17 @@ impl Caller {
 
     /// Gives a call up: it is not sent if its turn has not come. Returns whether its turn has come.
     pub fn withdraw(&self, ticket: u64) -> bool {
-        let pending = self.state().pending.remove(&ticket);
+        let pending = lock(&self.state).pending.remove(&ticket);
         pending.is_none_or(|pending| pending.is_sent)
     }
 
     /// Takes all calls that have ended.
     pub fn take(&self) -> Vec<Called> {
-        std::mem::take(&mut self.state().done)
+        std::mem::take(&mut lock(&self.state).done)
     }
 
     fn end(&self, ticket: u64, outcome: Result<Vec<u8>, Arc<ClientError>>) {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         let Some(Pending { request, is_sent }) = state.pending.remove(&ticket) else { return };
         let was_empty = state.done.is_empty();
         state.done.push(Called { ticket, request, outcome, is_sent });
@@ -111,10 +112,6 @@ impl Caller {
             // A full socket wakes the event loop too, and a closed one has no event loop.
             let _ = (&self.wake).write(&[0]);
         }
-    }
-
-    fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -130,12 +127,12 @@ impl Waiting {
     }
 
     pub(super) fn is_unwanted(&self) -> bool {
-        self.left().is_zero() || !self.caller.state().pending.contains_key(&self.ticket)
+        self.left().is_zero() || !lock(&self.caller.state).pending.contains_key(&self.ticket)
     }
 
     /// Its turn has come.
     pub(super) fn note_sent(&self) {
-        if let Some(pending) = self.caller.state().pending.get_mut(&self.ticket) {
+        if let Some(pending) = lock(&self.caller.state).pending.get_mut(&self.ticket) {
             pending.is_sent = true;
         }
     }

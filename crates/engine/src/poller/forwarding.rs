@@ -6,19 +6,18 @@ use std::collections::{HashMap, VecDeque};
 use std::io::{self, ErrorKind};
 use std::num::NonZeroU16;
 use std::rc::Rc;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use holdfast_memory::Area;
 use holdfast_protocol::raw_ingest::{DONE, Format, Header};
-use holdfast_runtime::Retry;
+use holdfast_runtime::{Counter, Retry, lock};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, timeout_at};
 
 use super::status::{BlockSettings, STATUS_BLOCK_LEN, Status};
-use crate::counter::Counter;
 use crate::link::{agree, dial};
 use crate::name_lookup;
 use crate::raw_ingest_areas::in_packet;
@@ -90,7 +89,7 @@ pub struct ForwardFailure {
 impl ForwardCounters {
     /// The last failure.
     pub fn failure(&self) -> Option<ForwardFailure> {
-        self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        lock(&self.failure).clone()
     }
 
     fn fail(&self, error: &io::Error) {
@@ -98,7 +97,7 @@ impl ForwardCounters {
         let failure =
             ForwardFailure { reason: tls.map(TlsFailure::reason), text: error.to_string() };
         self.failed.add();
-        *self.failure.lock().unwrap_or_else(PoisonError::into_inner) = Some(failure);
+        *lock(&self.failure) = Some(failure);
     }
 }
 

@@ -6,10 +6,11 @@
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 use std::time::{Duration, Instant, SystemTime};
 
 use holdfast_memory::Area;
+use holdfast_runtime::lock;
 
 use crate::link::Fault;
 
@@ -107,7 +108,7 @@ impl Results {
     }
 
     fn put(&self, put: impl FnOnce(&mut Batch)) {
-        let mut batch = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut batch = lock(&self.queue);
         debug_assert!(!batch.ended, "no result follows the end");
         let first = batch.is_empty();
         put(&mut batch);
@@ -120,7 +121,7 @@ impl Results {
     /// Ends the current or the next wait of the receiver, without results.
     pub fn wake(&self) {
         // The end wakes it too.
-        let mut batch = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut batch = lock(&self.queue);
         batch.woken = true;
         drop(batch);
         self.ready.notify_one();
@@ -128,7 +129,7 @@ impl Results {
 
     /// Takes all results that wait. If there are none, waits up to `timeout` for the first.
     pub fn take(&self, timeout: Duration) -> Batch {
-        let batch = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
+        let batch = lock(&self.queue);
         let (mut batch, _) = self
             .ready
             .wait_timeout_while(batch, timeout, |batch| batch.is_empty())
@@ -161,7 +162,7 @@ impl Default for Receivers {
 impl Receivers {
     pub(super) fn add(&self) -> Arc<Results> {
         let made = Arc::new(Results::since(self.began));
-        match &mut *self.all() {
+        match &mut *lock(&self.all) {
             Some(all) => {
                 all.retain(|other| other.strong_count() > 0);
                 all.push(Arc::downgrade(&made));
@@ -173,14 +174,10 @@ impl Receivers {
 
     /// Tells all receivers, and those that come later, that no results will come.
     pub(super) fn end(&self) {
-        for receiver in self.all().take().into_iter().flatten() {
+        for receiver in lock(&self.all).take().into_iter().flatten() {
             if let Some(receiver) = receiver.upgrade() {
                 receiver.end();
             }
         }
-    }
-
-    fn all(&self) -> MutexGuard<'_, Option<Vec<Weak<Results>>>> {
-        self.all.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -1,13 +1,15 @@
 //! Counters and health of a device: written by its task, read from any thread.
 
 use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
+
+use holdfast_runtime::{Counter, lock};
 
 use super::health::Health;
 use super::status::Status;
 use crate::client::StrayCounters;
-use crate::counter::{Counter, counters};
+use crate::counter::counters;
 use crate::link::Fault;
 
 /// Counters and health of a device.
@@ -92,14 +94,14 @@ impl DeviceState {
 
     /// Why the device has no plan.
     pub fn plan_error(&self) -> Option<String> {
-        self.plan_error.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        lock(&self.plan_error).clone()
     }
 
     /// Records the number of requests of the plan, or why there is none.
     pub(super) fn planned(&self, requests: Result<usize, String>) {
         let count = *requests.as_ref().unwrap_or(&0);
         self.requests_per_poll.store(count as u32, Ordering::Relaxed);
-        *self.plan_error.lock().unwrap_or_else(PoisonError::into_inner) = requests.err();
+        *lock(&self.plan_error) = requests.err();
     }
 
     /// Records whether a task of the device has panicked. If so, the device is in error until it is
@@ -125,7 +127,7 @@ impl DeviceState {
     /// What the connection to its address has received without a request, or late. Devices at one address
     /// share it.
     pub fn strays(&self) -> Arc<StrayCounters> {
-        Arc::clone(&self.strays.lock().unwrap_or_else(PoisonError::into_inner))
+        Arc::clone(&lock(&self.strays))
     }
 
     /// Whether another node polls the device.
@@ -143,7 +145,7 @@ impl DeviceState {
     }
 
     pub(super) fn set_strays(&self, strays: &Arc<StrayCounters>) {
-        *self.strays.lock().unwrap_or_else(PoisonError::into_inner) = Arc::clone(strays);
+        *lock(&self.strays) = Arc::clone(strays);
     }
 
     pub fn failures(&self) -> u32 {
@@ -176,7 +178,7 @@ impl DeviceState {
     }
 
     fn times(&self) -> std::sync::MutexGuard<'_, Times> {
-        self.since.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.since)
     }
 
     /// Records that polling begins. A device that was in error before still is.

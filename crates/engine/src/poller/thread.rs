@@ -5,13 +5,13 @@ use std::io;
 use std::net::IpAddr;
 use std::rc::{self, Rc};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, Weak};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use holdfast_memory::Memory;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, limit};
-use holdfast_runtime::Retry;
+use holdfast_runtime::{Retry, lock};
 use thiserror::Error;
 use tokio::runtime::Builder;
 use tokio::sync::mpsc;
@@ -206,7 +206,7 @@ impl Poller {
     }
 
     fn begin(&self, device: Planned) -> Result<(), PollerError> {
-        let mut all = self.polled();
+        let mut all = lock(&self.polled);
         let settings = &device.settings;
         if all.contains_key(&settings.name) {
             return Err(PollerError::Taken { device: settings.name.clone() });
@@ -237,7 +237,7 @@ impl Poller {
     ) -> Result<(), PollerError> {
         let device = checked(device)?;
         let settings = &device.settings;
-        let mut all = self.polled();
+        let mut all = lock(&self.polled);
         if settings.name != name && all.contains_key(&settings.name) {
             return Err(PollerError::Taken { device: settings.name.clone() });
         }
@@ -261,7 +261,7 @@ impl Poller {
     /// [`PollerError::Stopped`].
     pub fn link(&self, settings: LinkSettings) -> Result<Arc<SharedLink>, PollerError> {
         let address = address(&settings.endpoint);
-        let mut all = self.shared.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut all = lock(&self.shared);
         let known = all.iter().find(|(other, _)| *other == address);
         if let Some(known) = known.and_then(|(_, link)| link.upgrade()) {
             return Ok(known);
@@ -284,8 +284,8 @@ impl Poller {
         settings: LinkSettings,
     ) -> Result<Option<Arc<SharedLink>>, PollerError> {
         let address = address(&settings.endpoint);
-        let is_known = self.polled().values().any(|device| *device.address == address) || {
-            let all = self.shared.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_known = lock(&self.polled).values().any(|device| *device.address == address) || {
+            let all = lock(&self.shared);
             all.iter().any(|(other, link)| *other == address && link.strong_count() > 0)
         };
         is_known.then(|| self.link(settings)).transpose()
@@ -326,7 +326,7 @@ impl Poller {
             let function = request.pdu()[0];
             return Err(PollerError::NoWrite { device: name.to_owned(), function });
         }
-        if !self.polled().contains_key(name) {
+        if !lock(&self.polled).contains_key(name) {
             return Err(PollerError::Unknown { device: name.to_owned() });
         }
         let ticket = self.tickets.fetch_add(1, Ordering::Relaxed);
@@ -338,7 +338,7 @@ impl Poller {
     /// Stops polling a device. Its connection is closed when no other device uses it. Returns
     /// whether there was a device of that name.
     pub fn remove(&self, name: &str) -> bool {
-        let mut all = self.polled();
+        let mut all = lock(&self.polled);
         let known = all.remove(name).is_some();
         if known {
             // A stopped poller polls nothing.
@@ -349,13 +349,9 @@ impl Poller {
 
     /// The current devices, in the order in which they were added.
     pub fn devices(&self) -> Vec<Polled> {
-        let mut devices: Vec<_> = self.polled().values().cloned().collect();
+        let mut devices: Vec<_> = lock(&self.polled).values().cloned().collect();
         devices.sort_unstable_by_key(|device| device.number);
         devices
-    }
-
-    fn polled(&self) -> MutexGuard<'_, HashMap<String, Polled>> {
-        self.polled.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// A new receiver of polls and of the results of writes. It ends with the poller.

@@ -4,11 +4,12 @@ use std::io;
 use std::mem;
 use std::net::SocketAddr;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::thread;
 use std::time::Duration;
 
 use holdfast_protocol::pdu::identification::ObjectError;
+use holdfast_runtime::lock;
 use socket2::{SockRef, Socket};
 use thiserror::Error;
 use tokio::net::{TcpListener, UdpSocket};
@@ -221,7 +222,7 @@ impl Engine {
         let Listening { listeners: settings, identity, unit_names } = listening;
         let identity = || Identity::new(&identity, &unit_names);
         identity()?;
-        let mut listeners = self.listeners();
+        let mut listeners = lock(&self.listeners);
         let mut ending = listeners.clone();
         let kept = |ListenerSettings { name, kind }: &ListenerSettings| {
             let at = ending.iter().position(|running| *running.context.name == **name)?;
@@ -330,13 +331,9 @@ impl Engine {
         Ok((listener, task))
     }
 
-    fn listeners(&self) -> MutexGuard<'_, Vec<Arc<Listener>>> {
-        self.listeners.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     /// Judges all open connections again: a certificate may have expired.
     pub fn review(&self) {
-        for listener in self.listeners().iter() {
+        for listener in lock(&self.listeners).iter() {
             match &listener.served {
                 Served::Stream(live, _) => listener.review(live),
                 Served::Packets(live) => listener.review(live),
@@ -347,7 +344,7 @@ impl Engine {
 
     /// The open connections of each listener, by its name.
     pub fn sessions(&self) -> Vec<(Arc<str>, Vec<OpenConnection>)> {
-        let listeners = self.listeners();
+        let listeners = lock(&self.listeners);
         let sessions = |listener: &Arc<Listener>| {
             (Arc::clone(&listener.context.name), listener.context.admission.sessions())
         };
@@ -356,7 +353,7 @@ impl Engine {
 
     /// Ends a connection. Returns whether there was one.
     pub fn end_session(&self, listener: &str, id: u64) -> bool {
-        let listeners = self.listeners();
+        let listeners = lock(&self.listeners);
         let found = listeners.iter().find(|running| *running.context.name == *listener);
         let ended = found.and_then(|running| {
             running.context.admission.end(id).map(|peer| (Arc::clone(running), peer))
@@ -396,7 +393,7 @@ impl Engine {
 
     /// The address of each listener, in the order of the settings; `None` for serial lines.
     pub fn addresses(&self) -> Vec<Option<SocketAddr>> {
-        self.listeners().iter().map(|listener| listener.address).collect()
+        lock(&self.listeners).iter().map(|listener| listener.address).collect()
     }
 
     /// The sockets that listen. None after `stop`, and in a forked child.
@@ -404,13 +401,13 @@ impl Engine {
         if self.workers.are_of_another_process() || !self.workers.are_running() {
             return Vec::new();
         }
-        let listeners = self.listeners();
+        let listeners = lock(&self.listeners);
         listeners.iter().filter_map(|each| Some((each.socket_kind()?, each.address?))).collect()
     }
 
     /// The counters of each listener, in the order of the settings.
     pub fn counters(&self) -> Vec<ListenerCounters> {
-        self.listeners().iter().map(|listener| listener.counters()).collect()
+        lock(&self.listeners).iter().map(|listener| listener.counters()).collect()
     }
 
     /// Changes which events are sent.

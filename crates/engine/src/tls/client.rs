@@ -6,8 +6,9 @@
 
 use std::ffi::OsString;
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
+use holdfast_runtime::lock;
 use rustls::client::danger::{ServerCertVerified, ServerCertVerifier};
 use rustls::client::{Resumption, verify_server_name};
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
@@ -126,7 +127,7 @@ fn system_authorities() -> Result<Arc<[Listed]>, TlsError> {
     type Variables = [Option<OsString>; 2];
     static CACHE: Mutex<Option<(Variables, Arc<[Listed]>)>> = Mutex::new(None);
     let variables = ["SSL_CERT_FILE", "SSL_CERT_DIR"].map(std::env::var_os);
-    let mut known = CACHE.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut known = lock(&CACHE);
     if let Some((of, found)) = &*known
         && *of == variables
     {

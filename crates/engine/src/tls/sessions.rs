@@ -8,9 +8,10 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::fmt;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use holdfast_runtime::lock;
 use rustls::pki_types::UnixTime;
 use rustls::server::StoresServerSessions;
 use rustls::time_provider::TimeProvider;
@@ -57,7 +58,7 @@ impl Sessions {
 
     /// Forgets a session: its connection has failed.
     pub(super) fn forget(&self, key: &[u8]) {
-        self.stored().sessions.remove(key);
+        lock(&self.stored).sessions.remove(key);
     }
 
     /// The secrets of a session whose client is still trusted.
@@ -80,10 +81,6 @@ impl Sessions {
         });
         Some(session.secrets)
     }
-
-    fn stored(&self) -> MutexGuard<'_, Stored> {
-        self.stored.lock().unwrap_or_else(PoisonError::into_inner)
-    }
 }
 
 impl StoresServerSessions for Sessions {
@@ -99,7 +96,7 @@ impl StoresServerSessions for Sessions {
             return false;
         }
         noted(|notes| notes.session = Some(key.clone()));
-        let mut stored = self.stored();
+        let mut stored = lock(&self.stored);
         stored.in_order.push_back(key.clone());
         stored.sessions.insert(key, Session { secrets, chain, proved });
         if stored.in_order.len() > MAX_SESSIONS
@@ -112,13 +109,13 @@ impl StoresServerSessions for Sessions {
 
     /// For TLS 1.2, which resumes a session any number of times.
     fn get(&self, key: &[u8]) -> Option<Vec<u8>> {
-        let session = self.stored().sessions.get(key).cloned()?;
+        let session = lock(&self.stored).sessions.get(key).cloned()?;
         self.resumed(key, session)
     }
 
     /// For TLS 1.3, which resumes a session once, and then stores it with another key.
     fn take(&self, key: &[u8]) -> Option<Vec<u8>> {
-        let session = self.stored().sessions.remove(key)?;
+        let session = lock(&self.stored).sessions.remove(key)?;
         self.resumed(key, session)
     }
 
@@ -142,7 +139,7 @@ impl Sessions {
         for number in 0..MAX_SESSIONS as u64 {
             assert!(self.put(number.to_be_bytes().to_vec(), Vec::new()));
         }
-        assert_eq!(self.stored().sessions.len(), MAX_SESSIONS);
+        assert_eq!(lock(&self.stored).sessions.len(), MAX_SESSIONS);
         noted(std::mem::take);
     }
 }

@@ -10,6 +10,7 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use holdfast_memory::{Contents, Memory};
+use holdfast_runtime::lock;
 
 use super::before_reply::BeforeReply;
 use super::disk::Disk;
@@ -280,10 +281,6 @@ impl Drop for MemoryFile {
         // A caller that needs the result calls it before.
         let _ = self.stop();
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Checks that memories can be kept in one file.

@@ -4,8 +4,9 @@
 use std::collections::HashMap;
 use std::io;
 use std::ops::Bound;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 
+use holdfast_runtime::lock;
 use redb::{BackendError, StorageBackend};
 
 /// The unit in which changed bytes are copied.
@@ -28,10 +29,6 @@ struct Changes {
 impl<B: StorageBackend> Overlay<B> {
     pub fn new(below: B) -> Overlay<B> {
         Overlay { below, changes: Mutex::default() }
-    }
-
-    fn changes(&self) -> MutexGuard<'_, Changes> {
-        self.changes.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn lens(&self, changes: &Changes) -> io::Result<(u64, u64)> {
@@ -68,11 +65,11 @@ fn parts(offset: u64, len: usize) -> impl Iterator<Item = (u64, usize, usize)> {
 
 impl<B: StorageBackend> StorageBackend for Overlay<B> {
     fn len(&self) -> io::Result<u64> {
-        self.lens(&self.changes()).map(|(len, _)| len)
+        self.lens(&lock(&self.changes)).map(|(len, _)| len)
     }
 
     fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
-        let changes = self.changes();
+        let changes = lock(&self.changes);
         let (len, _) = self.lens(&changes)?;
         if offset.checked_add(out.len() as u64).is_none_or(|end| end > len) {
             return Err(io::ErrorKind::UnexpectedEof.into());
@@ -84,7 +81,7 @@ impl<B: StorageBackend> StorageBackend for Overlay<B> {
     }
 
     fn set_len(&self, len: u64) -> io::Result<()> {
-        let mut changes = self.changes();
+        let mut changes = lock(&self.changes);
         let (_, visible) = self.lens(&changes)?;
         changes.blocks.retain(|block, _| block * BLOCK_BYTES < len);
         let cut = (len % BLOCK_BYTES) as usize;
@@ -100,7 +97,7 @@ impl<B: StorageBackend> StorageBackend for Overlay<B> {
     }
 
     fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
-        let mut changes = self.changes();
+        let mut changes = lock(&self.changes);
         let (len, _) = self.lens(&changes)?;
         if offset.checked_add(data.len() as u64).is_none_or(|end| end > len) {
             return Err(io::ErrorKind::UnexpectedEof.into());

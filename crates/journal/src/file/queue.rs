@@ -2,10 +2,11 @@
 
 use std::mem;
 use std::process;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use holdfast_memory::{Action, Done, Journal, Memory, Refusal, Refused, Step};
+use holdfast_runtime::lock;
 
 use super::status::Status;
 
@@ -72,7 +73,7 @@ impl Queue {
 
     /// Lets steps wait from now on, if `store` stores what the memories contain now.
     pub fn begin<E>(&self, store: impl FnOnce() -> Result<(), E>) -> Result<(), E> {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         if matches!(state.phase, Phase::Loading(_)) {
             store()?;
             state.phase = Phase::Running;
@@ -82,7 +83,7 @@ impl Queue {
 
     /// Refuses steps from now on. Those that wait are still stored.
     pub fn stop(&self) {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         state.phase = match state.phase {
             Phase::Running | Phase::Stopping => Phase::Stopping,
             Phase::Loading(_) | Phase::Ended => Phase::Ended,
@@ -93,7 +94,7 @@ impl Queue {
 
     /// Refuses all steps, also those that wait.
     pub fn end(&self) {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         state.phase = Phase::Ended;
         state.bytes = 0;
         let waiting = mem::take(&mut state.waiting);
@@ -105,7 +106,7 @@ impl Queue {
     pub fn next(&self, timeout: Option<Duration>) -> Next {
         let is_idle =
             |state: &mut State| state.waiting.is_empty() && matches!(state.phase, Phase::Running);
-        let state = self.state();
+        let state = lock(&self.state);
         let mut state = match timeout {
             Some(timeout) => {
                 self.changed
@@ -123,19 +124,15 @@ impl Queue {
     }
 
     pub fn waiting(&self) -> usize {
-        self.state().waiting.len()
+        lock(&self.state).waiting.len()
     }
 
     /// Answers and counts steps that were not carried out.
     pub fn refuse(&self, steps: impl ExactSizeIterator<Item = Done>, refusal: Refusal) {
-        self.status.lock().unwrap_or_else(PoisonError::into_inner).refused += steps.len() as u64;
+        lock(&self.status).refused += steps.len() as u64;
         for done in steps {
             done(Err(Refused { index: 0, refusal }));
         }
-    }
-
-    fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -144,7 +141,7 @@ impl Journal for Queue {
         if self.process != process::id() {
             return done(Err(Refused { index: 0, refusal: Refusal::Unavailable }));
         }
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         let refusal = match &state.phase {
             Phase::Loading(memories) => {
                 let outcome = step.carry_out(memories);

@@ -1,9 +1,10 @@
 //! The file as a database: its tables, and transactions.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Instant, SystemTime};
 
+use holdfast_runtime::lock;
 use redb::{
     Builder, Database, ReadableDatabase, ReadableTable, TableDefinition, TableError,
     WriteTransaction,
@@ -132,7 +133,7 @@ impl Store {
     }
 
     fn note(&self, change: impl FnOnce(&mut Status)) {
-        change(&mut self.status.lock().unwrap_or_else(PoisonError::into_inner));
+        change(&mut lock(&self.status));
     }
 }
 

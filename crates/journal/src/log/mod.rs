@@ -33,11 +33,12 @@ mod status;
 mod stream;
 
 use std::collections::BTreeSet;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use holdfast_memory::{Journal, Memory};
+use holdfast_runtime::lock;
 
 pub use clock::time_since_boot;
 pub use defaults::{MAX_LAG, WHEN_BEHIND, WRITE_TIMEOUT};
@@ -103,7 +104,7 @@ impl Log {
                 "the file has contents of the log {found:?}, not of {name:?}: move it away"
             )));
         }
-        *self.note.lock().unwrap_or_else(PoisonError::into_inner) = Some(note);
+        *lock(&self.note) = Some(note);
         Ok(())
     }
 
@@ -118,7 +119,7 @@ impl Log {
     /// # Errors
     /// [`LogError::Thread`], and [`LogError::Snapshot`] for contents that are not those of the note.
     pub fn start(&self) -> Result<(), LogError> {
-        let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut thread = lock(&self.thread);
         if thread.is_some() {
             return Ok(());
         }
@@ -126,7 +127,7 @@ impl Log {
         let fingerprint = layout::fingerprint(&self.members);
         let (settings, shared) = (Arc::clone(&self.settings), Arc::clone(&self.shared));
         let mut node = Running::new(settings, fingerprint, shared, members);
-        if let Some(note) = self.note.lock().unwrap_or_else(PoisonError::into_inner).take() {
+        if let Some(note) = lock(&self.note).take() {
             node.applier.resume(note)?;
         }
         let name = format!("log {}", self.settings.name);
@@ -166,7 +167,7 @@ impl Log {
             return;
         }
         self.shared.stop();
-        let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut thread = lock(&self.thread);
         if let Some(thread) = thread.take() {
             let ended = thread.join();
             debug_assert!(ended.is_ok() || std::thread::panicking(), "the thread panicked");

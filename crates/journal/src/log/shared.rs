@@ -3,16 +3,17 @@
 use std::collections::VecDeque;
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use holdfast_memory::{Contents, Done, Journal, Refusal, Refused, Step};
+use holdfast_runtime::{Counter, lock};
 use tokio::sync::Notify;
 
 use super::clock::{Clock, Moment};
 use super::error::LogError;
 use super::settings::{Settings, WhenBehind};
-use super::status::{Counter, Counters, Event, Node, Phase, View};
+use super::status::{Counters, Event, Node, Phase, View};
 use crate::encoding;
 
 /// The most steps that wait to be sent, and their bytes.
@@ -101,7 +102,7 @@ impl Journal for Shared {
         encoding::encode(&step, &mut bytes);
         // The servers would end the connection: no later attempt could succeed either.
         if bytes.len() > self.max_step_bytes.load(Ordering::Relaxed) {
-            self.counters.not_stored.add(1);
+            self.counters.not_stored.add();
             return refuse(done, Refusal::NotStored);
         }
         let mut queue = lock(&self.queue);
@@ -109,7 +110,7 @@ impl Journal for Shared {
             queue.steps.len() < self.capacity && queue.bytes + bytes.len() <= MAX_QUEUE_BYTES;
         if !queue.open || !fits {
             drop(queue);
-            self.counters.unavailable.add(1);
+            self.counters.unavailable.add();
             return refuse(done, Refusal::Unavailable);
         }
         queue.bytes += bytes.len();
@@ -372,12 +373,8 @@ fn refuse(done: Done, refusal: Refusal) {
 
 /// Refuses and counts steps.
 pub(super) fn refuse_all(steps: Vec<Done>, refusal: Refusal, counted: &Counter) {
-    counted.add(steps.len() as u64);
+    counted.add_many(steps.len() as u64);
     steps.into_iter().for_each(|done| refuse(done, refusal));
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

@@ -6,12 +6,13 @@
 //! task closes the connection when the time is over: after a stop of the process, others may run first.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, Weak};
 use std::time::{Duration, Instant};
 
 use holdfast_memory::{
     Access, Done, Memory, Operation, Outcome, Refusal, Refused, Tenure, Term, Write,
 };
+use holdfast_runtime::lock;
 use tokio::sync::watch;
 use tokio::time::sleep_until;
 
@@ -71,7 +72,7 @@ impl Fence {
     pub fn open(&self, until: Instant, term: Term, settle: Duration) {
         let settled = if settle.is_zero() { 0 } else { self.time(Instant::now() + settle) };
         self.settled.store(settled, Ordering::Release);
-        *self.term() = term;
+        *lock(&self.term) = term;
         self.is_ending.store(false, Ordering::Release);
         self.until.store(self.time(until), Ordering::Release);
         self.announce();
@@ -114,13 +115,9 @@ impl Fence {
         self.stage() != Stage::Closed
     }
 
-    fn term(&self) -> MutexGuard<'_, Term> {
-        self.term.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     /// Under which term to write what a device holds into a log, and who receives the outcome in place of `done`.
     fn tenure(self: &Arc<Fence>, done: Done) -> (Tenure, Done) {
-        let tenure = Tenure { lease: self.lease, term: *self.term() };
+        let tenure = Tenure { lease: self.lease, term: *lock(&self.term) };
         let fence = Arc::clone(self);
         let noted = move |outcome: Outcome| {
             if matches!(outcome, Err(Refused { refusal: Refusal::Overtaken, .. })) {
@@ -134,7 +131,7 @@ impl Fence {
     /// A log has a later term. If this node has the lease all the same, what counts terms has begun anew, or was
     /// set back: with a greater epoch, the next step is carried out, or one of the next.
     fn overtaken(&self, sent: Term) {
-        let mut term = self.term();
+        let mut term = lock(&self.term);
         if *term == sent && self.allows() {
             term.epoch = term.epoch.saturating_mul(2).max(term.epoch.saturating_add(FORCED_EPOCH));
         }

@@ -2,8 +2,9 @@
 //! does a write pass an earlier request. Reads alone go as the link pleases.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
+use holdfast_runtime::lock;
 use tokio::sync::{OwnedRwLockReadGuard, OwnedRwLockWriteGuard, RwLock};
 
 /// The connections that have requests. Their locks are fair: first come, first served.
@@ -30,23 +31,19 @@ enum Held {
 impl Order {
     /// Waits until the requests are answered that this one may not pass.
     pub(in crate::link) async fn wait(self: &Arc<Order>, source: u64, is_read: bool) -> InOrder {
-        let lock = Arc::clone(self.sources().entry(source).or_default());
+        let of_source = Arc::clone(lock(&self.sources).entry(source).or_default());
         let held = match is_read {
-            true => Held::Read(lock.read_owned().await),
-            false => Held::Write(lock.write_owned().await),
+            true => Held::Read(of_source.read_owned().await),
+            false => Held::Write(of_source.write_owned().await),
         };
         InOrder { order: Arc::clone(self), source, held: Some(held) }
-    }
-
-    fn sources(&self) -> MutexGuard<'_, HashMap<u64, Arc<RwLock<()>>>> {
-        self.sources.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Drop for InOrder {
     fn drop(&mut self) {
         self.held = None;
-        let mut sources = self.order.sources();
+        let mut sources = lock(&self.order.sources);
         if sources.get(&self.source).is_some_and(|lock| Arc::strong_count(lock) == 1) {
             sources.remove(&self.source);
         }
@@ -107,8 +104,8 @@ mod tests {
         let first = now(&order, 1, true).unwrap();
         let second = now(&order, 1, true).unwrap();
         drop(first);
-        assert_eq!(order.sources().len(), 1);
+        assert_eq!(lock(&order.sources).len(), 1);
         drop(second);
-        assert!(order.sources().is_empty());
+        assert!(lock(&order.sources).is_empty());
     }
 }

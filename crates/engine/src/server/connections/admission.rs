@@ -6,9 +6,10 @@
 use std::collections::{BTreeMap, HashMap};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
+use holdfast_runtime::lock;
 use tokio::task::AbortHandle;
 
 use crate::server::connections::peer::Peer;
@@ -194,7 +195,7 @@ impl Admission {
 
     /// Changes the limits. Open connections stay.
     pub(crate) fn set_limits(&self, limits: ConnectionLimits) {
-        self.table().limits = limits;
+        lock(&self.table).limits = limits;
     }
 
     /// Admits a connection from `peer`. Also returns the connection that was evicted for it.
@@ -202,7 +203,7 @@ impl Admission {
         self: &Arc<Self>,
         peer: SocketAddr,
     ) -> Result<(Ticket, Option<Evicted>), Full> {
-        let mut table = self.table();
+        let mut table = lock(&self.table);
         let max_handshakes = table.limits.max_handshakes;
         let evicted = match max_handshakes {
             None => table.clear_session(peer.ip(), self.since(Instant::now()))?,
@@ -231,7 +232,7 @@ impl Admission {
     /// Ends the connections for which `ends` has a reason. The others look up their rights again,
     /// before they answer the next request. Returns the reasons, and whom they concern.
     pub(crate) fn review<R>(&self, ends: impl Fn(&Peer) -> Option<R>) -> Vec<(Peer, R)> {
-        let mut table = self.table();
+        let mut table = lock(&self.table);
         let mut ending = Vec::new();
         for (id, held) in table.held() {
             match ends(&held.peer) {
@@ -245,19 +246,19 @@ impl Admission {
 
     /// Ends all connections. From now on, none is admitted. Returns their peers.
     pub(crate) fn close(&self) -> Vec<Peer> {
-        let mut table = self.table();
+        let mut table = lock(&self.table);
         table.limits = ConnectionLimits::NONE;
         let ids: Vec<u64> = table.held().map(|(id, _)| *id).collect();
         ids.into_iter().filter_map(|id| table.end(id)).map(|held| held.peer).collect()
     }
 
     pub(crate) fn is_closed(&self) -> bool {
-        self.table().limits == ConnectionLimits::NONE
+        lock(&self.table).limits == ConnectionLimits::NONE
     }
 
     /// Ends one connection. Returns its peer, `None` if there is no such connection.
     pub(crate) fn end(&self, id: u64) -> Option<Peer> {
-        self.table().end(id).map(|held| held.peer)
+        lock(&self.table).end(id).map(|held| held.peer)
     }
 
     /// The open connections, in the order in which they were opened.
@@ -271,18 +272,14 @@ impl Admission {
                 now.saturating_sub(held.activity.last_request.load(Ordering::Relaxed)),
             ),
         };
-        let mut sessions: Vec<OpenConnection> = self.table().held().map(session).collect();
+        let mut sessions: Vec<OpenConnection> = lock(&self.table).held().map(session).collect();
         sessions.sort_unstable_by_key(|session| session.id);
         sessions
     }
 
     pub(crate) fn open(&self) -> usize {
-        let table = self.table();
+        let table = lock(&self.table);
         table.sessions.len() + table.handshakes.len()
-    }
-
-    fn table(&self) -> MutexGuard<'_, Table> {
-        self.table.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn since(&self, now: Instant) -> u64 {
@@ -482,7 +479,7 @@ impl Ticket {
     /// # Errors
     /// There is no place.
     pub(crate) fn establish(&self) -> Result<Option<Evicted>, Full> {
-        let mut table = self.admission.table();
+        let mut table = lock(&self.admission.table);
         let Some(source) = table.handshakes.get(&self.id).map(Held::source) else {
             // It has just been evicted, and ends at the next await.
             return Ok(None);
@@ -504,7 +501,7 @@ impl Ticket {
 
     /// Records the certificate that the peer has proved to own.
     pub(crate) fn identify(&self, certificate: Arc<PeerCertificate>) {
-        if let Some(held) = self.admission.table().held_mut(self.id) {
+        if let Some(held) = lock(&self.admission.table).held_mut(self.id) {
             held.peer.certificate = Some(certificate);
         }
     }
@@ -541,7 +538,7 @@ impl Ticket {
 
 /// Sets the task of a connection, so that it can be evicted.
 pub(crate) fn attach(admission: &Admission, id: u64, task: AbortHandle) {
-    match admission.table().held_mut(id) {
+    match lock(&admission.table).held_mut(id) {
         Some(held) => held.task = Some(task),
         // It was ended before its task ran, or its task has ended.
         None => task.abort(),
@@ -550,7 +547,7 @@ pub(crate) fn attach(admission: &Admission, id: u64, task: AbortHandle) {
 
 impl Drop for Ticket {
     fn drop(&mut self) {
-        self.admission.table().remove(self.id);
+        lock(&self.admission.table).remove(self.id);
     }
 }
 
@@ -657,7 +654,7 @@ mod tests {
     /// Which of several connections of HTTP gives way, given what each waits for, and for how long.
     fn http_evicts(waiting: &[(WaitingFor, Duration)]) -> Option<usize> {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
-        let mut limits = admission(waiting.len(), None, WhenFull::Evict).table().limits;
+        let mut limits = lock(&admission(waiting.len(), None, WhenFull::Evict).table).limits;
         limits.grace = Duration::from_secs(1);
         let mut admission = Admission::new(limits);
         admission.epoch -= Duration::from_secs(200);
@@ -702,7 +699,7 @@ mod tests {
     #[test]
     fn connections_of_http_in_use_have_half_of_the_places() {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
-        let mut limits = admission(3, None, WhenFull::Evict).table().limits;
+        let mut limits = lock(&admission(3, None, WhenFull::Evict).table).limits;
         limits.grace = Duration::from_secs(60);
         let mut admission = Admission::new(limits);
         admission.epoch -= Duration::from_secs(1);
@@ -893,7 +890,7 @@ mod tests {
         assert_eq!(tickets[0].establish(), Err(Full));
         assert_eq!(admission.admit(peer(2, 3)).unwrap_err(), Full);
         drop(tickets);
-        assert_eq!((admission.open(), admission.table().per_source.len()), (0, 0));
+        assert_eq!((admission.open(), lock(&admission.table).per_source.len()), (0, 0));
     }
 
     #[test]

@@ -264,7 +264,7 @@ fn a_listener_that_was_removed_admits_no_connection() {
     let memory = memory();
     let kind = ListenerKind::RawIngest(raw(&memory, V1, MANY));
     let engine = engine(vec![("raw", kind)]);
-    let listener = Arc::clone(&engine.listeners()[0]);
+    let listener = Arc::clone(&lock(&engine.listeners)[0]);
     let mut client = served(&engine);
     engine.reload(listening(Vec::new())).unwrap();
     assert_eq!(ask(&mut client, &packet(V1)), NO_REPLY);

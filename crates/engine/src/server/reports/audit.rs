@@ -4,10 +4,11 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use holdfast_protocol::raw_ingest;
+use holdfast_runtime::lock;
 
 use crate::link::exception_in;
 use crate::server::connections::peer::Peer;
@@ -228,7 +229,7 @@ impl Record {
 impl Records {
     /// Takes up to `most` records. Waits up to `timeout` for the first, and not for the others.
     pub(crate) fn take(&self, timeout: Duration, most: usize) -> Vec<Record> {
-        let receiver = self.receiver.lock().unwrap_or_else(PoisonError::into_inner);
+        let receiver = lock(&self.receiver);
         let first = receiver.recv_timeout(timeout).ok();
         let records: Vec<Record> =
             first.into_iter().chain(receiver.try_iter()).flatten().take(most).collect();

@@ -1,10 +1,11 @@
 //! The events of a listener that function 12 reads, Get Comm Event Log (V1.1b3, 6.10): one byte for each
 //! request that has come, and one when it has been dealt with.
 
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use holdfast_protocol::pdu::{ExceptionCode, limit};
+use holdfast_runtime::lock;
 
 /// How many events are kept: as many as a reply has.
 const KEPT: usize = limit::LOG_EVENTS as usize;
@@ -67,7 +68,7 @@ impl CommEvents {
     pub(crate) fn set(&self, is_on: bool) {
         self.is_on.store(is_on, Ordering::Relaxed);
         if !is_on {
-            *self.kept() = Kept::NOTHING;
+            *lock(&self.kept) = Kept::NOTHING;
         }
     }
 
@@ -101,7 +102,7 @@ impl CommEvents {
 
     /// Communications were restarted, with or without the events before.
     pub(crate) fn restart(&self, forgets: bool) {
-        let mut kept = self.kept();
+        let mut kept = lock(&self.kept);
         if forgets {
             *kept = Kept::NOTHING;
         }
@@ -110,7 +111,7 @@ impl CommEvents {
 
     /// The events, the latest first, and how many there are.
     pub(crate) fn latest(&self) -> ([u8; KEPT], usize) {
-        let kept = self.kept();
+        let kept = lock(&self.kept);
         let by_age = |age| kept.events[(kept.next + KEPT - 1 - age) % KEPT];
         (std::array::from_fn(by_age), kept.count)
     }
@@ -118,11 +119,7 @@ impl CommEvents {
     #[cold]
     #[inline(never)]
     fn add(&self, event: u8) {
-        self.kept().add(event);
-    }
-
-    fn kept(&self) -> MutexGuard<'_, Kept> {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.kept).add(event);
     }
 }
 

@@ -1,11 +1,12 @@
 //! The counters of a listener. Neither counting nor reading blocks.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 
 use holdfast_protocol::pdu::ExceptionCode;
 use holdfast_protocol::raw_ingest::{Header, Refusal};
+use holdfast_runtime::{Counter, lock};
 
-use crate::counter::{Counter, ReasonCounters, counters};
+use crate::counter::{ReasonCounters, counters};
 
 /// The counters of one listener since its start.
 #[derive(Debug)]
@@ -155,8 +156,7 @@ impl Counters {
 
     /// The counters of Diagnostics.
     pub fn bus(&self) -> Bus {
-        let (now, cleared) =
-            (self.total(), *self.cleared.lock().unwrap_or_else(PoisonError::into_inner));
+        let (now, cleared) = (self.total(), *lock(&self.cleared));
         Bus {
             messages: now.messages.saturating_sub(cleared.messages),
             communication_errors: now
@@ -176,7 +176,7 @@ impl Counters {
         let mut now = self.total();
         now.events += owed.events;
         now.no_response += owed.no_response;
-        *self.cleared.lock().unwrap_or_else(PoisonError::into_inner) = now;
+        *lock(&self.cleared) = now;
     }
 
     fn total(&self) -> Bus {

@@ -8,10 +8,11 @@
 use std::collections::{HashMap, VecDeque};
 use std::net::{IpAddr, Ipv6Addr};
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
 use holdfast_protocol::raw_ingest::Refusal;
+use holdfast_runtime::lock;
 
 use crate::server::connections::peer::Peer;
 use crate::server::reports::refused_request::RefusedRequest;
@@ -264,12 +265,6 @@ impl Queue {
     }
 }
 
-impl Shared {
-    fn queue(&self) -> MutexGuard<'_, Queue> {
-        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
 pub(crate) fn channel(verbosity: Verbosity) -> (Reporter, Events) {
     let shared = Arc::new(Shared::default());
     let events = Events { shared: Arc::clone(&shared) };
@@ -295,7 +290,7 @@ impl Reporter {
         }
         let subject = subject.map(Box::from);
         let event = Event { listener: Arc::clone(listener), kind, peer, subject, count: 1 };
-        if self.shared.queue().put(event) {
+        if lock(&self.shared.queue).put(event) {
             self.shared.arrived.notify_one();
         } else {
             self.shared.lost.fetch_add(1, Ordering::Relaxed);
@@ -307,7 +302,8 @@ impl Events {
     /// The next event; `None` when none arrives within `timeout`.
     pub(crate) fn next(&self, timeout: Duration) -> Option<Event> {
         let empty = |queue: &mut Queue| queue.events.is_empty();
-        let waited = self.shared.arrived.wait_timeout_while(self.shared.queue(), timeout, empty);
+        let waited =
+            self.shared.arrived.wait_timeout_while(lock(&self.shared.queue), timeout, empty);
         waited.unwrap_or_else(PoisonError::into_inner).0.take()
     }
 

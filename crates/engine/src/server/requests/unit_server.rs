@@ -14,8 +14,8 @@ use holdfast_memory::{Access, Area, Memory, Read, Write};
 use holdfast_protocol::pdu::{
     self, Buffer, Diagnostics, ExceptionCode, Function, Range, Request, SubFunction, reply,
 };
+use holdfast_runtime::Counter;
 
-use crate::counter::Counter;
 use crate::items::Items;
 use crate::link::{Asker, PendingReply, exception_in};
 use crate::server::connections::reloadable::Reloadable;

@@ -2,8 +2,9 @@
 
 use std::collections::HashMap;
 use std::net::IpAddr;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
+use holdfast_runtime::lock;
 use ipnet::IpNet;
 
 use crate::server::rights::peer_rights::PeerRights;
@@ -76,7 +77,7 @@ impl Policy {
             return self.alone.get(first).cloned();
         };
         let numbers: Vec<usize> = [first, second].into_iter().chain(matching).collect();
-        let mut together = self.together.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut together = lock(&self.together);
         if let Some(known) = together.get(&numbers) {
             return Some(Arc::clone(known));
         }

@@ -842,10 +842,10 @@ mod tests {
 
     use holdfast_memory::{Layout, Span};
     use holdfast_protocol::raw_ingest::Area as PacketArea;
+    use holdfast_runtime::Counter;
     use tokio::runtime::Runtime;
 
     use super::*;
-    use crate::counter::Counter;
     use crate::server::connections::admission::Admission;
     use crate::server::reports::event::{self, Verbosity};
     use crate::server::transports::cut_tests::assert_same_outcome;

@@ -109,9 +109,9 @@ impl Applier {
                     node.stored = place.stored;
                 });
             }
-            Applied::Stale(_) => shared.counters.stale.add(1),
+            Applied::Stale(_) => shared.counters.stale.add(),
             Applied::Ignored(error) => {
-                shared.counters.ignored.add(1);
+                shared.counters.ignored.add();
                 let sequence = place.sequence.to_string();
                 let fields = [("sequence", sequence.as_str()), ("reason", &error.to_string())];
                 shared.event(Event::new("log_message_ignored", &fields));

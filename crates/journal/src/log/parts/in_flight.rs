@@ -5,10 +5,11 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use holdfast_memory::{Done, Outcome, Refusal};
+use holdfast_runtime::Counter;
 
 use crate::log::clock::Moment;
 use crate::log::shared::refuse_all;
-use crate::log::status::{Counter, Counters};
+use crate::log::status::Counters;
 
 /// The most messages with unanswered steps. Further steps wait, and are sent as one batch.
 const MAX_OPEN_MESSAGES: usize = 16;
@@ -86,8 +87,8 @@ impl InFlight {
         let message = self.messages.pop_front()?;
         self.close(&message);
         let refused = outcomes.iter().filter(|outcome| outcome.is_err()).count() as u64;
-        counters.refused.add(refused);
-        counters.steps.add(outcomes.len() as u64 - refused);
+        counters.refused.add_many(refused);
+        counters.steps.add_many(outcomes.len() as u64 - refused);
         for (done, outcome) in message.steps.into_iter().zip(outcomes) {
             done(outcome);
         }
