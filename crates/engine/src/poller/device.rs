@@ -83,6 +83,32 @@ impl DeviceSettings {
     }
 }
 
+#[cfg(test)]
+impl DeviceSettings {
+    /// Nothing but these reads, each on its own.
+    pub(super) fn for_tests(endpoint: Endpoint, reads: Vec<ReadSettings>) -> DeviceSettings {
+        DeviceSettings {
+            name: "meter".into(),
+            endpoint,
+            in_flight: InFlight::Fixed(1),
+            retry: Retry::default(),
+            unit_id: 1,
+            interval: Duration::from_secs(1),
+            timeout: Duration::from_secs(1),
+            reads,
+            limits: PlanLimits::default(),
+            strategy: Strategy::Gap { max_gap: 0 },
+            measured: false,
+            forward: Vec::new(),
+            status: None,
+            start_within: Duration::ZERO,
+            report: None,
+            release: false,
+            fence: None,
+        }
+    }
+}
+
 #[derive(Debug, Clone)]
 pub struct ReadSettings {
     pub area: Area,

@@ -745,7 +745,6 @@ mod tests {
     use holdfast_protocol::raw_ingest::Format;
 
     use super::*;
-    use crate::poller::plan::Strategy;
     use crate::poller::{BlockSettings, Destination, ReadSettings, StatusSettings};
     use crate::serial_line::{LineDirection, LineMode, LineParity, SerialLine};
 
@@ -786,31 +785,9 @@ mod tests {
     }
 
     fn settings() -> DeviceSettings {
-        DeviceSettings {
-            name: "meter".into(),
-            endpoint: Place::Tcp { host: "127.0.0.1".into(), port: 502, tls: None }.into(),
-            in_flight: InFlight::Fixed(1),
-            retry: Retry::default(),
-            unit_id: 1,
-            interval: Duration::from_secs(1),
-            timeout: Duration::from_secs(1),
-            reads: vec![ReadSettings {
-                area: AREA,
-                address: 0,
-                count: 4,
-                into: None,
-                forward: true,
-            }],
-            limits: PlanLimits::default(),
-            strategy: Strategy::Gap { max_gap: 0 },
-            measured: false,
-            forward: Vec::new(),
-            status: None,
-            start_within: Duration::ZERO,
-            report: None,
-            release: false,
-            fence: None,
-        }
+        let endpoint = Place::Tcp { host: "127.0.0.1".into(), port: 502, tls: None }.into();
+        let read = ReadSettings { area: AREA, address: 0, count: 4, into: None, forward: true };
+        DeviceSettings::for_tests(endpoint, vec![read])
     }
 
     #[test]

@@ -174,8 +174,7 @@ mod tests {
     use std::sync::atomic::{AtomicU32, Ordering};
 
     use rcgen::{
-        BasicConstraints, Certificate, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer,
-        KeyPair, date_time_ymd,
+        BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, date_time_ymd,
     };
     use rustls::RootCertStore;
     use rustls::pki_types::PrivateKeyDer;
@@ -184,38 +183,10 @@ mod tests {
     use rustls::{ServerConfig, ServerConnection, SupportedProtocolVersion};
 
     use super::*;
+    use crate::tls::test_party::Owner;
 
     const CA: IsCa = IsCa::Ca(BasicConstraints::Unconstrained);
     const VERSIONS: [&SupportedProtocolVersion; 2] = [&TLS12, &TLS13];
-
-    /// A certificate and its key.
-    struct Owner {
-        certificate: Certificate,
-        params: CertificateParams,
-        key: KeyPair,
-    }
-
-    impl Owner {
-        fn new(name: &str, is_ca: IsCa, by: Option<&Owner>) -> Owner {
-            Owner::made(name, by, |params| params.is_ca = is_ca)
-        }
-
-        fn made(name: &str, by: Option<&Owner>, with: impl Fn(&mut CertificateParams)) -> Owner {
-            let mut params = CertificateParams::new([name.to_owned()]).unwrap();
-            params.distinguished_name.push(rcgen::DnType::CommonName, name);
-            with(&mut params);
-            let key = KeyPair::generate().unwrap();
-            let certificate = match by {
-                None => params.self_signed(&key),
-                Some(by) => params.signed_by(&key, &Issuer::from_params(&by.params, &by.key)),
-            };
-            Owner { certificate: certificate.unwrap(), params, key }
-        }
-
-        fn pem(&self) -> String {
-            self.certificate.pem()
-        }
-    }
 
     /// A temporary file, removed on drop.
     struct File(PathBuf);
@@ -317,8 +288,8 @@ mod tests {
 
     #[test]
     fn data_arrives_in_pieces_of_any_size() {
-        let authority = Owner::new("authority", CA, None);
-        let plc = Owner::new("plc", IsCa::NoCa, Some(&authority));
+        let authority = Owner::authority("authority", None);
+        let plc = Owner::new("plc", Some(&authority), |_| {});
         for version in VERSIONS {
             for piece in [1, 7, 1000, usize::MAX] {
                 let client = client(&authority.pem(), None, "plc");
@@ -330,10 +301,10 @@ mod tests {
 
     #[test]
     fn issuer_and_name_are_checked() {
-        let authority = Owner::new("authority", CA, None);
-        let stranger = Owner::new("stranger", CA, None);
-        let plc = Owner::new("plc", IsCa::NoCa, Some(&authority));
-        let address = Owner::new("10.0.0.5", IsCa::NoCa, Some(&authority));
+        let authority = Owner::authority("authority", None);
+        let stranger = Owner::authority("stranger", None);
+        let plc = Owner::new("plc", Some(&authority), |_| {});
+        let address = Owner::new("10.0.0.5", Some(&authority), |_| {});
         let both = authority.pem() + &stranger.pem();
 
         assert_eq!(outcome(&both, "plc", &plc), "pong");
@@ -359,15 +330,15 @@ mod tests {
             params.not_before = date_time_ymd(2020, 1, 1);
             params.not_after = date_time_ymd(2021, 1, 1);
         };
-        let authority = Owner::new("authority", CA, None);
-        let late = Owner::made("plc", Some(&authority), expired);
-        let own = Owner::made("plc", None, expired);
+        let authority = Owner::authority("authority", None);
+        let late = Owner::new("plc", Some(&authority), expired);
+        let own = Owner::new("plc", None, expired);
         for outcome in [outcome(&authority.pem(), "plc", &late), outcome(&own.pem(), "plc", &own)] {
             assert!(outcome.starts_with("the certificate expired "), "{outcome}");
         }
 
-        let early = Owner::made("plc", Some(&authority), |params| {
-            params.not_before = date_time_ymd(3000, 1, 1);
+        let early = Owner::new("plc", Some(&authority), |params| {
+            params.not_before = date_time_ymd(2099, 1, 1);
         });
         let told_early = outcome(&authority.pem(), "plc", &early);
         assert!(
@@ -375,34 +346,34 @@ mod tests {
             "{told_early}"
         );
 
-        let former = Owner::made("former", None, |params| {
+        let former = Owner::new("former", None, |params| {
             params.is_ca = CA;
             expired(params);
         });
-        let plc = Owner::new("plc", IsCa::NoCa, Some(&former));
+        let plc = Owner::new("plc", Some(&former), |_| {});
         let why = outcome(&former.pem(), "plc", &plc);
         assert!(why.starts_with("an authority above the certificate expired "), "{why}");
         // An expired authority does not affect the others.
-        let third = Owner::new("plc", IsCa::NoCa, Some(&authority));
+        let third = Owner::new("plc", Some(&authority), |_| {});
         assert_eq!(outcome(&(former.pem() + &authority.pem()), "plc", &third), "pong");
     }
 
     #[test]
     fn a_device_is_trusted_by_its_own_certificate() {
-        let unknown = Owner::new("unknown", CA, None);
+        let unknown = Owner::authority("unknown", None);
         for (is_ca, by) in [
             (CA, None),
             (IsCa::NoCa, None),
             (IsCa::ExplicitNoCa, None),
             (IsCa::NoCa, Some(&unknown)),
         ] {
-            let plc = Owner::new("plc", is_ca, by);
+            let plc = Owner::new("plc", by, |params| params.is_ca = is_ca);
             assert_eq!(outcome(&plc.pem(), "plc", &plc), "pong");
             assert!(outcome(&plc.pem(), "plc8", &plc).contains("for 'plc', not for 'plc8'"));
-            let twin = Owner::new("plc", is_ca, by);
+            let twin = Owner::new("plc", by, |params| params.is_ca = is_ca);
             assert!(outcome(&plc.pem(), "plc", &twin) != "pong");
         }
-        let of_client = Owner::made("plc", None, |params| {
+        let of_client = Owner::new("plc", None, |params| {
             params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
         });
         assert_eq!(
@@ -414,8 +385,8 @@ mod tests {
     #[test]
     fn the_key_of_a_device_cannot_issue_certificates() {
         for is_ca in [IsCa::NoCa, IsCa::ExplicitNoCa] {
-            let device = Owner::new("plc1", is_ca, None);
-            let forged = Owner::new("plc2", IsCa::NoCa, Some(&device));
+            let device = Owner::new("plc1", None, |params| params.is_ca = is_ca);
+            let forged = Owner::new("plc2", Some(&device), |_| {});
             let outcome = outcome(&device.pem(), "plc2", &forged);
             assert!(outcome.starts_with("the issuer of the certificate is unknown"), "{outcome}");
         }
@@ -423,11 +394,11 @@ mod tests {
 
     #[test]
     fn a_peer_that_requires_a_certificate_gets_it_or_refuses() {
-        let authority = Owner::new("authority", CA, None);
-        let stranger = Owner::new("stranger", CA, None);
-        let plc = Owner::new("plc", IsCa::NoCa, Some(&authority));
-        let panel = Owner::new("panel", IsCa::NoCa, Some(&authority));
-        let foreign = Owner::new("foreign", IsCa::NoCa, Some(&stranger));
+        let authority = Owner::authority("authority", None);
+        let stranger = Owner::authority("stranger", None);
+        let plc = Owner::new("plc", Some(&authority), |_| {});
+        let panel = Owner::new("panel", Some(&authority), |_| {});
+        let foreign = Owner::new("foreign", Some(&stranger), |_| {});
         for version in VERSIONS {
             let outcome = |own| {
                 let client = client(&authority.pem(), own, "plc");
@@ -444,7 +415,7 @@ mod tests {
 
     #[test]
     fn a_peer_without_tls_is_reported() {
-        let authority = Owner::new("authority", CA, None);
+        let authority = Owner::authority("authority", None);
         let tls = client(&authority.pem(), None, "plc");
         for bytes in [&b"HTTP/1.1 400 Bad Request\r\n\r\n"[..], b"\0\0\0\0\0\x03\x01\x83\x01"] {
             let (mut plain, mut out) = (Vec::new(), Vec::new());
@@ -456,7 +427,7 @@ mod tests {
 
     #[test]
     fn unusable_files_are_reported() {
-        let [plc, other] = ["plc", "other"].map(|name| Owner::new(name, IsCa::NoCa, None));
+        let [plc, other] = ["plc", "other"].map(|name| Owner::new(name, None, |_| {}));
         let (certificate, key) = (plc.pem(), plc.key.serialize_pem());
         let outcome = |certificate: &str, key: &[u8]| {
             let (ca, file, key) = (File::new(plc.pem()), File::new(certificate), File::new(key));
@@ -518,7 +489,7 @@ mod tests {
 
     #[test]
     fn values_with_the_same_certificates_and_name_are_equal() {
-        let [one, two] = ["one", "two"].map(|name| Owner::new(name, IsCa::NoCa, None));
+        let [one, two] = ["one", "two"].map(|name| Owner::new(name, None, |_| {}));
         let made = || client(&one.pem(), Some(&two), "plc");
         assert_eq!(made(), made());
         assert_ne!(made(), client(&two.pem(), Some(&two), "plc"));

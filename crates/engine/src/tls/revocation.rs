@@ -286,24 +286,16 @@ mod tests {
     use std::sync::Arc;
     use std::time::Duration;
 
-    use rcgen::{
-        CertificateParams, CertificateRevocationListParams, CrlDistributionPoint,
-        CrlIssuingDistributionPoint, CrlScope, KeyIdMethod, KeyUsagePurpose, RevokedCertParams,
-        SigningKey, date_time_ymd,
-    };
+    use rcgen::{CertificateParams, CrlDistributionPoint, CrlScope, KeyUsagePurpose, SigningKey};
 
     use super::*;
     use crate::tls::TlsFailure;
     use crate::tls::certificate::Purpose;
-    use crate::tls::test_party::Owner;
+    use crate::tls::test_party::{Owner, revocations};
     use crate::tls::verification::{Listed, Trust};
 
     /// Within the dates of every certificate and list.
     const NOW: UnixTime = UnixTime::since_unix_epoch(Duration::from_secs(1_800_000_000));
-
-    fn serial(owner: &Owner) -> rcgen::SerialNumber {
-        owner.params.serial_number.clone().unwrap()
-    }
 
     fn numbered(number: u8) -> impl Fn(&mut CertificateParams) {
         move |params| params.serial_number = Some(rcgen::SerialNumber::from(vec![number]))
@@ -319,28 +311,7 @@ mod tests {
 
     /// The list of an authority, as DER.
     fn list(by: &Owner, revoked: &[&Owner], scope: Option<(CrlScope, &str)>) -> Vec<u8> {
-        let entry = |owner: &&Owner| RevokedCertParams {
-            serial_number: serial(owner),
-            revocation_time: date_time_ymd(2026, 1, 1),
-            reason_code: None,
-            invalidity_date: None,
-        };
-        let list = CertificateRevocationListParams {
-            this_update: date_time_ymd(2026, 1, 1),
-            next_update: date_time_ymd(2090, 1, 1),
-            crl_number: 1.into(),
-            issuing_distribution_point: scope.map(|(scope, uri)| CrlIssuingDistributionPoint {
-                distribution_point: CrlDistributionPoint { uris: vec![uri.to_owned()] },
-                scope: Some(scope),
-            }),
-            revoked_certs: revoked.iter().map(entry).collect(),
-            key_identifier_method: KeyIdMethod::Sha256,
-        };
-        // Also an authority that may not sign lists signs this one.
-        let mut issuer = by.params.clone();
-        issuer.key_usages = Vec::new();
-        let issuer = rcgen::Issuer::from_params(&issuer, &by.key);
-        list.signed_by(&issuer).unwrap().der().to_vec()
+        revocations(by, revoked, scope).der().to_vec()
     }
 
     /// The same list in version 1, as OpenSSL writes it.

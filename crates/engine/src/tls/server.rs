@@ -299,16 +299,13 @@ mod tests {
     use std::sync::atomic::{AtomicU64, Ordering};
     use std::time::Duration;
 
-    use rcgen::{
-        CertificateRevocationListParams, CustomExtension, KeyIdMethod, RevokedCertParams,
-        date_time_ymd,
-    };
+    use rcgen::{CustomExtension, date_time_ymd};
     use rustls::HandshakeKind::{Full as FULL, Resumed as RESUMED};
     use rustls::version::{TLS12, TLS13};
     use rustls::{ClientConfig, HandshakeKind, SupportedProtocolVersion};
 
     use super::*;
-    use crate::tls::test_party::{Party, ROLE_ARCS, connection, role};
+    use crate::tls::test_party::{Party, ROLE_ARCS, connection, revocations, role};
 
     const DAY: u64 = 24 * 60 * 60;
     const VERSIONS: [&SupportedProtocolVersion; 2] = [&TLS12, &TLS13];
@@ -409,22 +406,8 @@ mod tests {
     #[test]
     fn a_session_is_not_resumed_when_the_certificate_was_revoked_since() {
         let party = Party::new();
-        let revoked = RevokedCertParams {
-            serial_number: party.client.params.serial_number.clone().unwrap(),
-            revocation_time: date_time_ymd(2026, 1, 1),
-            reason_code: None,
-            invalidity_date: None,
-        };
-        let list = CertificateRevocationListParams {
-            this_update: date_time_ymd(2026, 1, 1),
-            next_update: date_time_ymd(2090, 1, 1),
-            crl_number: 1.into(),
-            issuing_distribution_point: None,
-            revoked_certs: vec![revoked],
-            key_identifier_method: KeyIdMethod::Sha256,
-        };
-        let list = list.signed_by(&party.authority.issuer()).unwrap().pem().unwrap();
-        let crl_file = Some(party.folder.write("crl.pem", &list));
+        let list = revocations(&party.authority, &[&party.client], None);
+        let crl_file = Some(party.folder.write("crl.pem", &list.pem().unwrap()));
         for version in VERSIONS {
             let client = party.client(version);
             let before = ServerTls::load(&party.files(), None).unwrap();

@@ -6,8 +6,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use rcgen::{
-    BasicConstraints, Certificate, CertificateParams, CustomExtension, DnType, IsCa, Issuer,
-    KeyPair, KeyUsagePurpose, date_time_ymd,
+    BasicConstraints, Certificate, CertificateParams, CertificateRevocationList,
+    CertificateRevocationListParams, CrlDistributionPoint, CrlIssuingDistributionPoint, CrlScope,
+    CustomExtension, DnType, IsCa, Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose,
+    RevokedCertParams, date_time_ymd,
 };
 use rustls::client::WantsClientCert;
 use rustls::pki_types::{PrivateKeyDer, ServerName};
@@ -52,9 +54,42 @@ impl Owner {
         })
     }
 
+    pub(crate) fn pem(&self) -> String {
+        self.certificate.pem()
+    }
+
     pub(crate) fn issuer(&self) -> Issuer<'_, &KeyPair> {
         Issuer::from_params(&self.params, &self.key)
     }
+}
+
+/// A list of certificates that an authority has revoked, with its scope and distribution point. Also an
+/// authority that may not sign lists signs it.
+pub(crate) fn revocations(
+    by: &Owner,
+    revoked: &[&Owner],
+    scope: Option<(CrlScope, &str)>,
+) -> CertificateRevocationList {
+    let entry = |owner: &&Owner| RevokedCertParams {
+        serial_number: owner.params.serial_number.clone().unwrap(),
+        revocation_time: date_time_ymd(2026, 1, 1),
+        reason_code: None,
+        invalidity_date: None,
+    };
+    let list = CertificateRevocationListParams {
+        this_update: date_time_ymd(2026, 1, 1),
+        next_update: date_time_ymd(2090, 1, 1),
+        crl_number: 1.into(),
+        issuing_distribution_point: scope.map(|(scope, uri)| CrlIssuingDistributionPoint {
+            distribution_point: CrlDistributionPoint { uris: vec![uri.to_owned()] },
+            scope: Some(scope),
+        }),
+        revoked_certs: revoked.iter().map(entry).collect(),
+        key_identifier_method: KeyIdMethod::Sha256,
+    };
+    let mut issuer = by.params.clone();
+    issuer.key_usages = Vec::new();
+    list.signed_by(&Issuer::from_params(&issuer, &by.key)).unwrap()
 }
 
 /// The extension that holds the role.
@@ -121,9 +156,9 @@ impl Party {
         let write = |name, content: String| self.folder.write(name, &content);
         ServerFiles {
             protocol: Protocol::Modbus,
-            cert_file: write("server.pem", self.server.certificate.pem()),
+            cert_file: write("server.pem", self.server.pem()),
             key_file: write("server.key", self.server.key.serialize_pem()),
-            ca_file: Some(write("ca.pem", self.authority.certificate.pem())),
+            ca_file: Some(write("ca.pem", self.authority.pem())),
             crl_file: None,
             expired_lists: ExpiredLists::Refuse,
             roles: None,

@@ -307,41 +307,15 @@ mod tests {
     use std::time::Duration;
 
     use rcgen::{
-        BasicConstraints, Certificate, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa,
-        Issuer, KeyPair, KeyUsagePurpose, date_time_ymd,
+        BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, KeyPair,
+        KeyUsagePurpose, date_time_ymd,
     };
 
     use super::*;
+    use crate::tls::test_party::Owner;
 
     const CA: IsCa = IsCa::Ca(BasicConstraints::Unconstrained);
     const YEAR: u64 = 31_557_600;
-
-    struct Owner {
-        certificate: Certificate,
-        params: CertificateParams,
-        key: KeyPair,
-    }
-
-    impl Owner {
-        /// Valid from 2000 to 2100, unless `with` says otherwise.
-        fn new(name: &str, by: Option<&Owner>, with: impl Fn(&mut CertificateParams)) -> Owner {
-            let mut params = CertificateParams::new([name.to_owned()]).unwrap();
-            params.distinguished_name.push(DnType::CommonName, name);
-            (params.not_before, params.not_after) =
-                (date_time_ymd(2000, 1, 1), date_time_ymd(2100, 1, 1));
-            with(&mut params);
-            let key = KeyPair::generate().unwrap();
-            let certificate = match by {
-                None => params.self_signed(&key),
-                Some(by) => params.signed_by(&key, &Issuer::from_params(&by.params, &by.key)),
-            };
-            Owner { certificate: certificate.unwrap(), params, key }
-        }
-
-        fn authority(name: &str, by: Option<&Owner>) -> Owner {
-            Owner::new(name, by, |params| params.is_ca = CA)
-        }
-    }
 
     fn trust(listed: &[&Owner]) -> Trust {
         let listed = listed.iter().map(|owner| Listed::new(owner.certificate.der().clone()));

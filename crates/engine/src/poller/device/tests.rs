@@ -109,32 +109,10 @@ fn registers(memory: &Memory) -> Vec<u8> {
 
 /// Settings that read registers 10 to 13 of the device into `address` and the registers after it.
 fn settings(endpoint: Endpoint, memory: &Arc<Memory>, address: u16) -> DeviceSettings {
-    let into = Destination { memory: Arc::clone(memory), area: AREA, address };
-    DeviceSettings {
-        name: "meter".into(),
-        endpoint,
-        in_flight: InFlight::Fixed(1),
-        retry: Retry::default(),
-        unit_id: 1,
-        interval: Duration::from_millis(1),
-        timeout: TIMEOUT,
-        reads: vec![ReadSettings {
-            area: AREA,
-            address: 10,
-            count: 4,
-            into: Some(into),
-            forward: true,
-        }],
-        limits: PlanLimits::default(),
-        strategy: Strategy::Gap { max_gap: 0 },
-        measured: false,
-        forward: Vec::new(),
-        status: None,
-        start_within: Duration::ZERO,
-        report: None,
-        release: false,
-        fence: None,
-    }
+    let into = Some(Destination { memory: Arc::clone(memory), area: AREA, address });
+    let read = ReadSettings { area: AREA, address: 10, count: 4, into, forward: true };
+    let (interval, timeout) = (Duration::from_millis(1), TIMEOUT);
+    DeviceSettings { interval, timeout, ..DeviceSettings::for_tests(endpoint, vec![read]) }
 }
 
 fn block(area: Area, slot: u16) -> BlockSettings {

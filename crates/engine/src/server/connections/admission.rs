@@ -586,13 +586,9 @@ mod tests {
         max_connections_per_source: Option<usize>,
         when_full: WhenFull,
     ) -> Arc<Admission> {
-        Arc::new(Admission::new(ConnectionLimits {
-            max_connections,
-            max_connections_per_source,
-            when_full,
-            max_handshakes: Some(max_handshakes),
-            grace: Duration::ZERO,
-        }))
+        let admission = admission(max_connections, max_connections_per_source, when_full);
+        lock(&admission.table).limits.max_handshakes = Some(max_handshakes);
+        admission
     }
 
     /// Begins a handshake.
