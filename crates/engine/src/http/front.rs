@@ -16,6 +16,7 @@ use crate::server::connections::admission::ConnectionLimits;
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::event::{Kind, Reporter};
+use crate::server::rights::policy::contain;
 use crate::tls::server::ServerTls;
 
 #[derive(Debug)]
@@ -62,8 +63,7 @@ impl Front {
 
     /// Whether a client may connect.
     pub(super) fn admits(&self, peer: IpAddr) -> bool {
-        let peer = peer.to_canonical();
-        self.settings.sources.iter().any(|network| network.contains(&peer))
+        contain(&self.settings.sources, peer)
     }
 
     /// Uses these certificates for new connections. Returns those before.

@@ -1,6 +1,7 @@
 //! A TCP connection to a device: several requests in flight, if the settings allow it.
 
 use std::cell::{Cell, RefCell};
+use std::collections::BTreeMap;
 use std::future::poll_fn;
 use std::hash::{BuildHasher, RandomState};
 use std::io::{self, ErrorKind};
@@ -69,28 +70,8 @@ pub(in crate::link) struct TcpLink {
 /// The result of a request, and its next attempt, if there is one; `None` if it was not sent in time.
 type Outcome = Option<(Result<Vec<u8>, Failure>, Option<Attempt>)>;
 
-/// The callers that wait for the requests in flight, which are few.
-#[derive(Default)]
-struct Waiting(Vec<(Ticket, oneshot::Sender<Outcome>)>);
-
-impl Waiting {
-    fn insert(&mut self, ticket: Ticket, sender: oneshot::Sender<Outcome>) {
-        self.0.push((ticket, sender));
-    }
-
-    fn get(&self, ticket: Ticket) -> Option<&oneshot::Sender<Outcome>> {
-        self.0.iter().find(|(other, _)| *other == ticket).map(|(_, sender)| sender)
-    }
-
-    fn remove(&mut self, ticket: Ticket) -> Option<oneshot::Sender<Outcome>> {
-        let place = self.0.iter().position(|(other, _)| *other == ticket)?;
-        Some(self.0.swap_remove(place).1)
-    }
-
-    fn is_empty(&self) -> bool {
-        self.0.is_empty()
-    }
-}
+/// The callers that wait for the requests in flight. They are few: no hash is as fast.
+type Waiting = BTreeMap<Ticket, oneshot::Sender<Outcome>>;
 
 /// An open connection.
 struct Open {
@@ -192,10 +173,7 @@ impl TcpLink {
         }
         loop {
             match timeout_at(self.due(), &mut sent.outcome).await {
-                Ok(outcome) => {
-                    sent.is_over = true;
-                    return outcome.or(Err(LOST));
-                }
+                Ok(outcome) => return outcome.or(Err(LOST)),
                 Err(_) => self.advance(),
             }
         }
@@ -309,7 +287,7 @@ impl TcpLink {
             Ok(ticket) if found.write() => {
                 let (sender, outcome) = oneshot::channel();
                 found.waiting.insert(ticket, sender);
-                Ok(Sent { link: self, ticket, outcome, is_over: false })
+                Ok(Sent { link: self, ticket, outcome })
             }
             _ => {
                 *open = None;
@@ -362,21 +340,17 @@ struct Sent<'l> {
     link: &'l TcpLink,
     ticket: Ticket,
     outcome: oneshot::Receiver<Outcome>,
-    is_over: bool,
 }
 
 impl Drop for Sent<'_> {
     fn drop(&mut self) {
-        if self.is_over {
-            return;
-        }
         self.outcome.close();
         let mut open = self.link.open.borrow_mut();
         if let Some(found) = open.as_mut()
             // A new connection counts its tickets anew: this one may be of another request.
-            && found.waiting.get(self.ticket).is_some_and(oneshot::Sender::is_closed)
+            && found.waiting.get(&self.ticket).is_some_and(oneshot::Sender::is_closed)
         {
-            found.waiting.remove(self.ticket);
+            found.waiting.remove(&self.ticket);
             found.connection.cancel(self.ticket, found.epoch.elapsed());
             if found.connection.closed().is_some() {
                 *open = None;
@@ -387,7 +361,7 @@ impl Drop for Sent<'_> {
 
 /// Hands a result to the caller that waits for it.
 fn hand_on(waiting: &mut Waiting, done: &Done<'_>) {
-    if let Some(sender) = waiting.remove(done.ticket) {
+    if let Some(sender) = waiting.remove(&done.ticket) {
         // A device that was stopped does not wait.
         let answer = done.outcome.map(|_| done.pdu.to_vec());
         let _ = sender.send(Some((answer, done.again)));
@@ -418,7 +392,7 @@ impl Open {
                 return true;
             }
             connection.cancel(*ticket, now.saturating_duration_since(*epoch));
-            if let Some(sender) = waiting.remove(*ticket) {
+            if let Some(sender) = waiting.remove(ticket) {
                 // A device that was stopped does not wait.
                 let _ = sender.send(None);
             }

@@ -133,7 +133,7 @@ struct Held {
 }
 
 /// What a connection and the table of connections tell each other without waiting.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct Activity {
     /// In microseconds since the epoch of the admission. Before any request, when it was admitted.
     last_request: AtomicU64,
@@ -212,14 +212,8 @@ impl Admission {
         let id = table.next_id;
         table.next_id += 1;
         let admitted = self.since(Instant::now());
-        let activity = Arc::new(Activity {
-            last_request: AtomicU64::new(admitted),
-            is_amid_packet: AtomicBool::new(false),
-            is_busy: AtomicBool::new(false),
-            is_served: AtomicBool::new(false),
-            is_answered: AtomicBool::new(false),
-            is_outdated: AtomicBool::new(false),
-        });
+        let activity =
+            Arc::new(Activity { last_request: AtomicU64::new(admitted), ..Activity::default() });
         let (peer, opened) = (peer.into(), SystemTime::now());
         let held = Held { peer, opened, admitted, activity: Arc::clone(&activity), task: None };
         match max_handshakes {

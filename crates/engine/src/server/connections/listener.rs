@@ -23,6 +23,7 @@ use crate::server::reports::counters::ConnectionCounters;
 use crate::server::reports::event::{Kind, Reporter};
 use crate::server::reports::refused_request::{RefusedRequest, Reported};
 use crate::server::requests::unit_server::UnitServer;
+use crate::server::rights::functions::{is_write, only_reads};
 use crate::server::rights::peer_rights::PeerRights;
 
 /// The most connections that wait in the system to be accepted.
@@ -78,17 +79,17 @@ impl ListenerContext {
     /// Permits a request to a memory. `None` if it can't be recorded, although it must.
     #[inline]
     pub(crate) fn permit(&self, request: &[u8]) -> Option<Permit> {
-        self.permitted(|auditor| auditor.permit(request))
+        self.permitted(|auditor| auditor.permit(is_write(request), request))
     }
 
     /// As `permit`, for a request to a device.
     pub(crate) fn permit_forwarded(&self, request: &[u8]) -> Option<Permit> {
-        self.permitted(|auditor| auditor.permit_forwarded(request))
+        self.permitted(|auditor| auditor.permit(!only_reads(request), request))
     }
 
     /// As `permit`, for the write of a packet.
     pub(crate) fn permit_packet(&self, payload: &[u8]) -> Option<Permit> {
-        self.permitted(|auditor| auditor.permit_packet(payload))
+        self.permitted(|auditor| auditor.permit(true, payload))
     }
 
     #[inline]

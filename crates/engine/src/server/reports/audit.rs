@@ -116,27 +116,11 @@ pub(crate) fn auditing(unrecordable: Unrecordable) -> (Auditor, Records) {
 }
 
 impl Auditor {
-    /// Permits a request to a memory. `None` if it writes and can't be recorded.
-    pub(crate) fn permit(&self, request: &[u8]) -> Option<Permit> {
+    /// Permits what has these bytes. `None` if it writes and can't be recorded, although it must.
+    pub(crate) fn permit(&self, writes: bool, bytes: &[u8]) -> Option<Permit> {
         match self.unrecordable {
-            Unrecordable::Refuse if is_write(request) => self.take_room(request.len()),
+            Unrecordable::Refuse if writes => self.take_room(bytes.len()),
             _ => Some(Permit::default()),
-        }
-    }
-
-    /// Permits a request to a device. `None` if it may write and can't be recorded.
-    pub(crate) fn permit_forwarded(&self, request: &[u8]) -> Option<Permit> {
-        match self.unrecordable {
-            Unrecordable::Refuse if !only_reads(request) => self.take_room(request.len()),
-            _ => Some(Permit::default()),
-        }
-    }
-
-    /// Permits the write of a packet. `None` if it can't be recorded.
-    pub(crate) fn permit_packet(&self, payload: &[u8]) -> Option<Permit> {
-        match self.unrecordable {
-            Unrecordable::Refuse => self.take_room(payload.len()),
-            Unrecordable::Write => Some(Permit::default()),
         }
     }
 
@@ -273,23 +257,22 @@ mod tests {
     fn a_write_that_must_be_recorded_takes_room_before_it_is_carried_out() {
         let (auditor, records) = auditing(Unrecordable::Refuse);
         let most = MAX_QUEUE_BYTES / (RECORD_OVERHEAD_BYTES + WRITE.len()) + 1;
-        let permits: Vec<Permit> = (0..most).map_while(|_| auditor.permit(WRITE)).collect();
+        let permits: Vec<Permit> = (0..most).map_while(|_| auditor.permit(true, WRITE)).collect();
         assert_eq!(permits.len(), most);
-        assert!(auditor.permit(WRITE).is_none());
-        assert!(auditor.permit_forwarded(WRITE).is_none());
-        assert!(auditor.permit_packet(&[0, 1]).is_none());
-        assert!(auditor.permit(READ).is_some() && auditor.permit_forwarded(READ).is_some());
+        assert!(auditor.permit(true, WRITE).is_none());
+        assert!(auditor.permit(true, &[0, 1]).is_none());
+        assert!(auditor.permit(false, READ).is_some());
         for permit in permits {
             send(&auditor, Some(permit));
         }
         assert_eq!((records.take(Duration::ZERO, usize::MAX).len(), records.lost()), (most, 0));
-        assert!(auditor.permit(WRITE).is_some());
+        assert!(auditor.permit(true, WRITE).is_some());
     }
 
     #[test]
     fn room_that_is_not_used_is_released() {
         let (auditor, records) = auditing(Unrecordable::Refuse);
-        let taken = |_| auditor.permit(WRITE).is_some();
+        let taken = |_| auditor.permit(true, WRITE).is_some();
         assert!((0..2 * MAX_QUEUE_BYTES / RECORD_OVERHEAD_BYTES).all(taken));
         assert_eq!(records.shared.waiting.load(Ordering::Relaxed), 0);
     }
@@ -303,9 +286,9 @@ mod tests {
                 send(&auditor, None);
             }
             assert_eq!(records.lost(), 5);
-            assert_eq!(auditor.permit(WRITE).is_some(), unrecordable == Unrecordable::Write);
+            assert_eq!(auditor.permit(true, WRITE).is_some(), unrecordable == Unrecordable::Write);
             assert_eq!(records.take(Duration::ZERO, usize::MAX).len(), most);
-            assert!(auditor.permit(WRITE).is_some());
+            assert!(auditor.permit(true, WRITE).is_some());
         }
     }
 
@@ -316,8 +299,8 @@ mod tests {
             let (auditor, records) = auditing(unrecordable);
             for failing in [true, false] {
                 records.set_failing(failing);
-                assert_eq!(auditor.permit(WRITE).is_none(), refused && failing);
-                assert!(auditor.permit(READ).is_some());
+                assert_eq!(auditor.permit(true, WRITE).is_none(), refused && failing);
+                assert!(auditor.permit(false, READ).is_some());
             }
         }
     }

@@ -1,6 +1,7 @@
 //! The events of a listener that function 12 reads, Get Comm Event Log (V1.1b3, 6.10): one byte for each
 //! request that has come, and one when it has been dealt with.
 
+use std::collections::VecDeque;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -38,37 +39,20 @@ pub(crate) enum Received {
 #[derive(Debug)]
 pub(crate) struct CommEvents {
     is_on: AtomicBool,
-    kept: Mutex<Kept>,
-}
-
-#[derive(Debug)]
-struct Kept {
-    events: [u8; KEPT],
-    /// The place of the next event.
-    next: usize,
-    count: usize,
-}
-
-impl Kept {
-    const NOTHING: Kept = Kept { events: [0; KEPT], next: 0, count: 0 };
-
-    fn add(&mut self, event: u8) {
-        self.events[self.next] = event;
-        self.next = (self.next + 1) % KEPT;
-        self.count = (self.count + 1).min(KEPT);
-    }
+    /// The latest first.
+    kept: Mutex<VecDeque<u8>>,
 }
 
 impl CommEvents {
     pub(crate) fn new(is_on: bool) -> CommEvents {
-        CommEvents { is_on: AtomicBool::new(is_on), kept: Mutex::new(Kept::NOTHING) }
+        CommEvents { is_on: AtomicBool::new(is_on), kept: Mutex::default() }
     }
 
     /// Turned off, it forgets its events.
     pub(crate) fn set(&self, is_on: bool) {
         self.is_on.store(is_on, Ordering::Relaxed);
         if !is_on {
-            *lock(&self.kept) = Kept::NOTHING;
+            lock(&self.kept).clear();
         }
     }
 
@@ -104,23 +88,26 @@ impl CommEvents {
     pub(crate) fn restart(&self, forgets: bool) {
         let mut kept = lock(&self.kept);
         if forgets {
-            *kept = Kept::NOTHING;
+            kept.clear();
         }
-        kept.add(RESTARTED);
+        push(&mut kept, RESTARTED);
     }
 
-    /// The events, the latest first, and how many there are.
-    pub(crate) fn latest(&self) -> ([u8; KEPT], usize) {
-        let kept = lock(&self.kept);
-        let by_age = |age| kept.events[(kept.next + KEPT - 1 - age) % KEPT];
-        (std::array::from_fn(by_age), kept.count)
+    /// The events, the latest first.
+    pub(crate) fn latest(&self) -> Vec<u8> {
+        lock(&self.kept).iter().copied().collect()
     }
 
     #[cold]
     #[inline(never)]
     fn add(&self, event: u8) {
-        lock(&self.kept).add(event);
+        push(&mut lock(&self.kept), event);
     }
+}
+
+fn push(kept: &mut VecDeque<u8>, event: u8) {
+    kept.truncate(KEPT - 1);
+    kept.push_front(event);
 }
 
 fn silenced(silent: bool) -> u8 {
@@ -142,11 +129,6 @@ fn bit_of(exception: ExceptionCode) -> u8 {
 mod tests {
     use super::*;
 
-    fn latest(events: &CommEvents) -> Vec<u8> {
-        let (latest, count) = events.latest();
-        latest[..count].to_vec()
-    }
-
     #[test]
     fn each_event_has_the_byte_of_the_standard() {
         let events = CommEvents::new(true);
@@ -157,7 +139,7 @@ mod tests {
         events.silence();
         events.send(None, false);
         events.send(None, true);
-        assert_eq!(latest(&events), [0x60, 0x40, 0x04, 0x82, 0xC0, 0xA0, 0x80]);
+        assert_eq!(events.latest(), [0x60, 0x40, 0x04, 0x82, 0xC0, 0xA0, 0x80]);
     }
 
     #[test]
@@ -174,7 +156,7 @@ mod tests {
         for (exception, expected) in cases {
             let events = CommEvents::new(true);
             events.send(Some(exception), false);
-            assert_eq!(latest(&events), [expected], "{exception}");
+            assert_eq!(events.latest(), [expected], "{exception}");
         }
     }
 
@@ -185,7 +167,7 @@ mod tests {
             events.receive(Received::Error);
         }
         events.silence();
-        let found = latest(&events);
+        let found = events.latest();
         assert_eq!((found.len(), found[0]), (KEPT, 0x04));
         assert!(found[1..].iter().all(|event| *event == 0x82));
     }
@@ -196,7 +178,7 @@ mod tests {
             let events = CommEvents::new(true);
             events.receive(Received::Error);
             events.restart(forgets);
-            assert_eq!(latest(&events), expected);
+            assert_eq!(events.latest(), expected);
         }
     }
 
@@ -205,11 +187,11 @@ mod tests {
         let events = CommEvents::new(false);
         events.receive(Received::Error);
         events.send(None, false);
-        assert_eq!(latest(&events), []);
+        assert_eq!(events.latest(), []);
         events.set(true);
         events.receive(Received::Error);
-        assert_eq!(latest(&events), [0x82]);
+        assert_eq!(events.latest(), [0x82]);
         events.set(false);
-        assert_eq!(latest(&events), []);
+        assert_eq!(events.latest(), []);
     }
 }

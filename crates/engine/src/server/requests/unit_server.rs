@@ -382,9 +382,10 @@ impl UnitServer {
                 Ok(reply::event_counter(false, self.counters.bus().events as u16, reply))
             }
             Request::GetCommEventLog => {
-                let (bus, (latest, count)) = (self.counters.bus(), self.comm_events.latest());
+                let bus = self.counters.bus();
                 let (events, messages) = (bus.events as u16, bus.messages as u16);
-                let len = reply::event_log(false, events, messages, &latest[..count], reply);
+                let latest = self.comm_events.latest();
+                let len = reply::event_log(false, events, messages, &latest, reply);
                 Ok(len.expect("no more events are kept than fit into a reply"))
             }
             Request::ReadExceptionStatus => {

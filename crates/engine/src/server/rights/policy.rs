@@ -45,7 +45,7 @@ fn match_peer(
 }
 
 /// Whether one of the networks has this address. An IPv4-mapped IPv6 address is treated as IPv4.
-fn contain(sources: &[IpNet], peer: IpAddr) -> bool {
+pub(crate) fn contain(sources: &[IpNet], peer: IpAddr) -> bool {
     let peer = peer.to_canonical();
     sources.iter().any(|network| network.contains(&peer))
 }
