@@ -55,7 +55,6 @@ __all__ = [
     "TLS_REASONS",
     "TURNAROUND_S",
     "UNMEASURED_COST_MS",
-    "WHEN_BEHIND",
     "WRITE_RECORDS",
     "WRITE_TIMEOUT_S",
     "Attempt",
@@ -168,7 +167,6 @@ WRITE_TIMEOUT_S: Final[float]
 CONTACTS_PER_LAG: Final[int]
 """How often a node of a log without writes has contact with it, in the time of `max_lag`."""
 
-WHEN_BEHIND: Final[Literal["serve", "refuse"]]
 """What happens to reads of a node that is behind, where the log says nothing else."""
 
 MAX_LAG_S: Final[float]

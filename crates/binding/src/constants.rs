@@ -4,7 +4,7 @@
 use holdfast_engine::link::{Fault, InFlight, LinkSettings};
 use holdfast_engine::poller::UNMEASURED_COST_MS;
 use holdfast_engine::tls::TlsFailure;
-use holdfast_journal::log::{CONTACTS_PER_LAG, MAX_LAG, WHEN_BEHIND, WRITE_TIMEOUT};
+use holdfast_journal::log::{CONTACTS_PER_LAG, MAX_LAG, WRITE_TIMEOUT};
 use holdfast_memory::{Area, Span};
 use holdfast_protocol::client::{MAX_LATENESS, TURNAROUND};
 use holdfast_protocol::pdu::{self, ExceptionCode, Function, SubFunction, limit};
@@ -44,7 +44,6 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("LINK_QUEUE", LinkSettings::QUEUE)?;
     module.add("MAX_LINK_QUEUE", LinkSettings::MAX_QUEUE)?;
     module.add("WRITE_TIMEOUT_S", WRITE_TIMEOUT.as_secs_f64())?;
-    module.add("WHEN_BEHIND", WHEN_BEHIND.name())?;
     module.add("CONTACTS_PER_LAG", CONTACTS_PER_LAG)?;
     module.add("MAX_LAG_S", MAX_LAG.as_secs_f64())
 }

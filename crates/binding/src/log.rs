@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use holdfast_journal::log::{
-    Log as Core, LogError as CoreError, LogReader as CoreReader, Login, Next, Phase, Record,
-    Settings, Tls, Until, WhenBehind,
+    Log as Core, LogError as CoreError, LogReader as CoreReader, Login, Phase, Record, Settings,
+    Tls, Until,
 };
 use holdfast_memory::{Access, Action, Memory as CoreMemory, Step, StepWrite};
 use holdfast_runtime::lock;
@@ -71,8 +71,8 @@ impl Log {
             settings.write_timeout = seconds("write_timeout", write_timeout)?;
         }
         if let Some(when_behind) = when_behind {
-            settings.when_behind =
-                word("when_behind", when_behind, &WhenBehind::ALL.map(|each| (each.name(), each)))?;
+            settings.refuses_when_behind =
+                word("when_behind", when_behind, &[("serve", false), ("refuse", true)])?;
         }
         if let Some(max_lag) = max_lag {
             settings.max_lag = seconds("max_lag", max_lag)?;
@@ -226,10 +226,8 @@ impl LogReader {
 
     fn next<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Bound<'py, PyDict>>> {
         let timeout = seconds("timeout", timeout)?;
-        match py.detach(|| self.locked(|core| core.next(timeout))).map_err(raised)? {
-            Next::Record(record) => self.shown(py, &record).map(Some),
-            Next::Nothing | Next::End => Ok(None),
-        }
+        let record = py.detach(|| self.locked(|core| core.next(timeout))).map_err(raised)?;
+        record.map(|record| self.shown(py, &record)).transpose()
     }
 
     #[getter]

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use futures_util::StreamExt;
-use holdfast_journal::log::{LogError, LogReader, Next, Phase, Settings, Until};
+use holdfast_journal::log::{LogError, LogReader, Phase, Settings, Until};
 use holdfast_memory::{
     Access, Action, Area, Freshness, Memory, Mirrored, Operation, Outcome, Read, Refusal, Refused,
     Span, Step, StepWrite, Tenure, Term, Write, write_across,
@@ -443,7 +443,7 @@ fn a_replay_goes_on_behind_headers_that_nobody_can_read() {
     let settings = Settings::new("site", "replay", vec![server.url()]);
     let mut reader = LogReader::open(&settings, members, Until::Now, nodes::DEADLINE).unwrap();
     let mut foreign = 0;
-    while let Next::Record(record) = reader.next(nodes::DEADLINE).unwrap() {
+    while let Some(record) = reader.next(nodes::DEADLINE).unwrap() {
         foreign += usize::from(record.origin.is_none());
     }
     assert!(reader.has_ended());
@@ -561,7 +561,7 @@ fn what_a_former_holder_of_a_lease_writes_late_is_refused() {
     let members = vec![("plant".to_owned(), memory)];
     let mut reader = LogReader::open(&settings, members, Until::Now, nodes::DEADLINE).unwrap();
     let mut refusals = Vec::new();
-    while let Next::Record(record) = reader.next(nodes::DEADLINE).unwrap() {
+    while let Some(record) = reader.next(nodes::DEADLINE).unwrap() {
         refusals.extend(record.refusals.into_iter().flatten());
     }
     assert_eq!(refusals, [Refusal::Overtaken]);
@@ -765,7 +765,7 @@ fn equal_nodes_have_equal_digests() {
 fn without_contact_reads_are_refused_if_that_is_wanted() {
     let server = Server::new();
     let node = Node::new(&[&server], "a", |settings| {
-        settings.when_behind = holdfast_journal::log::WhenBehind::Refuse;
+        settings.refuses_when_behind = true;
         settings.max_lag = Duration::from_secs(5);
     });
     let other = Node::started(&[&server], "b");

@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use holdfast_journal::log::{LogReader, Next, Settings, Until};
+use holdfast_journal::log::{LogReader, Settings, Until};
 use holdfast_memory::{Action, Area, Layout, Memory, Span};
 use nodes::process::{Answer, Process};
 use nodes::{Server, cluster, until};
@@ -223,12 +223,7 @@ impl Run {
         let memories = vec![("plant".to_owned(), memory)];
         let mut reader = LogReader::open(&settings, memories, Until::Now, nodes::DEADLINE).unwrap();
         let mut found: BTreeMap<(u64, u16), u32> = BTreeMap::new();
-        loop {
-            let record = match reader.next(nodes::DEADLINE).unwrap() {
-                Next::Record(record) => record,
-                Next::End => break,
-                Next::Nothing => panic!("the stream does not go on"),
-            };
+        while let Some(record) = reader.next(nodes::DEADLINE).unwrap() {
             for step in record.steps.iter().filter(|_| record.fresh) {
                 let Action::Write(writes) = &step.action else { panic!("{step:?}") };
                 for write in writes {
@@ -237,6 +232,7 @@ impl Run {
                 }
             }
         }
+        assert!(reader.has_ended(), "the stream does not go on");
         println!("{} writes in the log, up to {}", found.len(), reader.sequence());
         let history = self.history.lock().unwrap();
         for write in history.iter().filter(|operation| operation.is_write) {

@@ -3,17 +3,14 @@
 use std::time::Duration;
 
 use super::parts::comparer::DIGEST_EVERY;
-use super::parts::snapshotter::{SNAPSHOT_AFTER, SNAPSHOT_STEPS};
+use super::parts::snapshotter::SNAPSHOT_STEPS;
 use super::parts::wrong_contents::REJOIN_AFTER;
-use super::settings::{Login, Servers, Settings, WhenBehind};
-use super::shared::MAX_QUEUE_STEPS;
+use super::settings::{Login, Servers, Settings};
 use super::stream::connection::CONNECT_TIMEOUT;
 use super::stream::server_lag::MAX_CUT_OFF;
 
 /// Until a write is answered that the log has not confirmed.
 pub const WRITE_TIMEOUT: Duration = Duration::from_secs(1);
-
-pub const WHEN_BEHIND: WhenBehind = WhenBehind::Serve;
 
 /// Without contact to the log, until the node is behind.
 pub const MAX_LAG: Duration = Duration::from_secs(5);
@@ -31,12 +28,10 @@ impl Settings {
             },
             replicas: 1,
             write_timeout: WRITE_TIMEOUT,
-            when_behind: WHEN_BEHIND,
+            refuses_when_behind: false,
             max_lag: MAX_LAG,
             snapshot_steps: SNAPSHOT_STEPS,
-            snapshot_after: SNAPSHOT_AFTER,
             digest_every: DIGEST_EVERY,
-            queue: MAX_QUEUE_STEPS,
             rejoin_after: Some(REJOIN_AFTER),
             memory_file: None,
             max_cut_off: MAX_CUT_OFF,

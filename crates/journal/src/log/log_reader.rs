@@ -53,16 +53,6 @@ pub struct LogReader {
     ended: bool,
 }
 
-/// What [`LogReader::next`] found.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Next {
-    Record(Record),
-    /// Nothing came within the time.
-    Nothing,
-    /// All is applied.
-    End,
-}
-
 struct Reading {
     state: State,
     messages: Fetched,
@@ -111,11 +101,11 @@ impl LogReader {
         }
     }
 
-    /// Applies the next message, if one comes within this time.
+    /// Applies the next message. `None` if none comes within this time, and at the [end](LogReader::has_ended).
     ///
     /// # Errors
     /// [`LogError`]. The reader is at its end then.
-    pub fn next(&mut self, timeout: Duration) -> Result<Next, LogError> {
+    pub fn next(&mut self, timeout: Duration) -> Result<Option<Record>, LogError> {
         let end = match self.until {
             Until::Sequence(end) => Some(end.min(self.last)),
             Until::Now => Some(self.last),
@@ -125,14 +115,14 @@ impl LogReader {
         };
         if self.ended || end.is_some_and(|end| self.reading.state.place.sequence >= end) {
             self.ended = true;
-            return Ok(Next::End);
+            return Ok(None);
         }
         let next = self.reading.next(self.until);
         let timed = async { tokio::time::timeout(timeout, next).await };
         let result = match self.runtime.block_on(timed) {
-            Err(_) => return Ok(Next::Nothing),
-            Ok(Ok(Some(record))) => return Ok(Next::Record(record)),
-            Ok(Ok(None) | Err(End::Stopped)) => Ok(Next::End),
+            Err(_) => return Ok(None),
+            Ok(Ok(Some(record))) => return Ok(Some(record)),
+            Ok(Ok(None) | Err(End::Stopped)) => Ok(None),
             Ok(Err(End::Fatal(error))) => Err(error),
             Ok(Err(End::Lost(last))) => Err(LogError::NoConnection { within: timeout, last }),
         };

@@ -41,10 +41,10 @@ use holdfast_memory::{Journal, Memory};
 use holdfast_runtime::lock;
 
 pub use clock::time_since_boot;
-pub use defaults::{MAX_LAG, WHEN_BEHIND, WRITE_TIMEOUT};
+pub use defaults::{MAX_LAG, WRITE_TIMEOUT};
 pub use error::LogError;
-pub use log_reader::{LogReader, Next, Record, Until};
-pub use settings::{CONTACTS_PER_LAG, Login, Servers, Settings, Tls, WhenBehind};
+pub use log_reader::{LogReader, Record, Until};
+pub use settings::{CONTACTS_PER_LAG, Login, Servers, Settings, Tls};
 pub use shared::Checkpoint;
 pub use status::{Digest, Event, Node, Phase, Status};
 pub use stream::message::Origin;

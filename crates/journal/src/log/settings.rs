@@ -41,25 +41,6 @@ pub struct Tls {
     pub own: Option<(PathBuf, PathBuf)>,
 }
 
-/// What reads do without contact with the log.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum WhenBehind {
-    Serve,
-    /// After `max_lag`, reads are refused with [`Refusal::Behind`](holdfast_memory::Refusal).
-    Refuse,
-}
-
-impl WhenBehind {
-    pub const ALL: [WhenBehind; 2] = [WhenBehind::Serve, WhenBehind::Refuse];
-
-    pub const fn name(self) -> &'static str {
-        match self {
-            WhenBehind::Serve => "serve",
-            WhenBehind::Refuse => "refuse",
-        }
-    }
-}
-
 #[derive(Debug, Clone)]
 pub struct Settings {
     /// The name of the log: all nodes with this name share the same contents.
@@ -71,16 +52,14 @@ pub struct Settings {
     pub replicas: usize,
     /// How long a write waits for its confirmation.
     pub write_timeout: Duration,
-    pub when_behind: WhenBehind,
+    /// Whether reads are refused with [`Refusal::Behind`](holdfast_memory::Refusal) after `max_lag` without
+    /// contact with the log.
+    pub refuses_when_behind: bool,
     pub max_lag: Duration,
     /// A snapshot is taken after so many steps.
     pub snapshot_steps: u64,
-    /// A snapshot is taken after this time, if anything was applied.
-    pub snapshot_after: Duration,
     /// Digests are compared at sequences that are multiples of this.
     pub digest_every: u64,
-    /// The most steps that wait to be sent.
-    pub queue: usize,
     /// A node whose contents differ rejoins by itself, unless it has done so within this time; with
     /// `None`, never.
     pub rejoin_after: Option<Duration>,
@@ -111,20 +90,14 @@ impl Settings {
         if !matches!(self.replicas, 1 | 3 | 5) {
             return refused(format!("replicas is {}, allowed: 1, 3, 5", self.replicas));
         }
-        for (what, found) in [
-            ("snapshot_steps", self.snapshot_steps),
-            ("digest_steps", self.digest_every),
-            ("queue", self.queue as u64),
-        ] {
+        for (what, found) in
+            [("snapshot_steps", self.snapshot_steps), ("digest_steps", self.digest_every)]
+        {
             if found == 0 {
                 return refused(format!("{what} is 0, at least 1 is required"));
             }
         }
-        for (what, found) in [
-            ("write_timeout", self.write_timeout),
-            ("max_lag", self.max_lag),
-            ("snapshot_seconds", self.snapshot_after),
-        ] {
+        for (what, found) in [("write_timeout", self.write_timeout), ("max_lag", self.max_lag)] {
             if found < MIN_TIMEOUT {
                 let (found, least) = (found.as_secs_f64(), MIN_TIMEOUT.as_secs_f64());
                 return refused(format!("{what} is {found} s, at least {least} s is required"));

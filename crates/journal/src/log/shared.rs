@@ -12,12 +12,12 @@ use tokio::sync::Notify;
 
 use super::clock::{Clock, Moment};
 use super::error::LogError;
-use super::settings::{Settings, WhenBehind};
+use super::settings::Settings;
 use super::status::{Counters, Event, Node, Phase, View};
 use crate::encoding;
 
 /// The most steps that wait to be sent, and their bytes.
-pub(super) const MAX_QUEUE_STEPS: usize = 4096;
+const MAX_QUEUE_STEPS: usize = 4096;
 const MAX_QUEUE_BYTES: usize = 64 << 20;
 
 /// The most events that wait to be taken. Then the oldest are dropped.
@@ -35,7 +35,6 @@ pub(super) struct Shared {
     refuses_when_behind: bool,
     max_lag: Duration,
     write_timeout: Duration,
-    capacity: usize,
     /// [`USABLE`], [`DIFFERS`] or [`LOADING`].
     usability: AtomicU8,
     /// The contents have been current at this [`Moment`], in nanoseconds. 0 means never.
@@ -107,7 +106,7 @@ impl Journal for Shared {
         }
         let mut queue = lock(&self.queue);
         let fits =
-            queue.steps.len() < self.capacity && queue.bytes + bytes.len() <= MAX_QUEUE_BYTES;
+            queue.steps.len() < MAX_QUEUE_STEPS && queue.bytes + bytes.len() <= MAX_QUEUE_BYTES;
         if !queue.open || !fits {
             drop(queue);
             self.counters.unavailable.add();
@@ -138,10 +137,9 @@ impl Shared {
     pub(super) fn new(settings: &Settings) -> Shared {
         Shared {
             clock: Clock::default(),
-            refuses_when_behind: settings.when_behind == WhenBehind::Refuse,
+            refuses_when_behind: settings.refuses_when_behind,
             max_lag: settings.max_lag,
             write_timeout: settings.write_timeout,
-            capacity: settings.queue,
             usability: AtomicU8::new(USABLE),
             contact: AtomicU64::new(0),
             max_step_bytes: AtomicUsize::new(usize::MAX),
@@ -387,7 +385,7 @@ mod tests {
     fn after_a_suspend_contents_are_old() {
         let time = Arc::new(Mutex::new(Duration::from_secs(100)));
         let mut settings = Settings::new("site", "a", Vec::new());
-        settings.when_behind = WhenBehind::Refuse;
+        settings.refuses_when_behind = true;
         let shared = Shared { clock: Clock::Test(Arc::clone(&time)), ..Shared::new(&settings) };
         assert_eq!(shared.admit(), Err(Refusal::Behind), "never current");
         shared.contact(shared.now());

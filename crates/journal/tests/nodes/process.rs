@@ -9,7 +9,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use holdfast_journal::log::{Log, Settings, WhenBehind};
+use holdfast_journal::log::{Log, Settings};
 use holdfast_memory::{
     Access, Area, Layout, Memory, Operation, Outcome, Read, Refusal, Span, Write,
 };
@@ -145,7 +145,7 @@ fn node_of_a_log() {
         match option {
             "answers-early" => settings.answers_early = true,
             "refuse" => {
-                settings.when_behind = WhenBehind::Refuse;
+                settings.refuses_when_behind = true;
                 settings.max_lag = Duration::from_secs(1);
             }
             "snapshots" => {

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, Strict, model_validator
 
-from holdfast._core import MAX_LAG_S, WHEN_BEHIND, WRITE_TIMEOUT_S
+from holdfast._core import MAX_LAG_S, WRITE_TIMEOUT_S
 from holdfast.config.models.services import NatsServersConfig
 from holdfast.config.values.scalars import FilePath, HttpUrl, Name, NatsUrl, NotNull, whole_number
 
@@ -38,7 +38,7 @@ class SharedLogConfig(NatsServersConfig):
     """On how many servers each write is, when it is confirmed."""
     write_timeout: Seconds = WRITE_TIMEOUT_S
     """Seconds until a write that the log has not confirmed is answered with exception 04."""
-    when_behind: Literal["serve", "refuse"] = WHEN_BEHIND
+    when_behind: Literal["serve", "refuse"] = "serve"
     """What happens to reads without contact to the log for max_lag seconds: they are served from
     the contents of this node, however old these are, or get exception 06."""
     max_lag: Seconds = MAX_LAG_S

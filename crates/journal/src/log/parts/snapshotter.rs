@@ -15,7 +15,7 @@ use crate::log::stream::store::{Pointer, Snapshot};
 
 /// A snapshot is taken after so many steps, or after this time if anything was applied since the last one.
 pub(in crate::log) const SNAPSHOT_STEPS: u64 = 100_000;
-pub(in crate::log) const SNAPSHOT_AFTER: Duration = Duration::from_secs(600);
+const SNAPSHOT_AFTER: Duration = Duration::from_secs(600);
 
 /// How long a snapshot, or a node that rejoins, waits for the digests of other nodes.
 pub(in crate::log) const DIGESTS_TIMEOUT: Duration = Duration::from_secs(5);
@@ -120,7 +120,7 @@ impl Snapshotter {
     fn is_due(&self, state: &State, now: Instant) -> bool {
         let Some(Known { pointer, since, .. }) = &self.known else { return false };
         let steps = state.steps.saturating_sub(pointer.newest.steps);
-        let is_old = now.saturating_duration_since(*since) >= self.settings.snapshot_after;
+        let is_old = now.saturating_duration_since(*since) >= SNAPSHOT_AFTER;
         steps >= self.settings.snapshot_steps
             || is_old && state.place.sequence > pointer.newest.sequence
     }
