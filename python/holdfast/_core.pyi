@@ -389,8 +389,8 @@ class Follower:
 class WriteQueue:
     """The writes to a memory, in their order. It is bounded: it drops the oldest writes."""
 
-    def next(self, timeout: float) -> tuple[Area, int, list[int], bool] | None:
-        """Waits for the next write: area, address, values, whether a Modbus client wrote it.
+    def next(self, timeout: float) -> tuple[Area, int, list[int]] | None:
+        """Waits for the next write: area, address, values.
 
         Returns `None` after `timeout` seconds, and when the queue is closed.
         """

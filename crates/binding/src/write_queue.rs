@@ -3,15 +3,15 @@
 use std::borrow::Cow;
 use std::sync::Arc;
 
-use holdfast_memory::{Access, WriteQueue as CoreQueue};
+use holdfast_memory::WriteQueue as CoreQueue;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
 
 use crate::arguments::seconds;
 use crate::python_values::listed;
 
-/// Area, address, values, and whether a Modbus client wrote them.
-type Written<'py> = (Cow<'static, str>, u16, Bound<'py, PyList>, bool);
+/// Area, address, values.
+type Written<'py> = (Cow<'static, str>, u16, Bound<'py, PyList>);
 
 #[pyclass(frozen, module = "holdfast")]
 pub struct WriteQueue {
@@ -24,8 +24,7 @@ impl WriteQueue {
         let timeout = seconds("timeout", timeout)?;
         let Some(written) = py.detach(|| self.core.next(timeout)) else { return Ok(None) };
         let values = listed(py, written.area, written.count, &written.bytes)?;
-        let is_client = written.access == Access::Client;
-        Ok(Some((written.area.name(), written.address, values, is_client)))
+        Ok(Some((written.area.name(), written.address, values)))
     }
 
     fn close(&self) {

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use crate::area::Area;
 use crate::operation::{Access, Write};
@@ -14,7 +14,6 @@ const MAX_QUEUED_BYTES: usize = 1024 * 1024;
 /// A write that was carried out.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Written {
-    pub access: Access,
     pub area: Area,
     pub address: u16,
     pub count: usize,
@@ -39,20 +38,12 @@ struct State {
 impl WriteQueue {
     /// Waits for the next write; `None` after `timeout`, and when the queue is closed.
     pub fn next(&self, timeout: Duration) -> Option<Written> {
-        let until = Instant::now() + timeout;
-        let mut state = self.state();
-        loop {
-            if let Some(written) = state.waiting.pop_front() {
-                state.bytes -= written.bytes.len();
-                return Some(written);
-            }
-            let left = until.saturating_duration_since(Instant::now());
-            if state.closed || left.is_zero() {
-                return None;
-            }
-            state =
-                self.arrived.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
-        }
+        let is_idle = |state: &mut State| state.waiting.is_empty() && !state.closed;
+        let waited = self.arrived.wait_timeout_while(self.state(), timeout, is_idle);
+        let mut state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        let written = state.waiting.pop_front()?;
+        state.bytes -= written.bytes.len();
+        Some(written)
     }
 
     /// Closes the queue: nothing is queued any more, and what waits is dropped.
@@ -74,14 +65,14 @@ impl WriteQueue {
     }
 
     /// Queues a write, unless the queue is closed.
-    fn push(&self, access: Access, write: &Write<'_>) {
+    fn push(&self, write: &Write<'_>) {
         let Write { area, address, count, bytes } = *write;
         let mut state = self.state();
         if state.closed {
             return;
         }
         state.bytes += bytes.len();
-        state.waiting.push_back(Written { access, area, address, count, bytes: bytes.to_vec() });
+        state.waiting.push_back(Written { area, address, count, bytes: bytes.to_vec() });
         // One write alone is never too large: an area has 128 KiB at most.
         while state.waiting.len() > MAX_QUEUED_WRITES || state.bytes > MAX_QUEUED_BYTES {
             let oldest = state.waiting.pop_front().map_or(0, |oldest| oldest.bytes.len());
@@ -127,7 +118,7 @@ impl Observers {
         for write in writes {
             for Observer { queue, clients_only } in &self.0 {
                 if access == Access::Client || !clients_only {
-                    queue.push(access, write);
+                    queue.push(write);
                 }
             }
         }

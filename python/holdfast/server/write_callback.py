@@ -51,9 +51,8 @@ class WriteCallback:
             written = self._queue.next(WAIT_S)
             if written is None:
                 continue
-            area, address, values, _ = written
             try:
-                self._callback(area, address, values)
+                self._callback(*written)
             except Exception:
                 thrown = threading.ExceptHookArgs((*sys.exc_info(), self._thread))
                 threading.excepthook(thrown)
