@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from holdfast.cli import answers
+from holdfast.runtime.text import counted as counted
 from holdfast.runtime.text import extent
 from holdfast.values.digits import shortest
 
@@ -45,11 +46,6 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], align: str = "") -
 def _filled(text: str, width: int, side: str) -> str:
     space = " " * (width - len(click.unstyle(text)))
     return space + text if side == ">" else text + space
-
-
-def counted(count: int, noun: str) -> str:
-    """`1 register`, `2 registers`, `2 addresses`."""
-    return f"{count} {noun}{'' if count == 1 else 'es' if noun.endswith('s') else 's'}"
 
 
 def number_ranges(numbers: Iterable[int]) -> str:

@@ -19,7 +19,7 @@ from holdfast.errors import (
     TlsFailed,
 )
 from holdfast.protocol import GATEWAY_FAILURES, ILLEGAL_ADDRESS, ILLEGAL_VALUE, READ_LIMITS
-from holdfast.tags.decoding import Decoder, Undecoded, decoder
+from holdfast.tags.decoding import Decoder, Undecoded, decoder, packed
 from holdfast.types import BIT_AREAS
 from holdfast.values import ConversionError
 
@@ -252,12 +252,6 @@ def _fetch(client: SyncClient, block: _Block) -> bytes:
         return b"".join(client.read(area, address, kind))
     read_bits = client.read_coils if area == "coils" else client.read_discrete_inputs
     return packed(read_bits(address, count))
-
-
-def packed(bits: Sequence[bool]) -> bytes:
-    """Bits as in a Modbus reply."""
-    together = sum(bit << at for at, bit in enumerate(bits))
-    return together.to_bytes((len(bits) + 7) // 8, "little")
 
 
 def _is_silence(error: ModbusError) -> bool:

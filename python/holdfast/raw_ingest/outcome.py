@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import reprlib
-import socket
 
+from holdfast.client.async_transports import explained
 from holdfast.net.addresses import joined
 from holdfast.raw_ingest.encoding import checked_field
-from holdfast.runtime.text import error_text
 
 DONE, REFUSED = b"\x00", b"\x01"
 
@@ -76,10 +75,7 @@ class Attempt:
         if isinstance(error, TlsLost):
             written = error.maybe_sent and self.sent
             return RawTlsFailed(f"{self.peer}: {error}", error.reason, maybe_written=written)
-        what = error.strerror or str(error)
-        if error.errno is not None and not isinstance(error, socket.gaierror):
-            what = error_text(error.errno)
-        return RawError(f"{self.peer}: {what}", maybe_written=self.sent)
+        return RawError(f"{self.peer}: {explained(error)}", maybe_written=self.sent)
 
     def conclude(self, reply: bytes) -> None:
         """Returns if the reply confirms the packet; otherwise raises `RawError`."""

@@ -41,6 +41,11 @@ def listing(values: Iterable[object]) -> str:
     return ", ".join(str(value) for value in values)
 
 
+def counted(count: int, noun: str) -> str:
+    """`1 register`, `2 registers`, `2 addresses`."""
+    return f"{count} {noun}{'' if count == 1 else 'es' if noun.endswith('s') else 's'}"
+
+
 def extent(numbers: range) -> str:
     """`5 to 9`."""
     return f"{numbers.start} to {numbers.stop - 1}"

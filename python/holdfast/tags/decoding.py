@@ -151,8 +151,13 @@ def assembled(tag: BaseTag, pieces: Sequence[tuple[int, bytes]]) -> bytes | None
         return None
     if not tag.of_bits:
         return b"".join(content)
-    packed = sum(1 << at for at, bit in enumerate(content) if bit)
-    return packed.to_bytes((len(content) + 7) // 8, "little")
+    return packed(content)
+
+
+def packed(bits: Sequence[bool]) -> bytes:
+    """Bits as in a Modbus reply."""
+    together = sum(bit << at for at, bit in enumerate(bits))
+    return together.to_bytes((len(bits) + 7) // 8, "little")
 
 
 def _alone(tag: BaseTag, data: bytes, address: int) -> Any:

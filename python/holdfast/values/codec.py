@@ -6,16 +6,10 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, overload
 
+from holdfast.runtime.text import counted
 from holdfast.types import BIT_AREAS
 from holdfast.values.bits import Bit, Bool
-from holdfast.values.errors import (
-    DoesNotFit,
-    UnknownEncoding,
-    WrongArea,
-    WrongLength,
-    counted,
-    shown,
-)
+from holdfast.values.errors import DoesNotFit, UnknownEncoding, WrongArea, WrongLength, shown
 from holdfast.values.numeric import INTEGERS, Bcd, Float, Integer
 from holdfast.values.orders import DEFAULT_ORDER, FOUR, order_of, swap_registers
 from holdfast.values.registers import RegisterBlock

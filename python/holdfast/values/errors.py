@@ -74,8 +74,3 @@ def shown(value: object) -> str:
     if value is None or isinstance(value, int | float):
         return repr(value)
     return f"a {type(value).__name__}"
-
-
-def counted(number: int, noun: str) -> str:
-    """`1 register`, `2 registers`."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from holdfast.protocol import MAX_WORD
-from holdfast.values.errors import InvalidRegister, WrongLength, counted, shown
+from holdfast.runtime.text import counted
+from holdfast.values.errors import InvalidRegister, WrongLength, shown
 from holdfast.values.integers import as_boolean, as_integer
 from holdfast.values.orders import swap_registers
 

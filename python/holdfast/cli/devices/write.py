@@ -26,6 +26,8 @@ from holdfast.cli.terminal_text import print_json
 from holdfast.client import requests
 from holdfast.errors import ModbusError
 from holdfast.protocol import WRITE_LIMITS
+from holdfast.tags.strict_text import BOOLEANS
+from holdfast.tags.text import SWITCHED
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
@@ -33,10 +35,9 @@ if TYPE_CHECKING:
 
     from holdfast.cli.options.plc_addresses import Place
     from holdfast.cli.options.value_type import Typed
-    from holdfast.cli.tags.options import TagFiles
     from holdfast.client import SyncClient
 
-TRUTHS = {"true": True, "on": True, "1": True, "false": False, "off": False, "0": False}
+TRUTHS = BOOLEANS | SWITCHED
 WHOLE = re.compile(r"([+-]?)(0[xX][0-9a-fA-F]{1,20}|[0-9]{1,20})")
 NUMBER = re.compile(
     r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|inf(inity)?|nan)", re.I | re.ASCII

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import click
 
@@ -15,9 +14,6 @@ from holdfast.discovery import address_search
 from holdfast.discovery.address_search import Survey
 from holdfast.protocol import LAST_ADDRESS
 from holdfast.types import AREAS, Area
-
-if TYPE_CHECKING:
-    pass
 
 MAX_REQUESTS = 20_000
 """The default of `--max-requests`, without `--exact`."""

@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast.client.tag_reading import TagReader, packed
+from holdfast.client.tag_reading import TagReader
 from holdfast.errors import ModbusError, ModbusException
 from holdfast.gateway.device import Failed, exception_text, problem
 from holdfast.gateway.endpoint import TARGET
@@ -19,6 +19,7 @@ from holdfast.gateway.streams.watch import interval_field
 from holdfast.net.http.fields import Field, filled, malformed, object_with
 from holdfast.net.http.requests import BadRequest, shown
 from holdfast.net.http.schemas import BOOLEAN, Schema, integer
+from holdfast.tags.decoding import packed
 from holdfast.tags.text import plain, text_of
 from holdfast.types import BIT_AREAS
 
