@@ -637,7 +637,7 @@ def test_a_poll_that_a_reload_overtakes_stores_nothing_at_its_former_place(rig: 
     held = Held(7)
     with (
         Stream("tcp", values(1), held, then=values(8)) as one,
-        Stream("tcp", values(2), then=silent) as two,
+        Stream("tcp", then=silent) as two,
     ):
 
         def places(first: int, second: int) -> Settings:
