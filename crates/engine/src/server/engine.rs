@@ -35,7 +35,7 @@ use crate::server::rights::policy::Policy;
 use crate::server::transports::raw_ingest::{RawIngest, RawSettings};
 use crate::server::transports::serial::{ModbusSerial, SerialSettings};
 use crate::server::transports::tcp::{ModbusStream, StreamSettings};
-use crate::server::transports::udp::{DatagramFraming, ModbusUdp, UdpSettings};
+use crate::server::transports::udp::{DatagramFraming, Datagrams, ModbusUdp, UdpSettings};
 
 /// The time that connections have to end when the engine stops.
 const STOP_TIMEOUT: Duration = Duration::from_millis(500);
@@ -135,7 +135,7 @@ struct Listener {
 type CopySocket = Box<dyn Fn() -> Option<Socket> + Send + Sync>;
 
 /// The socket of a new listener, its address, and what copies it.
-type Bound<S> = (Arc<S>, SocketAddr, CopySocket);
+type Bound<S> = (S, SocketAddr, CopySocket);
 
 enum Served {
     Stream(Arc<Reloadable<ModbusStream>>, Arc<UnitServer>),
@@ -565,7 +565,7 @@ fn bound_tcp(
     listener: &str,
     bind: SocketAddr,
     ending: &mut Vec<Arc<Listener>>,
-) -> Result<Bound<TcpListener>, StartError> {
+) -> Result<Bound<Arc<TcpListener>>, StartError> {
     let socket = match taken_over(ending, SocketKind::Tcp, bind) {
         Some(socket) => Ok(socket.into()),
         None => bind_tcp(bind),
@@ -583,17 +583,17 @@ fn bound_udp(
     listener: &str,
     bind: SocketAddr,
     ending: &mut Vec<Arc<Listener>>,
-) -> Result<Bound<UdpSocket>, StartError> {
+) -> Result<Bound<Datagrams>, StartError> {
     let socket = match taken_over(ending, SocketKind::Udp, bind) {
         Some(socket) => Ok(socket.into()),
         None => bind_udp(bind),
     };
     let socket = socket.and_then(UdpSocket::from_std);
-    let bound = socket.and_then(|socket| Ok((socket.local_addr()?, Arc::new(socket))));
-    let (address, socket) = bound.map_err(bind_error(listener, bind))?;
-    let weak = Arc::downgrade(&socket);
+    let bound = socket.and_then(|socket| Ok((socket.local_addr()?, Datagrams::new(socket)?)));
+    let (address, datagrams) = bound.map_err(bind_error(listener, bind))?;
+    let weak = Arc::downgrade(&datagrams.socket);
     let copy = move || SockRef::from(&*weak.upgrade()?).try_clone().ok();
-    Ok((socket, address, Box::new(copy)))
+    Ok((datagrams, address, Box::new(copy)))
 }
 
 /// Copies the socket of the ending listener with that address. Each is taken over once.

@@ -81,7 +81,7 @@ impl ModbusUdp {
     pub(crate) async fn serve(
         self,
         context: Arc<ListenerContext>,
-        socket: Arc<UdpSocket>,
+        socket: Datagrams,
         stop: watch::Receiver<bool>,
     ) {
         match self.framing {
@@ -93,11 +93,9 @@ impl ModbusUdp {
     async fn serve_framed<D: Datagram>(
         &self,
         context: &Arc<ListenerContext>,
-        socket: Arc<UdpSocket>,
+        socket: Datagrams,
         mut stop: watch::Receiver<bool>,
     ) {
-        let Ok(state) = UdpSocketState::new((&*socket).into()) else { return };
-        let socket = Datagrams { socket, state };
         let mut input = vec![0; INPUT_BYTES].into_boxed_slice();
         let mut later = Later::new(stop.clone());
         let mut turns = 0;
@@ -304,12 +302,18 @@ fn complete<D: Datagram>(socket: &Datagrams, completed: Completed, later: &mut L
 }
 
 /// A socket that reports the local address of each datagram.
-struct Datagrams {
-    socket: Arc<UdpSocket>,
+pub(crate) struct Datagrams {
+    pub(crate) socket: Arc<UdpSocket>,
     state: UdpSocketState,
 }
 
 impl Datagrams {
+    /// Fails if the system does not report local addresses.
+    pub(crate) fn new(socket: UdpSocket) -> io::Result<Datagrams> {
+        let state = UdpSocketState::new((&socket).into())?;
+        Ok(Datagrams { socket: Arc::new(socket), state })
+    }
+
     fn receive(&self, input: &mut [u8]) -> io::Result<RecvMeta> {
         let mut meta = [RecvMeta::default()];
         self.state.recv((&*self.socket).into(), &mut [IoSliceMut::new(input)], &mut meta)?;
@@ -364,6 +368,17 @@ mod tests {
         assert!(later.clients.is_empty());
     }
 
+    #[cfg(unix)]
+    #[test]
+    fn a_socket_that_reports_no_local_addresses_is_an_error() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let _context = runtime.enter();
+        let local = socket2::Socket::new(socket2::Domain::UNIX, socket2::Type::DGRAM, None);
+        let local = local.unwrap();
+        local.set_nonblocking(true).unwrap();
+        assert!(Datagrams::new(UdpSocket::from_std(local.into()).unwrap()).is_err());
+    }
+
     #[test]
     fn other_tasks_run_between_many_datagrams_that_have_arrived() {
         const DATAGRAMS: usize = 100;
@@ -394,7 +409,7 @@ mod tests {
         let read = || unit_server.counters.requests().map(|(_, count)| count).sum::<u64>();
         let most = runtime.block_on(async {
             let context = Arc::new(ListenerContext::for_tests());
-            let socket = Arc::new(UdpSocket::from_std(socket).unwrap());
+            let socket = Datagrams::new(UdpSocket::from_std(socket).unwrap()).unwrap();
             let _serving = tokio::spawn(service.serve(context, socket, stop));
             let (mut most, mut before) = (0, 0);
             while before < DATAGRAMS as u64 {
