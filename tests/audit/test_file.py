@@ -16,6 +16,7 @@ from holdfast.events.audit import Audit, verify
 from holdfast.events.throttle import Throttle
 from support import wire
 from support.audits import full
+from support.renaming import not_renamed
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -122,6 +123,36 @@ def test_a_file_that_can_not_be_renamed_goes_on(
     assert "audit_not_rotated" in caplog.messages
     assert numbers(log) == list(range(1000))
     assert is_chained(log)
+
+
+def test_a_file_that_can_not_be_renamed_costs_no_older_file(
+    log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    audit = opened(log)
+    numbered = iter(range(10_000))
+    while len(files(log)) < 3:
+        audit.write(number=next(numbered))
+    allow = not_renamed(monkeypatch, log)
+    for _ in range(1000):
+        audit.write(number=next(numbered))
+    assert len(files(log)) == 3
+    assert log.stat().st_size > SIZE
+    allow()
+    audit.rotate()
+    audit.write(number=next(numbered))
+    audit.close()
+    assert log.stat().st_size < SIZE
+    written = numbers(*files(log))
+    assert written == list(range(written[0], next(numbered)))
+    assert verify(files(log)).error is None
+
+
+def test_a_chain_goes_on_after_a_crash_amid_rotation(log: Path) -> None:
+    write(log, 1)
+    log.rename(log.with_name("audit.log.0"))
+    write(log, 2)
+    assert [file.name for file in files(log)] == ["audit.log.1", "audit.log"]
+    assert is_chained(*files(log))
 
 
 # Others

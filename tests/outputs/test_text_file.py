@@ -13,6 +13,7 @@ from holdfast.outputs.sqlite_file import Database
 from holdfast.outputs.text_file import TextFile
 from support.line_protocol import parsed
 from support.readings import reading, tag
+from support.renaming import not_renamed
 
 if TYPE_CHECKING:
     import io
@@ -98,6 +99,33 @@ def test_a_full_file_is_rotated(tmp_path: Path) -> None:
     sizes = {each.name: each.stat().st_size for each in tmp_path.iterdir()}
     assert sorted(sizes) == ["a.jsonl", "a.jsonl.1", "a.jsonl.2"]
     assert all(0 < size <= 65536 for size in sizes.values())
+
+
+def test_a_file_that_can_not_be_renamed_grows_and_costs_no_older_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "a.jsonl"
+    file = TextFile(settings(path, "jsonl", max_bytes=65536, keep=2))
+    batch = [reading(number) for number in range(200)]
+    for _ in range(12):
+        file.send(batch)
+    older = [(tmp_path / f"a.jsonl.{number}").read_bytes() for number in (1, 2)]
+    not_renamed(monkeypatch, path)
+    for _ in range(8):
+        file.send(batch)
+    file.close()
+    assert path.stat().st_size > 65536
+    assert [(tmp_path / f"a.jsonl.{number}").read_bytes() for number in (1, 2)] == older
+    assert caplog.messages == ["output_not_rotated"]
+
+
+def test_without_older_files_a_full_file_is_removed(tmp_path: Path) -> None:
+    file = TextFile(settings(tmp_path / "a.jsonl", "jsonl", max_bytes=65536, keep=0))
+    for _ in range(12):
+        file.send([reading(number) for number in range(200)])
+    file.close()
+    [left] = tmp_path.iterdir()
+    assert 0 < left.stat().st_size <= 65536
 
 
 def test_a_file_that_is_moved_is_written_again(tmp_path: Path) -> None:

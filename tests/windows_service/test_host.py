@@ -11,6 +11,7 @@ import pytest
 from holdfast.appliance.windows_service.log_file import LogFile
 from support import fake_windows, wire
 from support.cli import invoke
+from support.renaming import not_renamed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -150,3 +151,25 @@ def test_the_log_file_is_rotated_and_never_fails(
     for _ in range(100):
         log.write("dropped " * 20)
     log.close()
+
+
+def test_a_log_file_that_a_reader_has_open_grows_and_loses_no_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("holdfast.appliance.windows_service.log_file.MAX_BYTES", 100)
+    file = tmp_path / "service.log"
+    log = LogFile(file)
+    for number in range(20):
+        print(f"line {number}", file=log)
+    older = {one.name: one.read_bytes() for one in tmp_path.iterdir() if one != file}
+    allow = not_renamed(monkeypatch, file)
+    for number in range(20, 50):
+        print(f"line {number}", file=log)
+    assert {one.name: one.read_bytes() for one in tmp_path.iterdir() if one != file} == older
+    assert file.read_text().splitlines()[-30:] == [f"line {number}" for number in range(20, 50)]
+    assert caplog.messages == ["log_file_not_rotated"]
+    allow()
+    monkeypatch.setattr("holdfast.events.rotation.time.monotonic", lambda: float("inf"))
+    print("line 50", file=log)
+    log.close()
+    assert file.read_text() == "line 50\n"

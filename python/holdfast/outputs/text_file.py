@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.config.models.outputs import MEASUREMENT
+from holdfast.events import log_lines
+from holdfast.events.rotation import Rotation
 from holdfast.outputs.line_protocol import lines
 from holdfast.outputs.sending import Receiver
 from holdfast.tags.text import plain, text_of
@@ -29,8 +31,9 @@ class TextFile(Receiver):
     """A file of whole lines. What a full disk cuts off is removed, and written again later."""
 
     def __init__(self, settings: FileConfig) -> None:
-        self._file, self._keep = settings.file, settings.keep
+        self._file = settings.file
         self._max_bytes = settings.max_bytes
+        self._rotation = Rotation(settings.file, settings.keep, self._not_rotated)
         self._encode = ENCODINGS[settings.format]
         self._head = f"{','.join(COLUMNS)}\n".encode() if settings.format == "csv" else b""
         self._open: io.FileIO | None = None
@@ -65,26 +68,18 @@ class TextFile(Receiver):
         if self._open is not None and not _is_same(self._open, self._file):
             self.close()
         if self._open is None:
+            self._rotation.take_up()
             self._open = self._file.open("ab", buffering=0)
             _end_line(self._open, self._file)
         size = self._open.seek(0, os.SEEK_END)
-        if size and size + more > self._max_bytes:
+        if size and size + more > self._max_bytes and self._rotation.is_due:
             self.close()
-            rotate(self._file, self._keep)
+            self._rotation.rotate()
             self._open = self._file.open("ab", buffering=0)
         return self._open
 
-
-def rotate(file: Path, keep: int) -> None:
-    """Renames FILE to FILE.1, FILE.1 to FILE.2 and so on; removes the oldest."""
-    if keep == 0:
-        file.unlink(missing_ok=True)
-        return
-    for number in range(keep - 1, 0, -1):
-        older = file.with_name(f"{file.name}.{number}")
-        if older.exists():
-            older.replace(file.with_name(f"{file.name}.{number + 1}"))
-    file.replace(file.with_name(f"{file.name}.1"))
+    def _not_rotated(self) -> None:
+        log_lines.problem("output_not_rotated", file=str(self._file))
 
 
 def _is_same(file: io.FileIO, path: Path) -> bool:

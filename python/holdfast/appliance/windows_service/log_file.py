@@ -7,6 +7,9 @@ import logging
 from logging.handlers import RotatingFileHandler
 from typing import TYPE_CHECKING
 
+from holdfast.events import log_lines
+from holdfast.events.rotation import Rotation
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -22,7 +25,7 @@ class LogFile(io.TextIOBase):
 
     def __init__(self, file: Path) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
-        self._handler = _Handler(file, maxBytes=MAX_BYTES, backupCount=BACKUPS, encoding="utf-8")
+        self._handler = _Handler(file)
 
     def writable(self) -> bool:
         """It is."""
@@ -41,6 +44,26 @@ class LogFile(io.TextIOBase):
 
 class _Handler(RotatingFileHandler):
     terminator = ""
+
+    def __init__(self, file: Path) -> None:
+        self._rotation = Rotation(file, BACKUPS, self._not_rotated)
+        self._rotation.take_up()
+        super().__init__(file, maxBytes=MAX_BYTES, backupCount=BACKUPS, encoding="utf-8")
+
+    def shouldRollover(self, record: logging.LogRecord) -> bool:
+        """Whether the file is full, and can probably be renamed."""
+        return self._rotation.is_due and bool(super().shouldRollover(record))
+
+    def doRollover(self) -> None:
+        """Begins a new file, unless a reader has this one open: the default deletes older ones."""
+        if self.stream is not None:
+            self.stream.close()
+            self.stream = None
+        self._rotation.rotate()
+        self.stream = self._open()
+
+    def _not_rotated(self) -> None:
+        log_lines.problem("log_file_not_rotated", file=self.baseFilename)
 
     def handleError(self, record: logging.LogRecord) -> None:
         """Drops the text: the default writes to standard error, which leads back here."""

@@ -6,7 +6,6 @@ anew, so `logrotate` works too. Only one process at a time can write a file.
 
 from __future__ import annotations
 
-import itertools
 import os
 import stat
 from typing import TYPE_CHECKING
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING
 from holdfast.events import log_lines
 from holdfast.events.audit.chain import End, digest_of, place_of
 from holdfast.events.audit.lock import lock
+from holdfast.events.rotation import Rotation
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -36,13 +36,14 @@ class AuditFile:
         self.broken: str | None
         """Why the chain breaks before the next line, if it does."""
         self._max_bytes = max_bytes
-        self._keep = keep
+        self._rotation = Rotation(file, keep, self._not_rotated)
         self._prefix = b""
         self._descriptor = CLOSED
         self._identity: tuple[int, int] | None = None
         self._is_regular = False
         self._size = 0
         self._open()
+        self._rotation.take_up()
         try:
             self.end, self.broken = self._found()
         except OSError:
@@ -79,7 +80,8 @@ class AuditFile:
         """
         while lines:
             count = self._fitting(lines)
-            if self._size and (count == 0 or (together and count < len(lines))):
+            is_full = count == 0 or (together and count < len(lines))
+            if self._size and is_full and self._rotation.is_due:
                 self.rotate()
                 count = self._fitting(lines)
             count = len(lines) if together else max(count, 1)
@@ -89,16 +91,10 @@ class AuditFile:
 
     def rotate(self) -> None:
         """Renames the files and begins a new one. If that fails, goes on with the present one."""
-        names = [self.file, *(self.numbered(number) for number in range(1, self._keep + 1))]
         if self._prefix:
             self._write(b"")
-        self.close()  # Windows renames no open file.
-        try:
-            for newer, older in reversed(list(itertools.pairwise(names))):
-                if newer.exists():
-                    newer.replace(older)
-        except OSError:
-            log_lines.problem("audit_not_rotated", file=str(self.file))
+        self.close()
+        self._rotation.rotate()
         self._open()
 
     @property
@@ -106,9 +102,8 @@ class AuditFile:
         """Whether the file has no line yet."""
         return self._size == 0
 
-    def numbered(self, number: int) -> Path:
-        """The name of a file that was put aside."""
-        return self.file.with_name(f"{self.file.name}.{number}")
+    def _not_rotated(self) -> None:
+        log_lines.problem("audit_not_rotated", file=str(self.file))
 
     def _open(self) -> None:
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
@@ -148,7 +143,8 @@ class AuditFile:
         last = last_lines(self.file) if self._is_regular else []
         if last:
             return self._end_of(last)
-        before = last_lines(self.numbered(1)) if self.numbered(1).is_file() else []
+        aside = [self._rotation.numbered(number) for number in (0, 1)]
+        before = next((last_lines(file) for file in aside if file.is_file()), [])
         if not before:
             return End(), "new"
         place, digest = place_of(before[-1]), digest_of(before[-1])
