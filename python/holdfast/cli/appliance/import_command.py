@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from functools import partial
 from pathlib import Path
@@ -14,6 +13,7 @@ from holdfast.cli import SuggestingGroup
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.item import areas_of
 from holdfast.cli.options.option import config_argument, flag, json_option, option, option_group
+from holdfast.cli.shell_command import shell_command
 from holdfast.cli.terminal_text import (
     counted,
     print_json,
@@ -193,7 +193,7 @@ def _summary(imported: Imported, output: Path | None) -> str:
     if imported.generation is not None:
         of = f" is of the {ORDINALS[imported.generation]} generation"
     notes = counted(len(imported.notes), "note")
-    check = f"; next: holdfast check {shlex.quote(str(output))}" if output is not None else ""
+    check = f"; next: {shell_command('holdfast', 'check', output)}" if output is not None else ""
     return f"{imported.file}{of}: {notes}{check}"
 
 

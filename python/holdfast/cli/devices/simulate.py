@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 import time
 from contextlib import ExitStack
 from fnmatch import fnmatchcase
@@ -26,6 +25,7 @@ from holdfast.cli.options.bind_and_source import (
 from holdfast.cli.options.device import unit_option
 from holdfast.cli.options.duration import Duration, every_option
 from holdfast.cli.options.option import FILE, file_option, option, parsed_by
+from holdfast.cli.shell_command import shell_command
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.cli.tags.files import tags_of
 from holdfast.net.addresses import LOOPBACK, joined, reachable
@@ -235,18 +235,18 @@ def _unknown(url: str, unit: int) -> list[str]:
     one = ["--unit", unit] if unit != 1 else []
     describe = ["holdfast", "describe", url, *units, "--output", "heater.yaml"]
     watch = ["holdfast", "watch", url, "--tags", "heater.yaml", *one]
-    return [f"  {shlex.join(map(str, command))}" for command in (describe, watch)]
+    return [f"  {shell_command(*command)}" for command in (describe, watch)]
 
 
 def _known(file: Path, profile: str | None, tags: TagList, url: str, unit: int) -> list[str]:
     """Commands for a device with a tag list."""
     list_: list[Any] = ["--tags", file, *(["--profile", profile] if profile else [])]
     options = [*list_, *(["--unit", unit] if unit != 1 else [])]
-    command = shlex.join(["holdfast", "watch", url, *map(str, options)])
+    command = shell_command("holdfast", "watch", url, *options)
     lines = [f"  {command}"]
     writable = next((tag for tag in tags if tag.writable and tag.is_number), None)
     if writable is not None:
         value = text_of(writable, generators.still(writable).items[0])
-        write = ["holdfast", "write", url, f"{writable.name}={value}", *map(str, options)]
-        lines.append(f"  {shlex.join(write)}")
+        write = ["holdfast", "write", url, f"{writable.name}={value}", *options]
+        lines.append(f"  {shell_command(*write)}")
     return lines

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -15,6 +15,7 @@ from holdfast.cli.options.log_lines import log_format_option
 from holdfast.cli.options.option import choice, number_option, option, parsed_by
 from holdfast.cli.options.tls import DEVICES, https_options, tls_options
 from holdfast.cli.services.run import serve
+from holdfast.cli.shell_command import shell_command
 from holdfast.client.endpoint import check_files
 from holdfast.config import Config
 from holdfast.config.models.services import Compat
@@ -159,9 +160,10 @@ def _greeting_text(served: str, settings: Settings) -> str:
     who = ", ".join(name for name, _ in settings.tokens) or "no tokens"
     example, its_port = _example(settings.allow[0])
     body = f'{{"host":"{example}","port":{its_port}}}'
-    header = "-H 'Content-Type: application/json'"
+    header = shell_command("-H", "Content-Type: application/json")
     if settings.tokens:
-        header += ' -H "Authorization: Bearer $TOKEN"'
+        token = "%TOKEN%" if sys.platform == "win32" else "$TOKEN"
+        header += f' -H "Authorization: Bearer {token}"'
     if scheme == "https":
         header += " --cacert ca.pem"
     names = [f"  names: {', '.join(sorted(settings.hosts))}"] if settings.hosts else []
@@ -177,7 +179,7 @@ def _greeting_text(served: str, settings: Settings) -> str:
             "",
             "Try:",
             "",
-            f"  curl {url}/api/modbus/connect {header} -d {shlex.quote(body)}",
+            f"  curl {url}/api/modbus/connect {header} -d {shell_command(body)}",
             "",
             "Ctrl-C stops it.",
         ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shlex
 import threading
 import time
 from concurrent.futures import Future
@@ -17,6 +16,7 @@ import click
 from holdfast.adapters.plugins import UnknownAdapter
 from holdfast.appliance.reload import ReloadIncomplete, ReloadRefused
 from holdfast.cli.services.file_snapshot import FileSnapshot
+from holdfast.cli.shell_command import shell_command
 from holdfast.config import ConfigError
 from holdfast.config.fingerprint import files_of
 from holdfast.config.loader import unanswered
@@ -183,7 +183,7 @@ class Reloader:
         """Logs a change that is not taken over; once until the next reload."""
         if (key := (str(file), reason)) not in self._logged:
             self._logged.add(key)
-            todo = f"holdfast reload {shlex.quote(str(self._file))}"
+            todo = shell_command("holdfast", "reload", self._file)
             log_lines.write(
                 logging.WARNING, "reload_needed", file=str(file), reason=reason, command=todo
             )

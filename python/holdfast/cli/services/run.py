@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shlex
 import shutil
 import sys
 from contextlib import ExitStack
@@ -27,6 +26,7 @@ from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.option import config_argument
 from holdfast.cli.options.plc_addresses import MODICON_AREAS
 from holdfast.cli.services.reloader import Reloader
+from holdfast.cli.shell_command import shell_command
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Interrupted, Signals
 from holdfast.cli.terminal_text import ranges_shown
 from holdfast.config.fingerprint import files_of
@@ -307,7 +307,7 @@ def _behind(target: str | UnitMemoryConfig | RouteConfig) -> str:
 
 def _suggestions(appliance: Appliance, endpoints: list[ListenAddress], file: Path) -> list[str]:
     """Example commands for this appliance: a read, a write if one is allowed, the check."""
-    check = f"{_program()} check {shlex.quote(str(file))}"
+    check = f"{_program()} {shell_command('check', file)}"
     for endpoint in endpoints:
         if not isinstance(endpoint.settings, ModbusTcpListener):
             continue
@@ -339,5 +339,8 @@ def _program() -> str:
     """The name with which this program was called, or its path if a shell can't find it."""
     name = click.get_current_context().find_root().info_name or "holdfast"
     if name == "holdfast" and shutil.which(name) is None:
-        return shlex.quote(os.path.relpath(sys.argv[0]))
+        try:
+            return shell_command(os.path.relpath(sys.argv[0]))
+        except ValueError:  # Windows has no way from one drive to another.
+            return shell_command(sys.argv[0])
     return name

@@ -1,0 +1,13 @@
+"""Commands to paste into the shell of this system."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+
+
+def shell_command(*words: object) -> str:
+    """A command line that gives a program exactly these words."""
+    texts = list(map(str, words))
+    return subprocess.list2cmdline(texts) if sys.platform == "win32" else shlex.join(texts)
