@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import signal
 import subprocess
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import holdfast
+from holdfast.cli import standard_output
 from holdfast.server import Identity
 from support import cli, wire
 from support.brokers import free_port
@@ -98,3 +101,48 @@ def test_text_of_a_device_that_the_encoding_does_not_have_is_escaped() -> None:
         )
     assert (ended.returncode, ended.stderr) == (0, b"")
     assert rb"\u03a9mega" in ended.stdout
+
+
+class Stream(io.TextIOWrapper):
+    """Standard output of Windows, which is a terminal or not."""
+
+    def __init__(self, *, is_terminal: bool) -> None:
+        super().__init__(io.BytesIO(), encoding="cp1252")
+        self._is_terminal = is_terminal
+
+    def isatty(self) -> bool:
+        return self._is_terminal
+
+
+@pytest.mark.parametrize(
+    ("platform", "is_terminal", "demanded", "encoding"),
+    [
+        ("win32", False, "", "utf-8"),
+        ("win32", False, "cp1252", "cp1252"),
+        ("win32", True, "", "cp1252"),
+        ("linux", False, "", "cp1252"),
+    ],
+)
+def test_files_and_pipes_of_windows_get_utf_8(
+    monkeypatch: pytest.MonkeyPatch, platform: str, is_terminal: bool, demanded: str, encoding: str
+) -> None:
+    stream = Stream(is_terminal=is_terminal)
+    monkeypatch.setattr(sys, "platform", platform)
+    monkeypatch.setenv("PYTHONIOENCODING", demanded)
+    monkeypatch.setattr(sys, "stdout", stream)
+    standard_output.prepare()
+    assert (stream.encoding, stream.errors) == (encoding, "backslashreplace")
+
+
+def test_a_reader_that_is_gone_is_an_invalid_argument_on_windows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gone = OSError(errno.EINVAL, "Invalid argument")
+    gone.winerror = None  # type: ignore[attr-defined]
+    refused = OSError(errno.EINVAL, "The remote computer refused the network connection")
+    refused.winerror = 1225  # type: ignore[attr-defined]
+    assert not standard_output.is_unwritable(gone)
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert standard_output.is_unwritable(gone)
+    assert not standard_output.is_unwritable(refused)
+    assert not standard_output.is_unwritable(OSError(errno.EINVAL, "Invalid argument", "a.yaml"))

@@ -15,15 +15,25 @@ _UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EPIPE)
 
 
 def prepare() -> None:
-    """Lets text from outside pass that the encoding of standard output does not have."""
+    """Lets text from outside pass that the encoding of standard output does not have.
+
+    Files and pipes on Windows get UTF-8, which Holdfast requires of all that it reads, unless the
+    user demands another encoding.
+    """
+    is_local = sys.platform == "win32" and not os.environ.get("PYTHONIOENCODING")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+            encoding = "utf-8" if is_local and not stream.isatty() else None
+            stream.reconfigure(encoding=encoding, errors="backslashreplace")
 
 
 def is_unwritable(error: OSError) -> bool:
     """Whether this error is that of standard output, not of a file."""
-    return error.errno in _UNWRITABLE and error.filename is None
+    if error.filename is not None:
+        return False
+    if sys.platform == "win32" and error.errno == errno.EINVAL and error.winerror is None:
+        return True  # A pipe whose reader is gone. An error of the system has its own number, too.
+    return error.errno in _UNWRITABLE
 
 
 def leave() -> None:
