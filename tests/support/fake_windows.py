@@ -79,6 +79,7 @@ class Windows:
         self.services: dict[str, Service] = {}
         self.is_administrator = True
         self.fails = False
+        self.describes = True
         self.open_handles = 0
         self.reported: list[tuple[int, ...]] = []
         self.hosted: Any = None
@@ -106,6 +107,8 @@ class Windows:
         return made
 
     def ChangeServiceConfig2(self, service: Service, level: int, value: object) -> None:
+        if not self.describes:
+            raise Error(87, "ChangeServiceConfig2", "The parameter is incorrect.")
         service.settings[level] = value
 
     def OpenService(self, manager: Windows, name: str, access: int) -> Service:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 import threading
+from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Any
 
+import click
 import pytest
 
 from holdfast.appliance.windows_service.log_file import LogFile
@@ -151,6 +153,16 @@ def test_the_log_file_is_rotated_and_never_fails(
     for _ in range(100):
         log.write("dropped " * 20)
     log.close()
+
+
+def test_the_log_file_has_the_text_that_commands_print(tmp_path: Path) -> None:
+    log = LogFile(tmp_path / "service.log")
+    with redirect_stdout(log):
+        click.echo("a line")
+    with pytest.raises(TypeError, match="a log takes text, found bytes"):
+        log.write(b"")  # type: ignore[arg-type]
+    log.close()
+    assert (tmp_path / "service.log").read_text() == "a line\n"
 
 
 def test_a_log_file_that_a_reader_has_open_grows_and_loses_no_line(

@@ -65,6 +65,17 @@ def test_a_service_runs_the_configuration_at_every_boot_without_a_privilege(
     assert windows.open_handles == 0
 
 
+def test_a_service_that_can_not_be_described_is_not_installed(
+    windows: fake_windows.Windows, file: Path
+) -> None:
+    windows.describes = False
+    [told] = failure("service", "install", str(file))
+    assert (
+        told == "holdfast: can't install the service holdfast-my-plant: The parameter is incorrect"
+    )
+    assert (windows.services, windows.open_handles) == ({}, 0)
+
+
 def test_a_configuration_with_an_error_is_not_installed(
     windows: fake_windows.Windows, file: Path
 ) -> None:

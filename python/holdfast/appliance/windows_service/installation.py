@@ -71,7 +71,11 @@ class InstalledService:
                 None,
             )
             with _opened(service):
-                _describe(service, file)
+                try:
+                    _describe(service, file)
+                except pywintypes.error:
+                    win32service.DeleteService(service)
+                    raise
 
     def remove(self) -> None:
         """Stops the service, and deletes it."""

@@ -32,7 +32,9 @@ class LogFile(io.TextIOBase):
         return True
 
     def write(self, text: str, /) -> int:
-        """Appends text."""
+        """Appends text. Refuses bytes, as click tries whether a stream takes them."""
+        if not isinstance(text, str):
+            raise TypeError(f"a log takes text, found {type(text).__name__}")
         self._handler.handle(logging.makeLogRecord({"msg": text}))
         return len(text)
 
