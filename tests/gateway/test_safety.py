@@ -373,6 +373,12 @@ def test_a_token_file_has_a_name_and_a_hash_on_a_line(tmp_path: Path) -> None:
     assert token_file.load(file) == [*TOKENS, ("token-4", bytes.fromhex(bare))]
 
 
+def test_a_token_file_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    file = tmp_path / "tokens"
+    file.write_text(f"edge {hashlib.sha256(b'secret').hexdigest()}\n", encoding="utf-8-sig")
+    assert token_file.load(file) == [("edge", hashlib.sha256(b"secret").digest())]
+
+
 def test_a_token_line_shows_its_secret_once() -> None:
     made = cli.invoke("token", "--line")
     secret = made.stderr.split()[-1]

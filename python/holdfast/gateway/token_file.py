@@ -6,7 +6,7 @@ import re
 from typing import TYPE_CHECKING, TypeAlias
 
 from holdfast.config.values.scalars import NAME_FORM, is_name
-from holdfast.runtime.bounded_files import MAX_SECRETS_BYTES, read
+from holdfast.net.secret_file import read_bytes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,7 +26,7 @@ class WrongTokens(Exception):
 def load(file: Path) -> list[Token]:
     """Reads a token file; `#` starts a comment. Raises `OSError` and `WrongTokens`."""
     try:
-        lines = read(file, MAX_SECRETS_BYTES).decode().splitlines()
+        lines = read_bytes(file).decode().splitlines()
     except UnicodeDecodeError:
         raise WrongTokens(f"{file}: not UTF-8") from None
     tokens: list[Token] = []

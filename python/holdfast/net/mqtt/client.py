@@ -16,7 +16,7 @@ from paho.mqtt.properties import Properties
 from holdfast.net.mqtt import MAX_TEXT
 from holdfast.net.mqtt.connect import dial
 from holdfast.net.mqtt.packets import head
-from holdfast.runtime.bounded_files import MAX_SECRETS_BYTES, read
+from holdfast.net.secret_file import read_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -192,7 +192,7 @@ def _password(file: Path | None) -> bytes | None:
     """
     if file is None:
         return None
-    content = read(file, MAX_SECRETS_BYTES)
+    content = read_bytes(file)
     newline = b"\r\n" if content.endswith(b"\r\n") else b"\n"
     password = content.removesuffix(newline)
     if len(password) > MAX_TEXT:
