@@ -2,7 +2,21 @@
 
 from __future__ import annotations
 
-from holdfast.runtime.text import all_of, clip, either, listing, quote, suggestion
+import ctypes
+import errno
+import sys
+
+import pytest
+
+from holdfast.runtime.text import (
+    all_of,
+    clip,
+    either,
+    listing,
+    os_error_text,
+    quote,
+    suggestion,
+)
 
 
 def test_a_long_text_is_cut() -> None:
@@ -26,3 +40,16 @@ def test_lists_are_as_in_a_sentence() -> None:
 def test_a_close_word_is_suggested() -> None:
     assert suggestion("coil", ["holding_registers", "coils"]) == "; did you mean 'coils'?"
     assert suggestion("x", ["holding_registers"]) == ""
+
+
+def test_an_error_of_windows_has_the_text_of_its_own_number(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert os_error_text(OSError(errno.ECONNREFUSED, "[Errno 111] …")) == "Connection refused"
+    assert os_error_text(OSError("closed")) == "closed"
+    refused = OSError(errno.EINVAL, "The remote computer refused the network connection")
+    refused.winerror = 1225  # type: ignore[attr-defined]
+    texts = {1225: "The remote computer refused the network connection."}
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(ctypes, "FormatError", texts.get, raising=False)
+    assert os_error_text(refused) == texts[1225]

@@ -24,7 +24,7 @@ from holdfast.client.endpoint import endpoint
 from holdfast.client.fork import renew_in_children
 from holdfast.client.tcp_connect import addresses, connected
 from holdfast.errors import ConnectFailed, ConnectionLost, ModbusError, RequestTimeout
-from holdfast.runtime.text import error_text
+from holdfast.runtime.text import os_error_text
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable
@@ -474,6 +474,4 @@ def explained(error: Exception) -> str:
     """The system's text for an error, without the address that asyncio adds."""
     if isinstance(error, socket.gaierror):
         return error.strerror or str(error)
-    if isinstance(error, OSError) and error.errno is not None:
-        return error_text(error.errno)
-    return str(error)
+    return os_error_text(error) if isinstance(error, OSError) else str(error)

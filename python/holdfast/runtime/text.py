@@ -65,6 +65,15 @@ def error_text(number: int) -> str:
     return os.strerror(number)
 
 
+def os_error_text(error: OSError) -> str:
+    """The system's text for an error. On Windows, `errno` is often 22 for want of a better one."""
+    if sys.platform == "win32" and error.winerror:
+        import ctypes
+
+        return ctypes.FormatError(error.winerror)
+    return str(error) if error.errno is None else error_text(error.errno)
+
+
 def _listed(values: Iterable[object], word: str) -> str:
     *most, last = dict.fromkeys(str(value) for value in values)
     return f"{', '.join(most)} {word} {last}" if most else last
