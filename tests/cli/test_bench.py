@@ -8,6 +8,7 @@ import math
 import random
 import re
 import signal
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -154,6 +155,16 @@ def test_progress_is_told(server: holdfast.Server) -> None:
     assert seen == sorted(seen)
     assert load.elapsed >= 0.3
     assert load.rate > 0
+
+
+def test_a_clock_that_seldom_ticks_does_not_measure(
+    server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monotonic = time.monotonic
+    monkeypatch.setattr(time, "monotonic", lambda: monotonic() // 0.0156 * 0.0156)
+    load = Load(cli.url(server), "input_registers", 0, 5, seconds=0.3)
+    asyncio.run(load.run())
+    assert load.latencies.least > 0
 
 
 @given(st.lists(st.floats(1e-6, 1000), min_size=1))

@@ -150,7 +150,7 @@ class Load:
                 await client.close()
 
     async def _loaded(self, progress: Callable[[Load], object] | None) -> None:
-        began = time.monotonic()
+        began = time.perf_counter()
         workers = [
             asyncio.create_task(self._work(client, began + self.seconds))
             for client in self._clients
@@ -160,11 +160,11 @@ class Load:
             left = set(workers)
             while left:
                 _, left = await asyncio.wait(left, timeout=PROGRESS_INTERVAL_S)
-                self.elapsed = time.monotonic() - began
+                self.elapsed = time.perf_counter() - began
                 if progress is not None:
                     progress(self)
         finally:
-            self.elapsed = time.monotonic() - began
+            self.elapsed = time.perf_counter() - began
             for worker in workers:
                 worker.cancel()
             await asyncio.gather(*workers, return_exceptions=True)
@@ -177,15 +177,15 @@ class Load:
 
     async def _work(self, client: Client, end: float) -> None:
         """Reads repeatedly until the end of the test."""
-        while (began := time.monotonic()) < end:
+        while (began := time.perf_counter()) < end:
             try:
                 await self._read(client)
             except ModbusError as error:
                 self.errors[_kind(error)] += 1
                 if isinstance(error, ConnectionLost):
-                    await asyncio.sleep(min(RECONNECT_PAUSE_S, max(0.0, end - time.monotonic())))
+                    await asyncio.sleep(min(RECONNECT_PAUSE_S, max(0.0, end - time.perf_counter())))
             else:
-                self.latencies.add(time.monotonic() - began)
+                self.latencies.add(time.perf_counter() - began)
 
     async def _read(self, client: Client) -> None:
         await getattr(client, f"read_{self.area}")(self.address, self.count)

@@ -116,7 +116,7 @@ class RequestedDevice:
 
     async def attempt(self, call: Callable[[Client], Awaitable[Result]]) -> Result:
         """As `ask`, but connection errors, timeouts and invalid responses raise `ModbusError`."""
-        began = time.monotonic()
+        began = time.perf_counter()
         turns, route = None, None
 
         def run(given: Turns) -> Awaitable[Result]:
@@ -148,7 +148,7 @@ class RequestedDevice:
             is_sent = turns is not None and turns.is_sent
             self.maybe_sent |= is_sent
             self._is_waiting = not is_sent
-            self.rtt = round(1000 * (time.monotonic() - began))
+            self.rtt = round(1000 * (time.perf_counter() - began))
 
     def _timed_out(self) -> str:
         if self._is_waiting:

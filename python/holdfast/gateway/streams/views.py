@@ -233,7 +233,7 @@ class View:
         A device that does not answer is not asked further in this poll. If no part was answered,
         the error is raised.
         """
-        began = time.monotonic()
+        began = time.perf_counter()
         self._number += 1
         answered, ended = False, None
         for each in sorted(self._parts, key=lambda each: each.silent):
@@ -248,7 +248,7 @@ class View:
                     ended, each.silent = error, self._number
             if ended is not None:
                 each.problem = problem(ended)
-        self._took = round(1000 * (time.monotonic() - began))
+        self._took = round(1000 * (time.perf_counter() - began))
         if ended is not None and not answered:
             raise ended
 
