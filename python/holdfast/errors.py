@@ -31,7 +31,25 @@ with 0B, a gateway answers a request that it has sent and whose reply did not co
 
 
 class ModbusError(Exception):
-    """The base class of all errors of a client after the request was checked."""
+    """The base class of all errors of a client after the request was checked.
+
+    `written` is how many coils or registers earlier requests of the same call have written; 0
+    without `split`.
+    """
+
+    written = 0
+    _already = ""
+
+    def __str__(self) -> str:
+        return self._text() + self._already
+
+    def note_written(self, count: int, of: str) -> None:
+        """Notes that earlier requests have written `count` of what is named."""
+        self.written = count
+        self._already = f"; the first {count} of {of} are written"
+
+    def _text(self) -> str:
+        return super().__str__()
 
 
 class ModbusException(ModbusError):
@@ -45,26 +63,34 @@ class ModbusException(ModbusError):
         self.name = name or "unknown"
         super().__init__(code, name)
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
         return f"exception {self.code:02X} ({self.name})"
 
     @property
     def maybe_executed(self) -> bool:
-        """Whether the device may have executed the request: not after 01, 02, 03, 06 and 0A."""
-        return self.code not in NOT_EXECUTED
+        """Whether the device may have executed the request, or has executed earlier ones of the
+        call: not after 01, 02, 03, 06 and 0A to the first.
+        """
+        return self.written > 0 or self.code not in NOT_EXECUTED
 
 
 class ConnectionLost(ModbusError, ConnectionError):
     """The connection was lost before the reply, or could not be opened.
 
-    `maybe_sent` says whether the device may have executed the request.
+    `maybe_sent` says whether the device may have executed the request, or has executed earlier ones
+    of the call.
     """
 
     maybe_sent = True
 
+    def note_written(self, count: int, of: str) -> None:
+        """As of every error; the device has executed some of the call."""
+        super().note_written(count, of)
+        self.maybe_sent = True
+
 
 class ConnectFailed(ConnectionLost):
-    """Could not connect. Nothing was sent.
+    """Could not connect. Nothing was sent, but for earlier requests of the call.
 
     `target` is the URL, without options; `detail` is the reason as text.
     """
@@ -76,7 +102,7 @@ class ConnectFailed(ConnectionLost):
         self.detail = detail
         super().__init__(target, detail)
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
         return f"can't connect to {self.target}: {self.detail}"
 
 
@@ -92,10 +118,11 @@ class TlsFailed(ConnectionLost):
         self.target = target
         self.detail = detail
         self.maybe_sent = maybe_sent
+        self._was_connected = maybe_sent
         super().__init__(reason, target, detail, maybe_sent)
 
-    def __str__(self) -> str:
-        if self.maybe_sent:
+    def _text(self) -> str:
+        if self._was_connected:
             return f"connection lost: {self.detail}"
         return f"can't connect to {self.target}: {self.detail}"
 
@@ -103,12 +130,18 @@ class TlsFailed(ConnectionLost):
 class RequestTimeout(ModbusError, TimeoutError):
     """No reply arrived within the timeout, or no connection was made in that time.
 
-    `maybe_sent` says whether the device may have executed the request.
+    `maybe_sent` says whether the device may have executed the request, or has executed earlier ones
+    of the call.
     """
 
     def __init__(self, text: str = "", maybe_sent: bool = True) -> None:
         self.maybe_sent = maybe_sent
         super().__init__(text)
+
+    def note_written(self, count: int, of: str) -> None:
+        """As of every error; the device has executed some of the call."""
+        super().note_written(count, of)
+        self.maybe_sent = True
 
 
 class InvalidResponse(ModbusError):
@@ -122,5 +155,5 @@ class InvalidResponse(ModbusError):
         self.reason = reason
         super().__init__(detail, reason)
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
         return self.detail

@@ -314,6 +314,16 @@ def test_an_exception_that_leaves_it_open_whether_something_was_written(code: in
     assert (found["code"], found["maybe_written"]) == (code, True)
 
 
+@pytest.mark.parametrize("refused", [0, 123])
+def test_a_split_write_that_is_refused_says_what_is_written(refused: int) -> None:
+    with FakeDevice(
+        lambda pdu: exception(pdu, 3) if int.from_bytes(pdu[1:3]) == refused else pdu[:5]
+    ) as device:
+        found = answer("write", device.url, "hr", "0", *["1"] * 200, "--split", code=1)
+    assert (found["code"], found["maybe_written"]) == (3, refused > 0)
+    assert ("the first 123 of 200 registers are written" in found["detail"]) == (refused > 0)
+
+
 def test_without_a_connection_nothing_was_written() -> None:
     found = answer("write", f"tcp://127.0.0.1:{free_port()}", "hr", "0", "1", code=1)
     assert (found["reason"], found["maybe_written"]) == ("connection", False)

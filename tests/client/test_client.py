@@ -26,6 +26,7 @@ import pytest
 
 import holdfast
 from holdfast._core import BlockingClient, Request
+from holdfast.cli.device_errors import maybe_written
 from holdfast.client import endpoint as endpoints
 from holdfast.client.requests import TooManyValues
 from holdfast.client.url import NetworkTarget, SerialTarget, Tls, Tolerance, parse
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator, Sequence
 
     from holdfast.types import Area
-    from support.fake_device import Behaviour
+    from support.fake_device import Answer, Behaviour
     from support.running import Run, Serve
 
 REGISTERS = [0, 1, 255, 256, 32767, 32768, 65535]
@@ -420,6 +421,52 @@ def test_an_element_is_whole_if_a_later_request_is_refused(dial: Dial) -> None:
 
 
 @pytest.mark.parametrize(
+    ("reply", "error", "text"),
+    [
+        (
+            lambda pdu: exception(pdu, 2),
+            holdfast.ModbusException,
+            "exception 02 (Illegal Data Address); the first 123 of 200 registers are written",
+        ),
+        (
+            lambda _: b"",
+            holdfast.ConnectionLost,
+            "connection lost: closed by the peer; the first 123 of 200 registers are written",
+        ),
+        (
+            lambda pdu: bytes([pdu[0]]) + bytes(4),
+            holdfast.InvalidResponse,
+            "; the first 123 of 200 registers are written",
+        ),
+    ],
+    ids=["exception", "hang_up", "invalid"],
+)
+def test_a_write_that_fails_midway_says_how_much_is_written(
+    reply: Answer, error: type[holdfast.ModbusError], text: str, dial: Dial
+) -> None:
+    with (
+        FakeDevice(lambda pdu: reply(pdu) if int.from_bytes(pdu[1:3]) else pdu[:5]) as device,
+        pytest.raises(error) as raised,
+    ):
+        dial(device.url).write_registers(0, range(200), split=True)
+    assert str(raised.value).endswith(text)
+    assert raised.value.written == 123
+    assert getattr(raised.value, "maybe_executed", True)
+    assert getattr(raised.value, "maybe_sent", True)
+
+
+def test_a_write_whose_first_request_fails_says_nothing_of_others(dial: Dial) -> None:
+    with (
+        FakeDevice(lambda pdu: exception(pdu, 2)) as device,
+        pytest.raises(
+            holdfast.ModbusException, match=r"^exception 02 \(Illegal Data Address\)$"
+        ) as raised,
+    ):
+        dial(device.url).write_coils(0, [False] * 4000, split=True)
+    assert (raised.value.written, raised.value.maybe_executed) == (0, False)
+
+
+@pytest.mark.parametrize(
     ("kind", "reads"),
     [
         ("float64[60]", [(7, 124), (131, 116)]),
@@ -503,7 +550,7 @@ REFUSED: list[tuple[str, tuple[Any, ...], dict[str, Any], type[Exception], str]]
     ("write_coils", (0, [2]), {}, ValueError, r"values\[0\] is 2"),
     ("write_coils", (65535, [1, 0]), {}, ValueError, "the last address is 65535"),
     ("write_coils", (0, [0] * 1969), {}, ValueError, "use split=True"),
-    ("write_coils", (0, [0] * 2000 + [2]), {"split": True}, ValueError, r"is 2"),
+    ("write_coils", (0, [0] * 2000 + [2]), {"split": True}, ValueError, r"values\[2000\] is 2"),
     ("write_coils", (0, 1), {}, TypeError, "int"),
     ("write_coils", (65000, [0] * 2000), {"split": True}, ValueError, "the last address"),
     ("write_register", (0, 65536), {}, ValueError, "is 65536, allowed: integers 0 to 65535"),
@@ -513,6 +560,7 @@ REFUSED: list[tuple[str, tuple[Any, ...], dict[str, Any], type[Exception], str]]
     ("write_register", (0, True), {}, TypeError, "is True"),
     ("write_registers", (0, [1, 65536]), {}, ValueError, r"values\[1\] is 65536"),
     ("write_registers", (0, b"\1\2"), {}, TypeError, "bytes"),
+    ("write_registers", (0, [1] * 150 + [1.5]), {"split": True}, TypeError, r"values\[150\] is 1"),
     ("write_registers", (0, []), {"split": True}, ValueError, "count is 0"),
     ("write_registers", (0, [1] * 124), {}, ValueError, "use split=True"),
     ("write_registers", (-1, [1] * 200), {"split": True}, ValueError, "the last address"),
@@ -722,11 +770,36 @@ def test_all_errors_are_modbus_errors() -> None:
     assert issubclass(holdfast.RequestTimeout, TimeoutError)
 
 
+def of_a_later_request(error: holdfast.ModbusError) -> holdfast.ModbusError:
+    error.note_written(123, "200 registers")
+    return error
+
+
+LATER_ERRORS = [
+    holdfast.ModbusException(2),
+    holdfast.ConnectFailed("tcp://plc", "refused"),
+    holdfast.TlsFailed("expired", "tls://plc", "the certificate has expired"),
+    holdfast.RequestTimeout("no connection", maybe_sent=False),
+]
+
+
+@pytest.mark.parametrize("error", LATER_ERRORS, ids=lambda error: type(error).__name__)
+def test_no_error_of_a_later_request_says_that_nothing_was_written(
+    error: holdfast.ModbusError,
+) -> None:
+    before = str(error)
+    assert not maybe_written(error)
+    of_a_later_request(error)
+    assert maybe_written(error)
+    assert str(error) == f"{before}; the first 123 of 200 registers are written"
+
+
 @pytest.mark.parametrize(
     "error",
     [
         holdfast.ModbusException(2, "illegal data address"),
         holdfast.ConnectionLost("closed"),
+        of_a_later_request(holdfast.TlsFailed("expired", "tls://plc", "expired")),
         WriteFailed("meter", "power", 3),
         TooManyValues(200, 123),
         Refused("power", "power: too large"),

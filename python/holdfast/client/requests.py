@@ -223,11 +223,22 @@ def write_range(
         yield make(address, items)
         return
     size = whole_elements(limit, element)
-    requests = [
-        make(start, items[start - address : start - address + size])
-        for start in _starts(address, len(items), size)
-    ]
-    yield from requests
+    starts = _starts(address, len(items), size)
+    try:
+        requests = [
+            make(start, items[start - address : start - address + size]) for start in starts
+        ]
+    except (TypeError, ValueError):
+        make(address, items)  # Its error has the index in all items.
+        raise
+    for start, request in zip(starts, requests, strict=True):
+        try:
+            yield request
+        except ModbusError as error:
+            if start > address:
+                items_of = "coils" if area == "coils" else "registers"
+                error.note_written(start - address, f"{len(items)} {items_of}")
+            raise
 
 
 def read_typed(area: Area, address: int, kind: str, order: str, encoding: str | None) -> Steps[Any]:

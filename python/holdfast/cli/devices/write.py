@@ -161,7 +161,7 @@ def _carry_out(
             job.write(client)
         except (ModbusError, KeyboardInterrupt) as found:
             error = device_errors.of_write(found)
-            maybe = len(job.requests) > 1 or device_errors.maybe_written(error)
+            maybe = device_errors.maybe_written(error)
             shown = fields | {"maybe_written": maybe} if as_json else None
             first = f"{job.where} was possibly written" if maybe else None
             device_errors.fail(error, url, shown, first, is_in_area=isinstance(job, _Job))
