@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import gc
+import subprocess
+import sys
 import threading
+import weakref
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -392,6 +396,22 @@ def test_a_server_can_be_stopped_from_another_thread(
     assert client.rest() == b""
 
 
+STARTS_AND_FORGETS = """
+import gc
+import holdfast
+
+def start():
+    memory = holdfast.Memory(holding_registers=1000)
+    server = holdfast.Server({1: memory}, bind="127.0.0.1:0", access="read-write").start()
+    return server.address
+
+address = start()
+gc.collect()
+print(*address, flush=True)
+input()
+"""
+
+
 def test_several_threads_may_stop_a_server_at_once(
     server: holdfast.Server, client: wire.Connection
 ) -> None:
@@ -445,6 +465,32 @@ def test_a_stop_does_not_wait_for_a_peer_that_does_not_read(
         stopper.join(wire.DEADLINE)
 
         assert not stopper.is_alive()
+
+
+def test_a_started_server_runs_without_a_reference_until_the_program_ends() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-X", "dev", "-c", STARTS_AND_FORGETS],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as program:
+        assert program.stdout is not None
+        host, port = program.stdout.readline().split()
+        with wire.Connection((host, int(port))) as client:
+            assert is_open(client)
+            told = program.communicate("\n", timeout=wire.DEADLINE)
+            assert (program.returncode, told) == (0, ("", ""))
+            assert client.rest() == b""
+
+
+def test_a_stopped_server_without_a_reference_is_freed(memory: holdfast.Memory) -> None:
+    server = holdfast.Server({1: memory}, bind="127.0.0.1:0", access="read-write").start()
+    engine = weakref.ref(server._running())
+    server.stop()
+    del server
+    gc.collect()
+    assert engine() is None
 
 
 def test_a_stopped_server_listens_no_more(memory: holdfast.Memory) -> None:

@@ -46,6 +46,9 @@ FORMS = (
     "rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
 )
 
+_running: set[_core.Engine] = set()
+"""A server that was started serves until `stop`, also if the program has no reference to it."""
+
 MAX_WORKERS = 64
 SOURCES = tuple(map(str, LOOPBACK))
 
@@ -111,7 +114,7 @@ class Server:
         self._starting = threading.Lock()
 
     def start(self) -> Self:
-        """Listens and serves until `stop`.
+        """Listens and serves until `stop`, or the end of the program.
 
         Raises `OSError` if the address can't be bound, `RuntimeError` if the server is running,
         `ValueError` for an identity that can't be sent.
@@ -119,13 +122,15 @@ class Server:
         with self._starting:
             if self._engine is not None:
                 raise RuntimeError("the server is already running")
-            self._engine = _core.Engine(
+            engine = _core.Engine(
                 [self._listener],
                 identity=self._identity.objects(),
                 unit_names=self._identity.names(),
                 workers=self._workers,
             )
-            close_in_children(self._engine)
+            close_in_children(engine)
+            _running.add(engine)
+            self._engine = engine
         return self
 
     def stop(self) -> None:
@@ -136,6 +141,7 @@ class Server:
         engine, self._engine = self._engine, None
         if engine is not None:
             engine.stop()
+            _running.discard(engine)
 
     @property
     def address(self) -> tuple[str, int]:
