@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import subprocess
 import sys
 import threading
@@ -121,8 +122,9 @@ def test_a_slow_callback_holds_up_nobody_and_loses_the_oldest(
     assert len(numbers) == 6001 - dropped
 
 
+@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt, GeneratorExit])
 def test_an_exception_of_a_callback_is_reported_and_the_next_call_follows(
-    memory: holdfast.Memory, monkeypatch: pytest.MonkeyPatch
+    error: type[BaseException], memory: holdfast.Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reported: Queue[Any] = Queue()
     monkeypatch.setattr(threading, "excepthook", reported.put)
@@ -130,14 +132,47 @@ def test_an_exception_of_a_callback_is_reported_and_the_next_call_follows(
 
     def fails(area: str, address: int, values: list[int]) -> None:
         if values == [0]:
-            raise ZeroDivisionError
+            raise error
         calls(area, address, values)
 
     with memory.on_write(fails):
         memory.write("coils", 0, [0])
         memory.write("coils", 0, [1])
-        assert reported.get(timeout=wire.DEADLINE).exc_type is ZeroDivisionError
+        assert reported.get(timeout=wire.DEADLINE).exc_type is error
         assert calls.next() == ("coils", 0, [1])
+
+
+def test_a_callback_that_exits_is_printed_and_the_next_call_follows(
+    memory: holdfast.Memory, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(threading, "excepthook", threading.__excepthook__)
+    calls = Calls()
+
+    def exits(area: str, address: int, values: list[int]) -> None:
+        calls(area, address, values)
+        sys.exit("no pump")
+
+    with memory.on_write(exits):
+        memory.write("coils", 0, [0])
+        memory.write("coils", 0, [1])
+        assert [calls.next(), calls.next()] == [("coils", 0, [0]), ("coils", 0, [1])]
+        assert "exits at 0x" in (told := capsys.readouterr().err)
+        assert "raised SystemExit('no pump')" in told
+
+
+class AwaitedCalls:
+    async def __call__(self, area: str, address: int, values: list[int]) -> None: ...
+
+
+async def awaited(area: str, address: int, values: list[int]) -> None: ...
+
+
+@pytest.mark.parametrize(
+    "callback", [awaited, AwaitedCalls(), functools.partial(awaited, "coils")], ids=repr
+)
+def test_an_async_def_is_no_callback(callback: Any, memory: holdfast.Memory) -> None:
+    with pytest.raises(TypeError, match="an async def, allowed: a plain function"):
+        memory.on_write(callback)
 
 
 def test_after_close_nothing_is_called(memory: holdfast.Memory) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import atexit
-import sys
+import inspect
 import threading
 from typing import TYPE_CHECKING, Self
 
@@ -26,6 +26,9 @@ class WriteCallback:
     """A callback for the writes to a memory, until `close`. Made by `Memory.on_write`."""
 
     def __init__(self, queue: WriteQueue, callback: Written) -> None:
+        if _is_async(callback):
+            queue.close()
+            raise TypeError(f"callback is {callback!r}, an async def, allowed: a plain function")
         self._queue = queue
         self._callback = callback
         self._thread = threading.Thread(target=self._run, name="holdfast-on-write", daemon=True)
@@ -53,13 +56,25 @@ class WriteCallback:
                 continue
             try:
                 self._callback(*written)
-            except Exception:
-                thrown = threading.ExceptHookArgs((*sys.exc_info(), self._thread))
-                threading.excepthook(thrown)
+            except BaseException as error:
+                self._report(error)
         atexit.unregister(self.close)
+
+    def _report(self, error: BaseException) -> None:
+        if isinstance(error, SystemExit):  # The usual hook is silent about it.
+            exits, error = error, RuntimeError(f"{self._callback!r} raised {error!r}")
+            error.__cause__ = exits
+        thrown = (type(error), error, error.__traceback__, self._thread)
+        threading.excepthook(threading.ExceptHookArgs(thrown))
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _is_async(callback: Written) -> bool:
+    """Whether a call of this makes a coroutine, which nobody would run."""
+    called = (callback, type(callback).__call__)
+    return any(inspect.iscoroutinefunction(each) for each in called)
