@@ -1309,6 +1309,42 @@ def test_a_client_that_was_not_closed_begins_anew_when_its_event_loop_is_closed(
     assert any("unclosed transport" in str(warning.message) for warning in told)
 
 
+@pytest.mark.parametrize("is_connected", [True, False])
+def test_a_client_that_nobody_has_any_more_is_closed_in_its_event_loop(is_connected: bool) -> None:
+    def forget(clients: list[holdfast.Client]) -> None:
+        clients.clear()
+        gc.collect()
+
+    async def main() -> None:
+        with Stream("tcp") as device:
+            clients = [holdfast.Client(device.url, timeout=wire.DEADLINE)]
+            reading = asyncio.create_task(clients[0].read_coils(0, 1))
+            if is_connected:
+                await reading
+            else:
+                await asyncio.sleep(0)  # It begins to connect.
+                await cancelled(reading)
+                await asyncio.sleep(0)  # The loop forgets it.
+            del reading
+            with pytest.warns(ResourceWarning, match=f"unclosed client of {device.url}"):
+                forget(clients)
+            async with asyncio.timeout(wire.DEADLINE):
+                while device.is_connected or len(asyncio.all_tasks()) > 1:
+                    await asyncio.sleep(0.01)
+
+    run(main)
+
+
+def test_a_client_that_was_closed_ends_without_a_warning(server: holdfast.Server) -> None:
+    async def main() -> None:
+        async with holdfast.Client(url_of(server), timeout=wire.DEADLINE) as plc:
+            await plc.read_coils(0, 1)
+        del plc
+        gc.collect()
+
+    run(main)
+
+
 def test_a_client_is_in_use_in_one_event_loop_only(server: holdfast.Server) -> None:
     plc = holdfast.Client(url_of(server), timeout=wire.DEADLINE)
 

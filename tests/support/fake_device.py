@@ -362,6 +362,11 @@ class Stream(ScriptedDevice):
         self.port: int = port
         self.url = f"{kind}://127.0.0.1:{self.port}"
 
+    @property
+    def is_connected(self) -> bool:
+        """Whether a connection is open on this side."""
+        return any(peer.socket.fileno() >= 0 for peer in self._peers)
+
     def open(self) -> None:
         if self._listener is None:
             self._listener = socket.create_server(("127.0.0.1", self.port))

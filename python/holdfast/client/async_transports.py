@@ -11,8 +11,10 @@ the future of its request. All other transports have one request at a time: `Thr
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import copy
 import socket
+import warnings
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor, wait
 from math import inf
@@ -27,7 +29,7 @@ from holdfast.errors import ConnectFailed, ConnectionLost, ModbusError, RequestT
 from holdfast.runtime.text import os_error_text
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable
+    from collections.abc import Awaitable, Callable
 
     from holdfast._core import Endpoint, Request
     from holdfast.client.url import NetworkTarget, Target
@@ -181,6 +183,15 @@ class AsyncConnection:
         """Closes the connection; pending calls fail."""
         await self._here().close()
 
+    def __del__(self, _warn: Callable[..., None] = warnings.warn) -> None:
+        last = self._last
+        if last is None or not last.is_connected or last.loop.is_closed():
+            return
+        _warn(f"unclosed client of {self._target}", ResourceWarning, source=self)
+        # The loop may be closed by its thread meanwhile.
+        with contextlib.suppress(RuntimeError):
+            last.loop.call_soon_threadsafe(last.abandon)
+
     @property
     def late(self) -> int:
         """How many replies arrived after their timeout."""
@@ -265,11 +276,23 @@ class _LoopConnection:
             # Not the future itself: whoever cancels this must not cancel what the connection sets.
             await asyncio.wait([ended])
 
+    def abandon(self) -> None:
+        """Closes the connection of a client that is no more, which has no pending calls."""
+        if self._connecting is not None:
+            self._connecting.cancel()
+            self._connecting.add_done_callback(lambda _: self.abandon())
+        elif self._protocol is not None:
+            self._protocol.close()
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether there is a connection, or an attempt to make one."""
+        return self.open is not None or self._connecting is not None
+
     @property
     def in_use(self) -> bool:
         """Whether there is a connection, or a pending call."""
-        connected = self.open is not None or self._connecting is not None
-        return connected or self.free < self._max_in_flight
+        return self.is_connected or self.free < self._max_in_flight
 
     @property
     def late(self) -> int:
