@@ -12,7 +12,6 @@ use holdfast_engine::tls::FileError;
 use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
 use holdfast_engine::{LineDirection, LineMode, LineParity, SerialLine};
 use holdfast_memory::{Area, Span};
-use holdfast_protocol::client::InvalidResponse::Pdu as InvalidPdu;
 use holdfast_protocol::client::{AcceptUnit, Closed, Echo, Tolerance};
 use holdfast_protocol::frame::rtu;
 use holdfast_protocol::pdu::identification::ReadCode;
@@ -348,8 +347,7 @@ impl BlockingClient {
         let unit = byte("unit", unit)?;
         let timeout = seconds("timeout", timeout)?;
         let request = &request.encoded;
-        // Objects are made when the call is over: others may have their turn meanwhile.
-        let take = |_: Response<'_>, pdu: &[u8]| pdu.to_vec();
+        let take = |response: Response<'_>, _: &[u8]| Reply::new(response);
         let to_begin = || {
             let Some(is_cancelled) = &is_cancelled else { return Ok(()) };
             match Python::attach(|py| is_cancelled.call0(py)?.is_truthy(py)) {
@@ -362,8 +360,7 @@ impl BlockingClient {
             self.core.interruptible_call(interrupted, &to_begin, unit, request, timeout, take)
         })?;
         let result = result.ok_or_else(|| ConnectionLost::new_err(CLOSED))?;
-        let pdu = result.map_err(|error| raised(&error))?;
-        result_of(py, request, &pdu)
+        result.map_err(|error| raised(&error))?.into_python(py)
     }
 
     /// Ends the call that waits for its reply, and its connection.
@@ -462,52 +459,81 @@ pub fn line(
     })
 }
 
-/// The result of a request that this PDU answers. It is empty after a broadcast, which has no reply.
-pub(crate) fn result_of<'py>(
-    py: Python<'py>,
-    request: &EncodedRequest,
-    pdu: &[u8],
-) -> PyResult<Bound<'py, PyAny>> {
-    if pdu.is_empty() {
-        return Ok(py.None().into_bound(py));
+/// A response that owns its data.
+pub(crate) enum Reply {
+    /// Packed bits, and their number.
+    Bits(Vec<u8>, usize),
+    Registers(Vec<u8>),
+    Written,
+    Bytes(Vec<u8>),
+    EventCounter(bool, u16),
+    EventLog(bool, u16, u16, Vec<u8>),
+    Status(u8),
+    Files(Vec<Vec<u8>>),
+    Identification(u8, Option<u8>, Vec<(u8, Vec<u8>)>),
+}
+
+impl Reply {
+    pub(crate) fn new(response: Response<'_>) -> Reply {
+        match response {
+            Response::Bits(bits) => Reply::Bits(bits.as_bytes().to_vec(), bits.quantity().into()),
+            Response::ExceptionStatus(outputs) => Reply::Status(outputs),
+            Response::EventLog { busy, events, messages, log } => {
+                Reply::EventLog(busy, events, messages, log.to_vec())
+            }
+            Response::FileRecords(answer) => {
+                Reply::Files(answer.iter().map(<[u8]>::to_vec).collect())
+            }
+            Response::Queue(registers) => {
+                Reply::Registers(registers.map_or_else(Vec::new, |each| each.as_bytes().to_vec()))
+            }
+            Response::Registers(registers) => Reply::Registers(registers.as_bytes().to_vec()),
+            Response::Written => Reply::Written,
+            Response::Diagnostics(data) | Response::ServerId(data) | Response::Opaque(data) => {
+                Reply::Bytes(data.to_vec())
+            }
+            Response::EventCounter { busy, events } => Reply::EventCounter(busy, events),
+            Response::Identification(answer) => {
+                let objects = answer.iter().map(|(id, value)| (id, value.to_vec())).collect();
+                Reply::Identification(answer.conformity_level, answer.next, objects)
+            }
+        }
     }
-    match request.response(pdu) {
-        Ok(response) => value(py, response),
-        Err(error) => Err(raised(&ClientError::Invalid(InvalidPdu(error)))),
+
+    pub(crate) fn into_python<'py>(self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        Ok(match self {
+            Reply::Bits(bits, quantity) => {
+                let bit = |index: usize| bits[index / 8] >> (index % 8) & 1 == 1;
+                PyList::new(py, (0..quantity).map(bit))?.into_any()
+            }
+            Reply::Registers(registers) => words(py, &registers)?,
+            Reply::Written => py.None().into_bound(py),
+            Reply::Bytes(data) => PyBytes::new(py, &data).into_any(),
+            Reply::EventCounter(busy, events) => (busy, events).into_pyobject(py)?.into_any(),
+            Reply::Status(outputs) => outputs.into_pyobject(py)?.into_any(),
+            Reply::EventLog(busy, events, messages, log) => {
+                (busy, events, messages, PyBytes::new(py, &log)).into_pyobject(py)?.into_any()
+            }
+            Reply::Files(ranges) => {
+                let ranges = ranges.iter().map(|records| words(py, records));
+                PyList::new(py, ranges.collect::<PyResult<Vec<_>>>()?)?.into_any()
+            }
+            Reply::Identification(conformity, next, objects) => {
+                let objects: Vec<(u8, Bound<'_, PyBytes>)> =
+                    objects.iter().map(|(id, value)| (*id, PyBytes::new(py, value))).collect();
+                (conformity, next, objects).into_pyobject(py)?.into_any()
+            }
+        })
     }
 }
 
 /// A response as a Python object.
 pub(crate) fn value<'py>(py: Python<'py>, response: Response<'_>) -> PyResult<Bound<'py, PyAny>> {
-    Ok(match response {
-        Response::Registers(registers) => words(py, registers.as_bytes())?,
-        Response::Bits(bits) => {
-            let (quantity, bits) = (usize::from(bits.quantity()), bits.as_bytes());
-            let bit = |index: usize| bits[index / 8] >> (index % 8) & 1 == 1;
-            PyList::new(py, (0..quantity).map(bit))?.into_any()
-        }
-        Response::Written => py.None().into_bound(py),
-        Response::ExceptionStatus(outputs) => outputs.into_pyobject(py)?.into_any(),
-        Response::Diagnostics(data) | Response::ServerId(data) | Response::Opaque(data) => {
-            PyBytes::new(py, data).into_any()
-        }
-        Response::EventCounter { busy, events } => (busy, events).into_pyobject(py)?.into_any(),
-        Response::EventLog { busy, events, messages, log } => {
-            (busy, events, messages, PyBytes::new(py, log)).into_pyobject(py)?.into_any()
-        }
-        Response::FileRecords(answer) => {
-            let ranges = answer.iter().map(|records| words(py, records));
-            PyList::new(py, ranges.collect::<PyResult<Vec<_>>>()?)?.into_any()
-        }
-        Response::Queue(registers) => {
-            words(py, registers.as_ref().map_or(&[], |each| each.as_bytes()))?
-        }
-        Response::Identification(answer) => {
-            let objects: Vec<(u8, Bound<'_, PyBytes>)> =
-                answer.iter().map(|(id, value)| (id, PyBytes::new(py, value))).collect();
-            (answer.conformity_level, answer.next, objects).into_pyobject(py)?.into_any()
-        }
-    })
+    match response {
+        // Most are registers: without a copy.
+        Response::Registers(registers) => words(py, registers.as_bytes()),
+        other => Reply::new(other).into_python(py),
+    }
 }
 
 fn words<'py>(py: Python<'py>, registers: &[u8]) -> PyResult<Bound<'py, PyAny>> {

@@ -4,12 +4,13 @@ use std::net::IpAddr;
 use std::sync::{Arc, Mutex};
 
 use holdfast_engine::Wakes;
-use holdfast_engine::client::StrayCounters;
+use holdfast_engine::client::{ClientError, StrayCounters};
 use holdfast_engine::link::{
     Caller as CoreCaller, InFlight, LinkSettings, Route as CoreRoute, SharedLink,
 };
 use holdfast_engine::poller::{Passage as CorePassage, PassedRange};
 use holdfast_memory::Area;
+use holdfast_protocol::client::InvalidResponse;
 use holdfast_protocol::pdu::{self, Bits, Registers, Request as CoreRequest, limit};
 use holdfast_runtime::{Retry, lock};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
@@ -17,7 +18,7 @@ use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict, PyDict};
 
 use crate::arguments::{byte, seconds, within};
-use crate::client::{Endpoint, Request, raised, result_of};
+use crate::client::{Endpoint, Reply, Request, exception};
 use crate::memory::named;
 
 /// The number of requests in flight; `None` is `auto`.
@@ -141,15 +142,21 @@ impl Caller {
         Ok(handle(wakes))
     }
 
-    fn take<'py>(&self, py: Python<'py>) -> Vec<Called<'py>> {
+    fn take<'py>(&self, py: Python<'py>) -> PyResult<Vec<Called<'py>>> {
         let called = self.core.take().into_iter().map(|call| {
             let result = match call.outcome {
-                Ok(pdu) => result_of(py, &call.request, &pdu),
-                Err(error) => Err(raised(&error)),
+                // A broadcast has no reply.
+                Ok(pdu) if pdu.is_empty() => py.None().into_bound(py),
+                Ok(pdu) => match call.request.response(&pdu) {
+                    Ok(response) => Reply::new(response).into_python(py)?,
+                    Err(error) => {
+                        let invalid = ClientError::Invalid(InvalidResponse::Pdu(error));
+                        exception(py, &invalid)
+                    }
+                },
+                Err(error) => exception(py, &error),
             };
-            let result =
-                result.unwrap_or_else(|error| error.into_value(py).into_bound(py).into_any());
-            (call.ticket, call.is_sent, result)
+            Ok((call.ticket, call.is_sent, result))
         });
         called.collect()
     }
