@@ -14,7 +14,7 @@ use pyo3::types::{
     PyBool, PyByteArray, PyBytes, PyDict, PyFrozenSet, PyInt, PyList, PySet, PyString,
 };
 
-use crate::arguments::within;
+use crate::arguments::{within, word};
 use crate::mirror_age::MirrorAge;
 use crate::python_values::listed;
 use crate::write_queue::WriteQueue;
@@ -364,14 +364,10 @@ fn area_or_file(name: &str) -> PyResult<Area> {
 fn gate(seal: Seal) -> PyResult<Gate> {
     let (area, address, mode) = match seal {
         Seal::Once(area, address) => (area, address, GateMode::Once),
-        Seal::Mode(area, address, mode) => match mode.as_str() {
-            "once" => (area, address, GateMode::Once),
-            "level" => (area, address, GateMode::Level),
-            _ => {
-                let message = format!("unknown seal mode {mode:?}, allowed: once, level");
-                return Err(PyValueError::new_err(message));
-            }
-        },
+        Seal::Mode(area, address, mode) => {
+            let modes = [("once", GateMode::Once), ("level", GateMode::Level)];
+            (area, address, word("mode of seal", &mode, &modes)?)
+        }
     };
     let address = within("address of seal", address.0, 0..=65_535)? as u16;
     Ok(Gate { area: named(&area)?, address, mode })
