@@ -10,18 +10,18 @@ use std::time::Duration;
 
 use holdfast_protocol::pdu::identification::ObjectError;
 use holdfast_runtime::lock;
-use socket2::{SockRef, Socket};
 use thiserror::Error;
-use tokio::net::{TcpListener, UdpSocket};
 use tokio::runtime::{Builder, Handle, Runtime};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
+pub use self::listening_sockets::SocketKind;
+use self::listening_sockets::{ListeningSocket, tcp, udp as udp_socket};
 use crate::heartbeat::Heartbeat;
 use crate::own_threads::OwnThreads;
 use crate::serial_line::SerialLine;
 use crate::server::connections::admission::{ConnectionLimits, OpenConnection};
-use crate::server::connections::listener::{ListenerContext, Service, accept, bind_tcp, bind_udp};
+use crate::server::connections::listener::{ListenerContext, Service, accept};
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::audit::{Auditor, Record, Records, Unrecordable, auditing};
 use crate::server::reports::counters::{ConnectionCounters, PacketCounters};
@@ -35,7 +35,9 @@ use crate::server::rights::policy::Policy;
 use crate::server::transports::raw_ingest::{RawIngest, RawSettings};
 use crate::server::transports::serial::{ModbusSerial, SerialSettings};
 use crate::server::transports::tcp::{ModbusStream, StreamSettings};
-use crate::server::transports::udp::{DatagramFraming, Datagrams, ModbusUdp, UdpSettings};
+use crate::server::transports::udp::{DatagramFraming, ModbusUdp, UdpSettings};
+
+mod listening_sockets;
 
 /// The time that connections have to end when the engine stops.
 const STOP_TIMEOUT: Duration = Duration::from_millis(500);
@@ -92,22 +94,6 @@ pub struct Engine {
     records: Option<Records>,
 }
 
-/// The kind of a socket that listens.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SocketKind {
-    Tcp,
-    Udp,
-}
-
-impl SocketKind {
-    pub const fn name(self) -> &'static str {
-        match self {
-            SocketKind::Tcp => "tcp",
-            SocketKind::Udp => "udp",
-        }
-    }
-}
-
 /// What a listener serves, and who may use it.
 #[derive(Debug, Clone)]
 pub struct Listening {
@@ -124,18 +110,10 @@ struct Listener {
     /// The address in the settings; with port 0 for one that the system picked.
     bind: Option<SocketAddr>,
     /// `None` on a serial line.
-    address: Option<SocketAddr>,
-    /// `None` on a serial line.
-    copy_socket: Option<CopySocket>,
+    socket: Option<Arc<ListeningSocket>>,
     served: Served,
     task: OnceLock<AbortHandle>,
 }
-
-/// Copies the socket of a listener, unless its task has ended.
-type CopySocket = Box<dyn Fn() -> Option<Socket> + Send + Sync>;
-
-/// The socket of a new listener, its address, and what copies it.
-type Bound<S> = (S, SocketAddr, CopySocket);
 
 enum Served {
     Stream(Arc<Reloadable<ModbusStream>>, Arc<UnitServer>),
@@ -230,12 +208,13 @@ impl Engine {
             Some(Change::Keep(ending.remove(at), update))
         };
         let kept: Vec<_> = settings.iter().map(kept).collect();
+        let mut sockets = ending.iter().filter_map(|listener| listener.socket.clone()).collect();
         let mut changes = Vec::new();
         for (ListenerSettings { name, kind }, kept) in settings.into_iter().zip(kept) {
             changes.push(match kept {
                 Some(kept) => kept,
                 None => {
-                    let (listener, task) = self.listener(&name, kind, identity()?, &mut ending)?;
+                    let (listener, task) = self.listener(&name, kind, identity()?, &mut sockets)?;
                     Change::Start(Arc::new(listener), task)
                 }
             });
@@ -269,9 +248,11 @@ impl Engine {
         name: &str,
         kind: ListenerKind,
         identity: Identity,
-        ending: &mut Vec<Arc<Listener>>,
+        ending: &mut Vec<Arc<ListeningSocket>>,
     ) -> Result<(Listener, Task), StartError> {
         let _runtime = self.handles[0].enter();
+        let bind_error =
+            |address| move |error| StartError::Bind { listener: name.to_owned(), address, error };
         let context = |limits: Option<ConnectionLimits>| {
             let (reporter, auditor) = (self.reporter.clone(), self.auditor.clone());
             Arc::new(ListenerContext::new(name, limits, reporter, auditor))
@@ -280,32 +261,34 @@ impl Engine {
         let (workers, stopping) = (self.handles.clone(), self.stop.subscribe());
         let (context, bound, served, task): (_, _, _, Task) = match kind {
             ListenerKind::ModbusStream(stream) => {
-                let (socket, address, copy) = bound_tcp(name, stream.bind, ending)?;
+                let (accepting, socket) =
+                    tcp(stream.bind, ending).map_err(bind_error(stream.bind))?;
                 let context = context(Some(stream.limits));
                 let unit_server = unit_server(stream.units);
                 let service = ModbusStream::new(&stream, Arc::clone(&unit_server), None);
                 let live = Arc::new(Reloadable::new(service));
                 let served = Served::Stream(Arc::clone(&live), unit_server);
-                let task = accept(Arc::clone(&context), live, socket, workers, stopping);
-                (context, Some((stream.bind, address, copy)), served, Box::pin(task))
+                let task = accept(Arc::clone(&context), live, accepting, workers, stopping);
+                (context, Some((stream.bind, socket)), served, Box::pin(task))
             }
             ListenerKind::RawIngest(raw) => {
-                let (socket, address, copy) = bound_tcp(name, raw.bind, ending)?;
+                let (accepting, socket) = tcp(raw.bind, ending).map_err(bind_error(raw.bind))?;
                 let context = context(Some(raw.limits));
                 let live = Arc::new(Reloadable::new(RawIngest::new(&raw, Arc::default())));
                 let served = Served::Packets(Arc::clone(&live));
-                let task = accept(Arc::clone(&context), live, socket, workers, stopping);
-                (context, Some((raw.bind, address, copy)), served, Box::pin(task))
+                let task = accept(Arc::clone(&context), live, accepting, workers, stopping);
+                (context, Some((raw.bind, socket)), served, Box::pin(task))
             }
             ListenerKind::ModbusUdp(udp) => {
-                let (socket, address, copy) = bound_udp(name, udp.bind, ending)?;
+                let (datagrams, socket) =
+                    udp_socket(udp.bind, ending).map_err(bind_error(udp.bind))?;
                 let (context, unit_server) = (context(None), unit_server(udp.units));
                 let policy = Arc::new(Reloadable::new(Policy::of(&udp.rules)));
                 let (rules, units) = (Arc::clone(&policy), Arc::clone(&unit_server));
                 let service = ModbusUdp::new(udp.framing, rules, units);
                 let served = Served::Datagrams(udp.framing, policy, unit_server);
-                let task = service.serve(Arc::clone(&context), socket, stopping);
-                (context, Some((udp.bind, address, copy)), served, Box::pin(task))
+                let task = service.serve(Arc::clone(&context), datagrams, stopping);
+                (context, Some((udp.bind, socket)), served, Box::pin(task))
             }
             ListenerKind::ModbusSerial(SerialSettings { line, rule, units }) => {
                 let port = line.open().map_err(|error| StartError::Open {
@@ -322,12 +305,8 @@ impl Engine {
                 (context, None, served, Box::pin(task))
             }
         };
-        let (bind, address, copy_socket) = match bound {
-            Some((bind, address, copy)) => (Some(bind), Some(address), Some(copy)),
-            None => (None, None, None),
-        };
-        let listener =
-            Listener { context, bind, address, copy_socket, served, task: OnceLock::new() };
+        let (bind, socket) = bound.map(|(bind, socket)| (bind, Arc::new(socket))).unzip();
+        let listener = Listener { context, bind, socket, served, task: OnceLock::new() };
         Ok((listener, task))
     }
 
@@ -393,7 +372,10 @@ impl Engine {
 
     /// The address of each listener, in the order of the settings; `None` for serial lines.
     pub fn addresses(&self) -> Vec<Option<SocketAddr>> {
-        lock(&self.listeners).iter().map(|listener| listener.address).collect()
+        lock(&self.listeners)
+            .iter()
+            .map(|listener| Some(listener.socket.as_ref()?.address))
+            .collect()
     }
 
     /// The sockets that listen. None after `stop`, and in a forked child.
@@ -402,7 +384,8 @@ impl Engine {
             return Vec::new();
         }
         let listeners = lock(&self.listeners);
-        listeners.iter().filter_map(|each| Some((each.socket_kind()?, each.address?))).collect()
+        let sockets = listeners.iter().filter_map(|each| each.socket.as_ref());
+        sockets.map(|socket| (socket.kind, socket.address)).collect()
     }
 
     /// The counters of each listener, in the order of the settings.
@@ -464,15 +447,6 @@ fn heartbeat(index: usize) -> Arc<Heartbeat> {
 }
 
 impl Listener {
-    /// `None` on a serial line.
-    fn socket_kind(&self) -> Option<SocketKind> {
-        match self.served {
-            Served::Datagrams(..) => Some(SocketKind::Udp),
-            Served::Stream(..) | Served::Packets(_) => Some(SocketKind::Tcp),
-            Served::Serial(..) => None,
-        }
-    }
-
     fn counters(&self) -> ListenerCounters {
         let protocol = match &self.served {
             Served::Stream(live, unit_server) => {
@@ -557,60 +531,6 @@ impl Listener {
             self.context.ended(Kind::RightsRevoked, peer);
         }
     }
-}
-
-/// Binds a socket, or takes over that of a listener that ends. Must be called in the context of a
-/// runtime.
-fn bound_tcp(
-    listener: &str,
-    bind: SocketAddr,
-    ending: &mut Vec<Arc<Listener>>,
-) -> Result<Bound<Arc<TcpListener>>, StartError> {
-    let socket = match taken_over(ending, SocketKind::Tcp, bind) {
-        Some(socket) => Ok(socket.into()),
-        None => bind_tcp(bind),
-    };
-    let socket = socket.and_then(TcpListener::from_std);
-    let bound = socket.and_then(|socket| Ok((socket.local_addr()?, Arc::new(socket))));
-    let (address, socket) = bound.map_err(bind_error(listener, bind))?;
-    let weak = Arc::downgrade(&socket);
-    let copy = move || SockRef::from(&*weak.upgrade()?).try_clone().ok();
-    Ok((socket, address, Box::new(copy)))
-}
-
-/// As `bound_tcp`: two functions, because Windows has another trait for what both sockets are.
-fn bound_udp(
-    listener: &str,
-    bind: SocketAddr,
-    ending: &mut Vec<Arc<Listener>>,
-) -> Result<Bound<Datagrams>, StartError> {
-    let socket = match taken_over(ending, SocketKind::Udp, bind) {
-        Some(socket) => Ok(socket.into()),
-        None => bind_udp(bind),
-    };
-    let socket = socket.and_then(UdpSocket::from_std);
-    let bound = socket.and_then(|socket| Ok((socket.local_addr()?, Datagrams::new(socket)?)));
-    let (address, datagrams) = bound.map_err(bind_error(listener, bind))?;
-    let weak = Arc::downgrade(&datagrams.socket);
-    let copy = move || SockRef::from(&*weak.upgrade()?).try_clone().ok();
-    Ok((datagrams, address, Box::new(copy)))
-}
-
-/// Copies the socket of the ending listener with that address. Each is taken over once.
-fn taken_over(
-    ending: &mut Vec<Arc<Listener>>,
-    kind: SocketKind,
-    address: SocketAddr,
-) -> Option<Socket> {
-    let has_socket =
-        |each: &Arc<Listener>| each.address == Some(address) && each.socket_kind() == Some(kind);
-    let at = ending.iter().position(has_socket)?;
-    ending.remove(at).copy_socket.as_ref()?()
-}
-
-fn bind_error(listener: &str, address: SocketAddr) -> impl FnOnce(io::Error) -> StartError {
-    let listener = listener.to_owned();
-    move |error| StartError::Bind { listener, address, error }
 }
 
 impl Drop for Engine {

@@ -11,6 +11,7 @@ use rustls::version::TLS13;
 use super::*;
 use crate::server::connections::admission::Full;
 use crate::server::connections::listener::accept;
+use crate::server::connections::listener::bind_tcp;
 use crate::server::requests::unit_server::UnitSettings;
 use crate::server::rights::functions::{AccessMode, Functions};
 use crate::server::rights::rule::Rule;
