@@ -53,8 +53,9 @@ class ChildProcess:
     """A program that runs from `start` to `stop`, in a session of its own.
 
     One thread starts it and reads its output: on Linux the program ends with that thread, and so
-    with this process, however it ends. With `restarts`, a program that was ready is started again
-    whenever it ends, after a pause, which `ended` gets with the reason.
+    with this process, however it ends; on Windows with this process. With `restarts`, a program
+    that was ready is started again whenever it ends, after a pause, which `ended` gets with the
+    reason.
     """
 
     def __init__(
@@ -173,7 +174,7 @@ class ChildProcess:
             descriptor = -1 if inherited is None else inherited
             become = [sys.executable, "-I", "-S", exec_with_parent.__file__, str(descriptor)]
             command = [*become, str(os.getpid()), *command]
-        return subprocess.Popen(
+        process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -185,3 +186,13 @@ class ChildProcess:
             creationflags=_FLAGS,
             pass_fds=() if sys.platform == "win32" or inherited is None else (inherited,),
         )
+        if sys.platform == "win32":
+            from holdfast.runtime import windows_job
+
+            try:
+                windows_job.join(process)
+            except OSError:
+                process.kill()
+                process.communicate()
+                raise
+        return process
