@@ -117,7 +117,7 @@ DECISIONS: dict[tuple[str, str], Decision] = {
     ("docs/security-events.md", "<localfile>"): checks.xml,
     ("docs/tour.md", "examples/plant.yaml is served:"): greeting,
     ("docs/service.md", "[Service]"): checks.drop_in,
-    ("docs/service.md", "py -m venv"): windows,
+    ("docs/service.md", "mkdir C:"): windows,
     ("docs/service.md", "C:\\Holdfast\\Scripts"): checks.windows_commands,
     ("docs/values.md", ">>> "): VALUES,
     ("docs/values.md", "                        uint32"): LETTERS,
