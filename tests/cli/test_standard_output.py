@@ -144,5 +144,6 @@ def test_a_reader_that_is_gone_is_an_invalid_argument_on_windows(
     assert not standard_output.is_unwritable(gone)
     monkeypatch.setattr(sys, "platform", "win32")
     assert standard_output.is_unwritable(gone)
+    assert standard_output.reason(gone) == "Broken pipe"
     assert not standard_output.is_unwritable(refused)
     assert not standard_output.is_unwritable(OSError(errno.EINVAL, "Invalid argument", "a.yaml"))

@@ -172,7 +172,7 @@ class Program(SuggestingGroup):
             if not standard_output.is_unwritable(error):
                 raise
             standard_output.leave()
-            fail(f"standard output: {error.strerror}")
+            fail(f"standard output: {standard_output.reason(error)}")
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """The names of all commands."""

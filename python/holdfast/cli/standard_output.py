@@ -31,9 +31,20 @@ def is_unwritable(error: OSError) -> bool:
     """Whether this error is that of standard output, not of a file."""
     if error.filename is not None:
         return False
+    return _number(error) in _UNWRITABLE
+
+
+def reason(error: OSError) -> str:
+    """Why standard output can't be written."""
+    return os.strerror(_number(error))
+
+
+def _number(error: OSError) -> int:
+    """The number of an error; of a pipe whose reader is gone on Windows, too."""
+    # The C library has no other number for that. Errors of the system have one of their own, too.
     if sys.platform == "win32" and error.errno == errno.EINVAL and error.winerror is None:
-        return True  # A pipe whose reader is gone. An error of the system has its own number, too.
-    return error.errno in _UNWRITABLE
+        return errno.EPIPE
+    return error.errno or 0
 
 
 def leave() -> None:
