@@ -26,8 +26,6 @@ from holdfast.cli.terminal_text import print_json
 from holdfast.client import requests
 from holdfast.errors import ModbusError
 from holdfast.protocol import WRITE_LIMITS
-from holdfast.tags.strict_text import BOOLEANS
-from holdfast.tags.text import SWITCHED
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
@@ -37,7 +35,7 @@ if TYPE_CHECKING:
     from holdfast.cli.options.value_type import Typed
     from holdfast.client import SyncClient
 
-TRUTHS = BOOLEANS | SWITCHED
+TRUTHS = {"true": True, "on": True, "1": True, "false": False, "off": False, "0": False}
 WHOLE = re.compile(r"([+-]?)(0[xX][0-9a-fA-F]{1,20}|[0-9]{1,20})")
 NUMBER = re.compile(
     r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|inf(inity)?|nan)", re.I | re.ASCII
