@@ -319,3 +319,47 @@ fn an_open_seal_stays_open_in_a_log() {
     node.start();
     assert_eq!(Memory::contents(std::slice::from_ref(&node.node.memory)), before);
 }
+
+/// Whoever may delete messages can shorten the log while a node is away.
+#[test]
+fn a_node_does_not_go_back_to_a_snapshot_that_the_log_does_not_continue() {
+    let (server, folder) = (Server::new(), Folder::new());
+    let path = file_in(&folder);
+    let other = Node::new(&[&server], "b", |settings| settings.snapshot_steps = 100);
+    other.start();
+    let kept = KeptNode::started(&server, &path);
+    kept.node.write(0, 7).unwrap();
+    let contents = kept.node.all();
+    kept.stop();
+    for value in 0..20 {
+        other.write(1, value).unwrap();
+    }
+    let first = other.status().sequence;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        let stream = jetstream.get_stream("holdfast-log-site").await.unwrap();
+        stream.purge().sequence(first).await.unwrap();
+    });
+    let kept = KeptNode::new(&server, &path, |_| {});
+    let new = Node::new(&[&server], "c", |_| {});
+    for node in [&*kept.node, &new] {
+        node.log.start().unwrap();
+        until("the node says why it can't go on", || {
+            let error = node.status().last_error.unwrap_or_default();
+            error.contains("were removed, and no snapshot has them")
+        });
+    }
+    let error = new.status().last_error.unwrap();
+    assert!(error.starts_with(&format!("messages 1 to {} of the log", first - 1)), "{error}");
+    assert_eq!(kept.node.all(), contents, "it keeps its own");
+    until("a running node stores a snapshot", || {
+        other.write(1, 21).unwrap();
+        other.status().snapshot.is_some_and(|sequence| sequence > first)
+    });
+    for node in [&*kept.node, &new] {
+        until("the node goes on", || node.read(1) == Ok(21));
+        assert_eq!(node.read(0), Ok(7));
+    }
+}

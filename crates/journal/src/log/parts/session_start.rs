@@ -34,7 +34,7 @@ pub(in crate::log) async fn join(node: &mut Node, store: &Store) -> Result<u64, 
     // The next message was removed behind a snapshot: this node was away for too long.
     let is_gone = first > place.sequence + 1;
     if !is_known || is_gone || node.rejoin.needs_snapshot() {
-        load(node, store, end.sequence).await?;
+        load(node, store, first, end.sequence).await?;
         node.rejoin.reloaded();
     }
     node.applier.joined(id);
@@ -49,8 +49,8 @@ fn lags(node: &mut Node, text: String) -> End {
     node.lag.judge(error)
 }
 
-/// Loads the newest snapshot that is good, or makes the first one.
-async fn load(node: &mut Node, store: &Store, last: u64) -> Result<(), End> {
+/// Loads the newest snapshot that is good, or makes the first one. The stream goes from `first` to `last`.
+async fn load(node: &mut Node, store: &Store, first: u64, last: u64) -> Result<(), End> {
     let pointer = node.run_with_expiry(store.pointer()).await??;
     let Some((revision, pointer)) = pointer else {
         if last > 0 {
@@ -75,7 +75,9 @@ async fn load(node: &mut Node, store: &Store, last: u64) -> Result<(), End> {
     }
     // A node whose contents were wrong does not trust what it has stored itself.
     let distrusted = (!node.rejoin.contents_are_right()).then(|| node.settings.node.clone());
-    let order = load_order(&pointer, distrusted.as_deref());
+    let Some(order) = load_order(&pointer, distrusted.as_deref(), first) else {
+        return Err(End::Lost(unreachable(node, &pointer.newest, first)));
+    };
     let (shared, mut state) = (node.shared.clone(), node.applier.begin_load());
     let loading = load_good(store, order, revision, &shared, &mut state);
     let loaded = node.run_with_expiry(loading).await.and_then(|loaded| loaded);
@@ -99,16 +101,34 @@ async fn create_first(node: &mut Node, store: &Store) -> Result<(), End> {
     Ok(())
 }
 
-/// The snapshots in the order in which they are tried.
+/// The snapshots that the stream continues, in the order in which they are tried. `None` if messages behind
+/// the newest one were removed.
+///
+/// None of them leads a node back: it loads one because its own next message was removed, or because its
+/// contents are wrong or none yet.
 fn load_order<'p>(
     pointer: &'p Pointer,
     distrusted: Option<&str>,
-) -> (&'p Snapshot, Option<&'p Snapshot>) {
+    first: u64,
+) -> Option<(&'p Snapshot, Option<&'p Snapshot>)> {
     let Pointer { newest, previous } = pointer;
-    match previous {
-        Some(previous) if distrusted == Some(newest.node.as_str()) => (previous, Some(newest)),
-        previous => (newest, previous.as_ref()),
+    let mut known = [Some(newest), previous.as_ref()];
+    if distrusted == Some(newest.node.as_str()) {
+        known.reverse();
     }
+    let is_continued = |snapshot: &&Snapshot| snapshot.sequence + 1 >= first;
+    let mut order = known.into_iter().flatten().filter(is_continued);
+    order.next().map(|one| (one, order.next()))
+}
+
+/// Why this node can't go on. It keeps its contents: those of the snapshot are older, or lead to nothing.
+fn unreachable(node: &Node, newest: &Snapshot, first: u64) -> String {
+    let own = if node.rejoin.needs_snapshot() { 0 } else { node.applier.sequence() };
+    let (from, to) = (newest.sequence.max(own) + 1, first - 1);
+    format!(
+        "messages {from} to {to} of the log were removed, and no snapshot has them: only a new snapshot of a \
+         node that runs helps"
+    )
 }
 
 /// Loads the first snapshot, or the second if the first is damaged.
@@ -153,10 +173,20 @@ mod tests {
     fn a_node_whose_contents_were_wrong_first_tries_the_snapshot_of_another_node() {
         let (newest, previous) = (snapshot(2, "a"), snapshot(1, "b"));
         let pointer = Pointer { newest: newest.clone(), previous: Some(previous.clone()) };
-        assert_eq!(load_order(&pointer, None), (&newest, Some(&previous)));
-        assert_eq!(load_order(&pointer, Some("b")), (&newest, Some(&previous)));
-        assert_eq!(load_order(&pointer, Some("a")), (&previous, Some(&newest)));
+        assert_eq!(load_order(&pointer, None, 1), Some((&newest, Some(&previous))));
+        assert_eq!(load_order(&pointer, Some("b"), 1), Some((&newest, Some(&previous))));
+        assert_eq!(load_order(&pointer, Some("a"), 1), Some((&previous, Some(&newest))));
         let only = Pointer { newest: newest.clone(), previous: None };
-        assert_eq!(load_order(&only, Some("a")), (&newest, None));
+        assert_eq!(load_order(&only, Some("a"), 1), Some((&newest, None)));
+    }
+
+    #[test]
+    fn a_snapshot_that_the_stream_does_not_continue_is_not_loaded() {
+        let (newest, previous) = (snapshot(20, "a"), snapshot(10, "b"));
+        let pointer = Pointer { newest: newest.clone(), previous: Some(previous.clone()) };
+        assert_eq!(load_order(&pointer, None, 11), Some((&newest, Some(&previous))));
+        assert_eq!(load_order(&pointer, Some("a"), 12), Some((&newest, None)));
+        assert_eq!(load_order(&pointer, None, 21), Some((&newest, None)));
+        assert_eq!(load_order(&pointer, None, 22), None);
     }
 }
