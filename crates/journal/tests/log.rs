@@ -477,6 +477,36 @@ fn a_node_joins_late_with_a_snapshot_and_the_stream_is_purged() {
     until("all have it", || a.read(7) == Ok(7777) && b.read(7) == Ok(7777));
 }
 
+/// Whoever may delete what the log keeps beside its steps can't make it unusable while a node runs.
+#[test]
+fn snapshots_are_stored_again_after_a_bucket_of_the_log_was_deleted() {
+    let server = Server::new();
+    let soon = |settings: &mut Settings| settings.snapshot_steps = 20;
+    let nodes = ["a", "b"].map(|name| Node::new(&[&server], name, soon));
+    nodes.iter().for_each(Node::start);
+    let mut value = 0;
+    let mut until_stored = |what: &str| {
+        let applied = nodes[0].status().sequence;
+        until(what, || {
+            value += 1;
+            let _ = nodes[0].write(0, value);
+            nodes.iter().all(|node| node.status().snapshot.is_some_and(|at| at > applied))
+        });
+    };
+    until_stored("a snapshot is stored");
+    for bucket in ["KV_holdfast-log-site", "OBJ_holdfast-log-site", "KV_holdfast-log-site-leases"] {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(async {
+            let client = async_nats::connect(server.url()).await.unwrap();
+            async_nats::jetstream::new(client).delete_stream(bucket).await.unwrap();
+        });
+        until_stored(bucket);
+        nodes[1].write_at_last(1, 7);
+        let new = Node::started(&[&server], "c");
+        assert_eq!(new.read(1), Ok(7), "{bucket}");
+    }
+}
+
 fn first_sequence(server: &Server) -> u64 {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     runtime.block_on(async {

@@ -2,14 +2,17 @@
 
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 
+use crate::log::error::End;
 use crate::log::stream::store::{Pointer, Store};
 
 /// The result of work in the background.
 pub(in crate::log) enum Report {
     /// Whether this node may take a snapshot.
-    Leased(bool),
-    /// The revision of the snapshot's key, or why there is none.
-    Stored(Result<(u64, Pointer), String>),
+    Leased(Result<bool, End>),
+    /// The revision of the snapshot's key.
+    Stored((u64, Pointer)),
+    /// Why a snapshot was not stored, and what the key names now.
+    NotStored { reason: String, found: Result<(u64, Pointer), End> },
     /// The digest that the log leads to.
     Replayed { sequence: u64, digest: Result<String, String> },
 }

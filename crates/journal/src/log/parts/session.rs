@@ -285,14 +285,18 @@ impl<'n> Session<'n> {
 
     async fn reported(&mut self, report: Report) -> Result<(), End> {
         match report {
-            Report::Leased(true) => {
+            Report::Leased(Ok(true)) => {
                 let until = Instant::now() + self.node.settings.write_timeout;
                 let Node { sender, snapshotter, .. } = &mut *self.node;
                 let counter = sender.send_probe(&mut self.publisher, true, until).await?;
                 snapshotter.requested(counter);
             }
-            Report::Leased(false) => self.node.snapshotter.postpone(),
-            Report::Stored(stored) => self.node.snapshotter.stored(stored),
+            Report::Leased(Ok(false)) => self.node.snapshotter.postpone(),
+            Report::Leased(Err(end)) => return Err(end),
+            Report::Stored((revision, pointer)) => {
+                self.node.snapshotter.stored(revision, pointer);
+            }
+            Report::NotStored { reason, found } => self.node.snapshotter.failed(&reason, found)?,
             Report::Replayed { sequence, digest } => self.replayed(sequence, digest)?,
         }
         Ok(())
@@ -361,11 +365,12 @@ async fn open_store(node: &mut Node, client: &Client) -> Result<Store, End> {
     node.run_with_expiry(Store::open(&context, &settings, &fingerprint, true)).await?
 }
 
-/// Anyone may write keys whose headers end the connection. They would end each session.
+/// Anyone may write keys whose headers end the connection. They would end each session. And whoever may
+/// delete the bucket of the keys deletes what nodes begin with.
 async fn mend_keys(node: &mut Node, store: &Store) -> Result<(), End> {
     let Some(pointer) = node.snapshotter.pointer().cloned() else { return Ok(()) };
     if node.run_with_expiry(store.mend_keys(&pointer)).await?? {
-        let reason = "keys of the log that can't be read were replaced";
+        let reason = "keys of the log that were missing, or can't be read, were replaced";
         node.shared.event(Event::new("log_error", &[("reason", reason)]));
     }
     Ok(())

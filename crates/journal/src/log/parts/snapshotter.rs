@@ -6,6 +6,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use crate::log::error::End;
 use crate::log::parts::background::{Background, Report};
 use crate::log::settings::Settings;
 use crate::log::shared::Shared;
@@ -79,6 +80,15 @@ impl Snapshotter {
     /// What was under way has ended with the last session.
     pub(in crate::log) fn begin_session(&mut self) {
         self.stage = Stage::idle();
+        self.doubt();
+    }
+
+    /// The key may be in another bucket than before, whose revisions begin anew: it is learnt again, whatever
+    /// its revision is.
+    fn doubt(&mut self) {
+        if let Some(known) = &mut self.known {
+            known.revision = 0;
+        }
     }
 
     /// The snapshots that the log has, if it is known.
@@ -96,7 +106,10 @@ impl Snapshotter {
         if self.known.as_ref().is_none_or(|known| known.revision < revision) {
             let sequence = pointer.newest.sequence;
             self.shared.update(|view| view.snapshot = Some(sequence));
-            self.known = Some(Known { revision, pointer, since: Instant::now() });
+            // A snapshot that was known before is no newer now.
+            let same = self.known.as_ref().filter(|known| known.pointer == pointer);
+            let since = same.map_or_else(Instant::now, |known| known.since);
+            self.known = Some(Known { revision, pointer, since });
         }
     }
 
@@ -197,23 +210,35 @@ impl Snapshotter {
                 Err(error) => Err(error),
             };
             store.release().await;
-            Report::Stored(stored)
+            match stored {
+                Ok(named) => Report::Stored(named),
+                Err(reason) => Report::NotStored { reason, found: store.examine().await },
+            }
         });
     }
 
-    /// The snapshot was stored, or was not.
-    pub(in crate::log) fn stored(&mut self, stored: Result<(u64, Pointer), String>) {
-        match stored {
-            Ok((revision, pointer)) => {
-                self.stage = Stage::idle();
-                let sequence = pointer.newest.sequence.to_string();
-                self.shared.event(Event::new("log_snapshot_stored", &[("sequence", &sequence)]));
-                self.learn(revision, pointer);
-            }
-            Err(reason) => {
-                self.postpone();
-                self.shared.event(Event::new("log_snapshot_failed", &[("reason", &reason)]));
-            }
-        }
+    /// The snapshot was stored.
+    pub(in crate::log) fn stored(&mut self, revision: u64, pointer: Pointer) {
+        self.stage = Stage::idle();
+        let sequence = pointer.newest.sequence.to_string();
+        self.shared.event(Event::new("log_snapshot_stored", &[("sequence", &sequence)]));
+        self.learn(revision, pointer);
+    }
+
+    /// The snapshot was not stored. What the key was known to name may have been wrong.
+    ///
+    /// # Errors
+    /// [`End`] if the log has lost the key, or what it was in: the next session makes it anew.
+    pub(in crate::log) fn failed(
+        &mut self,
+        reason: &str,
+        found: Result<(u64, Pointer), End>,
+    ) -> Result<(), End> {
+        self.postpone();
+        self.shared.event(Event::new("log_snapshot_failed", &[("reason", reason)]));
+        let (revision, pointer) = found?;
+        self.doubt();
+        self.learn(revision, pointer);
+        Ok(())
     }
 }

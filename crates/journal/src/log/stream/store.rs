@@ -207,19 +207,23 @@ impl Store {
         }
     }
 
-    /// Replaces the key of the snapshot, or removes digests, if a watch can't read them. Returns whether
-    /// it has done so. A digest that is missing is stored again at the next comparison.
+    /// Replaces the key of the snapshot if it is missing, or replaces it and removes digests, if a watch can't
+    /// read them. Returns whether it has done so. A digest that is missing is stored again at the next
+    /// comparison.
     pub(in crate::log) async fn mend_keys(&self, pointer: &Pointer) -> Result<bool, End> {
         let (stream, lost) = (&self.keys.stream_name, |error: &dyn std::fmt::Display| {
             End::lost("mending the keys", error)
         });
         let which = json!({"last_by_subj": format!("{}{SNAPSHOT_KEY}", self.keys.prefix)});
         let mut is_mended = false;
-        if let Some(entry) = fetch(&self.context, stream, which).await?
-            && !entry.is_readable
-        {
+        let entry = fetch(&self.context, stream, which).await?;
+        // A deleted key is empty.
+        let is_there = |entry: &Received| entry.is_readable && !entry.payload.is_empty();
+        if !entry.as_ref().is_some_and(is_there) {
             let value = serde_json::to_vec(pointer).map_err(|error| lost(&error))?;
-            let updated = self.keys.update(SNAPSHOT_KEY, value.into(), entry.place.sequence).await;
+            let revision = entry.map_or(0, |entry| entry.place.sequence);
+            // Fails if another node does it at the same time.
+            let updated = self.keys.update(SNAPSHOT_KEY, value.into(), revision).await;
             updated.map_err(|error| lost(&error))?;
             is_mended = true;
         }
@@ -275,9 +279,34 @@ impl Store {
     }
 
     /// Whether this node may take a snapshot now.
-    pub(in crate::log) async fn lease(&self, node: &str) -> bool {
-        let Some(leases) = &self.leases else { return false };
-        leases.create(SNAPSHOT_KEY, Bytes::copy_from_slice(node.as_bytes())).await.is_ok()
+    pub(in crate::log) async fn lease(&self, node: &str) -> Result<bool, End> {
+        let Some(leases) = &self.leases else { return Ok(false) };
+        let value = Bytes::copy_from_slice(node.as_bytes());
+        match leases.create(SNAPSHOT_KEY, value).await {
+            Ok(_) => Ok(true),
+            Err(error) if error.kind() == kv::CreateErrorKind::AlreadyExists => Ok(false),
+            Err(_) => self.examine().await.map(|_| false),
+        }
+    }
+
+    /// What the key of the snapshots names, after something has failed.
+    ///
+    /// # Errors
+    /// [`End`] if the servers have lost the key, or a bucket of the log.
+    pub(in crate::log) async fn examine(&self) -> Result<(u64, Pointer), End> {
+        let leases = self.leases.iter().map(|leases| leases.stream_name.clone());
+        let objects = format!("OBJ_{}", self.stream.cached_info().config.name);
+        for name in leases.chain([self.keys.stream_name.clone(), objects]) {
+            let found = self.context.get_stream(&name).await;
+            found.map_err(|error| End::lost(&format!("the stream {name}"), error))?;
+        }
+        match self.pointer().await {
+            Ok(Some(named)) => Ok(named),
+            Ok(None) => Err(End::Lost("the key of the snapshot is missing".to_owned())),
+            // The next session replaces what can't be read.
+            Err(End::Fatal(error)) => Err(End::Lost(error.to_string())),
+            Err(end) => Err(end),
+        }
     }
 
     pub(in crate::log) async fn release(&self) {
