@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.appliance import Appliance
+from holdfast.appliance.nats_servers import nats_servers
+from holdfast.appliance.parts import device_leases
 from holdfast.client.url import connection_of, parse
 from holdfast.config import ConfigError, load
 from holdfast.replication.leases.leases import Leases
@@ -354,6 +356,44 @@ def test_a_device_whose_address_another_node_polls_without_it_is_named(
             "nobody polls it",
         )
         wire.until(lambda: "device_not_polled" in caplog.messages, "it is logged")
+
+
+def test_a_node_whose_log_has_failed_lets_others_poll(
+    node: Callable[..., Appliance], caplog: pytest.LogCaptureFixture
+) -> None:
+    one = node("a", BRIEF)
+    wire.until(lambda: health(one) == "ok", "it polls")
+    two = node("a", BRIEF)  # Two processes with one name: the first one fails.
+    wire.until(lambda: health(two) == "ok", "the other node has taken over")
+    assert health(one) == "standby"
+    [fields] = logged(caplog, "device_given_up")
+    assert fields["reason"] == "the log is not usable here: failed (name_taken)"
+
+
+def test_a_node_whose_log_hangs_lets_others_poll_and_takes_part_again(
+    node: Callable[..., Appliance],
+    settings: Callable[..., Path],
+    server: NatsServer,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its leases have a connection of their own, which goes on."""
+    direct = nats_servers(load(settings("a")).logs["site"])
+    monkeypatch.setattr(device_leases, "nats_servers", lambda _: direct)
+    with closing(Proxy(server.port, "nats")) as proxy:
+        file = settings("a")
+        text = file.read_text().replace(server.url, proxy.url)
+        file.write_text(text.replace("write_timeout: 10", "write_timeout: 10, max_lag: 1"))
+        with Appliance(load(file), lease_times=BRIEF) as one:
+            wire.until(lambda: health(one) == "ok", "it polls")
+            two = node("b", BRIEF)
+            wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
+            proxy.hold()
+            wire.until(lambda: health(two) == "ok", "the other node has taken over")
+            assert health(one) == "standby"
+            proxy.go_on()
+            wire.until(lambda: one.replicas()["site"]["obstacle"] is None, "its log works again")
+            two.stop()
+            wire.until(lambda: health(one) == "ok", "it polls again")
 
 
 def test_without_its_log_a_node_stops_polling_and_comes_back(

@@ -27,7 +27,7 @@ def leases(tmp_path: Path) -> _LogLeases:
         "listeners": {"scada": {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": rules}},
     }
     file.write_text(written(parts))
-    return _LogLeases("site", load(file), None)
+    return _LogLeases("site", load(file), None, lambda _: None)
 
 
 @pytest.mark.parametrize(

@@ -240,6 +240,21 @@ def test_a_node_that_can_not_use_its_devices_lets_others_have_them(
     first.has("x")
 
 
+def test_a_lease_that_is_withheld_when_it_is_due_is_renewed_as_soon_as_it_is_not(
+    node: Callable[..., Node],
+) -> None:
+    one = node("a", LeaseTimes(ttl_s=300.0, hold_s=200.0, renewal_s=0.1))
+    one.thread.want(["x"])
+    one.has("x")
+    one.withheld = "there is nobody to tell"
+    time.sleep(0.5)
+    one.leases.times = LeaseTimes(ttl_s=300.0, hold_s=200.0, renewal_s=100.0)
+    time.sleep(0.5)  # It becomes due.
+    revision = one.leases.revision("x")
+    one.withheld = None
+    wire.until(lambda: one.leases.revision("x") > revision, "it is renewed")
+
+
 def test_another_event_loop_is_told_in_order_and_of_many_changes_once() -> None:
     class Watcher:
         def __init__(self) -> None:

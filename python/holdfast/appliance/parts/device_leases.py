@@ -2,7 +2,8 @@
 
 One lease for each address, because devices behind it share a connection. Whoever has it polls, all
 others stand by. The thread of a log holds the leases. The native poller uses a device while
-its fence is open.
+its fence is open. A node whose log does not take what it polls renews no lease, so that others
+take them.
 """
 
 from __future__ import annotations
@@ -70,7 +71,9 @@ class DeviceLeases(Part):
         logs_used = set(leased(config).values()) | {
             memory.replicate.log for memory in config.memories.values() if memory.replicate
         }
-        self._of_log = {name: _LogLeases(name, config, times) for name in sorted(logs_used)}
+        self._of_log = {
+            name: _LogLeases(name, config, times, logs.obstacle) for name in sorted(logs_used)
+        }
 
     def fence(self, device: str, config: Config) -> _core.Fence | None:
         """The fence of a device; `None` if every node polls it."""
@@ -132,6 +135,7 @@ class _LogLeases:
     log: str
     config: Config
     times: LeaseTimes | None
+    obstacle: Callable[[str], str | None]
 
     def __post_init__(self) -> None:
         # Only an appliance with logs loads the client of NATS.
@@ -147,6 +151,7 @@ class _LogLeases:
             times=self.times or LEASE_TIMES,
             replicas=settings.replicas,
             about=lambda key: {"devices": self._devices.get(key, [])},
+            withheld=self._withheld,
         )
         self._servers = nats_servers(settings)
         self._thread = LeaseThread(self.leases, self._connect, f"holdfast-leases-{self.log}")
@@ -216,6 +221,11 @@ class _LogLeases:
                     self._missing.add((device, holder.node))
                     fields = {"device": device, "log": self.log, "node": holder.node}
                     log_lines.write(logging.WARNING, "device_not_polled", **fields)
+
+    def _withheld(self) -> str | None:
+        """Why what this node polls does not reach the others, though it could renew its leases."""
+        obstacle = self.obstacle(self.log)
+        return None if obstacle is None else f"the log is not usable here: {obstacle}"
 
     async def _connect(self, connected: Callable[[Any], None]) -> None:
         from holdfast.net.nats.connection import Broker, Ping

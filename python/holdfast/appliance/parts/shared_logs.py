@@ -129,6 +129,10 @@ class SharedLogs(Part):
         self._memories.follow(name, log)
         log_servers.begin(name, settings)
 
+    def obstacle(self, name: str) -> str | None:
+        """Why a log is not caught up; `None` if it is. Thread-safe."""
+        return _obstacle(self._logs[name].status(), self.config.logs[name].max_lag)
+
     def status(self) -> dict[str, dict[str, Any]]:
         """The state and the counters of each log, and why it is not caught up."""
         return {name: self._status(name, log.status()) for name, log in self._logs.items()}

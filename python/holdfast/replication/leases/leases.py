@@ -197,7 +197,8 @@ class Leases:
                 self._note_lapsed(now, withheld or "it could not be renewed")
                 is_due = now >= due
                 if is_due:
-                    due = now + self.times.renewal_s
+                    # What is withheld for a moment is renewed as soon as it is not.
+                    due = now + (self.times.renewal_s if withheld is None else TICK_S)
                 if withheld is None:
                     for key, held in self._held.items():
                         if is_due or held.is_late:
