@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import nats
 import pytest
 from nats.errors import NoRespondersError
 
@@ -177,6 +178,39 @@ def test_a_request_that_nobody_takes_yet_is_sent_again(monkeypatch: pytest.Monke
         log_backup.BackupFailed, match=r"STREAM\.INFO\.site: nobody answers; JetStream"
     ):
         asyncio.run(config)
+
+
+def purge(server: NatsServer, stream: str) -> int:
+    """Deletes all messages of a stream. Returns the sequence of the last one."""
+
+    async def purged() -> int:
+        client = await nats.connect(server.url)
+        jetstream = client.jetstream()
+        await jetstream.purge_stream(stream)
+        last = (await jetstream.stream_info(stream)).state.last_seq
+        await client.close()
+        return last
+
+    return asyncio.run(purged())
+
+
+def test_a_log_that_can_not_be_rebuilt_is_not_backed_up(tmp_path: Path) -> None:
+    (tmp_path / "server").mkdir()
+    server, backup = NatsServer(tmp_path / "server"), tmp_path / "backup"
+    file = configuration(tmp_path, servers=[server.url])
+    try:
+        with Appliance(load(file)) as appliance:
+            write(appliance, 1, 7)
+        last = purge(server, "holdfast-log-site")
+        missing_steps = f"messages 1 to {last} behind the newest snapshot are missing: no node"
+        assert missing_steps in failed("backup", file, backup)
+        purge(server, "OBJ_holdfast-log-site")
+        assert "OBJ_holdfast-log-site has no object 0-scada-a-" in failed("backup", file, backup)
+        purge(server, "KV_holdfast-log-site")
+        assert "KV_holdfast-log-site has no key snapshot: no" in failed("backup", file, backup)
+    finally:
+        server.kill()
+    assert not backup.exists()
 
 
 def test_servers_without_the_log_are_told(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ A backup is a folder: `backup.json`, and one file for each stream, as the server
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import hashlib
 import json
@@ -34,6 +35,16 @@ VERSION = 1
 STREAM_NOT_FOUND = 10059
 """The code of JetStream for a stream that does not exist."""
 
+NO_MESSAGE_FOUND = 10037
+"""The same for a message."""
+
+SNAPSHOT_KEY = "snapshot"
+"""The key that names the snapshots."""
+
+USELESS = (
+    "no node could begin with the backup; try again when a node that runs has stored a new snapshot"
+)
+
 CHUNK_BYTES = 128 * 1024
 ANSWER_TIMEOUT_S = 30.0
 """Seconds within which a server must answer, or send the next part."""
@@ -54,6 +65,13 @@ class _NotFound(BackupFailed):
     """The servers don't have the stream."""
 
 
+class _NoMessage(BackupFailed):
+    """The stream does not have the message."""
+
+
+_KINDS = {STREAM_NOT_FOUND: _NotFound, NO_MESSAGE_FOUND: _NoMessage}
+
+
 def streams(log: str) -> list[str]:
     """The streams of a log, the one with the steps last."""
     name = f"holdfast-log-{log}"
@@ -69,7 +87,7 @@ def back_up(servers: Servers, log: str, folder: Path) -> int:
     """Writes a backup to a new folder. Returns the number of messages. Raises `BackupFailed`.
 
     What is confirmed later is not in it. Nodes may run: the newest snapshot is fetched before the
-    steps that follow it.
+    steps that follow it. A log that could not be rebuilt from it is refused.
     """
     try:
         folder.mkdir()
@@ -120,7 +138,7 @@ async def _ask(client: SafeClient, subject: str, request: Any = None) -> dict[st
     answer: dict[str, Any] = json.loads(reply.data)
     if "error" in answer:
         error = answer["error"]
-        kind = _NotFound if error.get("err_code") == STREAM_NOT_FOUND else BackupFailed
+        kind = _KINDS.get(error.get("err_code"), BackupFailed)
         raise kind(str(error.get("description", error)))
     return answer
 
@@ -148,10 +166,42 @@ async def _config(client: SafeClient, name: str) -> dict[str, Any] | None:
         return None
 
 
+async def _last(client: SafeClient, stream: str, subject: str) -> bytes:
+    """The last message with this subject; empty if the stream has none."""
+    try:
+        found = await _ask(client, f"STREAM.MSG.GET.{stream}", {"last_by_subj": subject})
+    except _NoMessage:
+        return b""
+    return base64.b64decode(found["message"].get("data", ""))
+
+
+async def _newest_snapshot(client: SafeClient, log: str) -> int:
+    """The sequence of the newest snapshot. Raises `BackupFailed` if there is none."""
+    keys, objects, steps = streams(log)
+    key = await _last(client, keys, f"$KV.{steps}.{SNAPSHOT_KEY}")
+    if not key:
+        raise BackupFailed(f"{keys} has no key {SNAPSHOT_KEY}: {USELESS}")
+    try:
+        newest = json.loads(key)["newest"]
+        sequence, name = int(newest["sequence"]), str(newest["object"])
+    except (ValueError, KeyError, TypeError) as error:
+        reason = f"{keys}: the key {SNAPSHOT_KEY} is {key[:100]!r}, not a snapshot: {USELESS}"
+        raise BackupFailed(reason) from error
+    encoded = base64.urlsafe_b64encode(name.encode()).decode()
+    if not await _last(client, objects, f"$O.{steps}.M.{encoded}"):
+        raise BackupFailed(f"{objects} has no object {name}, the newest snapshot: {USELESS}")
+    return sequence
+
+
 async def _back_up(client: SafeClient, log: str, folder: Path) -> int:
+    newest = await _newest_snapshot(client, log)
     contents = {}
     for name in streams(log):
         contents[name] = await _fetch(client, name, folder / name)
+    first = int(contents[streams(log)[-1]]["state"]["first_seq"])
+    if first > newest + 1:
+        reason = f"messages {newest + 1} to {first - 1} behind the newest snapshot are missing"
+        raise BackupFailed(f"{reason}: {USELESS}")
     text = json.dumps({"version": VERSION, "log": log, "streams": contents}, indent=2)
     with (folder / "backup.json").open("xb") as out:
         out.write(text.encode())
