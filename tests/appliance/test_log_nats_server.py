@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -22,6 +23,7 @@ import pytest
 import holdfast
 from holdfast.appliance import Appliance
 from holdfast.config import load
+from holdfast.net.nats_server import folder as nats_folder
 from holdfast.net.nats_server.folder import Folder as NatsFolder
 from holdfast.net.nats_server.log import ServerLog
 from support import wire
@@ -266,9 +268,9 @@ def test_a_server_that_was_left_over_is_ended(
     assert [each.message for each in caplog.records].count("log_server_left_over") == 1
 
 
-def refused(file: Path) -> str:
+def refused(file: Path, exit_code: int = 2) -> str:
     result = invoke("run", str(file))
-    assert result.exit_code == 2
+    assert result.exit_code == exit_code
     [line] = [line for line in result.stderr.splitlines() if line.startswith("holdfast: ")]
     assert line.startswith("holdfast: logs.site.embedded: ")
     return line
@@ -289,6 +291,21 @@ def test_a_port_that_is_taken_is_told(tmp_path: Path) -> None:
         told = refused(configuration(tmp_path, port))
         assert f"127.0.0.1:{port}" in told
         assert "in use" in told
+
+
+def test_a_disk_that_is_full_may_have_room_at_the_next_start(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as full, socket.create_server(("127.0.0.1", 0)) as taken:
+        full.setattr(NatsFolder, "has_room", lambda _: False)
+        port = taken.getsockname()[1]
+        refused(configuration(file.parent, port, "other"), 1)  # The server itself could not start.
+
+    def replace(path: Path, *_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(nats_folder, "replace", replace)
+    assert "nats-server.conf can't be used: No space left" in refused(file, 1)
 
 
 @pytest.mark.parametrize("name", ["log", "log/nats-server.conf"])

@@ -76,6 +76,7 @@ class SharedLogs(Part):
     def _serve(self, name: str, settings: SharedLogConfig) -> None:
         """Starts the server of the log, if the log has one of its own."""
         from holdfast.appliance.parts import log_servers  # Most appliances have no log.
+        from holdfast.net.nats_server import DiskFull
 
         server = log_servers.embedded(name, settings)
         if server is None:
@@ -85,7 +86,10 @@ class SharedLogs(Part):
         try:
             server.start()
         except OSError as error:
-            raise LogNotJoined(f"logs.{name}.embedded: {error}", is_settings=True) from None
+            # The disk may have room at the next start.
+            is_settings = not isinstance(error, DiskFull)
+            text = f"logs.{name}.embedded: {error}"
+            raise LogNotJoined(text, is_settings=is_settings) from None
 
     def _join(
         self, name: str, settings: SharedLogConfig, members: list[tuple[str, _core.Memory]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import secrets
@@ -28,6 +29,10 @@ ROOM_BYTES = 2**20
 
 class ServerUnusable(OSError):
     """The server can't be started. The message says why."""
+
+
+class DiskFull(ServerUnusable):
+    """The disk of the folder is full."""
 
 
 class InUse(ServerUnusable):
@@ -69,8 +74,7 @@ class Folder:
         except BaseException as error:
             self.close()
             if isinstance(error, OSError) and not isinstance(error, ServerUnusable):
-                reason = error.strerror or error
-                raise ServerUnusable(f"{path} can't be used: {reason}") from error
+                raise _unusable(path, error) from error
             raise
 
     @property
@@ -85,8 +89,7 @@ class Folder:
             settings = json.dumps(self._settings(access), indent=2, ensure_ascii=False)
             replace(file, f"{settings}\n".encode(), SECRET)
         except OSError as error:
-            named = error.filename or file
-            raise ServerUnusable(f"{named} can't be used: {error.strerror or error}") from error
+            raise _unusable(error.filename or file, error) from error
         return file
 
     def has_room(self) -> bool:
@@ -140,6 +143,11 @@ class Folder:
         if access.token_file.parent == self.path and not access.token_file.exists():
             replace(access.token_file, f"{secrets.token_hex(32)}\n".encode(), SECRET)
         return {"token": read_secret(access.token_file)}
+
+
+def _unusable(file: Path | str, error: OSError) -> ServerUnusable:
+    kind = DiskFull if error.errno in {errno.ENOSPC, errno.EDQUOT} else ServerUnusable
+    return kind(f"{file} can't be used: {error.strerror or error}")
 
 
 def _opened(file: Path) -> int:
