@@ -914,6 +914,24 @@ fn a_server_that_was_set_back_is_not_followed() {
     b.write(2, 2).unwrap();
 }
 
+/// The server still knows of the message, so it seems to come.
+#[test]
+fn a_node_that_starts_says_that_the_last_message_of_the_log_is_missing() {
+    let mut server = Server::new();
+    let node = Node::started(&[&server], "a");
+    node.write(0, 1).unwrap();
+    drop(node);
+    server.stop();
+    server.cut_messages(5);
+    server.start();
+    let node = Node::new(&[&server], "a", |_| {});
+    node.log.start().unwrap();
+    until("the node says what is missing", || {
+        let error = node.status().last_error.unwrap_or_default();
+        error.starts_with("message") && error.contains("missing: only a new snapshot")
+    });
+}
+
 /// Puts other bytes in place of the snapshots whose names are chosen.
 fn damage(server: &Server, chosen: impl Fn(&[String]) -> Vec<String>) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();

@@ -348,7 +348,7 @@ fn a_node_does_not_go_back_to_a_snapshot_that_the_log_does_not_continue() {
         node.log.start().unwrap();
         until("the node says why it can't go on", || {
             let error = node.status().last_error.unwrap_or_default();
-            error.contains("were removed, and no snapshot has them")
+            error.contains("of the log are missing: only a new snapshot")
         });
     }
     let error = new.status().last_error.unwrap();

@@ -75,6 +75,18 @@ impl From<LogError> for End {
 }
 
 impl End {
+    /// The stream does not have messages that come next.
+    pub(super) fn missing(from: u64, to: u64) -> End {
+        let which = if from == to {
+            format!("message {from} of the log is")
+        } else {
+            format!("messages {from} to {to} of the log are")
+        };
+        End::Lost(format!(
+            "{which} missing: only a new snapshot of a node that has applied them helps"
+        ))
+    }
+
     /// What a server could not do for now.
     pub(super) fn lost(what: &str, error: impl std::fmt::Display) -> End {
         End::Lost(format!("{what}: {error}"))

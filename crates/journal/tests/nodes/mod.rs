@@ -111,6 +111,22 @@ impl Server {
         }
     }
 
+    /// Ends the server, which stores what it knows of its streams before.
+    pub fn stop(&mut self) {
+        self.signal("TERM");
+        if let Some(mut process) = self.process.take() {
+            process.wait().unwrap();
+        }
+    }
+
+    /// Cuts bytes off the end of the messages of a log, while the server is stopped.
+    pub fn cut_messages(&self, bytes: u64) {
+        assert!(self.process.is_none(), "the server is stopped");
+        let stream = "store/jetstream/$G/streams/holdfast-log-site/msgs/1.blk";
+        let file = std::fs::File::options().write(true).open(self.folder.0.join(stream)).unwrap();
+        file.set_len(file.metadata().unwrap().len() - bytes).unwrap();
+    }
+
     /// Copies what the stopped server has stored, or puts the copy back.
     pub fn copy(&self, from: &str, to: &str) {
         assert!(self.process.is_none(), "the server is stopped");

@@ -86,8 +86,7 @@ impl Applier {
             return Ok(None);
         }
         if place.sequence != applied.sequence + 1 {
-            let next = applied.sequence + 1;
-            return Err(End::Lost(format!("sequence {} came in place of {next}", place.sequence)));
+            return Err(End::missing(applied.sequence + 1, place.sequence - 1));
         }
         self.apply(place, &received.payload, first_sent).map(Some)
     }

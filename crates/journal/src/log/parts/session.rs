@@ -328,6 +328,7 @@ impl<'n> Session<'n> {
         let silent = now.saturating_duration_since(self.last_applied.max(self.began));
         // A server that is cut off from the stream may keep the connection open for long.
         if silent > self.node.settings.silence() {
+            self.check_end().await?;
             let seconds = silent.as_secs_f64();
             return Err(End::Lost(format!("the log has confirmed nothing for {seconds:.1} s")));
         }
@@ -344,6 +345,22 @@ impl<'n> Session<'n> {
             self.replay(sequence);
         }
         Ok(())
+    }
+
+    /// Whether the stream still has what it ended with when the session began: a node that reads up to there
+    /// would wait for ever.
+    async fn check_end(&mut self) -> Result<(), End> {
+        let (next, end) = (self.node.applier.sequence() + 1, self.stream_end);
+        if self.catch_up != CatchUp::Reading || next > end {
+            return Ok(());
+        }
+        let store = self.background.store().clone();
+        for sequence in [next, end] {
+            if self.node.run_with_expiry(store.message(sequence)).await??.is_some() {
+                return Ok(());
+            }
+        }
+        Err(End::missing(next, end))
     }
 
     /// Sends a message if nothing was sent for a while: when it is applied, the contents are current.

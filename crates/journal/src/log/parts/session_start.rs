@@ -76,7 +76,9 @@ async fn load(node: &mut Node, store: &Store, first: u64, last: u64) -> Result<(
     // A node whose contents were wrong does not trust what it has stored itself.
     let distrusted = (!node.rejoin.contents_are_right()).then(|| node.settings.node.clone());
     let Some(order) = load_order(&pointer, distrusted.as_deref(), first) else {
-        return Err(End::Lost(unreachable(node, &pointer.newest, first)));
+        // It keeps its contents: those of the snapshot are older, or lead to nothing.
+        let own = if node.rejoin.needs_snapshot() { 0 } else { node.applier.sequence() };
+        return Err(End::missing(pointer.newest.sequence.max(own) + 1, first - 1));
     };
     let (shared, mut state) = (node.shared.clone(), node.applier.begin_load());
     let loading = load_good(store, order, revision, &shared, &mut state);
@@ -119,16 +121,6 @@ fn load_order<'p>(
     let is_continued = |snapshot: &&Snapshot| snapshot.sequence + 1 >= first;
     let mut order = known.into_iter().flatten().filter(is_continued);
     order.next().map(|one| (one, order.next()))
-}
-
-/// Why this node can't go on. It keeps its contents: those of the snapshot are older, or lead to nothing.
-fn unreachable(node: &Node, newest: &Snapshot, first: u64) -> String {
-    let own = if node.rejoin.needs_snapshot() { 0 } else { node.applier.sequence() };
-    let (from, to) = (newest.sequence.max(own) + 1, first - 1);
-    format!(
-        "messages {from} to {to} of the log were removed, and no snapshot has them: only a new snapshot of a \
-         node that runs helps"
-    )
 }
 
 /// Loads the first snapshot, or the second if the first is damaged.
