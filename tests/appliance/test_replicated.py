@@ -276,6 +276,18 @@ def test_a_node_that_keeps_its_memory_does_not_go_back_with_its_servers(
         assert register(node, 1) == 111
 
 
+def test_nothing_is_imported_into_the_file_of_a_log(tmp_path: Path, server: NatsServer) -> None:
+    settings, file = config(tmp_path, [server.url], keep={"file": "plant.redb"}), "plant.redb"
+    with Appliance(settings) as node:
+        node.memories["plant"].write("holding_registers", 1, [111])
+    (tmp_path / "values.csv").write_text("holding_registers,1,7\n")
+    result = invoke("memory", "import", str(tmp_path / file), str(tmp_path / "values.csv"))
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert f"{file}: the file is of a log, which alone changes it" in result.stderr
+    with Appliance(settings) as node:
+        assert register(node, 1) == 111
+
+
 def test_without_its_log_a_node_reads_and_does_not_write(
     node: Callable[..., Appliance], server: NatsServer
 ) -> None:

@@ -251,13 +251,12 @@ fn a_file_that_something_else_has_changed_is_refused() {
     let member = Member { name: "plant".to_owned(), memory: Arc::clone(&alone) };
     let disk = Arc::new(FileOnDisk::new(&path));
     let file = MemoryFile::open(disk, vec![member], Options::new(Duration::ZERO)).unwrap();
+    assert!(file.note().is_some(), "until it starts, the file is that of the log");
     file.start(None).unwrap();
     file.stop().unwrap();
     let error = opened(&path, &memory()).unwrap_err();
-    assert!(
-        error.to_string().starts_with("the file has contents that are not of a log"),
-        "{error}"
-    );
+    let text = "the file has contents that are not of a log: export it first";
+    assert!(error.to_string().starts_with(text), "{error}");
 }
 
 #[test]

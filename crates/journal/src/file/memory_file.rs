@@ -118,7 +118,8 @@ impl MemoryFile {
         check(&members)?;
         let status = Arc::new(Mutex::new(Status::default()));
         let store = Store::open(disk, Arc::clone(&status))?;
-        let note = if is_of_log { note_of(store.image(), &members)? } else { None };
+        let note =
+            if is_of_log { note_of(store.image(), &members)? } else { store.image().note.clone() };
         let (mut loaded, mut warnings) = (Vec::new(), Vec::new());
         for Member { name, memory } in &members {
             let Some(stored) = store.image().named(name) else { continue };
@@ -178,7 +179,8 @@ impl MemoryFile {
         &self.warnings
     }
 
-    /// What the log had noted with the contents that were loaded.
+    /// What the log had noted with the contents that were loaded; of a file that is not opened as that of a
+    /// log, too.
     pub fn note(&self) -> Option<&[u8]> {
         self.note.as_deref()
     }
@@ -311,7 +313,10 @@ fn note_of(image: &Image, members: &[Member]) -> Result<Option<Vec<u8>>, FileErr
     }
     let advice = "move the file away to start with the contents of the log";
     let Some(note) = &image.note else {
-        let text = format!("the file has contents that are not of a log: {advice}");
+        let text = format!(
+            "the file has contents that are not of a log: export it first, and use that as 'initial' if a \
+             new log is to begin with them; then {advice}"
+        );
         return Err(FileError::OfLog(text));
     };
     for (Member { name, memory }, stored) in all() {

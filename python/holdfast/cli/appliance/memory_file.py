@@ -49,7 +49,7 @@ def contents(file: Path, *, set_aside: bool = False) -> dict[str, dict[Area, Kep
 def replace(file: Path, memory: str, runs: Iterable[InitialRun], *, merge: bool) -> None:
     """Stores values in a memory of the file. Without `merge`, all its other values become 0.
 
-    Raises `OSError` for a file that can't be used, and `OutOfRange`.
+    Raises `OSError` for a file that can't be used, or is that of a log, and `OutOfRange`.
     """
     areas = contents(file)[memory]
     sizes = {area: len(kept.values) for area, kept in areas.items()}
@@ -58,6 +58,12 @@ def replace(file: Path, memory: str, runs: Iterable[InitialRun], *, merge: bool)
     made = _core.Memory(**spans, files=files)
     opened = _core.MemoryFile(str(file), [(memory, made)], 1.0)
     try:
+        if opened.note is not None:
+            # A node would refuse contents that are not those of its note.
+            raise OSError(
+                f"{file}: the file is of a log, which alone changes it. Write to a node that runs,"
+                " or export the file, and begin a new log with the values as 'initial'"
+            )
         writes: list[tuple[str, int, Sequence[int]]] = []
         if not merge:
             zeros = ((area, kept.start, [0] * len(kept.values)) for area, kept in areas.items())
