@@ -651,7 +651,8 @@ def test_what_cannot_be_asked_is_not_sent(
         ({"timeout": -1}, ValueError, "timeout is -1"),
         ({"timeout": float("nan")}, ValueError, "timeout is nan"),
         ({"timeout": 10**400}, ValueError, "timeout is 1000"),
-        ({"timeout": "1"}, TypeError, "str"),
+        ({"timeout": "1"}, TypeError, "timeout is '1', allowed: more than 0, up to 86400 seconds"),
+        ({"timeout": None}, TypeError, "timeout is None, allowed: more than 0"),
     ],
 )
 def test_what_a_client_cannot_be_is_refused(
@@ -687,6 +688,9 @@ def test_the_number_in_flight_has_its_limits(number: Any) -> None:
             ),
         ),
         ("rtu:///dev/ttyUSB0", SerialTarget("rtu", "/dev/ttyUSB0", 19200, "even", 1, 8)),
+        ("tcp://plc_7.site-2.example", NetworkTarget("tcp", "plc_7.site-2.example", 502)),
+        ("tcp://प्लांट", NetworkTarget("tcp", "प्लांट", 502)),
+        ("tcp://[fe80::1%25eth0]", NetworkTarget("tcp", "fe80::1%eth0", 502)),
         ("rtu:///dev/ttyS0?parity=none", SerialTarget("rtu", "/dev/ttyS0", 19200, "none", 2, 8)),
         (
             "rtu:///dev/a%20b?baud=115200&parity=odd&stop_bits=2&silence=0.01&echo=1",
@@ -724,6 +728,14 @@ def test_a_target_is_shown_as_a_url() -> None:
         ("tcp://plc?ca=a", "unknown option 'ca', allowed: accept_unit, pad, pause"),
         ("rtu:///dev/x?ca=a", "unknown option 'ca', allowed: baud, parity"),
         ("tcp://", "is not the address of a device"),
+        (
+            "tcp://10.0.0.5 :502",
+            r"host is '10\.0\.0\.5 ', allowed: letters, digits, '-', '.' and '_', or",
+        ),
+        ("tcp://('127.0.0.1', 5020)", r"""host is "\('127.0.0.1', 5020\)", allowed: letters"""),
+        ("udp://10.0.0.5,10.0.0.6", "host is '10.0.0.5,10.0.0.6', allowed"),
+        ("tls://plc%20", "host is 'plc ', allowed"),
+        ("tcp://plc%C2%A0", r"host is 'plc\\xa0', allowed"),
         ("tcp://plc:0", "port 0"),
         ("tcp://plc:65536", "[Pp]ort out of range"),
         ("tcp://plc:x", "x"),

@@ -394,6 +394,18 @@ def test_a_read_that_fails_is_retried_as_often_as_allowed(
     wire.until_long_enough(is_answered, "the retry is answered")
 
 
+@pytest.mark.parametrize("options", ["retries=2", "pause=0.01"])
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
+def test_a_timeout_is_told_as_it_was_given(kind: str, options: str, make: Make, dial: Dial) -> None:
+    client = dial(f"{make(kind, good, then=silent).url}?{options}")
+    assert client.read_holding_registers(7, 1) == [7]
+    client.timeout = 0.05
+    with pytest.raises(
+        holdfast.RequestTimeout, match=r"^no (reply|connection to \S+) within 0\.05 s$"
+    ):
+        client.read_holding_registers(8, 2)
+
+
 @pytest.mark.parametrize("failure", [silent, from_unit_9, close])
 @pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
 def test_a_write_is_never_retried(failure: Behaviour, kind: str, make: Make, dial: Dial) -> None:

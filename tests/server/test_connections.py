@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import re
 import subprocess
 import sys
 import threading
@@ -379,6 +380,27 @@ def test_an_argument_that_can_not_be_is_a_value_error(
 
     with pytest.raises(ValueError, match=text):
         holdfast.Server(**options)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"units": 7}, "units is 7, allowed: a memory for each unit id, as in {1: memory}"),
+        ({"units": {"1": 7}}, "found the unit id '1', allowed: 0 to 255, as in {1: memory}"),
+        ({"units": {1: {}}}, "unit 1 is {}, allowed: a holdfast.Memory"),
+        ({"functions": 3}, "functions is 3, allowed: a list, as in [3, 16]"),
+        ({"deny": "6"}, "deny is '6', allowed: a list, as in [3, 16]"),
+        ({"sources": "10.0.0.0/8"}, "sources is '10.0.0.0/8', allowed: a list, as in ['10.0.0.0"),
+        ({"identity": "x"}, "identity is 'x', allowed: holdfast.server.Identity(vendor_name=…)"),
+    ],
+    ids=str,
+)
+def test_an_argument_of_another_type_is_a_type_error(
+    wrong: dict[str, Any], text: str, memory: holdfast.Memory
+) -> None:
+    valid: dict[str, Any] = {"units": {1: memory}, "bind": "127.0.0.1:0", "access": "read-only"}
+    with pytest.raises(TypeError, match=re.escape(text)):
+        holdfast.Server(**valid | wrong)
 
 
 # Start and stop

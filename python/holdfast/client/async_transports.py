@@ -165,6 +165,10 @@ class AsyncConnection:
                     if connection.closed is not None:
                         here.end(connection)
                     raise
+                except RequestTimeout:
+                    if left == timeout:
+                        raise
+                    raise RequestTimeout(f"no reply within {timeout:g} s") from None
                 if type(result) is not Attempt:
                     return result
                 attempt = result

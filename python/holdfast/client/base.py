@@ -26,9 +26,7 @@ class BaseClient:
     def __init__(self, url: str, unit: int, timeout: float) -> None:
         self.target = parse(url)
         self.unit = _unit(unit)
-        if not 0 < timeout <= MAX_TIMEOUT_S:
-            raise ValueError(f"timeout is {timeout!r}, allowed: more than 0, up to 86400 seconds")
-        self.timeout = float(timeout)
+        self.timeout = _timeout(timeout)
 
     def unit_for(self, request: Request, unit: int | None) -> int:
         """The unit id of a call. Raises `ValueError` for a function that can't be broadcast."""
@@ -43,6 +41,17 @@ class BaseClient:
 def is_broadcast(target: Target, unit: int) -> bool:
     """Whether a unit id is the broadcast of a serial line, which has no reply."""
     return unit == 0 and isinstance(target, SerialTarget)
+
+
+def _timeout(seconds: float) -> float:
+    refusal = f"timeout is {seconds!r}, allowed: more than 0, up to 86400 seconds"
+    try:
+        is_allowed = 0 < seconds <= MAX_TIMEOUT_S
+    except TypeError:
+        raise TypeError(refusal) from None
+    if not is_allowed:
+        raise ValueError(refusal)
+    return float(seconds)
 
 
 def _unit(unit: int) -> int:

@@ -43,6 +43,9 @@ FORMS = (
 )
 
 
+NOT_IN_HOSTS = re.compile(r"[^\w.:%\x80-\U0010ffff-]|\s")
+"""What no name or address of a host contains. Names may have letters of any language."""
+
 MAX_PAUSE_S = 60
 MAX_RETRIES = 10
 MAX_CLOSE_AFTER = 65_535
@@ -165,6 +168,10 @@ def parse(url: str) -> Target:
     if scheme in TRANSPORTS:
         if not parts.hostname or parts.path not in ("", "/"):
             raise ValueError(f"{url!r} is not the address of a device, allowed: {FORMS}")
+        host = unquote(parts.hostname)
+        if NOT_IN_HOSTS.search(host):
+            allowed = "letters, digits, '-', '.' and '_', or an IP address, as in"
+            raise ValueError(f"{url!r}: host is {host!r}, allowed: {allowed} {FORMS}")
         if port == 0:
             raise ValueError(f"{url!r}: port 0, allowed: 1 to {LAST_PORT}")
         port = usual_port(scheme) if port is None else port
@@ -174,7 +181,7 @@ def parse(url: str) -> Target:
             tls = Tls(**options)
         except ValueError as error:
             raise ValueError(f"{url!r}: {error}") from None
-        return NetworkTarget(scheme, unquote(parts.hostname), port, tls, tolerance)
+        return NetworkTarget(scheme, host, port, tls, tolerance)
     if scheme in ("rtu", "ascii"):
         return _serial(url, cast("Mode", scheme), parts.netloc + parts.path, parts.query)
     near = suggestion(scheme, (*TRANSPORTS, *SERIAL)) if scheme else ""

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterable, Mapping
 from operator import index
-from typing import TYPE_CHECKING, Literal, Self, TypeAlias, Unpack, cast
+from typing import TYPE_CHECKING, Literal, Self, TypeAlias, TypeVar, Unpack, cast
 from urllib.parse import urlsplit
 
 from holdfast import _core
 from holdfast.client.url import SERIAL, STRICT, SerialTarget, parse
 from holdfast.net.addresses import LOOPBACK
-from holdfast.protocol import MAX_SERIAL_UNIT
+from holdfast.protocol import MAX_SERIAL_UNIT, MAX_UNIT
 from holdfast.server.fork import close_in_children
 from holdfast.server.identity import Identity
 from holdfast.server.options import DEFAULTS, STREAM_DEFAULTS
 from holdfast.types import TRANSPORTS
+from holdfast.values.integers import as_integer
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Collection, Sequence
 
     from holdfast._core import Memory, Rule
     from holdfast.server.options import (
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 
 NAME = "server"
 
+Item = TypeVar("Item")
 Framing: TypeAlias = Literal["mbap", "rtu", "ascii"]
 
 _CONNECTIONS: dict[str, Framing] = {
@@ -48,6 +51,10 @@ FORMS = (
 
 _running: set[_core.Engine] = set()
 """A server that was started serves until `stop`, also if the program has no reference to it."""
+
+SERVED = (_core.Memory, _core.Route, _core.Passage)
+UNITS = "{1: memory}"
+CODES = "[3, 16]"
 
 MAX_WORKERS = 64
 SOURCES = tuple(map(str, LOOPBACK))
@@ -92,12 +99,13 @@ class Server:
         if rules is None:
             if units is None or access is None:
                 raise TypeError("a server requires units and access, or rules")
+            _check_units(units)
             rule = _core.Rule(
                 units,
-                sources=list(sources),
+                sources=_listed("sources", sources, "['10.0.0.0/24', 'fd00::/64']"),
                 access=access,
-                functions=None if functions is None else list(functions),
-                deny=list(deny) if deny else None,
+                functions=None if functions is None else _listed("functions", functions, CODES),
+                deny=_listed("deny", deny, CODES) if deny else None,
             )
             rules = [rule]
             scheme, _ = _split(bind)
@@ -107,6 +115,9 @@ class Server:
             raise TypeError("a server requires units and access, or rules, not both")
         if not 1 <= index(workers) <= MAX_WORKERS:
             raise ValueError(f"workers is {workers}, allowed: 1 to {MAX_WORKERS}")
+        if identity is not None and not isinstance(identity, Identity):
+            allowed = "holdfast.server.Identity(vendor_name=…)"
+            raise TypeError(f"identity is {identity!r}, allowed: {allowed}")
         self._listener = _listener(bind, list(rules), options)
         self._identity = identity or Identity()
         self._workers = workers
@@ -168,6 +179,24 @@ class Server:
 
     def __exit__(self, *_: object) -> None:
         self.stop()
+
+
+def _check_units(units: object) -> None:
+    """Raises `TypeError` for what maps no unit ids to memories."""
+    if not isinstance(units, Mapping):
+        raise TypeError(f"units is {units!r}, allowed: a memory for each unit id, as in {UNITS}")
+    for unit, memory in units.items():
+        if as_integer(unit) is None:
+            raise TypeError(f"found the unit id {unit!r}, allowed: 0 to {MAX_UNIT}, as in {UNITS}")
+        if not isinstance(memory, SERVED):
+            raise TypeError(f"unit {unit} is {memory!r}, allowed: a holdfast.Memory")
+
+
+def _listed(name: str, given: Iterable[Item], example: str) -> list[Item]:
+    """Several items as a list. Raises `TypeError` for one item or a text."""
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise TypeError(f"{name} is {given!r}, allowed: a list, as in {example}")
+    return list(given)
 
 
 def _listener(bind: str, rules: Sequence[Rule], options: ServerOptions) -> _core.Listener:
