@@ -820,7 +820,8 @@ def test_a_late_reply_is_not_taken_for_that_of_a_call_that_waits(
     wire.until_long_enough(is_told_apart, "the late reply comes while the next call waits", SHORT)
 
 
-def test_a_device_that_is_always_late_gets_more_time(make: Make, dial: Dial) -> None:
+@pytest.mark.parametrize("kind", ["tcp", *LINES])
+def test_a_device_that_is_always_late_gets_more_time(kind: str, make: Make, dial: Dial) -> None:
     """One that does nothing else meanwhile: without more time, no request ever has its reply."""
     timeout = 0.1
 
@@ -828,7 +829,7 @@ def test_a_device_that_is_always_late_gets_more_time(make: Make, dial: Dial) -> 
         threading.Event().wait(1.4 * timeout)
         asked.answer()
 
-    client = connected(dial, make("tcp", good, then=slow).url, timeout)
+    client = connected(dial, make(kind, good, then=slow).url, timeout)
 
     def has_value() -> bool:
         try:
