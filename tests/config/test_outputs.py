@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ import pytest
 
 from holdfast.config import ConfigError, load
 from holdfast.config.fingerprint import files_of, fingerprint
+from support.config_folder import Folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -105,6 +107,71 @@ def test_what_is_written_to_own_files_is_no_change_of_the_configuration(tmp_path
     assert fingerprint(config) == before
     (tmp_path / "token").write_text("two and more")
     assert fingerprint(config) != before
+
+
+def csv(file: str, more: str = "") -> str:
+    return f"{{type: file, file: {file}, format: csv{more}}}"
+
+
+OTHER = "allowed: a different one"
+READ = "which the configuration reads, allowed: another file"
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (
+            f"audit: {{file: log}}\noutputs: {{o: {csv('./log')}}}",
+            f"3: outputs.o.file: found './log', which is the file of audit in line 2, {OTHER}",
+        ),
+        (
+            f"outputs: {{o: {csv('a')}, p: {csv('folder/../a')}}}",
+            "2: outputs.p.file: found 'folder/../a', which is the file of outputs.o in line 2, "
+            f"{OTHER}",
+        ),
+        (
+            f"outputs: {{o: {csv('a', ', buffer: {file: a}')}}}",
+            "2: outputs.o.buffer.file: found 'a', which is the file of outputs.o in line 2, "
+            f"{OTHER}",
+        ),
+        (
+            "memories: {m: {coils: 1, keep: {file: k}}, n: {coils: 1, keep: {file: k}}}\n"
+            "outputs: {o: {type: nats, servers: ['nats://a'], buffer: {file: k}}}",
+            "2: memories.m.keep.file: found 'k', which is the file of outputs.o.buffer in line 3, "
+            f"{OTHER}",
+        ),
+        ("audit: {file: p.yaml}", f"2: audit.file: found 'p.yaml', {READ}"),
+        (
+            f"outputs: {{o: {csv('t')}, i: {{type: influx, url: 'http://h/w', token_file: t}}}}",
+            f"2: outputs.o.file: found 't', {READ}",
+        ),
+    ],
+)
+def test_nothing_else_uses_a_file_that_is_written(tmp_path: Path, text: str, problem: str) -> None:
+    (tmp_path / "folder").mkdir()
+    assert Folder(tmp_path).problems(f"{DEVICE}{text}\n", t="token") == [f"p.yaml:{problem}"]
+
+
+def test_memories_may_share_a_file(tmp_path: Path) -> None:
+    kept = "{coils: 1, keep: {file: k}}"
+    Folder(tmp_path).config(f"{DEVICE}memories: {{m: {kept}, n: {kept}}}\n")
+
+
+PLACE = "allowed: a file in an existing folder"
+
+
+def test_files_of_outputs_have_a_folder_and_are_regular(tmp_path: Path) -> None:
+    kinds = {"none/a": "whose folder does not exist", ".": "which is a folder"}
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(tmp_path / "pipe")
+        kinds |= {"pipe": "which is a named pipe", os.devnull: "which is a device"}
+    for file, reason in kinds.items():
+        for output, key in (
+            (csv(file), "file"),
+            (csv("v", f", buffer: {{file: {file}}}"), "buffer.file"),
+        ):
+            [found] = Folder(tmp_path).problems(f"{DEVICE}outputs: {{o: {output}}}\n")
+            assert found == f"p.yaml:2: outputs.o.{key}: found {file!r}, {reason}, {PLACE}"
 
 
 NODE = "{type: sparkplug, url: 'mqtt://h', group: g, edge_node: e}"

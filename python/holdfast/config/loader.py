@@ -28,6 +28,7 @@ from holdfast.config.checks.outputs import check_outputs, warn_of_outputs
 from holdfast.config.checks.services import check_services
 from holdfast.config.checks.tags import check_tags
 from holdfast.config.checks.units import warn_of_routes
+from holdfast.config.checks.written_files import check_written_files
 from holdfast.config.models.root import Config
 from holdfast.config.tag_files.profiles import ProfileFiles
 from holdfast.config.text import yaml_document
@@ -82,7 +83,7 @@ def checked(document: yaml_document.Document, problems: list[Problem], folder: P
     profiles.read()
     expand_templates(report)
     take_out_former_keys(report)
-    config = build(report.document.data, folder, report)
+    config = build(report.document.data, folder, report).with_profile_files(profiles.files)
     scope = Scope(config, folder, report)
     _check(scope)
     problems = [*problems, *report.problems, *report.elsewhere]
@@ -90,7 +91,7 @@ def checked(document: yaml_document.Document, problems: list[Problem], folder: P
         raise ConfigError(document.file, problems)
     _warn(scope)
     warnings = sorted(report.warnings, key=lambda warning: warning.line or 0)
-    return config.with_profile_files(profiles.files).with_warnings(warnings)
+    return config.with_warnings(warnings)
 
 
 def _check(scope: Scope) -> None:
@@ -103,6 +104,7 @@ def _check(scope: Scope) -> None:
     check_devices(scope)
     check_outputs(scope)
     check_tags(scope)
+    check_written_files(scope)
     check_binds(scope)
     check_extras(scope)
 

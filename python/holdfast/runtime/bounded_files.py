@@ -202,10 +202,15 @@ def _check_stored(file: File) -> None:
 
 def unstored(file: File, mode: int) -> str:
     """Returns why a file can't be read again and again, or "" if it can."""
+    kind = special(file, mode)
+    return kind and f"it is {kind}, allowed: a regular file"
+
+
+def special(file: File, mode: int) -> str:
+    """Returns what a file is that is neither a regular one nor a folder, "" for these."""
     if stat.S_ISREG(mode) or stat.S_ISDIR(mode) or is_shell_pipe(file, mode):
         return ""
-    kind = next((kind for is_kind, kind in _KINDS if is_kind(mode)), "no file")
-    return f"it is {kind}, allowed: a regular file"
+    return next((kind for is_kind, kind in _KINDS if is_kind(mode)), "no file")
 
 
 def is_shell_pipe(file: File, mode: int) -> bool:

@@ -118,16 +118,22 @@ def unreadable(path: Path) -> str:
     return bounded_files.unstored(path, mode) or ("" if may_read else os.strerror(errno.EACCES))
 
 
-def unplaceable(file: Path) -> str:
-    """Why a file can't be in its folder, or "" if it can."""
+def unplaceable(file: Path, *, may_be_device: bool = False) -> str:
+    """Why a file can't be written in its folder, or "" if it can."""
     try:
         if not bounded_files.call(file, file.parent.is_dir):
             return "whose folder does not exist"
-        return "which is a folder" if bounded_files.call(file, file.is_dir) else ""
+        mode = bounded_files.call(file, file.stat).st_mode
+    except FileNotFoundError:
+        return ""
     except bounded_files.NotAnswered:
         raise
     except OSError as error:
         return f"which can't be used: {error.strerror}"
+    if stat.S_ISDIR(mode):
+        return "which is a folder"
+    kind = "" if may_be_device and stat.S_ISCHR(mode) else bounded_files.special(file, mode)
+    return kind and f"which is {kind}"
 
 
 def check_readable(

@@ -12,7 +12,6 @@ from holdfast.config.checks.common import (
     given,
     items,
     refuse_repeats,
-    unplaceable,
     until_invalid,
 )
 from holdfast.config.models.base import INVALID
@@ -152,12 +151,8 @@ def _check_files(scope: Scope) -> None:
         with until_invalid():
             if memory.keep is None:
                 continue
-            file, where = memory.keep.file, (*path, "keep", "file")
-            owner, other = first.setdefault(file, (path, memory))
-            found = f"found {show(scope.report.raw(where))}"
-            if reason := unplaceable(file):
-                scope.report.add(where, f"{found}, {reason}")
-            elif other.keep is not None and other.keep.sync != memory.keep.sync:
+            owner, other = first.setdefault(memory.keep.file, (path, memory))
+            if other.keep is not None and other.keep.sync != memory.keep.sync:
                 allowed = f"{other.keep.sync:g}, as {owner[-1]} has for the file"
                 message = f"found {memory.keep.sync:g}, allowed: {allowed}"
                 scope.report.add((*path, "keep", "sync"), message)

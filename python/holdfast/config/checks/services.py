@@ -9,7 +9,6 @@ from holdfast.config.checks.common import (
     check_name,
     given,
     items,
-    unplaceable,
     until_invalid,
 )
 from holdfast.config.checks.memories import check_grant, check_memory, layout
@@ -26,7 +25,6 @@ from holdfast.values.orders import DEFAULT_ORDER
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from pathlib import Path
 
     from holdfast.config.checks.common import Scope
     from holdfast.config.models.devices import DeviceConfig
@@ -183,8 +181,6 @@ def _check_scanner(scope: Scope, nats: NatsConfig) -> None:
 
 def _check_audit(scope: Scope, audit: AuditConfig) -> None:
     if given(audit, "file"):
-        if audit.file is not None:
-            _check_audit_file(scope, audit.file)
         return
     report = scope.report
     if not given(audit, "syslog") and audit.__dict__.get("journald") is not True:
@@ -194,13 +190,6 @@ def _check_audit(scope: Scope, audit: AuditConfig) -> None:
         report.add(("audit", "fail"), "found 'closed' without file, allowed: only with it")
     for key in given(audit, "max_bytes", "keep"):
         report.add_key(("audit", key), "found without file, allowed: only with it")
-
-
-def _check_audit_file(scope: Scope, file: Path) -> None:
-    path = ("audit", "file")
-    found = f"found {show(scope.report.raw(path))}"
-    if reason := unplaceable(file):
-        scope.report.add(path, f"{found}, {reason}, allowed: a file in an existing folder")
 
 
 def check_broker(path: KeyPath, settings: BrokerConfig, report: Report) -> None:
