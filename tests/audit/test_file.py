@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import stat
 import threading
 from hashlib import sha256
@@ -286,6 +287,13 @@ def test_two_processes_can_not_write_one_file(log: Path) -> None:
         opened(log)
     audit.close()
     opened(log).close()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+def test_a_pipe_without_a_reader_does_not_hold_up_the_start(log: Path) -> None:
+    os.mkfifo(log)
+    with pytest.raises(OSError, match="it is a named pipe, allowed: a regular file"):
+        opened(log)
 
 
 # Full disks

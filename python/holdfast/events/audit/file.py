@@ -6,6 +6,7 @@ anew, so `logrotate` works too. Only one process at a time can write a file.
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from typing import TYPE_CHECKING
@@ -106,6 +107,9 @@ class AuditFile:
         log_lines.problem("audit_not_rotated", file=str(self.file))
 
     def _open(self) -> None:
+        if _is_pipe(self.file):
+            # Without a reader, opening it would never end.
+            raise OSError(errno.EINVAL, "it is a named pipe, allowed: a regular file", self.file)
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
         self._descriptor = os.open(self.file, flags, FILE_MODE)
         status = os.fstat(self._descriptor)
@@ -166,6 +170,14 @@ class AuditFile:
         """Ends an incomplete last line with the next line that is written."""
         last = last_lines(self.file) if self._is_regular and self._size else []
         self._prefix = b"\n" if last and not last[-1].endswith(b"\n") else b""
+
+
+def _is_pipe(file: Path) -> bool:
+    """Whether a file is a pipe, other than one of the process itself, such as `/dev/stdout`."""
+    try:
+        return stat.S_ISFIFO(file.stat().st_mode) and not str(file).startswith(("/dev/", "/proc/"))
+    except FileNotFoundError:
+        return False
 
 
 def _identity(status: os.stat_result) -> tuple[int, int]:
