@@ -13,10 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from holdfast import _core
 from holdfast.adapters import Stop
+from holdfast.appliance.parts.listeners import GROUP
 from holdfast.net.addresses import joined
 from holdfast.net.http import port as ports
 from holdfast.net.http.port import Port
+from holdfast.runtime.text import told
 from support import web, wire
 from support.cli import RunCommand
 from support.running import endpoint
@@ -161,6 +164,32 @@ def test_the_port_of_a_listener_still_fails_the_start_and_frees_the_others(
         run(taken.configuration(scada=bind).replace(f'"{bind}"', "127.0.0.1:0"))
     with socket.create_server(taken.addresses["rest"]):
         pass
+
+
+@pytest.mark.parametrize(
+    ("listener", "refused", "hint"),
+    [
+        ("bind: '127.0.0.1:502'", "can't listen on 127.0.0.1:502", f" ({ports.PRIVILEGE})"),
+        ("bind: '127.0.0.1:1024'", "can't listen on 127.0.0.1:1024", ""),
+        ("serial: {device: /dev/ttyS9}", "can't open /dev/ttyS9", f" ({GROUP})"),
+    ],
+)
+def test_a_hint_says_what_a_listener_needs_that_may_not_be_opened(
+    listener: str, refused: str, hint: str, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(**_: object) -> None:
+        raise PermissionError(errno.EACCES, f"listener a: {refused}: Permission denied")
+
+    monkeypatch.setattr(_core, "Engine", refuse)
+    sources = "" if "serial" in listener else "sources: [127.0.0.1], "
+    rules = f"[{{{sources}units: {{1: plant}}, access: read-only}}]"
+    kind = "modbus-tcp" if sources else "modbus-rtu"
+    with pytest.raises(PermissionError) as caught:
+        run(
+            "memories: {plant: {coils: 8}}\n"
+            f"listeners: {{a: {{type: {kind}, {listener}, rules: {rules}}}}}"
+        )
+    assert told(caught.value) == f"listener a: {refused}: Permission denied{hint}"
 
 
 def test_the_greeting_names_the_port_and_the_log_the_reason(taken: Taken, tmp_path: Path) -> None:

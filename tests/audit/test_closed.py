@@ -320,3 +320,11 @@ def test_a_file_that_is_full_does_not_seem_to_work_before_it_does(
     audit.close()
     assert writes(log) == [{"lost": 0}, {"number": 2}]
     assert verify([log]).lost == 0
+
+
+def test_a_file_that_can_not_be_opened_is_named_with_its_setting(run: Run, tmp_path: Path) -> None:
+    file = tmp_path / "audit.log"
+    audit = Audit(file, max_bytes=65536, keep=1)
+    with pytest.raises(OSError, match=f"^audit.file: {file}: another process writes this audit"):
+        run(CONFIGURATION + CLOSED)
+    audit.close()

@@ -56,6 +56,12 @@ def sentence(text: str) -> str:
     return text if not text or text.endswith((".", "?", "!")) else f"{text}."
 
 
+def told(error: OSError) -> str:
+    """An error of the system with its file, and without its number."""
+    text = error.strerror or str(error)
+    return text if error.filename is None else f"{error.filename}: {text}"
+
+
 def error_text(number: int) -> str:
     """The system's text for an error number."""
     if sys.platform == "win32" and number >= _FIRST_OF_WINSOCK:

@@ -15,6 +15,7 @@ from holdfast.events.audit import Audit, Copies, Journal, Syslog
 from holdfast.events.audit.refusal_summaries import Refusals
 from holdfast.runtime.heartbeat import PERIOD_S, Heartbeat
 from holdfast.runtime.standstill import WallClock
+from holdfast.runtime.text import told
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -55,13 +56,16 @@ class AuditLog(Part):
         settings = plan.config.audit
         if settings is None:
             return
-        self.log = log = Audit(
-            settings.file,
-            max_bytes=settings.max_bytes,
-            keep=settings.keep,
-            fail_closed=settings.fail == "closed",
-            copies=_copies(settings),
-        )
+        try:
+            self.log = log = Audit(
+                settings.file,
+                max_bytes=settings.max_bytes,
+                keep=settings.keep,
+                fail_closed=settings.fail == "closed",
+                copies=_copies(settings),
+            )
+        except OSError as error:
+            raise OSError(f"audit.file: {told(error)}") from error
         self._record(log, "start")
         self.closing.callback(log.close)
         self.closing.callback(self._record, log, "stop")

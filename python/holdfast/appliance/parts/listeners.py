@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,6 +14,7 @@ from holdfast.appliance.parts.part import Part
 from holdfast.config.models.listeners import ModbusAsciiListener, ModbusRtuListener, tls_of
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
+from holdfast.net.http.port import explained
 from holdfast.server.fork import close_in_children
 
 if TYPE_CHECKING:
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
     from holdfast.config.models.listeners import Listener
     from holdfast.config.models.services import GatewayConfig, MetricsConfig, RestConfig
     from holdfast.types import ThreadHeartbeat
+
+GROUP = "add the user to the group of the device, on Linux mostly dialout"
 
 # Events that are not rate-limited. All others are, as warnings; `secured` is info.
 LEVELS = {
@@ -72,11 +76,12 @@ class Listeners(Part):
     def open(self, plan: Plan) -> None:
         """Binds all listeners, and serves."""
         audit = self.config.audit
-        self.engine = _core.Engine(
-            **_settings(plan),
-            workers=self.config.workers,
-            audit=None if audit is None else audit.fail,
-        )
+        with _advising(plan.config):
+            self.engine = _core.Engine(
+                **_settings(plan),
+                workers=self.config.workers,
+                audit=None if audit is None else audit.fail,
+            )
         close_in_children(self.engine)
         self.closing.callback(self._log_last_events)
         # Answers the requests already received.
@@ -85,7 +90,8 @@ class Listeners(Part):
 
     def prepare(self, plan: Plan) -> Callable[[], None]:
         """Takes over all listeners, or refuses all. Every other part is prepared by then."""
-        self.engine.reload(**_settings(plan))
+        with _advising(plan.config):
+            self.engine.reload(**_settings(plan))
         return super().prepare(plan)
 
     def log_events(self, timeout_s: float) -> None:
@@ -151,6 +157,24 @@ class Listeners(Part):
         while (event := self.engine.next_event(0)) is not None:
             _log_event(*event)
         log_lines.tell_held_back(all_of_them=True)
+
+
+@contextmanager
+def _advising(config: Config) -> Iterator[None]:
+    """Adds what a listener needs that may not be opened; the text of the error begins with it."""
+    try:
+        yield
+    except PermissionError as error:
+        text = error.strerror or ""
+        name = text.removeprefix("listener ").partition(":")[0]
+        settings = config.listeners.get(name)
+        if settings is None:
+            raise
+        if isinstance(settings, ModbusRtuListener | ModbusAsciiListener):
+            text = f"{text} ({GROUP})"
+        else:
+            text = explained(error, settings.bind.port)
+        raise PermissionError(error.errno, text) from error
 
 
 def _settings(plan: Plan) -> dict[str, Any]:

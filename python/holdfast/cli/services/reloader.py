@@ -21,8 +21,8 @@ from holdfast.config import ConfigError
 from holdfast.config.fingerprint import files_of
 from holdfast.config.loader import unanswered
 from holdfast.events import log_lines
-from holdfast.net.http.port import explained
 from holdfast.runtime.bounded_files import TIMEOUT_MS, FileWork, NotAnswered, Unreadable, answered
+from holdfast.runtime.text import told
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -217,7 +217,7 @@ class Reloader:
         except (Unreadable, UnknownAdapter, ValueError) as error:
             problems = [self._placed(str(error))]
         except OSError as error:
-            problems = [self._placed(explained(error))]
+            problems = [self._placed(told(error))]
         except ReloadIncomplete as error:
             log_lines.problem("reload_incomplete")
             return {"incomplete": self._placed(f"internal error: {error}")}

@@ -36,10 +36,10 @@ from holdfast.config.unit_rights import unit_rights
 from holdfast.config.values.scanner_settings import written_pollable
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined, reachable
-from holdfast.net.http.port import explained
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.runtime.bounded_files import Unreadable
 from holdfast.runtime.interpreter import spare_what_stays, yield_interpreter
+from holdfast.runtime.text import told
 from holdfast.types import BIT_AREAS, REGISTER_AREAS
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def serve(
     except Unreadable as error:
         fail(error)
     except OSError as error:
-        fail(explained(error))
+        fail(told(error))
     except UnknownAdapter as error:
         click.echo(f"{named}: {error}", err=True)
         sys.exit(ExitCode.WRONG)

@@ -27,6 +27,7 @@ MAX_PAUSE_S = 10.0
 LOG_INTERVAL_S = 60.0
 """Seconds after which a failure is logged again, if its reason is still the same."""
 
+FIRST_WITHOUT_PRIVILEGE = 1024
 PRIVILEGE = "ports below 1024 require a privilege, on Linux CAP_NET_BIND_SERVICE"
 
 
@@ -38,10 +39,11 @@ def listen(host: str, port: int) -> ListeningSocket:
         raise OSError(str(error)) from None
 
 
-def explained(error: OSError) -> str:
+def explained(error: OSError, port: int) -> str:
     """Returns why a port can't be bound, with a hint about privileges."""
     text = error.strerror or str(error)
-    return f"{text} ({PRIVILEGE})" if error.errno == errno.EACCES else text
+    is_privileged = error.errno == errno.EACCES and port < FIRST_WITHOUT_PRIVILEGE
+    return f"{text} ({PRIVILEGE})" if is_privileged else text
 
 
 class Port:
@@ -107,14 +109,16 @@ class Port:
             self._open()
         except OSError as error:
             at = self.bind_address
-            raise OSError(f"{self.name}: can't listen on {at}: {explained(error)}") from error
+            raise OSError(
+                f"{self.name}: can't listen on {at}: {explained(error, self._port)}"
+            ) from error
 
     def bind(self) -> bool:
         """Tries once to bind the port. A failure is logged. Returns whether the port is bound."""
         try:
             self._open()
         except OSError as error:
-            self._note(explained(error))
+            self._note(explained(error, self._port))
             return False
         return True
 
