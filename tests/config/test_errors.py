@@ -497,6 +497,8 @@ def test_initial_values_from_yaml_are_checked(folder: Folder, values: str, probl
          f"1: found a mapping with one unknown key, allowed: a mapping with the keys {TOP}"),
         ("a: 1\n b: 2", "2: not YAML: a `:` where no key can be: indented further than the keys "
          "above it, or a text with `: `, which needs quotes"),
+        ('a: "D:\\data"', "1: not YAML: found unknown escape character 'd'; in double quotes, "
+         "\\ begins an escape: write a path in single quotes, or with /"),
         ("a:\n\tb: 1", "2: not YAML: a tab indents this line, allowed: spaces"),
         ("a:\n    b: 1\n  c: 2", "3: not YAML: indented unlike the keys above it, allowed: keys of "
          "one mapping begin in the same column"),

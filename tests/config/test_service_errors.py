@@ -284,7 +284,8 @@ def test_a_topic_filter_that_mqtt_allows_is_right(folder: Folder, topic: str) ->
         ("  client", "  username: a\n  password_file: /\n  client",
          "7: password_file: found '/', which can't be read: Is a directory"),
         ("  client", '  username: a\n  password_file: "\\0"\n  client',
-         "7: password_file: found '\\x00', allowed: the path of a file"),
+         "7: password_file: found '\\x00', allowed: the path of a file, without '\\x00'; write a "
+         "path in single quotes, or with /"),
         ("  client", "  tls: {ca_file: none.pem}\n  client",
          "6: tls.ca_file: found 'none.pem', which can't be read: No such file or directory"),
         ("  client", "  tls: {cert_file: p.yaml}\n  client",
@@ -378,6 +379,8 @@ def test_a_topic_is_subscribed_once(folder: Folder) -> None:
          "whose folder does not exist, allowed: a file in an existing folder"),
         ("audit.log", ".", "7: audit.file: found '.', which is a folder, "
          "allowed: a file in an existing folder"),
+        ("audit.log", '"today\\new.log"', "7: audit.file: found 'today\\new.log', allowed: the "
+         "path of a file, without '\\n'; write a path in single quotes, or with /"),
         ("audit.log", "audit.log, max_bytes: 65535",
          "7: audit.max_bytes: found 65535, allowed: an integer of at least 65536"),
         ("audit.log", "audit.log, keep: 1001",

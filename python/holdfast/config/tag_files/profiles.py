@@ -10,7 +10,7 @@ from holdfast.config.tag_files.read import KINDS, load_profile
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError
 from holdfast.config.text.raw_access import entries, mapping
-from holdfast.config.values.scalars import NAME_FORM, is_name
+from holdfast.config.values.scalars import NAME_FORM, is_name, path_of_file
 from holdfast.runtime.text import either
 
 if TYPE_CHECKING:
@@ -43,8 +43,13 @@ class ProfileFiles:
         self.report.document = replace(document, data={**data, "profiles": profiles})
 
     def _read(self, path: KeyPath, file: object, profiles: dict[str, Any]) -> None:
-        if not isinstance(file, str) or not file.lower().endswith(KINDS) or "\0" in file:
+        if not isinstance(file, str) or not file.lower().endswith(KINDS):
             self.report.add(path, f"found {show(file)}, allowed: a file {either(KINDS)}")
+            return
+        try:
+            path_of_file(file)
+        except ValueError as error:
+            self.report.add(path, str(error))
             return
         where = self.folder / file
         if not is_name(where.stem):

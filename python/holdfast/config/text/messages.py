@@ -6,6 +6,9 @@ from holdfast.runtime.text import clip
 
 MAX_SHOWN = 60
 
+PATH_QUOTES = "write a path in single quotes, or with /"
+"""What helps against `\\` in double quotes, where it begins an escape."""
+
 
 def show(value: object) -> str:
     """A value for a message: scalars as they are, text in quotes, a mapping or list by its kind."""

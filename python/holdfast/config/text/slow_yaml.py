@@ -19,6 +19,7 @@ from ruamel.yaml.events import (
     SequenceStartEvent,
 )
 
+from holdfast.config.text.messages import PATH_QUOTES
 from holdfast.config.text.problems import ConfigError, Problem
 
 if TYPE_CHECKING:
@@ -51,6 +52,8 @@ def _syntax(error: MarkedYAMLError, file: str) -> Problem:
         reason = PLAIN_REASONS[reason]
     elif error.context and start and mark and start.line != mark.line:
         reason += f", {error.context} that starts in line {start.line + 1}"
+    if reason.startswith(("found unknown escape", "expected escape")):
+        reason += f"; in double quotes, \\ begins an escape: {PATH_QUOTES}"
     return Problem(file, line, column, "", f"not YAML: {reason}")
 
 

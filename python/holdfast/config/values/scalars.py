@@ -37,7 +37,7 @@ from holdfast.client.url import (
     parse_receiver,
     receiver_in_folder,
 )
-from holdfast.config.text.messages import shape, show
+from holdfast.config.text.messages import PATH_QUOTES, shape, show
 from holdfast.config.values.allow_entries import parse_allowed
 from holdfast.config.values.host_names import parse_host_name
 from holdfast.config.values.ip_addresses import Bind, parse_bind, parse_peer, parse_source
@@ -195,9 +195,18 @@ def _folder(info: ValidationInfo) -> Path:
 def _in_folder(value: object, info: ValidationInfo) -> object:
     if not isinstance(value, str):
         return value
-    if not value or "\0" in value:
+    return _folder(info) / path_of_file(value)
+
+
+def path_of_file(value: str) -> str:
+    """Checks the path of a file. Raises `ValueError` for one that no file has, or a wrong quote."""
+    if not value:
         raise ValueError(f"found {show(value)}, allowed: the path of a file")
-    return _folder(info) / value
+    for character in value:
+        if unicodedata.category(character) == "Cc":
+            allowed = f"allowed: the path of a file, without {character!r}; {PATH_QUOTES}"
+            raise ValueError(f"found {show(value)}, {allowed}")
+    return value
 
 
 def _key_of(least: int, most: int, note: str = "") -> Callable[[object], UnitKey]:
