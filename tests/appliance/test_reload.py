@@ -20,7 +20,13 @@ import holdfast
 from holdfast import _core, raw_ingest
 from holdfast.appliance import Appliance
 from holdfast.appliance.parts.mirrors import Mirrors
-from holdfast.appliance.reload import ReloadIncomplete, ReloadRefused, restart_reasons
+from holdfast.appliance.reload import (
+    ReloadIncomplete,
+    ReloadRefused,
+    differences,
+    fingerprints,
+    restart_reasons,
+)
 from holdfast.config import load
 from support import web, wire
 from support.certificates import Certificates, Issued, named
@@ -871,3 +877,18 @@ def test_an_internal_error_is_not_told_as_a_refusal(
     with pytest.raises(ReloadIncomplete, match="KeyError: 'pump'"):
         rig.reload(plant(listeners={"scada": less}))
     assert connect(rig.address()).ask(WRITE) == FORBIDDEN
+
+
+def test_a_tag_that_only_a_topic_uses_changes_mqtt(rig: Rig) -> None:
+    topic = {"topic": "a", "memory": "plant", "profile": "tank", "name": "level"}
+    mqtt = {"url": "mqtt://127.0.0.1:1", "client_id": "a", "map": [topic]}
+
+    def prints(address: int, other: int = 0) -> dict[str, str]:
+        tags = {
+            name: {"area": "holding_registers", "address": at}
+            for name, at in (("level", address), ("other", other))
+        }
+        return fingerprints(rig.load(plant(mqtt=mqtt, profiles={"tank": {"tags": tags}})))
+
+    assert differences(prints(1), prints(2)) == ["mqtt"]
+    assert differences(prints(1), prints(1, other=2)) == []

@@ -100,6 +100,15 @@ def test_a_wrong_configuration_changes_nothing_and_every_problem_is_printed(
     assert log.count("error reload_refused problem=") == 3
 
 
+def test_initial_values_are_said_to_wait_for_the_next_start(running: Running) -> None:
+    text = running.file.read_text()
+    (running.file.parent / "values.csv").write_text("holding_registers,1,5\n")
+    running.file.write_text(text.replace("{holding_", "{initial: values.csv, holding_"))
+    told = "Reloaded: memories.plant (initial values at the next start)"
+    assert done("reload", str(running.file)) == [told]
+    assert "info reloaded changed=memories.plant sha256=" in running.end()
+
+
 def test_sighup_reloads_also_that_of_a_closed_terminal(running: Running) -> None:
     with wire.Connection(running.address) as client:
         running.write(access="read-only")
@@ -114,7 +123,7 @@ def test_a_watched_file_reloads_when_another_one_takes_its_place(
     watch = "reload: on-change"
     with wire.Connection(running.address) as client:
         running.write(more=watch)
-        assert done("reload", str(running.file)) == ["Reloaded: nothing has changed"]
+        assert done("reload", str(running.file)) == ["Reloaded: reload"]
         running.replace(access="read-only", more=watch)
         wire.until(lambda: client.ask(WRITE) == FORBIDDEN, "the file was noticed")
         running.replace(access="wrong", more=watch)

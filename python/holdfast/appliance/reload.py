@@ -30,7 +30,7 @@ class ReloadIncomplete(Exception):
     """An internal error after a part of the configuration has changed. Requires a restart."""
 
 
-SINGLE = ("identity", "rest", "mqtt", "nats", "gateway", "metrics", "log")
+SINGLE = ("identity", "rest", "mqtt", "nats", "gateway", "metrics", "log", "reload")
 OF_ALL_PROFILES = ("nats", "gateway")
 """Services that know the tags of every profile."""
 SEVERAL = ("memories", "listeners", "devices", "links", "outputs", "adapters")
@@ -57,12 +57,24 @@ def _fingerprints(config: Config) -> dict[str, str]:
     for key in OF_ALL_PROFILES:
         if getattr(config, key) is not None:
             found[key] += fingerprint(config.profiles)
+    if config.mqtt is not None:
+        found["mqtt"] += fingerprint(list(config.mapped().items()))
     return found
 
 
 def differences(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """The keys whose fingerprints differ, in order."""
     return [key for key in sorted({*before, *now}) if before.get(key) != now.get(key)]
+
+
+def described(changed: list[str], before: Config, now: Config) -> list[str]:
+    """The keys that have changed, with what takes effect later."""
+    later = {
+        f"memories.{name}"
+        for name, memory in now.memories.items()
+        if name in before.memories and memory.initial_values != before.memories[name].initial_values
+    }
+    return [f"{key} (initial values at the next start)" if key in later else key for key in changed]
 
 
 def restart_reasons(before: Config, now: Config) -> Iterator[str]:

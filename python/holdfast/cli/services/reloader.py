@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from holdfast.adapters.plugins import UnknownAdapter
-from holdfast.appliance.reload import ReloadIncomplete, ReloadRefused
+from holdfast.appliance.reload import ReloadIncomplete, ReloadRefused, described
 from holdfast.cli.services.file_snapshot import FileSnapshot
 from holdfast.cli.shell_command import shell_command
 from holdfast.config import ConfigError
@@ -203,6 +203,7 @@ class Reloader:
                 raise ValueError(f"internal error: {read.error!r}") from read.error
             assert read.config is not None, "without an error, there is a configuration"
             config = read.config
+            before = self._appliance.config
             changed = self._appliance.reload(config)
         except ConfigError as error:
             problems = [str(problem) for problem in error.problems]
@@ -233,7 +234,7 @@ class Reloader:
             changed=" ".join(changed) or "nothing",
             sha256=config.sha256 or "-",
         )
-        return {"changed": changed, "sha256": config.sha256}
+        return {"changed": described(changed, before, config), "sha256": config.sha256}
 
     def _placed(self, problem: str) -> str:
         return problem if self._file is None else f"{self._file}: {problem}"
