@@ -55,7 +55,7 @@ DEVICE = "devices: {a: {url: tcp://a, tags: {x: {area: coils, address: 1}}, inte
         ),
         (
             "{type: influx, url: 'http://h/w', token_file: t}",
-            "o.token_file: found 't', which can't be read",
+            "o.token_file: found text of 1 characters, which can't be read",
         ),
         ("{type: nats, servers: []}", "o.servers: found an empty list"),
         ("{type: nats, servers: ['http://a']}", "o.servers[0]: "),

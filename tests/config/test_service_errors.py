@@ -284,8 +284,13 @@ def test_a_topic_filter_that_mqtt_allows_is_right(folder: Folder, topic: str) ->
         ("  client", "  username: a\n  password_file: /\n  client",
          "7: password_file: found '/', which can't be read: Is a directory"),
         ("  client", '  username: a\n  password_file: "\\0"\n  client',
-         "7: password_file: found '\\x00', allowed: the path of a file, without '\\x00'; write a "
-         "path in single quotes, or with /"),
+         "7: password_file: found text of 1 characters, allowed: the path of a file, without "
+         "'\\x00'; write a path in single quotes, or with /"),
+        ("  client", "  username: a\n  password_file: hunter2\n  client", "7: password_file: found "
+         "text of 7 characters, which can't be read: No such file or directory"),
+        ("  client", "  username: a\n  password_file: |\n    hunter2\n  client",
+         "8: password_file: found text of 8 characters, allowed: the path of a file, "
+         "without '\\n'; write a path in single quotes, or with /"),
         ("  client", "  tls: {ca_file: none.pem}\n  client",
          "6: tls.ca_file: found 'none.pem', which can't be read: No such file or directory"),
         ("  client", "  tls: {cert_file: p.yaml}\n  client",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.config.checks.common import check_readable, given, refuse_repeats, until_invalid
+from holdfast.config.text.messages import show_file
 from holdfast.net.tls import alone
 
 if TYPE_CHECKING:
@@ -17,12 +18,16 @@ if TYPE_CHECKING:
 CLIENT_FILES = ("ca_file", "cert_file", "key_file")
 SERVER_FILES = (*CLIENT_FILES, "key_passphrase_file", "client_ca_file", "crl_file")
 
+SECRETS = ("password_file", "token_file", "credentials_file", "key_passphrase_file")
+
 
 def check_files(path: KeyPath, settings: Model, keys: tuple[str, ...], report: Report) -> None:
     """Reports files that can't be read, of those of the keys that are given."""
     for key in given(settings, *keys):
         with until_invalid():
-            check_readable((*path, key), getattr(settings, key), report)
+            where = (*path, key)
+            shown = show_file(report.raw(where)) if key in SECRETS else None
+            check_readable(where, getattr(settings, key), report, shown=shown)
 
 
 def check_client_tls(path: KeyPath, tls: ClientTlsConfig | None, report: Report) -> None:

@@ -23,6 +23,12 @@ def show(value: object) -> str:
     return clip(repr(value), MAX_SHOWN)
 
 
+def show_file(value: object) -> str:
+    """The name of a file that has a secret. Text that is no path may be the secret itself."""
+    is_path = isinstance(value, str) and len(value) <= MAX_SHOWN and set("./\\") & set(value)
+    return show(value) if is_path else shape(value)
+
+
 def shape(value: object) -> str:
     """The kind of a value that may be a secret."""
     if isinstance(value, str):

@@ -37,7 +37,7 @@ from holdfast.client.url import (
     parse_receiver,
     receiver_in_folder,
 )
-from holdfast.config.text.messages import PATH_QUOTES, shape, show
+from holdfast.config.text.messages import PATH_QUOTES, shape, show, show_file
 from holdfast.config.values.allow_entries import parse_allowed
 from holdfast.config.values.host_names import parse_host_name
 from holdfast.config.values.ip_addresses import Bind, parse_bind, parse_peer, parse_source
@@ -205,7 +205,7 @@ def path_of_file(value: str) -> str:
     for character in value:
         if unicodedata.category(character) == "Cc":
             allowed = f"allowed: the path of a file, without {character!r}; {PATH_QUOTES}"
-            raise ValueError(f"found {show(value)}, {allowed}")
+            raise ValueError(f"found {show_file(value)}, {allowed}")
     return value
 
 
