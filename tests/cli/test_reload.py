@@ -158,9 +158,14 @@ def test_sessions_are_listed_and_ended(running: Running) -> None:
 
 
 def test_without_an_appliance_both_say_so(tmp_path: Path) -> None:
+    file, none = tmp_path / "other.yaml", "no appliance of this user runs it on this machine"
     for command in ("reload", "sessions"):
-        (line,) = failure(command, str(tmp_path / "other.yaml"))
-        assert line.startswith(f"holdfast: {tmp_path}/other.yaml: no appliance of this user runs")
+        (line,) = failure(command, str(file))
+        assert line.startswith(f"holdfast: {file}: no such file, and {none}")
+        file.touch()
+        (line,) = failure(command, str(file))
+        assert line.startswith(f"holdfast: {file}: {none}")
+        file.unlink()
 
 
 @pytest.mark.usefixtures("running")

@@ -522,6 +522,11 @@ def test_what_is_no_configuration_is_told_so(
     assert folder.problems(text) == [f"p.yaml:{problem}"]
 
 
+def test_a_section_in_capitals_is_one_of_a_configuration(folder: Folder) -> None:
+    first, *_ = folder.problems("GATEWAY:\n")
+    assert first == f"p.yaml:1: GATEWAY: unknown key, allowed: {TOP}; did you mean 'gateway'?"
+
+
 def test_values_without_end_are_refused(folder: Folder) -> None:
     endless = "[" * sys.getrecursionlimit()
     assert folder.problems(endless) == ["p.yaml: not a configuration: nested too deeply"]

@@ -140,7 +140,10 @@ def _answered(file: Path, request: bytes) -> dict[str, Any] | NotRunning:
                 return NotRunning(f"{file}: the appliance ended the connection")
         return answer
     tried = ", ".join(_addresses(file))
-    return NotRunning(f"{file}: no appliance of this user runs it on this machine (tried {tried})")
+    # An appliance can run a file that is gone, so this is looked at last.
+    missing = "" if file.exists() else "no such file, and "
+    none = f"{missing}no appliance of this user runs it on this machine"
+    return NotRunning(f"{file}: {none} (tried {tried})")
 
 
 def _listen(address: str) -> Listener:

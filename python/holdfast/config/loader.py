@@ -133,7 +133,7 @@ def _foreign(data: object) -> str | None:
     from difflib import get_close_matches
 
     known = known_keys((), None)
-    if any(get_close_matches(str(key), known, cutoff=0.8) for key in data):
+    if any(get_close_matches(str(key).lower(), known, cutoff=0.8) for key in data):
         return None
     unknown = "one unknown key" if len(data) == 1 else f"{len(data)} unknown keys"
     return f"a mapping with {unknown}"
