@@ -107,6 +107,7 @@ def test_a_replay_that_is_interrupted_fails(
         """Reads a log whose end never comes."""
 
         ended = False
+        sequence = 0
 
         def __init__(self, *_arguments: object, **_more: object) -> None:
             pass

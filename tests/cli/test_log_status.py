@@ -10,7 +10,7 @@ import pytest
 from holdfast.cli.appliance import log_status
 from support import wire
 from support.brokers import NatsServer, free_port
-from support.cli import RunCommand, answer, invoke
+from support.cli import RunCommand, ServingCommand, answer, invoke
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -101,3 +101,23 @@ def test_the_nodes_of_a_log_are_shown(node: RunCommand, server: NatsServer, tmp_
     assert node.end(signal.SIGTERM)[0] == 0
     result = invoke("log", "status", file)
     assert (result.exit_code, result.stdout) == (1, "")
+
+
+def test_a_log_is_followed_on_after_its_server_was_frozen(
+    node: RunCommand, server: NatsServer, tmp_path: Path
+) -> None:
+    writes = [bytes.fromhex(f"06000300{value}") for value in ("2a", "2b")]
+    with wire.Connection(node.wait_until_it_serves()) as connection:
+        following = ServingCommand("log", "replay", str(tmp_path / "plant.yaml"), "--follow")
+        printed, told = following.process.stdout, following.process.stderr
+        assert printed is not None
+        assert told is not None
+        assert connection.ask(writes[0]) == writes[0]
+        assert any("holding_registers 3: 42" in line for line in iter(printed.readline, ""))
+        server.freeze()
+        assert told.readline().startswith("holdfast: logs.site: no contact, retried: ")
+        server.thaw()
+        wire.until(lambda: connection.ask(writes[1]) == writes[1], "the log takes writes again")
+        later = next(line for line in iter(printed.readline, "") if "holding_" in line)
+        assert later.endswith("holding_registers 3: 43\n")
+        assert following.end(signal.SIGTERM)[0] == 0

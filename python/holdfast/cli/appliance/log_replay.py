@@ -6,6 +6,7 @@ import json
 import time
 from contextlib import ExitStack
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ from holdfast.runtime.text import listing
 from holdfast.server import Server
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from holdfast.config.values.ip_addresses import Bind
     from holdfast.types import LogRecord
@@ -87,7 +88,8 @@ def replay(
         try:
             sequence, time_ns = _end(to)
             running.enter_context(log_servers.running(log, settings))
-            replaying = _core.LogReader(
+            opened = partial(
+                _core.LogReader,
                 log,
                 servers(settings),
                 memories,
@@ -97,9 +99,22 @@ def replay(
                 connect_timeout=ANSWERING / len(settings.servers),
                 **credentials(settings),
             )
+            replaying = opened()
+            last = replaying.sequence
             while not signals.received and not replaying.ended:
-                record = replaying.next(SIGNAL_INTERVAL_S)
-                if record is not None and follow:
+                try:
+                    record = replaying.next(SIGNAL_INTERVAL_S)
+                except _core.LogError as error:
+                    if not follow or not _passes(error):
+                        raise
+                    reason = str(error).partition(": ")[2]
+                    click.echo(f"holdfast: logs.{log}: no contact, retried: {reason}", err=True)
+                    replaying = _reopened(opened, signals) or replaying
+                    last = _noted(replaying, last)
+                    continue
+                # After an outage, what was shown before it comes again.
+                if record is not None and follow and record["sequence"] > last:
+                    last = record["sequence"]
                     click.echo(_line(file, record, as_json=as_json))
             if not follow:
                 if not replaying.ended:
@@ -112,6 +127,31 @@ def replay(
             fail(f"logs.{log}: {error}{where}", reason="connection" if where else "failed")
     if bind is not None and not signals.received:
         _serve(memories, bind, signals, as_json=as_json)
+
+
+def _passes(error: _core.LogError) -> bool:
+    """Whether servers can't be reached, as opposed to a log that can't be followed."""
+    return bool(error.kind == "no_connection")
+
+
+def _reopened(opened: Callable[[], _core.LogReader], signals: Signals) -> _core.LogReader | None:
+    """The log from its newest snapshot on, as soon as its servers answer; `None` at a signal."""
+    while not signals.received:
+        try:
+            return opened()
+        except _core.LogError as error:
+            if not _passes(error):
+                raise
+            time.sleep(SIGNAL_INTERVAL_S)
+    return None
+
+
+def _noted(replaying: _core.LogReader, last: int) -> int:
+    """Notes steps that only a newer snapshot has. Returns the last that is not to be shown."""
+    if replaying.sequence > last:
+        missing = f"steps {last + 1} to {replaying.sequence} are not shown"
+        click.echo(f"holdfast: {missing}: the log has a newer snapshot", err=True)
+    return max(replaying.sequence, last)
 
 
 def _end(to: str | None) -> tuple[int | None, int | None]:
