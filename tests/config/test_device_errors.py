@@ -92,6 +92,9 @@ def test_a_right_device_is_right(folder: Folder) -> None:
         ("tcp://10.0.0.9", "http://a", "5: url: 'http://a' is not the URL of a device, allowed: "
          f"{URLS}"),
         ("tcp://10.0.0.9", "tcp://a:0", "5: url: 'tcp://a:0': port 0, allowed: 1 to 65535"),
+        ("tcp://10.0.0.9", "tcp://10.0.0.09", "5: url: 'tcp://10.0.0.09': the host is '10.0.0.09', "
+         "allowed: a host name, an IPv4 address of four numbers without leading zeros, or an IPv6 "
+         "address in brackets"),
         ("tcp://10.0.0.9", "tls://plc?ca=none.pem",
          "5: url: found ca='none.pem', which can't be read: No such file or directory"),
         ("tcp://10.0.0.9", "tls://plc?cert=p.yaml&key=/",
@@ -196,7 +199,7 @@ def test_a_right_device_is_right(folder: Folder) -> None:
         ("    status", "    forward: [{url: 'raw://u@a:1', unit: 1}]\n    status",
          f"13: forward[0].url: found 'raw://u@a:1', allowed: {RECEIVER}"),
         ("    status", "    forward: [{url: 'raw://a:0', unit: 1}]\n    status",
-         f"13: forward[0].url: found 'raw://a:0', allowed: {RECEIVER}"),
+         "13: forward[0].url: 'raw://a:0': port 0, allowed: 1 to 65535"),
         ("    status", "    forward: [{url: 'raw://a:1'}]\n    status",
          f"13: forward[0].unit: missing with format v1, allowed: {WORD}"),
         ("    status", "    forward: [{url: 'raw://a:1', format: crc}]\n    status",

@@ -46,7 +46,10 @@ OTHER = "a name other than rest, mqtt, nats, gateway or metrics"
 SOME = "a list with at least one entry"
 DIGEST = "the SHA-256 of the token, 64 hexadecimal digits"
 URL = "mqtt://host:port or mqtts://host:port"
-HOST = "a host name or an address, IPv6 in brackets, and a port from 1 to 65535"
+HOST = (
+    "a host name, an IPv4 address of four numbers without leading zeros, or an IPv6 address in "
+    "brackets, and a port from 1 to 65535"
+)
 
 
 @pytest.fixture
@@ -221,6 +224,8 @@ def test_tokens_differ_in_name_and_hash(folder: Folder) -> None:
         ("mqtt://bro ker", f"found an invalid host or port, allowed: {HOST}"),
         ("mqtt://[fd00::g]", f"found an invalid host or port, allowed: {HOST}"),
         ("mqtt://fd00::1", f"found an invalid host or port, allowed: {HOST}"),
+        ("mqtt://10.0.0.010", f"found an invalid host or port, allowed: {HOST}"),
+        ("mqtt://broker:+1", f"found an invalid host or port, allowed: {HOST}"),
         ("mqtt://user:secret@broker", f"found a user in the URL, allowed: {URL}; set username "
          "and password_file instead"),
         ("mqtt://user:se/cr#et@broker", f"found a user in the URL, allowed: {URL}; "

@@ -532,7 +532,10 @@ def test_urls_of_receivers(url: str, found: Receiver) -> None:
     ("url", "wrong"),
     [
         ("raw+tls://plant", "allowed: raw://10.0.2.9:9000 or"),
-        ("raw+tls://plant:0", "allowed: raw://10.0.2.9:9000 or"),
+        ("raw+tls://plant:0", "port 0, allowed: 1 to 65535"),
+        ("raw+tls://plant:", "port '', allowed: 1 to 65535"),
+        ("raw://10.0.2.09:9000", "the host is '10.0.2.09', allowed: a host name"),
+        ("raw://plant:9000 ", "allowed: raw://10.0.2.9:9000 or"),
         ("raw+tls://plant:9000/x?ca=a", "allowed: raw://10.0.2.9:9000 or"),
         ("raw+tls://u@plant:9000", "allowed: raw://10.0.2.9:9000 or"),
         ("tls://plant:9000", "allowed: raw://10.0.2.9:9000 or"),

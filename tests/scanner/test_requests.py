@@ -40,6 +40,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"tags": [tag("a", 0, writable="false")]}, "got `str` - at `$.tags[0].writable`"),
     ({"subscriberId": 7}, "Expected `str`, got `int` - at `$.subscriberId`"),
     ({"host": None}, "host is missing: give host or url"),
+    ({"host": "10.0.0.010"}, "host is '10.0.0.010', allowed: a host name, an IPv4 address of"),
     ({"host": 5}, "Expected `str | null`, got `int` - at `$.host`"),
     ({"port": 0}, "Expected `int` >= 1 - at `$.port`"),
     ({"url": "tcp://127.0.0.1"}, "both url and host are given, allowed: only one"),

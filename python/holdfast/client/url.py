@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from holdfast.net.addresses import LAST_PORT, address_in, joined
+from holdfast.net.addresses import address_in, joined
+from holdfast.net.hosts import host_and_port
 from holdfast.net.tls import NO_FILES
 from holdfast.net.tls import Tls as Tls
 from holdfast.protocol import MAX_UNIT, usual_port
@@ -42,9 +43,6 @@ FORMS = (
     "rtu+udp://host:502, ascii+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
 )
 
-
-NOT_IN_HOSTS = re.compile(r"[^\w.:%\x80-\U0010ffff-]|\s")
-"""What no name or address of a host contains. Names may have letters of any language."""
 
 MAX_PAUSE_S = 60
 MAX_RETRIES = 10
@@ -158,22 +156,16 @@ def parse(url: str) -> Target:
     if not isinstance(url, str):
         raise TypeError(f"{url!r} is not the URL of a device, allowed: {FORMS}")
     try:
-        parts = urlsplit(url)
-        port = parts.port
+        parts = urlsplit(_clean(url))
     except ValueError as error:
         raise ValueError(f"{url!r}: {error}, allowed: {FORMS}") from None
     scheme = parts.scheme
     if parts.fragment or parts.username is not None:
         raise ValueError(f"{url!r} has a user or a fragment, allowed: {FORMS}")
     if scheme in TRANSPORTS:
-        if not parts.hostname or parts.path not in ("", "/"):
+        if not parts.netloc or parts.path not in ("", "/"):
             raise ValueError(f"{url!r} is not the address of a device, allowed: {FORMS}")
-        host = unquote(parts.hostname)
-        if NOT_IN_HOSTS.search(host):
-            allowed = "letters, digits, '-', '.' and '_', or an IP address, as in"
-            raise ValueError(f"{url!r}: host is {host!r}, allowed: {allowed} {FORMS}")
-        if port == 0:
-            raise ValueError(f"{url!r}: port 0, allowed: 1 to {LAST_PORT}")
+        host, port = _location(url, parts.netloc)
         port = usual_port(scheme) if port is None else port
         options = options_of(url, scheme, parts.query)
         tolerance = _pop_fields(Tolerance, options)
@@ -186,6 +178,22 @@ def parse(url: str) -> Target:
         return _serial(url, cast("Mode", scheme), parts.netloc + parts.path, parts.query)
     near = suggestion(scheme, (*TRANSPORTS, *SERIAL)) if scheme else ""
     raise ValueError(f"{url!r} is not the URL of a device, allowed: {FORMS}{near}")
+
+
+def _clean(url: str) -> str:
+    """A URL without what `urlsplit` would drop in silence. Raises `ValueError`."""
+    if url != url.strip() or re.search(r"[\t\r\n]", url):
+        raise ValueError("blanks around it or a control character")
+    return url
+
+
+def _location(url: str, netloc: str) -> tuple[str, int | None]:
+    """The host and the port of a URL. Raises `ValueError`."""
+    try:
+        return host_and_port(netloc)
+    except ValueError as error:
+        hint = "; options begin with '?'" if re.search("[&;,=]", netloc) else ""
+        raise ValueError(f"{url!r}: {error}{hint}") from None
 
 
 def in_folder(url: str, folder: Path) -> str:
@@ -362,14 +370,14 @@ def parse_receiver(url: str) -> Receiver:
     """Parses `raw://host:port` and `raw+tls://host:port`. Raises `ValueError` for anything else."""
     wrong = f"found {url!r}, allowed: {RECEIVER_FORM}"
     try:
-        parts = urlsplit(url)
-        host, port = parts.hostname, parts.port
+        parts = urlsplit(_clean(url))
     except ValueError:
         raise ValueError(wrong) from None
     bare = url.partition("?")[0] == f"{parts.scheme}://{parts.netloc}"
-    if parts.scheme not in ("raw", "raw+tls") or not bare or set(parts.netloc) & set(" @"):
+    if parts.scheme not in ("raw", "raw+tls") or not bare or "@" in parts.netloc:
         raise ValueError(wrong)
-    if not host or not port:
+    host, port = _location(url, parts.netloc)
+    if port is None:
         raise ValueError(wrong)
     options = options_of(url, parts.scheme, parts.query)
     if parts.scheme == "raw":

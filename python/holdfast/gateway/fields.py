@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import re
-
-from holdfast.net.addresses import LAST_PORT, address_in
+from holdfast.net.addresses import LAST_PORT
+from holdfast.net.hosts import is_host
 from holdfast.net.http.fields import Field
 from holdfast.net.http.schemas import Schema, integer
 from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, MAX_WORD, TLS_PORT
@@ -23,17 +22,6 @@ TYPED_SCHEMA: Schema = {"type": ["integer", "number", "string", "boolean"]}
 """A value of the type that `datatype` names."""
 TEXT: Schema = {"type": "string", "minLength": 1, "maxLength": 32}
 ORDER: Schema = {"type": "string", "pattern": "^([A-D]{4}|[A-H]{8})$"}
-
-
-def is_host(text: str) -> bool:
-    """Returns whether text is an IP address or a possible name.
-
-    A name must not end in a numeric label, because resolvers parse it as an IPv4 address.
-    """
-    if address_in(text) is not None:
-        return True
-    last = text.removesuffix(".").rpartition(".")[2]
-    return ":" not in text and re.fullmatch("[0-9]*|0[xX][0-9a-fA-F]*", last) is None
 
 
 NAME_OR_ADDRESS = "a name or an IP address; the port is a field of its own"

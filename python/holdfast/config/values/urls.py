@@ -6,19 +6,14 @@ No message repeats a URL, because a URL may contain a password.
 from __future__ import annotations
 
 import re
-from ipaddress import IPv6Address
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from holdfast.config.text.messages import shape, show
 from holdfast.net.addresses import LAST_PORT, joined
+from holdfast.net.hosts import HOST_FORM, host_and_port
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-_HOST = re.compile(
-    r"(?:\[(?P<six>[^\]]*)\]|(?P<name>[A-Za-z0-9][A-Za-z0-9_.-]{0,252}))(?::(?P<port>[0-9]{1,5}))?",
-    re.ASCII,
-)
 
 
 class Remote(NamedTuple):
@@ -51,20 +46,12 @@ def parse_remote(
         raise ValueError(f"found a user in the URL, allowed: {form}; {where}")
     if re.search("[/?#]", rest):
         raise ValueError(f"found more than host and port, allowed: {form}")
-    match = _HOST.fullmatch(rest)
-    port = int(match["port"] or ports[scheme]) if match else 0
-    if match is None or not _is_host(match) or not least_port <= port <= LAST_PORT:
-        port_form = f"a port from {least_port} to {LAST_PORT}"
-        allowed = f"allowed: a host name or an address, IPv6 in brackets, and {port_form}"
-        raise ValueError(f"found an invalid host or port, {allowed}")
-    return Remote(scheme, match["name"] or match["six"], port)
-
-
-def _is_host(match: re.Match[str]) -> bool:
     try:
-        return match["six"] is None or bool(IPv6Address(match["six"]))
+        host, port = host_and_port(rest, least_port=least_port)
     except ValueError:
-        return False
+        allowed = f"allowed: {HOST_FORM}, and a port from {least_port} to {LAST_PORT}"
+        raise ValueError(f"found an invalid host or port, {allowed}") from None
+    return Remote(scheme, host, ports[scheme] if port is None else port)
 
 
 HTTP_FORM = "http://host:port/path or https://host:port/path"

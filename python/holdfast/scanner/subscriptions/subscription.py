@@ -10,7 +10,9 @@ from holdfast import tags
 from holdfast.client import url as urls
 from holdfast.client.url import STRICT, NetworkTarget, SerialTarget
 from holdfast.net.addresses import address_in, unbracketed
+from holdfast.net.hosts import HOST_FORM, is_host
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS, usual_port
+from holdfast.runtime.text import quote
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.decoding import Adjustments
 from holdfast.scanner.messages.types import TagRequest
@@ -117,6 +119,8 @@ def _target(request: SubscribeRequest) -> Target:
             raise Refused(f"url: {error}") from None
     if request.host is None:
         raise Refused("host is missing: give host or url")
+    if not is_host(request.host):
+        raise Refused(f"host is {quote(request.host)}, allowed: {HOST_FORM}")
     transport = request.transport or "tcp"
     port = usual_port(transport) if request.port is None else request.port
     is_address = address_in(request.host) is not None
