@@ -53,3 +53,10 @@ def test_an_error_of_windows_has_the_text_of_its_own_number(
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setattr(ctypes, "FormatError", texts.get, raising=False)
     assert os_error_text(refused) == texts[1225]
+
+
+def test_a_word_in_another_case_is_suggested_before_words_that_are_close() -> None:
+    types = ["modbus-udp", "modbus-tcp", "read_only"]
+    assert suggestion("Modbus-TCP", types) == "; did you mean 'modbus-tcp'?"
+    assert suggestion("Read-Only", types) == "; did you mean 'read_only'?"
+    assert suggestion("plant_b", ["plant_a", "Plant_B"]) == "; did you mean 'Plant_B'?"

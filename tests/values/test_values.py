@@ -315,6 +315,11 @@ def test_an_unknown_type_is_refused_with_all_that_are_allowed(name: Any) -> None
         *(("string", "string:8"), ("udint", "uint32"), ("uint", "uint16"), ("WORD", "uint16")),
         *(("u16", "uint16"), ("I32", "int32"), ("f64", "float64"), ("f16", "float16")),
         *(("flaot32", "float32"), ("unit64", "uint64")),
+        *(("ushort", "uint16"), ("lreal", "float64"), ("ulint", "uint64"), ("lint", "int64")),
+        *(("iunt16", "uint16"), ("sint16", "int16"), ("float 32", "float32"), ("s16", "int16")),
+        *(("bit3", "bit:3"), ("bit.3", "bit:3"), ("Bit:3", "bit:3"), ("bit7[2]", "bit:7[2]")),
+        *(("String:20", "string:20"), ("string20", "string:20"), ("STRING[20]", "string:20")),
+        *(("Bytes4", "bytes:4"), ("bytes[4]", "bytes:8[4]"), ("String:5[3]", "string:5[3]")),
         *(("flaot32[5]", "float32[5]"), ("real[5]", "float32[5]"), ("real[x", "float32")),
     ],
 )
@@ -323,9 +328,10 @@ def test_a_type_of_another_program_is_suggested_as_it_is_called_here(name: str, 
         register_count(name)
 
 
-def test_no_type_is_suggested_for_what_is_like_none() -> None:
+@pytest.mark.parametrize("name", ["qqqqqq", "sint", "USINT", "uint8", "uint61", "byte", "bit16"])
+def test_no_type_is_suggested_for_what_is_like_none(name: str) -> None:
     with pytest.raises(values.UnknownType, match=r"arrays: float32\[10\]$"):
-        register_count("qqqqqq")
+        register_count(name)
 
 
 @pytest.mark.parametrize(

@@ -90,6 +90,12 @@ def suggestion(word: object, known: Iterable[object]) -> str:
     import difflib
 
     words, text = list(map(str, known)), str(word)
-    close = difflib.get_close_matches(text, words, 1)
+    same = [each for each in words if _plain(each) == _plain(text)]
+    close = same or difflib.get_close_matches(text, words, 1)
     close = close or difflib.get_close_matches(text.lower(), words, 1)
     return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _plain(word: str) -> str:
+    """A word without what people write in several ways."""
+    return word.casefold().replace("_", "-")

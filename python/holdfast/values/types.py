@@ -91,30 +91,70 @@ USUAL_NAMES = {
     "dint": "int32",
     "dword": "uint32",
     "float": "float32",
+    "half": "float16",
     "int": "int16",
+    "lint": "int64",
     "long": "int32",
+    "lreal": "float64",
+    "lword": "uint64",
+    "qword": "uint64",
     "real": "float32",
     "short": "int16",
+    "signed": "int16",
+    "single": "float32",
+    "str": "string:8",
     "string": "string:8",
+    "text": "string:8",
     "udint": "uint32",
     "uint": "uint16",
+    "ulint": "uint64",
+    "ulong": "uint32",
+    "unsigned": "uint16",
+    "ushort": "uint16",
     "word": "uint16",
+    **dict.fromkeys(("byte", "sint", "usint", "wchar", "wstring"), ""),
 }
-"""What other programs call these types, to suggest ours."""
+"""What other programs call these types, to suggest ours; "" for types that are not here."""
+
+_SIZED = re.compile(r"(bit|bytes|char|str|string|text)([:.\[]?)([0-9]{1,6})[.\]]?")
 
 
 def _unknown(name: object) -> UnknownType:
-    word = str(name).lower()
-    short = re.fullmatch("([uif])(16|32|64)", word)
-    if short:
-        word = {"u": "uint", "i": "int", "f": "float"}[short[1]] + short[2]
-    base, bracket, count = word.partition("[")
-    near = ""
-    # Imported here, for a fast start: only wrong names need it.
-    import difflib
-
-    for close in difflib.get_close_matches(base, (*FIXED, *USUAL_NAMES), 1):
-        meant = USUAL_NAMES.get(close, close)
-        array = meant + bracket + count
-        near = f"; did you mean {array if _NAME.fullmatch(array) else meant!r}?"
+    base, bracket, count = re.sub(r"[\s_-]", "", str(name).lower()).partition("[")
+    meant = _meant(base)
+    sized = _SIZED.fullmatch(base + bracket + count)
+    if sized and (sized[2] != "[" or sized[1] not in ("bit", "bytes")):  # STRING[20]
+        meant, bracket = _with_number(sized[1], int(sized[3])), ""
+    elif sized := _SIZED.fullmatch(base):
+        meant = _with_number(sized[1], int(sized[3]))
+    array = meant + bracket + count if bracket else meant
+    near = f"; did you mean {array if _NAME.fullmatch(array) else meant!r}?" if meant else ""
     return UnknownType(f"type {shown(name)} is unknown, allowed: {ALLOWED}{near}")
+
+
+def _with_number(word: str, number: int) -> str:
+    """The type of this number of a field's bit or bytes, "" if there is none."""
+    base = USUAL_NAMES.get(word, word).partition(":")[0]
+    return f"{base}:{number}" if _width(base, number) else ""
+
+
+def _meant(word: str) -> str:
+    """The type that a word is probably meant to be, "" if that is not clear."""
+    short = re.fullmatch("([uisf])(16|32|64)", word)
+    if short:
+        word = {"u": "uint", "i": "int", "s": "int", "f": "float"}[short[1]] + short[2]
+    known = (*FIXED, *USUAL_NAMES)
+    if word not in known:
+        # Sign and size must not be guessed: others copy what is suggested.
+        alike = [each for each in known if _traits(each) == _traits(word)]
+        swapped = [each for each in alike if sorted(each) == sorted(word)]
+        # Imported here, for a fast start: only wrong names need it.
+        import difflib
+
+        word = next(iter(swapped or difflib.get_close_matches(word, alike, 1)), "")
+    return USUAL_NAMES.get(word, word)
+
+
+def _traits(word: str) -> tuple[bool, str]:
+    """What tells the sign and the size: whether the word has a `u`, and its digits."""
+    return "u" in word, re.sub("[^0-9]", "", word)
