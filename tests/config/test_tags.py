@@ -270,6 +270,13 @@ def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
         ("t.csv", "name,adress\nx,1\n", "t.csv:1: found the column 'adress', allowed: name, area"),
         ("t.csv", "name,name\n", "t.csv:1: two columns have the name 'name'"),
         ("t.csv", "x,hr,1,,,,,,,,more\n", "t.csv:1: found 11 cells, allowed: up to 10"),
+        (
+            "t.csv",
+            'name,area,address,type,order,scale,offset,unit\na,hr,0,,,,,V\nb,hr,1,,,,,"A\nc,hr,2\n',
+            "t.csv:3: not CSV: unexpected end of data, allowed: a cell that begins with a quote",
+        ),
+        ("t.csv", 'a,hr,0,,,,,"V\nb,hr,1,,,,,"A\n', "t.csv:1: not CSV: ',' expected after '\"'"),
+        ("t.csv", 'a,hr,0,,,,,"V\nA"\n', "t.csv:2: tags.a.unit: found 'V\\nA', allowed: text"),
         ("t.csv", "", "t.csv:1: tags: "),
         ("t.yaml", "- a\n", "t.yaml:1: found a list, allowed: a mapping with the keys order"),
         ("t.yaml", "tags: {a: {area: coils}}\n", "t.yaml:1: tags.a.address: missing"),
@@ -282,6 +289,12 @@ def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
 )
 def test_a_wrong_file_is_refused(tmp_path: Path, name: str, text: str, expected: str) -> None:
     assert problems(written(tmp_path, text, name))[0].startswith(expected)
+
+
+def test_a_wrong_column_is_the_only_problem_of_its_file(tmp_path: Path) -> None:
+    file = written(tmp_path, "name,area,adress\na,hr,1\nb,hr,2\n", "t.csv")
+    [problem] = problems(file)
+    assert problem.startswith("t.csv:1: found the column 'adress'")
 
 
 def test_one_entry_makes_many_devices(tmp_path: Path) -> None:

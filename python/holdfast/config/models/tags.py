@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import unicodedata
 from functools import cached_property
 from typing import Annotated, Any
 
-from pydantic import Field, PlainSerializer, PlainValidator, Strict
+from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, Strict
 from pydantic.config import JsonDict
 from pydantic.json_schema import WithJsonSchema
 
 from holdfast.config.models.base import INVALID, InvalidValue, Model
 from holdfast.config.models.memories import Register
+from holdfast.config.text.messages import show
 from holdfast.config.values.scalars import NAME_KEYS, Name, NotNull, whole_number
 from holdfast.config.values.tag_scale import SCALE_SCHEMA, ScaleConfig, parse_scale, written_scale
 from holdfast.tags import Tag, TagList
@@ -26,6 +28,13 @@ Scale = Annotated[
     PlainSerializer(written_scale),
     WithJsonSchema(SCALE_SCHEMA),
 ]
+
+
+def _one_line(value: str) -> str:
+    if any(unicodedata.category(each) == "Cc" for each in value):
+        raise ValueError(f"found {show(value)}, allowed: text without control characters")
+    return value
+
 
 _INTEGER_KEYS: JsonDict = {"propertyNames": {"pattern": "^-?[0-9]+$"}}
 
@@ -48,7 +57,7 @@ class TagConfig(Model):
     with from and as names the register that contains the scale."""
     offset: Number = 0.0
     """What is added."""
-    unit: str = ""
+    unit: Annotated[str, AfterValidator(_one_line)] = ""
     """The unit of the value, such as V or °C."""
     writable: bool = False
     """Whether outputs and commands may write it."""

@@ -112,9 +112,11 @@ def _csv(text: str, file: str) -> tuple[yaml_document.Document, list[Problem]]:
     table, columns = _Table(file), list[str]()
     sample = next((line for line in text.splitlines() if line.strip() and line[0] != "#"), "")
     separator = ";" if sample.count(";") > sample.count(",") else ","
-    rows = csv.reader(io.StringIO(text, newline=None), delimiter=separator)
+    rows = csv.reader(io.StringIO(text, newline=None), delimiter=separator, strict=True)
+    first = 1
     try:
         for row in rows:
+            first = rows.line_num + 1
             cells = [cell.strip() for cell in row]
             if not any(cells) or cells[0].startswith("#"):
                 continue
@@ -122,11 +124,14 @@ def _csv(text: str, file: str) -> tuple[yaml_document.Document, list[Problem]]:
                 table.take(rows.line_num, columns, cells)
             elif "name" in map(str.lower, cells):
                 columns = _columns(table, rows.line_num, cells)
+                if table.problems:  # The same ones would follow for each row.
+                    raise ConfigError(file, table.problems)
             else:
                 columns = list(COLUMNS)
                 table.take(rows.line_num, columns, cells)
     except csv.Error as error:
-        table.refuse(rows.line_num, f"not CSV: {error}")
+        rule = "a cell that begins with a quote ends with one, and has others twice"
+        table.refuse(first, f"not CSV: {error}, allowed: {rule}")
     document = yaml_document.table(file, {"tags": table.tags}, table.lines)
     return document, table.problems
 
