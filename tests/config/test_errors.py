@@ -206,6 +206,12 @@ def test_a_memory_with_a_number_as_its_name_is_reported_only_there(folder: Folde
         ),
         ("type: modbus-tcp", "type: 5", f"5: type: found 5, allowed: {TYPES}"),
         ("type: modbus-tcp", "type: ", f"5: type: found nothing, allowed: {TYPES}"),
+        (
+            "type: modbus-tcp",
+            "typ: modbus-tcp",
+            "5: typ: unknown key, allowed: type; did you mean 'type'?",
+        ),
+        ("type: modbus-tcp", "event_log: true", f"4: type: missing, allowed: {TYPES}"),
         ("127.0.0.1:5020", "localhost:502", f"6: bind: found 'localhost:502', allowed: {BIND}"),
         ("127.0.0.1:5020", "502", f"6: bind: found 502, allowed: {BIND}"),
         ("127.0.0.1:5020", "1.2.3.4:65536", f"6: bind: found '1.2.3.4:65536', allowed: {BIND}"),

@@ -94,7 +94,12 @@ def _add_kind(path: KeyPath, owner: dict[str, Any], report: Report) -> None:
     types = OUTPUT_TYPES if path[0] == "outputs" else LISTENER_TYPES
     words = f"allowed: {either(types)}"
     if "type" not in owner:
-        report.add_key(path, f"missing, {words}")
+        known = known_keys(path[:-1], report.document.data)
+        meant = {key: suggestion(key, ["type"]) for key in owner if key not in known}
+        for key in filter(meant.get, meant):
+            report.add_key((*path[:-1], key), f"unknown key, allowed: type{meant[key]}")
+        if not any(meant.values()):
+            report.add_key(path, f"missing, {words}")
     else:
         near = suggestion(owner["type"], types)
         report.add(path, f"found {show(owner['type'])}, {words}{near}")
