@@ -152,8 +152,8 @@ def test_a_port_that_is_taken_is_one_line_and_exit_code_1() -> None:
     [
         (["plc"], "Error: Invalid value for 'DEVICE-URL': 'plc' is not the URL of a device, "),
         ([NOBODY, "--bind", "localhost:1"], "Error: Invalid value for '--bind': found "
-         "'localhost:1', allowed: address:port with an IP address, as in 127.0.0.1:502 or "
-         "[::1]:502."),
+         "'localhost:1', allowed: address:port with an IP address, as in 127.0.0.1:502 or, with "
+         "quotes, '[::1]:502'."),
         ([NOBODY, "--bind", "0.0.0.0:1"], "Error: --bind 0.0.0.0:1 is reachable from other "
          "machines: name the clients that may connect with --source NETWORK."),
         ([NOBODY, "--source", "10.0.0.1/8"], "Error: Invalid value for '--source': found "

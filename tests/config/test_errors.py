@@ -49,7 +49,8 @@ def changed(old: str, new: str, text: str = GOOD) -> str:
 
 AREA = "an integer from 1 to 65536 or a mapping with the keys start, size"
 SOURCE = "a network or an address, as in 10.0.0.0/24, 10.0.0.7 or fd00::/64"
-BIND = "address:port with an IP address, as in 127.0.0.1:502 or [::1]:502"
+BRACKETS = "text that begins with [, { or a quote needs quotes around the whole, as in '[::1]:502'"
+BIND = "address:port with an IP address, as in 127.0.0.1:502 or, with quotes, '[::1]:502'"
 CODES = "1, 2, 3, 4, 5, 6, 7, 8, 11, 12, 15, 16, 17, 20, 21, 22, 23, 24 or 43"
 TOP = (
     "memories, logs, identity, listeners, profiles, devices, links, rest, mqtt, nats, gateway, "
@@ -513,6 +514,8 @@ def test_initial_values_from_yaml_are_checked(folder: Folder, values: str, probl
             "3: not YAML: expected ',' or ']', but got ':', "
             "while parsing a flow sequence that starts in line 1",
         ),
+        ("bind: [::1]:502\n", f"1: not YAML: more text after the end of a value: {BRACKETS}"),
+        ("a: {bind: [::1]:502}\n", f"1: not YAML: a comma is missing, or {BRACKETS}"),
         ("a: 1\n---\nb: 1\n", "2: not YAML: expected a single document in the stream, "
          "but found another document"),
         ("a: 1\nb: \x01\n", "2: the character U+0001 is not allowed in YAML"),

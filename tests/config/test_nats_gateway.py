@@ -52,8 +52,8 @@ POLLABLE = (
     "/dev/ttyUSB0 or COM3"
 )
 EGRESS = (
-    "NETWORK[:PORTS], as in 10.0.0.0/8, 10.0.0.5:502, 10.0.0.0/24:502-510, 10.0.0.5:* or "
-    "[fd00::]/8:502; default ports: 502, with TLS also 802"
+    "NETWORK[:PORTS], as in 10.0.0.0/8, 10.0.0.5:502, 10.0.0.0/24:502-510, 10.0.0.5:* or, "
+    "with quotes, '[fd00::]/8:502'; default ports: 502, with TLS also 802"
 )
 ONE = "only one of username, token_file, credentials_file"
 NO_FILE = "which can't be read: No such file or directory"
@@ -403,7 +403,7 @@ def test_a_line_of_a_listener_or_a_device_is_not_polled_for_subscribers(folder: 
         ("  allow: [10.0.0.0/8]\n", "", f"1: allow: missing, allowed: {SOME}"),
         ("  access: read-only\n", "", "1: access: missing, allowed: read-only or read-write"),
         ("127.0.0.1:8090", "8090", "2: bind: found 8090, allowed: address:port with an IP "
-         "address, as in 127.0.0.1:502 or [::1]:502"),
+         "address, as in 127.0.0.1:502 or, with quotes, '[::1]:502'"),
         ("sources: [10.0.0.0/8]", "sources: []",
          f"3: sources: found an empty list, allowed: {SOME}"),
         ("sources: [10.0.0.0/8]", "sources: [me]", "3: sources[0]: found 'me', allowed: a network "

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
     from holdfast.types import YamlEvent
 
+_QUOTES = "text that begins with [, { or a quote needs quotes around the whole, as in '[::1]:502'"
+
 PLAIN_REASONS = {
     "found character '\\t' that cannot start any token": "a tab indents this line, allowed: spaces",
     "expected <block end>, but found '<block mapping start>'": (
@@ -39,8 +41,17 @@ PLAIN_REASONS = {
         "a `:` where no key can be: indented further than the keys above it, or a text with `: `, "
         "which needs quotes"
     ),
+    "expected <block end>, but found '<scalar>'": f"more text after the end of a value: {_QUOTES}",
 }
-"""What errors of the YAML parser mean that come from indentation, in words of those who write."""
+"""What errors of the YAML parser mean that come from indentation and brackets, in words of those
+who write."""
+
+IN_BRACKETS = {
+    f"expected ',' or '{end}', but got '{found}'": f"a comma is missing, or {_QUOTES}"
+    for end in "}]"
+    for found in (":", "<scalar>")
+}
+"""The same for errors in the line of the bracket; in another line, it was probably not closed."""
 
 
 def _syntax(error: MarkedYAMLError, file: str) -> Problem:
@@ -52,6 +63,8 @@ def _syntax(error: MarkedYAMLError, file: str) -> Problem:
         reason = PLAIN_REASONS[reason]
     elif error.context and start and mark and start.line != mark.line:
         reason += f", {error.context} that starts in line {start.line + 1}"
+    else:
+        reason = IN_BRACKETS.get(reason, reason)
     if reason.startswith(("found unknown escape", "expected escape")):
         reason += f"; in double quotes, \\ begins an escape: {PATH_QUOTES}"
     return Problem(file, line, column, "", f"not YAML: {reason}")

@@ -10,8 +10,8 @@ from holdfast.net.addresses import LAST_PORT
 from holdfast.net.allow_list import ALL_PORTS, AllowedNetwork
 
 FORM = (
-    "NETWORK[:PORTS], as in 10.0.0.0/8, 10.0.0.5:502, 10.0.0.0/24:502-510, 10.0.0.5:* or "
-    "[fd00::]/8:502; default ports: 502, with TLS also 802"
+    "NETWORK[:PORTS], as in 10.0.0.0/8, 10.0.0.5:502, 10.0.0.0/24:502-510, 10.0.0.5:* or, with "
+    "quotes, '[fd00::]/8:502'; default ports: 502, with TLS also 802"
 )
 
 _ENTRY = re.compile(

@@ -14,7 +14,7 @@ from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network
 from holdfast.config.text.messages import show
 from holdfast.net.addresses import LAST_PORT, Address, Network, joined, unmapped
 
-BIND_FORM = "address:port with an IP address, as in 127.0.0.1:502 or [::1]:502"
+BIND_FORM = "address:port with an IP address, as in 127.0.0.1:502 or, with quotes, '[::1]:502'"
 PEER_FORM = "an IP address, as in 10.0.0.7 or fd00::7"
 SOURCE_FORM = "a network or an address, as in 10.0.0.0/24, 10.0.0.7 or fd00::/64"
 
