@@ -366,6 +366,23 @@ QUOTES = "allowed: 1 to 64 letters, digits, '_', '.' and '-'; write '1' to make 
                 "allowed: other addresses"
             ],
         ),
+        (
+            DEVICE.replace("address: 1", "address: 1, states: {0: false, 1: true}"),
+            ["states.0: found false, allowed: text", "states.1: found true, allowed: text"],
+        ),
+        (
+            "profiles: {p: p.csv}\n" + DEVICE,
+            ["profiles.p: found 'p.csv', allowed: a mapping with the keys order, tags; files are"],
+        ),
+        (
+            "memories: {plant: {coils: 5}}\n" + LISTENER % "{memry: plant, access: read-only}",
+            [
+                "units.1.memory: missing, allowed: text",
+                "units.1.memry: unknown key, allowed: memory, access, functions, deny, read, "
+                "write, exception_status, route; did you mean 'memory'?",
+            ],
+        ),
+        (": 5\n" + DEVICE, ["found an empty key, allowed: text or an integer"]),
         (DEVICE + LISTENER % "{memory: plant}", ["memories: missing, allowed: a mapping"]),
         (
             "devices: {'d{n}': {for: {n: 1-999999999}, url: tcp://a, interval: 1}}\n",

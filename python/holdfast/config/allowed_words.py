@@ -27,12 +27,13 @@ def allowed(path: KeyPath, data: object) -> str:
 
 def known_keys(path: KeyPath, data: object) -> list[str]:
     """The keys that are allowed in the mapping at `path` of `data`."""
-    return [
+    keys = [
         key
         for node in _at(path, data)
         for kind in _kinds(_resolved(node), _value(path, data)) or [node]
         for key in _resolved(kind).get("properties", {})
     ]
+    return list(dict.fromkeys(keys))
 
 
 def _at(path: KeyPath, data: object) -> list[Node]:
@@ -57,8 +58,8 @@ def _children(node: Node, part: Key, value: object) -> Iterator[Node]:
     if part in node.get("properties", {}):
         yield node["properties"][part]
     yield from node.get("patternProperties", {}).values()
-    for inside in ("additionalProperties", "items"):
-        if isinstance(node.get(inside), dict):
+    for inside, unlike in (("additionalProperties", list), ("items", dict)):
+        if isinstance(node.get(inside), dict) and not isinstance(value, unlike):
             yield node[inside]
 
 

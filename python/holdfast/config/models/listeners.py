@@ -37,6 +37,7 @@ from holdfast.config.values.scalars import (
     UnitIds,
 )
 from holdfast.protocol import LAST_ADDRESS
+from holdfast.runtime.text import suggestion
 from holdfast.server.options import DEFAULTS
 from holdfast.types import Access, BitArea
 
@@ -99,9 +100,16 @@ UNIT_TAGS = ("memory", "long", "route")
 
 def _tag_of(value: object) -> str:
     memory, long, route = UNIT_TAGS
-    if isinstance(value, UnitMemoryConfig) or (isinstance(value, dict) and "memory" in value):
+    if isinstance(value, UnitMemoryConfig) or (isinstance(value, dict) and _has_memory(value)):
         return long
     return route if isinstance(value, dict | RouteConfig) else memory
+
+
+def _has_memory(value: dict[Any, Any]) -> bool:
+    """Whether a mapping has the key of a memory, or a misspelled one."""
+    return "memory" in value or (
+        "route" not in value and any(suggestion(key, ("memory",)) for key in value)
+    )
 
 
 Target: TypeAlias = Annotated[

@@ -80,7 +80,7 @@ class TagConfig(Model):
         """The tag, with a default order. Raises `TagError`."""
         settings: dict[str, Any] = {key: getattr(self, key) for key in _KEYS}
         order = (self.order or order).upper()
-        if INVALID in self.null:
+        if INVALID in (*self.null, *self.states.values()):
             raise InvalidValue
         if isinstance(self.scale, ScaleConfig):
             settings["scale"] = self.scale.of(order)

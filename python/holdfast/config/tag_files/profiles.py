@@ -35,12 +35,26 @@ class ProfileFiles:
         """Replaces a list of files in the document by the profiles in them."""
         document = self.report.document
         data = mapping(document.data)
-        if not isinstance(data.get("profiles"), list):
+        given = data.get("profiles")
+        profiles: dict[Any, Any] = {}
+        if isinstance(given, list):
+            for index, file in enumerate(entries(given)):
+                self._read(("profiles", index), file, profiles)
+        elif any(isinstance(each, str) for each in mapping(given).values()):
+            for name, profile in mapping(given).items():
+                self._add(name, profile, profiles)
+        else:
             return
-        profiles: dict[str, Any] = {}
-        for index, file in enumerate(entries(data["profiles"])):
-            self._read(("profiles", index), file, profiles)
         self.report.document = replace(document, data={**data, "profiles": profiles})
+
+    def _add(self, name: Any, profile: object, profiles: dict[Any, Any]) -> None:
+        """Adds an entry of a mapping, which has no files."""
+        if isinstance(profile, str):
+            message = "allowed: a mapping with the keys order, tags; files are a list"
+            self.report.add(
+                ("profiles", name), f"found {show(profile)}, {message}: profiles: [heater.yaml]"
+            )
+        profiles[name] = _ANY if isinstance(profile, str) else profile
 
     def _read(self, path: KeyPath, file: object, profiles: dict[str, Any]) -> None:
         if not isinstance(file, str) or not file.lower().endswith(KINDS):

@@ -349,7 +349,7 @@ class _Reader:
             del self.mistakes[known:]
             found = "a list or mapping as key"
         else:
-            found = f"the key {event[-1] or ''}"
+            found = f"the key {event[-1]}" if event[-1] else "an empty key"
         allowed = "text or an integer; quote it to make it text"
         self._add(event, path, f"found {found}, allowed: {allowed}")
         return None
