@@ -569,6 +569,7 @@ def test_receivers_have_ipv6_addresses_too(send: Send, receiver: Receive) -> Non
         ("127.0.0.1", 9000, float("inf"), "timeout is inf, allowed: more than 0 seconds"),
         ("", 9000, 1.0, "'' is not a host name"),
         ("a..b", 9000, 1.0, "'a..b' is not a host name"),
+        ("10.0.0.010", 9000, 1.0, "'10.0.0.010' is not a host name"),
     ],
 )
 def test_arguments_that_can_not_be_are_refused(

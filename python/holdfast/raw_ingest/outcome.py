@@ -7,6 +7,7 @@ import reprlib
 
 from holdfast.client.async_transports import explained
 from holdfast.net.addresses import joined
+from holdfast.net.hosts import is_host
 from holdfast.raw_ingest.encoding import checked_field
 
 DONE, REFUSED = b"\x00", b"\x01"
@@ -56,11 +57,8 @@ class Attempt:
         checked_field("port", port, least=1)
         if not 0 < timeout < math.inf:
             raise ValueError(f"timeout is {timeout}, allowed: more than 0 seconds")
-        try:
-            if not host.encode("idna"):
-                raise UnicodeError
-        except UnicodeError:
-            raise ValueError(f"{reprlib.repr(host)} is not a host name") from None
+        if not is_host(host):
+            raise ValueError(f"{reprlib.repr(host)} is not a host name")
         self.peer = joined(host, port)
         self.timeout = timeout
         self.connected = False

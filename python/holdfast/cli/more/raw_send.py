@@ -16,7 +16,6 @@ from holdfast.cli.options.option import flag, json_option, option, whole_number
 from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.url import Receiver, parse_receiver
-from holdfast.net.hosts import is_host
 from holdfast.protocol import MAX_WORD
 
 FILE = click.File(encoding="utf-8")
@@ -51,7 +50,7 @@ def _receiver(text: str) -> Receiver:
     elif ":" in host:
         raise click.BadParameter(f"{text!r}: an IPv6 address requires brackets, as in [::1]:9000.")
     port = whole_number(digits)
-    if not is_host(host) or port is None:
+    if not host or port is None:
         raise click.BadParameter(f"{text!r} is not HOST:PORT, as in 127.0.0.1:9000.")
     if not 1 <= port <= MAX_WORD:
         raise click.BadParameter(f"{text!r}: port {port} is outside 1 to {MAX_WORD}.")
