@@ -317,6 +317,7 @@ def test_an_unknown_type_is_refused_with_all_that_are_allowed(name: Any) -> None
         *(("flaot32", "float32"), ("unit64", "uint64")),
         *(("ushort", "uint16"), ("lreal", "float64"), ("ulint", "uint64"), ("lint", "int64")),
         *(("iunt16", "uint16"), ("sint16", "int16"), ("float 32", "float32"), ("s16", "int16")),
+        *(("float23", "float32"), ("uint61", "uint16")),
         *(("bit3", "bit:3"), ("bit.3", "bit:3"), ("Bit:3", "bit:3"), ("bit7[2]", "bit:7[2]")),
         *(("String:20", "string:20"), ("string20", "string:20"), ("STRING[20]", "string:20")),
         *(("Bytes4", "bytes:4"), ("bytes[4]", "bytes:8[4]"), ("String:5[3]", "string:5[3]")),
@@ -328,7 +329,7 @@ def test_a_type_of_another_program_is_suggested_as_it_is_called_here(name: str, 
         register_count(name)
 
 
-@pytest.mark.parametrize("name", ["qqqqqq", "sint", "USINT", "uint8", "uint61", "byte", "bit16"])
+@pytest.mark.parametrize("name", ["qqqqqq", "sint", "USINT", "uint8", "uint24", "byte", "bit16"])
 def test_no_type_is_suggested_for_what_is_like_none(name: str) -> None:
     with pytest.raises(values.UnknownType, match=r"arrays: float32\[10\]$"):
         register_count(name)

@@ -147,7 +147,7 @@ def _meant(word: str) -> str:
     if word not in known:
         # Sign and size must not be guessed: others copy what is suggested.
         alike = [each for each in known if _traits(each) == _traits(word)]
-        swapped = [each for each in alike if sorted(each) == sorted(word)]
+        swapped = [each for each in known if sorted(each) == sorted(word)]
         # Imported here, for a fast start: only wrong names need it.
         import difflib
 
