@@ -464,6 +464,34 @@ def test_what_would_be_another_value_is_refused(
     assert refusals(raised.value) == [f"8: modbus[0].sensors[0].{message}"]
 
 
+@pytest.mark.parametrize(
+    ("climate", "message"),
+    [
+        ("min_temp: 30, max_temp: 20", "max_temp: found 20, allowed: at least min_temp, 30"),
+        ("min_temp: 40", "min_temp: found 40, allowed: up to max_temp, 35"),
+    ],
+)
+def test_a_thermostat_without_a_setpoint_that_it_allows_is_refused(
+    imported: Callable[..., Imported], climate: str, message: str
+) -> None:
+    with pytest.raises(NotImportable) as raised:
+        imported(f"climates: [{{name: x, address: 1, target_temp_register: 2, {climate}}}]")
+    assert refusals(raised.value) == [f"8: modbus[0].climates[0].{message}"]
+
+
+def test_what_a_line_can_not_have_is_refused(imported: Callable[..., Imported]) -> None:
+    hub = (
+        "- {name: line, type: serial, method: rtu, port: /dev/ttyUSB0, baudrate: 9600, timeout: "
+        "-5, bytesize: 8, parity: E, stopbits: 1, sensors: {name: a, address: 1, slave: 0}}\n"
+    )
+    with pytest.raises(NotImportable) as raised:
+        imported("", hub)
+    assert [line.partition(": ")[2] for line in refusals(raised.value)] == [
+        "[0].timeout: found -5, allowed: 0.001 to 31622400 seconds",
+        "[0].sensors.slave: found 0, allowed: a unit id from 1 to 247",
+    ]
+
+
 def test_an_entity_ends_with_its_area(imported: Callable[..., Imported]) -> None:
     with pytest.raises(NotImportable, match="x is at 65535 to 65536, allowed: up to 65535"):
         imported("sensors: [{name: x, address: 65535, data_type: uint32}]")

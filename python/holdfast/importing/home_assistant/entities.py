@@ -357,7 +357,7 @@ def _climate(places: Places, entity: Section) -> None:
     address, settings = _address(entity), _typed(entity)
     target = _numbers(entity, "target_temp_register")
     unit = {"F": "°F", "K": "K"}.get(entity.text("temperature_unit") or "C", "°C")
-    least, most = entity.number("min_temp"), entity.number("max_temp")
+    limits = _limits(entity)
     current = _scaled(entity, "current_temp_")
     aim = _scaled(entity, "target_temp_")
     if not target:
@@ -381,9 +381,22 @@ def _climate(places: Places, entity: Section) -> None:
     if register_count(settings["type"]) == 1:
         is_multiple = entity.flag("target_temp_write_registers") or False
         places.written[is_multiple].append(entity.at("target_temp_register"))
-    limits = {"min": 5 if least is None else least, "max": 35 if most is None else most}
     written = {**_given({**settings, **aim, "unit": unit}), "writable": True, **limits}
     places.add(f"{_name(entity)} setpoint", "holding_registers", target[0], **written)
+
+
+def _limits(entity: Section) -> dict[str, float]:
+    """The lowest and the highest setpoint."""
+    least, most = entity.number("min_temp"), entity.number("max_temp")
+    limits = {"min": 5 if least is None else least, "max": 35 if most is None else most}
+    if limits["min"] > limits["max"]:
+        if most is None:
+            message = f"found {least}, allowed: up to max_temp, {limits['max']}"
+            entity.desk.problem(entity.at("min_temp"), message)
+        else:
+            message = f"found {most}, allowed: at least min_temp, {limits['min']}"
+            entity.desk.problem(entity.at("max_temp"), message)
+    return limits
 
 
 def _mode(places: Places, entity: Section, key: str, *, writable: bool) -> None:

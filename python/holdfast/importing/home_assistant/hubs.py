@@ -14,12 +14,13 @@ from holdfast.client.url import parse
 from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError
+from holdfast.config.values.scalars import MAX_TIME, MIN_TIME
 from holdfast.importing.home_assistant.entities import PLATFORMS, Entities, Places
 from holdfast.importing.imported import Imported, Source
 from holdfast.importing.key_reader import Secret, Section, section
 from holdfast.importing.names import MAX_LENGTH, free_name, unique_names
 from holdfast.net.addresses import joined
-from holdfast.protocol import MAX_UNIT
+from holdfast.protocol import MAX_SERIAL_UNIT, MAX_UNIT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -227,18 +228,31 @@ class _Hub:
         kind = hub.word("type", tuple(_SCHEMES), required=True)
         if kind is not None:
             self.location = self._serial() if kind == "serial" else self._network(kind)
-        self.timeout = hub.number("timeout") or TIMEOUT_S
+        self.timeout = self._timeout()
         for platform, convert in PLATFORMS.items():
             for entity in self._entities(platform):
                 self._entity(entity, convert)
         self._choose_functions()
         hub.close(_HUB_REASONS)
 
+    def _timeout(self) -> float:
+        """The seconds of a request and its reply."""
+        given = self.hub.number("timeout") or TIMEOUT_S
+        if not MIN_TIME <= given <= MAX_TIME:
+            message = f"found {show(given)}, allowed: {MIN_TIME} to {MAX_TIME} seconds"
+            self.desk.problem(self.hub.at("timeout"), message)
+        return given
+
     @property
     def url(self) -> str:
         """The URL with the options of the line, and what the device needs."""
         options = {**self.line, **self.tolerance}
         return f"{self.location}?{urlencode(options)}" if options else self.location
+
+    @property
+    def _is_line(self) -> bool:
+        """Whether requests go to a serial line itself, where 0 is the broadcast."""
+        return self.location.startswith(("rtu:", "ascii:"))
 
     def _choose_functions(self) -> None:
         """Writes all values with functions 15 and 16 if one was: the device has no 5 or 6."""
@@ -258,7 +272,8 @@ class _Hub:
     def _entity(self, entity: Section, convert: Entities) -> None:
         given = entity.get("device_address")
         key = "device_address" if given is not None else "slave"
-        number = entity.integer(key, 0, MAX_UNIT, what="a unit id")
+        least, most = (1, MAX_SERIAL_UNIT) if self._is_line else (0, MAX_UNIT)
+        number = entity.integer(key, least, most, what="a unit id")
         unit = self.units.setdefault(1 if number is None else number, _Unit(Places(self.desk)))
         interval = entity.integer("scan_interval", 0, 86_400, what="seconds")
         if interval == 0:
