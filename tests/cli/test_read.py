@@ -372,6 +372,7 @@ def test_a_wrong_url_is_wrong_usage() -> None:
         (("holding registers7", "1"), "did you mean 'holding registers:7'?"),
         (("hr_1", "1"), "did you mean 'hr:1'?"),
         (("4hr", "1"), "did you mean 'hr'?"),
+        (("hr:5-2",), "in FIRST-LAST, the lower address is first: 2-5."),
     ],
 )
 def test_a_suggestion_ends_an_error(words: tuple[str, ...], told: str) -> None:

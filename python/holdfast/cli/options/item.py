@@ -213,6 +213,9 @@ def _addressed(text: str, area: Area, *, modicon: bool) -> tuple[Place, int | No
         if MODICON_NUMBER.fullmatch(text):
             meant = of_modicon(text)
             near = f"; did you mean {SHORT_OF[meant.area]}:{meant.address}, Modicon's {text}?"
+        first, _, last = text.partition("-")
+        if None not in (span(first), span(last)):
+            near = f"; in FIRST-LAST, the lower address is first: {last}-{first}"
         allowed = f"allowed: 0 to {LAST_ADDRESS}, decimal or 0x{near}"
         raise click.UsageError(f"ADDRESS is {text!r}, {allowed}")
     return Place(area, found.start), len(found) if "-" in text else None
