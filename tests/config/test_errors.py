@@ -281,7 +281,8 @@ def test_limits_and_times_are_checked(folder: Folder, setting: str, problem: str
         ("{1: plant}", "{}",
          "9: units: found an empty mapping, allowed: a mapping with at least one entry"),
         ("{1: plant}", "{256: plant}", f"9: units.256: found 256, allowed: {UNIT}"),
-        ("{1: plant}", "{'1': plant}", f"9: units.1: found '1', allowed: {UNIT}"),
+        ("{1: plant}", "{'1': plant}", f"9: units.1: found '1', allowed: {UNIT}; write 1 "
+         "without quotes"),
         ("{1: plant}", "{1: plan}",
          "9: units.1: found 'plan', allowed: plant; did you mean 'plant'?"),
         ("{1: plant}", "{1: 5}",
@@ -517,6 +518,8 @@ def test_initial_values_from_yaml_are_checked(folder: Folder, values: str, probl
         ("bind: [::1]:502\n", f"1: not YAML: more text after the end of a value: {BRACKETS}"),
         ("a: {bind: [::1]:502}\n", f"1: not YAML: a comma is missing, or {BRACKETS}"),
         ("a: 1\n---\nb: 1\n", "2: not YAML: expected a single document in the stream, "
+        ("memories: {}".encode("utf-16"), " a file in UTF-16, allowed: YAML in UTF-8; save it as "
+         "UTF-8"),
          "but found another document"),
         ("a: 1\nb: \x01\n", "2: the character U+0001 is not allowed in YAML"),
         (b"a: 1\nb: \xff\n", "2: not UTF-8, allowed: YAML in UTF-8"),
@@ -539,6 +542,12 @@ def test_a_section_in_capitals_is_one_of_a_configuration(folder: Folder) -> None
 def test_values_without_end_are_refused(folder: Folder) -> None:
     endless = "[" * sys.getrecursionlimit()
     assert folder.problems(endless) == ["p.yaml: not a configuration: nested too deeply"]
+def test_a_merge_key_is_named_as_one(folder: Folder) -> None:
+    assert folder.problems(changed("    rules:", "    <<: {when_full: evict}\n    rules:")) == [
+        "p.yaml:7: listeners.scada: merge keys are not allowed: repeat the keys"
+    ]
+
+
 
 
 def test_too_many_values_are_refused_before_they_take_memory(

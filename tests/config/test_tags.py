@@ -318,6 +318,11 @@ def test_one_entry_makes_many_devices(tmp_path: Path) -> None:
     ("entry", "expected"),
     [
         ("'m{n}': {for: {n: 1-3}, url: 'tcp://a{m}', unit: 1}", "devices.'m{n}': found {m}, "),
+        (
+            "'m{n}': {for: {n: 1-3}, url: 'tcp://10.0.0.{ n }', unit: 1}",
+            "devices.'m{n}': found { n }, allowed: {n}; with at least three digits {n:03}",
+        ),
+        ("'m{n}': {for: {n: 1-3}, url: 'tcp://a{n:2}'}", "devices.'m{n}': found {n:2}, allowed: "),
         ("'m{n}': {for: {n: 3-1}, url: tcp://a}", "devices.'m{n}'.for.n: found '3-1', allowed: as"),
         ("'m{n}': {for: 3, url: tcp://a}", "devices.'m{n}'.for: found 3, allowed: as in"),
         ("'m{n}': {for: {}, url: tcp://a}", "devices.'m{n}'.for: found an empty mapping"),

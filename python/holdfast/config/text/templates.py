@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.config.text.messages import show
 from holdfast.config.text.raw_access import mapping
+from holdfast.runtime.text import listing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,6 +25,7 @@ MAX_DEVICES = 10_000
 """The most devices of one file."""
 
 _FIELD = re.compile(r"\{([A-Za-z_][A-Za-z0-9_]*)(?::(0[1-9]))?\}")
+_BRACES = re.compile(r"\{([^{}]*)\}")
 _SPAN = re.compile(r"([0-9]{1,9})-([0-9]{1,9})")
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _ALLOWED = "allowed: as in {n: 1-300} or {n: [1, 2, 5]}"
@@ -48,8 +50,9 @@ def expand_templates(report: Report) -> None:
                 named = str(_filled(name, values))
                 content = _filled(plain, values)
             except KeyError as error:
-                known = ", ".join(f"{{{each}}}" for each in values)
-                report.add_key(path, f"found {{{error.args[0]}}}, allowed: {known}")
+                known = listing(f"{{{each}}}" for each in values)
+                digits = f"; with at least three digits {{{next(iter(values))}:03}}"
+                report.add_key(path, f"found {{{error.args[0]}}}, allowed: {known}{digits}")
                 break
             if len(made) >= MAX_DEVICES:
                 report.add(
@@ -103,12 +106,18 @@ def _numbers(span: object) -> range | list[int] | None:
 
 
 def _filled(value: Any, values: Mapping[str, int]) -> Any:
-    """A value with the numbers in all its text. Raises `KeyError` for an unknown variable."""
+    """A value with the numbers in all its text. Raises `KeyError` for an unknown variable, and for
+    a known one in another form.
+    """
     if isinstance(value, str):
         whole = _FIELD.fullmatch(value)
         if whole is not None and whole[2] is None:
             return values[whole[1]]
-        return _FIELD.sub(lambda found: f"{values[found[1]]:{found[2] or 'd'}}", value)
+        filled = _FIELD.sub(lambda found: f"{values[found[1]]:{found[2] or 'd'}}", value)
+        for inside in _BRACES.findall(filled) if "{" in filled else ():
+            if not values.keys().isdisjoint(_VARIABLE.findall(inside)):
+                raise KeyError(inside)
+        return filled
     if isinstance(value, list):
         return [_filled(each, values) for each in value]
     if isinstance(value, dict):

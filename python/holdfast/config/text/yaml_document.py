@@ -7,6 +7,7 @@ not know what the keys mean.
 
 from __future__ import annotations
 
+import codecs
 import re
 from dataclasses import dataclass, field
 from enum import Enum
@@ -158,6 +159,8 @@ def _error(file: str, message: str, line: int | None = None) -> ConfigError:
 
 def decoded(data: bytes, file: str, form: str = "YAML") -> str:
     """Decodes the content of a file, which has to be of the `form`. Raises `ConfigError`."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise _error(file, f"a file in UTF-16, allowed: {form} in UTF-8; save it as UTF-8")
     if b"\0" in data:
         raise _error(file, f"a binary file, allowed: {form} in UTF-8")
     try:
@@ -303,7 +306,10 @@ class _Reader:
             if key == "<<" and self._merges:
                 merged.append((event, *self._value(next(self._events), (*path, key))))
                 continue
-            if key in data:
+            if key == "<<" and event[0] == "plain":
+                self._add(event, path, "merge keys are not allowed: repeat the keys")
+                key = None
+            elif key in data:
                 first = spot.children[key][0].line
                 name = str(key) if isinstance(key, int) else show(key)
                 self._add(event, path, f"{name} is given twice, first in line {first}")

@@ -105,7 +105,8 @@ def _id_of(what: str, least: int, most: int, note: str = "") -> Callable[[object
     def number(value: object) -> int:
         if type(value) is int and least <= value <= most:
             return value
-        raise ValueError(f"found {show(value)}, allowed: {what} from {least} to {most}{note}")
+        form = f"{what} from {least} to {most}{note}{_unquoted(value)}"
+        raise ValueError(f"found {show(value)}, allowed: {form}")
 
     return number
 
@@ -216,10 +217,16 @@ def _key_of(least: int, most: int, note: str = "") -> Callable[[object], UnitKey
     def key(value: object) -> UnitKey:
         parsed = parse_unit_key(value, least, most)
         if parsed is None:
-            raise ValueError(f"found {show(value)}, allowed: {allowed}")
+            raise ValueError(f"found {show(value)}, allowed: {allowed}{_unquoted(value)}")
         return parsed
 
     return key
+
+
+def _unquoted(value: object) -> str:
+    """A hint for an integer that is text, as in `"1": plant`."""
+    is_integer = isinstance(value, str) and re.fullmatch("[0-9]{1,5}", value)
+    return f"; write {value} without quotes" if is_integer else ""
 
 
 def _sparkplug_id(value: object) -> str:
