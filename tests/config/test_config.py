@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from ipaddress import ip_network
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
+import jsonschema_rs
 import pytest
 from hypothesis import given, settings
 
@@ -30,6 +32,7 @@ from holdfast.config.models.listeners import (
 )
 from holdfast.config.models.memories import Seal, Span
 from holdfast.config.models.services import AuditConfig, MqttConfig, RestConfig, TokenConfig
+from holdfast.config.text import yaml_document
 from support.cases import examples
 from support.config_folder import written
 from support.configurations import configurations
@@ -593,6 +596,15 @@ def test_the_dump_loads_from_another_folder_with_its_initial_values(
 def test_the_examples_are_right() -> None:
     for path in EXAMPLES.glob("*.yaml"):
         assert load(path).warnings == ()
+
+
+def test_the_schema_accepts_devices_that_are_written_once_for_many() -> None:
+    data = yaml_document.parse((EXAMPLES / "full.yaml").read_text(), "full.yaml")[0].data
+    validator = jsonschema_rs.validator_for(json_schema())
+    validator.validate(json.loads(json.dumps(data)))
+    assert any("for" in device for device in data["devices"].values())
+    for wrong in ({"for": {"n": "1-"}, "url": "tcp://a{n}"}, {"url": "tcp://a", "fro": {"n": 1}}):
+        assert not validator.is_valid({"devices": {"a{n}": wrong}})
 
 
 def test_the_full_example_has_every_section_and_every_listener() -> None:

@@ -359,6 +359,8 @@ def test_a_topic_is_subscribed_once(folder: Folder) -> None:
          "5: adapters.weather.access: missing, allowed: read-only or read-write"),
         ("read-only", "read-only, options: [1]",
          "5: adapters.weather.options: found a list, allowed: a mapping"),
+        ("read-only", "read-only, options: {a: {b: [.nan]}}",
+         "5: adapters.weather.options.a: found nan, allowed: finite numbers"),
         ("read-only", "read-only, options: {7: 1}", "5: adapters.weather.options.7: found 7, "
          "allowed: text; write '7' to make it text"),
         ("{bind: 127.0.0.1:9464}", "{}", "6: metrics.bind: missing, allowed: text, as in "

@@ -429,6 +429,16 @@ def test_what_would_fail_at_the_start_is_a_problem(
         assert part in problem
 
 
+def test_markers_that_json_can_not_have_are_text(tmp_path: Path) -> None:
+    place = "input_registers, address: 1, type: float32, null: [.nan, .inf, -.inf, 0]"
+    config = load(written(tmp_path, DEVICE.replace("coils, address: 1", place)))
+    markers = config.effective()["devices"]["a"]["tags"]["x"]["null"]
+    assert markers == ["nan", "inf", "-inf", 0]
+    [tag] = config.tags("a")
+    assert {str(marker) for marker in tag.null} == {"nan", "inf", "-inf", "0.0"}
+    assert load(written(tmp_path, config.dump())) == config
+
+
 def test_what_is_called_options_is_printed_like_all_else(tmp_path: Path) -> None:
     config = load(written(tmp_path, DEVICE.replace("{a:", "{options:")))
     assert load(written(tmp_path, config.dump())) == config

@@ -76,6 +76,8 @@ def _kinds(node: Node, value: object) -> list[Node]:
 
 
 def _resolved(node: Node) -> Node:
+    if "else" in node:
+        node = node["else"]  # Devices; those with `for` have been expanded.
     if "$ref" not in node:
         return node
     target: Node = cached()["$defs"][node["$ref"].rpartition("/")[2]]

@@ -241,8 +241,8 @@ def as_decoded(marker: Marker, type: Type, encoding: str | None) -> Marker:
     """
     if type.base == "bytes":
         raise ValueError(f"not supported for {type.name}")
-    if marker == "nan" and type.base in FLOATS:
-        return math.nan
+    if marker in ("nan", "inf", "-inf") and type.base in FLOATS:
+        return float(marker)
     try:
         registers = encode(marker, type.element, encoding=encoding)
         made: Marker = decode(registers, type.element, encoding=encoding)

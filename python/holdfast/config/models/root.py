@@ -42,6 +42,7 @@ from holdfast.config.values.scalars import (
     Text,
     UnitId,
 )
+from holdfast.config.values.template_schema import with_templates
 from holdfast.events import FORMAT, LEVEL, Format, Level
 from holdfast.server.identity import Identity
 from holdfast.tags import Tag, TagList
@@ -121,7 +122,7 @@ class Config(Model):
     """The servers, by name; optional with rest, mqtt, nats, gateway or a device."""
     profiles: Profiles = Field(default={}, json_schema_extra=NAME_KEYS)
     """The tags of kinds of devices, by name; or a list of files with one profile each."""
-    devices: dict[Name, DeviceConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
+    devices: dict[Name, DeviceConfig] = Field(default={}, json_schema_extra=with_templates)
     """Devices to poll, or to pass requests on to, by name."""
     links: dict[Name, LinkConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
     """Connections and serial lines to pass requests on to, by name."""

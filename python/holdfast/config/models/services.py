@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
-from pydantic import Discriminator, Field, Strict, Tag
+from pydantic import AfterValidator, Discriminator, Field, Strict, Tag
 
 from holdfast.config.models.base import Model
 from holdfast.config.models.server_tls import HttpsConfig
 from holdfast.config.models.tags import TagConfig
+from holdfast.config.text.raw_access import entries
 from holdfast.config.values.scalars import (
     Areas,
     BindAddress,
@@ -350,11 +352,20 @@ class AdapterConfig(Model):
     """The entry point of the adapter, in the group holdfast.adapters."""
     memories: MemoryNames
     """The memories it can access."""
+def _finite(value: Any) -> Any:
+    """Refuses what JSON can't have, anywhere in the value of an option."""
+    if isinstance(value, float) and not isfinite(value):
+        raise ValueError(f"found {value}, allowed: finite numbers")
+    for each in value.values() if isinstance(value, dict) else entries(value):
+        _finite(each)
+    return value
+
+
     areas: Areas
     """The areas it can access."""
     access: Access
     """Whether it may write."""
-    options: dict[OptionName, Any] = Field(default={})
+    options: dict[OptionName, Annotated[Any, AfterValidator(_finite)]] = Field(default={})
     """The adapter's own settings."""
 
 

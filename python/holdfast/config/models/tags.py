@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import unicodedata
 from functools import cached_property
+from math import isfinite
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, Strict
@@ -20,8 +21,14 @@ from holdfast.tags.writing import Rounding
 from holdfast.types import Area
 from holdfast.values.orders import DEFAULT_ORDER
 
+
+def _written(marker: bool | int | float | str) -> bool | int | float | str:
+    """A marker as JSON can have it."""
+    return str(marker) if isinstance(marker, float) and not isfinite(marker) else marker
+
+
 Number = Annotated[float, Field(allow_inf_nan=False), whole_number]
-Marker = bool | int | float | str
+Marker = Annotated[bool | int | float | str, AfterValidator(_written)]
 Scale = Annotated[
     float | ScaleConfig,
     PlainValidator(parse_scale),
