@@ -175,7 +175,7 @@ def test_keep_takes_effect_at_a_start(tmp_path: Path) -> None:
         ("{file: .}", "memories.plant.keep.file: found '.', which is a folder"),
         (
             "{file: x.redb, sync: -1}",
-            "memories.plant.keep.sync: found -1, allowed: a number from 0 to 3600",
+            "memories.plant.keep.sync: found -1, allowed: a number from 0 to 3600 seconds",
         ),
         ("{file: x.redb, snyc: 0}", "memories.plant.keep.snyc: unknown key, allowed: file, sync"),
         ("{sync: 0}", "memories.plant.keep.file: missing, allowed: text"),

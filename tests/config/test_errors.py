@@ -245,13 +245,16 @@ def test_a_listener_is_checked(folder: Folder, old: str, new: str, problem: str)
             "found 0, allowed: an integer from 1 to 65535 or null",
         ),
         ("when_full: wait", "found 'wait', allowed: refuse or evict"),
-        ("idle_timeout: -1", "found -1, allowed: a number from 0 to 31622400"),
-        ("idle_timeout: .inf", "found inf, allowed: a number from 0 to 31622400"),
-        ("idle_timeout: .nan", "found nan, allowed: a number from 0 to 31622400"),
-        ("idle_timeout: true", "found true, allowed: a number from 0 to 31622400"),
+        ("idle_timeout: -1", "found -1, allowed: a number from 0 to 31622400 seconds"),
+        ("idle_timeout: .inf", "found inf, allowed: a number from 0 to 31622400 seconds"),
+        ("idle_timeout: .nan", "found nan, allowed: a number from 0 to 31622400 seconds"),
+        ("idle_timeout: true", "found true, allowed: a number from 0 to 31622400 seconds"),
         ("idle_timeout: 1e-5", "found 1e-05, allowed: 0, or 0.001 to 31622400 seconds"),
-        ("request_timeout: 0", "found 0, allowed: a number from 0.001 to 31622400"),
-        ("request_timeout: '5'", "found '5', allowed: a number from 0.001 to 31622400"),
+        ("request_timeout: 0", "found 0, allowed: a number from 0.001 to 31622400 seconds"),
+        (
+            "request_timeout: '5'",
+            "found '5', allowed: a number from 0.001 to 31622400 seconds; did you mean 5?",
+        ),
     ],
 )
 def test_limits_and_times_are_checked(folder: Folder, setting: str, problem: str) -> None:
@@ -515,11 +518,11 @@ def test_initial_values_from_yaml_are_checked(folder: Folder, values: str, probl
             "3: not YAML: expected ',' or ']', but got ':', "
             "while parsing a flow sequence that starts in line 1",
         ),
+        ("memories: {}".encode("utf-16"), " a file in UTF-16, allowed: YAML in UTF-8; save it as "
+         "UTF-8"),
         ("bind: [::1]:502\n", f"1: not YAML: more text after the end of a value: {BRACKETS}"),
         ("a: {bind: [::1]:502}\n", f"1: not YAML: a comma is missing, or {BRACKETS}"),
         ("a: 1\n---\nb: 1\n", "2: not YAML: expected a single document in the stream, "
-        ("memories: {}".encode("utf-16"), " a file in UTF-16, allowed: YAML in UTF-8; save it as "
-         "UTF-8"),
          "but found another document"),
         ("a: 1\nb: \x01\n", "2: the character U+0001 is not allowed in YAML"),
         (b"a: 1\nb: \xff\n", "2: not UTF-8, allowed: YAML in UTF-8"),
@@ -539,15 +542,15 @@ def test_a_section_in_capitals_is_one_of_a_configuration(folder: Folder) -> None
     assert first == f"p.yaml:1: GATEWAY: unknown key, allowed: {TOP}; did you mean 'gateway'?"
 
 
-def test_values_without_end_are_refused(folder: Folder) -> None:
-    endless = "[" * sys.getrecursionlimit()
-    assert folder.problems(endless) == ["p.yaml: not a configuration: nested too deeply"]
 def test_a_merge_key_is_named_as_one(folder: Folder) -> None:
     assert folder.problems(changed("    rules:", "    <<: {when_full: evict}\n    rules:")) == [
         "p.yaml:7: listeners.scada: merge keys are not allowed: repeat the keys"
     ]
 
 
+def test_values_without_end_are_refused(folder: Folder) -> None:
+    endless = "[" * sys.getrecursionlimit()
+    assert folder.problems(endless) == ["p.yaml: not a configuration: nested too deeply"]
 
 
 def test_too_many_values_are_refused_before_they_take_memory(

@@ -149,9 +149,9 @@ def test_a_listener_for_rtu_over_tcp_is_checked_like_modbus_tcp(folder: Folder) 
         ("{device: a, data_bits: 7}",
          "serial.data_bits: removed, RTU has 8 data bits: delete the key"),
         ("{device: a, silence: 0}",
-         "serial.silence: found 0, allowed: a number from 0.0001 to 10"),
+         "serial.silence: found 0, allowed: a number from 0.0001 to 10 seconds"),
         ("{device: a, silence: }",
-         "serial.silence: found nothing, allowed: a number from 0.0001 to 10"),
+         "serial.silence: found nothing, allowed: a number from 0.0001 to 10 seconds"),
         ("{device: a, sillence: 1}", "serial.sillence: unknown key, allowed: device, baud, parity, "
          "stop_bits, rs485, silence; did you mean 'silence'?"),
         ("/dev/ttyUSB0", "serial: found '/dev/ttyUSB0', allowed: a mapping with the keys device, "

@@ -154,7 +154,7 @@ def test_a_serial_listener_has_routes_too(folder: Folder) -> None:
         ('"rtu:///dev/none?baud=9600"', '"tcp://a", cache: 0.0001',
          "5: links.bus.cache: found 0.0001, allowed: 0, or 0.001 to 31622400 seconds"),
         ('"rtu:///dev/none?baud=9600"', '"tcp://a", timeout: 0',
-         "5: links.bus.timeout: found 0, allowed: a number from 0.001 to 31622400"),
+         "5: links.bus.timeout: found 0, allowed: a number from 0.001 to 31622400 seconds"),
         ('"rtu:///dev/none?baud=9600"', '"tcp://a", in_flight: 1025',
          "5: links.bus.in_flight: found 1025, allowed: an integer from 1 to 1024 or auto"),
         ('"rtu:///dev/none?baud=9600"', '"tcp://a", coalesce: 1',
@@ -324,7 +324,7 @@ def test_settings_of_polling_have_no_effect_without_reads(folder: Folder, settin
 def test_reads_need_an_interval(folder: Folder) -> None:
     reads = READS.removeprefix("interval: 1, ")
     assert told(folder, changed("unit: 7}", f"unit: 7, {reads}}}")) == [
-        "3: devices.drive.interval: missing, allowed: a number from 0.01 to 31622400"
+        "3: devices.drive.interval: missing, allowed: a number from 0.01 to 31622400 seconds"
     ]
 
 

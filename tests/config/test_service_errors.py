@@ -98,7 +98,7 @@ def test_listeners_are_not_empty_text(folder: Folder) -> None:
         ("  tokens:", "  when_full: wait\n  tokens:",
          "7: when_full: found 'wait', allowed: refuse or evict"),
         ("  tokens:", "  request_timeout: 0\n  tokens:",
-         "7: request_timeout: found 0, allowed: a number from 0.001 to 31622400"),
+         "7: request_timeout: found 0, allowed: a number from 0.001 to 31622400 seconds"),
         ("  tokens:", "  token: []\n  tokens:",
          "7: token: unknown key, allowed: bind, sources, tokens, max_body, max_connections, "
          "max_connections_per_source, when_full, request_timeout, tls, hosts; did you mean "
@@ -279,7 +279,7 @@ def test_a_topic_filter_that_mqtt_allows_is_right(folder: Folder, topic: str) ->
         ("  client", "  version: 4\n  client", "6: version: found 4, allowed: 5 or 3.1.1"),
         ("  client", "  version: 5.0\n  client", "6: version: found 5.0, allowed: 5 or 3.1.1"),
         ("  client", "  keep_alive: 0\n  client",
-         "6: keep_alive: found 0, allowed: an integer from 1 to 65535"),
+         "6: keep_alive: found 0, allowed: an integer from 1 to 65535 seconds"),
         ("  client", "  username: ''\n  client",
          "6: username: found text of 0 bytes, allowed: text of 1 to 65535 bytes"),
         ("  client", "  password_file: p.yaml\n  client",

@@ -101,9 +101,10 @@ def _words(node: Node) -> str:
 def _range(kind: str, node: Node) -> str:
     if "minimum" not in node:
         return kind
+    unit = f" {node['$comment']}" if "$comment" in node else ""
     if "maximum" not in node:
-        return f"{kind} of at least {node['minimum']}"
-    return f"{kind} from {node['minimum']} to {node['maximum']}"
+        return f"{kind} of at least {node['minimum']}{unit}"
+    return f"{kind} from {node['minimum']} to {node['maximum']}{unit}"
 
 
 def _text(node: Node) -> str:

@@ -16,7 +16,7 @@ from holdfast.config.models.outputs import OUTPUT_TYPES
 from holdfast.config.models.partial import partial
 from holdfast.config.models.root import Config
 from holdfast.config.text.messages import shape, show
-from holdfast.runtime.text import either, listing, suggestion
+from holdfast.runtime.text import either, listing, seconds_in, suggestion
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -82,12 +82,21 @@ def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
             path = path[:-1]
         near = suggestion(error["input"], _words(error)) if kind == "literal_error" else ""
         words = "an integer" if of_key and kind == "int_type" else f"{allowed(path, data)}{near}"
+        words += _in_seconds(error["input"], words)
         report.add(path, f"found {_shown(path, error['input'])}, allowed: {words}")
 
 
 def _words(error: ErrorDetails) -> list[str]:
     """The words that a literal allows."""
     return re.findall("'([^']*)'", error["ctx"]["expected"])
+
+
+def _in_seconds(found: object, words: str) -> str:
+    """The number that a time with a unit probably means."""
+    if not isinstance(found, str) or re.match("a number .* seconds", words) is None:
+        return ""
+    number = seconds_in(found)
+    return "" if number is None else f"; did you mean {number:.12g}?"
 
 
 def _add_kind(path: KeyPath, owner: dict[str, Any], report: Report) -> None:

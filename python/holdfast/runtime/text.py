@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,11 @@ if TYPE_CHECKING:
 
 MAX_CHARACTERS = 40
 """A longer value is cut."""
+
+TIME = re.compile(r"([0-9]+\.?[0-9]*|\.[0-9]+)(?:e([+-]?[0-9]{1,3}))? ?([a-z]*)", re.I)
+"""A time as people write it: a number, its exponent, and its unit."""
+
+_UNITS_S = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "": 1.0}
 
 _FIRST_OF_WINSOCK = 10_000
 """Errors of sockets on Windows, which `os.strerror` does not know, have no lower number."""
@@ -60,6 +66,15 @@ def told(error: OSError) -> str:
     """An error of the system with its file, and without its number."""
     text = error.strerror or str(error)
     return text if error.filename is None else f"{error.filename}: {text}"
+
+
+def seconds_in(text: str) -> float | None:
+    """The seconds of a time as in `500ms`, `2s` or `2`; `None` for other text, also for `m`."""
+    match = TIME.fullmatch(text)
+    unit = None if match is None else _UNITS_S.get(match[3].lower())
+    if match is None or unit is None:
+        return None
+    return float(f"{match[1]}e{match[2] or 0}") * unit
 
 
 def error_text(number: int) -> str:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING
 
 import click
 
 from holdfast.cli.options.option import Command, option
 from holdfast.client.base import MAX_TIMEOUT_S
+from holdfast.runtime.text import TIME, seconds_in
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 WHOLE_REQUEST = "Time limit for connection, request and reply together."
-UNITS_S = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "": 1.0}
-_TIME = re.compile(r"([0-9]+\.?[0-9]*|\.[0-9]+)(?:e([+-]?[0-9]{1,3}))? ?([a-z]*)", re.I)
 
 
 class Duration(click.ParamType):  # type: ignore[type-arg]
@@ -35,13 +33,11 @@ class Duration(click.ParamType):  # type: ignore[type-arg]
     ) -> float:
         """Parses a time, in seconds."""
         text = str(value).strip()
-        match = _TIME.fullmatch(text)
-        unit = match[3].lower() if match else ""
-        if match is not None and unit == "m":
+        match = TIME.fullmatch(text)
+        if match is not None and match[3].lower() == "m":
             self.fail(f"{text!r} is not clear: write {match[1]}min or {match[1]}ms.", param, ctx)
-        seconds = -1.0
-        if match is not None and unit in UNITS_S:
-            seconds = float(f"{match[1]}e{match[2] or 0}") * UNITS_S[unit]
+        found = seconds_in(text)
+        seconds = -1.0 if found is None else found
         if seconds == 0 and self._zero:
             return 0.0
         if not max(self._least_s, 1e-9) <= seconds <= self._most_s:

@@ -34,6 +34,7 @@ from holdfast.config.values.scalars import (
     StatusName,
     Text,
     UnitId,
+    seconds,
     whole_number,
 )
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
@@ -199,8 +200,8 @@ class ForwardConfig(Model):
 
 
 InFlight = Annotated[int, Field(ge=1, le=MAX_IN_FLIGHT)] | Literal["auto"]
-Interval = Annotated[float, Field(ge=MIN_INTERVAL, le=MAX_TIME, allow_inf_nan=False), whole_number]
-Pause = Annotated[float, Field(ge=0, le=MAX_PAUSE_S, allow_inf_nan=False), whole_number]
+Interval = Annotated[float, seconds(MIN_INTERVAL, MAX_TIME), whole_number]
+Pause = Annotated[float, seconds(0, MAX_PAUSE_S), whole_number]
 AcceptUnit = Annotated[Annotated[int, Field(ge=0, le=MAX_UNIT)] | Literal["any"] | None, NotNull()]
 
 

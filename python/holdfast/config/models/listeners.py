@@ -16,6 +16,7 @@ from holdfast.config.models.devices import RangeConfig
 from holdfast.config.models.server_tls import ServerTlsConfig
 from holdfast.config.values.scalars import (
     RAW_UNIT_KEYS,
+    SECONDS,
     SERIAL_UNITS_KEYS,
     UNITS_KEYS,
     Areas,
@@ -35,6 +36,7 @@ from holdfast.config.values.scalars import (
     Sources,
     StopBits,
     UnitIds,
+    seconds,
 )
 from holdfast.protocol import LAST_ADDRESS
 from holdfast.runtime.text import suggestion
@@ -204,7 +206,9 @@ class _ModbusRules(Model):
 class _ModbusLimits(ConnectionLimits):
     """Limits of all Modbus servers over TCP connections."""
 
-    keepalive: Annotated[int, Field(ge=1, le=32767)] = DEFAULTS["keepalive"]
+    keepalive: Annotated[int, Field(ge=1, le=32767, json_schema_extra=SECONDS)] = DEFAULTS[
+        "keepalive"
+    ]
     """Seconds without a byte after which TCP asks whether the peer is still there. Some firewalls
     and mobile networks forget connections that are silent for a shorter time."""
 
@@ -328,9 +332,7 @@ class SerialConfig(Model):
 class RtuSerialConfig(SerialConfig):
     """A serial port for Modbus RTU."""
 
-    silence: Annotated[
-        Annotated[float, Field(ge=0.0001, le=10, allow_inf_nan=False)] | None, NotNull()
-    ] = None
+    silence: Annotated[Annotated[float, seconds(0.0001, 10)] | None, NotNull()] = None
     """Seconds of silence that end a frame. Default: the time of 3.5 characters; above 19200 baud
     1.75 ms."""
 

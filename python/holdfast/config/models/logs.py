@@ -8,7 +8,15 @@ from pydantic import Field, Strict, model_validator
 
 from holdfast._core import MAX_LAG_S, WRITE_TIMEOUT_S
 from holdfast.config.models.services import NatsServersConfig
-from holdfast.config.values.scalars import FilePath, HttpUrl, Name, NatsUrl, NotNull, whole_number
+from holdfast.config.values.scalars import (
+    FilePath,
+    HttpUrl,
+    Name,
+    NatsUrl,
+    NotNull,
+    seconds,
+    whole_number,
+)
 
 EMBEDDED_URL = "nats://127.0.0.1:4222"
 """Where an embedded server listens, unless servers says otherwise."""
@@ -16,7 +24,7 @@ EMBEDDED_URL = "nats://127.0.0.1:4222"
 TOKEN_FILE = "token"
 """The file with the secret of an embedded server, in its folder, unless the log has another one."""
 
-Seconds = Annotated[float, Field(ge=0.05, le=3600, allow_inf_nan=False), whole_number]
+Seconds = Annotated[float, seconds(0.05, 3600), whole_number]
 
 
 class SharedLogConfig(NatsServersConfig):

@@ -14,6 +14,7 @@ from holdfast.config.values.scalars import (
     FilePath,
     Name,
     NotNull,
+    seconds,
     whole_number,
 )
 from holdfast.protocol import (
@@ -78,7 +79,7 @@ class KeepConfig(Model):
 
     file: FilePath
     """The file, in an existing folder. Memories that are written together share one."""
-    sync: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False), whole_number] = 1.0
+    sync: Annotated[float, seconds(0, 3600), whole_number] = 1.0
     """0: every write is on the disk before its reply. Otherwise the seconds of writes that a crash
     or a power cut may cost; a clean stop loses nothing. With replicate, more than 0."""
 

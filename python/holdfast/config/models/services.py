@@ -12,6 +12,8 @@ from holdfast.config.models.server_tls import HttpsConfig
 from holdfast.config.models.tags import TagConfig
 from holdfast.config.text.raw_access import entries
 from holdfast.config.values.scalars import (
+    MILLISECONDS,
+    SECONDS,
     Areas,
     BindAddress,
     BrokerUrl,
@@ -36,6 +38,7 @@ from holdfast.config.values.scalars import (
     SyslogUrl,
     TopicFilter,
     TopicName,
+    seconds,
     whole_number,
 )
 from holdfast.config.values.scanner_settings import (
@@ -170,7 +173,7 @@ class BrokerConfig(Model):
     """A file that contains the password; requires username."""
     version: MqttVersion = "5"
     """The version of MQTT."""
-    keep_alive: Annotated[int, Field(ge=1, le=65535)] = 60
+    keep_alive: Annotated[int, Field(ge=1, le=65535, json_schema_extra=SECONDS)] = 60
     """Seconds without a message after which the client sends a ping."""
     tls: Annotated[ClientTlsConfig | None, NotNull()] = None
     """Certificates; requires mqtts://."""
@@ -238,20 +241,24 @@ class NatsLimitsConfig(Model):
 class NatsDefaultsConfig(Model):
     """The values for keys that a subscribe request leaves out."""
 
-    timeout: Annotated[int, Field(ge=MIN_TIMEOUT, le=MAX_TIMEOUT)] = TIMEOUT
+    timeout: Annotated[
+        int, Field(ge=MIN_TIMEOUT, le=MAX_TIMEOUT, json_schema_extra=MILLISECONDS)
+    ] = TIMEOUT
     """Milliseconds for a Modbus request and its reply."""
     publish: Publish = "scan"
     """Whether every value is published, or only changes."""
     deadband: Annotated[float, Field(ge=0, le=MAX_DEADBAND), whole_number] = 0.0
     """With publish: change, the change of a number must be greater than this."""
-    scan_rate: Annotated[int, Field(ge=MIN_SCAN_RATE, le=MAX_SCAN_RATE)] = SCAN_RATE
+    scan_rate: Annotated[
+        int, Field(ge=MIN_SCAN_RATE, le=MAX_SCAN_RATE, json_schema_extra=MILLISECONDS)
+    ] = SCAN_RATE
     """The scan interval in milliseconds."""
 
 
 class NatsPingConfig(Model):
     """How a NATS server that does not answer is detected."""
 
-    interval: Annotated[float, Field(ge=MIN_PING_INTERVAL, le=MAX_PING_INTERVAL), whole_number] = (
+    interval: Annotated[float, seconds(MIN_PING_INTERVAL, MAX_PING_INTERVAL), whole_number] = (
         PING_INTERVAL_S
     )
     """Seconds between pings to the server."""
@@ -345,13 +352,6 @@ class GatewayConfig(Model):
     """The program whose requests it accepts, and whose errors it sends. Default: none."""
 
 
-class AdapterConfig(Model):
-    """A third-party adapter, and what it can access."""
-
-    type: Name
-    """The entry point of the adapter, in the group holdfast.adapters."""
-    memories: MemoryNames
-    """The memories it can access."""
 def _finite(value: Any) -> Any:
     """Refuses what JSON can't have, anywhere in the value of an option."""
     if isinstance(value, float) and not isfinite(value):
@@ -361,6 +361,13 @@ def _finite(value: Any) -> Any:
     return value
 
 
+class AdapterConfig(Model):
+    """A third-party adapter, and what it can access."""
+
+    type: Name
+    """The entry point of the adapter, in the group holdfast.adapters."""
+    memories: MemoryNames
+    """The memories it can access."""
     areas: Areas
     """The areas it can access."""
     access: Access

@@ -409,10 +409,18 @@ DataBits = Annotated[Literal[7, 8], BeforeValidator(integral)]
 Connections = Annotated[int, Field(ge=1, le=MAX_CONNECTIONS)]
 whole_number = PlainSerializer(_whole, return_type=int | float)
 """Writes `1.0` as `1`."""
-Duration = Annotated[float, Field(ge=MIN_TIME, le=MAX_TIME, allow_inf_nan=False), whole_number]
-DurationOrZero = Annotated[
-    float, Field(ge=0, le=MAX_TIME, allow_inf_nan=False), AfterValidator(_no_instant), whole_number
-]
+SECONDS: JsonDict = {"$comment": "seconds"}
+MILLISECONDS: JsonDict = {"$comment": "milliseconds"}
+"""JSON Schema keys for the units of times, which messages name."""
+
+
+def seconds(least: float, most: float) -> Any:
+    """The constraints of a time."""
+    return Field(ge=least, le=most, allow_inf_nan=False, json_schema_extra=SECONDS)
+
+
+Duration = Annotated[float, seconds(MIN_TIME, MAX_TIME), whole_number]
+DurationOrZero = Annotated[float, seconds(0, MAX_TIME), AfterValidator(_no_instant), whole_number]
 Codes = Annotated[
     tuple[FunctionCode, ...], Strict(False), Field(json_schema_extra={"uniqueItems": True})
 ]
