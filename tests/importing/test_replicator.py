@@ -161,6 +161,9 @@ def test_a_note_names_what_is_not_converted_unchanged(
          "4: replicator.units[0].source.endpoint: found an empty text, allowed: text"),
         ("10.5.1.20:501", " ",
          "11: replicator.units[0].targets[0].endpoint: found an empty text, allowed: text"),
+        ("10.5.1.29:502", "10.5.1.029:502",
+         "4: replicator.units[0].source.endpoint: found '10.5.1.029:502', allowed: host:port, as "
+         "in 10.5.1.29:502"),
         ("10.5.1.29:502", "u@a:1",
          "4: replicator.units[0].source.endpoint: found 'u@a:1', allowed: host:port, as in "
          "10.5.1.29:502"),

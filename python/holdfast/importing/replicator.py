@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
 from holdfast.config.models.devices import LAST_SLOT, MIN_INTERVAL
 from holdfast.config.text.messages import show
@@ -12,6 +11,7 @@ from holdfast.importing.imported import Imported, Source
 from holdfast.importing.key_reader import Section, seconds, section
 from holdfast.importing.names import unique_names
 from holdfast.net.addresses import joined
+from holdfast.net.hosts import host_and_port
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT
 from holdfast.types import AREAS, Area
 
@@ -145,11 +145,10 @@ class _Units:
         if text is None:
             return None
         try:
-            parts = urlsplit(f"//{text}")
-            host, port = parts.hostname or "127.0.0.1", parts.port
+            host, port = host_and_port(f"127.0.0.1{text}" if text.startswith(":") else text)
         except ValueError:
             port = None
-        if not port or parts.netloc != text or "@" in text:
+        if port is None:
             message = f"found {show(text)}, allowed: host:port, as in 10.5.1.29:502"
             self.desk.problem(one.at("endpoint"), message)
             return None
