@@ -297,6 +297,7 @@ def test_ctrl_c_leaves_a_whole_recording(server: holdfast.Server, tmp_path: Path
         (("hr", "0", "--csv"), "--csv requires AREA:ADDRESS or --tags."),
         (("hr", "0", "--record", "x.csv"), "--record requires AREA:ADDRESS or --tags."),
         (("--profile", "x"), "--profile requires --tags."),
+        (("--tags", "x.csv", "--modicon"), "--modicon can't be used with tags."),
     ],
 )
 def test_wrong_usage_is_told(words: tuple[str, ...], told: str) -> None:

@@ -130,6 +130,8 @@ def device_of(
     if files.given:
         if encoding is not None:
             raise click.UsageError("--encoding can't be used with tags.")
+        if modicon:
+            raise click.UsageError("--modicon can't be used with tags.")
         if words:
             raise click.UsageError(f"{' '.join(words)!r} can't be used with --tags or --config.")
         found = files.device(url, unit, timeout)
