@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from holdfast.values.digits import shortest
+from holdfast.values.digits import decimal_of, shortest
 
 
 def float32(number: float) -> float:
@@ -52,3 +52,17 @@ def test_a_float_has_the_digits_that_its_type_needs(value: float, kind: str, tex
 @given(st.floats(width=32, allow_nan=False))
 def test_a_short_float_is_the_same_float(value: float) -> None:
     assert struct.pack("f", float(shortest(value, "float32"))) == struct.pack("f", value)
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "text"),
+    [
+        (160.25, "float16", "160.25"),
+        (0.0999755859375, "float16", "0.0999755859375"),
+        (2049.0, "float16", "2049"),
+        (float32(0.1), "float32", "0.1"),
+        (0.1, "float64", "0.1"),
+    ],
+)
+def test_a_float16_stands_for_all_of_its_digits(value: float, kind: str, text: str) -> None:
+    assert decimal_of(value, kind) == text

@@ -15,7 +15,7 @@ import click
 from holdfast.cli import answers
 from holdfast.runtime.text import counted as counted
 from holdfast.runtime.text import extent
-from holdfast.values.digits import shortest
+from holdfast.values.digits import decimal_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -84,7 +84,7 @@ def shown(value: Any, kind: str) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
-        return shortest(value, kind)
+        return decimal_of(value, kind)
     if isinstance(value, bytes):
         return value.hex(" ")
     if isinstance(value, str):

@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from holdfast.tags.base import TagError
-from holdfast.values.digits import shortest
+from holdfast.values.digits import decimal_of
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class RegisterScale:
             allowed = "a finite number other than 0"
             raise ValueError(f"the scale in {self.where} is {value}, allowed: {allowed}")
         if isinstance(value, float) and value == content:
-            return float(shortest(value, parsed(self.source.type).base))
+            return float(decimal_of(value, parsed(self.source.type).base))
         return value
 
     def linear(self, content: Any, offset: float) -> Linear:

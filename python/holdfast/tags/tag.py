@@ -21,7 +21,7 @@ from holdfast.values import (
     decode,
     encode,
 )
-from holdfast.values.digits import FLOATS, shortest
+from holdfast.values.digits import FLOATS, decimal_of
 from holdfast.values.integers import as_integer
 from holdfast.values.orders import DEFAULT_ORDER
 from holdfast.values.types import Type, parsed
@@ -209,12 +209,12 @@ class Tag(WritableTag):
         return all(map(self.is_null, raw)) if type(raw) is list else self.is_null(raw)
 
     def _as_written(self, raw: Any) -> Any:
-        """Floats as the shortest decimals that they stand for: 0.1 of a `float32` is 0.1."""
+        """Floats as the decimals that they stand for: 0.1 of a `float32` is 0.1."""
         if type(raw) is list:
             return [self._as_written(item) for item in raw]
         if not isinstance(raw, float) or not math.isfinite(raw) or raw in self.null:
             return raw
-        return Fraction(shortest(raw, self.of_type.base))
+        return Fraction(decimal_of(raw, self.of_type.base))
 
     def _value(self, raw: Any, linear: Linear) -> Any:
         if type(raw) is list:

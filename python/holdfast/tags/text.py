@@ -129,7 +129,7 @@ def _switched(word: str, names: Collection[str]) -> bool:
 def _trimmed(tag: Tag, value: float) -> float:
     """A finite value, as if its registers held the shortest decimal that they stand for."""
     base = tag.of_type.base
-    if base not in ("float16", "float32"):
+    if base != "float32":
         return value
     if tag.scale == 1 and tag.offset == 0:
         return float(shortest(value, base))

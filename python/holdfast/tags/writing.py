@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from holdfast.protocol import WRITE_LIMITS
@@ -11,7 +10,7 @@ from holdfast.tags.base import BaseTag
 from holdfast.tags.scale import RegisterScale, is_finite
 from holdfast.types import BIT_AREAS
 from holdfast.values import DoesNotFit
-from holdfast.values.digits import FLOATS, shortest
+from holdfast.values.digits import FLOATS
 from holdfast.values.errors import shown
 
 if TYPE_CHECKING:
@@ -109,13 +108,13 @@ class WritableTag(BaseTag):
             raise DoesNotFit(f"{value} does not fit {self.type}") from None
 
     def _check_half(self, value: float, number: float) -> None:
-        """Checks the limits of what a `float16` makes of a number, in the digits that it has."""
+        """Checks the limits of what a `float16` makes of a number."""
         form = FLOATS["float16"]
         try:
             [held] = struct.unpack(form, struct.pack(form, number))
         except OverflowError:
             return  # The codec refuses it, and says what the type allows.
-        rounded = self._linear.value(Fraction(shortest(held, "float16")))
+        rounded = self._linear.value(held)
         self._check_limits(rounded, f"{value} is {rounded} in {self.of_type.element},")
 
     def _check_limits(self, value: float, found: str) -> None:

@@ -9,7 +9,7 @@ from holdfast import values
 from holdfast.net.http.fields import malformed
 from holdfast.protocol import WRITE_REGISTERS
 from holdfast.values import ConversionError, WrongArea
-from holdfast.values.digits import shortest
+from holdfast.values.digits import decimal_of
 from holdfast.values.json import jsonable
 from holdfast.values.orders import DEFAULT_ORDER
 from holdfast.values.types import FIXED
@@ -89,7 +89,7 @@ class Typed:
         if isinstance(value, bool):
             return "true" if value else "false"
         if isinstance(value, float):
-            return shortest(value, self.element)
+            return decimal_of(value, self.element)
         return value.hex(" ") if isinstance(value, bytes) else str(value)
 
 
