@@ -7,13 +7,14 @@ import re
 import signal
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import pytest
 
 import holdfast
 from holdfast import values
 from holdfast.config.tag_files.read import load_tags
+from holdfast.discovery import segments
 from support import cli, sunspec_device, wire
 from support.cli import answer, done, usage_error
 from support.commands import Command
@@ -155,6 +156,25 @@ def test_the_description_so_far_is_written_when_it_is_interrupted(tmp_path: Path
     )
     assert f"holdfast: {device.url}: interrupted" in shown
     assert len(load_tags(file)) == 9
+
+
+def test_a_signal_ends_the_inference(monkeypatch: pytest.MonkeyPatch) -> None:
+    def divide(*_args: Any, **_options: Any) -> NoReturn:
+        signal.raise_signal(signal.SIGTERM)
+        raise AssertionError("the signal was lost")
+
+    monkeypatch.setattr(segments, "divide", divide)
+    options = ("--units", "1", "--range", "0-99", "--areas", "hr")
+    with FakeDevice(small) as device:
+        result = cli.invoke("describe", device.url, *options)
+        found = answer("describe", device.url, *options, code=1)
+    assert result.exit_code == 1
+    assert "Incomplete. Not described: holding_registers 0-8." in result.stdout
+    assert result.stderr == f"holdfast: {device.url}: interrupted\n"
+    assert (found["ok"], found["detail"]) == (False, "interrupted")
+    [unit] = found["units"]
+    left = [{"area": "holding_registers", "address": 0, "count": 9}]
+    assert (unit["complete"], unit["not_described"]) == (False, left)
 
 
 @pytest.mark.parametrize(

@@ -190,3 +190,14 @@ def test_a_device_that_does_not_answer_absent_addresses_is_described() -> None:
     with FakeDevice(answers) as device, holdfast.SyncClient(device.url, timeout=0.05) as client:
         description.describe(found, client, reads=1, every=1, delay=0)
     assert found.survey.areas[0].ranges == [range(9)]
+
+
+def test_what_there_is_no_time_for_is_named() -> None:
+    found = Description(1, Survey(["holding_registers", "coils"]))
+    found.reads["holding_registers", range(7, 307)] = [[*range(1000, 1300)]]
+    found.reads["coils", range(3)] = [[1, 0, 1]]
+    for area in found.survey.areas:
+        area.ranges += [extent for name, extent in found.reads if name == area.area]
+    description.conclude(found, seconds=0)
+    assert [each.tag.name for each in found.tags] == ["co_0", "co_1", "co_2"]
+    assert list(description.undescribed(found)) == [("holding_registers", range(7, 307))]

@@ -52,6 +52,9 @@ MAX_CONFIDENCE = 0.99
 IMPROBABLE = 0.01
 """The probability up to which a habit is not considered."""
 
+MAX_REGISTERS_AT_ONCE = 100
+"""Registers that are divided together while time is limited: one more takes some milliseconds."""
+
 MAX_ORDER_REGISTERS = 400
 """Registers from which the order of a device is inferred; more would cost time only."""
 
@@ -142,25 +145,51 @@ def _contents(
         yield from client.read(area, first, f"{kind}[{count}]")
 
 
-def conclude(found: Description, now: float | None = None) -> None:
+def conclude(found: Description, now: float | None = None, seconds: float | None = None) -> None:
     """Infers the tags from what was read; from what the survey has seen, where it ended early.
 
-    `now` is the time in seconds of Unix time.
+    `now` is the time in seconds of Unix time. After `seconds`, and after an exception, the tags so
+    far are there: `undescribed` has the other ranges.
     """
+    end = None if seconds is None else time.monotonic() + seconds
     for area, extent, _ in _places(found):
         if (area, extent) not in found.reads and (area, extent) not in found.unread:
             found.reads[area, extent] = [[found.seen[area][each] for each in extent]]
-    pieces = list(_pieces(found))
-    habits = _habits(pieces, now)
-    found.orders = byte_order_habits.order_shares(habits)
-    tags = list(sunspec_tags.tags_of(found.sunspec)) if found.sunspec is not None else []
+    areas = [each.area for each in found.survey.areas]
+    if found.sunspec is not None:
+        found.tags += sunspec_tags.tags_of(found.sunspec)
     for (area, extent), contents in found.reads.items():
         if area in BIT_AREAS:
-            tags += _bits(area, extent, contents)
-    for piece in pieces:
-        tags += _values(piece, habits, now)
-    areas = [each.area for each in found.survey.areas]
-    found.tags = sorted(tags, key=lambda each: (areas.index(each.tag.area), each.tag.address))
+            found.tags += _bits(area, extent, contents)
+    try:
+        pieces = list(_pieces(found, None if end is None else MAX_REGISTERS_AT_ONCE))
+        habits = _habits(pieces, now)
+        found.orders = byte_order_habits.order_shares(habits)
+        for piece in pieces:
+            if end is not None and time.monotonic() > end:
+                break
+            found.tags += list(_values(piece, habits, now))
+    finally:
+        found.tags.sort(key=lambda each: (areas.index(each.tag.area), each.tag.address))
+
+
+def undescribed(found: Description) -> Iterator[tuple[Area, range]]:
+    """The ranges that were found and have no tags, because `conclude` ended early."""
+    ends = {(each.tag.area, each.tag.address): each.tag.end for each in found.tags}
+    for area, extent, _ in _places(found):
+        if (area, extent) in found.unread:
+            continue
+        first = at = extent.start
+        while at < extent.stop:
+            end = ends.get((area, at))
+            if end is None:
+                at += 1
+                continue
+            if first < at:
+                yield area, range(first, at)
+            first = at = end
+        if first < extent.stop:
+            yield area, range(first, extent.stop)
 
 
 @dataclass(frozen=True)
@@ -173,19 +202,20 @@ class _Piece:
     is_empty: bool
 
 
-def _pieces(found: Description) -> Iterator[_Piece]:
-    """The registers that were read, divided where many contain nothing."""
+def _pieces(found: Description, most: int | None) -> Iterator[_Piece]:
+    """The registers that were read, divided where many contain nothing, and after `most`."""
     for (area, extent), contents in found.reads.items():
         if area in BIT_AREAS:
             continue
         start = 0
-        for first, stop in _empty(contents):
-            if first > start:
-                yield _cut(area, extent.start, contents, start, first, is_empty=False)
-            yield _cut(area, extent.start, contents, first, stop, is_empty=True)
+        for first, stop in (*_empty(contents), (len(extent), len(extent))):
+            step = most or len(extent)
+            for at in range(start, first, step):
+                end = min(at + step, first)
+                yield _cut(area, extent.start, contents, at, end, is_empty=False)
+            if first < stop:
+                yield _cut(area, extent.start, contents, first, stop, is_empty=True)
             start = stop
-        if start < len(extent):
-            yield _cut(area, extent.start, contents, start, len(extent), is_empty=False)
 
 
 def _cut(

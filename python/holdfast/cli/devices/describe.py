@@ -20,7 +20,13 @@ from holdfast.cli.devices.describe_output import (
     units_lines,
     units_to_json,
 )
-from holdfast.cli.devices.search_report import Ended, RangeReport, Report, ended_to_json
+from holdfast.cli.devices.search_report import (
+    INTERRUPTED,
+    Ended,
+    RangeReport,
+    Report,
+    ended_to_json,
+)
 from holdfast.cli.exit_codes import fail
 from holdfast.cli.options import device
 from holdfast.cli.options.duration import every_option, timeout_option
@@ -52,6 +58,9 @@ _UNITS_HELP = (
 )
 MAX_LINES = 60
 """The most lines of tags in the text; a file and JSON have all tags."""
+
+INFERENCE_S = 2
+"""The time for what was found when a signal has ended the search."""
 
 
 def _file(text: str) -> Path:
@@ -113,8 +122,9 @@ def describe(
     inputs. Unit ids and ranges are printed when they are found; with --json, as elements of
     "found". Each unit id is written to FILE when its description is complete.
 
-    Ctrl-C, or SIGTERM, prints and writes the results so far, and where the search did not look. A
-    second one ends the command at once. FILE is replaced as a whole, or not at all.
+    Ctrl-C, or SIGTERM, prints and writes the results so far, where the search did not look, and
+    what has no tags yet. A second one ends the command at once. FILE is replaced as a whole, or
+    not at all.
 
     Exit codes: 0 done; 1 no unit id answered, or the search ended early; 2 wrong usage.
     """
@@ -184,8 +194,7 @@ class _Run:
             client.unit = number
             unit = _UnitReport(Description(number, planned(self._plan.settings)), self._report)
             self._found.append(unit.found)
-            why = self._attempt(partial(self._describe, unit, client))
-            self._conclude(unit)
+            why = self._conclude(unit, self._attempt(partial(self._describe, unit, client)))
             if why is not None:
                 break
         unwritten = self._unwritten
@@ -241,17 +250,25 @@ class _Run:
                 progress=lambda _: unit.update(),
             )
 
-    def _conclude(self, unit: _UnitReport) -> None:
-        """Infers the tags of a unit id, writes its file, and prints them."""
+    def _conclude(self, unit: _UnitReport, why: Ended | None) -> Ended | None:
+        """Infers the tags of a unit id, writes its file, and prints them.
+
+        `why` is why its search ended early. Returns that, or why the inference did.
+        """
         unit.end()
         if sys.stderr.isatty():
             click.echo("Inferring types.", err=True)
-        description.conclude(unit.found, now=time.time())
+        infer = partial(description.conclude, unit.found, now=time.time())
+        if why is INTERRUPTED:
+            infer(seconds=INFERENCE_S)
+        else:
+            why = self._attempt(infer) or why
         file = self._written(unit.found)
         self._report.text(*described_lines(unit.found, self._plan.most))
         if file is not None:
             self._files.append(str(file))
             self._report.text(f"Written: {file}")
+        return why
 
     def _written(self, found: Description) -> Path | None:
         """Writes the tag list of a unit id: to a file of its own if several answer."""

@@ -9,6 +9,7 @@ from holdfast.cli import terminal_text
 from holdfast.cli.devices import coverage
 from holdfast.cli.terminal_text import number_ranges
 from holdfast.config.tag_files.write import scale_as_data
+from holdfast.discovery.description import undescribed
 from holdfast.discovery.segments import FILL_REASONS
 from holdfast.tags.scale import RegisterScale
 from holdfast.values.json import jsonable
@@ -77,6 +78,9 @@ def described_lines(found: Description, most: int | None) -> list[str]:
     for (area, extent), error in found.unread.items():
         tags.append(f"{area} {extent.start}-{extent.stop - 1} could not be read again: {error}")
     counts = [*coverage.counts(found.survey), *coverage.incomplete(found.survey)]
+    left = [f"{area} {span.start}-{span.stop - 1}" for area, span in undescribed(found)]
+    if left:
+        counts.append(f"Incomplete. Not described: {', '.join(left)}.")
     parts = (orders, tags, counts, () if found.survey.exact else coverage.unknown(found.survey))
     return [line for part in parts if part for line in ("", *part)]
 
@@ -193,9 +197,13 @@ def sunspec_to_json(found: SunSpec) -> dict[str, object]:
 
 def unit_to_json(found: Description) -> dict[str, object]:
     """The description of a unit id for JSON."""
+    left = [
+        {"area": area, "address": span.start, "count": len(span)}
+        for area, span in undescribed(found)
+    ]
     return {
         "unit": found.unit,
-        "complete": found.survey.is_done,
+        "complete": found.survey.is_done and not left,
         "identification": dict(found.identity.objects),
         "sunspec": None if found.sunspec is None else sunspec_to_json(found.sunspec),
         "orders": {order: round(share, 4) for order, share in found.orders.items()},
@@ -209,6 +217,7 @@ def unit_to_json(found: Description) -> dict[str, object]:
             }
             for each in found.survey.areas
         },
+        "not_described": left,
         "tags": [_tag(each) for each in found.tags],
     }
 
