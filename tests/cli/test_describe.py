@@ -199,6 +199,16 @@ def test_a_file_is_not_replaced_without_force(plant: str, tmp_path: Path) -> Non
     assert len(load_tags(file)) > 20
 
 
+def test_a_tag_list_that_is_too_long_is_told(
+    plant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("holdfast.cli.devices.describe.MAX_BYTES", 100)
+    file = tmp_path / "device.yaml"
+    result = cli.invoke("describe", plant, "--units", "1", *QUICK, "--output", str(file))
+    assert result.exit_code == 1
+    assert f"{file} has {file.stat().st_size} bytes, and other commands read" in result.stderr
+
+
 def small(pdu: bytes) -> bytes:
     """The answer of a device with 9 holding registers."""
     first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])

@@ -233,6 +233,13 @@ def test_the_columns_of_csv_have_an_order(tmp_path: Path) -> None:
     assert tag == replace(plain, unit="°C", writable=True, description="outside")
 
 
+def test_a_tag_list_has_more_room_than_a_configuration(tmp_path: Path) -> None:
+    lines = ["a,hr,1\n", *["# a comment\n"] * 150_000]
+    assert len(load_tags(written(tmp_path, "".join(lines), "t.csv"))) == 1
+    with pytest.raises(ConfigError, match="more than 3145728 bytes"):
+        load_tags(written(tmp_path, "".join(lines) * 3, "t.csv"))
+
+
 def test_problems_in_profile_files_name_file_line_and_tag(tmp_path: Path) -> None:
     written(tmp_path, "tags:\n  a: {area: coils, address: 1, scale: 2}\n  b: {area: x}\n", "a.yaml")
     written(tmp_path, "v,hr,0,float32\nw,ir,70000\nv,ir,1\nz,hr,1,flaot\n,hr,1\n", "b.csv")

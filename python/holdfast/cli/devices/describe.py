@@ -37,7 +37,7 @@ from holdfast.cli.options.url import checked_url
 from holdfast.cli.signals import interruptions
 from holdfast.cli.terminal_text import number_ranges
 from holdfast.client.url import SerialTarget, parse
-from holdfast.config.tag_files.read import KINDS
+from holdfast.config.tag_files.read import KINDS, MAX_BYTES
 from holdfast.config.tag_files.write import tags_as_csv, tags_as_yaml
 from holdfast.discovery import description, device_search
 from holdfast.discovery.description import Description
@@ -282,8 +282,14 @@ class _Run:
                 return None
         tags = [each.tag for each in found.tags]
         text = tags_as_csv(tags) if path.suffix.lower() == ".csv" else tags_as_yaml(tags)
+        data = text.encode()
+        if len(data) > MAX_BYTES:
+            self._fail_to_write(
+                f"{path} has {len(data)} bytes, and other commands read tag lists of up to "
+                f"{MAX_BYTES}: divide it, or describe it in parts, with --range or --areas"
+            )
         try:
-            files.replace(path, text.encode())
+            files.replace(path, data)
         except OSError as error:
             self._fail_to_write(f"{path} can't be written: {error.strerror}")
             return None

@@ -26,6 +26,11 @@ if TYPE_CHECKING:
     from holdfast.config.text.yaml_document import KeyPath
 
 KINDS = (".yaml", ".yml", ".csv")
+
+MAX_BYTES = 3 << 20
+"""The size limit of a tag list. It has room for 25,000 tags, which take about 5 s; more would have
+too many keys and values."""
+
 COLUMNS = (
     *("name", "area", "address", "type", "order"),
     *("scale", "offset", "unit", "writable", "description"),
@@ -53,7 +58,7 @@ def parse_tags(text: str, file: str, *, is_csv: bool) -> TagList:
 def load_profile(path: Path, file: str) -> ProfileConfig:
     """Reads a profile; messages call it `file`. Raises `ConfigError` with every problem."""
     name = path.stem if is_name(path.stem) else "tags"
-    text = yaml_document.read_text(path, file, "YAML or CSV")
+    text = yaml_document.read_text(path, file, "YAML or CSV", MAX_BYTES)
     return _profile(text, file, name, path.parent, is_csv=path.suffix.lower() == ".csv")
 
 
