@@ -30,10 +30,10 @@ def test_registers_are_shown_in_three_ways(
 ) -> None:
     memory.write("holding_registers", 7, [215, 65535, 0])
     assert done("read", cli.url(server), "holding_registers", "7", "3") == [
-        "address  decimal     hex               binary",
-        "      7      215  0x00D7  0000 0000 1101 0111",
-        "      8    65535  0xFFFF  1111 1111 1111 1111",
-        "      9        0  0x0000  0000 0000 0000 0000",
+        "holding_registers  decimal     hex               binary",
+        "                7      215  0x00D7  0000 0000 1101 0111",
+        "                8    65535  0xFFFF  1111 1111 1111 1111",
+        "                9        0  0x0000  0000 0000 0000 0000",
     ]
 
 
@@ -172,7 +172,7 @@ def test_bits_are_shown_sixteen_a_line(server: holdfast.Server, memory: holdfast
     memory.write("coils", 3, [1, 0, 1])
     memory.write("coils", 20, [1])
     head, first, second = done("read", cli.url(server), "coils", "3", "18")
-    assert head.split() == ["address", *(f"+{offset}" for offset in range(16))]
+    assert head.split() == ["coils", *(f"+{offset}" for offset in range(16))]
     assert first.split() == ["3", "1", "0", "1", *"0" * 13]
     assert second.split() == ["19", "0", "1"]
 
@@ -214,9 +214,9 @@ def test_typed_values_are_shown_with_their_registers(
     floats = struct.unpack(">4H", struct.pack(">2f", 21.5, 0.1))
     memory.write("holding_registers", 100, floats)
     assert done("read", cli.url(server), "hr", "100", "2", "--type", "float32") == [
-        "address  registers  float32",
-        "100-101  41AC 0000  21.5",
-        "102-103  3DCC CCCD  0.1",
+        "holding_registers  registers  float32",
+        "          100-101  41AC 0000  21.5",
+        "          102-103  3DCC CCCD  0.1",
     ]
     found = answer("read", cli.url(server), "hr", "100", "--type", "float32[2]")
     assert found["values"] == [21.5, struct.unpack(">f", struct.pack(">f", 0.1))[0]]
@@ -266,8 +266,8 @@ def test_what_is_no_value_is_told_and_the_others_are_shown(
     result = invoke("read", cli.url(server), "hr", "0", "2", "--type", "bcd16")
     assert result.exit_code == 1
     assert result.stdout.splitlines()[1:] == [
-        "      0  12A4       ? digits 0x12A4 are not bcd16, allowed: 0 to 9",
-        "      1  1234       1234",
+        "                0  12A4       ? digits 0x12A4 are not bcd16, allowed: 0 to 9",
+        "                1  1234       1234",
     ]
     found = answer("read", cli.url(server), "hr", "0", "2", "--type", "bcd16", code=1)
     assert found["values"] == [None, 1234]
@@ -295,6 +295,8 @@ def test_a_modicon_number_names_area_and_address(
     found = answer("read", cli.url(server), number, "--modicon")
     assert (found["area"], found["address"]) == (area, address)
     assert answer("read", cli.url(server), area, number, "1", "--modicon") == found
+    head, row = done("read", cli.url(server), number, "--modicon")
+    assert (head.split()[0], row.split()[0]) == (area, str(address))
 
 
 @pytest.mark.parametrize(

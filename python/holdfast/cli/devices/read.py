@@ -229,17 +229,17 @@ class _Query:
         return any(isinstance(each, ConversionError) for each in self.typed.decode(raw))
 
     def lines(self, raw: Sequence[int]) -> list[str]:
-        """The values as a table."""
+        """The values as a table. Its first heading is the area, which a Modicon number hides."""
         if self.typed is not None:
             return self._values(raw)
         return self._bits(raw) if self.of_bits else self._registers(raw)
 
     def _registers(self, raw: Sequence[int]) -> list[str]:
-        return device_items.registers_table("address", self.place.address, raw)
+        return device_items.registers_table(self.place.area, self.place.address, raw)
 
     def _bits(self, raw: Sequence[int]) -> list[str]:
         width = min(BITS_PER_LINE, len(raw))
-        head = ["address", *(f"+{offset}" for offset in range(width))]
+        head = [self.place.area, *(f"+{offset}" for offset in range(width))]
         rows = []
         for start in range(0, len(raw), width):
             bits = [str(int(bit)) for bit in raw[start : start + width]]
@@ -255,14 +255,14 @@ class _Query:
                 (str(self.place.address + index), _value_text(each, "bool"))
                 for index, each in enumerate(self.typed.decode(raw))
             ]
-            return terminal_text.table(("address", "bool"), rows, "><")
+            return terminal_text.table((self.place.area, "bool"), rows, "><")
         lines = []
         width = self.typed.width
         for index, value in enumerate(self.typed.decode(raw)):
             at = index * width
             own = " ".join(f"{each:04X}" for each in raw[at : at + width])
             lines.append((self._where(at, width), own, _value_text(value, self.typed.element)))
-        return terminal_text.table(("address", "registers", self.typed.element), lines, ">")
+        return terminal_text.table((self.place.area, "registers", self.typed.element), lines, ">")
 
     def _where(self, at: int, width: int) -> str:
         first = self.place.address + at
