@@ -167,6 +167,18 @@ def test_a_refused_register_costs_only_its_tag() -> None:
         assert result.stderr == f"holdfast: hr:1: {detail}\n{hint}"
 
 
+def test_a_tag_whose_address_is_a_modicon_number_has_a_hint(
+    server: holdfast.Server, tmp_path: Path
+) -> None:
+    file = tmp_path / "device.csv"
+    file.write_text("flow,hr,41001,,,,,,yes\n")
+    url, hint = cli.url(server), "addresses count from 0; as a Modicon number 41001 is hr:1000"
+    for arguments in (("read", url), ("write", url, "flow=1")):
+        result = invoke(*arguments, "--tags", str(file))
+        assert result.exit_code == 1
+        assert f"hint: {hint}\nhint: 'holdfast describe map {url}'" in result.stderr
+
+
 def test_a_hint_is_printed_once_for_all_tags_and_readings() -> None:
     often = ("--every", "0.01", "--times", "2")
     with FakeDevice(lambda pdu: exception(pdu, 11)) as device:

@@ -240,6 +240,13 @@ def test_a_tag_list_has_more_room_than_a_configuration(tmp_path: Path) -> None:
         load_tags(written(tmp_path, "".join(lines) * 3, "t.csv"))
 
 
+def test_types_and_orders_are_in_any_case(tmp_path: Path) -> None:
+    text = "tags: {a: {area: holding_registers, address: 1, type: Float32, order: cdab}}\n"
+    [in_yaml] = load_tags(written(tmp_path, text, "t.yaml"))
+    [in_csv] = load_tags(written(tmp_path, "a,hr,1,FLOAT32,cdab\n", "t.csv"))
+    assert in_yaml == in_csv == Tag("a", "holding_registers", 1, "float32", "CDAB")
+
+
 def test_problems_in_profile_files_name_file_line_and_tag(tmp_path: Path) -> None:
     written(tmp_path, "tags:\n  a: {area: coils, address: 1, scale: 2}\n  b: {area: x}\n", "a.yaml")
     written(tmp_path, "v,hr,0,float32\nw,ir,70000\nv,ir,1\nz,hr,1,flaot\n,hr,1\n", "b.csv")
@@ -284,6 +291,11 @@ def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
         ),
         ("t.csv", 'a,hr,0,,,,,"V\nb,hr,1,,,,,"A\n', "t.csv:1: not CSV: ',' expected after '\"'"),
         ("t.csv", 'a,hr,0,,,,,"V\nA"\n', "t.csv:2: tags.a.unit: found 'V\\nA', allowed: text"),
+        (
+            "t.csv",
+            "name;area;address;scale\nx;hr;1;0,1\n",
+            "t.csv:2: tags.x.scale: '0,1' has a decimal comma, allowed: a decimal point, as in 0.1",
+        ),
         ("t.csv", "", "t.csv:1: tags: "),
         ("t.yaml", "- a\n", "t.yaml:1: found a list, allowed: a mapping with the keys order"),
         ("t.yaml", "tags: {a: {area: coils}}\n", "t.yaml:1: tags.a.address: missing"),

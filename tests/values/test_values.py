@@ -399,6 +399,28 @@ def test_an_unknown_order_is_refused_with_those_that_are_allowed(order: Any) -> 
 
 
 @pytest.mark.parametrize(
+    ("order", "meant"),
+    [
+        ("abcd", "ABCD"),
+        ("big", "ABCD"),
+        ("Big-Endian", "ABCD"),
+        ("LITTLE", "DCBA"),
+        ("little_endian", "DCBA"),
+        ("le", "DCBA"),
+        ("LE_BE", "BADC"),
+        ("BE_LE", "CDAB"),
+        ("word swap", "CDAB"),
+        ("WORDSWAP", "CDAB"),
+        ("byte-swap", "BADC"),
+        ("BYTESWAP", "BADC"),
+    ],
+)
+def test_an_order_as_other_programs_call_it_is_suggested(order: str, meant: str) -> None:
+    with pytest.raises(values.UnknownOrder, match=rf"is unknown, .*; did you mean '{meant}'\?$"):
+        decode([1, 2], "uint32", order)
+
+
+@pytest.mark.parametrize(
     ("order", "name", "text"),
     [
         (

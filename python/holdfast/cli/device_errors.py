@@ -79,14 +79,19 @@ HINTS = {
 """What to do after an exception of a device at a URL, by its code."""
 
 
-def hint(error: object, url: str) -> None:
-    """Prints what to do after an error, or the code of an exception, once in a command."""
+def hint(error: object, url: str, absent: str | None = None) -> None:
+    """Prints what to do after an error, or the code of an exception, once in a command.
+
+    `absent` is what to say first of an address that does not exist.
+    """
     code = error.code if isinstance(error, ModbusException) else error
     if not isinstance(code, int) or code not in HINTS:
         return
     told: set[int] = click.get_current_context().meta.setdefault(f"{__name__}.told", set())
     if code not in told:
         told.add(code)
+        if code == ILLEGAL_ADDRESS and absent is not None:
+            click.echo(f"hint: {absent}", err=True)
         click.echo(f"hint: {HINTS[code].format(url)}", err=True)
 
 

@@ -108,12 +108,18 @@ def value_from(tag: Tag, text: str, *, states: bool = True) -> Any:
         if tag.of_type.base in _LONG and Decimal(repr(number)) != exact:
             raise DoesNotFit(f"{quote(text)} has too many digits, allowed with a point: 15")
         return number
-    if _COMMA.fullmatch(word):
-        point = word.replace(",", ".")
-        raise DoesNotFit(f"{text!r} has a decimal comma, allowed: a decimal point, as in {point}")
+    if flaw := decimal_comma(word):
+        raise DoesNotFit(f"{text!r} {flaw}")
     if names:
         return word
     raise DoesNotFit(f"{quote(text)} is not a number")
+
+
+def decimal_comma(word: str) -> str | None:
+    """What to say of a number with a decimal comma; `None` for other words."""
+    if _COMMA.fullmatch(word) is None:
+        return None
+    return f"has a decimal comma, allowed: a decimal point, as in {word.replace(',', '.')}"
 
 
 def _switched(word: str, names: Collection[str]) -> bool:

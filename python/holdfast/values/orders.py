@@ -12,6 +12,7 @@ can be swapped inside.
 
 from __future__ import annotations
 
+import re
 from array import array
 from dataclasses import dataclass
 from functools import lru_cache
@@ -47,6 +48,14 @@ EIGHT = {
     "BADCFEHG": FOUR["BADC"],
     "GHEFCDAB": FOUR["CDAB"],
 }
+USUAL_NAMES = {
+    **dict.fromkeys(("be", "bebe", "big"), "ABCD"),
+    **dict.fromkeys(("bele", "swap", "swapped", "wordswap", "wordswapped"), "CDAB"),
+    **dict.fromkeys(("byteswap", "byteswapped", "lebe"), "BADC"),
+    **dict.fromkeys(("le", "lele", "little"), "DCBA"),
+}
+"""What other programs call these orders, to suggest ours: letters only, without `endian`. Words
+that programs use for several, such as `mixed`, are not there."""
 DEFAULT_ORDER = "ABCD"
 """The order of a field for which nobody names one."""
 
@@ -58,14 +67,22 @@ def order_of(name: str, element: str, width: int) -> Order:
     """The order of a name for elements of `width` bytes. Raises `UnknownOrder`."""
     if name in FOUR:
         return FOUR[name]
-    if not isinstance(name, str) or len(name) != 8 or not name.isalpha():
-        raise UnknownOrder(f"order {shown(name)} is unknown, allowed: {ALLOWED}")
+    near = _usual(name)
+    if near or not isinstance(name, str) or len(name) != 8 or not name.isalpha():
+        raise UnknownOrder(f"order {shown(name)} is unknown, allowed: {ALLOWED}{near}")
     flaw = _flaw(name)
     if flaw is not None:
         raise UnknownOrder(f"order {name} {flaw}")
     if width != 8:
         raise UnknownOrder(f"order {name} is for 8 bytes, {element} has {width}")
     return EIGHT.get(name) or Order(places=_places(name))
+
+
+def _usual(name: object) -> str:
+    """A suggestion for a name of other programs, and for small letters, else ""."""
+    word = re.sub("endian|[^a-z]", "", str(name).lower())
+    meant = USUAL_NAMES.get(word, word.upper())
+    return f"; did you mean {meant!r}?" if meant in FOUR else ""
 
 
 def swap_registers(data: bytes) -> bytes:

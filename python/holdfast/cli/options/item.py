@@ -19,6 +19,7 @@ from holdfast.cli.options.plc_addresses import (
     Place,
     of_modicon,
     of_number,
+    suggested_bit,
 )
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.runtime.text import listing, suggestion
@@ -83,7 +84,7 @@ def _with_colon(text: str) -> str:
     match = re.fullmatch("(.*[A-Za-z])[^A-Za-z0-9]?([0-9]+)", text)
     if match is None or _area_named(match[1]) is None or MODICON_NUMBER.fullmatch(match[2]):
         return ""  # `hr40001` may mean the address 40001, or 0.
-    return f"; did you mean '{match[1]}:{match[2]}'?"
+    return f"; did you mean '{match[1]}:{match[2]}', counted from 0?"
 
 
 def areas_of(text: str) -> tuple[Area, ...]:
@@ -209,7 +210,7 @@ def _addressed(text: str, area: Area, *, modicon: bool) -> tuple[Place, int | No
         return place, None
     found = span(text)
     if found is None:
-        near = ""
+        near = suggested_bit(text, area)
         if MODICON_NUMBER.fullmatch(text):
             meant = of_modicon(text)
             near = f"; did you mean {SHORT_OF[meant.area]}:{meant.address}, Modicon's {text}?"

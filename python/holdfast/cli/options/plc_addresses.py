@@ -13,15 +13,17 @@ import click
 
 from holdfast.cli.options.option import flag, whole_number
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
-from holdfast.types import AREAS
+from holdfast.types import AREAS, BIT_AREAS, SHORT_OF
 
 if TYPE_CHECKING:
+    from holdfast.tags import Tag
     from holdfast.types import Area
 
 MODICON_AREAS: dict[str, Area] = dict(zip("0143", AREAS, strict=True))
 """The first digits of Modicon numbers."""
 
 MODICON_FORMS = "40001, 400001 or 4x0001, and 0, 1, 3 for coils, discrete inputs, input registers"
+_BIT = re.compile(r"(.+)[.]0*([0-9]|1[0-5])")
 MODICON_NUMBER = re.compile(r"([0134])(?:([xX])([0-9]{1,5})|([0-9]{4,5}))")
 
 _IEC = re.compile(r"%([A-Z]+)([0-9]{1,5})(.*)", re.I)
@@ -57,6 +59,8 @@ def of_number(text: str, *, modicon: bool) -> Place | None:
             f"{text!r} is not clear: type co:{meant} for the Modicon number, or name the area of "
             f"the address {int(text, 16)}, as in hr:{text}."
         )
+    if near := suggested_bit(text):
+        raise click.UsageError(f"{text!r} is not an item{near}")
     if match is not None or (modicon and not text[:1].isalpha()):
         return of_modicon(text)
     if whole_number(text) is not None:
@@ -76,7 +80,23 @@ def of_modicon(text: str) -> Place:
     return Place(MODICON_AREAS[match[1]], count - 1)
 
 
-def modicon_hint(place: Place) -> str | None:
+def suggested_bit(text: str, area: Area | None = None) -> str:
+    """A suggestion for an address with a bit, as `40101.3` in other programs, else "".
+
+    `area` is that of a number beside it.
+    """
+    match = _BIT.fullmatch(text)
+    number = match and MODICON_NUMBER.fullmatch(match[1])
+    area = MODICON_AREAS[number[1]] if number and area is None else area
+    if match is None or area is None or area in BIT_AREAS:
+        return ""
+    if number is None and whole_number(match[1]) is None:
+        return ""
+    place = match[1] if number else f"{SHORT_OF[area]}:{match[1]}"
+    return f"; did you mean '{place}:bit:{match[2]}'?"
+
+
+def modicon_hint(place: Place | Tag) -> str | None:
     """A hint for an address that does not exist but looks like a Modicon number."""
     match = MODICON_NUMBER.fullmatch(str(place.address))
     if match is None or MODICON_AREAS[match[1]] != place.area:
@@ -84,7 +104,8 @@ def modicon_hint(place: Place) -> str | None:
     meant = int(match[4]) - 1
     if meant < 0:
         return None
-    return f"addresses count from 0; as a Modicon number (--modicon) {place.address} is {meant}"
+    found = f"{SHORT_OF[place.area]}:{meant}"
+    return f"addresses count from 0; as a Modicon number {place.address} is {found}"
 
 
 def of_iec(text: str) -> Place:

@@ -10,6 +10,7 @@ import click
 from holdfast.cli import answers, device_errors, terminal_text
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.live import schedule
+from holdfast.cli.options.plc_addresses import modicon_hint
 from holdfast.cli.tags import recording
 from holdfast.cli.terminal_text import print_json
 from holdfast.errors import ModbusError, RequestTimeout
@@ -50,7 +51,7 @@ def read_tags(source: TagSource, form: Form, every: float | None, times: int | N
                 _show(source, readings)
             if form == "text" or (form == "csv" and every is None):
                 for each in readings:
-                    device_errors.hint(each.error, source.url)
+                    device_errors.hint(each.error, source.url, modicon_hint(each.tag))
             if every is None:
                 _listen(source, readings)
     except KeyboardInterrupt:

@@ -10,6 +10,7 @@ import click
 from holdfast.cli import device_errors, terminal_text
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options import device
+from holdfast.cli.options.plc_addresses import modicon_hint
 from holdfast.cli.tags.read import value_shown
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.tag_writing import prepared
@@ -143,7 +144,7 @@ def _fail(
     click.echo(f"holdfast: {of.url}: {names[at]}: {error}", err=True)
     if maybe:
         click.echo(f"hint: {names[at]} was possibly written", err=True)
-    device_errors.hint(error, of.url)
+    device_errors.hint(error, of.url, modicon_hint(writes[at].tag))
     _print_not_written(writes[at + 1 :])
     sys.exit(ExitCode.FAILED)
 

@@ -86,6 +86,7 @@ class TagConfig(Model):
     def tag(self, name: str, order: str) -> Tag:
         """The tag, with a default order. Raises `TagError`."""
         settings: dict[str, Any] = {key: getattr(self, key) for key in _KEYS}
+        settings["type"] = self.type.lower()
         order = (self.order or order).upper()
         if INVALID in (*self.null, *self.states.values()):
             raise InvalidValue

@@ -19,6 +19,7 @@ from holdfast.config.values.scalars import is_name
 from holdfast.config.values.tag_scale import FORMS, PLACE_KEYS
 from holdfast.runtime.text import listing, suggestion
 from holdfast.tags import TagList
+from holdfast.tags.text import decimal_comma
 from holdfast.types import AREAS, SHORT_AREAS
 
 if TYPE_CHECKING:
@@ -41,6 +42,8 @@ MORE_COLUMNS = ("min", "max", "deadband", "round", "encoding", "null")
 
 _SHORT = SHORT_AREAS | dict(zip(("coil", "discrete", "holding", "input"), AREAS, strict=True))
 """Names of areas that lists of manufacturers have."""
+
+_NUMBERS = ("scale", "offset", "min", "max", "deadband", "null")
 
 _TEXT = ("name", "type", "order", "unit", "description", "encoding", "round")
 
@@ -109,8 +112,14 @@ class _Table:
             first = self.lines["tags", name]
             self.refuse(line, f"the tag {show(name)} is given twice, first in line {first}")
         else:
-            self.tags[name] = {key: _cell(key, cell) for key, cell in given.items()}
+            self.tags[name] = tag = {}
             self.lines["tags", name] = line
+            for key, cell in given.items():
+                flaw = decimal_comma(cell) if key in _NUMBERS else None
+                if flaw is None:
+                    tag[key] = _cell(key, cell)
+                else:
+                    self.refuse(line, f"{show(cell)} {flaw}", f"tags.{name}.{key}")
 
 
 def _csv(text: str, file: str) -> tuple[yaml_document.Document, list[Problem]]:

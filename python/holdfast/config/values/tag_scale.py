@@ -57,7 +57,7 @@ class ScaleConfig:
             return RegisterScale(self.form, name=self.source)
         area, address, kind = self.source
         try:
-            return RegisterScale(self.form, source=Tag("", area, address, kind, order))
+            return RegisterScale(self.form, source=Tag("", area, address, kind.lower(), order))
         except TagError as error:
             raise TagError("scale", f"from: {error}") from None
 
