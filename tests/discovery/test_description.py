@@ -15,7 +15,7 @@ from holdfast import values
 from holdfast.client.tag_reading import TagReader
 from holdfast.config.tag_files.read import load_tags
 from holdfast.config.tag_files.write import tags_as_yaml
-from holdfast.discovery import description, sunspec
+from holdfast.discovery import description, segments, sunspec
 from holdfast.discovery.address_search import LimitReached, Survey
 from holdfast.discovery.description import Description
 from holdfast.tags.scale import RegisterScale
@@ -190,6 +190,25 @@ def test_a_device_that_does_not_answer_absent_addresses_is_described() -> None:
     with FakeDevice(answers) as device, holdfast.SyncClient(device.url, timeout=0.05) as client:
         description.describe(found, client, reads=1, every=1, delay=0)
     assert found.survey.areas[0].ranges == [range(9)]
+
+
+def test_an_interruption_costs_only_the_registers_at_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = Description(1, Survey(["holding_registers"]))
+    found.reads["holding_registers", range(90)] = [[*range(1000, 1090)]]
+    found.survey.areas[0].ranges.append(range(90))
+    divide, calls = segments.divide, iter(range(2))
+
+    def interrupted(*args: Any, **options: Any) -> segments.Division:
+        if next(calls, None) is None:
+            raise KeyboardInterrupt
+        return divide(*args, **options)
+
+    monkeypatch.setattr(description, "MAX_REGISTERS_AT_ONCE", 40)
+    monkeypatch.setattr(segments, "divide", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        description.conclude(found)
+    assert sum(each.tag.count for each in found.tags) == 80
+    assert list(description.undescribed(found)) == [("holding_registers", range(80, 90))]
 
 
 def test_what_there_is_no_time_for_is_named() -> None:

@@ -52,8 +52,12 @@ MAX_CONFIDENCE = 0.99
 IMPROBABLE = 0.01
 """The probability up to which a habit is not considered."""
 
-MAX_REGISTERS_AT_ONCE = 100
-"""Registers that are divided together while time is limited: one more takes some milliseconds."""
+MAX_REGISTERS_AT_ONCE = 1000
+"""Registers that are divided together, for some seconds: the time grows faster than their number,
+and those before an interruption are described."""
+
+MAX_REGISTERS_IN_A_HURRY = 100
+"""The same, while time is limited."""
 
 MAX_ORDER_REGISTERS = 400
 """Registers from which the order of a device is inferred; more would cost time only."""
@@ -152,6 +156,7 @@ def conclude(found: Description, now: float | None = None, seconds: float | None
     far are there: `undescribed` has the other ranges.
     """
     end = None if seconds is None else time.monotonic() + seconds
+    most = MAX_REGISTERS_AT_ONCE if end is None else MAX_REGISTERS_IN_A_HURRY
     for area, extent, _ in _places(found):
         if (area, extent) not in found.reads and (area, extent) not in found.unread:
             found.reads[area, extent] = [[found.seen[area][each] for each in extent]]
@@ -162,7 +167,7 @@ def conclude(found: Description, now: float | None = None, seconds: float | None
         if area in BIT_AREAS:
             found.tags += _bits(area, extent, contents)
     try:
-        pieces = list(_pieces(found, None if end is None else MAX_REGISTERS_AT_ONCE))
+        pieces = list(_pieces(found, most))
         habits = _habits(pieces, now)
         found.orders = byte_order_habits.order_shares(habits)
         for piece in pieces:
@@ -202,16 +207,15 @@ class _Piece:
     is_empty: bool
 
 
-def _pieces(found: Description, most: int | None) -> Iterator[_Piece]:
+def _pieces(found: Description, most: int) -> Iterator[_Piece]:
     """The registers that were read, divided where many contain nothing, and after `most`."""
     for (area, extent), contents in found.reads.items():
         if area in BIT_AREAS:
             continue
         start = 0
         for first, stop in (*_empty(contents), (len(extent), len(extent))):
-            step = most or len(extent)
-            for at in range(start, first, step):
-                end = min(at + step, first)
+            for at in range(start, first, most):
+                end = min(at + most, first)
                 yield _cut(area, extent.start, contents, at, end, is_empty=False)
             if first < stop:
                 yield _cut(area, extent.start, contents, first, stop, is_empty=True)
