@@ -19,7 +19,7 @@ from holdfast.appliance.parts.listeners import GROUP
 from holdfast.net.addresses import joined
 from holdfast.net.http import port as ports
 from holdfast.net.http.port import Port
-from holdfast.runtime.text import told
+from holdfast.runtime.text import file_error_text
 from support import web, wire
 from support.cli import RunCommand
 from support.running import endpoint
@@ -189,7 +189,7 @@ def test_a_hint_says_what_a_listener_needs_that_may_not_be_opened(
             "memories: {plant: {coils: 8}}\n"
             f"listeners: {{a: {{type: {kind}, {listener}, rules: {rules}}}}}"
         )
-    assert told(caught.value) == f"listener a: {refused}: Permission denied{hint}"
+    assert file_error_text(caught.value) == f"listener a: {refused}: Permission denied{hint}"
 
 
 def test_the_greeting_names_the_port_and_the_log_the_reason(taken: Taken, tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def sentence(text: str) -> str:
     return text if not text or text.endswith((".", "?", "!")) else f"{text}."
 
 
-def told(error: OSError) -> str:
+def file_error_text(error: OSError) -> str:
     """An error of the system with its file, and without its number."""
     text = error.strerror or str(error)
     return text if error.filename is None else f"{error.filename}: {text}"

@@ -15,7 +15,7 @@ from holdfast.events.audit import Audit, Copies, Journal, Syslog
 from holdfast.events.audit.refusal_summaries import Refusals
 from holdfast.runtime.heartbeat import PERIOD_S, Heartbeat
 from holdfast.runtime.standstill import WallClock
-from holdfast.runtime.text import told
+from holdfast.runtime.text import file_error_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -65,7 +65,7 @@ class AuditLog(Part):
                 copies=_copies(settings),
             )
         except OSError as error:
-            raise OSError(f"audit.file: {told(error)}") from error
+            raise OSError(f"audit.file: {file_error_text(error)}") from error
         self._record(log, "start")
         self.closing.callback(log.close)
         self.closing.callback(self._record, log, "stop")

@@ -22,7 +22,7 @@ from holdfast.config.fingerprint import files_of
 from holdfast.config.loader import unanswered
 from holdfast.events import log_lines
 from holdfast.runtime.bounded_files import TIMEOUT_MS, FileWork, NotAnswered, Unreadable, answered
-from holdfast.runtime.text import told
+from holdfast.runtime.text import file_error_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -218,7 +218,7 @@ class Reloader:
         except (Unreadable, UnknownAdapter, ValueError) as error:
             problems = [self._placed(str(error))]
         except OSError as error:
-            problems = [self._placed(told(error))]
+            problems = [self._placed(file_error_text(error))]
         except ReloadIncomplete as error:
             log_lines.problem("reload_incomplete")
             return {"incomplete": self._placed(f"internal error: {error}")}

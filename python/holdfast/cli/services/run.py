@@ -39,7 +39,7 @@ from holdfast.net.addresses import joined, reachable
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.runtime.bounded_files import Unreadable
 from holdfast.runtime.interpreter import spare_what_stays, yield_interpreter
-from holdfast.runtime.text import told
+from holdfast.runtime.text import file_error_text
 from holdfast.types import BIT_AREAS, REGISTER_AREAS
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def serve(
     except Unreadable as error:
         fail(error)
     except OSError as error:
-        fail(told(error))
+        fail(file_error_text(error))
     except UnknownAdapter as error:
         click.echo(f"{named}: {error}", err=True)
         sys.exit(ExitCode.WRONG)
