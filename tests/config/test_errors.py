@@ -544,7 +544,7 @@ def test_a_section_in_capitals_is_one_of_a_configuration(folder: Folder) -> None
 
 def test_a_merge_key_is_named_as_one(folder: Folder) -> None:
     assert folder.problems(changed("    rules:", "    <<: {when_full: evict}\n    rules:")) == [
-        "p.yaml:7: listeners.scada: merge keys are not allowed: repeat the keys"
+        "p.yaml:7: listeners.scada.'<<': found a merge key, allowed: the keys themselves"
     ]
 
 

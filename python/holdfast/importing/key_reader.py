@@ -146,10 +146,6 @@ class Section:
         for key in self.data:
             if key in self._asked:
                 continue
-            if key == "<<":
-                message = "found a merge key, allowed: the keys themselves"
-                self.desk.problem_of_key(self.at(key), message)
-                continue
             message = (reasons or {}).get(key) or f"unknown key{suggestion(key, known)}"
             self.desk.left_out(self.at(key), message)
 

@@ -307,7 +307,8 @@ class _Reader:
                 merged.append((event, *self._value(next(self._events), (*path, key))))
                 continue
             if key == "<<" and event[0] == "plain":
-                self._add(event, path, "merge keys are not allowed: repeat the keys")
+                message = "found a merge key, allowed: the keys themselves"
+                self._add(event, (*path, key), message)
                 key = None
             elif key in data:
                 first = spot.children[key][0].line
