@@ -168,7 +168,9 @@ async def awaited(area: str, address: int, values: list[int]) -> None: ...
 
 
 @pytest.mark.parametrize(
-    "callback", [awaited, AwaitedCalls(), functools.partial(awaited, "coils")], ids=repr
+    "callback",
+    [awaited, AwaitedCalls(), functools.partial(awaited, "coils")],
+    ids=["function", "object", "partial"],
 )
 def test_an_async_def_is_no_callback(callback: Any, memory: holdfast.Memory) -> None:
     with pytest.raises(TypeError, match="an async def, allowed: a plain function"):
