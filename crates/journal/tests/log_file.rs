@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use holdfast_journal::file::{FileError, FileOnDisk, Member, MemoryFile, Options, Source, read};
-use holdfast_journal::log::{Checkpoint, LogError, Settings};
+use holdfast_journal::log::{Checkpoint, LogError, LogReader, Settings, Until};
 use holdfast_memory::{Contents, Gate, GateMode, Layout, Memory, Refusal, Span};
 use nodes::{Folder, Node, Server, memory, memory_of, until};
 
@@ -351,7 +351,12 @@ fn a_node_does_not_go_back_to_a_snapshot_that_the_log_does_not_continue() {
         });
     }
     let error = new.status().last_error.unwrap();
-    assert!(error.starts_with(&format!("messages 1 to {} of the log", first - 1)), "{error}");
+    let missing = format!("messages 1 to {} of the log are missing", first - 1);
+    assert!(error.starts_with(&missing), "{error}");
+    let settings = Settings::new("site", "replay", vec![server.url()]);
+    let members = vec![("plant".to_owned(), memory())];
+    let mut reader = LogReader::open(&settings, members, Until::Now, nodes::DEADLINE).unwrap();
+    assert_eq!(reader.next(nodes::DEADLINE).unwrap_err().to_string(), missing);
     assert_eq!(kept.node.all(), contents, "it keeps its own");
     until("a running node stores a snapshot", || {
         other.write(1, 21).unwrap();

@@ -57,6 +57,15 @@ impl LogError {
     }
 }
 
+/// Says which messages the stream lacks.
+pub(super) fn missing(from: u64, to: u64) -> String {
+    if from == to {
+        format!("message {from} of the log is missing")
+    } else {
+        format!("messages {from} to {to} of the log are missing")
+    }
+}
+
 /// Why a session with the servers ended.
 #[derive(Debug)]
 pub(super) enum End {
@@ -77,14 +86,8 @@ impl From<LogError> for End {
 impl End {
     /// The stream does not have messages that come next.
     pub(super) fn missing(from: u64, to: u64) -> End {
-        let which = if from == to {
-            format!("message {from} of the log is")
-        } else {
-            format!("messages {from} to {to} of the log are")
-        };
-        End::Lost(format!(
-            "{which} missing: only a new snapshot of a node that has applied them helps"
-        ))
+        let what = missing(from, to);
+        End::Lost(format!("{what}: only a new snapshot of a node that has applied them helps"))
     }
 
     /// What a server could not do for now.

@@ -7,7 +7,7 @@ use async_nats::jetstream;
 use futures_util::StreamExt;
 use holdfast_memory::{Memory, Outcome, Refusal, Step};
 
-use super::error::{End, LogError};
+use super::error::{End, LogError, missing};
 use super::layout::fingerprint;
 use super::settings::Settings;
 use super::state::{Applied, Place, State, digest_of};
@@ -169,8 +169,7 @@ impl Reading {
             }
             // Messages were removed behind a newer snapshot: what is missing can't be rebuilt.
             if place.sequence > next {
-                let text = format!("sequence {} came in place of {next}", place.sequence);
-                return Err(LogError::Snapshot(text).into());
+                return Err(LogError::Snapshot(missing(next, place.sequence - 1)).into());
             }
             if matches!(until, Until::Time(end) if place.stored > end) {
                 return Ok(None);
