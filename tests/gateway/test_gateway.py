@@ -506,7 +506,7 @@ def test_the_next_address_of_a_name_is_tried(device: tuple[str, int]) -> None:
         ("/connect", {"host": PLC, "serverName": "plc"}, "serverName requires transport tls"),
         ("/connect", {"host": PLC, "transport": "tls", "serverName": ""}, "serverName"),
         ("/connect", {"host": PLC, "transport": "tls", "serverName": "a b"}, "serverName"),
-        ("/connect", {"host": PLC, "transport": "tls", "serverName": "plc-"}, "as the name in a"),
+        ("/connect", {"host": PLC, "transport": "tls", "serverName": "plc-"}, 'is "plc-"'),
         ("/connect", {"host": PLC, "unitid": 3}, '"unitid" is not a parameter'),
         ("/read", {"functionCode": 5}, "Invalid read function code: 0x5"),
         ("/read", {"functionCode": 6}, "Invalid read function code: 0x6"),
