@@ -217,10 +217,10 @@ def test_the_settings_of_client_certificates_are_checked(files: Files, tmp_path:
 
 @pytest.mark.parametrize("key", ["cert_file", "key_passphrase_file", "client_ca_file"])
 def test_files_that_can_t_be_read_are_errors(files: Files, tmp_path: Path, key: str) -> None:
-    tls = {**files.tls(), key: "none"}
+    tls = {**files.tls(), key: "none.pem"}
     file = configured(tmp_path, tls)
     code, [line, _] = checked(file)
-    told = "found 'none', which can't be read: No such file or directory"
+    told = "found 'none.pem', which can't be read: No such file or directory"
     assert (code, line) == (2, f"{file}:1: rest.tls.{key}: {told}")
 
 

@@ -7,6 +7,7 @@ A text that ends in a number and is no IP address is not a host: resolvers take 
 from __future__ import annotations
 
 import re
+import unicodedata
 
 from holdfast.net.addresses import LAST_PORT, address_in
 from holdfast.runtime.text import quote
@@ -16,17 +17,22 @@ HOST_FORM = (
     "brackets"
 )
 
-_LABEL = "[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?"
-_NAME = re.compile(
-    rf"(?=.{{1,253}}\Z)({_LABEL}\.)*(?!([0-9]+|0[xX][0-9a-fA-F]*)\Z){_LABEL}", re.ASCII
-)
+_LETTER = "A-Za-z0-9_\x80-\U0010ffff"
+_LABEL = f"[{_LETTER}]([{_LETTER}-]{{0,61}}[{_LETTER}])?"
+_NAME = re.compile(rf"(?=.{{1,253}}\Z)({_LABEL}\.)*(?!([0-9]+|0[xX][0-9a-fA-F]*)\Z){_LABEL}")
+_NO_LETTER = re.compile(r"[\s\u3002]")
+"""Beyond ASCII: blanks, and a full stop that resolvers take for a dot."""
 _ADDRESS_6 = re.compile(r"[0-9a-f.]*:[0-9a-f:.]*(%[!-~]+)?")
 _NETLOC = re.compile(r"(?:\[(?P<six>[^\[\]]*)\]|(?P<name>[^:\[\]]*))(?::(?P<port>[^:]*))?")
 
 
 def is_host_name(text: str) -> bool:
-    """Whether text can be the name of a host; as in Docker and Windows, it may contain `_`."""
-    return _NAME.fullmatch(text) is not None
+    """Whether text can be the name of a host; as in Docker and Windows, it may contain `_`.
+
+    Letters may be of any language, but none that resolvers replace by others: wide digits.
+    """
+    is_name = _NAME.fullmatch(text) is not None and _NO_LETTER.search(text) is None
+    return is_name and unicodedata.is_normalized("NFKC", text)
 
 
 def is_host(text: str) -> bool:
