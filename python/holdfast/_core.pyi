@@ -167,8 +167,6 @@ WRITE_TIMEOUT_S: Final[float]
 CONTACTS_PER_LAG: Final[int]
 """How often a node of a log without writes has contact with it, in the time of `max_lag`."""
 
-"""What happens to reads of a node that is behind, where the log says nothing else."""
-
 MAX_LAG_S: Final[float]
 """The time without contact until a node of a log is behind, where the log has no other."""
 

@@ -69,7 +69,7 @@ class ModbusException(ModbusError):
     @property
     def maybe_executed(self) -> bool:
         """Whether the device may have executed the request, or has executed earlier ones of the
-        call: not after 01, 02, 03, 06 and 0A to the first.
+        call. False only if the first request got 01, 02, 03, 06 or 0A.
         """
         return self.written > 0 or self.code not in NOT_EXECUTED
 
@@ -84,7 +84,7 @@ class ConnectionLost(ModbusError, ConnectionError):
     maybe_sent = True
 
     def note_written(self, count: int, of: str) -> None:
-        """As of every error; the device has executed some of the call."""
+        """As for every error. The device has executed a part of the call."""
         super().note_written(count, of)
         self.maybe_sent = True
 
@@ -139,7 +139,7 @@ class RequestTimeout(ModbusError, TimeoutError):
         super().__init__(text)
 
     def note_written(self, count: int, of: str) -> None:
-        """As of every error; the device has executed some of the call."""
+        """As for every error. The device has executed a part of the call."""
         super().note_written(count, of)
         self.maybe_sent = True
 

@@ -156,6 +156,7 @@ type Lock = Arc<HeldLock>;
 #[derive(Debug)]
 struct HeldLock {
     file: OwnedFd,
+    user: User,
     of_process: u32,
 }
 
@@ -175,7 +176,7 @@ enum User {
     Client,
 }
 
-/// Locks a line. Within this process, only a listener may open it while it is open.
+/// Locks a line. Within this process, only a listener may open it again, while another one has it.
 #[cfg(unix)]
 fn lock(device: &str, user: User) -> io::Result<Lock> {
     static HELD: Mutex<BTreeMap<PathBuf, Weak<HeldLock>>> = Mutex::new(BTreeMap::new());
@@ -191,7 +192,7 @@ fn lock(device: &str, user: User) -> io::Result<Lock> {
         })
     };
     if let Some(lock) = held.get(&path).and_then(Weak::upgrade).filter(is_same) {
-        if user == User::Client {
+        if (lock.user, user) != (User::Listener, User::Listener) {
             let what = "another client or listener of this program uses the line";
             return Err(io::Error::new(ErrorKind::ResourceBusy, what));
         }
@@ -205,7 +206,7 @@ fn lock(device: &str, user: User) -> io::Result<Lock> {
         }
         other => other.into(),
     })?;
-    let lock = Arc::new(HeldLock { file, of_process: std::process::id() });
+    let lock = Arc::new(HeldLock { file, user, of_process: std::process::id() });
     held.insert(path, Arc::downgrade(&lock));
     Ok(lock)
 }

@@ -6,6 +6,7 @@ Each error becomes one message: what was found, and what is allowed.
 from __future__ import annotations
 
 import re
+from math import inf
 from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
@@ -96,7 +97,7 @@ def _in_seconds(found: object, words: str) -> str:
     if not isinstance(found, str) or re.match("a number .* seconds", words) is None:
         return ""
     number = seconds_in(found)
-    return "" if number is None else f"; did you mean {number:.12g}?"
+    return "" if number is None or number == inf else f"; did you mean {number:.12g}?"
 
 
 def _add_kind(path: KeyPath, owner: dict[str, Any], report: Report) -> None:

@@ -16,7 +16,7 @@ RETRY_S = 10.0
 
 
 class Rotation:
-    """A file, and up to `keep` files that it was before. While it can't be renamed, all stay.
+    """A file, and up to `keep` older ones. While it can't be renamed, all stay.
 
     It is FILE.0 until the others have made room. What a crash leaves there is put aside later.
     """

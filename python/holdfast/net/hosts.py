@@ -7,7 +7,6 @@ A text that ends in a number and is no IP address is not a host: resolvers take 
 from __future__ import annotations
 
 import re
-import unicodedata
 
 from holdfast.net.addresses import LAST_PORT, address_in
 from holdfast.runtime.text import quote
@@ -20,8 +19,6 @@ HOST_FORM = (
 _LETTER = "A-Za-z0-9_\x80-\U0010ffff"
 _LABEL = f"[{_LETTER}]([{_LETTER}-]{{0,61}}[{_LETTER}])?"
 _NAME = re.compile(rf"(?=.{{1,253}}\Z)({_LABEL}\.)*(?!([0-9]+|0[xX][0-9a-fA-F]*)\Z){_LABEL}")
-_NO_LETTER = re.compile(r"[\s\u3002]")
-"""Beyond ASCII: blanks, and a full stop that resolvers take for a dot."""
 _ADDRESS_6 = re.compile(r"[0-9a-f.]*:[0-9a-f:.]*(%[!-~]+)?")
 _NETLOC = re.compile(r"(?:\[(?P<six>[^\[\]]*)\]|(?P<name>[^:\[\]]*))(?::(?P<port>[^:]*))?")
 
@@ -29,10 +26,16 @@ _NETLOC = re.compile(r"(?:\[(?P<six>[^\[\]]*)\]|(?P<name>[^:\[\]]*))(?::(?P<port
 def is_host_name(text: str) -> bool:
     """Whether text can be the name of a host; as in Docker and Windows, it may contain `_`.
 
-    Letters may be of any language, but none that resolvers replace by others: wide digits.
+    Letters may be of any language, but none that resolvers replace by others, as wide digits.
     """
-    is_name = _NAME.fullmatch(text) is not None and _NO_LETTER.search(text) is None
-    return is_name and unicodedata.is_normalized("NFKC", text)
+    return _NAME.fullmatch(text) is not None and (text.isascii() or _has_own_letters(text.lower()))
+
+
+def _has_own_letters(text: str) -> bool:
+    try:
+        return text.encode("idna").decode("idna") == text
+    except UnicodeError:
+        return False
 
 
 def is_host(text: str) -> bool:

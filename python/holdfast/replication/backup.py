@@ -194,10 +194,11 @@ async def _newest_snapshot(client: SafeClient, log: str) -> int:
 
 
 async def _back_up(client: SafeClient, log: str, folder: Path) -> int:
-    newest = await _newest_snapshot(client, log)
-    contents = {}
+    contents, newest = {}, 0
     for name in streams(log):
         contents[name] = await _fetch(client, name, folder / name)
+        if not newest:  # Steps before it may be removed while the rest is fetched.
+            newest = await _newest_snapshot(client, log)
     first = int(contents[streams(log)[-1]]["state"]["first_seq"])
     if first > newest + 1:
         reason = f"messages {newest + 1} to {first - 1} behind the newest snapshot are missing"

@@ -215,7 +215,8 @@ def special(file: File, mode: int) -> str:
 
 def is_shell_pipe(file: File, mode: int) -> bool:
     """Returns whether a file is a pipe of the process itself: `<(command)`, or standard input."""
-    return stat.S_ISFIFO(mode) and os.fspath(file).startswith(("/dev/", "/proc/"))
+    # Where a link leads to: in containers, files of logs lead to /dev/stdout.
+    return stat.S_ISFIFO(mode) and os.path.realpath(file).startswith(("/dev/", "/proc/"))
 
 
 def not_answered(file: str, timeout_ms: int) -> NotAnswered:

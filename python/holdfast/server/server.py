@@ -151,8 +151,8 @@ class Server:
         """
         engine, self._engine = self._engine, None
         if engine is not None:
-            engine.stop()
             _running.discard(engine)
+            engine.stop()
 
     @property
     def address(self) -> tuple[str, int]:

@@ -93,7 +93,9 @@ USUAL_NAMES = {
     "float": "float32",
     "half": "float16",
     "int": "int16",
+    "integer": "int16",
     "lint": "int64",
+    "longlong": "int64",
     "long": "int32",
     "lreal": "float64",
     "lword": "uint64",
@@ -110,11 +112,17 @@ USUAL_NAMES = {
     "ulint": "uint64",
     "ulong": "uint32",
     "unsigned": "uint16",
+    "unsignedint": "uint16",
+    "unsignedlong": "uint32",
+    "unsignedshort": "uint16",
     "ushort": "uint16",
     "word": "uint16",
     **dict.fromkeys(("byte", "sint", "usint", "wchar", "wstring"), ""),
 }
 """What other programs call these types, to suggest ours; "" for types that are not here."""
+
+CLOSE = 0.8
+"""How close a word must be to a type: `flag` and `float32` are not."""
 
 _SIZED = re.compile(r"(bit|bytes|char|str|string|text)([:.\[]?)([0-9]{1,6})[.\]]?")
 
@@ -123,7 +131,7 @@ def _unknown(name: object) -> UnknownType:
     base, bracket, count = re.sub(r"[\s_-]", "", str(name).lower()).partition("[")
     meant = _meant(base)
     sized = _SIZED.fullmatch(base + bracket + count)
-    if sized and (sized[2] != "[" or sized[1] not in ("bit", "bytes")):  # STRING[20]
+    if sized:  # STRING[20]
         meant, bracket = _with_number(sized[1], int(sized[3])), ""
     elif sized := _SIZED.fullmatch(base):
         meant = _with_number(sized[1], int(sized[3]))
@@ -151,7 +159,7 @@ def _meant(word: str) -> str:
         # Imported here, for a fast start: only wrong names need it.
         import difflib
 
-        word = next(iter(swapped or difflib.get_close_matches(word, alike, 1)), "")
+        word = next(iter(swapped or difflib.get_close_matches(word, alike, 1, CLOSE)), "")
     return USUAL_NAMES.get(word, word)
 
 

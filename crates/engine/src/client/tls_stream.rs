@@ -172,7 +172,7 @@ impl ByteStream for TlsStream {
 
 impl Drop for TlsStream {
     fn drop(&mut self) {
-        // A forked child ends its copy: the connection of its parent goes on.
+        // In a forked child, nothing is said to the peer: the connection is that of the parent.
         if self.of_process != std::process::id() {
             return;
         }

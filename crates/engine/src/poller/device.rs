@@ -175,9 +175,9 @@ impl Inbox {
         self.arrived.notify_one();
     }
 
-    /// Waits for a successor that stores its values elsewhere: those of this device would replace what
-    /// belongs to another one now.
-    async fn moved(&self, device: &Device) {
+    /// Waits for a successor whose values have another source or place: those of this device would replace
+    /// what belongs to another one now.
+    async fn until_moved(&self, device: &Device) {
         while !self.successor.borrow().as_ref().is_some_and(|next| device.is_moved(next)) {
             self.arrived.notified().await;
         }
@@ -336,7 +336,10 @@ impl Device {
             tokio::select! {
                 biased;
                 () = closed => {}
-                () = inbox.moved(self) => {}
+                () = inbox.until_moved(self) => {
+                    self.turn.polls(false);
+                    continue;
+                }
                 () = poll => {}
             }
             self.turn.polls(false);

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use bytes::Buf;
 use holdfast_memory::{Refusal, Refused, Tenure, Term};
 
-/// The most leases whose last term is known. Without one, all steps are carried out.
+/// The most leases whose last term is known. Steps of all others are carried out.
 const MAX_LEASES: usize = 65_536;
 
 #[derive(Debug, Default, PartialEq, Eq)]
@@ -30,6 +30,10 @@ impl LeaseTerms {
 
     pub(super) fn is_empty(&self) -> bool {
         self.0.is_empty()
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.0.len()
     }
 
     pub(super) fn iter(&self) -> impl Iterator<Item = (u64, Term)> + '_ {

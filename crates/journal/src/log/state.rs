@@ -148,7 +148,8 @@ impl State {
         let contents = Memory::contents(&self.members);
         let len: usize =
             contents.iter().flat_map(|contents| &contents.areas).map(|area| area.len() + 8).sum();
-        let mut out = Vec::with_capacity(len + 64 + self.origins.len() * 96);
+        let mut out =
+            Vec::with_capacity(len + 64 + self.origins.len() * 96 + self.terms.len() * 24);
         out.extend_from_slice(&MARK);
         out.push(self.version());
         out.extend_from_slice(&self.place.sequence.to_le_bytes());

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
-from holdfast.adapters.mqtt.deliveries import Deliveries, NotKept
+from holdfast.adapters.mqtt.deliveries import Deliveries, NotTaken
 from holdfast.adapters.mqtt.inbox import MAX_PAYLOAD_BYTES
 from holdfast.net.mqtt.client import BrokerClient
 from holdfast.net.mqtt.packets import MAX_PROPERTIES_BYTES
@@ -172,7 +172,7 @@ class BrokerConnection(BrokerClient):
     def _take(self, first: int, body: bytes | bytearray, size: int) -> None:
         try:
             taken = self._deliveries.take(first, body, size)
-        except (ValueError, NotKept) as error:
+        except NotTaken as error:
             self.end(str(error))
             return
         if taken.acknowledgement:

@@ -24,9 +24,9 @@ _RETAIN, _DUP = 0x01, 0x08
 _PUBACK, _PUBREC, _PUBCOMP = 0x40, 0x50, 0x70
 
 
-class NotKept(Exception):
-    """A memory can't keep the message now. Without an acknowledgement, the broker sends it again
-    after a reconnect.
+class NotTaken(Exception):
+    """A message is malformed, or a memory can't keep it now. Without an acknowledgement, the broker
+    sends it again after a reconnect.
     """
 
 
@@ -54,17 +54,17 @@ class Deliveries:
     def take(self, first: int, body: bytes | bytearray, size: int) -> Taken:
         """Writes the message of a PUBLISH packet, whose body is cut if it is shorter than `size`.
 
-        Raises `ValueError` for a malformed packet, and `NotKept`.
+        Raises `NotTaken`.
         """
         try:
             message = parse_publish(first, body, size, five=self._five)
         except ValueError as error:
-            raise ValueError(f"malformed message: {error}") from error
+            raise NotTaken(f"malformed message: {error}") from error
         if message.qos == 2 and message.identifier in self._unreleased:
             return Taken(acknowledgement(_PUBREC, message.identifier), message, None)
         result = self._inbox.take(message, stale=_staleness(first))
         if message.qos and result.get("reason") in KEEPING:
-            raise NotKept(result["detail"])
+            raise NotTaken(result["detail"])
         sent = b""
         if message.qos == 1:
             sent = acknowledgement(_PUBACK, message.identifier)

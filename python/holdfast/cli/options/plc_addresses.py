@@ -86,13 +86,15 @@ def suggested_bit(text: str, area: Area | None = None) -> str:
     `area` is that of a number beside it.
     """
     match = _BIT.fullmatch(text)
-    number = match and MODICON_NUMBER.fullmatch(match[1])
-    area = MODICON_AREAS[number[1]] if number and area is None else area
-    if match is None or area is None or area in BIT_AREAS:
+    if match is None:
         return ""
-    if number is None and whole_number(match[1]) is None:
+    if area is not None:
+        place = f"{SHORT_OF[area]}:{match[1]}" if whole_number(match[1]) is not None else ""
+    else:
+        number = MODICON_NUMBER.fullmatch(match[1])
+        area, place = (MODICON_AREAS[number[1]], match[1]) if number else (None, "")
+    if not place or area in BIT_AREAS:
         return ""
-    place = match[1] if number else f"{SHORT_OF[area]}:{match[1]}"
     return f"; did you mean '{place}:bit:{match[2]}'?"
 
 

@@ -118,11 +118,14 @@ def unreadable(path: Path) -> str:
     return bounded_files.unstored(path, mode) or ("" if may_read else os.strerror(errno.EACCES))
 
 
+NO_FOLDER = "whose folder does not exist"
+
+
 def unplaceable(file: Path, *, may_be_device: bool = False) -> str:
     """Why a file can't be written in its folder, or "" if it can."""
     try:
         if not bounded_files.call(file, file.parent.is_dir):
-            return "whose folder does not exist"
+            return NO_FOLDER
         mode = bounded_files.call(file, file.stat).st_mode
     except FileNotFoundError:
         return ""

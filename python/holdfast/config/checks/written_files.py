@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from holdfast.config.checks.common import Owners, items, unplaceable, until_invalid
+from holdfast.config.checks.common import NO_FOLDER, Owners, items, unplaceable, until_invalid
 from holdfast.config.fingerprint import files_of
 from holdfast.config.models.outputs import FileConfig
 from holdfast.config.text.messages import show
@@ -25,17 +25,20 @@ def check_written_files(scope: Scope) -> None:
     report, owners = scope.report, Owners(scope.report, "file")
     written = list(_written(scope.config))
     read = _read(scope) if written else set()
-    kept: set[Path] = set()
-    for path, file in written:
+    shared: set[tuple[str, Path]] = set()
+    for path, file, users in written:
         shown = show(report.raw(path))
         if reason := unplaceable(file, may_be_device=path[0] == "audit"):
-            report.add(path, f"found {shown}, {reason}, allowed: a file in an existing folder")
+            # Outputs try again: a disk that is not mounted yet must not keep memories down.
+            waits = path[0] == "outputs" and reason == NO_FOLDER
+            note = report.warn if waits else report.add
+            note(path, f"found {shown}, {reason}, allowed: a file in an existing folder")
         elif (place := _place(file)) in read:
             report.add(path, f"found {shown}, which the configuration reads, allowed: another file")
-        elif path[0] != "memories" or file not in kept:  # Memories may share a file.
+        elif (users, file) not in shared:
             owners.claim(path, place, shown, path[:-1])
-        if path[0] == "memories":
-            kept.add(file)
+        if users:
+            shared.add((users, file))
 
 
 def _read(scope: Scope) -> set[str]:
@@ -47,25 +50,26 @@ def _read(scope: Scope) -> set[str]:
     return read
 
 
-def _written(config: Config) -> Iterator[tuple[KeyPath, Path]]:
-    """The valid files that are written, with their paths."""
-    found: list[tuple[KeyPath, Path | None]] = []
+def _written(config: Config) -> Iterator[tuple[KeyPath, Path, str]]:
+    """The valid files that are written, with their paths, and who may share one, if anybody."""
+    found: list[tuple[KeyPath, Path | None, str]] = []
     with until_invalid():
         if config.audit is not None:
-            found.append((("audit", "file"), config.audit.file))
+            found.append((("audit", "file"), config.audit.file, ""))
     with until_invalid():
         for path, output in items(("outputs",), config.outputs):
             with until_invalid():
                 if isinstance(output, FileConfig):
-                    found.append(((*path, "file"), output.file))
+                    users = "databases" if output.format == "sqlite" else ""
+                    found.append(((*path, "file"), output.file, users))
             with until_invalid():
-                found.append(((*path, "buffer", "file"), output.buffer.file))
+                found.append(((*path, "buffer", "file"), output.buffer.file, ""))
     with until_invalid():
         for path, memory in items(("memories",), config.memories):
             with until_invalid():
                 if memory.keep is not None:
-                    found.append(((*path, "keep", "file"), memory.keep.file))
-    return ((path, file) for path, file in found if file is not None)
+                    found.append(((*path, "keep", "file"), memory.keep.file, "memories"))
+    return ((path, file, users) for path, file, users in found if file is not None)
 
 
 def _place(file: Path) -> str:

@@ -146,6 +146,7 @@ def _csv(text: str, file: str) -> tuple[yaml_document.Document, list[Problem]]:
     except csv.Error as error:
         rule = "a cell that begins with a quote ends with one, and has others twice"
         table.refuse(first, f"not CSV: {error}, allowed: {rule}")
+        raise ConfigError(file, table.problems) from None
     document = yaml_document.table(file, {"tags": table.tags}, table.lines)
     return document, table.problems
 

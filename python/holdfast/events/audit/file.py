@@ -175,7 +175,8 @@ class AuditFile:
 def _is_pipe(file: Path) -> bool:
     """Whether a file is a pipe, other than one of the process itself, such as `/dev/stdout`."""
     try:
-        return stat.S_ISFIFO(file.stat().st_mode) and not str(file).startswith(("/dev/", "/proc/"))
+        mode = file.stat().st_mode
+        return stat.S_ISFIFO(mode) and not os.path.realpath(file).startswith(("/dev/", "/proc/"))
     except FileNotFoundError:
         return False
 

@@ -70,7 +70,7 @@ pub(in crate::link) struct TcpLink {
 /// The result of a request, and its next attempt, if there is one; `None` if it was not sent in time.
 type Outcome = Option<(Result<Vec<u8>, Failure>, Option<Attempt>)>;
 
-/// The callers that wait for the requests in flight. They are few: no hash is as fast.
+/// The callers that wait for the requests in flight. They are few.
 type Waiting = BTreeMap<Ticket, oneshot::Sender<Outcome>>;
 
 /// An open connection.

@@ -11,8 +11,8 @@ pub(in crate::log) enum Report {
     Leased(Result<bool, End>),
     /// The revision of the snapshot's key.
     Stored((u64, Pointer)),
-    /// Why a snapshot was not stored, and what the key names now.
-    NotStored { reason: String, found: Result<(u64, Pointer), End> },
+    /// Why a snapshot was not stored, the revision of the key that was known, and what the key names now.
+    NotStored { reason: String, known: Option<u64>, found: Result<Option<(u64, Pointer)>, End> },
     /// The digest that the log leads to.
     Replayed { sequence: u64, digest: Result<String, String> },
 }

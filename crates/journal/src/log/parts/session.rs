@@ -296,7 +296,9 @@ impl<'n> Session<'n> {
             Report::Stored((revision, pointer)) => {
                 self.node.snapshotter.stored(revision, pointer);
             }
-            Report::NotStored { reason, found } => self.node.snapshotter.failed(&reason, found)?,
+            Report::NotStored { reason, known, found } => {
+                self.node.snapshotter.failed(&reason, known, found)?;
+            }
             Report::Replayed { sequence, digest } => self.replayed(sequence, digest)?,
         }
         Ok(())

@@ -204,7 +204,8 @@ impl Snapshotter {
         let stage = std::mem::replace(&mut self.stage, Stage::Storing);
         let Stage::Prepared(Prepared { encoded, snapshot, .. }) = stage else { return };
         let seen = self.known.as_ref().map(|known| (known.revision, known.pointer.clone()));
-        background.spawn(|store| async move {
+        let known = seen.as_ref().map(|(revision, _)| *revision);
+        background.spawn(move |store| async move {
             let stored = match store.put(seen, &encoded, snapshot).await {
                 Ok((revision, pointer)) => store.tidy(&pointer).await.map(|()| (revision, pointer)),
                 Err(error) => Err(error),
@@ -212,7 +213,7 @@ impl Snapshotter {
             store.release().await;
             match stored {
                 Ok(named) => Report::Stored(named),
-                Err(reason) => Report::NotStored { reason, found: store.examine().await },
+                Err(reason) => Report::NotStored { reason, known, found: store.examine().await },
             }
         });
     }
@@ -225,19 +226,23 @@ impl Snapshotter {
         self.learn(revision, pointer);
     }
 
-    /// The snapshot was not stored. What the key was known to name may have been wrong.
+    /// The snapshot was not stored. What the key was known to name may have been wrong, unless more is known
+    /// now.
     ///
     /// # Errors
     /// [`End`] if the log has lost the key, or what it was in: the next session makes it anew.
     pub(in crate::log) fn failed(
         &mut self,
         reason: &str,
-        found: Result<(u64, Pointer), End>,
+        known: Option<u64>,
+        found: Result<Option<(u64, Pointer)>, End>,
     ) -> Result<(), End> {
         self.postpone();
         self.shared.event(Event::new("log_snapshot_failed", &[("reason", reason)]));
-        let (revision, pointer) = found?;
-        self.doubt();
+        let Some((revision, pointer)) = found? else { return Ok(()) };
+        if self.known.as_ref().map(|now| now.revision) == known {
+            self.doubt();
+        }
         self.learn(revision, pointer);
         Ok(())
     }

@@ -207,8 +207,8 @@ impl Store {
         }
     }
 
-    /// Replaces the key of the snapshot if it is missing, or replaces it and removes digests, if a watch can't
-    /// read them. Returns whether it has done so. A digest that is missing is stored again at the next
+    /// Makes the key of the snapshot anew if it is missing and the stream goes on behind the snapshot; replaces
+    /// it and removes digests, if a watch can't read them. Returns whether it has done so. A digest that is missing is stored again at the next
     /// comparison.
     pub(in crate::log) async fn mend_keys(&self, pointer: &Pointer) -> Result<bool, End> {
         let (stream, lost) = (&self.keys.stream_name, |error: &dyn std::fmt::Display| {
@@ -219,7 +219,9 @@ impl Store {
         let entry = fetch(&self.context, stream, which).await?;
         // A deleted key is empty.
         let is_there = |entry: &Received| entry.is_readable && !entry.payload.is_empty();
-        if !entry.as_ref().is_some_and(is_there) {
+        let is_continued =
+            pointer.newest.sequence + 1 >= self.stream.cached_info().state.first_sequence;
+        if is_continued && !entry.as_ref().is_some_and(is_there) {
             let value = serde_json::to_vec(pointer).map_err(|error| lost(&error))?;
             let revision = entry.map_or(0, |entry| entry.place.sequence);
             // Fails if another node does it at the same time.
@@ -289,23 +291,28 @@ impl Store {
         }
     }
 
-    /// What the key of the snapshots names, after something has failed.
+    /// What the key of the snapshots names, after something has failed. `None` if the servers don't say.
     ///
     /// # Errors
-    /// [`End`] if the servers have lost the key, or a bucket of the log.
-    pub(in crate::log) async fn examine(&self) -> Result<(u64, Pointer), End> {
+    /// [`End`] if they have lost the key, or a bucket of the log.
+    pub(in crate::log) async fn examine(&self) -> Result<Option<(u64, Pointer)>, End> {
         let leases = self.leases.iter().map(|leases| leases.stream_name.clone());
         let objects = format!("OBJ_{}", self.stream.cached_info().config.name);
         for name in leases.chain([self.keys.stream_name.clone(), objects]) {
-            let found = self.context.get_stream(&name).await;
-            found.map_err(|error| End::lost(&format!("the stream {name}"), error))?;
+            match self.context.get_stream(&name).await {
+                Ok(_) => {}
+                Err(error) if is_missing(&error.kind()) => {
+                    return Err(End::lost(&format!("the stream {name}"), error));
+                }
+                Err(_) => return Ok(None),
+            }
         }
         match self.pointer().await {
-            Ok(Some(named)) => Ok(named),
+            Ok(Some(named)) => Ok(Some(named)),
             Ok(None) => Err(End::Lost("the key of the snapshot is missing".to_owned())),
             // The next session replaces what can't be read.
             Err(End::Fatal(error)) => Err(End::Lost(error.to_string())),
-            Err(end) => Err(end),
+            Err(_) => Ok(None),
         }
     }
 
