@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import random
+import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -207,8 +208,22 @@ def test_an_interruption_costs_only_the_registers_at_hand(monkeypatch: pytest.Mo
     monkeypatch.setattr(segments, "divide", interrupted)
     with pytest.raises(KeyboardInterrupt):
         description.conclude(found)
-    assert sum(each.tag.count for each in found.tags) == 80
-    assert list(description.undescribed(found)) == [("holding_registers", range(80, 90))]
+    # The last value of each part is divided with the next one.
+    assert sum(each.tag.count for each in found.tags) == 78
+    assert list(description.undescribed(found)) == [("holding_registers", range(78, 90))]
+
+
+def test_a_value_across_the_registers_at_hand_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    volts = [230.1 + index / 7 for index in range(60)]
+    words = struct.unpack(">120H", struct.pack(">60f", *volts))
+    for most in (1000, 41):
+        monkeypatch.setattr(description, "MAX_REGISTERS_AT_ONCE", most)
+        found = Description(1, Survey(["holding_registers"]))
+        found.reads["holding_registers", range(120)] = [[*words]]
+        found.survey.areas[0].ranges.append(range(120))
+        description.conclude(found)
+        assert {each.tag.type for each in found.tags} == {"float32"}, most
+        assert [each.tag.address for each in found.tags] == [*range(0, 120, 2)]
 
 
 def test_what_there_is_no_time_for_is_named() -> None:

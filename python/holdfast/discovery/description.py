@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from holdfast.discovery import (
@@ -167,13 +167,12 @@ def conclude(found: Description, now: float | None = None, seconds: float | None
         if area in BIT_AREAS:
             found.tags += _bits(area, extent, contents)
     try:
-        pieces = list(_pieces(found, most))
+        pieces = list(_pieces(found))
         habits = _habits(pieces, now)
         found.orders = byte_order_habits.order_shares(habits)
-        for piece in pieces:
-            if end is not None and time.monotonic() > end:
-                break
-            found.tags += list(_values(piece, habits, now))
+        parts = (part for piece in pieces for part in _tags_by_part(piece, most, habits, now))
+        while (end is None or time.monotonic() <= end) and (tags := next(parts, None)) is not None:
+            found.tags += tags
     finally:
         found.tags.sort(key=lambda each: (areas.index(each.tag.area), each.tag.address))
 
@@ -206,26 +205,25 @@ class _Piece:
     reads: list[list[int]]
     is_empty: bool
 
+    def part(self, first: int, stop: int) -> _Piece:
+        """Some of the registers."""
+        reads = [read[first:stop] for read in self.reads]
+        return replace(self, address=self.address + first, reads=reads)
 
-def _pieces(found: Description, most: int) -> Iterator[_Piece]:
-    """The registers that were read, divided where many contain nothing, and after `most`."""
+
+def _pieces(found: Description) -> Iterator[_Piece]:
+    """The registers that were read, divided where many contain nothing."""
     for (area, extent), contents in found.reads.items():
         if area in BIT_AREAS:
             continue
         start = 0
         for first, stop in (*_empty(contents), (len(extent), len(extent))):
-            for at in range(start, first, most):
-                end = min(at + most, first)
-                yield _cut(area, extent.start, contents, at, end, is_empty=False)
+            whole = _Piece(area, extent.start, contents, is_empty=False)
+            if start < first:
+                yield whole.part(start, first)
             if first < stop:
-                yield _cut(area, extent.start, contents, first, stop, is_empty=True)
+                yield replace(whole, is_empty=True).part(first, stop)
             start = stop
-
-
-def _cut(
-    area: Area, address: int, reads: list[list[int]], first: int, stop: int, *, is_empty: bool
-) -> _Piece:
-    return _Piece(area, address + first, [read[first:stop] for read in reads], is_empty)
 
 
 def _empty(reads: list[list[int]]) -> Iterator[tuple[int, int]]:
@@ -255,6 +253,23 @@ def _habits(pieces: Sequence[_Piece], now: float | None) -> dict[Habit, float]:
         return {}
     shares = segments.habits(parts, now=now)
     return {habit: share for habit, share in shares.items() if share > IMPROBABLE}
+
+
+def _tags_by_part(
+    piece: _Piece, most: int, habits: Mapping[Habit, float], now: float | None
+) -> Iterator[list[DescribedTag]]:
+    """The tags of `most` registers at a time.
+
+    The last value of a part may go on in the next one, and is found there.
+    """
+    first, size = 0, len(piece.reads[0])
+    while first < size:
+        stop = size if piece.is_empty else min(first + most, size)
+        tags = list(_values(piece.part(first, stop), habits, now))
+        if stop < size and len(tags) > 1:
+            stop = tags.pop().tag.address - piece.address
+        yield tags
+        first = stop
 
 
 def _values(
