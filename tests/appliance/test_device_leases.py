@@ -488,19 +488,6 @@ def test_a_device_of_two_logs_is_refused(settings: Callable[..., Path]) -> None:
         load(file)
 
 
-def test_what_only_the_node_that_polls_has_is_a_warning(settings: Callable[..., Path]) -> None:
-    read = {"area": "holding_registers", "address": 7, "count": 2}
-    into = {"area": "holding_registers", "address": 10}
-    reads = [{**read, "into": {"memory": name, **into}} for name in ("plant", "own")]
-    file = settings("a", reads=reads)
-    text = file.read_text()
-    file.write_text(
-        text.replace('"memories": {', '"memories": {"own": {"holding_registers": 20}, ')
-    )
-    [warning] = load(file).warnings
-    assert "devices.meter.reads[1].into.memory: only the node that polls has these" in str(warning)
-
-
 def test_one_connection_has_one_name_however_it_is_written() -> None:
     def of(url: str) -> str:
         return connection_of(parse(url))

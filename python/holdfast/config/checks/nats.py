@@ -110,26 +110,17 @@ def _check_devices(scope: Scope) -> None:
     """Reports devices of more than one log: one lease says which node polls a device."""
     for path, device in items(("devices",), scope.config.devices):
         with until_invalid():
-            places: list[tuple[KeyPath, Any]] = [
-                ((*where, "into"), read.into)
-                for where, read in items((*path, "reads"), device.reads)
-                if read.into is not None
+            places: list[Any] = [
+                read.into for _, read in items(path, device.reads) if read.into is not None
             ]
             if device.status is not None:
-                places.append(((*path, "status"), device.status))
-            known = [
-                (where, memory)
-                for where, place in places
-                if (memory := scope.config.memories.get(place.memory)) not in (None, INVALID)
-            ]
-            logs = {where: _log(memory) for where, memory in known}
-            found = list(dict.fromkeys(log for log in logs.values() if log is not None))
-            if len(found) > 1:
-                message = f"found memories of the logs {all_of(found)}, allowed: those of one log"
+                places.append(device.status)
+            memories = [scope.config.memories.get(place.memory) for place in places]
+            known = [each for each in memories if each is not None and each is not INVALID]
+            logs = dict.fromkeys(log for memory in known if (log := _log(memory)) is not None)
+            if len(logs) > 1:
+                message = f"found memories of the logs {all_of(logs)}, allowed: those of one log"
                 scope.report.add_key(path, message)
-            for where in [each for each, log in logs.items() if log is None] if found else ():
-                message = "only the node that polls has these values: the memory is in no log"
-                scope.report.warn((*where, "memory"), message)
 
 
 def check_nats(path: KeyPath, nats: NatsServersConfig, report: Report) -> None:
