@@ -378,6 +378,7 @@ def test_a_wrong_url_is_wrong_usage() -> None:
         (("holding registers7", "1"), "did you mean 'holding registers:7', counted from 0?"),
         (("hr_1", "1"), "did you mean 'hr:1', counted from 0?"),
         (("40101.3",), "did you mean '40101:bit:3'?"),
+        (("hr:12345.3",), "did you mean 'hr:12345:bit:3'?"),
         (("4x0101.03",), "did you mean '4x0101:bit:3'?"),
         (("hr:100.15",), "did you mean 'hr:100:bit:15'?"),
         (("ir", "100.3"), "did you mean 'ir:100:bit:3'?"),

@@ -320,7 +320,13 @@ def test_an_unknown_type_is_refused_with_all_that_are_allowed(name: Any) -> None
         *(("float23", "float32"), ("uint61", "uint16")),
         *(("bit3", "bit:3"), ("bit.3", "bit:3"), ("Bit:3", "bit:3"), ("bit7[2]", "bit:7[2]")),
         *(("String:20", "string:20"), ("string20", "string:20"), ("STRING[20]", "string:20")),
-        *(("Bytes4", "bytes:4"), ("bytes[4]", "bytes:8[4]"), ("String:5[3]", "string:5[3]")),
+        *(
+            ("Bytes4", "bytes:4"),
+            ("bytes[4]", "bytes:4"),
+            ("INTEGER", "int16"),
+            ("unsigned long", "uint32"),
+            ("String:5[3]", "string:5[3]"),
+        ),
         *(("flaot32[5]", "float32[5]"), ("real[5]", "float32[5]"), ("real[x", "float32")),
     ],
 )
