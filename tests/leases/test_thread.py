@@ -45,9 +45,18 @@ class Node:
     def __init__(self, server: NatsServer, name: str, times: LeaseTimes = LASTING) -> None:
         self.events: list[str] = []
         self.withheld: str | None = None
-        self.leases = Leases(BUCKET, name, self, times=times, withheld=lambda: self.withheld)
+        self.asked = 0
+        self.leases = Leases(BUCKET, name, self, times=times, withheld=self._why_withheld)
         self.thread = LeaseThread(self.leases, self._connect, f"leases of {name}", retry_s=0.01)
         self._servers = Servers((server.url,))
+
+    def _why_withheld(self) -> str | None:
+        self.asked += 1
+        return self.withheld
+
+    def looks_several_times(self) -> None:
+        asked = self.asked
+        wire.until(lambda: self.asked >= asked + 5, "the leases are looked at")
 
     async def _connect(self, connected: Callable[[Client | None], None]) -> None:
         await Broker(self._servers, {}, connected, Ping()).run()
@@ -247,9 +256,9 @@ def test_a_lease_that_is_withheld_when_it_is_due_is_renewed_as_soon_as_it_is_not
     one.thread.want(["x"])
     one.has("x")
     one.withheld = "there is nobody to tell"
-    time.sleep(0.5)
+    one.looks_several_times()
     one.leases.times = LeaseTimes(ttl_s=300.0, hold_s=200.0, renewal_s=100.0)
-    time.sleep(0.5)  # It becomes due.
+    one.looks_several_times()  # It becomes due.
     revision = one.leases.revision("x")
     one.withheld = None
     wire.until(lambda: one.leases.revision("x") > revision, "it is renewed")

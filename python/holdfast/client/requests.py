@@ -157,7 +157,7 @@ def read_range(area: Area, address: int, count: int, element: int = 1) -> Plan[l
     address, count = index(address), index(count)
     if count <= limit:
         return Request.read(area, address, count)
-    size = whole_elements(limit, element)
+    size = _whole_elements(limit, element)
     return _in_turn(
         [
             Request.read(area, start, min(size, address + count - start))
@@ -222,7 +222,7 @@ def write_range(
             raise TooManyValues(len(items), limit)
         yield make(address, items)
         return
-    size = whole_elements(limit, element)
+    size = _whole_elements(limit, element)
     starts = _starts(address, len(items), size)
     try:
         requests = [
@@ -346,7 +346,7 @@ def diagnostics(sub_function: int, data: Sequence[int]) -> Steps[list[int]]:
     return [int.from_bytes(reply[at : at + 2], "big") for at in range(0, len(reply), 2)]
 
 
-def whole_elements(limit: int, element: int) -> int:
+def _whole_elements(limit: int, element: int) -> int:
     """The most registers of a request with whole elements; `limit` if not even one fits."""
     return limit // element * element or limit
 

@@ -53,7 +53,7 @@ def join(process: subprocess.Popen[Any]) -> None:
 def _job() -> tuple[Any, Any]:
     """The functions of the system, and the job. Nobody closes it: the end of this process does."""
     if sys.platform != "win32":
-        raise NotImplementedError
+        raise AssertionError("only `join` calls it, on Windows")
     kernel = ctypes.WinDLL("kernel32", use_last_error=True)
     kernel.CreateJobObjectW.restype = wintypes.HANDLE
     job = wintypes.HANDLE(kernel.CreateJobObjectW(None, None))

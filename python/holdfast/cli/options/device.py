@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import struct
 from typing import TYPE_CHECKING
 
 import click
@@ -13,13 +14,12 @@ from holdfast.cli.options.option import Command, number_option, option_group
 from holdfast.cli.options.units import refuse_broadcast
 from holdfast.client import SyncClient
 from holdfast.client.base import is_broadcast
-from holdfast.client.requests import whole_elements
 from holdfast.client.url import parse
 from holdfast.errors import (
     ModbusError,
     ModbusException,
 )
-from holdfast.protocol import ILLEGAL_ADDRESS, LAST_ADDRESS, MAX_UNIT, READ_LIMITS
+from holdfast.protocol import ILLEGAL_ADDRESS, LAST_ADDRESS, MAX_UNIT
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
@@ -88,13 +88,16 @@ def read_raw(
     element: int = 1,
     unit: int | None = None,
 ) -> list[int]:
-    """Reads bits or registers, in several requests if necessary, as `read_range` does."""
+    """Reads bits or registers, in several requests if necessary.
+
+    These end where an element ends, of `element` registers.
+    """
+    if element > 1:
+        kind = f"bytes:{2 * element}[{count // element}]"
+        data = b"".join(client.read(area, address, kind, unit=unit))
+        return list(struct.unpack(f">{count}H", data))
     kind = "bool" if area in BIT_AREAS else "uint16"
-    size = whole_elements(READ_LIMITS[area], element)
-    raw: list[int] = []
-    for start in range(address, address + count, size):
-        most = min(size, address + count - start)
-        raw += client.read(area, start, f"{kind}[{most}]", unit=unit)
+    raw: list[int] = client.read(area, address, f"{kind}[{count}]", unit=unit)
     return raw
 
 
