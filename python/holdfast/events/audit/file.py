@@ -173,7 +173,10 @@ class AuditFile:
 
 
 def _is_pipe(file: Path) -> bool:
-    """Whether a file is a pipe, other than one of the process itself, such as `/dev/stdout`."""
+    """Whether a file is a pipe, other than one of the process itself, such as `/dev/stdout`.
+
+    The check of configurations has the same rule (`runtime/bounded_files.py`, a floor above).
+    """
     try:
         mode = file.stat().st_mode
         return stat.S_ISFIFO(mode) and not os.path.realpath(file).startswith(("/dev/", "/proc/"))
