@@ -27,6 +27,7 @@ pub mod poller;
 pub mod raw_ingest_areas;
 mod serial_line;
 pub mod server;
+mod socket_calls;
 pub mod tls;
 mod wake;
 

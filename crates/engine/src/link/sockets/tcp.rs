@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use std::future::poll_fn;
 use std::hash::{BuildHasher, RandomState};
 use std::io::{self, ErrorKind};
-use std::pin::Pin;
 use std::rc::Rc;
 use std::sync::Arc;
 use std::task::{Poll, ready};
@@ -16,7 +15,6 @@ use holdfast_protocol::client::{
 };
 use holdfast_protocol::pdu::EncodedRequest;
 use holdfast_runtime::Retry;
-use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::net::tcp::OwnedReadHalf;
 use tokio::sync::{Mutex, oneshot};
@@ -33,6 +31,7 @@ use crate::link::scheduling::in_flight::Pace;
 use crate::link::sockets::connect::dial;
 use crate::link::sockets::handshake;
 use crate::name_lookup;
+use crate::socket_calls::{self, poll_receive};
 use crate::tls::client::ClientTls;
 use crate::tls::{Channel, TlsFailure};
 
@@ -413,7 +412,7 @@ impl Open {
         }
         let len = frames.len();
         self.connection.sent(len);
-        match self.writer.try_write(&self.unsent) {
+        match socket_calls::send(self.writer.as_ref(), &self.unsent) {
             Ok(len) => {
                 self.unsent.drain(..len);
                 true
@@ -454,7 +453,7 @@ impl Drop for Open {
         }
         if let Some(tls) = &mut self.tls {
             tls.end(&mut self.unsent);
-            let _ = self.writer.try_write(&self.unsent);
+            let _ = socket_calls::send(self.writer.as_ref(), &self.unsent);
         }
         if let Some(reader) = &self.reader {
             reader.abort();
@@ -463,20 +462,17 @@ impl Drop for Open {
 }
 
 /// Reads replies until the connection ends.
-async fn receive(link: Rc<RefCell<Option<Open>>>, mut reader: OwnedReadHalf) {
+async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
     let mut plain = Vec::new();
     loop {
-        // `readable` and `try_read` would ask the system twice for each reply.
         let received = poll_fn(|context| {
             CHUNK.with_borrow_mut(|chunk| {
-                let mut chunk = ReadBuf::new(chunk);
-                let read = ready!(Pin::new(&mut reader).poll_read(context, &mut chunk));
-                let received =
-                    Some(chunk.filled()).filter(|bytes| read.is_ok() && !bytes.is_empty());
+                let received = ready!(poll_receive(reader.as_ref(), context, chunk));
+                let len = received.unwrap_or(0);
                 let mut open = link.borrow_mut();
-                Poll::Ready(open.as_mut().map(|open| {
-                    received.is_some_and(|received| open.receive(received, &mut plain))
-                }))
+                Poll::Ready(
+                    open.as_mut().map(|open| len > 0 && open.receive(&chunk[..len], &mut plain)),
+                )
             })
         });
         let Some(intact) = received.await else { return };

@@ -16,7 +16,7 @@ use std::task::{Context, Poll};
 use holdfast_protocol::pdu;
 use tokio::runtime::Handle;
 use tokio::sync::watch;
-use tokio::task::yield_now;
+use tokio::task::{coop, yield_now};
 use tokio::time::{Instant, Sleep, sleep_until};
 
 use crate::server::connections::admission::Ticket;
@@ -178,10 +178,11 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
 
     /// Serves until the connection ends. Returns `None` when the engine stops.
     async fn serve(&mut self, stop: &mut watch::Receiver<bool>) -> Option<Kind> {
-        // With a peer that never pauses, the branch for `stop` would never run.
-        let flooded = stop.clone();
-        let mut stopping = pin!(stop.wait_for(|stop| *stop));
+        let stopping = stop.clone();
+        let mut stopped = pin!(stop.wait_for(|stop| *stop));
         let mut alarm = pin!(sleep_until(Instant::now() + NO_DEADLINE));
+        // Whether both of them wake this task.
+        let mut is_armed = false;
         loop {
             // In a box: most peers read their replies.
             if !self.unsent.is_empty()
@@ -189,18 +190,28 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             {
                 return Some(end);
             }
-            if flooded.has_changed().unwrap_or(true) {
-                return None;
-            }
-            self.set_alarm(alarm.as_mut());
-            let step = tokio::select! {
-                biased;
-                step = poll_fn(|context| self.poll(context)) => step,
-                () = &mut alarm => self.on_alarm(),
-                _ = &mut stopping => return None,
-            };
-            if let Err(end) = step {
-                return Some(end);
+            is_armed &= !self.set_alarm(alarm.as_mut());
+            let step = poll_fn(|context| {
+                if stopping.has_changed().unwrap_or(true) {
+                    return Poll::Ready(None);
+                }
+                if let Poll::Ready(step) = self.poll(context) {
+                    return Poll::Ready(Some(step));
+                }
+                // A task keeps its waker, so both need it only once.
+                if !is_armed {
+                    if stopped.as_mut().poll(context).is_ready() {
+                        return Poll::Ready(None);
+                    }
+                    let _ = alarm.as_mut().poll(context);
+                    is_armed = coop::has_budget_remaining();
+                }
+                if alarm.is_elapsed() { Poll::Ready(Some(self.on_alarm())) } else { Poll::Pending }
+            });
+            match step.await {
+                None => return None,
+                Some(Err(end)) => return Some(end),
+                Some(Ok(())) => {}
             }
             if self.reads_in_turn == READS_PER_TURN {
                 self.reads_in_turn = 0;
@@ -241,8 +252,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             let read = read?;
             self.renew()?;
             let answered = self.answering.answer(&input[..partial + read], output);
-            self.share.charge(WORK_OF_READ);
-            self.note_times(&answered);
+            self.note_answered(&answered, WORK_OF_READ);
             let output = &output[..answered.len];
             if !output.is_empty() {
                 self.stream.send(output, &mut self.unsent)?;
@@ -267,7 +277,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
                 let answered = self.answering.answer(&input[..behind], &mut output[len..]);
                 len += answered.len;
                 broken = answered.broken;
-                self.note_times(&answered);
+                self.note_answered(&answered, 0);
             } else {
                 self.deadlines.note_request(Instant::now());
             }
@@ -291,14 +301,14 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
         Ok(())
     }
 
-    /// Updates the times that the deadlines depend on.
-    fn note_times(&mut self, answered: &Answered) {
+    /// Notes the work of the source, and the times that the deadlines depend on.
+    fn note_answered(&mut self, answered: &Answered, work_before: u32) {
         let now = Instant::now();
         if answered.requests > 0 {
             self.deadlines.note_request(now);
             self.ticket.touch(now.into_std());
         }
-        self.share.charge((answered.requests + answered.discarded) as u32);
+        self.share.charge(work_before + (answered.requests + answered.discarded) as u32);
         let is_at_start = F::is_at_start(&self.answering.before);
         if self.answering.partial.is_empty() && is_at_start && !self.stream.is_amid_record() {
             return self.deadlines.note_complete();
@@ -329,11 +339,14 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
 
     /// Moves the alarm to an earlier time. A later deadline is set when the alarm fires: requests
     /// are much more frequent than alarms.
-    fn set_alarm(&self, alarm: Pin<&mut Sleep>) {
+    /// Returns whether it has moved.
+    fn set_alarm(&self, alarm: Pin<&mut Sleep>) -> bool {
         let deadline = self.deadlines.next(self.exchange());
-        if deadline < alarm.deadline() || alarm.is_elapsed() {
+        let moves = deadline < alarm.deadline() || alarm.is_elapsed();
+        if moves {
             alarm.reset(deadline);
         }
+        moves
     }
 
     /// Discards the beginning of a request that nothing followed, or ends the connection.

@@ -1,16 +1,15 @@
 //! The stream of a connection: a socket, or TLS over a socket.
 
 use std::io::{self, ErrorKind, Read, Write};
-use std::pin::Pin;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
 use socket2::SockRef;
-use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
 use crate::server::reports::event::Kind;
+use crate::socket_calls;
 
 /// Why a stream has no more data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -70,15 +69,10 @@ impl Stream for TcpStream {
         input: &mut [u8],
         _unsent: &mut Vec<u8>,
     ) -> Poll<Result<usize, End>> {
-        let mut buffer = ReadBuf::new(input);
-        let Poll::Ready(read) = AsyncRead::poll_read(Pin::new(self), context, &mut buffer) else {
-            return Poll::Pending;
-        };
-        let len = buffer.filled().len();
-        Poll::Ready(match read {
+        socket_calls::poll_receive(self, context, input).map(|received| match received {
             Err(_) => Err(End::Broken),
-            Ok(()) if len == 0 => Err(End::ByPeer),
-            Ok(()) => Ok(len),
+            Ok(0) => Err(End::ByPeer),
+            Ok(len) => Ok(len),
         })
     }
 
@@ -100,7 +94,7 @@ impl Stream for TcpStream {
 /// not empty, all of `output` is appended.
 #[inline]
 pub(crate) fn send(socket: &TcpStream, output: &[u8], unsent: &mut Vec<u8>) -> Result<(), Kind> {
-    let sent = if unsent.is_empty() { socket.try_write(output) } else { Ok(0) };
+    let sent = if unsent.is_empty() { socket_calls::send(socket, output) } else { Ok(0) };
     match sent {
         Ok(sent) => unsent.extend_from_slice(&output[sent..]),
         Err(error) if error.kind() == ErrorKind::WouldBlock => unsent.extend_from_slice(output),

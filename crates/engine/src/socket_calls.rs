@@ -1,0 +1,65 @@
+//! Receiving and sending on the TCP sockets of the runtime, for servers and clients.
+//!
+//! In a process with several threads, the C library notes around each such call that the thread may be
+//! cancelled in it. On Unix, the system is called without that: it takes a thirtieth of a request.
+
+use std::io::{self, ErrorKind};
+use std::task::{Context, Poll, ready};
+
+#[cfg(unix)]
+use rustix::net::{RecvFlags, SendFlags};
+#[cfg(unix)]
+use tokio::io::Interest;
+use tokio::net::TcpStream;
+
+/// Receives once. Returns the number of bytes, 0 at the end of the stream.
+#[cfg(unix)]
+#[inline]
+pub(crate) fn poll_receive(
+    socket: &TcpStream,
+    context: &mut Context<'_>,
+    input: &mut [u8],
+) -> Poll<io::Result<usize>> {
+    loop {
+        ready!(socket.poll_read_ready(context))?;
+        let mut received = None;
+        let outcome = socket.try_io(Interest::READABLE, || {
+            let (len, _) = rustix::net::recv(socket, &mut *input, RecvFlags::empty())?;
+            received = Some(len);
+            // Less than there is room for was all there is. So it need not be asked for more before
+            // the system reports it.
+            if 0 < len && len < input.len() { Err(ErrorKind::WouldBlock.into()) } else { Ok(()) }
+        });
+        match (received, outcome) {
+            (Some(len), _) => return Poll::Ready(Ok(len)),
+            (None, Err(error)) if error.kind() == ErrorKind::WouldBlock => {}
+            (None, outcome) => return Poll::Ready(outcome.map(|()| 0)),
+        }
+    }
+}
+
+#[cfg(not(unix))]
+pub(crate) fn poll_receive(
+    socket: &TcpStream,
+    context: &mut Context<'_>,
+    input: &mut [u8],
+) -> Poll<io::Result<usize>> {
+    loop {
+        ready!(socket.poll_read_ready(context))?;
+        match socket.try_read(input) {
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+            received => return Poll::Ready(received),
+        }
+    }
+}
+
+/// Sends once, without blocking. Returns the number of bytes that the system has accepted.
+#[inline]
+pub(crate) fn send(socket: &TcpStream, output: &[u8]) -> io::Result<usize> {
+    #[cfg(unix)]
+    return socket.try_io(Interest::WRITABLE, || {
+        Ok(rustix::net::send(socket, output, SendFlags::NOSIGNAL)?)
+    });
+    #[cfg(not(unix))]
+    return socket.try_write(output);
+}
