@@ -1038,7 +1038,9 @@ class BlockingClient:
     connection.
     """
 
-    def __new__(cls, endpoint: Endpoint) -> BlockingClient: ...
+    def __new__(
+        cls, endpoint: Endpoint, trace: Callable[[str, bytes], object] | None = None
+    ) -> BlockingClient: ...
     def call(
         self,
         request: Request,

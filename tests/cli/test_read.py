@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 import signal
 import struct
 import time
@@ -35,6 +36,18 @@ def test_registers_are_shown_in_three_ways(
         "                8    65535  0xFFFF  1111 1111 1111 1111",
         "                9        0  0x0000  0000 0000 0000 0000",
     ]
+
+
+def test_a_trace_shows_the_bytes_on_standard_error() -> None:
+    with FakeDevice(registers) as device:
+        result = invoke("read", device.url, "hr:7", "2", "--json", "--trace")
+    assert json.loads(result.stdout)["registers"] == [0, 0]
+    line = r"\d\d:\d\d:\d\d\.\d{6} (sent    |received) ([0-9a-f]{2} ?)+"
+    sent, received = result.stderr.splitlines()
+    assert re.fullmatch(line, sent)
+    assert re.fullmatch(line, received)
+    assert sent.endswith(" 00 00 00 06 01 03 00 07 00 02")
+    assert received.endswith(" 00 00 00 07 01 03 04 00 00 00 00")
 
 
 def test_a_request_reads_whole_numbers() -> None:

@@ -2,11 +2,11 @@
 
 use std::cell::Cell;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 
 use holdfast_engine::client::{
-    BlockingClient as Core, ClientError, Endpoint as CoreEndpoint, Lost, Place,
+    BlockingClient as Core, ClientError, Direction, Endpoint as CoreEndpoint, Lost, Place,
 };
 use holdfast_engine::tls::FileError;
 use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
@@ -19,7 +19,8 @@ use holdfast_protocol::pdu::{
     self, Bits, Diagnostics, EncodedRequest, ExceptionCode, FileRange, FileRanges, FileRecords,
     Range, Registers, Request as CoreRequest, RequestError, Response, SubFunction, limit,
 };
-use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
+use holdfast_runtime::lock;
+use pyo3::exceptions::{PyException, PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyList};
 
@@ -325,13 +326,29 @@ pub struct BlockingClient {
     core: Core,
     /// How often calls were ended.
     ended: AtomicU64,
+    /// What a signal handler has raised in the trace.
+    interrupt: Arc<Mutex<Option<PyErr>>>,
 }
 
 #[pymethods]
 impl BlockingClient {
     #[new]
-    fn new(endpoint: PyRef<'_, Endpoint>) -> BlockingClient {
-        BlockingClient { core: Core::new(endpoint.core.clone()), ended: AtomicU64::new(0) }
+    #[pyo3(signature = (endpoint, trace=None))]
+    fn new(endpoint: PyRef<'_, Endpoint>, trace: Option<Py<PyAny>>) -> BlockingClient {
+        let core = Core::new(endpoint.core.clone());
+        let interrupt = Arc::new(Mutex::new(None));
+        let core = match trace {
+            None => core,
+            Some(trace) => {
+                let interrupt = Arc::clone(&interrupt);
+                core.traced(Arc::new(move |direction, bytes| {
+                    if let Some(raised) = show(&trace, direction, bytes) {
+                        *lock(&interrupt) = Some(raised);
+                    }
+                }))
+            }
+        };
+        BlockingClient { core, ended: AtomicU64::new(0), interrupt }
     }
 
     /// Sends a request and returns its result as a Python object.
@@ -385,11 +402,16 @@ impl BlockingClient {
 }
 
 thread_local! {
-    /// The client that runs signal handlers in this thread, as an address; 0 is none.
-    static CHECKING: Cell<usize> = const { Cell::new(0) };
+    /// The client with a call in this thread, as an address; 0 is none. Signal handlers and the trace run in it.
+    static CALLING: Cell<usize> = const { Cell::new(0) };
 }
 
 impl BlockingClient {
+    /// Runs signal handlers, and returns what one has raised, here or in the trace.
+    fn interrupted(&self) -> Option<PyErr> {
+        lock(&self.interrupt).take().or_else(|| Python::attach(|py| py.check_signals()).err())
+    }
+
     /// Runs `work` without the interpreter. While it waits, handlers of Python signals run; an
     /// exception of a handler ends it, as does `end_call`.
     fn interruptible<T: Send>(
@@ -398,25 +420,45 @@ impl BlockingClient {
         work: impl FnOnce(&mut dyn FnMut() -> bool) -> T + Send,
     ) -> PyResult<T> {
         let me = std::ptr::from_ref(self).addr();
-        if CHECKING.get() == me {
-            let message = "this client is waiting for a reply: a signal handler can't use it";
+        if CALLING.get() == me {
+            let message =
+                "this client is waiting for a reply: a signal handler or a trace can't use it";
             return Err(PyRuntimeError::new_err(message));
         }
         let mut raised = None;
         let ended = self.ended.load(Ordering::Relaxed);
+        let before = CALLING.replace(me);
         let result = py.detach(|| {
             work(&mut || {
                 if self.ended.load(Ordering::Relaxed) != ended {
                     return true;
                 }
-                let before = CHECKING.replace(me);
-                raised = Python::attach(|py| py.check_signals()).err();
-                CHECKING.set(before);
+                raised = self.interrupted();
                 raised.is_some()
             })
         });
+        CALLING.set(before);
+        let raised = raised.or_else(|| lock(&self.interrupt).take());
         raised.map_or(Ok(result), Err)
     }
+}
+
+/// Shows bytes to a function of Python. Its errors are only reported, because the device may have carried
+/// out the request. Returns what else it raised: `KeyboardInterrupt`, for example.
+fn show(trace: &Py<PyAny>, direction: Direction, bytes: &[u8]) -> Option<PyErr> {
+    let word = match direction {
+        Direction::Sent => "sent",
+        Direction::Received => "received",
+    };
+    Python::attach(|py| {
+        let trace = trace.bind(py);
+        let error = trace.call1((word, PyBytes::new(py, bytes))).err()?;
+        if !error.is_instance_of::<PyException>(py) {
+            return Some(error);
+        }
+        error.write_unraisable(py, Some(trace));
+        None
+    })
 }
 
 /// Maps a file that cannot be read to the `OSError` subclass that Python itself would raise.

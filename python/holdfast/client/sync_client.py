@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from holdfast._core import BlockingClient
 from holdfast.client.base import DEFAULT_TIMEOUT_S
 from holdfast.client.endpoint import endpoint
 from holdfast.client.fork import renew_in_children
 from holdfast.client.sync_operations import SyncOperations
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 class SyncClient(SyncOperations):
@@ -27,6 +30,10 @@ class SyncClient(SyncOperations):
 
     Threads may share a client; their calls take turns, for which `timeout` does not count.
 
+    `trace` is called with `"sent"` or `"received"` and the bytes, as they come, in the thread of
+    the call: what is inside TLS, and a frame perhaps in several parts. Its errors are only
+    reported, to `sys.unraisablehook`.
+
     Methods raise `ValueError` or `TypeError` before anything is sent, and `ModbusException`,
     `ConnectionLost`, `RequestTimeout` or `InvalidResponse` after; all four are `ModbusError`.
 
@@ -35,14 +42,22 @@ class SyncClient(SyncOperations):
     [11, 22, 33]
     """
 
-    def __init__(self, url: str, *, unit: int = 1, timeout: float = DEFAULT_TIMEOUT_S) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        unit: int = 1,
+        timeout: float = DEFAULT_TIMEOUT_S,
+        trace: Callable[[str, bytes], object] | None = None,
+    ) -> None:
         super().__init__(url, unit, timeout)
         self._endpoint = endpoint(self.target)
+        self._trace = trace
         self._connect_anew()
         renew_in_children(self, SyncClient._connect_anew)
 
     def _connect_anew(self) -> None:
-        self._transport = BlockingClient(self._endpoint)
+        self._transport = BlockingClient(self._endpoint, self._trace)
 
     def close(self) -> None:
         """Closes the connection after the calls before it. A later call reconnects."""

@@ -85,6 +85,9 @@ DECISIONS: dict[tuple[str, str], Decision] = {
     ("docs/architecture.md", "cli\nappliance"): drawing,
     ("docs/audit.md", '{"time":'): checks.audit_lines,
     ("docs/cli.md", "REST at http://127.0.0.1:5080   every"): drawing,
+    ("docs/troubleshooting.md", "14:03:21.123456 sent"): elsewhere(
+        "cli/test_read.py::test_a_trace_shows_the_bytes_on_standard_error"
+    ),
     ("docs/durability.md", "jetstream {"): SYNC,
     ("docs/client.md", ">>> import holdfast"): CLIENT,
     ("docs/client.md", ">>> with holdfast.SyncClient"): CLIENT,

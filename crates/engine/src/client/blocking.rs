@@ -19,6 +19,7 @@ use super::byte_stream::{ByteStream, StreamError};
 use super::connect::connect;
 use super::fair_lock::Turns;
 use super::interrupt::{Interrupt, SIGNAL_CHECK_INTERVAL};
+use super::trace::{Trace, Traced};
 use super::{ClientError, Endpoint, Lost, Place, StrayCounters};
 
 /// Bytes per read of a socket. No Modbus datagram is longer.
@@ -41,6 +42,7 @@ pub struct BlockingClient {
     strays: Arc<StrayCounters>,
     /// The zero of the clock of all its connections.
     epoch: Instant,
+    trace: Option<Trace>,
 }
 
 /// The state of the connection.
@@ -101,7 +103,13 @@ impl BlockingClient {
             longest_late: AtomicU64::new(0),
             strays: Arc::default(),
             epoch: Instant::now(),
+            trace: None,
         }
+    }
+
+    /// Shows all bytes that are sent and received to `trace`, in the thread of the call.
+    pub fn traced(self, trace: Trace) -> BlockingClient {
+        BlockingClient { trace: Some(trace), ..self }
     }
 
     /// As [`BlockingClient::call`], unless `interrupted` returns true. It is asked at most every 0.1 s.
@@ -244,6 +252,11 @@ impl BlockingClient {
             }
             match self.open(deadline, timeout, interrupt) {
                 Some(Ok(mut open)) => {
+                    if let Some(trace) = &self.trace {
+                        let trace = Arc::clone(trace);
+                        let stream = Box::new(Traced { stream: open.stream, trace });
+                        open = Open { stream, ..open };
+                    }
                     open.connection.follow(std::mem::take(&mut state.past));
                     state.open = Some(open);
                 }

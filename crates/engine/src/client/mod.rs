@@ -11,10 +11,12 @@ mod fair_lock;
 mod interrupt;
 mod stray_counts;
 mod tls_stream;
+mod trace;
 
 pub use blocking::{BlockingClient, Conditions};
 pub use endpoint::{Endpoint, Place};
 pub use stray_counts::StrayCounters;
+pub use trace::{Direction, Trace};
 
 use std::io;
 use std::time::Duration;

@@ -13,7 +13,7 @@ import click
 from holdfast.cli import device_errors, terminal_text
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options import device, item
-from holdfast.cli.options.duration import time_option
+from holdfast.cli.options.duration import time_option, timeout_option
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import json_option, number_option
 from holdfast.cli.options.plc_addresses import modicon_option
@@ -38,7 +38,8 @@ COUNT = 10
 @time_option("--duration", "Duration of the test.", "5")
 @number_option("--count", "Same as COUNT: bits or registers per request.", 1, READ_BITS)
 @modicon_option
-@device.device_options
+@device.unit_option()
+@timeout_option()
 @json_option
 def bench(
     url: str,

@@ -1,4 +1,4 @@
-"""The options `--unit` and `--timeout`, and the device that commands talk to with them."""
+"""The options `--unit`, `--timeout`, `--trace`, and the device that commands talk to with them."""
 
 from __future__ import annotations
 
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from holdfast.cli.options.plc_addresses import Place
     from holdfast.types import Area
 
+TRACE = f"{__name__}.trace"
+"""The place in the context of a command of what shows the bytes."""
+
 UNIT = f"Unit id, 0 to {MAX_UNIT}."
 
 
@@ -37,8 +40,24 @@ def unit_option(default: int | None = 1, help: str = UNIT) -> Callable[[Command]
     return number_option("--unit", help, 0, MAX_UNIT, default)
 
 
-device_options = option_group(unit_option(), timeout_option())
-"""Adds `--unit` and `--timeout`."""
+def _print_bytes(direction: str, data: bytes) -> None:
+    from datetime import datetime
+
+    click.echo(f"{datetime.now():%H:%M:%S.%f} {direction:8} {data.hex(' ')}", err=True)
+
+
+def _trace_option() -> Callable[[Command], Command]:
+    """Adds `--trace`, which `connect` looks up: no command has anything else to do with it."""
+
+    def keep(context: click.Context, _option: click.Parameter, is_given: bool) -> None:
+        context.meta[TRACE] = _print_bytes if is_given else None
+
+    help = "Print the bytes sent and received, with the time, to standard error."
+    return click.option("--trace", is_flag=True, expose_value=False, callback=keep, help=help)
+
+
+device_options = option_group(unit_option(), timeout_option(), _trace_option())
+"""Adds `--unit`, `--timeout` and `--trace`."""
 
 
 def sent_pdus(url: str, requests: Sequence[Request]) -> list[str]:
@@ -55,11 +74,11 @@ def connect(url: str, unit: int, timeout: float, *, only_writes: bool = False) -
 
     Raises `click.UsageError` for the broadcast of a serial line, unless the command `only_writes`.
     """
+    context = click.get_current_context()
     with usable():
-        client = SyncClient(url, unit=unit, timeout=timeout)
+        client = SyncClient(url, unit=unit, timeout=timeout, trace=context.meta.get(TRACE))
     if not only_writes and is_broadcast(client.target, unit):
         refuse_broadcast([unit])
-    context = click.get_current_context()
     context.call_on_close(lambda: hint_at_late_replies(client.longest_late, timeout))
     return client
 

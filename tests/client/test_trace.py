@@ -1,0 +1,106 @@
+"""The trace of `SyncClient`: the bytes that are sent and received."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from support import transports
+from support.fake_device import FakeDevice, registers
+from support.running import endpoint
+
+if TYPE_CHECKING:
+    from support.running import Run
+
+READ = bytes.fromhex("0000 0006 01 03 0007 0002")
+"""A request after its transaction id."""
+REPLY = bytes.fromhex("0000 0007 01 03 04 0000 0000")
+
+
+class Shown:
+    """What a trace was called with, joined where a frame came in parts."""
+
+    def __init__(self) -> None:
+        self.parts: list[tuple[str, bytes]] = []
+
+    def __call__(self, direction: str, data: bytes) -> None:
+        assert data
+        if self.parts and self.parts[-1][0] == direction:
+            data = self.parts.pop()[1] + data
+        self.parts.append((direction, data))
+
+
+def test_all_bytes_are_shown_in_order() -> None:
+    shown = Shown()
+    with FakeDevice(registers) as device, holdfast.SyncClient(device.url, trace=shown) as plc:
+        assert plc.read_holding_registers(7, 2) == [0, 0]
+        assert plc.read_holding_registers(7, 2) == [0, 0]
+    words, frames = zip(*shown.parts, strict=True)
+    assert words == ("sent", "received") * 2
+    ids = [frame[:2] for frame in frames]
+    assert ids[0] == ids[1] != ids[2] == ids[3]
+    assert [frame[2:] for frame in frames] == [READ, REPLY] * 2
+
+
+@pytest.mark.parametrize("kind", ["udp", "rtu", "rtu-udp", "ascii"])
+def test_frames_are_those_of_the_transport(kind: str, run: Run) -> None:
+    appliance = run(transports.configuration(kind))
+    host, port = endpoint(appliance, "scada")
+    scheme = {"udp": "udp", "rtu": "rtu+tcp", "rtu-udp": "rtu+udp", "ascii": "ascii+tcp"}[kind]
+    shown = Shown()
+    with holdfast.SyncClient(f"{scheme}://{host}:{port}", trace=shown) as plc:
+        plc.read_holding_registers(7, 2)
+    [(sent, request), (received, reply)] = shown.parts
+    assert (sent, received) == ("sent", "received")
+    expected = {
+        "udp": (READ, REPLY),
+        "rtu": (bytes.fromhex("0103 0007 0002 75CA"), bytes.fromhex("010304 00000000 FA33")),
+        "ascii": (b":010300070002F3\r\n", b":01030400000000F8\r\n"),
+    }
+    if kind == "udp":
+        request, reply = request[2:], reply[2:]
+    assert (request, reply) == expected[kind.removesuffix("-udp")]
+
+
+def test_an_error_in_the_trace_is_reported_and_the_call_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reported: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda found: reported.append(found.exc_value))
+
+    def trace(direction: str, _data: bytes) -> None:
+        raise ValueError(direction)
+
+    with FakeDevice(registers) as device, holdfast.SyncClient(device.url, trace=trace) as plc:
+        assert plc.read_holding_registers(7, 2) == [0, 0]
+    assert [str(each) for each in reported] == ["sent", "received"]
+
+
+@pytest.mark.parametrize("at", ["sent", "received"])
+def test_an_interrupt_in_the_trace_ends_the_call(at: str) -> None:
+    interrupts = [KeyboardInterrupt]
+
+    def trace(direction: str, _data: bytes) -> None:
+        if direction == at and interrupts:
+            raise interrupts.pop()
+
+    with FakeDevice(registers) as device, holdfast.SyncClient(device.url, trace=trace) as plc:
+        with pytest.raises(KeyboardInterrupt):
+            plc.read_holding_registers(7, 2)
+        assert plc.read_holding_registers(7, 2) == [0, 0]
+
+
+def test_the_trace_cannot_use_its_client() -> None:
+    refused: list[RuntimeError] = []
+
+    def trace(_direction: str, _data: bytes) -> None:
+        with pytest.raises(RuntimeError, match="a trace can't use it") as found:
+            plc.read_coils(0, 1)
+        refused.append(found.value)
+
+    with FakeDevice(registers) as device, holdfast.SyncClient(device.url, trace=trace) as plc:
+        assert plc.read_holding_registers(7, 2) == [0, 0]
+    assert len(refused) == 2
