@@ -25,9 +25,6 @@ pub(super) enum Framing {
 /// V1.02, 2.4.1).
 pub const TURNAROUND: Duration = Duration::from_millis(100);
 
-/// Reads in a row whose echo came before their reply, after which an echo is expected of writes too.
-const MIN_ECHOES: u8 = 3;
-
 /// The exception of a gateway that has no reply yet: that of the device may follow.
 const GATEWAY_NO_REPLY: u8 = ExceptionCode::GatewayTargetFailedToRespond as u8;
 
@@ -415,7 +412,7 @@ impl OneAtATime {
     fn is_like_echo(&self, flights: &Flights, pdu: &[u8]) -> bool {
         let State::Sent { echoed: false } = self.state else { return false };
         let equals = flights.first().is_some_and(|flight| flight.request.pdu() == pdu);
-        equals && self.echo == Echo::Auto && (1..MIN_ECHOES).contains(&self.late_replies.echoes)
+        equals && self.echo.is_likely(self.late_replies.echoes)
     }
 
     /// Handles bytes after a reply that is doubted.
@@ -573,11 +570,7 @@ impl OneAtATime {
 
     /// Whether no reply comes before the echo of this request.
     fn awaits_echo(&self, flight: &Flight) -> bool {
-        match self.echo {
-            Echo::Always => true,
-            Echo::Never => false,
-            Echo::Auto => self.late_replies.echoes >= MIN_ECHOES && !is_no_reply(flight),
-        }
+        self.echo.is_awaited(self.late_replies.echoes, is_no_reply(flight))
     }
 
     /// Whether the request itself, sent back, is its echo.
