@@ -7,9 +7,9 @@
 use alloc::collections::{BTreeSet, VecDeque};
 use core::time::Duration;
 
+use super::Time;
 use super::raised_timeouts::Lateness;
 use super::tolerance::{AcceptUnit, Tolerance};
-use super::{GUARD, Time};
 use crate::pdu::{EncodedRequest, Request};
 
 /// Requests without a reply that are remembered. With the bounds on their time, there are never as many.
@@ -27,6 +27,10 @@ const MAX_LATENESS_BY_OTHERS: Duration = Duration::from_secs(1);
 /// A late reply may take so long however short the timeouts are: a request may have had only what was left of
 /// its time.
 const MIN_LATENESS: Duration = Duration::from_millis(250);
+
+/// The time after a reply in which the same one may come again, on lines and streams without transaction
+/// ids. It passes before the next request until enough replies have come once.
+pub const GUARD: Duration = Duration::from_millis(25);
 
 /// Replies that a new line or stream has to give, none of them twice, before it needs no guard time.
 const PROBATION_REPLIES: u32 = 8;

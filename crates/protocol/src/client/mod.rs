@@ -38,7 +38,7 @@ mod tolerance;
 pub use attempts::{Attempt, BUSY_PAUSE};
 pub use connection::{Connection, Past};
 pub use flights::{Done, Strays, Ticket};
-pub use late_replies_without_ids::MAX_LATENESS;
+pub use late_replies_without_ids::{GUARD, MAX_LATENESS};
 pub use mbap_datagrams::{MAX_STRAY_DATAGRAMS, UDP_ATTEMPTS};
 pub use rtu_and_ascii::TURNAROUND;
 pub use tolerance::{AcceptUnit, Echo, Tolerance};
@@ -56,10 +56,6 @@ pub type Time = Duration;
 /// The number of consecutive timeouts, without a received byte, after which a connection ends.
 /// Requests in flight at the same time count as one.
 pub const MAX_CONSECUTIVE_TIMEOUTS: u32 = 3;
-
-/// The time after a reply in which the same one may come again, on lines and streams without transaction
-/// ids. It passes before the next request until enough replies have come once.
-pub const GUARD: Duration = Duration::from_millis(25);
 
 /// The transport of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
