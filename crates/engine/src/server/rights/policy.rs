@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex};
 use holdfast_runtime::lock;
 use ipnet::IpNet;
 
+use crate::server::connections::peer::Peer;
 use crate::server::rights::peer_rights::PeerRights;
 use crate::server::rights::rule::Rule;
 
@@ -21,14 +22,23 @@ pub struct PolicyEntry<G> {
 
 /// Which peers have which rights: the first entry that matches a peer applies.
 #[derive(Debug)]
-pub struct Grants<G>(pub Vec<PolicyEntry<Arc<G>>>);
+pub struct Grants<G> {
+    pub entries: Vec<PolicyEntry<Arc<G>>>,
+    /// Those of a peer that no entry matches.
+    pub nobody: Arc<G>,
+}
 
 impl<G> Grants<G> {
     /// The rights of a peer with that role, or whatever its role; `None` when no entry matches.
     pub fn rights(&self, peer: IpAddr, role: Option<&str>) -> Option<Arc<G>> {
-        let mut entries = self.0.iter();
+        let mut entries = self.entries.iter();
         let found = entries.find(|entry| match_peer(&entry.sources, &entry.roles, peer, role));
         found.map(|entry| Arc::clone(&entry.rights))
+    }
+
+    /// As [`Policy::by_certificate`]: each packet is refused.
+    pub(crate) fn by_certificate(&self, peer: &Peer) -> Result<Arc<G>, Arc<G>> {
+        self.rights(peer.ip(), peer.role()).ok_or_else(|| Arc::clone(&self.nobody))
     }
 }
 
@@ -55,6 +65,8 @@ pub(crate) fn contain(sources: &[IpNet], peer: IpAddr) -> bool {
 #[derive(Debug)]
 pub struct Policy {
     rules: Vec<Rule>,
+    /// The rights of a peer that no rule names.
+    pub(crate) nobody: Arc<PeerRights>,
     /// The rights by each rule alone.
     alone: Vec<Arc<PeerRights>>,
     /// The rights by several rules, by their numbers.
@@ -64,7 +76,8 @@ pub struct Policy {
 impl Policy {
     pub fn of(rules: &[Rule]) -> Policy {
         let alone = rules.iter().map(|rule| Arc::new(PeerRights::new(rule))).collect();
-        Policy { rules: rules.to_vec(), alone, together: Mutex::default() }
+        let nobody = Arc::new(PeerRights::none());
+        Policy { rules: rules.to_vec(), nobody, alone, together: Mutex::default() }
     }
 
     /// The rights of a peer with that role, or whatever its role; `None` when no rule matches.
@@ -85,5 +98,12 @@ impl Policy {
         let rights = Arc::new(PeerRights::of(rules));
         together.insert(numbers, Arc::clone(&rights));
         Some(rights)
+    }
+
+    /// The rights by the role in a certificate; `Err` with those of nobody when no rule matches. The session
+    /// stays, and each request gets exception 01 (MB-TCP-Security, R-23, R-31), which tells the peer more than
+    /// the end of the connection.
+    pub(crate) fn by_certificate(&self, peer: &Peer) -> Result<Arc<PeerRights>, Arc<PeerRights>> {
+        self.rights(peer.ip(), peer.role()).ok_or_else(|| Arc::clone(&self.nobody))
     }
 }

@@ -119,8 +119,6 @@ pub(crate) struct RawGrant {
 pub(crate) struct RawIngest {
     pub(crate) packets: Arc<PacketCounters>,
     policy: Grants<RawGrant>,
-    /// The rights of a peer that no rule names, by its role.
-    no_rights: Arc<RawGrant>,
     tls: Option<Arc<ServerTls>>,
     format: Format,
     flags: Flags,
@@ -221,18 +219,15 @@ impl RawIngest {
             let rights = Arc::new(RawGrant { format, targets, areas });
             PolicyEntry { sources: rule.sources.clone(), roles: rule.roles.clone(), rights }
         });
+        let nobody =
+            RawGrant { format: settings.format, targets: HashMap::new(), areas: Vec::new() };
         let (many, after_refusal) = match settings.packets {
             PacketsPerConnection::One => (None, AfterRefusal::Close),
             PacketsPerConnection::Many { idle, after_refusal } => (Some(idle), after_refusal),
         };
         RawIngest {
             packets,
-            policy: Grants(rules.collect()),
-            no_rights: Arc::new(RawGrant {
-                format: settings.format,
-                targets: HashMap::new(),
-                areas: Vec::new(),
-            }),
+            policy: Grants { entries: rules.collect(), nobody: Arc::new(nobody) },
             tls: settings.tls.clone(),
             format: settings.format,
             flags: settings.flags,
@@ -325,23 +320,16 @@ impl RawIngest {
             return;
         }
         // A reload reviews connections by their roles. This one looks up its rights only now.
-        let rights = live.get().granted(&peer).unwrap_or_else(|| {
-            // Each packet is refused, which tells the sender more than the end of the connection.
+        let rights = live.get().policy.by_certificate(&peer).unwrap_or_else(|nobody| {
             context.refuse_role(peer.clone());
-            Arc::clone(&self.no_rights)
+            nobody
         });
         let by_role = peer.clone();
         let renewal = Box::new(move || {
-            let service = live.get();
-            Some(service.granted(&by_role).unwrap_or_else(|| Arc::clone(&service.no_rights)))
+            Some(live.get().policy.by_certificate(&by_role).unwrap_or_else(|nobody| nobody))
         });
         let sending = self.begin((stream, peer), rights, &[], ticket);
         self.serve_packets(context, sending, renewal, stop).await;
-    }
-
-    /// The rights of a peer: of any role, or of the role in its certificate.
-    fn granted(&self, peer: &Peer) -> Option<Arc<RawGrant>> {
-        self.policy.rights(peer.ip(), peer.role())
     }
 
     /// Checks the bytes received so far, up to the end of the first packet.
@@ -787,8 +775,8 @@ impl Service for RawIngest {
             return Some(Kind::TlsFailed(failure.reason()));
         }
         // A sender that never had rights keeps its refusals.
-        let had_rights = before.granted(peer).is_some();
-        (had_rights && self.granted(peer).is_none()).then_some(Kind::RightsRevoked)
+        let had_rights = before.policy.by_certificate(peer).is_ok();
+        (had_rights && self.policy.by_certificate(peer).is_err()).then_some(Kind::RightsRevoked)
     }
 
     fn serve(

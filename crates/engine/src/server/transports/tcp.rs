@@ -67,8 +67,6 @@ pub struct StreamSettings {
 pub(crate) struct ModbusStream {
     unit_server: Arc<UnitServer>,
     policy: Policy,
-    /// The rights of a peer that no rule names, by its role.
-    no_rights: Arc<PeerRights>,
     timeouts: Timeouts,
     keepalive: Duration,
     framing: StreamFraming,
@@ -92,7 +90,6 @@ impl ModbusStream {
                 .map(|raw| Arc::new(RawIngest::new(raw, packets.unwrap_or_default()))),
             unit_server,
             policy: Policy::of(&settings.rules),
-            no_rights: Arc::new(PeerRights::none()),
             timeouts: Timeouts {
                 idle: settings.idle_timeout,
                 request: settings.request_timeout,
@@ -107,15 +104,6 @@ impl ModbusStream {
     /// The counters of Raw Ingest packets on the same port.
     pub(crate) fn packets(&self) -> Option<Arc<PacketCounters>> {
         self.raw_ingest.as_ref().map(|raw| Arc::clone(&raw.packets))
-    }
-
-    /// The terms of a connection: of any role, or of the role in its certificate.
-    fn terms(&self, peer: &Peer) -> Option<Terms> {
-        let rights = match &peer.certificate {
-            None => self.rights(peer.ip())?,
-            Some(_) => self.policy.rights(peer.ip(), peer.role())?,
-        };
-        Some(Terms { rights, timeouts: self.timeouts })
     }
 
     fn connection<F: Framing>(
@@ -151,10 +139,9 @@ impl ModbusStream {
             return;
         }
         // A reload reviews connections by their roles. This one looks up its rights only now.
-        let rights = live.get().terms(&peer).map(|terms| terms.rights).unwrap_or_else(|| {
-            // The session stays, and each request gets exception 01 (MB-TCP-Security, R-23, R-31).
+        let rights = live.get().policy.by_certificate(&peer).unwrap_or_else(|nobody| {
             context.refuse_role(peer.clone());
-            Arc::clone(&self.no_rights)
+            nobody
         });
         self.modbus::<F, _>(live, context, (stream, peer), (rights, Vec::new()), ticket, stop)
             .await;
@@ -240,13 +227,13 @@ impl ModbusStream {
 }
 
 impl Renewal for Reloadable<ModbusStream> {
-    /// A connection that had no rights by its role has none still.
     fn terms(&self, peer: &Peer) -> Option<Terms> {
         let service = self.get();
-        let no_rights =
-            || Terms { rights: Arc::clone(&service.no_rights), timeouts: service.timeouts };
-        let terms = service.terms(peer);
-        terms.or_else(|| peer.certificate.is_some().then(no_rights))
+        let rights = match peer.certificate {
+            None => service.rights(peer.ip())?,
+            Some(_) => service.policy.by_certificate(peer).unwrap_or_else(|nobody| nobody),
+        };
+        Some(Terms { rights, timeouts: service.timeouts })
     }
 }
 
@@ -257,7 +244,7 @@ impl Service for ModbusStream {
         let rights = self.policy.rights(peer, None);
         rights.or_else(|| {
             let raw = self.raw_ingest.as_ref()?;
-            raw.rights(peer).map(|_| Arc::clone(&self.no_rights))
+            raw.rights(peer).map(|_| Arc::clone(&self.policy.nobody))
         })
     }
 
@@ -271,7 +258,8 @@ impl Service for ModbusStream {
             return Some(Kind::TlsFailed(failure.reason()));
         }
         // A session that never had rights keeps its exceptions.
-        (self.terms(peer).is_none() && before.terms(peer).is_some()).then_some(Kind::RightsRevoked)
+        let had_rights = before.policy.by_certificate(peer).is_ok();
+        (had_rights && self.policy.by_certificate(peer).is_err()).then_some(Kind::RightsRevoked)
     }
 
     fn serve(
