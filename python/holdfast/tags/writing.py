@@ -94,7 +94,7 @@ class WritableTag(BaseTag):
         steps = f"steps of {abs(self.scale)}"
         if not self.is_stepped or (self.round or default_round) == "exact":
             raise DoesNotFit(f"{value} is between two values of the registers, allowed: {steps}")
-        nearest = round(exact)
+        nearest = self._linear.nearest(value)
         rounded = self._linear.value(nearest)
         self._check_limits(rounded, f"{value} is {rounded} in {steps},")
         return nearest
