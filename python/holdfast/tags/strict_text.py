@@ -13,7 +13,6 @@ import msgspec
 
 from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.runtime.text import quote
-from holdfast.values.digits import FLOATS
 
 if TYPE_CHECKING:
     from holdfast.values.types import Type
@@ -36,7 +35,7 @@ def from_text(text: str, type: Type, named: str) -> Any:
         return _bytes(text, named)
     if type.base in ("bool", "bit"):
         return _boolean(text, named)
-    return _number(text.strip(), named, type.base in FLOATS)
+    return _number(text.strip(), named, type.is_float)
 
 
 def _boolean(text: str, named: str) -> bool:

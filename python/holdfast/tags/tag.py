@@ -21,7 +21,7 @@ from holdfast.values import (
     decode,
     encode,
 )
-from holdfast.values.digits import FLOATS, decimal_of
+from holdfast.values.digits import decimal_of
 from holdfast.values.integers import as_integer
 from holdfast.values.orders import DEFAULT_ORDER
 from holdfast.values.types import Type, parsed
@@ -241,7 +241,7 @@ def as_decoded(marker: Marker, type: Type, encoding: str | None) -> Marker:
     """
     if type.base == "bytes":
         raise ValueError(f"not supported for {type.name}")
-    if marker in ("nan", "inf", "-inf") and type.base in FLOATS:
+    if marker in ("nan", "inf", "-inf") and type.is_float:
         return float(marker)
     try:
         registers = encode(marker, type.element, encoding=encoding)

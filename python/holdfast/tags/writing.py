@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 Rounding: TypeAlias = Literal["nearest", "exact"]
 """What happens to a value between two values of the registers: rounded, or refused."""
 
-INTEGERS = ("int", "uint", "bcd")
-"""What the names of integer types begin with."""
-
 
 class WritableTag(BaseTag):
     """A tag as writes see it."""
@@ -41,12 +38,12 @@ class WritableTag(BaseTag):
     @property
     def is_float(self) -> bool:
         """Whether the registers hold floating-point numbers."""
-        return self.of_type.base in FLOATS
+        return self.of_type.is_float
 
     @property
     def is_number(self) -> bool:
         """Whether the values are numbers, and not bits or text."""
-        return self.is_float or self.of_type.base.startswith(INTEGERS)
+        return self.of_type.is_number
 
     @property
     def is_stepped(self) -> bool:

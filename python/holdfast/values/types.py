@@ -54,6 +54,16 @@ class Type:
         """Registers per field of this type."""
         return self.width // 2 * (1 if self.count is None else self.count)
 
+    @property
+    def is_float(self) -> bool:
+        """Whether the elements are floating-point numbers."""
+        return self.base.startswith("float")
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the elements are numbers, and not bits or text."""
+        return self.base in FIXED and self.base != "bool"
+
 
 @lru_cache(1024)
 def parsed(name: str) -> Type:

@@ -131,9 +131,6 @@ def _target(request: SubscribeRequest) -> Target:
 ORDERS = {"big": "ABCD", "little": "DCBA"}
 """Other names of byte orders, as callers of tentacle-modbus use them."""
 
-NUMERIC = ("bcd", "float", "int", "uint")
-"""What the names of numeric types begin with."""
-
 NO_MARKERS: frozenset[Marker] = frozenset()
 """One object for nearly all tags."""
 
@@ -191,7 +188,7 @@ def _tag(
     order = ORDERS.get(order, order)
     try:
         type = parsed(name)
-        if _is_number(type) and area in BIT_AREAS and not rules.strict:
+        if type.is_number and type.count is None and area in BIT_AREAS and not rules.strict:
             adjustments.changes.append(("datatype_ignored", f"{request.id} ({name} in {area})"))
             name, type = "bool", parsed("bool")
         if type.base == "bool":
@@ -227,10 +224,6 @@ def _null_markers(request: TagRequest, type: Type, where: str) -> frozenset[Mark
         return frozenset(as_decoded(each, type, request.encoding) for each in request.null)
     except ValueError as error:
         raise Refused(f"{where}.null: {error}") from None
-
-
-def _is_number(type: Type) -> bool:
-    return type.count is None and type.base.startswith(NUMERIC)
 
 
 def _profile_requests(name: str, rules: Rules) -> list[TagRequest]:
