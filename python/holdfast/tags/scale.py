@@ -12,17 +12,25 @@ from fractions import Fraction
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from holdfast.tags.base import TagError
+from holdfast.protocol import READ_LIMITS
+from holdfast.tags.base import BaseTag, TagError
 from holdfast.values.digits import decimal_of
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
-    from holdfast.tags.base import BaseTag
+    from holdfast.values.types import Type
 
 Form: TypeAlias = Literal["factor", "exponent"]
 
 EXPONENTS = range(-10, 11)
 """The exponents that SunSpec allows; 0x8000 is that of a point without a value."""
+
+
+class ScaledTag(BaseTag):
+    """A tag as scales see it."""
+
+    of_type: Type
+    scale: float | RegisterScale
 
 
 @dataclass(frozen=True)
@@ -33,7 +41,7 @@ class RegisterScale:
     """`factor`: the value is the scale. `exponent`: the scale is 10 to the power of the value."""
     name: str | None = None
     """The tag of the register, in the same tag list; `None` if only its place is known."""
-    source: BaseTag | None = None
+    source: ScaledTag | None = None
     """The register. With a name, `None` until a tag list has found it."""
 
     def __str__(self) -> str:
@@ -44,6 +52,29 @@ class RegisterScale:
         """The register, for messages."""
         assert self.source is not None, "a tag list finds the registers of all scales"
         return f"{self.source.area} {self.source.address}"
+
+    def check(self, tag: BaseTag) -> None:
+        """Raises `TagError` if the request that reads the value of the tag can't read its scale."""
+        source = self.source
+        if source is None:
+            return
+        found = f"the scale is from {self.where}"
+        if source.area != tag.area:
+            raise TagError("scale", f"{found}, allowed: a register in {tag.area}, as the value")
+        if not source.of_type.is_number or source.of_type.count is not None:
+            raise TagError("scale", f"{found}, type {source.type}, allowed: a single number")
+        if source.of_type.is_float and self.form == "exponent":
+            raise TagError("scale", f"{found}, type {source.type}, allowed: an integer exponent")
+        if isinstance(source.scale, RegisterScale):
+            raise TagError("scale", f"{found}, whose own scale is in a register")
+        most = READ_LIMITS[tag.area]
+        if len(tag.span) > most:
+            place = f"{tag.span.start} to {tag.span.stop - 1}"
+            raise TagError(
+                "scale",
+                f"{found}: {place} are {len(tag.span)} registers, one request reads at most "
+                f"{most}, and a value is only read together with its scale",
+            )
 
     def factor(self, content: Any) -> float:
         """The scale for the decoded content of the register. Raises `ValueError` without one."""

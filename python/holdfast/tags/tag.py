@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
-from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_LIMITS, WRITE_LIMITS
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS
 from holdfast.tags.base import Marker, Scaled, TagError
 from holdfast.tags.scale import Linear, RegisterScale, is_finite
 from holdfast.tags.writing import Rounding, WritableTag, unwritable
@@ -112,7 +112,8 @@ class Tag(WritableTag):
             for key in ("scale", "offset", "min", "max", "deadband"):
                 if (given := getattr(self, key)) != getattr(Tag, key):
                     raise TagError(key, f"{key} is {given}, allowed: only with numbers")
-        self._check_source()
+        if isinstance(self.scale, RegisterScale):
+            self.scale.check(self)
         if not (is_finite(self.deadband) and self.deadband >= 0):
             found = f"deadband is {self.deadband}"
             raise TagError("deadband", f"{found}, allowed: a finite number from 0")
@@ -127,30 +128,6 @@ class Tag(WritableTag):
         if self.round is not None and not self.is_stepped:
             message = "allowed: only with integers without states"
             raise TagError("round", f"round is {self.round}, {message}")
-
-    def _check_source(self) -> None:
-        """A scale must be readable in the request that reads the value."""
-        source = self.source
-        if source is None:
-            return
-        assert isinstance(self.scale, RegisterScale), "only such tags have a register for it"
-        found = f"the scale is from {self.scale.where}"
-        if source.area != self.area:
-            raise TagError("scale", f"{found}, allowed: a register in {self.area}, as the value")
-        if not source.is_number or source.of_type.count is not None:
-            raise TagError("scale", f"{found}, type {source.type}, allowed: a single number")
-        if source.is_float and self.scale.form == "exponent":
-            raise TagError("scale", f"{found}, type {source.type}, allowed: an integer exponent")
-        if isinstance(source.scale, RegisterScale):
-            raise TagError("scale", f"{found}, whose own scale is in a register")
-        most = READ_LIMITS[self.area]
-        if len(self.span) > most:
-            place = f"{self.span.start} to {self.span.stop - 1}"
-            raise TagError(
-                "scale",
-                f"{found}: {place} are {len(self.span)} registers, one request reads at most "
-                f"{most}, and a value is only read together with its scale",
-            )
 
     def _check_writable(self) -> None:
         if self.writable and (flaw := self.unwritable) is not None:

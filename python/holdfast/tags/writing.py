@@ -6,8 +6,7 @@ import struct
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from holdfast.protocol import WRITE_LIMITS
-from holdfast.tags.base import BaseTag
-from holdfast.tags.scale import RegisterScale, is_finite
+from holdfast.tags.scale import RegisterScale, ScaledTag, is_finite
 from holdfast.types import BIT_AREAS
 from holdfast.values import DoesNotFit
 from holdfast.values.digits import FLOATS
@@ -24,11 +23,9 @@ Rounding: TypeAlias = Literal["nearest", "exact"]
 """What happens to a value between two values of the registers: rounded, or refused."""
 
 
-class WritableTag(BaseTag):
+class WritableTag(ScaledTag):
     """A tag as writes see it."""
 
-    of_type: Type
-    scale: float | RegisterScale
     min: float | None
     max: float | None
     states: Mapping[int, str]
