@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import re
 import zipfile
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from ruamel.yaml import YAML
 
 from support.packaging_programs import program
 from support.paths import ROOT
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 
 CHANGELOG = """\
 # Changelog
@@ -110,11 +106,3 @@ def test_a_core_that_is_too_large_is_named(check: Any, tmp_path: Path) -> None:
     assert problems(13_000_001) == [
         f"{wheel.name}: holdfast/_core.abi3.so has 13,000,001 bytes, allowed: 13,000,000"
     ]
-
-
-@pytest.mark.parametrize("file", WORKFLOWS, ids=lambda file: file.name)
-def test_workflows_pin_actions_and_have_no_rights_by_default(file: Path) -> None:
-    text = file.read_text()
-    for action in re.findall(r"uses: (.+)", text):
-        assert re.fullmatch(r"[\w/-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+", action), action
-    assert YAML(typ="safe").load(text)["permissions"] == {"contents": "read"}
