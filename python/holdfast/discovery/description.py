@@ -22,6 +22,7 @@ from holdfast.discovery import (
 )
 from holdfast.discovery.described_tag import DescribedTag
 from holdfast.discovery.device_search import Identity
+from holdfast.discovery.type_rarity import SIZES
 from holdfast.errors import ModbusException
 from holdfast.protocol import READ_LIMITS
 from holdfast.tags import Tag
@@ -306,7 +307,7 @@ def _described(piece: _Piece, value: Value, confidence: float) -> DescribedTag:
     reasons = value.reasons if any(value.found) else (segments.FILL_REASONS[0],)
     if value.also is not None and any(value.found):
         reasons = (*reasons, f"or {value.also}")
-    size = segments.SIZES.get(value.kind, value.registers)
+    size = SIZES.get(value.kind, value.registers)
     if size < value.registers:
         kind = f"{kind}[{value.registers // size}]"
     tag = _tag(piece.area, piece.address + value.offset, kind, value.order, confidence, reasons)

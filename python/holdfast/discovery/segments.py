@@ -16,7 +16,7 @@ import itertools
 import math
 import struct
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast import values
@@ -24,15 +24,13 @@ from holdfast.discovery import clock_fields, plausibility, text_fields
 from holdfast.discovery.byte_order_habits import (
     COMMON,
     HABITS,
-    MIXED,
     ORDER_HABITS,
     ORDERS,
     PREFERENCES,
-    PREFERRED,
     Habit,
 )
+from holdfast.discovery.type_rarity import NARROW, RARE, SIZES, rarity
 from holdfast.values import ConversionError
-from holdfast.values.orders import SWAPPED_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -52,29 +50,6 @@ content, of the zeros in front of a long integer, of a beginning like that of th
 and of each change.
 """
 
-RARE = {
-    "uint16": 1.0,
-    "int16": 0.9,
-    "float32": 5.3,
-    "uint32": 2.1,
-    "int32": 4.5,
-    "float64": 6.0,
-    "uint64": 7.3,
-    "int64": 8.0,
-    "bcd16": 8.0,
-    "bcd32": 8.5,
-    "float16": 18.0,
-    "string": 6.0,
-    PART: 0.0,
-}
-"""How rare a type is among the values of devices, in bits."""
-
-SIZES = {kind: values.register_count(kind) for kind in RARE if kind not in ("string", PART)}
-"""The registers of a value of each type."""
-
-NARROW = {PART, *(kind for kind, size in SIZES.items() if size == 1)}
-"""The types of one register, in which words have no order."""
-
 TRUST = {"float32": 1.4, "int32": 0.65, "string": 0.6, "uint16": 0.76}
 OTHER_TRUST = 0.78
 """The power of the odds that makes a confidence from a probability, by type. The bits of neighbours
@@ -89,11 +64,6 @@ NEGLIGIBLE = 1e-6
 
 IMPROBABLE = 8.0
 """The bits by which an order is worse than the best if its preferences are not considered."""
-
-SWAPPED_TEXT = {True: 1.0, False: 5.5}
-"""How rare swapped bytes in text are, in bits, on a device that swaps those of numbers and on
-others. The former leaves the text as it is as often.
-"""
 
 SAME_TYPE = 0.4
 OTHER_TYPE = 0.2
@@ -387,18 +357,9 @@ class _Lattice:
 
 def _rarity(value: Value, habit: Habit) -> float:
     """How rare the type and order of a value are in a device with this habit."""
-    return 0.0 if value.is_nothing else _type_rarity(value.kind, value.order, habit)
-
-
-@cache
-def _type_rarity(kind: str, order: str, habit: Habit) -> float:
-    rare = RARE[kind] + PREFERRED[habit.prefers].get(kind, 0.0)
-    if kind == "string":
-        swaps = habit.order in SWAPPED_BYTES
-        return rare + (SWAPPED_TEXT[swaps] if swaps or order == "BADC" else 0)
-    if kind in NARROW:
-        return rare
-    return rare + (MIXED if order != habit.order else 0)
+    if value.is_nothing or value.type == PART:
+        return 0.0
+    return rarity(value.kind, value.order, habit)
 
 
 def _fits(value: Value, habit: Habit) -> bool:
