@@ -11,12 +11,12 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from holdfast.client.requests import write_typed
+from holdfast.errors import NOT_EXECUTED
 from holdfast.events import log_lines
-from holdfast.polling.faults import EXPIRED, STANDBY, fault_text
+from holdfast.polling.faults import EXPIRED, NO_CONNECTION, STANDBY, UNREACHABLE, fault_text
 from holdfast.scanner.errors import Moved, Refused
 from holdfast.scanner.late_commands import SEND_AGAIN, Lateness
 from holdfast.scanner.messages.types import Answer
-from holdfast.scanner.subscriptions.health import NOT_WRITTEN_FAULTS
 from holdfast.scanner.subscriptions.write_access import unwritable
 from holdfast.tags.strict_text import from_text
 from holdfast.tags.text import value_from
@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from holdfast.scanner.settings import Settings
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.tag import Tag
+
+NOT_WRITTEN_FAULTS = (*NOT_EXECUTED, NO_CONNECTION, UNREACHABLE, STANDBY, EXPIRED)
+"""Faults of a write that the device certainly has not carried out."""
 
 MOVED = f"not written: {fault_text(STANDBY)}"
 

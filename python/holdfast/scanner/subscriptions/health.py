@@ -7,15 +7,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from holdfast.errors import NOT_EXECUTED
-from holdfast.polling.faults import (
-    EXPIRED,
-    NO_CONNECTION,
-    STANDBY,
-    UNREACHABLE,
-    fault_text,
-    is_exception,
-)
+from holdfast.polling.faults import NO_CONNECTION, UNREACHABLE, fault_text, is_exception
 from holdfast.protocol import GATEWAY_FAILURES
 
 if TYPE_CHECKING:
@@ -29,15 +21,6 @@ Block = TypeVar("Block", bound=tuple[Any, ...])
 
 TOLERATED_FAILURES = 1
 """Consecutive scans without a response before a device is offline."""
-
-NOT_WRITTEN_FAULTS = (
-    *NOT_EXECUTED,
-    NO_CONNECTION,
-    UNREACHABLE,
-    STANDBY,
-    EXPIRED,
-)
-"""Faults of a write that the device certainly has not carried out."""
 
 
 @dataclass(slots=True)
