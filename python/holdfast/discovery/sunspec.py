@@ -21,6 +21,7 @@ from holdfast.errors import (
     RequestTimeout,
 )
 from holdfast.protocol import ADDRESSES, READ_REGISTERS
+from holdfast.tags.scale import EXPONENTS
 from holdfast.values import decode, register_count
 
 if TYPE_CHECKING:
@@ -43,8 +44,6 @@ END = 0xFFFF
 
 MAX_MODELS = 100
 """With the limit of an address, this limits the requests, whatever the device answers."""
-
-MAX_SCALE = 10
 
 TYPES = {
     "uint16": ("uint16", 0xFFFF),
@@ -295,7 +294,7 @@ class _Group:
         found = self._number(factor) if isinstance(factor, str) else (0, factor & 0xFFFF)
         raw = None if found is None else found[1]
         power = None if raw is None else raw - 0x10000 if raw & 0x8000 else raw
-        if power is None or abs(power) > MAX_SCALE:
+        if power is None or power not in EXPONENTS:
             return None
         return float(f"1e{power}") if power < 0 else 10**power
 
