@@ -33,13 +33,10 @@ use super::poll_pause::PollPause;
 use super::results::{BlockResult, Poll, Results};
 use super::schedule::Schedule;
 use super::state::DeviceState;
-use super::status::StatusSettings;
+use super::status::{STATUS_INTERVAL, StatusSettings};
 use super::turn::Turn;
 use crate::client::Endpoint;
 use crate::link::{Fault, Fence, InFlight, Link, Permit, Priority, submit_under};
-
-/// The longest interval between writes of the status block.
-const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Settings of a device.
 #[derive(Debug, Clone)]

@@ -1,6 +1,7 @@
 //! The status block: 30 registers with health and counters of a device.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use holdfast_memory::{Access, Area, Memory, Refusal, Write};
 
@@ -8,6 +9,9 @@ use super::health::Health;
 
 /// Registers of one block.
 pub const STATUS_BLOCK_LEN: u16 = 30;
+
+/// The longest interval between writes of the status block.
+pub(super) const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The size of the device name, in bytes.
 const NAME_BYTES: usize = 16;
