@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.adapters.mqtt import adapter, answers, connection, inbox
+from holdfast.adapters.mqtt import adapter, answers, connection, inbox, sessions
 from holdfast.ingest import MemoryAccess
 from holdfast.net.mqtt import client, connect
 from holdfast.net.mqtt.stream import BrokerSocket
@@ -217,7 +217,7 @@ def test_it_asks_for_a_session_that_is_kept(rig: Rig, fake: FakeBroker, tmp_path
     with fake.accept() as peer:
         body = peer.expect(mqtt.CONNECT).body
 
-    expiry = bytes([mqtt.SESSION_EXPIRY]) + struct.pack(">I", connection.SESSION_EXPIRY_S)
+    expiry = bytes([mqtt.SESSION_EXPIRY]) + struct.pack(">I", sessions.SESSION_EXPIRY_S)
     assert body == b"".join(
         [
             mqtt.string("MQTT"),

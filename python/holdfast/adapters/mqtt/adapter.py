@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
 from holdfast.adapters.mqtt.answers import Answers
 from holdfast.adapters.mqtt.connection import BrokerConnection
 from holdfast.adapters.mqtt.inbox import Filters, Inbox, Value
+from holdfast.adapters.mqtt.sessions import session_of
 from holdfast.adapters.mqtt.subscriptions import Subscriptions
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
 
-    from holdfast.adapters.mqtt.subscriptions import Known
     from holdfast.config.models.root import MappedTag
     from holdfast.config.models.services import MqttConfig
     from holdfast.ingest import MemoryAccess
@@ -38,22 +37,6 @@ LOG_INTERVAL_S = 600.0
 
 _CHECK_INTERVAL_S = 1.0
 """Seconds between checks of the keep-alive."""
-
-
-@dataclass
-class _Session:
-    """What the process knows of a session with a broker."""
-
-    unreleased: set[int] = field(default_factory=set)
-    """Packet identifiers of QoS 2."""
-    known: Known = field(default_factory=dict)
-    """Its topics. A retained message that was written is not written again when the adapter is
-    replaced: another writer may have written a newer value since."""
-
-
-_SESSIONS: dict[tuple[str, str], _Session] = {}
-"""By broker and client id. A session goes on when the adapter is replaced by another one, after a
-reload or a failure."""
 
 FIRST_PAUSE_S = 1.0
 MAX_PAUSE_S = 10.0
@@ -83,7 +66,7 @@ class Mqtt:
         values = {topic: Value(topic, each) for topic, each in (mapped or {}).items()}
         self._inbox = Inbox(memory_access, filters, values, self._broker)
         self._answers = Answers(filters, values)
-        session = _SESSIONS.setdefault((self._broker, settings.client_id), _Session())
+        session = session_of(self._broker, settings.client_id)
         self._subscriptions = Subscriptions(settings, mapped or {}, session.known)
         self._unreleased = session.unreleased
         self._failures = _Failures(self._broker)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.adapters.mqtt.deliveries import Deliveries, NotTaken
 from holdfast.adapters.mqtt.inbox import MAX_PAYLOAD_BYTES
+from holdfast.adapters.mqtt.sessions import SESSION_EXPIRY_S
 from holdfast.net.mqtt.client import BrokerClient
 from holdfast.net.mqtt.packets import MAX_PROPERTIES_BYTES
 from holdfast.net.mqtt.stream import Packets
@@ -28,9 +29,6 @@ if TYPE_CHECKING:
     from holdfast.config.models.services import MqttConfig
     from holdfast.net.mqtt.packets import Publish
     from holdfast.net.mqtt.selector import Waiter
-
-SESSION_EXPIRY_S = 3600
-"""Seconds that the broker keeps the session while this client is disconnected. MQTT 5 only."""
 
 MAX_UNSENT_PACKETS = 1000
 """Limit of unsent packets, mostly acknowledgements. Above it nothing is read from the broker."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from paho.mqtt.reasoncodes import ReasonCode
 
     from holdfast.adapters.mqtt.connection import BrokerConnection
+    from holdfast.adapters.mqtt.sessions import Known, Meaning
     from holdfast.config.models.root import MappedTag
     from holdfast.config.models.services import MappingConfig, MqttConfig, SubscriptionConfig
 
@@ -24,13 +25,6 @@ class _Topic:
     entry: SubscriptionConfig | MappingConfig
     granted: int | None = None
     """In this connection."""
-
-
-Meaning: TypeAlias = "tuple[SubscriptionConfig | MappingConfig, MappedTag | None]"
-"""The settings of a topic, and the tag that its values are for."""
-
-Known: TypeAlias = "dict[str, tuple[Meaning, int]]"
-"""Topics that a session has: what they mean, and the quality of service that was granted."""
 
 
 class Subscriptions:
