@@ -214,6 +214,17 @@ def test_old_rows_go_when_a_database_is_too_large(tmp_path: Path) -> None:
     assert 0 < first < 35_000
 
 
+def test_rows_of_a_clock_that_was_in_the_future_go_first(tmp_path: Path) -> None:
+    database = Database(settings(tmp_path / "a.db", "sqlite", max_bytes=2**20))
+    for start in (2.0e9, 1.7e9):
+        for at in range(0, 20_000, 5000):
+            database.send([reading(at, start + number) for number in range(at, at + 5000)])
+    assert database._db is not None
+    years = database._db.execute("SELECT DISTINCT substr(time, 1, 4) FROM readings").fetchall()
+    database.close()
+    assert years == [("2023",)]
+
+
 def test_a_database_that_is_broken_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "a.db").write_bytes(b"no database" * 1000)
     with pytest.raises(OSError, match=r"a\.db: file is not a database"):

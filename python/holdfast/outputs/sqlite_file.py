@@ -69,7 +69,7 @@ class Database(Receiver):
             with db:
                 gone = db.execute(
                     "DELETE FROM readings WHERE rowid IN "
-                    f"(SELECT rowid FROM readings ORDER BY time LIMIT {MAX_ROWS_PER_REMOVAL})"
+                    f"(SELECT rowid FROM readings ORDER BY rowid LIMIT {MAX_ROWS_PER_REMOVAL})"
                 ).rowcount
             db.executescript("PRAGMA incremental_vacuum")  # `execute` would free one page.
             if gone < MAX_ROWS_PER_REMOVAL:
