@@ -45,8 +45,9 @@ def verify(files: tuple[Path, ...], anchors: tuple[str, ...], as_json: bool) -> 
     """Verify that lines in the FILES of an audit log are unchanged, complete and in order.
 
     The files can be given in any order. Exit codes: 0 intact, 1 a line was changed, deleted,
-    inserted or moved, or an anchor is missing, 2 a file can't be read, 3 intact, but the log itself
-    reports missing lines.
+    inserted or moved, or an anchor is missing, 2 a file can't be read, is compressed or is not an
+    audit log, or all are empty, 3 intact, but the log itself reports missing lines, or has lines
+    without a place in the chain.
     """
     try:
         findings = verified(files, anchors)

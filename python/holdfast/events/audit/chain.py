@@ -73,14 +73,23 @@ class Place(NamedTuple):
 
 def place_of(line: bytes) -> Place | None:
     """The place that a line names; `None` if it is not a line of a chain."""
-    try:
-        fields = msgspec.json.decode(line)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return None
-    if not isinstance(fields, dict):
-        return None
+    fields = _fields(line)
     seq, prev = fields.get("seq"), fields.get("prev")
     if type(seq) is not int or not (prev is None or isinstance(prev, str)):
         return None
     broken = str(fields.get("reason")) if fields.get("event") == BREAK else None
     return Place(seq, prev, broken, fields)
+
+
+def is_record(line: bytes) -> bool:
+    """Whether a line can be one of an audit log, also of a version without a chain."""
+    return isinstance(_fields(line).get("time"), str)
+
+
+def _fields(line: bytes) -> dict[str, Any]:
+    """The fields of a line; none if it is not a JSON object."""
+    try:
+        fields = msgspec.json.decode(line)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return {}
+    return fields if isinstance(fields, dict) else {}

@@ -7,18 +7,23 @@ who has written the whole chain anew: against both, keep digests elsewhere (`anc
 
 from __future__ import annotations
 
+import errno
 import itertools
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
-from holdfast.events.audit.chain import Place, digest_of, place_of
+from holdfast.events.audit.chain import Place, digest_of, is_record, place_of
 from holdfast.events.audit.file import MAX_LINE_BYTES, last_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
+
+
+RECORD_START = b'{"time":"'
+GZIP_START = b"\x1f\x8b"
 
 
 class Line(NamedTuple):
@@ -77,10 +82,14 @@ class Findings:
 
 
 def verify(files: Iterable[Path], anchors: Iterable[str] = ()) -> Findings:
-    """Verifies files in the order of their chain. Raises `OSError` if one can't be read.
+    """Verifies files in the order of their chain.
 
-    `anchors`: digests of lines, written down earlier. The lines must still be there.
+    Raises `OSError` if one can't be read or is not an audit log, or if all are empty. `anchors`:
+    digests of lines, written down earlier. The lines must still be there.
     """
+    files = list(files)
+    for file in files:
+        _require_log(file)
     findings = Findings(_in_order(files), missing_anchors=set(anchors))
     before: Line | None = None
     before_that: Line | None = None
@@ -102,7 +111,25 @@ def verify(files: Iterable[Path], anchors: Iterable[str] = ()) -> Findings:
             findings.breaks["torn"] += 1
         elif before.place is None:
             findings.unchained += 1
+    else:
+        raise OSError(errno.EINVAL, "empty: there is nothing to verify", str(findings.files[0]))
     return findings
+
+
+def _require_log(file: Path) -> None:
+    """Raises `OSError` for a file with lines, none of which is one of an audit log."""
+    start = next(_lines([file]), None)
+    # A record may be the first one, and incomplete.
+    if start is None or start.data.startswith(RECORD_START) or any(map(_is_of_log, _lines([file]))):
+        return
+    reason = f"not an audit log: it begins with {start.data[:20].decode('latin-1')!a}"
+    if start.data.startswith(GZIP_START):
+        reason = "compressed: unpack it first"
+    raise OSError(errno.EINVAL, reason, str(file))
+
+
+def _is_of_log(line: Line) -> bool:
+    return line.place is not None or is_record(line.data)
 
 
 def _note(findings: Findings, place: Place, *, running: bool) -> bool:
@@ -144,7 +171,7 @@ def _foreign(before: Line | None, line: Line, after: Line | None) -> str | None:
     Allowed are an incomplete last line, an incomplete line before one that reports it, and lines
     from before the chain began.
     """
-    begins = before is None or before.place is None
+    begins = (before is None or before.place is None) and is_record(line.data)
     if after is None:
         right = begins or not line.data.endswith(b"\n")
     elif after.place is None:
