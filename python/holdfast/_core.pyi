@@ -92,6 +92,7 @@ __all__ = [
     "ServerTls",
     "Stale",
     "TlsChannel",
+    "UnusableMemoryFile",
     "WriteQueue",
     "__version__",
     "encode_raw_ingest",
@@ -306,9 +307,9 @@ class MemoryFile:
     seconds, with one thread. With `of_log`, the memories are all those of a log, and `sync` is more
     than 0.
 
-    Raises `OSError` for a file that is damaged, locked by another process, not writable, of
-    another program, or of a newer version; the file and the memories are unchanged then. Raises
-    `ValueError` for memories that can't be kept together.
+    Raises `UnusableMemoryFile`, and other `OSError`s for a file that is locked by another process,
+    or can't be read or written; the file and the memories are unchanged then. Raises `ValueError`
+    for memories that can't be kept together.
     """
 
     def __new__(
@@ -347,6 +348,9 @@ class MemoryFile:
 
     def status(self) -> MemoryFileStatus:
         """How storing goes."""
+
+class UnusableMemoryFile(OSError):
+    """A file of memories is damaged, of another program, of a newer version, or of another log."""
 
 def read_memory_file(
     path: str | PathLike[str], *, set_aside: bool = False

@@ -52,8 +52,8 @@ def file(tmp_path: Path) -> Path:
     return configuration(tmp_path, free_port())
 
 
-def configuration(folder: Path, port: int, name: str = "plant", more: str = "") -> Path:
-    file = folder / f"{name}.yaml"
+def configuration(folder: Path, port: int, more: str = "") -> Path:
+    file = folder / "plant.yaml"
     file.write_text(
         f"""
 memories: {{plant: {{holding_registers: 100, replicate: {{log: site}}}}}}
@@ -278,17 +278,17 @@ def refused(file: Path, exit_code: int = 2) -> str:
 
 def test_a_folder_has_one_user(file: Path, tmp_path: Path) -> None:
     with Appliance(load(file)):
-        assert "log is in use by another process" in refused(file)
+        assert "log is in use by another process" in refused(file, 1)
         (tmp_path / "other").mkdir()
         (tmp_path / "other" / "log").symlink_to(tmp_path / "log")
         other = configuration(tmp_path / "other", free_port())
-        assert "log is in use by another process" in refused(other)
+        assert "log is in use by another process" in refused(other, 1)
 
 
 def test_a_port_that_is_taken_is_told(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        told = refused(configuration(tmp_path, port))
+        told = refused(configuration(tmp_path, port), 1)
         assert f"127.0.0.1:{port}" in told
         assert "in use" in told
 
@@ -296,16 +296,11 @@ def test_a_port_that_is_taken_is_told(tmp_path: Path) -> None:
 def test_a_disk_that_is_full_may_have_room_at_the_next_start(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with monkeypatch.context() as full, socket.create_server(("127.0.0.1", 0)) as taken:
-        full.setattr(NatsFolder, "has_room", lambda _: False)
-        port = taken.getsockname()[1]
-        refused(configuration(file.parent, port, "other"), 1)  # The server itself could not start.
-
     def replace(path: Path, *_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
     monkeypatch.setattr(nats_folder, "replace", replace)
-    assert "nats-server.conf can't be used: No space left" in refused(file, 1)
+    assert "token can't be used: No space left" in refused(file, 1)
 
 
 @pytest.mark.parametrize("name", ["log", "log/nats-server.conf"])

@@ -13,10 +13,11 @@ import pytest
 from click.testing import CliRunner
 
 import holdfast
-from holdfast.cli import COMMANDS, main
+from holdfast.cli import COMMANDS, configuration, main
 from holdfast.cli.configuration import load_or_exit
 from holdfast.config import json_schema, load
 from holdfast.runtime import bounded_files
+from support.silent_files import Silent
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -148,6 +149,18 @@ def test_a_command_ends_with_2_on_a_wrong_configuration(
     assert capsys.readouterr().err.endswith("2 problems\n")
 
 
+def test_a_command_ends_with_1_if_the_configuration_does_not_answer(
+    good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answered = partial(bounded_files.answered, timeout_ms=50)
+    monkeypatch.setattr(configuration, "answered", answered)
+    with Silent(monkeypatch, "open", good), pytest.raises(SystemExit) as ended:
+        load_or_exit(good)
+    assert ended.value.code == 1
+    reason = "can't be read: no answer within 0.05 s, the limit"
+    assert capsys.readouterr().err == f"{good}: {reason}\n1 problem\n"
+
+
 def test_schema_prints_the_schema() -> None:
     result = CliRunner().invoke(main, ["check", "--schema"])
     assert result.exit_code == 0
@@ -241,7 +254,8 @@ class TestPipes:
         pipe = tmp_path / "pipe"
         os.mkfifo(pipe)
         result = CliRunner().invoke(main, ["check", str(pipe)])
-        assert (result.exit_code, result.stdout) == (2, "")
+        # 1, not 2: a service manager tries it again.
+        assert (result.exit_code, result.stdout) == (1, "")
         assert result.stderr.splitlines() == [
             f"{pipe}: can't be read: no answer within 0.05 s, the limit",
             "1 problem",

@@ -67,7 +67,9 @@ mod _core {
     #[pymodule_export]
     use super::memory::{Memory, OutOfRange, Stale};
     #[pymodule_export]
-    use super::memory_file::{MemoryFile, read_memory_file, release_memory_file};
+    use super::memory_file::{
+        MemoryFile, UnusableMemoryFile, read_memory_file, release_memory_file,
+    };
     #[pymodule_export]
     use super::mirror_age::MirrorAge;
     #[pymodule_export]

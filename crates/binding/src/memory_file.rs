@@ -16,6 +16,13 @@ use crate::arguments::seconds;
 use crate::log::Log;
 use crate::memory::Memory;
 
+pyo3::create_exception!(
+    holdfast._core,
+    UnusableMemoryFile,
+    PyOSError,
+    "What is in a file of memories can't be used."
+);
+
 #[pyclass(frozen, module = "holdfast")]
 pub struct MemoryFile {
     path: PathBuf,
@@ -137,6 +144,10 @@ pub fn release_memory_file(py: Python<'_>, path: PathBuf, memory: &str) -> PyRes
 fn raised(path: &Path, error: FileError) -> PyErr {
     match error {
         FileError::Memories(message) => PyValueError::new_err(message),
-        error => PyOSError::new_err(format!("{}: {error}", path.display())),
+        // Both may pass.
+        FileError::Locked | FileError::Io(_) => {
+            PyOSError::new_err(format!("{}: {error}", path.display()))
+        }
+        error => UnusableMemoryFile::new_err(format!("{}: {error}", path.display())),
     }
 }

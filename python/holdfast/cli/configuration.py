@@ -15,9 +15,10 @@ from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.terminal_text import show_problems
 from holdfast.client.endpoint import check_files, endpoint, receiver_endpoint
 from holdfast.config import ConfigError
-from holdfast.config.loader import loaded, unanswered
+from holdfast.config.loader import loaded
 from holdfast.config.models.listeners import tls_of
 from holdfast.config.models.services import HTTP_SERVICES
+from holdfast.config.text.problems import ConfigNotAnswered
 from holdfast.config.text.report import Report
 from holdfast.runtime.bounded_files import NotAnswered, answered
 
@@ -39,7 +40,7 @@ def load_whole(path: Path | str) -> Config:
     try:
         return answered(lambda: _load_whole(path))
     except NotAnswered as error:
-        raise ConfigError(str(path), [unanswered(error)]) from None
+        raise ConfigNotAnswered(error) from None
 
 
 def _load_whole(path: Path | str) -> Config:
@@ -109,7 +110,7 @@ def _check_scanner(files: Tls) -> None:
 
 
 def load_or_exit(path: Path | str) -> Config:
-    """Loads a configuration. If it is not valid, prints every problem and exits with 2.
+    """Loads a configuration. If it is not valid, prints every problem and exits.
 
     Prints warnings on standard error.
     """
@@ -117,7 +118,15 @@ def load_or_exit(path: Path | str) -> Config:
         config = load_whole(path)
     except ConfigError as error:
         show_problems(error)
-        sys.exit(ExitCode.WRONG)
+        sys.exit(exit_code(error))
     for warning in config.warnings:
         click.echo(f"warning: {warning}", err=True)
     return config
+
+
+def exit_code(error: ConfigError) -> ExitCode:
+    """The exit code for a configuration that could not be loaded.
+
+    Service managers start nothing again after `WRONG`, but a mount may answer later.
+    """
+    return ExitCode.FAILED if isinstance(error, ConfigNotAnswered) else ExitCode.WRONG

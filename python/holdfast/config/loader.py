@@ -33,7 +33,7 @@ from holdfast.config.models.root import Config
 from holdfast.config.tag_files.profiles import ProfileFiles
 from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import shape, show
-from holdfast.config.text.problems import ConfigError, Problem
+from holdfast.config.text.problems import ConfigError, ConfigNotAnswered, Problem
 from holdfast.config.text.report import Report
 from holdfast.config.text.templates import expand_templates
 from holdfast.runtime import bounded_files
@@ -60,12 +60,7 @@ def loaded(path: Path | str) -> tuple[Config, yaml_document.Document]:
     try:
         return bounded_files.answered(work)
     except bounded_files.NotAnswered as error:
-        raise ConfigError(file, [unanswered(error)]) from None
-
-
-def unanswered(error: bounded_files.NotAnswered) -> Problem:
-    """The problem of a file that was not read in time."""
-    return Problem(str(error.filename), None, None, "", f"can't be read: {error.strerror}")
+        raise ConfigNotAnswered(error) from None
 
 
 def checked(document: yaml_document.Document, problems: list[Problem], folder: Path) -> Config:

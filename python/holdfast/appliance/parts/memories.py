@@ -23,10 +23,6 @@ if TYPE_CHECKING:
     from holdfast.config.models.memories import MemoryConfig
 
 
-class UnusableFile(OSError):
-    """A file of memories is damaged, in use, or can't be written."""
-
-
 class Memories(Part):
     """The memories by name, and their files."""
 
@@ -40,12 +36,9 @@ class Memories(Part):
         self._failing: dict[Path, str | None] = {}
 
     def open(self, plan: Plan) -> None:
-        """Loads the contents of the memories. Raises `UnusableFile`."""
-        try:
-            for path, names in _files_of(self.config).items():
-                self._open(path, names, plan.memories)
-        except OSError as error:
-            raise UnusableFile(str(error)) from None
+        """Loads the contents of the memories. Raises the `OSError`s of `MemoryFile`."""
+        for path, names in _files_of(self.config).items():
+            self._open(path, names, plan.memories)
 
     def prepare(self, plan: Plan) -> Callable[[], None]:
         """Creates memories that the configuration adds."""
@@ -101,14 +94,13 @@ class Memories(Part):
         return None if path is None else self._files[path].note
 
     def follow(self, name: str, log: _core.Log) -> None:
-        """Stores from now on what the memories of a log contain. Raises `UnusableFile`."""
+        """Stores from now on what the memories of a log contain.
+
+        Raises the `OSError`s of `MemoryFile`.
+        """
         path = self.of_log(name)
-        if path is None:
-            return
-        try:
+        if path is not None:
             self._files[path].start(log)
-        except OSError as error:
-            raise UnusableFile(str(error)) from None
 
     def stats(self) -> Mapping[str, Any]:
         """The state and the counters of each file."""

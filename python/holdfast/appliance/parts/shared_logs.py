@@ -62,7 +62,10 @@ class SharedLogs(Part):
         self._servers: dict[str, NatsServer] = {}
 
     def open(self, plan: Plan) -> None:
-        """Returns when the memories have caught up. Raises `LogNotJoined`, `UnusableFile`."""
+        """Returns when the memories have caught up.
+
+        Raises `LogNotJoined`, and the `OSError`s of `MemoryFile`.
+        """
         for name, settings in self.config.logs.items():
             members = [
                 (each, plan.memories[each])
@@ -76,7 +79,7 @@ class SharedLogs(Part):
     def _serve(self, name: str, settings: SharedLogConfig) -> None:
         """Starts the server of the log, if the log has one of its own."""
         from holdfast.appliance.parts import log_servers  # Most appliances have no log.
-        from holdfast.net.nats_server import DiskFull
+        from holdfast.net.nats_server import TemporarilyUnusable
 
         server = log_servers.embedded(name, settings)
         if server is None:
@@ -86,8 +89,7 @@ class SharedLogs(Part):
         try:
             server.start()
         except OSError as error:
-            # The disk may have room at the next start.
-            is_settings = not isinstance(error, DiskFull)
+            is_settings = not isinstance(error, TemporarilyUnusable)
             text = f"logs.{name}.embedded: {error}"
             raise LogNotJoined(text, is_settings=is_settings) from None
 

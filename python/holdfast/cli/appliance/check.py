@@ -10,8 +10,7 @@ import click
 
 from holdfast.cli import CommandWithSubcommands, complete_subcommand
 from holdfast.cli.appliance.peer_rights import Peer, as_data, as_text
-from holdfast.cli.configuration import load_or_exit, load_whole
-from holdfast.cli.exit_codes import ExitCode
+from holdfast.cli.configuration import exit_code, load_or_exit, load_whole
 from holdfast.cli.options.option import json_option, option, schema_option
 from holdfast.cli.terminal_text import print_json, print_problems, problems_to_json
 from holdfast.config import ConfigError, json_schema
@@ -75,7 +74,7 @@ def check(file: Path, as_json: bool, address: Address | None, role: str | None) 
         config = load_whole(file)
     except ConfigError as error:
         print_problems(error)
-        sys.exit(ExitCode.WRONG)
+        sys.exit(exit_code(error))
     answer: dict[str, object] = {
         "ok": True,
         "target": str(file),

@@ -19,7 +19,7 @@ from holdfast.cli.services.file_snapshot import FileSnapshot
 from holdfast.cli.shell_command import shell_command
 from holdfast.config import ConfigError
 from holdfast.config.fingerprint import files_of
-from holdfast.config.loader import unanswered
+from holdfast.config.text.problems import ConfigNotAnswered
 from holdfast.events import log_lines
 from holdfast.runtime.bounded_files import TIMEOUT_MS, FileWork, NotAnswered, Unreadable, answered
 from holdfast.runtime.text import file_error_text
@@ -210,7 +210,7 @@ class Reloader:
         except NotAnswered as error:
             # The look that led here is not to lead here again.
             self._loaded_files = self._last_snapshot or self._loaded_files
-            problems = [str(unanswered(error))]
+            problems = [str(ConfigNotAnswered(error))]
         except click.UsageError as error:
             problems = [error.format_message()]
         except ReloadRefused as refused:

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from holdfast._core import UnusableMemoryFile
 from holdfast.adapters.plugins import UnknownAdapter
 from holdfast.appliance import Appliance
 from holdfast.appliance.control import Control
-from holdfast.appliance.parts.memories import UnusableFile
 from holdfast.appliance.parts.shared_logs import LogNotJoined
 from holdfast.appliance.service_manager import ServiceManager
 from holdfast.appliance.services.gateway import gateway_settings
@@ -80,8 +80,8 @@ def run(file: Path) -> None:
     """Run the appliance with the configuration FILE.
 
     Prints listeners and polled devices, then serves until Ctrl-C or SIGTERM. Exit codes: 0 stopped
-    by a signal, 1 can't bind a listener, 2 the configuration has errors. The ports of REST, gateway
-    and metrics are retried until they are free.
+    by a signal, 1 another start may succeed, as with a port that was taken, 2 the configuration or
+    a file has errors. The ports of REST, gateway and metrics are retried until they are free.
     """
     config = load_or_exit(file)
     serve(config, lambda appliance: _greeting(appliance, file), named=str(file), file=file)
@@ -123,7 +123,7 @@ def serve(
     except Interrupted:
         appliance.stop()
         return
-    except UnusableFile as error:
+    except UnusableMemoryFile as error:
         fail(error, ExitCode.WRONG)
     except LogNotJoined as error:
         fail(error, ExitCode.WRONG if error.is_settings else ExitCode.FAILED)

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from holdfast.runtime.bounded_files import NotAnswered
+
 
 @dataclass(frozen=True, slots=True)
 class Problem:
@@ -39,3 +41,11 @@ class ConfigError(Exception):
 
         self.problems: tuple[Problem, ...] = tuple(sorted(problems, key=order))
         super().__init__("\n".join(str(problem) for problem in self.problems))
+
+
+class ConfigNotAnswered(ConfigError):
+    """A file was not read in time. The configuration may be valid."""
+
+    def __init__(self, error: NotAnswered) -> None:
+        file = str(error.filename)
+        super().__init__(file, [Problem(file, None, None, "", f"can't be read: {error.strerror}")])

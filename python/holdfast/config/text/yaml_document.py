@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from holdfast._core import yaml_events
 from holdfast.config.text.messages import show
-from holdfast.config.text.problems import ConfigError, Problem
+from holdfast.config.text.problems import ConfigError, ConfigNotAnswered, Problem
 from holdfast.runtime import bounded_files
 
 if TYPE_CHECKING:
@@ -174,6 +174,8 @@ def read_bytes(path: Path, file: str, max_bytes: int = MAX_BYTES) -> bytes:
     """Reads a file without decoding it. Raises `ConfigError`."""
     try:
         return bounded_files.read(path, max_bytes, named_pipe=True)
+    except bounded_files.NotAnswered as error:
+        raise ConfigNotAnswered(error) from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise _error(file, f"can't be read: {reason}") from None

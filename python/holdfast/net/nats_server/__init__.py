@@ -5,8 +5,16 @@ The server of a log has a folder that it alone uses. That of a command is tempor
 
 from __future__ import annotations
 
-from holdfast.net.nats_server.folder import Access, DiskFull, InUse, ServerUnusable
+from holdfast.net.nats_server.folder import Access, InUse, ServerUnusable, TemporarilyUnusable
 from holdfast.net.nats_server.server import NatsServer
 from holdfast.net.nats_server.temporary import HOST, TemporaryServer
 
-__all__ = ["HOST", "Access", "DiskFull", "InUse", "NatsServer", "ServerUnusable", "TemporaryServer"]
+__all__ = [
+    "HOST",
+    "Access",
+    "InUse",
+    "NatsServer",
+    "ServerUnusable",
+    "TemporarilyUnusable",
+    "TemporaryServer",
+]

@@ -31,11 +31,11 @@ class ServerUnusable(OSError):
     """The server can't be started. The message says why."""
 
 
-class DiskFull(ServerUnusable):
-    """The disk of the folder is full."""
+class TemporarilyUnusable(ServerUnusable):
+    """Another start may succeed: the disk is full, or the server has not started."""
 
 
-class InUse(ServerUnusable):
+class InUse(TemporarilyUnusable):
     """Another process uses the folder."""
 
 
@@ -146,7 +146,7 @@ class Folder:
 
 
 def _unusable(file: Path | str, error: OSError) -> ServerUnusable:
-    kind = DiskFull if error.errno in {errno.ENOSPC, errno.EDQUOT} else ServerUnusable
+    kind = TemporarilyUnusable if error.errno in {errno.ENOSPC, errno.EDQUOT} else ServerUnusable
     return kind(f"{file} can't be used: {error.strerror or error}")
 
 

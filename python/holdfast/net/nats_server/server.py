@@ -11,7 +11,7 @@ import sysconfig
 from typing import TYPE_CHECKING, Any
 
 from holdfast.events import log_lines
-from holdfast.net.nats_server.folder import DiskFull, Folder, ServerUnusable
+from holdfast.net.nats_server.folder import Folder, ServerUnusable, TemporarilyUnusable
 from holdfast.net.nats_server.log import ServerLog
 from holdfast.runtime.backoff import PROVEN_S, Backoff
 from holdfast.runtime.child_process import ChildFailed, ChildProcess
@@ -66,9 +66,9 @@ class NatsServer:
             )
             self._child.start(START_TIMEOUT_S)
         except ChildFailed as error:
-            kind = ServerUnusable if self._folder.has_room() else DiskFull
+            # Its configuration is ours: the port is taken, or the disk full or slow.
             self.stop()
-            raise kind(str(error)) from None
+            raise TemporarilyUnusable(str(error)) from None
         except BaseException:
             self.stop()
             raise
