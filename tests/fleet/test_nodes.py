@@ -32,6 +32,7 @@ from support.scanner_parts import client_of, member_of, registry_of, ttls_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.ttl import SubscriptionTtls
     from support.brokers import NatsServer
     from support.judges import Judge
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
 
 Node = "Callable[..., Running]"
 PARTITIONS = 16
+WANTS = f"holdfast_fleet_{FLEET}_wants"
+D0, D1 = "device.ZDA", "device.ZDE"
+"""The keys of the devices `d0` and `d1`."""
 
 
 @pytest.fixture
@@ -189,6 +193,77 @@ def test_a_request_that_is_refused_changes_nothing_anywhere(
         assert "hmi" in refused["error"]
     [device] = caller.request("modbus.browse", "")["devices"]
     assert [each["id"] for each in device["subscribers"]] == ["hmi"]
+
+
+@pytest.mark.parametrize("part", ["port", "tag"])
+def test_a_change_of_all_subscribers_at_once_is_adopted(
+    node: Callable[..., Running], caller: Caller, judges: Judges, part: str
+) -> None:
+    running = node("a")
+    share(running)
+    former, new, *_ = judges.devices
+    for subscriber in ("hmi", "log"):
+        request = wanted(former, subscriberId=subscriber)
+        assert caller.request("modbus.subscribe", request)["success"]
+    # What a node finds that was cut off while others carried out all of it, one by one.
+    before, after = f'"port":{former.port}', f'"port":{new.port}'
+    if part == "tag":
+        before, after = '"address":0', '"address":10'
+    caller.put(WANTS, D0, caller.text(WANTS, D0).replace(before, after))
+    if part == "tag":
+        wire.until(lambda: devices_of(running)["d0"].tags["t0"].address == 10, "it is read there")
+    else:
+        wire.until(lambda: bool(new.polls), "it is polled at its new address")
+        wire.until(lambda: not former.open, "and not at the former one")
+    assert set(devices_of(running)["d0"].subscribers) == {"hmi", "log"}
+
+
+def test_settings_of_a_shared_connection_that_change_are_adopted(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    running = node("a")
+    share(running)
+    url = f"tcp://127.0.0.1:{judges.devices[0].port}"
+    for number in range(2):
+        request = wanted(judges.devices[0], number, url=url, unitId=number + 1)
+        del request["host"], request["port"]
+        assert caller.request("modbus.subscribe", request)["success"]
+    for key in (D0, D1):
+        caller.put(WANTS, key, caller.text(WANTS, key).replace(url, f"{url}?retries=1"))
+
+    def are_adopted() -> bool:
+        devices = devices_of(running).values()
+        return [each.source.target.tolerance.retries for each in devices] == [1, 1]
+
+    wire.until(are_adopted, "both have the new settings")
+
+
+def test_a_refused_device_is_not_polled_as_it_was_before(
+    node: Callable[..., Running], caller: Caller, judges: Judges, own_nats: NatsServer
+) -> None:
+    running = node("a")
+    share(running)
+    assert caller.request("modbus.subscribe", wanted(judges.devices[0]))["success"]
+    wire.until(lambda: bool(judges.devices[0].open), "it is connected")
+
+    def shown() -> tuple[int, int]:
+        result = invoke("fleet", "status", FLEET, "--nats", own_nats.url, "--json")
+        return result.exit_code, json.loads(result.stdout)["nodes"][0]["refused"]
+
+    good = caller.text(WANTS, D0)
+    caller.put(WANTS, D0, good.replace("uint16", "uint17"))
+    wire.until(lambda: not judges.devices[0].open, "it is not polled")
+    wire.until(lambda: shown() == (3, 1), "it is shown as refused")
+    answer = caller.request("modbus.subscribe", wanted(judges.devices[0], subscriberId="log"))
+    assert "the fleet's subscriptions of d0: " in answer["error"]
+    assert "uint17" in caller.text(WANTS, D0)
+    caller.put(WANTS, D0, good)
+    wire.until(lambda: bool(judges.devices[0].open), "it is connected again")
+    wire.until(lambda: shown() == (0, 0), "it is not shown any more")
+
+
+def devices_of(running: Running) -> dict[str, ScannedDevice]:
+    return registry_of(running.scanner).devices.copy()
 
 
 def test_a_command_reaches_the_device_whoever_receives_it(

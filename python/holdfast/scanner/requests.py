@@ -222,10 +222,30 @@ class Requests:
         `desired` has the requests of each subscriber; other subscribers are removed. The `ttl` of
         `renewed` subscribers starts again. Raises `Refused`.
         """
+        self._keep_subscribers(device, desired)
+        try:
+            await self._adopt(device, desired, renewed)
+        except Refused:
+            if device not in self._registry.devices:
+                raise
+            # Several subscribers have changed the device together: what one of them has now
+            # contradicts what is known here of the next one. So all of them begin anew.
+            self._keep_subscribers(device, ())
+            await self._adopt(device, desired, desired)
+
+    def _keep_subscribers(self, device: str, subscribers: Collection[str]) -> None:
+        """Removes the other subscribers of a device."""
         known = self._registry.devices.get(device)
         for subscriber in [] if known is None else list(known.subscribers):
-            if subscriber not in desired:
+            if subscriber not in subscribers:
                 self._devices.remove(UnsubscribeRequest(device, subscriber))
+
+    async def _adopt(
+        self,
+        device: str,
+        desired: Mapping[str, Sequence[SubscribeRequest]],
+        renewed: Collection[str],
+    ) -> None:
         for subscriber, requests in desired.items():
             tags: set[str] = set()
             for request in requests:

@@ -19,7 +19,17 @@ from holdfast.net import event_loop
 from holdfast.net.nats.connection import Servers
 from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
 
-_HEAD = ("node", "state", "partitions", "devices", "tags", "scans/s", "missed", "version")
+_HEAD = (
+    "node",
+    "state",
+    "partitions",
+    "devices",
+    "tags",
+    "refused",
+    "scans/s",
+    "missed",
+    "version",
+)
 _SAMPLE_INTERVAL_S = 1.0
 """Between two samples, from which rates are calculated."""
 
@@ -38,7 +48,7 @@ def status(fleet: str, servers: Servers, as_json: bool, watch: bool) -> None:
     """Show the nodes of the fleet NAME, and what each of them does.
 
     Exit codes: 0 every partition has a node, 1 NATS can't be reached or has no such fleet, 3 there
-    is no live node, or a partition has none.
+    is no live node, a partition has none, or a node refuses a device.
     """
     try:
         is_well = event_loop.run(_status(fleet, servers, as_json, watch))
@@ -66,7 +76,9 @@ async def _status(name: str, servers: Servers, as_json: bool, watch: bool) -> bo
                 click.echo("\n".join(_lines(shown)))
             before, at = now, time.monotonic()
             if not watch:
-                return bool(shown["nodes"]) and not shown["free_partitions"]
+                nodes = shown["nodes"]
+                refused = sum(node["refused"] for node in nodes)
+                return bool(nodes) and not (shown["free_partitions"] or refused)
 
 
 def _lines(shown: dict[str, Any]) -> list[str]:
@@ -79,6 +91,7 @@ def _lines(shown: dict[str, Any]) -> list[str]:
             str(node["partitions"]),
             str(node["devices"]),
             str(node["tags"]),
+            str(node["refused"]),
             f"{node['scans_per_second']:.1f}",
             str(node["missed"]),
             node["version"],

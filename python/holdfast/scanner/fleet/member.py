@@ -32,7 +32,7 @@ from holdfast.scanner.jetstream.entries import restored
 from holdfast.scanner.placement import Changed, Placement
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Awaitable, Callable, Collection, Iterator
 
     from nats.aio.client import Client
 
@@ -91,7 +91,8 @@ class FleetMember(Placement):
         self._has_new_client = asyncio.Event()
         self._has_touched = asyncio.Event()
         self._touched: set[str] = set()
-        self._failed: set[str] = set()
+        self._refused: set[str] = set()
+        """The devices whose subscriptions are refused here. This node does not know them."""
         self._renewed: dict[str, dict[str, int]] = {}
         """When subscribers with a time to live have renewed it, by device and subscriber."""
         self._devices: dict[int, dict[str, ScannedDevice]] = {}
@@ -151,8 +152,7 @@ class FleetMember(Placement):
 
     async def _read(self, ready: asyncio.Event) -> None:
         await self.desired.is_read.wait()
-        for device in self.desired.devices:
-            await self._adopt(device)
+        await self._adopt_all(self.desired.devices)
         ready.set()
 
     async def _follow_again(self) -> None:
@@ -181,13 +181,23 @@ class FleetMember(Placement):
 
     async def _adopt_changes(self) -> None:
         """Carries out what other nodes have stored."""
+        retry_at = 0.0
         while True:
             await tasks.within(ADOPT_RETRY_S, self._has_touched.wait())
             self._has_touched.clear()
-            if not self._touched:
-                self._touched, self._failed = self._failed, set()
             touched, self._touched = self._touched, set()
-            for device in touched:
+            if (now := time.monotonic()) >= retry_at:
+                touched |= self._refused
+                retry_at = now + ADOPT_RETRY_S
+            await self._adopt_all(touched)
+
+    async def _adopt_all(self, devices: Collection[str]) -> None:
+        for device in devices:
+            await self._adopt(device)
+        # One that comes later may have been in the way, as on a connection with other settings.
+        refused = self._refused.intersection(devices)
+        if len(refused) < len(devices):
+            for device in refused:
                 await self._adopt(device)
 
     def _on_change(self, device: str) -> None:
@@ -199,7 +209,8 @@ class FleetMember(Placement):
             await self._adopt_now(device)
 
     async def _adopt_now(self, device: str) -> Refused | None:
-        """Returns why it is refused here."""
+        """Returns why it is refused here. Then this node does not know the device any more."""
+        self._refused.discard(device)
         revision, desired = self.desired.value(device)
         times = {} if desired is None else desired.renewed
         before = self._renewed.get(device, {})
@@ -212,7 +223,11 @@ class FleetMember(Placement):
             await self._subscription_host.adopt(device, by_subscriber, renewed)
         except Refused as refused:
             log_lines.refused("not_restored", kind="fleet", device=device, reason=str(refused))
-            self._failed.add(device)
+            self._refused.add(device)
+            # What it was before must not go on: programs count on the new address and tags.
+            await self._subscription_host.adopt(device, {}, set())
+            self._applied.pop(device, None)
+            self._renewed.pop(device, None)
             return refused
         self._applied[device] = revision
         self._note_renewed(device, times)
@@ -324,6 +339,11 @@ class FleetMember(Placement):
     def is_current(self, device: ScannedDevice, epoch: int) -> bool:
         """Whether this node has the lease of a device since that revision, or a later one."""
         return self.is_own(device) and self.fleet.revision(device.partition) >= epoch
+
+    @property
+    def refused(self) -> int:
+        """How many devices of the fleet are refused here."""
+        return len(self._refused)
 
     @property
     def own(self) -> Iterator[ScannedDevice]:

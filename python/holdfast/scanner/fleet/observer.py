@@ -62,6 +62,7 @@ class Seen:
                     "partitions": sum(node == name for node in self.partitions.values()),
                     "devices": about.get("devices", 0),
                     "tags": about.get("tags", 0),
+                    "refused": about.get("refused", 0),
                     "scans_per_second": round(max(scans, 0) / seconds, 1),
                     "missed": about.get("missed", 0),
                     "lost": about.get("lost", 0),

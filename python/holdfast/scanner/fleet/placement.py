@@ -163,5 +163,6 @@ class FleetPlacement(FleetMember):
             "version": _core.__version__,
             "devices": len(own),
             "tags": sum(len(device.tags) for device in own),
+            "refused": self.refused,
             **self._counts(),
         }
