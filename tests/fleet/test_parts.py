@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +12,13 @@ import pytest
 from nats.errors import TimeoutError as NoAnswer
 
 from holdfast.net.nats import batch
+from holdfast.net.nats.connection import Servers
 from holdfast.net.nats.outbox import Outbox
 from holdfast.scanner.fleet import desired_state
 from holdfast.scanner.fleet.agreement import Terms
 from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
+from holdfast.scanner.settings import FleetSettings, Settings
+from holdfast.tags import Tag, TagList
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -65,6 +69,29 @@ def test_the_first_difference_of_terms_is_named() -> None:
     assert TERMS.difference(TERMS) is None
     other = msgspec.structs.replace(TERMS, strict=True)
     assert TERMS.difference(other) == "strict is False, and True in the fleet"
+
+
+def test_a_profile_with_other_tags_is_a_difference() -> None:
+    def terms(**addresses: int) -> Terms:
+        profiles = {
+            name: TagList([Tag("power", "holding_registers", address)])
+            for name, address in addresses.items()
+        }
+        fleet = FleetSettings("plant", "a", 16)
+        return Terms.of(Settings(Servers(), fleet=fleet, profiles=profiles), fleet)
+
+    own = terms(meter=0, pump=0)
+    assert own.difference(terms(pump=0, meter=0)) is None
+    found = own.difference(terms(meter=10, pump=0))
+    assert found is not None
+    assert re.sub("[0-9a-f]{16}", "N", found) == (
+        "profiles is meter (tags N), and meter (tags N) in the fleet"
+    )
+    found = own.difference(terms(meter=0))
+    assert found is not None
+    assert re.sub("[0-9a-f]{16}", "N", found) == (
+        "profiles is pump (tags N), and no others in the fleet"
+    )
 
 
 class Bucket:
