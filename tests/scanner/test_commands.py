@@ -7,18 +7,21 @@ import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from nats.errors import NoRespondersError
 
+from holdfast.scanner import service
 from holdfast.scanner.commands import value
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.subscriptions.request_rules import ScannerLimits
 from holdfast.scanner.subscriptions.tag import Tag
 from support import wire
 from support.fake_device import FakeDevice, exception, registers
-from support.nats_bus import leaving, subscription, tag
+from support.nats_bus import Caller, leaving, subscription, tag
 
 if TYPE_CHECKING:
     import holdfast
-    from support.nats_bus import Caller, Run
+    from support.brokers import NatsServer
+    from support.nats_bus import Run
 
 
 @pytest.fixture(autouse=True)
@@ -260,6 +263,60 @@ def test_a_write_is_answered_when_the_device_has_confirmed_it(caller: Caller) ->
         asking.join()
         assert answered == [{"success": True}]
         caller.request("modbus.unsubscribe", leaving("a", subscriberId="x"))
+
+
+@pytest.mark.parametrize("is_confirmed", [True, False])
+def test_a_command_is_answered_while_the_scanner_stops(
+    own_nats: NatsServer,
+    run_scanner: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    is_confirmed: bool,
+) -> None:
+    written, go_on = threading.Event(), threading.Event()
+
+    def answer(pdu: bytes) -> bytes:
+        if pdu[0] == 6:
+            written.set()
+            assert go_on.wait(wire.DEADLINE)
+            return pdu
+        return registers(pdu)
+
+    def takes_nothing(caller: Caller) -> bool:
+        try:
+            caller.request("modbus.browse", "")
+        except NoRespondersError:
+            return True
+        return False
+
+    if not is_confirmed:
+        monkeypatch.setattr(service, "REQUESTS_TIMEOUT_S", 0.01)
+    answered: list[Any] = []
+    scanner = run_scanner(own_nats)
+    with FakeDevice(answer) as plc, Caller(own_nats.url) as caller:
+        request = {
+            "deviceId": "plc1",
+            "subscriberId": "x",
+            "url": plc.url,
+            "timeout": 30_000,
+            "scanRate": 60_000,
+            "tags": [tag("a", 0, writable=True)],
+        }
+        assert caller.request("modbus.subscribe", request)["success"]
+        asking = threading.Thread(
+            target=lambda: answered.append(caller.request("modbus.command.a", "1"))
+        )
+        asking.start()
+        assert written.wait(wire.DEADLINE)
+        stopping = threading.Thread(target=scanner.stop)
+        stopping.start()
+        wire.until(lambda: takes_nothing(caller), "it takes no further requests")
+        if not is_confirmed:
+            asking.join()
+        go_on.set()
+        asking.join()
+        stopping.join()
+    said = {"success": False, "error": "not confirmed: the scanner is stopping"}
+    assert answered == [{"success": True} if is_confirmed else said]
 
 
 def test_what_the_device_refuses_is_told(caller: Caller) -> None:

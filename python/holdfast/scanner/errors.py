@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+STOPPING = "the scanner is stopping"
+
 
 class Refused(Exception):
     """A request was refused; nothing has changed. The message is sent to the caller."""

@@ -11,7 +11,8 @@ import msgspec
 
 from holdfast.events import log_lines
 from holdfast.net.nats import batch
-from holdfast.scanner.errors import Refused
+from holdfast.runtime import tasks
+from holdfast.scanner.errors import STOPPING, Refused
 from holdfast.scanner.messages.types import Answer, BrowseAnswer
 
 if TYPE_CHECKING:
@@ -73,20 +74,27 @@ class Responder:
                 "request_refused", kind=kind, subject=message.subject, reason=str(refused)
             )
             return Answer(success=False, error=str(refused))
+        except asyncio.CancelledError:  # By `end`, while the caller waits.
+            outcome = "not written" if kind == "command" else "not confirmed"
+            return Answer(success=False, error=f"{outcome}: {STOPPING}")
         except Exception as error:  # An error in one request must not stop the service.
             log_lines.problem("request_failed", subject=message.subject)
             return Answer(success=False, error=f"internal error: {type(error).__name__}")
 
     def begin(self, work: Coroutine[Any, Any, None]) -> None:
-        """Runs a task that `cancel` ends."""
+        """Runs a task that `end` ends."""
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    def cancel(self) -> None:
-        """Ends all tasks."""
-        for task in list(self._tasks):
-            task.cancel()
+    async def finish(self, within_s: float) -> None:
+        """Waits until all tasks have ended, or for this time."""
+        if self._tasks:
+            await asyncio.wait(self._tasks, timeout=within_s)
+
+    async def end(self) -> None:
+        """Ends all tasks. Requests that are still being carried out are answered."""
+        await tasks.end(self._tasks)
 
     @contextlib.asynccontextmanager
     async def in_order(self, message: Msg, *, is_large: bool = False) -> AsyncIterator[None]:

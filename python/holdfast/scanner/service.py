@@ -43,6 +43,10 @@ if TYPE_CHECKING:
 STOP_STEP_TIMEOUT_S = 2.0
 """Timeout of each step of a stop."""
 
+REQUESTS_TIMEOUT_S = 3.0
+"""Timeout at a stop of the requests that are being carried out: that of a device, by default. An
+appliance waits 5 s for all of the stop."""
+
 
 class Scanner:
     """One service, from `run` to its end."""
@@ -225,9 +229,11 @@ class Scanner:
         """Stops all parts, each with a timeout."""
         # First nothing new may begin; then other nodes take over while this one still polls.
         self._buckets.connected(None)
+        await tasks.within(STOP_STEP_TIMEOUT_S, self._broker.drain())
         await self._placement.leave()
+        await self._responder.finish(REQUESTS_TIMEOUT_S)
         await tasks.within(STOP_STEP_TIMEOUT_S, self._polling.stop())
-        self._responder.cancel()
+        await tasks.within(STOP_STEP_TIMEOUT_S, self._responder.end())
         await tasks.within(STOP_STEP_TIMEOUT_S, self._publish_end())
         await tasks.within(STOP_STEP_TIMEOUT_S, tasks.end(running))
 

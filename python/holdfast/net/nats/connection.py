@@ -31,6 +31,7 @@ from holdfast.runtime.backoff import Backoff
 if TYPE_CHECKING:
     from nats.aio.client import Client
     from nats.aio.msg import Msg
+    from nats.aio.subscription import Subscription
 
 Handler: TypeAlias = "Callable[[Msg], Awaitable[None]]"
 
@@ -131,6 +132,7 @@ class Broker:
         self.client: SafeClient | None = None
         """The client while there is a connection."""
         self._subscribed = False
+        self._subscriptions: list[Subscription] = []
 
     @property
     def serves(self) -> bool:
@@ -156,6 +158,12 @@ class Broker:
                 self._note_lost("stopped")
                 await _closed(client)
             await asyncio.sleep(self._pause_s)
+
+    async def drain(self) -> None:
+        """Takes no further messages. Handlers are called for all that the server has sent."""
+        if self.client is not None:
+            with contextlib.suppress(Error, OSError):
+                await self.client.drain_all(self._subscriptions)
 
     async def _connect(self, client: SafeClient, ended: asyncio.Event) -> None:
         """Connects and subscribes; returns when nats-py gives up, which sets `ended`."""
@@ -202,10 +210,12 @@ class Broker:
 
     async def _listen(self, client: Client, ended: asyncio.Event) -> None:
         """Subscribes to all subjects. Sets `ended` on failure."""
+        self._subscriptions = []
         try:
             for subject, handler in self.handlers.items():
                 queue = self.queue if subject in self.shared else ""
-                await client.subscribe(subject, queue=queue, cb=handler)
+                made = await client.subscribe(subject, queue=queue, cb=handler)
+                self._subscriptions.append(made)
             # nats-py may send the ping of a flush before what is still in its buffer. At the end of
             # the first flush, the buffer is sent; the second one waits until the server has it.
             await client.flush()

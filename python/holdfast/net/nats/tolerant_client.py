@@ -31,8 +31,10 @@ from holdfast.net.tls import NO_FILES, Tls
 from holdfast.runtime.standstill import now
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Iterable
     from urllib.parse import ParseResult
+
+    from nats.aio.subscription import Subscription
 
 END = b"\r\n"
 CHUNK_BYTES = 65_536
@@ -348,6 +350,18 @@ class SafeClient(Client):
         """Whether the task of nats-py has failed that makes the connection again."""
         task = self._reconnection_task
         return self.is_reconnecting and task is not None and task.done()
+
+    async def drain_all(self, subscriptions: Iterable[Subscription]) -> None:
+        """Ends subscriptions, after the handlers were called for all that the server has sent."""
+        subscriptions = tuple(subscriptions)
+        for each in subscriptions:
+            await self._send_unsubscribe(each._id)
+        # nats-py sends the ping of a flush before what is still in its buffer, so that `drain`
+        # alone loses messages.
+        await self.flush()
+        await self.flush()
+        for each in subscriptions:
+            await each.drain()  # type: ignore[no-untyped-call]
 
     async def prove(self, since: float) -> None:
         """Pings the server, unless that was done after `since`."""

@@ -15,7 +15,7 @@ from nats.errors import TimeoutError as NoAnswer
 from holdfast.events import log_lines
 from holdfast.net.nats.connection import nats_reason
 from holdfast.runtime.malformed_json import MALFORMED_JSON
-from holdfast.scanner.errors import Moved, Refused
+from holdfast.scanner.errors import STOPPING, Moved, Refused
 from holdfast.scanner.reports.variables import joined
 
 if TYPE_CHECKING:
@@ -139,6 +139,8 @@ class OtherNodes:
             return f"node {owner.node} is gone"
         except (Error, OSError):
             raise Refused(f"not confirmed: node {owner.node} did not answer") from None
+        except asyncio.CancelledError:  # By the end of the responder.
+            raise Refused(f"not confirmed: {STOPPING}") from None
         if done.moved:
             return f"{device.id} moves from node {owner.node} to another one"
         if done.error is not None:

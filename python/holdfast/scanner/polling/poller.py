@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast import _core
-from holdfast.scanner.errors import Refused
+from holdfast.scanner.errors import STOPPING, Refused
 from holdfast.types import PolledBlock
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class Polling:
         polling is paused, it is polled when that ends. Raises `Refused` after `stop`.
         """
         if self._stopping.is_set():
-            raise Refused("the scanner is stopping")
+            raise Refused(STOPPING)
         if self._paused is not None:
             self._paused.add(device)
             return
@@ -175,7 +175,7 @@ class Polling:
         Raises `Refused` while polling is paused, and after `stop`.
         """
         if self._stopping.is_set():
-            raise Refused("the scanner is stopping")
+            raise Refused(f"not written: {STOPPING}")
         if self._paused is not None:
             raise Refused("not written: the scanner is disabled")
         number = self._poller.write(device.polled_as, request, self._results, within=within)
@@ -183,6 +183,8 @@ class Polling:
         self._writes[number] = done
         try:
             return await done
+        except asyncio.CancelledError:  # By the end of the responder. It may have been sent.
+            raise Refused(f"not confirmed: {STOPPING}") from None
         finally:
             del self._writes[number]
 
