@@ -239,6 +239,30 @@ def test_a_new_password_is_used_after_sighup_and_a_wrong_file_changes_nothing(
         own.kill()
 
 
+@pytest.mark.parametrize("keep", [True, False])
+def test_after_sighup_subscriptions_go_on_without_jetstream(
+    start: Start, tmp_path: Path, server: holdfast.Server, keep: bool
+) -> None:
+    options = ("--user", "scan", "--pass", "s3cret")
+    own = NatsServer(tmp_path, *options, jetstream=not keep)
+    try:
+        password = tmp_path / "password"
+        password.write_text("s3cret")
+        files = ("--user", "scan", "--password-file", str(password))
+        more = () if keep else ("--no-keep-subscriptions",)
+        process = start("--nats", own.url, *files, *more)
+        connected(process)
+        with Caller(own.url.replace("//", "//scan:s3cret@")) as caller:
+            _subscribe(caller, server)
+            password.write_text("s3cret\n")
+            process.send_signal(signal.SIGHUP)
+            assert "changed=files" in _await_line(process, "reloaded")
+            _await_line(process, "restored")
+            caller.listen("modbus.data.plc1").next()
+    finally:
+        own.kill()
+
+
 def _await_line(process: Command, event: str) -> str:
     """The next line of the log that has this event."""
     assert process.stderr is not None

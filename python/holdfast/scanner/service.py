@@ -12,8 +12,10 @@ from holdfast.net.nats.connection import Broker
 from holdfast.runtime import tasks
 from holdfast.scanner.commands import Commands
 from holdfast.scanner.dialects import DIALECTS, Dialect
+from holdfast.scanner.errors import Refused
 from holdfast.scanner.fleet.placement import FleetPlacement
 from holdfast.scanner.jetstream.buckets import Buckets, TentacleNextBuckets
+from holdfast.scanner.jetstream.entries import requests, restored
 from holdfast.scanner.jetstream.restore import StoredSubscriptions
 from holdfast.scanner.placement import Placement
 from holdfast.scanner.polling import device_tls
@@ -30,7 +32,7 @@ from holdfast.scanner.subscriptions.registry import Registry
 from holdfast.scanner.subscriptions.request_rules import Rules
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from nats.aio.msg import Msg
 
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     from holdfast.net.nats.connection import Handler
     from holdfast.net.nats.tolerant_client import SafeClient
     from holdfast.replication.leases.thread import StartThread
+    from holdfast.scanner.messages.types import SubscribeRequest
     from holdfast.scanner.settings import Settings
 
 STOP_STEP_TIMEOUT_S = 2.0
@@ -56,9 +59,14 @@ class Scanner:
         settings: Settings,
         poller: Poller | None = None,
         start_thread: StartThread = threading.Thread.start,
+        former: Iterable[SubscribeRequest] = (),
     ) -> None:
-        """Without `poller`, it has a poller of its own. `start_thread` is for leases."""
+        """Without `poller`, it has a poller of its own. `start_thread` is for leases.
+
+        It begins with the subscriptions of a `former` scanner: its `stored_requests`.
+        """
         self._settings = settings
+        self._former = former
         self._ended = asyncio.Event()
         self._ready = asyncio.Event()
         """Set when the stored subscriptions are restored, or can't be."""
@@ -133,6 +141,8 @@ class Scanner:
         """
         device_tls.check(self._settings.device_tls)
         self._polling.start(self._devices.on_poll)
+        # Before requests arrive, which may end what is restored.
+        await self._restore_former()
         works = [
             self._buckets.run(self._requests),  # First: it may pause polling.
             self._broker.run(),
@@ -154,6 +164,26 @@ class Scanner:
         finally:
             await self._stop(running)
             log_lines.LOGGER.removeHandler(log_mirror)
+
+    async def _restore_former(self) -> None:
+        if self._settings.fleet is None:  # A fleet has stored all of them.
+            await asyncio.gather(*map(self._restore, self._former))
+
+    async def _restore(self, request: SubscribeRequest) -> None:
+        about = {"device": request.device_id, "subscriber": request.subscriber_id}
+        try:
+            await self._requests.restore(request)
+        except Refused as refused:
+            log_lines.write(logging.WARNING, "not_restored", **about, reason=str(refused))
+        else:
+            log_lines.write(logging.INFO, "restored", **about, tags=len(request.tags))
+
+    def stored_requests(self) -> Iterator[SubscribeRequest]:
+        """Yields requests that make the subscriptions, except those from entries of a bucket."""
+        for device in self._registry.devices.values():
+            for subscriber in device.subscribers:
+                if not self._requests.is_entry(device.id, subscriber):
+                    yield from map(restored, requests(device, subscriber))
 
     @property
     def serves(self) -> bool:

@@ -73,10 +73,11 @@ from holdfast.scanner.settings import FleetSettings, Settings, places
 from holdfast.scanner.subscriptions.request_rules import Defaults, ScannerLimits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from holdfast.net.allow_list import AllowEntry
     from holdfast.net.tls import Tls
+    from holdfast.scanner.messages.types import SubscribeRequest
 
 
 class _Timeout(Duration):
@@ -240,15 +241,24 @@ async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
     signals = Signals(reload="with a terminal")
     log_lines.write(logging.INFO, "started", version=__version__)
     spare_what_stays()
-    while await _scan(settings, check, signals):
-        pass
+    former: Iterable[SubscribeRequest] | None = ()
+    while former is not None:
+        former = await _scan(settings, check, signals, former)
     log_lines.tell_held_back(all_of_them=True)
     log_lines.write(logging.INFO, "stopped")
 
 
-async def _scan(settings: Settings, check: Callable[[], None] | None, signals: Signals) -> bool:
-    """Runs a scanner. Returns whether it ended because of files that have changed."""
-    scanner, known, clock = Scanner(settings), _contents(settings), WallClock()
+async def _scan(
+    settings: Settings,
+    check: Callable[[], None] | None,
+    signals: Signals,
+    former: Iterable[SubscribeRequest],
+) -> Iterable[SubscribeRequest] | None:
+    """Runs a scanner with the subscriptions of a former one.
+
+    Returns its own if it ended because of files that have changed.
+    """
+    scanner, known, clock = Scanner(settings, former=former), _contents(settings), WallClock()
     running = asyncio.create_task(scanner.run())
     changed = False
     reading: FileWork[bool] | None = None
@@ -274,7 +284,7 @@ async def _scan(settings: Settings, check: Callable[[], None] | None, signals: S
         elif reading is None and signals.take_reload():
             reading = FileWork(lambda: _has_changed(settings, known))
     await running
-    return changed and not signals.received
+    return scanner.stored_requests() if changed and not signals.received else None
 
 
 def _contents(settings: Settings) -> str:
