@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
+import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 import holdfast
-from support import transports
-from support.fake_device import FakeDevice, registers
+from support import transports, wire
+from support.fake_device import FakeDevice, Stream, registers
 from support.running import endpoint
 
 if TYPE_CHECKING:
@@ -104,3 +105,26 @@ def test_the_trace_cannot_use_its_client() -> None:
     with FakeDevice(registers) as device, holdfast.SyncClient(device.url, trace=trace) as plc:
         assert plc.read_holding_registers(7, 2) == [0, 0]
     assert len(refused) == 2
+
+
+def test_a_trace_within_a_call_of_another_trace_cannot_use_the_client_of_either() -> None:
+    refused: list[str] = []
+
+    def inner_trace(direction: str, _data: bytes) -> None:
+        for plc in (outer, inner):
+            with pytest.raises(RuntimeError, match="a trace can't use it"):
+                plc.read_coils(0, 1)
+            refused.append(direction)
+
+    def outer_trace(_direction: str, _data: bytes) -> None:
+        assert inner.read_holding_registers(7, 2) == [7, 8]
+
+    with Stream("tcp") as device:
+        outer = holdfast.SyncClient(device.url, trace=outer_trace)
+        inner = holdfast.SyncClient(device.url, trace=inner_trace)
+        call = threading.Thread(target=outer.read_holding_registers, args=(7, 2), daemon=True)
+        call.start()
+        call.join(wire.DEADLINE)
+        assert refused == ["sent", "sent", "received", "received"] * 2
+        inner.close()
+        outer.close()

@@ -1,6 +1,6 @@
 //! `Request`, `Endpoint` and `BlockingClient`: requests, and their results or exceptions.
 
-use std::cell::Cell;
+use std::cell::RefCell;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
@@ -402,8 +402,9 @@ impl BlockingClient {
 }
 
 thread_local! {
-    /// The client with a call in this thread, as an address; 0 is none. Signal handlers and the trace run in it.
-    static CALLING: Cell<usize> = const { Cell::new(0) };
+    /// The clients with a call in this thread, as addresses. Signal handlers and the trace run within
+    /// a call: one that called its client, directly or within a call of another, would wait for ever.
+    static CALLING: RefCell<Vec<usize>> = const { RefCell::new(Vec::new()) };
 }
 
 impl BlockingClient {
@@ -420,14 +421,14 @@ impl BlockingClient {
         work: impl FnOnce(&mut dyn FnMut() -> bool) -> T + Send,
     ) -> PyResult<T> {
         let me = std::ptr::from_ref(self).addr();
-        if CALLING.get() == me {
+        if CALLING.with_borrow(|clients| clients.contains(&me)) {
             let message =
                 "this client is waiting for a reply: a signal handler or a trace can't use it";
             return Err(PyRuntimeError::new_err(message));
         }
         let mut raised = None;
         let ended = self.ended.load(Ordering::Relaxed);
-        let before = CALLING.replace(me);
+        CALLING.with_borrow_mut(|clients| clients.push(me));
         let result = py.detach(|| {
             work(&mut || {
                 if self.ended.load(Ordering::Relaxed) != ended {
@@ -437,7 +438,7 @@ impl BlockingClient {
                 raised.is_some()
             })
         });
-        CALLING.set(before);
+        CALLING.with_borrow_mut(Vec::pop);
         let raised = raised.or_else(|| lock(&self.interrupt).take());
         raised.map_or(Ok(result), Err)
     }
