@@ -16,6 +16,7 @@ from holdfast.polling.faults import NO_CONNECTION
 from holdfast.tags.scale import RegisterScale
 from support import wire
 from support.brokers import free_port
+from support.fake_device import Asked, Stream, good
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -303,6 +304,43 @@ def test_a_batch_that_a_cancelled_task_waited_for_is_not_lost(device: holdfast.S
         assert [batch async for batch in made] == []
 
     asyncio.run(steps())
+
+
+def test_a_batch_that_a_closed_event_loop_waited_for_is_not_lost(
+    device: holdfast.Server, poller: Poller
+) -> None:
+    async def first() -> list[Reading]:
+        return list(await anext(aiter(poller)))
+
+    async def given_up() -> None:
+        waiting = asyncio.ensure_future(first())
+        await asyncio.sleep(0)
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+
+    loop = asyncio.new_event_loop()
+    loop.run_until_complete(given_up())
+    loop.close()
+    poller.add(url(device), {"x": ("coils", 3)}, interval=3600)
+    [reading] = asyncio.run(asyncio.wait_for(first(), wire.DEADLINE))
+    assert reading.value is True
+
+
+def test_a_write_that_a_close_has_interrupted_may_have_been_carried_out(poller: Poller) -> None:
+    def close(asked: Asked) -> None:
+        poller.close()
+        asked.answer()
+
+    reads = {"x": ("holding_registers", 5)}
+    with Stream("tcp", good, then=close) as server:
+        poller.add(server.url, reads, name="oven", interval=3600, timeout=wire.DEADLINE)
+        taken(poller)
+        with pytest.raises(WriteFailed, match=r"oven\.x: the connection was lost"):
+            poller.write("oven", "x", 1)
+    assert [asked.pdu[0] for asked in server.requests] == [3, 6]
+    with pytest.raises(RuntimeError):
+        poller.write("oven", "x", 1)
 
 
 def test_a_scale_in_a_register_is_that_of_the_same_poll(

@@ -12,6 +12,7 @@ another code is an exception of the device.
 
 NO_CONNECTION = FAULTS["refused"]
 UNREACHABLE = FAULTS["unreachable"]
+LOST = FAULTS["reset"]
 STANDBY = FAULTS["standby"]
 EXPIRED = FAULTS["expired"]
 
@@ -20,7 +21,7 @@ _TEXTS = {
     FAULTS["timeout"]: "no reply in time",
     NO_CONNECTION: "no connection",
     UNREACHABLE: "the device can't be reached",
-    FAULTS["reset"]: "the connection was lost",
+    LOST: "the connection was lost",
     FAULTS["invalid reply"]: "an invalid reply",
     FAULTS["no plan"]: "no plan to read the device",
     FAULTS["not stored"]: "memory refused the values",

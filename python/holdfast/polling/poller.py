@@ -13,15 +13,15 @@ from holdfast.client.base import BROADCAST, DEFAULT_TIMEOUT_S, is_broadcast
 from holdfast.client.endpoint import endpoint
 from holdfast.client.requests import write_typed
 from holdfast.client.url import parse
-from holdfast.polling.faults import fault_text
+from holdfast.polling.faults import LOST, fault_text
 from holdfast.polling.readings import Batch, Reader
 from holdfast.protocol import READ_BITS, READ_REGISTERS
 from holdfast.tags import Tag, TagList
 from holdfast.tags.read_gap import DEFAULT_MAX_GAP
 
 if TYPE_CHECKING:
-    import asyncio
     from collections.abc import AsyncIterator, Iterator, Mapping
+    from concurrent.futures import Future, ThreadPoolExecutor
 
     from holdfast.polling.readings import DevicePoll
 
@@ -71,7 +71,9 @@ class Poller:
         """A device that is added again has a new one: polls of the earlier device may be queued."""
         self._names = itertools.count(1)
         self._generations = itertools.count(1)
-        self._pending: asyncio.Future[Batch | None] | None = None
+        self._executor: ThreadPoolExecutor | None = None
+        self._pending: Future[Batch | None] | None = None
+        """Of no event loop: the next iteration may be in another one."""
         self._has_ended = False
         self._queued: deque[tuple[str, float, list[Any]]] = deque()
 
@@ -145,7 +147,7 @@ class Poller:
 
         Returns when the device has confirmed it. Raises `KeyError` for an unknown device or tag,
         `ValueError` for a tag that is not `writable` or a value that does not fit, `WriteFailed`,
-        and `RuntimeError` after `close`.
+        also for a `close` meanwhile, and `RuntimeError` after `close`.
         """
         core_name = self._core_names[name]
         of = self._readers[core_name].named.get(tag)
@@ -161,8 +163,8 @@ class Poller:
         number = self._poller.write(core_name, request, writing)
         while True:
             results = writing.take(SIGNAL_CHECK_S)
-            if results is None:
-                raise RuntimeError("the poller has been closed")
+            if results is None:  # The poller was closed meanwhile.
+                raise WriteFailed(name, tag, LOST)
             for done, fault in results[1]:
                 if done == number and fault:
                     raise WriteFailed(name, tag, fault)
@@ -226,13 +228,15 @@ class Poller:
 
     async def __aiter__(self) -> AsyncIterator[Batch]:
         import asyncio  # Who iterates over it without a loop does not need it.
+        from concurrent.futures import ThreadPoolExecutor
 
+        if self._executor is None:
+            self._executor = ThreadPoolExecutor(1, "holdfast-poller")
         while True:
-            if self._pending is None:
-                loop = asyncio.get_running_loop()
-                self._pending = loop.run_in_executor(None, self.take, ABANDON_CHECK_S)
-            # A batch that nobody waits for any more is the first of the next iteration.
-            batch = await asyncio.shield(self._pending)
+            if self._pending is None or self._pending.cancelled():
+                self._pending = self._executor.submit(self.take, ABANDON_CHECK_S)
+            # One that runs can't be cancelled: its batch is the first of the next iteration.
+            batch = await asyncio.wrap_future(self._pending)
             self._pending = None
             if batch is not None:
                 yield batch
