@@ -40,6 +40,19 @@ def described(server: holdfast.Server, **options: Any) -> Description:
     return found
 
 
+def test_every_read_has_the_unit_of_the_description(serve: Serve) -> None:
+    other = holdfast.Memory(holding_registers=10)
+    memory = holdfast.Memory(holding_registers=20, coils=3)
+    memory.write("holding_registers", 0, [555] * 20)
+    found = Description(5, Survey(span=range(100)))
+    with holdfast.SyncClient(cli.url(serve({1: other, 5: memory}))) as client:
+        description.describe(found, client, reads=1, every=1, delay=0)
+    assert found.reads == {
+        ("holding_registers", range(20)): [[555] * 20],
+        ("coils", range(3)): [[0] * 3],
+    }
+
+
 def types(found: Description) -> dict[str, tuple[str, str]]:
     return {each.tag.name: (each.tag.type, each.tag.order) for each in found.tags}
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from holdfast.discovery import (
@@ -98,10 +99,10 @@ def describe(
     """
     found.identity = device_search.identify(client, found.unit)
     if any(each.area == "holding_registers" for each in found.survey.areas):
-        found.sunspec = sunspec.find(client.read_holding_registers)
+        found.sunspec = sunspec.find(partial(client.read_holding_registers, unit=found.unit))
 
     def read(area: Area, address: int, kind: str) -> None:
-        content: list[int] = client.read(area, address, kind)
+        content: list[int] = client.read(area, address, kind, unit=found.unit)
         found.seen.setdefault(area, {}).update(enumerate(content, address))
 
     address_search.run_sync(found.survey, read, progress, delay=delay)
@@ -115,7 +116,7 @@ def describe(
             if (area, extent) in found.unread:
                 continue
             try:
-                content = list(_contents(client, area, extent, largest, delay))
+                content = list(_contents(client, found.unit, area, extent, largest, delay))
             except ModbusException as error:
                 found.unread[area, extent] = str(error)
                 found.reads.pop((area, extent), None)
@@ -139,7 +140,7 @@ def _places(found: Description) -> Iterator[tuple[Area, range, int]]:
 
 
 def _contents(
-    client: SyncClient, area: Area, extent: range, largest: int, delay: float
+    client: SyncClient, unit: int, area: Area, extent: range, largest: int, delay: float
 ) -> Iterator[int]:
     kind = "bool" if area in BIT_AREAS else "uint16"
     step = min(largest, READ_LIMITS[area])
@@ -147,7 +148,7 @@ def _contents(
         if delay:
             time.sleep(delay)
         count = min(step, extent.stop - first)
-        yield from client.read(area, first, f"{kind}[{count}]")
+        yield from client.read(area, first, f"{kind}[{count}]", unit=unit)
 
 
 def conclude(found: Description, now: float | None = None, seconds: float | None = None) -> None:
